@@ -2,39 +2,45 @@
 
 import ast
 from graphlib import TopologicalSorter
+from itertools import chain
 from pathlib import Path
 
 from docs.make.architecture import PACKAGES, imports_of, modules
 from docs.make.architecture import page as drawn
 
 ROOT = Path(__file__).resolve().parents[1]
-INSIDE = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("__init__.py"))]
+INSIDE: list[Path] = []
+for folder in PACKAGES:
+    INSIDE += sorted((ROOT / folder).rglob("__init__.py"))
 """What says what a package holds."""
 MOST_MODULES = 18
 
 
 def test_no_module_imports_itself_by_a_detour() -> None:
-    known = modules()
+    paths = modules()
     order = TopologicalSorter(
-        {name: imports_of(path, known, late=False) for name, path in known.items()}
+        {name: imports_of(path, paths, late=False) for name, path in paths.items()}
     )
-    assert len(list(order.static_order())) == len(known)  # a circle raises, and names its modules
+    # A cycle raises CycleError, which names its modules.
+    assert len(list(order.static_order())) == len(paths)
 
 
 def test_packages_stay_small_enough_to_look_through_and_say_what_is_inside() -> None:
     for path in INSIDE:
-        beside = [each for each in path.parent.glob("*.py") if each != path]
-        assert len(beside) <= MOST_MODULES, path.parent
+        neighbours = [file for file in path.parent.glob("*.py") if file != path]
+        assert len(neighbours) <= MOST_MODULES, path.parent
         assert ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))), path
 
 
 def test_the_page_names_files_that_are_there() -> None:
     page = (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8")
-    named = {
-        word for word in page.split("`") if word.startswith(tuple(f"{each}/" for each in PACKAGES))
+    mentions = {
+        word
+        for word in page.split("`")
+        if word.startswith(tuple(f"{package}/" for package in PACKAGES))
     }
-    assert len(named) > 40
-    assert not [word for word in named if not (ROOT / word).exists()]
+    assert len(mentions) > 40
+    assert not [word for word in mentions if not (ROOT / word).exists()]
 
 
 def test_the_picture_is_drawn_from_the_imports_of_today() -> None:
@@ -47,22 +53,20 @@ def listed(docstring: str) -> set[str]:
     """The modules that a list in a package's docstring is about: those before a colon, or the first
     of a clause.
     """
-    clauses = [
-        part
-        for line in docstring.splitlines()
-        if line.startswith("- ")
-        for part in line[2:].split("; ")
-    ]
+    clauses = list[str]()
+    for line in docstring.splitlines():
+        if line.startswith("- "):
+            clauses += line[2:].split("; ")
     quoted = [clause.split(": ")[0].split("`")[1::2] for clause in clauses]
     about = [
         words if ": " in clause else words[:1]
         for clause, words in zip(clauses, quoted, strict=True)
     ]
-    return {word for words in about for word in words if word.isidentifier()}
+    return {word for word in chain.from_iterable(about) if word.isidentifier()}
 
 
 def test_a_package_says_what_is_inside_by_names_that_are_there() -> None:
     for path in INSIDE:
         docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
-        here = {each.stem for each in path.parent.iterdir()}
+        here = {entry.stem for entry in path.parent.iterdir()}
         assert listed(docstring) <= here, (path, listed(docstring) - here)

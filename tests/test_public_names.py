@@ -28,5 +28,7 @@ def test_the_library_offers_these_names_and_no_others() -> None:
 def test_packages_are_looked_at_without_torch() -> None:
     heavy = "{'torch', 'skimage', 'scipy', 'matplotlib', 'onnxruntime'}"
     code = f"import sys, {', '.join(LIGHT)}; print({heavy} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "set()"
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert process.stdout.strip() == "set()"

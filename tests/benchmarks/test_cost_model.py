@@ -55,8 +55,8 @@ def test_every_network_is_the_published_one_and_passes_the_rules_of_its_boards()
             assert sum(op.weight_bytes for op in net.operations) == pytest.approx(
                 WEIGHTS[name], rel=0.01
             ), name
-        read = {tensor for op in net.operations for tensor in op.inputs} | set(net.outputs)
-        assert [op.name for op in net.operations if op.output not in read] == [], name
+        consumed = set(net.outputs).union(*(op.inputs for op in net.operations))
+        assert [op.name for op in net.operations if op.output not in consumed] == [], name
         for board in {rate["board"] for rate in published_rates() if rate["network"] == name}:
             assert [node.op.name for node in place(net, load_dpu(board)).failed] == [], (
                 name,
@@ -71,11 +71,11 @@ def test_the_fit_and_the_prediction_are_one_formula(board: str, name: str) -> No
     dpu = load_dpu(board)
     case = Cases((network_case(name, dpu, (1.0,)),), Structure.of(dpu))
     times = case.times(Constants.of(dpu))
-    found = predict(place(written(name).network, dpu), dpu, NETWORKS[name].host)
-    assert found.dpu.handlers / found.latency_s == pytest.approx(
+    prediction = predict(place(written(name).network, dpu), dpu, NETWORKS[name].host)
+    assert prediction.dpu.handlers / prediction.latency_s == pytest.approx(
         1 / float(times.alone_s[0] + times.host_s[0])
     )
-    assert found.fps == pytest.approx(math.exp(float(case.predicted(times)[0])))
+    assert prediction.fps == pytest.approx(math.exp(float(case.predicted(times)[0])))
 
 
 def test_the_fitted_range_ends_with_the_largest_network() -> None:

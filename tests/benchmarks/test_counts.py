@@ -28,7 +28,8 @@ def test_what_is_counted() -> None:
     nodes = list(ast.walk(tree))
     tokens, lines, comments = counts.measured(CODE, tree)
     assert (lines, comments) == (13, 1)
-    assert tokens == 7 + 7 + 23 + 7 + 10 + 14  # a line each
+    # There is one summand for each line with code.
+    assert tokens == 7 + 7 + 23 + 7 + 10 + 14
     assert sum(map(counts.is_paired, nodes)) == 1
     assert sum(map(counts.is_nested_conditional, nodes)) == 1
     assert counts.lone_helpers(nodes) == 1
@@ -36,17 +37,17 @@ def test_what_is_counted() -> None:
 
 def test_the_project_keeps_its_limits() -> None:
     script = Path(counts.__file__)
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, str(script), "--check"], capture_output=True, text=True, check=False
     )
-    assert done.returncode == 0, done.stderr
-    assert "| tokens a line |" in done.stdout
+    assert process.returncode == 0, process.stderr
+    assert "| tokens a line |" in process.stdout
 
 
 @pytest.mark.parametrize("limit", [0.0, 1.0])
 def test_a_limit_that_is_passed_is_told(monkeypatch: pytest.MonkeyPatch, limit: float) -> None:
-    found = {name: counts.counted(("benchmarks",)) for name in counts.PARTS}
+    totals = {name: counts.counted(("benchmarks",)) for name in counts.PARTS}
     monkeypatch.setattr(counts, "DENSITY_LIMITS", {"source": limit})
     monkeypatch.setattr(counts, "PAIRED_LIMITS", {})
-    (sentence,) = counts.over(found)
+    (sentence,) = counts.over(totals)
     assert f"{limit:.2f} at most" in sentence

@@ -25,10 +25,10 @@ TIMEOUT_S = 180
 
 def browser() -> str:
     """The path of a browser; the test is skipped where there is none."""
-    found = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if found is None:
+    path = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if path is None:
         pytest.skip("no Chromium or Chrome here to drive the page with")
-    return found
+    return path
 
 
 def seen(page: str, look: str, folder: Path, *, width_px: int = 1280, dark: bool = False) -> Any:
@@ -42,16 +42,17 @@ def seen(page: str, look: str, folder: Path, *, width_px: int = 1280, dark: bool
     )
     options = [
         "--headless",
-        "--no-sandbox",  # which refuses to run as root, as containers do
+        # Chromium's sandbox refuses to run as root, which is the user of containers.
+        "--no-sandbox",
         "--disable-gpu",
         f"--user-data-dir={folder / 'profile'}",
         f"--blink-settings=preferredColorScheme={0 if dark else 1}",
         "--dump-dom",
     ]
     command = [browser(), *options, (folder / "page.html").as_uri()]
-    shown = subprocess.run(
+    dom = subprocess.run(
         command, capture_output=True, text=True, timeout=TIMEOUT_S, check=True
     ).stdout
-    told = re.search(r'<pre id="told">(.*?)</pre>', shown, re.DOTALL)
-    assert told, "the script did not run"
-    return json.loads(unescape(told[1]))
+    match = re.search(r'<pre id="told">(.*?)</pre>', dom, re.DOTALL)
+    assert match, "the script did not run"
+    return json.loads(unescape(match[1]))

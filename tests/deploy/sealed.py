@@ -40,6 +40,7 @@ def seal() -> None:
     Raises:
         OSError: the kernel takes no filters.
     """
+    # After an operation come the numbers of steps to skip if it is true and if it is false.
     steps = [
         (LOAD, 0, 0, CALL_OFFSET),
         (JUMP_IF_EQUAL, 0, 3, SOCKET_CALL[platform.machine()]),
@@ -49,9 +50,11 @@ def seal() -> None:
         (RETURN, 0, 0, ALLOW),
         (RETURN, 0, 0, KILL_PROCESS),
     ]
+    # The kernel's `struct sock_filter`: 16 bits, two times 8 bits, 32 bits.
     code = b"".join(struct.pack("HBBI", *step) for step in steps)
     program = Program(len(steps), code)
     libc = ctypes.CDLL(None, use_errno=True)
+    # Without privileges the kernel takes a filter only of a process that can gain none.
     if libc.prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) or libc.prctl(
         PR_SET_SECCOMP, SECCOMP_MODE_FILTER, ctypes.byref(program), 0, 0
     ):

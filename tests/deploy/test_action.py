@@ -51,9 +51,9 @@ def networks(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def runner(tmp_path: Path) -> Runner:
     (tmp_path / "workspace").mkdir()
-    made = Runner(tmp_path / "workspace")
-    made.prepare()
-    return made
+    job = Runner(tmp_path / "workspace")
+    job.prepare()
+    return job
 
 
 def take(runner: Runner, networks: Path, *names: str) -> None:
@@ -89,8 +89,8 @@ def test_a_broken_pair_is_red(runner: Runner, networks: Path) -> None:
     """The first convolution's bias doubled, beside the baseline of the sound pair."""
     take(runner, networks, "float.onnx", "int8.onnx", "broken.onnx")
     pair = {"float": "models/float.onnx", "int8": "models/int8.onnx"}
-    sound = runner.run_action({**pair, "json": "models/gate.json"})
-    assert sound["verdict"] == "passed"
+    outputs_before = runner.run_action({**pair, "json": "models/gate.json"})
+    assert outputs_before["verdict"] == "passed"
     outputs = runner.run_action(
         {**pair, "int8": "models/broken.onnx", "baseline": "models/gate.json"}
     )
@@ -106,12 +106,12 @@ def test_a_broken_pair_is_red(runner: Runner, networks: Path) -> None:
     assert "MAE against the baseline" in failed
 
 
-@pytest.mark.parametrize("given", [{}, {"int8": "models/int8.onnx"}])
+@pytest.mark.parametrize("more", [{}, {"int8": "models/int8.onnx"}])
 def test_a_missing_float_network_is_red_in_one_sentence(
-    given: dict[str, str], runner: Runner, networks: Path
+    more: dict[str, str], runner: Runner, networks: Path
 ) -> None:
     take(runner, networks, "int8.onnx")
-    outputs = runner.run_action({"float": "models/float.onnx", **given})
+    outputs = runner.run_action({"float": "models/float.onnx", **more})
     assert runner.red
     assert runner.stderr.count("\n") == 1
     assert "models/float.onnx: expected an ONNX file, got no such file" in runner.stderr
@@ -173,7 +173,7 @@ def obeyed(stdout: str) -> list[str]:
     """Return the workflow commands that GitHub obeys in an output, without what follows their
     second colons.
     """
-    found = list[str]()
+    commands = list[str]()
     token = ""
     for line in stdout.splitlines():
         if token and line == f"::{token}::":
@@ -181,15 +181,15 @@ def obeyed(stdout: str) -> list[str]:
         elif line.startswith("::stop-commands::") and not token:
             token = line.removeprefix("::stop-commands::")
         elif line.startswith("::") and not token:
-            found.append(line[2:].partition("::")[0])
-    return found
+            commands.append(line[2:].partition("::")[0])
+    return commands
 
 
 def test_names_are_never_run(runner: Runner) -> None:
-    given = dict.fromkeys(
+    inputs = dict.fromkeys(
         ("float", "int8", "sensor", "limits"), "$(touch ran) `touch ran` ; touch ran"
     )
-    assert runner.run_action(given)["verdict"] == "error"
+    assert runner.run_action(inputs)["verdict"] == "error"
     assert not (runner.folder / "ran").exists()
 
 
@@ -207,9 +207,8 @@ def test_installing_puts_the_command_alone_on_the_path(tmp_path: Path) -> None:
     """With a Python that writes down what it is asked for, for want of a
     package index in a test.
     """
-    (step,) = (
-        step for step in read_yaml(ACTION)["runs"]["steps"] if "pip install" in step.get("run", "")
-    )
+    steps = read_yaml(ACTION)["runs"]["steps"]
+    (step,) = (step for step in steps if "pip install" in step.get("run", ""))
     python = tmp_path / "python"
     python.write_text(
         '#!/usr/bin/env bash\necho "$*" >> "$LOG"\n'
@@ -217,7 +216,7 @@ def test_installing_puts_the_command_alone_on_the_path(tmp_path: Path) -> None:
         'if [ "$3" = install ]; then echo ok > "$(dirname "$0")/beers-deploy"; fi\n'
     )
     python.chmod(0o755)
-    given = {
+    variables = {
         "PYTHON": str(python),
         "SOURCE": "the action",
         "RUNNER_TEMP": str(tmp_path),
@@ -228,28 +227,24 @@ def test_installing_puts_the_command_alone_on_the_path(tmp_path: Path) -> None:
         "GITHUB_PATH": str(tmp_path / "path"),
         "PATH": "/usr/bin:/bin",
     }
-    done = subprocess.run([*BASH, step["run"]], cwd=tmp_path, env=given | files, **KEPT)
-    assert done.returncode == 0, done.stderr
+    process = subprocess.run([*BASH, step["run"]], cwd=tmp_path, env=variables | files, **KEPT)
+    assert process.returncode == 0, process.stderr
     venv = tmp_path / "beers-deploy"
     assert (tmp_path / "log").read_text() == f"-m venv {venv}\n-m pip install --quiet the action\n"
-    (added,) = (tmp_path / "path").read_text().splitlines()
-    assert [path.name for path in Path(added).iterdir()] == ["beers-deploy"]
+    (folder,) = (tmp_path / "path").read_text().splitlines()
+    assert [path.name for path in Path(folder).iterdir()] == ["beers-deploy"]
     assert "PIP_EXTRA_INDEX_URL" not in step["env"]
-
-
-def steps_of_workflow() -> list[dict[str, object]]:
-    (job,) = read_yaml(WORKFLOW)["jobs"].values()
-    steps: list[dict[str, object]] = job["steps"]
-    return steps
 
 
 def test_the_workflow_is_green_with_one(runner: Runner, networks: Path) -> None:
     take(runner, networks / "plain", "float.onnx")
-    (runner.folder / "protected" / ".ci").mkdir(parents=True)  # by its second checkout
-    (runner.folder / "protected" / ".ci" / "gate.toml").write_text(
-        "mae = 0.001\npsnr_drop_db = 0.4\n"
-    )
-    runner.run_steps([step for step in steps_of_workflow() if step.get("name") != OURS], {})
+    # The workflow's second checkout leaves the limits of the protected branch here.
+    limits = runner.folder / "protected" / ".ci" / "gate.toml"
+    limits.parent.mkdir(parents=True)
+    limits.write_text("mae = 0.001\npsnr_drop_db = 0.4\n")
+    (job,) = read_yaml(WORKFLOW)["jobs"].values()
+    steps = [step for step in job["steps"] if step.get("name") != OURS]
+    runner.run_steps(steps, {})
     assert not runner.red, runner.stderr
     assert runner.outputs["steps.gate.outputs.verdict"] == "passed"
     assert (runner.folder / "gate.xml").is_file()

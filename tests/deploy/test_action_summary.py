@@ -5,6 +5,7 @@ import os
 import re
 import runpy
 from html import unescape
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -39,10 +40,10 @@ def reported(folder: Path, code: int, document: object, stderr: str = "") -> tup
     (folder / "gate.json").write_text(json.dumps(document), encoding="utf-8")
     (folder / "stderr").write_text(stderr, encoding="utf-8", errors="surrogatepass")
     VERDICT["main"](code, folder / "gate.json", folder / "stderr")
-    written = [(folder / name).read_text(encoding="utf-8") for name in names]
+    texts = [(folder / name).read_text(encoding="utf-8") for name in names]
     for name in names:
         del os.environ[name]
-    return written[1], written[0]
+    return texts[1], texts[0]
 
 
 def failed(name: str, detail: str) -> dict[str, Any]:
@@ -123,14 +124,14 @@ def used(path: Path) -> list[str]:
 
 
 def test_actions_of_others_are_pinned_by_commit_with_their_version() -> None:
-    lines = [line for path in (*workflows(), ACTION) for line in used(path)]
+    lines = list(chain.from_iterable(used(path) for path in (*workflows(), ACTION)))
     assert len(lines) > 20
     for line in lines:
         assert PINNED.fullmatch(line), line
     versions = {line.partition("@")[0]: set[str]() for line in lines}
     for line in lines:
         versions[line.partition("@")[0]].add(line)
-    assert all(len(found) == 1 for found in versions.values()), (
+    assert all(len(uses) == 1 for uses in versions.values()), (
         "one version of an action in all files"
     )
 

@@ -46,10 +46,10 @@ def written(path: Path, content: object) -> Path:
 
 
 def test_what_a_gate_wrote_is_read(tmp_path: Path) -> None:
-    found = read_baseline(written(tmp_path / "b.json", document()), ASKED)
-    assert (found.mae, found.psnr_float_db) == (5e-4, 50.0)
-    assert found.digests == {"float.onnx": {"a" * 64}, "sensor s": {"b" * 64}}
-    assert found.checks == {"MAE"}
+    baseline = read_baseline(written(tmp_path / "b.json", document()), ASKED)
+    assert (baseline.mae, baseline.psnr_float_db) == (5e-4, 50.0)
+    assert baseline.digests == {"float.onnx": {"a" * 64}, "sensor s": {"b" * 64}}
+    assert baseline.checks == {"MAE"}
 
 
 def failed(content: dict[str, Any]) -> None:
@@ -81,7 +81,7 @@ def two_rows(content: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (failed, "a gate that passed, got failed"),
         (another_command, "got one of check"),
@@ -98,11 +98,11 @@ def two_rows(content: dict[str, Any]) -> None:
     ],
 )
 def test_a_document_that_is_no_baseline_is_refused(
-    change: Callable[[dict[str, Any]], None], said: str, tmp_path: Path
+    change: Callable[[dict[str, Any]], None], message: str, tmp_path: Path
 ) -> None:
     content = document()
     change(content)
-    with pytest.raises(OptionError, match=said):
+    with pytest.raises(OptionError, match=message):
         read_baseline(written(tmp_path / "b.json", content), ASKED)
 
 
@@ -129,7 +129,7 @@ def test_a_key_that_stands_twice_is_refused(key: str, tmp_path: Path) -> None:
 
 def test_a_name_that_is_not_utf_8_comes_back(tmp_path: Path) -> None:
     inputs = (Input("float.onnx", "a" * 64), Input("samples n\udcff.npy", "b" * 64))
-    made = document(samples="n\udcff.npy")
+    content = document(samples="n\udcff.npy")
     table = Table(
         "gate",
         {**ASKED, "samples": "n\udcff.npy"},
@@ -137,11 +137,11 @@ def test_a_name_that_is_not_utf_8_comes_back(tmp_path: Path) -> None:
         (Row("gate", "n", {"MAE": MAE}),),
         (KEPT,),
     )
-    found = read_baseline(
+    baseline = read_baseline(
         table.save(tmp_path / "b.json"), {**ASKED, "samples": Path("n\udcff.npy")}
     )
-    found.require_same("a" * 64, 0.0, inputs[1:])
-    assert "\udcff" not in made["arguments"]["samples"]
+    baseline.require_same("a" * 64, 0.0, inputs[1:])
+    assert "\udcff" not in content["arguments"]["samples"]
 
 
 def test_files_that_are_no_document_are_refused(tmp_path: Path) -> None:
@@ -161,11 +161,11 @@ def test_a_baseline_of_other_patches_is_refused_and_a_folder_may_lie_elsewhere(
     other: dict[str, object], tmp_path: Path
 ) -> None:
     path = written(tmp_path / "b.json", document(images="/here/ground"))
-    same = {**ASKED, "images": Path("there/ground")}
-    assert read_baseline(path, same).mae == 5e-4
+    asked = {**ASKED, "images": Path("there/ground")}
+    assert read_baseline(path, asked).mae == 5e-4
     (name,) = other
     with pytest.raises(OptionError, match=f"same patches \\({name}"):
-        read_baseline(path, {**same, **other})
+        read_baseline(path, {**asked, **other})
 
 
 DIGESTS = {"net.onnx": frozenset({"a" * 64, "d" * 64}), "sensor s": frozenset({"b" * 64})}
@@ -207,7 +207,8 @@ def test_a_folder_is_known_by_its_files(change: str, tmp_path: Path) -> None:
     (folder / "a.tif").write_bytes(b"1")
     (folder / "b.tif").write_bytes(b"2")
     before = data_inputs(folder, None)
-    (folder / "gate.json").touch()  # not read as a scene
+    # A file that is not read as a scene does not count.
+    (folder / "gate.json").touch()
     if change == "content":
         (folder / "a.tif").write_bytes(b"3")
     elif change == "name":
@@ -224,8 +225,8 @@ def test_a_baseline_holds_the_mae(scenes: Path, tmp_path: Path) -> None:
     done(*command, "--json", first)
     before = read_baseline(first, {**ASKED, "images": scenes}).mae
     first.write_text(first.read_text().replace(str(before), str(before / 2)))
-    said = done(*command, "--baseline", first, "--json", second, code=1).splitlines()[-1]
-    assert f"MAE against the baseline {before:.4g} of full scale" in said
+    last_line = done(*command, "--baseline", first, "--json", second, code=1).splitlines()[-1]
+    assert f"MAE against the baseline {before:.4g} of full scale" in last_line
     content = json.loads(second.read_text())
     assert content["verdict"] == "failed"
     limits = {check["name"]: (check["value"], check["limit"]) for check in content["checks"]}

@@ -18,10 +18,10 @@ from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, in
 
 
 def tables(path: Path) -> dict[str, list[dict[str, Any]]]:
-    found: dict[str, list[dict[str, Any]]] = {}
+    by_name: dict[str, list[dict[str, Any]]] = {}
     for row in valid(path)["rows"]:
-        found.setdefault(row["table"], []).append(row)
-    return found
+        by_name.setdefault(row["table"], []).append(row)
+    return by_name
 
 
 def test_convbeers_passes_whole_in_every_encoding(tmp_path: Path) -> None:
@@ -47,10 +47,10 @@ def test_the_document_holds_subgraphs_cuts_and_remarks(tmp_path: Path) -> None:
         tmp_path / "bad.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image")))
     )
     output = done("check", path, "--tile", 96, "--json", tmp_path / "o.json", code=1)
-    found = tables(tmp_path / "o.json")
-    assert [row["text"]["device"] for row in found["subgraphs"]] == ["DPU", "CPU", "DPU"]
-    assert [row["figures"]["size"]["value"] for row in found["cuts"]] == [8 * 96 * 96] * 4
-    assert {row["name"] for row in found["remarks"]} == {"fix2float", "subgraphs"}
+    rows = tables(tmp_path / "o.json")
+    assert [row["text"]["device"] for row in rows["subgraphs"]] == ["DPU", "CPU", "DPU"]
+    assert [row["figures"]["size"]["value"] for row in rows["cuts"]] == [8 * 96 * 96] * 4
+    assert {row["name"] for row in rows["remarks"]} == {"fix2float", "subgraphs"}
     assert "device subgraphs: 3, DPU subgraphs: 2" in output
     assert "check FAILED: nodes the DPU refuses 1 (" in output.splitlines()[-1]
 
@@ -60,13 +60,13 @@ def test_the_document_holds_the_verdict(tmp_path: Path) -> None:
     path = sketch.save(
         tmp_path / "bad.onnx", sketch.conv(sketch.node("Sigmoid", sketch.conv("image")))
     )
-    bad = verdict(tmp_path / "bad.json", path, code=1)
-    sound = verdict(tmp_path / "sound.json", float_convbeers(tmp_path / "n.onnx", 2, 8))
-    assert [found[0] for found in (bad, sound)] == ["failed", "passed"]
+    failing = verdict(tmp_path / "bad.json", path, code=1)
+    passing = verdict(tmp_path / "sound.json", float_convbeers(tmp_path / "n.onnx", 2, 8))
+    assert [result[0] for result in (failing, passing)] == ["failed", "passed"]
     limit = {"limit": 0, "bound": "at most"}
     nodes = {"name": "nodes the DPU refuses", "unit": "node", **limit}
-    assert nodes.items() | {"value": 1, "passed": False}.items() <= bad[1].items()
-    assert nodes.items() | {"value": 0, "passed": True, "detail": ""}.items() <= sound[1].items()
+    assert nodes.items() | {"value": 1, "passed": False}.items() <= failing[1].items()
+    assert nodes.items() | {"value": 0, "passed": True, "detail": ""}.items() <= passing[1].items()
 
 
 def verdict(path: Path, model: Path, code: int = 0) -> tuple[str, dict[str, Any]]:
@@ -96,18 +96,19 @@ def test_a_picture_is_drawn(tmp_path: Path) -> None:
 
 def test_of_a_float_file_check_says_what_quantize_would(tmp_path: Path) -> None:
     """Both give the same reason, so that nobody passes one to be refused by the other."""
-    taken = float_convbeers(tmp_path / "taken.onnx", 1, 8)
-    other = tmp_path / "other.onnx"
-    model = onnx.load(taken)
-    model.graph.node[-1].op_type = "Div"  # the global add
-    onnx.save(model, other)
-    assert "'quantize' takes it" in done("check", taken)
+    supported = float_convbeers(tmp_path / "taken.onnx", 1, 8)
+    unsupported = tmp_path / "other.onnx"
+    model = onnx.load(supported)
+    # The last node is the global add.
+    model.graph.node[-1].op_type = "Div"
+    onnx.save(model, unsupported)
+    assert "'quantize' takes it" in done("check", supported)
     with pytest.raises(ModelError) as error:
         read_network(model)
-    said = " ".join(done("check", other).split())
+    output = " ".join(done("check", unsupported).split())
     assert (
         f"'quantize' does not take it: expected {error.value.expected}, got {error.value.got}"
-        in said
+        in output
     )
 
 
@@ -121,5 +122,7 @@ def test_a_check_and_its_picture_need_no_torch(tmp_path: Path) -> None:
         f"import sys; from beers_deploy.cli import app; {call}; print({{'torch', 'skimage'}} "
         "& set(sys.modules))"
     )
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert ran.stdout.splitlines()[-1] == "set()"
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert process.stdout.splitlines()[-1] == "set()"

@@ -47,9 +47,9 @@ def fails(arguments: list[str], *words: str) -> None:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_help_with_an_example(name: str) -> None:
-    said = done(name, "--help")
-    assert f"beers-deploy {name}" in " ".join(said.split())
-    assert "Example" in said
+    output = done(name, "--help")
+    assert f"beers-deploy {name}" in " ".join(output.split())
+    assert "Example" in output
 
 
 def test_what_is_told_no_sensor_takes_the_same_one() -> None:
@@ -58,12 +58,11 @@ def test_what_is_told_no_sensor_takes_the_same_one() -> None:
     """
     group = get_command(app)
     assert isinstance(group, TyperGroup)
-    defaults = {
-        name: p.default
-        for name, c in group.commands.items()
-        for p in c.params
-        if p.name == "sensor"
-    }
+    defaults = {}
+    for name, command in group.commands.items():
+        for option in command.params:
+            if option.name == "sensor":
+                defaults[name] = option.default
     assert {"quantize", "gate", "evaluate"} <= set(defaults)
     assert defaults.pop("detect") == "dior-medium,dior-high"
     assert set(defaults.values()) == {SENSOR, None}
@@ -72,8 +71,10 @@ def test_what_is_told_no_sensor_takes_the_same_one() -> None:
 def test_help_imports_nothing_heavy() -> None:
     heavy = ("torch", "onnxruntime", "onnx", "skimage", "scipy")
     code = f"import sys; import beers_deploy.cli; print([m for m in {heavy} if m in sys.modules])"
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert ran.stdout.strip() == "[]"
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert process.stdout.strip() == "[]"
 
 
 def test_version() -> None:
@@ -114,16 +115,17 @@ def test_a_name_that_the_terminal_cannot_show_ends_no_run(tmp_path: Path) -> Non
         image,
         tmp_path / "out.tif",
     ]
-    environment = {**os.environ, "PYTHONIOENCODING": "cp1252"}  # as pipes have it on Windows
-    ran = subprocess.run(
+    # Pipes have this encoding on Windows.
+    environment = {**os.environ, "PYTHONIOENCODING": "cp1252"}
+    process = subprocess.run(
         list(map(str, command)),
         env=environment,
         capture_output=True,
         encoding="cp1252",
         check=False,
     )
-    assert ran.returncode == 0, ran.stderr
-    assert "\\u6771\\u4eac" in ran.stdout
+    assert process.returncode == 0, process.stderr
+    assert "\\u6771\\u4eac" in process.stdout
     assert tifffile.imread(tmp_path / "out.tif").shape == (40, 50)
 
 
@@ -159,9 +161,8 @@ def test_an_acquisition_of_another_scale_is_read_as_digital_numbers(tmp_path: Pa
     np.testing.assert_allclose(read_acquisition(tmp_path / "share.tif", 1), dn, atol=1e-3)
     np.testing.assert_allclose(read_acquisition(tmp_path / "eight.tif", 255), dn, atol=17)
     for name in ("share.tif", "eight.tif"):
-        with pytest.raises(
-            ImageError, match="rescale it"
-        ):  # where no option settles it, as for pairs
+        # Where no option settles the scale, as for pairs, the remedy is to rescale the image.
+        with pytest.raises(ImageError, match="rescale it"):
             read_acquisition(tmp_path / name)
         with pytest.raises(ImageError, match="full_scale"):
             read_input(
@@ -170,9 +171,8 @@ def test_an_acquisition_of_another_scale_is_read_as_digital_numbers(tmp_path: Pa
         with pytest.raises(ImageError, match="values from 0"):
             read_acquisition(tmp_path / name, 0.5 if name == "share.tif" else 100)
     assert read_input(tmp_path / "share.tif", 0, load_sensors(), 1)[0].max() == 4095
-    assert (
-        read_input(tmp_path / "eight.tif", 0, load_sensors(), 255)[1] is None
-    )  # a raw image, no scene
+    # A raw image is no scene, so it has no pair.
+    assert read_input(tmp_path / "eight.tif", 0, load_sensors(), 255)[1] is None
 
 
 def test_a_full_scale_without_an_image_is_refused() -> None:
@@ -223,9 +223,9 @@ def test_profiles_show_scenes_targets_and_sensors_with_every_source() -> None:
     for name in ("snow", "vck190", "pleiades-variable"):
         assert "source" in done("profiles", name)
     assert "pleiades-degraded" in done("profiles")
-    shown = done("profiles", "pleiades-degraded")
-    assert "gain_dn_per_radiance" in shown
-    assert "assumed" in shown
+    output = done("profiles", "pleiades-degraded")
+    assert "gain_dn_per_radiance" in output
+    assert "assumed" in output
 
 
 def test_a_description_is_shown_and_not_obeyed(tmp_path: Path) -> None:
@@ -258,8 +258,8 @@ def run_with(closing: str, *words: object) -> tuple[int, str]:
     """The program in a shell that redirects its streams; its exit code and what it still says."""
     words = (sys.executable, "-m", "beers_deploy", *words)
     line = ["/usr/bin/env", "bash", "-c", f'"$@" {closing}', "bash", *map(str, words)]
-    done = subprocess.run(line, capture_output=True, text=True, check=False)
-    return done.returncode, done.stdout + done.stderr
+    process = subprocess.run(line, capture_output=True, text=True, check=False)
+    return process.returncode, process.stdout + process.stderr
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here: Linux has one")
@@ -279,12 +279,13 @@ def test_no_stream_loses_an_image(closing: str, code: int, tmp_path: Path) -> No
         np.random.default_rng(0).integers(900, 1200, (40, 50)).astype(np.uint16),
     )
     network = ("--network", "convbeers-xs-int8")
-    found, said = run_with(closing, "restore", tmp_path / "in.tif", tmp_path / "out.tif", *network)
+    exit_code, output = run_with(
+        closing, "restore", tmp_path / "in.tif", tmp_path / "out.tif", *network
+    )
     assert tifffile.imread(tmp_path / "out.tif").shape == (40, 50)
-    assert "Traceback" not in said
-    assert found == code or (
-        found == 0 and "true" in closing
-    )  # the pipe may live until the last word
+    assert "Traceback" not in output
+    # The pipe to `true` may live until the last word is written, and then the run ends with 0.
+    assert exit_code == code or (exit_code == 0 and "true" in closing)
 
 
 @pytest.mark.parametrize("module", ["typing_extensions", "psutil", "numpy"])
@@ -294,12 +295,14 @@ def test_an_installation_that_does_not_work_is_no_failed_gate(module: str, tmp_p
     """
     (tmp_path / f"{module}.py").write_text("raise RuntimeError('broken')\n", encoding="utf-8")
     command = [sys.executable, "-m", "beers_deploy", "--version", "-v"]
-    found = subprocess.run(
+    process = subprocess.run(
         command,
         env={**os.environ, "PYTHONPATH": str(tmp_path)},
         capture_output=True,
         text=True,
         check=False,
     )
-    assert found.returncode == CRASHED
-    assert found.stderr.splitlines()[-1].startswith("beers-deploy: this installation does not work")
+    assert process.returncode == CRASHED
+    assert process.stderr.splitlines()[-1].startswith(
+        "beers-deploy: this installation does not work"
+    )

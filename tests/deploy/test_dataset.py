@@ -44,7 +44,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def made(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dataset(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The small dataset, to be read."""
     folder = tmp_path_factory.mktemp("made") / "all"
     write_dataset(small(scene), folder, 1, resume=False, tick=silent)
@@ -76,11 +76,11 @@ def test_the_bytes_do_not_depend_on_the_workers(scene: Path, tmp_path: Path) -> 
     assert bytes_of(tmp_path / "1") == bytes_of(tmp_path / "2")
 
 
-def test_any_patch_can_be_made_again_alone(scene: Path, made: Path) -> None:
+def test_any_patch_can_be_made_again_alone(scene: Path, dataset: Path) -> None:
     window = plan_windows(small(scene))[7]
     (patch,) = make_patches(small(scene), [window])
     for role, dn in (("degraded", patch.degraded), ("reference", patch.reference)):
-        np.testing.assert_array_equal(dn, tifffile.imread(made / role / f"{window.name}.tif"))
+        np.testing.assert_array_equal(dn, tifffile.imread(dataset / role / f"{window.name}.tif"))
 
 
 def test_the_manifest_tells_where_each_patch_comes_from(scene: Path, tmp_path: Path) -> None:
@@ -103,7 +103,7 @@ def test_the_manifest_tells_where_each_patch_comes_from(scene: Path, tmp_path: P
 @pytest.mark.slow
 def test_a_killed_dataset_is_resumed_to_the_same_bytes(scene: Path, tmp_path: Path) -> None:
     options = [str(scene), "--oversampling", "2", "--patch", "8", "--workers", "1"]
-    whole, killed = (tmp_path / name for name in ("whole", "killed"))
+    unbroken, killed = (tmp_path / name for name in ("whole", "killed"))
     command = [
         sys.executable,
         "-c",
@@ -112,7 +112,7 @@ def test_a_killed_dataset_is_resumed_to_the_same_bytes(scene: Path, tmp_path: Pa
         *options,
         "--out",
     ]
-    subprocess.run([*command, str(whole)], check=True, capture_output=True)
+    subprocess.run([*command, str(unbroken)], check=True, capture_output=True)
     with subprocess.Popen(
         [*command, str(killed)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     ) as run:
@@ -120,17 +120,17 @@ def test_a_killed_dataset_is_resumed_to_the_same_bytes(scene: Path, tmp_path: Pa
             time.sleep(0.01)
         run.kill()
     subprocess.run([*command, str(killed), "--resume"], check=True, capture_output=True)
-    assert bytes_of(killed) == bytes_of(whole)
+    assert bytes_of(killed) == bytes_of(unbroken)
 
 
-def test_another_dataset_in_the_folder_is_not_overwritten(scene: Path, made: Path) -> None:
-    before = bytes_of(made)
+def test_another_dataset_in_the_folder_is_not_overwritten(scene: Path, dataset: Path) -> None:
+    before = bytes_of(dataset)
     with pytest.raises(OptionError, match="add `resume`"):
-        write_dataset(small(scene), made, 1, resume=False, tick=silent)
+        write_dataset(small(scene), dataset, 1, resume=False, tick=silent)
     with pytest.raises(OptionError, match="another dataset"):
-        write_dataset(small(scene, patch_px=32), made, 1, resume=True, tick=silent)
-    write_dataset(small(scene), made, 1, resume=True, tick=silent)
-    assert bytes_of(made) == before
+        write_dataset(small(scene, patch_px=32), dataset, 1, resume=True, tick=silent)
+    write_dataset(small(scene), dataset, 1, resume=True, tick=silent)
+    assert bytes_of(dataset) == before
 
 
 def flip(path: Path, share: float = 0.5) -> None:
@@ -170,18 +170,20 @@ DAMAGES: dict[str, tuple[str, Callable[[Path], None], int]] = {
 
 @pytest.mark.parametrize("kind", DAMAGES)
 def test_damaged_pairs_of_a_finished_dataset_are_made_again(
-    kind: str, scene: Path, made: Path, tmp_path: Path
+    kind: str, scene: Path, dataset: Path, tmp_path: Path
 ) -> None:
     name, damage, count = DAMAGES[kind]
-    folder = Path(shutil.copytree(made, tmp_path / "damaged"))
+    folder = Path(shutil.copytree(dataset, tmp_path / "damaged"))
     damage(folder / name)
-    said: list[str] = []
-    write_dataset(small(scene), folder, 1, resume=True, tick=silent, log=said.append)
-    assert bytes_of(folder) == bytes_of(made)
+    messages: list[str] = []
+    write_dataset(small(scene), folder, 1, resume=True, tick=silent, log=messages.append)
+    assert bytes_of(folder) == bytes_of(dataset)
     assert (
-        [sentence.split(" ")[0] for sentence in said] == [str(count)] if count else len(said) <= 1
+        [sentence.split(" ")[0] for sentence in messages] == [str(count)]
+        if count
+        else len(messages) <= 1
     )
-    assert all("they are made again" in sentence for sentence in said)
+    assert all("they are made again" in sentence for sentence in messages)
 
 
 def rejected(value: object) -> Callable[[Line], None]:
@@ -199,34 +201,34 @@ FORGED: dict[str, Callable[[Line], object]] = {
 
 @pytest.mark.parametrize("kind", FORGED)
 def test_a_forged_line_with_its_digest_is_made_again(
-    kind: str, scene: Path, made: Path, tmp_path: Path
+    kind: str, scene: Path, dataset: Path, tmp_path: Path
 ) -> None:
-    folder = Path(shutil.copytree(made, tmp_path / "forged"))
+    folder = Path(shutil.copytree(dataset, tmp_path / "forged"))
     lines = (folder / "manifest.jsonl").read_text().splitlines(keepends=True)
     line = json.loads(lines[0])
     del line[DIGESTS]
     FORGED[kind](line)
     (folder / "manifest.jsonl").write_text("".join([line_text(folder, line), *lines[1:]]))
-    said: list[str] = []
-    write_dataset(small(scene), folder, 1, resume=True, tick=silent, log=said.append)
-    assert bytes_of(folder) == bytes_of(made)
-    assert said[0].startswith("1 of ")
+    messages: list[str] = []
+    write_dataset(small(scene), folder, 1, resume=True, tick=silent, log=messages.append)
+    assert bytes_of(folder) == bytes_of(dataset)
+    assert messages[0].startswith("1 of ")
 
 
 def test_a_recipe_whose_lines_end_otherwise_is_the_same(
-    scene: Path, made: Path, tmp_path: Path
+    scene: Path, dataset: Path, tmp_path: Path
 ) -> None:
-    folder = Path(shutil.copytree(made, tmp_path / "other"))
+    folder = Path(shutil.copytree(dataset, tmp_path / "other"))
     recipe = folder / "recipe.json"
     recipe.write_bytes(recipe.read_bytes().replace(b"\n", b"\r\n"))
     write_dataset(small(scene), folder, 1, resume=True, tick=silent)
-    assert bytes_of(folder) == bytes_of(made)
+    assert bytes_of(folder) == bytes_of(dataset)
 
 
 def test_left_overs_of_a_run_are_deleted_and_nothing_else(
-    scene: Path, made: Path, tmp_path: Path
+    scene: Path, dataset: Path, tmp_path: Path
 ) -> None:
-    folder = Path(shutil.copytree(made, tmp_path / "left"))
+    folder = Path(shutil.copytree(dataset, tmp_path / "left"))
     ours = [folder / "degraded" / ".a.tif.123.part", folder / ".manifest.jsonl.9.part"]
     foreign = [folder / "mine" / ".b.tif.123.part", folder / ".mine.part"]
     foreign[0].parent.mkdir()
@@ -238,9 +240,9 @@ def test_left_overs_of_a_run_are_deleted_and_nothing_else(
 
 @pytest.mark.parametrize("damage", [flip, cut, Path.unlink])
 def test_a_damaged_part_of_an_unfinished_dataset_is_made_again(
-    damage: Callable[[Path], None], scene: Path, made: Path, tmp_path: Path
+    damage: Callable[[Path], None], scene: Path, dataset: Path, tmp_path: Path
 ) -> None:
-    folder = Path(shutil.copytree(made, tmp_path / "unfinished"))
+    folder = Path(shutil.copytree(dataset, tmp_path / "unfinished"))
     (folder / "parts").mkdir()
     lines = (folder / "manifest.jsonl").read_text().splitlines(keepends=True)
     part = folder / "parts" / "00000000.jsonl"
@@ -248,7 +250,7 @@ def test_a_damaged_part_of_an_unfinished_dataset_is_made_again(
     (folder / "manifest.jsonl").unlink()
     damage(part)
     write_dataset(small(scene), folder, 1, resume=True, tick=silent)
-    assert bytes_of(folder) == bytes_of(made)
+    assert bytes_of(folder) == bytes_of(dataset)
 
 
 def test_a_scene_without_room_for_a_patch_is_refused(scene: Path) -> None:
@@ -276,8 +278,9 @@ def test_effects_are_added_and_forbidden() -> None:
     profile = load_sensor("pleiades-degraded")
     haze = load_scene_call("haze-over-sea")
     assert set(calling_for(profile, haze, ["prnu"], ["veil"]).effects) == {"striping", "prnu"}
-    stated = calling_for(profile, haze, ["veil"]).effects["veil"]["transmittance"]
-    assert stated.low == 0.6  # the scene's own value, not the typical one
+    transmittance = calling_for(profile, haze, ["veil"]).effects["veil"]["transmittance"]
+    # This is the scene's own value, not the typical one.
+    assert transmittance.low == 0.6
     with pytest.raises(OptionError, match="clouds"):
         calling_for(profile, None, ["clouds"])
 
@@ -298,8 +301,8 @@ def test_each_effect_says_who_asks_for_it() -> None:
         == "left out by scene haze-over-sea"
     )
     for scene, add in ((None, []), (haze, ["prnu"])):
-        kept = {name for name in origins(profile, scene, add) if name not in base}
-        assert kept == set(calling_for(profile, scene, add).effects)
+        added = {name for name in origins(profile, scene, add) if name not in base}
+        assert added == set(calling_for(profile, scene, add).effects)
 
 
 @pytest.fixture(scope="module")
@@ -317,12 +320,14 @@ def test_a_scheduler_s_workers_give_the_same_bytes(
     recipe = DatasetRecipe((scene, scene), VARIABLE, REFERENCE, oversampling=2, patch_px=12)
     assert len(plan_windows(recipe)) > 2 * CHUNK
     write_dataset(recipe, tmp_path / "here", 1, resume=False, tick=silent)
-    done: list[int] = []
+    patches: list[int] = []
     with open_cluster(scheduler) as cluster:
         assert cluster
-        write_dataset(recipe, tmp_path / "there", cluster.slots, False, done.append, cluster.pool)
+        write_dataset(
+            recipe, tmp_path / "there", cluster.slots, False, patches.append, cluster.pool
+        )
     assert bytes_of(tmp_path / "there") == bytes_of(tmp_path / "here")
-    assert sum(done) == len(plan_windows(recipe))
+    assert sum(patches) == len(plan_windows(recipe))
 
 
 @pytest.mark.slow
@@ -350,15 +355,7 @@ def test_a_scene_that_cannot_be_read_there_is_one_sentence(scene: Path, tmp_path
 
 
 def test_workers_and_a_scheduler_do_not_go_together(scene: Path, tmp_path: Path) -> None:
-    options = [
-        "simulate",
-        str(scene),
-        "--out",
-        str(tmp_path / "d"),
-        "--workers",
-        "2",
-        "--scheduler",
-        "host:8786",
-    ]
-    assert "--workers: expected none beside --scheduler" in refused(*options)
+    both = ("--workers", "2", "--scheduler", "host:8786")
+    message = refused("simulate", scene, "--out", tmp_path / "d", *both)
+    assert "--workers: expected none beside --scheduler" in message
     assert not (tmp_path / "d").exists()

@@ -77,10 +77,10 @@ def test_figures_that_come_and_go_are_counted_and_a_watched_one_that_goes_fails(
 def test_from_nothing_any_rise_is_endless() -> None:
     limit = parse_limit("saturated>5%")
     none = measured(0.0, "%", "seen")
-    for value, broken in ((0.0, False), (1e-9, True)):
+    for value, is_broken in ((0.0, False), (1e-9, True)):
         assert (
             limit.broken_by(Change(("t", "n", "saturated"), none, measured(value, "%", "seen")))
-            is broken
+            is is_broken
         )
 
 
@@ -118,5 +118,5 @@ def test_a_watched_figure_that_can_no_longer_be_had_fails(tmp_path: Path) -> Non
 @pytest.mark.parametrize("text", ["PSNR", "PSNR=3", ">3", "PSNR<lots", "PSMR<0"])
 def test_what_is_no_limit_or_of_no_figure_gets_one_sentence(text: str, tmp_path: Path) -> None:
     one = document(tmp_path / "a.json")
-    said = "MAE, PSNR, latency" if text == "PSMR<0" else "NAME>CHANGE"
-    assert said in refused("diff", one, one, "--fail-on", text)
+    message = "MAE, PSNR, latency" if text == "PSMR<0" else "NAME>CHANGE"
+    assert message in refused("diff", one, one, "--fail-on", text)

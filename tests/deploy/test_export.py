@@ -90,30 +90,27 @@ def test_the_shipped_network_at_half_resolution_restores_the_same_image() -> Non
     small = load_network(shipped_weights("convbeers-xs"))[0]
     sensor = load_sensor("pleiades-degraded").nominal()
     coarse = grow(small, VARIANTS["convbeers-half"], torch.Generator().manual_seed(0))
-    both = [
+    both_weights = [
         Weights(arrays(network.state_dict()), network.variant, {}) for network in (small, coarse)
     ]
     image = np.random.default_rng(1).random((1, 1, 34, 50), dtype=np.float32)
-    expected, found = (
-        run(open_session(banked_to_onnx(weights, sensor, {})), image) for weights in both
+    expected, result = (
+        run(open_session(banked_to_onnx(weights, sensor, {})), image) for weights in both_weights
     )
-    np.testing.assert_allclose(found, expected, atol=2e-6)
-
-
-def overflowing(network: ConvBEERS) -> ConvBEERS:
-    """Finite weights all the same, as a far too high learning rate leaves them."""
-    broken = ConvBEERS(network.variant)
-    broken.load_state_dict({name: value * 1e25 for name, value in network.state_dict().items()})
-    return broken.eval()
+    np.testing.assert_allclose(result, expected, atol=2e-6)
 
 
 def test_a_network_that_gives_nan_is_not_exported(network: ConvBEERS, tmp_path: Path) -> None:
     weights = tmp_path / "run.safetensors"
     out = tmp_path / "float.onnx"
-    save_network(weights, overflowing(network), {})
-    said = refused("export", "--network", weights, "--out", out)
-    assert "expected finite pixels" in said
-    assert "largest difference" not in said
+    # A far too high learning rate leaves such weights: they are finite, the pixels are not.
+    overflowing = ConvBEERS(network.variant)
+    state = {name: value * 1e25 for name, value in network.state_dict().items()}
+    overflowing.load_state_dict(state)
+    save_network(weights, overflowing.eval(), {})
+    message = refused("export", "--network", weights, "--out", out)
+    assert "expected finite pixels" in message
+    assert "largest difference" not in message
     assert not out.exists()
     save_network(weights, network, {})
     done("export", "--network", weights, "--out", out)
@@ -150,9 +147,11 @@ def test_a_users_own_sensor_and_what_lies_outside_the_ranges_is_said(
     conditioned: Path, tmp_path: Path
 ) -> None:
     mine = own_sensor(tmp_path, ("[noise]", "mtf_nyquist_along = 0.004\n[noise]"))
-    said = done("export", "--network", conditioned, "--sensor", mine, "--out", tmp_path / "x.onnx")
+    output = done(
+        "export", "--network", conditioned, "--sensor", mine, "--out", tmp_path / "x.onnx"
+    )
     warning = "warning: mtf_along 0.004 is outside 0.015 to 0.15, the network is told 0.015"
-    assert warning in " ".join(said.split())
+    assert warning in " ".join(output.split())
 
 
 def test_plain_weights_take_no_sensor_and_conditioned_ones_the_default(
@@ -184,13 +183,13 @@ def test_the_deltas_of_exposures_make_the_networks_that_restore_runs(
 ) -> None:
     """To the byte, applied to the INT8 file of another sensor."""
     words = ["export", "--network", SMALL, "--out", tmp_path / "x.onnx"]
-    said = done(*words, "--sensor", sensor, "--delta", tmp_path / "my.delta")
+    output = done(*words, "--sensor", sensor, "--delta", tmp_path / "my.delta")
     expected = brighter_files(Path(SMALL), load_sensor(sensor))
     assert sorted(expected) == factors
     names = ["my.delta", *(f"my-x{factor}.delta" for factor in factors)]
     assert sorted(path.name for path in tmp_path.glob("*.delta")) == sorted(names)
     for name in names:
-        assert f"{name}: {(tmp_path / name).stat().st_size} bytes" in said.replace("\n", "")
+        assert f"{name}: {(tmp_path / name).stat().st_size} bytes" in output.replace("\n", "")
     for factor in factors:
         delta = tmp_path / f"my-x{factor}.delta"
         applied = tmp_path / f"x{factor}.onnx"
@@ -200,32 +199,16 @@ def test_the_deltas_of_exposures_make_the_networks_that_restore_runs(
 
 
 def test_where_no_higher_exposure_is_allowed_there_is_one_delta(tmp_path: Path) -> None:
-    done(
-        "export",
-        "--network",
-        SMALL,
-        "--sensor",
-        "dior-high",
-        "--out",
-        tmp_path / "x.onnx",
-        "--delta",
-        tmp_path / "d",
-    )
+    outputs = ("--out", tmp_path / "x.onnx", "--delta", tmp_path / "d")
+    done("export", "--network", SMALL, "--sensor", "dior-high", *outputs)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["d", "x.onnx"]
 
 
 def test_a_damaged_delta_is_named(tmp_path: Path) -> None:
     (tmp_path / "bad.delta").write_bytes(b"none")
-    said = refused(
-        "export",
-        "--network",
-        SMALL,
-        "--out",
-        tmp_path / "x.onnx",
-        "--apply",
-        tmp_path / "bad.delta",
-    )
-    assert "bad.delta: expected a delta of this network, got damaged bytes" in said
+    files = ("--out", tmp_path / "x.onnx", "--apply", tmp_path / "bad.delta")
+    message = refused("export", "--network", SMALL, *files)
+    assert "bad.delta: expected a delta of this network, got damaged bytes" in message
 
 
 def test_the_files_of_exposures_are_refused_before_any_work(tmp_path: Path) -> None:

@@ -103,9 +103,9 @@ def test_a_module_computes_as_in_torch(tiny: bd.Network) -> None:
 
 def test_a_network_is_whatever_holds_one(tiny: bd.Network, tmp_path: Path) -> None:
     path = tiny.save(tmp_path / "tiny.onnx")
-    for held in (str(path), path, onnx.load(path), tiny):
-        found = bd.Network.load(held)
-        np.testing.assert_array_equal(found(np.ones((1, 1, 9, 9))), tiny(np.ones((1, 1, 9, 9))))
+    for source in (str(path), path, onnx.load(path), tiny):
+        network = bd.Network.load(source)
+        np.testing.assert_array_equal(network(np.ones((1, 1, 9, 9))), tiny(np.ones((1, 1, 9, 9))))
 
 
 def test_int8_knows_its_float_network_and_its_layers(tiny: bd.Network, int8: bd.Network) -> None:
@@ -137,14 +137,14 @@ def test_samples_of_any_kind_are_the_same(
         "batches": [[batch] for batch in (samples[:3], torch.from_numpy(samples[3:]))],
         "file": str(tmp_path / "samples.npy"),
     }
-    made = bd.quantize(tiny, forms[kind], board="zcu102", progress=False)
-    np.testing.assert_array_equal(made(samples), int8(samples))
+    network = bd.quantize(tiny, forms[kind], board="zcu102", progress=False)
+    np.testing.assert_array_equal(network(samples), int8(samples))
 
 
 def test_a_board_says_whether_and_how_fast(int8: bd.Network) -> None:
-    found = bd.check(int8, "zcu102")
-    assert found
-    assert not found.failed
+    result = bd.check(int8, "zcu102")
+    assert result
+    assert not result.failed
     speed = bd.predict(int8, ["zcu102", bd.Board.load("vck190")], size=(3000, 2000))
     frame = speed.to_pandas()
     assert list(frame.index) == ["zcu102 B4096, tiles of 640", "vck190 C32B3, tiles of 640"]
@@ -179,17 +179,17 @@ def test_a_kit_holds_what_a_board_computes(int8: bd.Network, tmp_path: Path) -> 
 def test_a_pair_is_read_as_evaluate_reads_it(pair: bd.Pair, tmp_path: Path) -> None:
     degraded, reference = pair
     assert degraded.shape == reference.shape == pair.clean.shape == (70, 70)
-    saved = bd.evaluate(["convbeers-half-xs"], pair.save(tmp_path / "pairs"), progress=False)
+    from_files = bd.evaluate(["convbeers-half-xs"], pair.save(tmp_path / "pairs"), progress=False)
     ways: dict[str, Any] = {
         "network": "convbeers-half-xs",
         "half": lambda dn: dn / 2,
         "mine": Tiny(),
     }
-    held = bd.evaluate(ways, [pair], progress=False)
-    names = {row.name: row.figures for row in held.rows if row.table == "mean"}
+    in_memory = bd.evaluate(ways, [pair], progress=False)
+    names = {row.name: row.figures for row in in_memory.rows if row.table == "mean"}
     assert set(names) >= {"degraded", "network", "half", "mine"}
     assert names["network"]["PSNR"].value == next(
-        row.figures["PSNR"].value for row in saved.rows if row.name == "convbeers-half-xs"
+        row.figures["PSNR"].value for row in from_files.rows if row.name == "convbeers-half-xs"
     )
     assert (names["network"]["PSNR"].value or 0) > (names["half"]["PSNR"].value or 0)
     assert pair._repr_html_().count("<img") == 3
@@ -204,13 +204,13 @@ def test_tensors_and_masks_come_back_as_they_went(raw: np.ndarray) -> None:
     expected = bd.restore(raw, SMALL)
     tensor = bd.restore(torch.from_numpy(raw), SMALL)
     assert torch.equal(tensor, torch.from_numpy(expected))
-    for pixels, missing in ((raw, 65535), (raw.astype(np.float32), np.nan)):
+    for pixels, fill in ((raw, 65535), (raw.astype(np.float32), np.nan)):
         masked = np.ma.array(pixels, mask=raw < 400)
         restored = bd.restore(masked, SMALL)
-        marked = np.where(masked.mask, pixels.dtype.type(missing), pixels)
-        plain = bd.restore(marked, SMALL, nodata=None if missing != missing else missing)
+        filled = np.where(masked.mask, pixels.dtype.type(fill), pixels)
+        expected_pixels = bd.restore(filled, SMALL, nodata=None if fill != fill else fill)
         np.testing.assert_array_equal(restored.mask, masked.mask)
-        np.testing.assert_array_equal(restored.compressed(), plain[~masked.mask])
+        np.testing.assert_array_equal(restored.compressed(), expected_pixels[~masked.mask])
 
 
 def test_bands_are_told_by_name(raw: np.ndarray) -> None:
@@ -326,14 +326,14 @@ def test_bad_input_is_one_sentence_and_the_class_that_one_expects(
 def test_from_raw_images_to_a_kit(tmp_path: Path) -> None:
     sensor = bd.Sensor.load("pleiades-degraded")
     raws = [bd.simulate(sensor=sensor, size=1200, seed=0).degraded]
-    found = bd.characterize(raws, bits=12, progress=False)
-    assert found.mtf_nyquist.low == pytest.approx(0.07, abs=0.02)
-    assert found.evidence is not None
-    low, high = found.evidence.rows[0].figures["MTF across at Nyquist"].interval or (0, 0)
+    estimated = bd.characterize(raws, bits=12, progress=False)
+    assert estimated.mtf_nyquist.low == pytest.approx(0.07, abs=0.02)
+    assert estimated.evidence is not None
+    low, high = estimated.evidence.rows[0].figures["MTF across at Nyquist"].interval or (0, 0)
     assert low < 7 < high
     with small_studies():
         study = bd.tradeoff(
-            [SMALL], sensor=found, board="zcu104", budget="latency<=60s", progress=False
+            [SMALL], sensor=estimated, board="zcu104", budget="latency<=60s", progress=False
         )
     assert study.best is not None
     assert study.plot().get_xlabel().startswith("board latency")

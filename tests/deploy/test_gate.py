@@ -70,8 +70,8 @@ def failed(
 
 
 def node(model: onnx.ModelProto, name: str) -> onnx.NodeProto:
-    found: onnx.NodeProto = next(n for n in model.graph.node if n.name == name)
-    return found
+    match: onnx.NodeProto = next(n for n in model.graph.node if n.name == name)
+    return match
 
 
 def own_constant(model: onnx.ModelProto, name: str, value: np.ndarray) -> str:
@@ -170,7 +170,8 @@ def test_limits_come_from_a_file(tmp_path: Path) -> None:
     assert limits_of(None) == Limits()
     assert limits_of({"mae": 0}).mae == limits_of(None, 0.0).mae == 0
     path.write_text("mae_growth = 1.2")
-    assert limits_of(path) == Limits(mae_growth=1.2)  # what is left out has its default
+    # A limit that is left out has its default.
+    assert limits_of(path) == Limits(mae_growth=1.2)
 
 
 UNBREAKABLE = [
@@ -188,13 +189,13 @@ UNBREAKABLE += ["psnr_drop_db = inf", "min_psnr_float_int8_db = 1e-9"]
 def test_a_limit_that_no_network_breaks_is_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "gate.toml").write_text(text)
     name, value = text.split(" = ")
-    for given in (
+    for limits in (
         tmp_path / "gate.toml",
         {name: float(value)},
         replace(Limits(), **{name: float(value)}),
     ):
         with pytest.raises(OptionError, match="broken network"):
-            limits_of(given)
+            limits_of(limits)
     with pytest.raises(OptionError, match="max_mae"):
         limits_of(None, float("inf"))
 
@@ -253,7 +254,7 @@ def test_the_action_s_summary_is_a_table_whatever_a_stranger_s_name_holds(
     document = {
         "verdict": "failed",
         "rows": [{"figures": figures}],
-        "checks": [each.to_json() for each in CHECKS],
+        "checks": [check.to_json() for check in CHECKS],
     }
     (tmp_path / "gate.json").write_text(json.dumps(document))
     runpy.run_path(str(ROOT / ".github" / "verdict.py"))["main"](
@@ -270,7 +271,8 @@ def test_the_action_s_summary_is_a_table_whatever_a_stranger_s_name_holds(
 def test_the_last_line_names_what_failed_and_nothing_else() -> None:
     assert sentence(CHECKS[:1], "MAE 0.0006") == "passed, all 1 checks: MAE 0.0006"
     text = sentence(CHECKS, "MAE 0.0006")
-    assert text.isprintable()  # a node's name may hold what a terminal or a CI's log would obey
+    # A node's name may hold what a terminal or a CI's log would obey.
+    assert text.isprintable()
     assert text.startswith(
         "FAILED, 2 of 4 checks: PSNR drop 0.31 dB, allowed at most 0.25; nodes <all> 1 (tail"
     )
@@ -279,7 +281,7 @@ def test_the_last_line_names_what_failed_and_nothing_else() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "limit", "bound", "passed"),
+    ("value", "limit", "bound", "expected"),
     [
         (1.0, 1.0, "at most", True),
         (1.0, 1.0, "at least", True),
@@ -290,8 +292,8 @@ def test_the_last_line_names_what_failed_and_nothing_else() -> None:
         (np.inf, 60.0, "at least", True),
     ],
 )
-def test_the_number_decides(value: float, limit: float, bound: Bound, passed: bool) -> None:
-    assert Check("x", value, limit, "dB", bound).passed == passed
+def test_the_number_decides(value: float, limit: float, bound: Bound, expected: bool) -> None:
+    assert Check("x", value, limit, "dB", bound).passed == expected
 
 
 def test_options_that_do_not_go_together_are_refused(tmp_path: Path) -> None:
@@ -310,25 +312,17 @@ def test_the_judged_file_does_not_choose_its_judges(model: Path) -> None:
     samples = np.random.default_rng(0).random((12, 1, 32, 40), np.float32)
     int8 = bd.quantize(model, samples[:8])
     mixed = np.concatenate([samples[10:], samples[2:7]])
-    found = bd.compare(int8, samples=mixed)
-    assert found.result.patches == 7
-    assert (
-        "4 of the 7 samples" in found.notes[0]
-    )  # of the eight, two were held out, and one of them is here
-    claimed = replace(
-        int8, model=claiming(int8.model, CALIBRATED_ON, " ".join(map(digest_of, mixed[:, None])))
-    )
-    again = bd.compare(claimed, samples=mixed)
-    assert (again.result.mae, again.result.patches) == (found.result.mae, 7)
-    assert "7 of the 7 samples" in again.notes[0]
-
-
-def claiming(model: onnx.ModelProto, key: str, text: str) -> onnx.ModelProto:
-    """A copy whose metadata say so."""
-    other = onnx.ModelProto()
-    other.CopyFrom(model)
-    onnx.helper.set_model_props(other, {**metadata(model), key: text})
-    return other
+    comparison = bd.compare(int8, samples=mixed)
+    assert comparison.result.patches == 7
+    # Quantising held two of its eight samples out of calibration, and one of them is here.
+    assert "4 of the 7 samples" in comparison.notes[0]
+    model_with_claim = onnx.ModelProto()
+    model_with_claim.CopyFrom(int8.model)
+    claim = {CALIBRATED_ON: " ".join(map(digest_of, mixed[:, None]))}
+    onnx.helper.set_model_props(model_with_claim, metadata(int8.model) | claim)
+    second = bd.compare(replace(int8, model=model_with_claim), samples=mixed)
+    assert (second.result.mae, second.result.patches) == (comparison.result.mae, 7)
+    assert "7 of the 7 samples" in second.notes[0]
 
 
 def test_what_is_no_image_is_compared_unclipped_and_other_shapes_are_refused() -> None:
@@ -365,14 +359,14 @@ def test_a_baseline_shows_a_wrong_bias_in_nearly_any_layer(factor: int, unseen: 
     """
     weights, path = shipped_pair(SMALL, BLIND)
     session = open_session(float_model(weights))
-    sound = onnx.load(path)
-    before = compare(session, open_session(sound), unseen.pairs).mae
-    found = [node.input[8] for node in sound.graph.node if node.op_type == "QLinearConv"]
-    names = [name for name in found if name not in ("bank.bias", "analytic.bias")]
+    intact = onnx.load(path)
+    before = compare(session, open_session(intact), unseen.pairs).mae
+    biases = [node.input[8] for node in intact.graph.node if node.op_type == "QLinearConv"]
+    names = [name for name in biases if name not in ("bank.bias", "analytic.bias")]
     assert len(names) == 11
     hidden = set()
     for name in names:
-        model = changed(sound, name, lambda bias: bias * factor)
+        model = changed(intact, name, lambda bias: bias * factor)
         checks = judge(compare(session, open_session(model), unseen.pairs), Limits(), before)
         hidden |= {name.removesuffix(".bias")} if all(check.passed for check in checks) else set()
     assert hidden == {"body.2.second", "body.3.second"} | ({"body.3.first"} if factor else set())
@@ -380,22 +374,24 @@ def test_a_baseline_shows_a_wrong_bias_in_nearly_any_layer(factor: int, unseen: 
 
 def as_nodes(model: onnx.ModelProto) -> onnx.ModelProto:
     """The same network, its constants held by nodes."""
-    held = [
+    constants = [
         onnx.helper.make_node("Constant", [], [t.name], name=f"of.{t.name}", value=t)
         for t in model.graph.initializer
     ]
-    nodes = [*held, *model.graph.node]
+    nodes = [*constants, *model.graph.node]
     del model.graph.initializer[:], model.graph.node[:]
     model.graph.node.extend(nodes)
     return model
 
 
 def test_constants_may_be_nodes() -> None:
-    sound = onnx.load(shipped_pair("convbeers-xs")[1])
-    other = as_nodes(onnx.load(shipped_pair("convbeers-xs")[1]))
-    assert count_relus(other) == count_relus(sound) == Relus(4, 0)
-    assert [t.name for t in rounded_tensors(other)] == [t.name for t in rounded_tensors(sound)]
-    assert read_core(other).frac_bits == read_core(sound).frac_bits
+    by_initializers = onnx.load(shipped_pair("convbeers-xs")[1])
+    by_nodes = as_nodes(onnx.load(shipped_pair("convbeers-xs")[1]))
+    assert count_relus(by_nodes) == count_relus(by_initializers) == Relus(4, 0)
+    assert [t.name for t in rounded_tensors(by_nodes)] == [
+        t.name for t in rounded_tensors(by_initializers)
+    ]
+    assert read_core(by_nodes).frac_bits == read_core(by_initializers).frac_bits
 
 
 @pytest.mark.parametrize("explicit", [["x", "zero"], ["zero", "x"]])
@@ -411,8 +407,8 @@ def test_results_that_are_never_below_zero_need_no_relu() -> None:
     """An 8-bit range from zero may be a ReLU folded in, or none: both are told apart by what was
     there in float.
     """
-    found = Relus(explicit=1, folded=2)
-    assert [found.off_by(wanted) for wanted in range(6)] == [1, 0, 0, 0, 1, 2]
+    relus = Relus(explicit=1, folded=2)
+    assert [relus.off_by(count) for count in range(6)] == [1, 0, 0, 0, 1, 2]
 
 
 def test_a_file_of_another_quantiser_is_judged_without_the_rules_of_a_dpu(
@@ -454,9 +450,9 @@ def test_samples_without_references_tell_no_loss_and_cannot_keep_a_limit_on_it(
     limits = tmp_path / "limits.toml"
     np.save(samples, np.random.default_rng(0).uniform(0.1, 0.9, (2, 1, 40, 40)).astype(np.float32))
     command = ["gate", *shipped_pair("convbeers-xs"), "--samples", samples, "--max-mae", "0.1"]
-    said = done(*command)
-    assert "gate passed" in said
-    assert "nan" not in said.lower()
+    output = done(*command)
+    assert "gate passed" in output
+    assert "nan" not in output.lower()
     limits.write_text("psnr_drop_db = 0.25\n", encoding="utf-8")
     assert "references for psnr_drop_db, got images alone" in refused(*command, "--limits", limits)
 
@@ -474,7 +470,8 @@ def test_references_that_do_not_fit_are_refused_and_the_sample_is_named(tmp_path
         "s.npz[0]: expected a reference of the results' size for psnr_drop_db, got 1 x 40 x 20"
         in refused(*command)
     )
-    assert "gate passed" in done(*command[:-2], "--max-mae", 0.1)  # no check needs them
+    # Without a limit on the PSNR drop no check needs the references.
+    assert "gate passed" in done(*command[:-2], "--max-mae", 0.1)
     assert "--metric: expected one of psnr" in refused(*command, "--metric", "PSNR")
     mixed = [(image[:1], image[:1]), (image[1:], image[1:, ..., :20])]
     with pytest.raises(

@@ -52,24 +52,15 @@ def test_a_refused_gate_leaves_no_older_verdict_and_tells_the_ci(tmp_path: Path)
         "record.json",
     ]
     (tmp_path / "none.onnx").write_bytes(b"no network\n<&>\x1b[31m")
-    said = refused(
-        "gate",
-        tmp_path / "none.onnx",
-        tmp_path / "none.onnx",
-        "--json",
-        document,
-        "--junit",
-        junit,
-        "--record",
-        record,
-    )
+    outputs = ("--json", document, "--junit", junit, "--record", record)
+    message = refused("gate", tmp_path / "none.onnx", tmp_path / "none.onnx", *outputs)
     assert not document.exists()
     assert list(record.iterdir()) == []
     suite = ET.fromstring(junit.read_text())  # noqa: S314 - our own text
     assert [suite.get(name) for name in ("tests", "failures", "errors")] == ["1", "0", "1"]
     error = suite.find("testcase/error")
     assert error is not None
-    assert " ".join((error.text or "").split()) in said
+    assert " ".join((error.text or "").split()) in message
 
 
 def test_an_output_that_is_an_input_is_refused_and_stays(
@@ -83,10 +74,10 @@ def test_an_output_that_is_an_input_is_refused_and_stays(
 
 def test_notes_stand_in_the_document(tmp_path: Path) -> None:
     samples = np.random.default_rng(0).random((2, 1, 48, 40), np.float32) * 0.5
-    found = bd.compare("convbeers-xs-int8", "convbeers-xs", samples)
-    assert "nothing brighter was judged" in found.notes[0]
-    found.save(tmp_path / "found.json")
-    assert json.loads((tmp_path / "found.json").read_text())["notes"] == list(found.notes)
+    comparison = bd.compare("convbeers-xs-int8", "convbeers-xs", samples)
+    assert "nothing brighter was judged" in comparison.notes[0]
+    comparison.save(tmp_path / "found.json")
+    assert json.loads((tmp_path / "found.json").read_text())["notes"] == list(comparison.notes)
 
 
 def test_the_digest_is_that_of_the_bytes_that_were_judged(
@@ -97,14 +88,14 @@ def test_the_digest_is_that_of_the_bytes_that_were_judged(
     before = hashlib.sha256(int8.read_bytes()).hexdigest()
     compare = gates.differences_of  # type: ignore[attr-defined]
 
-    def replaced(*given: object) -> object:
+    def replaced(*arguments: object) -> object:
         int8.write_bytes(b"another file")
-        return compare(*given)  # type: ignore[arg-type]
+        return compare(*arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(gates, "differences_of", replaced)
     done("gate", *pair, "--patches", 1, "--json", tmp_path / "g.json", "--record", tmp_path / "r")
     document = json.loads((tmp_path / "g.json").read_text())
-    assert {each["name"]: each["sha256"] for each in document["inputs"]}["int8.onnx"] == before
+    assert {entry["name"]: entry["sha256"] for entry in document["inputs"]}["int8.onnx"] == before
     assert json.loads((tmp_path / "r" / "record.json").read_text())["network"]["sha256"] == before
 
 
@@ -124,9 +115,8 @@ def test_a_file_that_changes_while_it_is_read_is_refused(
 def test_too_little_contrast_judges_nothing() -> None:
     """Samples of 2 DN of contrast: a network that returned their mean would keep the limit."""
     generator = np.random.default_rng(0)
-    samples = (2000 + generator.integers(0, 3, (3, 1, 48, 40))).astype(np.float32) / np.float32(
-        4095
-    )
+    dn = 2000 + generator.integers(0, 3, (3, 1, 48, 40))
+    samples = dn.astype(np.float32) / np.float32(4095)
     with pytest.raises(OptionError, match="contrast"):
         bd.gate("convbeers-xs-int8", "convbeers-xs", samples)
 
@@ -135,9 +125,10 @@ def test_a_note_says_if_the_default_limit_does_not_suit(model: Path) -> None:
     samples = np.random.default_rng(0).random((6, 1, 32, 40), np.float32)
     verdict = bd.gate(bd.quantize(model, samples), samples=samples)
     (mae,) = (check for check in verdict.checks if check.name == "MAE")
-    said = [note for note in verdict.notes if "--max-mae" in note]
-    assert len(said) == (not mae.passed)
-    assert not mae.passed  # noise is what this network changes most
+    notes = [note for note in verdict.notes if "--max-mae" in note]
+    assert len(notes) == (not mae.passed)
+    # The samples are noise, which this network changes most.
+    assert not mae.passed
 
 
 @pytest.mark.parametrize("claim", ["weights", "none"])
@@ -164,8 +155,8 @@ def test_claims_of_weights_are_verified(
             other, {k: v for k, v in metadata(other).items() if k != WEIGHTS}
         )
     save_onnx(other, tmp_path / "other.onnx")
-    said = record_of(verdict, replace(int8, model=load_onnx(tmp_path / "other.onnx")), sensor)
-    assert (said["weights_sha256"], said["training"], said["licence"]) == (None, None, None)
+    record = record_of(verdict, replace(int8, model=load_onnx(tmp_path / "other.onnx")), sensor)
+    assert (record["weights_sha256"], record["training"], record["licence"]) == (None, None, None)
 
 
 def test_a_file_without_its_description_loses_no_check_silently(
@@ -184,11 +175,10 @@ def test_a_file_without_its_description_loses_no_check_silently(
     assert "faults of the encoding" in done("gate", *pair, "--patches", 1, code=1)
     onnx.helper.set_model_props(model, about)
     save_onnx(model, int8)
-    assert "note: not checked: faults of the encoding" in " ".join(
-        done("gate", *pair, "--patches", 1).split()
-    )
-    said = done("gate", *pair, "--patches", 1, "--baseline", baseline, code=1)
-    assert "does not describe its integers" in said
+    output = " ".join(done("gate", *pair, "--patches", 1).split())
+    assert "note: not checked: faults of the encoding" in output
+    output = done("gate", *pair, "--patches", 1, "--baseline", baseline, code=1)
+    assert "does not describe its integers" in output
     onnx.helper.set_model_props(model, about | {"core": "{}"})
     save_onnx(model, int8)
     assert "int8.onnx: expected metadata 'core'" in refused("gate", *pair, "--patches", 1)
@@ -202,11 +192,11 @@ def test_what_refuses_the_outputs_deletes_an_older_verdict_and_says_why(tmp_path
     outputs = ["--json", document, "--junit", junit]
     for words in (["--record", file], ["--max-mae", "nan"], ["--samples", file, "--patches", 2]):
         document.write_text('"passed"')
-        said = refused("gate", *SMALL[:1], *outputs, *words)
+        message = refused("gate", *SMALL[:1], *outputs, *words)
         assert not document.exists()
         error = ET.fromstring(junit.read_text()).find("testcase/error")  # noqa: S314 - our own text
         assert error is not None
-        assert (error.text or "").rpartition(":")[2] in said
+        assert (error.text or "").rpartition(":")[2] in message
     document.write_text('"passed"')
     refused("gate", *SMALL, "--json", document, "--junit", tmp_path)
     assert not document.exists()
@@ -224,8 +214,8 @@ def test_a_record_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.Monk
     assert not document.exists()
     assert not folder.exists()
     monkeypatch.setitem(sys.modules, "cyclonedx.output.json", None)
-    said = refused("gate", *SMALL, "--json", document, "--record", folder)
-    assert "the package cyclonedx, got one that does not load" in said
+    message = refused("gate", *SMALL, "--json", document, "--record", folder)
+    assert "the package cyclonedx, got one that does not load" in message
 
 
 def test_claims_of_the_file_are_shown_as_claims(pair: tuple[Path, Path], tmp_path: Path) -> None:
@@ -244,26 +234,26 @@ def test_claims_of_the_file_are_shown_as_claims(pair: tuple[Path, Path], tmp_pat
     write_record(
         verdict, int8, Sensor.load("pleiades-degraded"), tmp_path / "r", verdict.comparison.floating
     )
-    said = json.loads((tmp_path / "r" / "record.json").read_text())
-    assert said["sensors_in_range"] is None
-    assert said["says"][CALIBRATED_ON] == "deadbeef cafe"
-    assert "calibration_samples" not in said
-    known, claimed = (
+    record = json.loads((tmp_path / "r" / "record.json").read_text())
+    assert record["sensors_in_range"] is None
+    assert record["says"][CALIBRATED_ON] == "deadbeef cafe"
+    assert "calibration_samples" not in record
+    facts, claims_shown = (
         (tmp_path / "r" / "record.html").read_text().split("What the file says of itself")
     )
-    assert int8.sha256 in known
-    assert "0" * 64 not in known
-    assert "convbeers-gold" in claimed
-    assert len(claimed) < 100_000
+    assert int8.sha256 in facts
+    assert "0" * 64 not in facts
+    assert "convbeers-gold" in claims_shown
+    assert len(claims_shown) < 100_000
 
 
 def test_a_bill_names_two_inputs_of_one_name(pair: tuple[Path, Path]) -> None:
     int8 = Network.load(pair[1])
     verdict = bd.gate(int8, Network.load(pair[0]), patches=1)
-    said = record_of(verdict, int8, Sensor.load("pleiades-degraded"))
-    for each in said["results"]["inputs"][:2]:
-        each["name"] = "net.onnx"
-    bill = json.loads(bill_of(said))
-    (depends,) = (each["dependsOn"] for each in bill["dependencies"] if "dependsOn" in each)
-    assert set(depends) == {each["bom-ref"] for each in bill["components"]}
-    assert len(depends) == len(said["results"]["inputs"])
+    record = record_of(verdict, int8, Sensor.load("pleiades-degraded"))
+    for entry in record["results"]["inputs"][:2]:
+        entry["name"] = "net.onnx"
+    bill = json.loads(bill_of(record))
+    (depends,) = (entry["dependsOn"] for entry in bill["dependencies"] if "dependsOn" in entry)
+    assert set(depends) == {entry["bom-ref"] for entry in bill["components"]}
+    assert len(depends) == len(record["results"]["inputs"])

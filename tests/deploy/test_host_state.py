@@ -36,28 +36,27 @@ print(before, peak_memory().value)
 @pytest.mark.parametrize("taken_mb", [0, 300])
 def test_memory_that_was_given_back_is_still_in_the_peak(taken_mb: int) -> None:
     command = [sys.executable, "-c", TAKE, str(taken_mb * MEGABYTE)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    before, after = map(float, done.stdout.split())
+    process = subprocess.run(command, capture_output=True, text=True, check=True)
+    before, after = map(float, process.stdout.split())
     assert 0.005 < before < 0.3
     assert after - before == pytest.approx(taken_mb / 1e3, abs=0.01)
 
 
 def test_the_peak_is_this_process_s_own_not_its_parent_s() -> None:
     block = b"x" * (400 * MEGABYTE)
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", TAKE, "0"], capture_output=True, text=True, check=True
     )
     assert gigabytes(peak_memory()) > len(block) / 1e9
-    assert float(done.stdout.split()[1]) < 0.3
+    assert float(process.stdout.split()[1]) < 0.3
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="another way is the only one here")
 def test_every_posix_system_s_way_agrees_with_linux_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
     own = gigabytes(peak_memory())
     monkeypatch.setattr("beers_deploy.host_state.STATUS", NOWHERE)
-    assert (
-        own * 0.95 < gigabytes(peak_memory()) < psutil.virtual_memory().total / 1e9
-    )  # a parent may have held more
+    # The peak may be that of a parent process, which may have held more.
+    assert own * 0.95 < gigabytes(peak_memory()) < psutil.virtual_memory().total / 1e9
 
 
 @pytest.mark.parametrize(("system", "unit_bytes"), [("darwin", 1), ("freebsd14", 1024)])
@@ -85,4 +84,5 @@ def test_where_nothing_counts_it_there_is_a_reason_and_no_zero(
 def test_results_say_what_they_were_measured_on(monkeypatch: pytest.MonkeyPatch) -> None:
     assert host()["processor"] == processor_name()
     monkeypatch.setattr(platform, "system", lambda: "Windows")
-    assert host()["load_1_min"] is None  # psutil's first answer there is a zero that means unknown
+    # On Windows psutil's first answer is a zero that means unknown.
+    assert host()["load_1_min"] is None

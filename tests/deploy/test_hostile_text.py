@@ -9,6 +9,7 @@ import io
 import json
 import re
 from html.parser import HTMLParser
+from itertools import chain
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -95,10 +96,10 @@ def test_a_page_has_the_text_and_no_tag_of_it(text: str) -> None:
         Report(text, text, [Section(text, rows_with(text), text)], [picture], [text], sorts=True)
     )
     assert shown_alike(html)
-    found = Tags(html)
-    assert found.tags <= TAGS | {"figure", "img", "figcaption"}
-    assert "onerror" not in found.attributes
-    assert visible(text).strip() in "".join(found.words)
+    parsed = Tags(html)
+    assert parsed.tags <= TAGS | {"figure", "img", "figcaption"}
+    assert "onerror" not in parsed.attributes
+    assert visible(text).strip() in "".join(parsed.words)
 
 
 @given(TEXT)
@@ -146,12 +147,16 @@ def test_progress_is_one_line_without_markup(text: str) -> None:
     lines = stream.getvalue().split("\n")
     assert len(lines) == 3
     assert shown_alike("".join(lines), "")
-    shown = io.StringIO()
+    terminal = io.StringIO()
     bar_on_terminal = progress._bar()
     task = bar_on_terminal.add_task(one_line(text))
-    Console(file=shown, width=10_000).print(bar_on_terminal.make_tasks_table(bar_on_terminal.tasks))
+    Console(file=terminal, width=10_000).print(
+        bar_on_terminal.make_tasks_table(bar_on_terminal.tasks)
+    )
     assert bar_on_terminal.tasks[task].description == one_line(text)
-    assert shown.getvalue().rstrip() == one_line(text).rstrip(), "a name in brackets is no markup"
+    assert terminal.getvalue().rstrip() == one_line(text).rstrip(), (
+        "a name in brackets is no markup"
+    )
 
 
 @given(TEXT)
@@ -169,9 +174,9 @@ def test_a_cell_of_markdown_is_one_cell_of_plain_text(text: str) -> None:
 def document(text: str) -> tuple[Table, dict[str, Any]]:
     """A judged table, and what a record says of its network."""
     check = Check("MAE", 2.0, 1.0, "dB", detail=text)
-    judged = Table("gate", {}, (Input(text, "0" * 64),), tuple(rows_with(text)), (check,), (text,))
+    table = Table("gate", {}, (Input(text, "0" * 64),), tuple(rows_with(text)), (check,), (text,))
     network = {"name": text, "precision": "INT8", "sha256": "0" * 64}
-    said = {
+    record = {
         "tool": {"name": "beers-deploy", "version": "1", "code_sha256": "0" * 64},
         "network": network,
         "says": {text: text, "sensor": text},
@@ -179,15 +184,15 @@ def document(text: str) -> tuple[Table, dict[str, Any]]:
         "passed": False,
         "results": {"inputs": [{"name": text, "sha256": "0" * 64}]},
     }
-    said |= dict.fromkeys(("weights_sha256", "training", "sensors_in_range", "licence"))
-    return judged, said
+    record |= dict.fromkeys(("weights_sha256", "training", "sensors_in_range", "licence"))
+    return table, record
 
 
 @given(TEXT)
 @example(HOSTILE)
 def test_a_record_has_the_text_of_a_network_s_metadata_escaped(text: str) -> None:
-    judged, said = document(text)
-    html = render(_page(judged, said))
+    table, record = document(text)
+    html = render(_page(table, record))
     assert shown_alike(html)
     assert Tags(html).tags <= TAGS
 
@@ -196,14 +201,14 @@ def test_a_record_has_the_text_of_a_network_s_metadata_escaped(text: str) -> Non
 @example(HOSTILE)
 def test_a_bill_of_materials_has_names_on_one_line(text: str) -> None:
     pytest.importorskip("cyclonedx")
-    _, said = document(text)
-    bill = bill_of(said)
+    _, record = document(text)
+    bill = bill_of(record)
     assert shown_alike(bill, "\n")
-    found = json.loads(bill)
-    component = found["metadata"]["component"]
+    content = json.loads(bill)
+    component = content["metadata"]["component"]
     assert component["name"] == one_line(text)
-    assert all(each["name"].isprintable() for each in component["properties"])
-    assert all(each["value"].isprintable() for each in component["properties"])
+    assert all(entry["name"].isprintable() for entry in component["properties"])
+    assert all(entry["value"].isprintable() for entry in component["properties"])
 
 
 @given(TEXT)
@@ -225,23 +230,23 @@ def test_no_output_is_written_past_the_functions_that_escape() -> None:
     looked at once.
     """
     folder = Path(__file__).parents[2]
-    found = {
-        path.relative_to(folder).as_posix()
-        for part in ("deploy", "model", "quant", "profiles")
-        for path in (folder / part).rglob("*.py")
-        if re.search(
-            r"typer\.echo\(|\bconsole\.print\(|std(out|err)\.write\(|(?<![.\w>])print\(",
-            _code(path),
-        )
+    printing = re.compile(
+        r"typer\.echo\(|\bconsole\.print\(|std(out|err)\.write\(|(?<![.\w>])print\("
+    )
+    parts = ("deploy", "model", "quant", "profiles")
+    paths = chain.from_iterable((folder / part).rglob("*.py") for part in parts)
+    writers = {
+        path.relative_to(folder).as_posix() for path in paths if printing.search(_code(path))
     }
-    known = {
+    allowed = {
         "deploy/__main__.py",
         "deploy/cli.py",
         "deploy/commands/shared.py",
         "deploy/results.py",
         "model/progress.py",
     }
-    assert found - known == {"deploy/kit/measure.py"}  # runs on a board, by itself
+    # measure.py runs on a board, by itself.
+    assert writers - allowed == {"deploy/kit/measure.py"}
 
 
 def _code(path: Path) -> str:

@@ -50,12 +50,12 @@ def test_of_a_large_image_few_pixels_are_read(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.ones((900, 700), np.uint16))
-    read = TiffSource.read
+    read_rows = TiffSource.read
     rows = list[int]()
 
     def counting(self: TiffSource, start: int, stop: int) -> np.ndarray:
         rows.append(stop - start)
-        return read(self, start, stop)
+        return read_rows(self, start, stop)
 
     monkeypatch.setattr(TiffSource, "read", counting)
     monkeypatch.setattr("beers_deploy.restoration.detectors.look.LOOKED_PX", 200 * 700)
@@ -66,12 +66,12 @@ def test_of_a_large_image_few_pixels_are_read(
 def test_its_plan_is_that_of_the_restoration(model: Path, tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.ones((90, 70), np.uint16))
     options = Options(model, tile_px=23)
-    told = about(tmp_path / "in.tif", options)
-    done = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", options)
+    plan = about(tmp_path / "in.tif", options)
+    row = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", options)
     for key in ("tiles", "work factor"):
-        assert told.figures[key].value == done.figures[key].value
+        assert plan.figures[key].value == row.figures[key].value
     for key in ("halo", "full scale", "full scale from"):
-        assert told.text[key] == done.text[key]
+        assert plan.text[key] == row.text[key]
 
 
 @pytest.mark.parametrize("kind", ["uint8", "float32"])
@@ -106,8 +106,8 @@ def test_time_on_the_board_is_the_cost_model_s(tmp_path: Path) -> None:
         times.append(
             about(tmp_path / f"{height}.tif", Options(shipped_pair()[1])).figures["time on vck190"]
         )
-    assert all(each.mode == "predicted" for each in times)
-    first, second = (each.value or math.nan for each in times)
+    assert all(figure.mode == "predicted" for figure in times)
+    first, second = (figure.value or math.nan for figure in times)
     assert second / first == pytest.approx(2, abs=0.1)
 
 
@@ -121,7 +121,7 @@ def test_it_reads_none_of_a_file_of_ten_gigabytes(model: Path, tmp_path: Path) -
     done("info", tmp_path / "big.tif", "--network", model, "--json", out)
     (row,) = json.loads(out.read_text())["rows"]
     assert row["figures"]["width"]["value"] == 73_000
-    assert [each["name"] for each in json.loads(out.read_text())["inputs"]] == [model.name]
+    assert [entry["name"] for entry in json.loads(out.read_text())["inputs"]] == [model.name]
 
 
 def test_no_image_is_one_sentence(tmp_path: Path) -> None:

@@ -5,6 +5,8 @@ of such a run.
 import contextlib
 import io
 import json
+import re
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +28,14 @@ def run_cell(source: str, names: dict[str, Any]) -> str:
     """What a cell prints: of Python, or of the program where its line begins with an exclamation
     mark.
     """
-    printed = io.StringIO()
+    stream = io.StringIO()
     if source.startswith("!beers-deploy "):
-        done = CliRunner().invoke(app, source.split()[1:])
-        assert done.exit_code == 0, (source, done.output, done.exception)
-        return done.stdout
-    with contextlib.redirect_stdout(printed):
+        result = CliRunner().invoke(app, source.split()[1:])
+        assert result.exit_code == 0, (source, result.output, result.exception)
+        return result.stdout
+    with contextlib.redirect_stdout(stream):
         exec(source, names)  # noqa: S102 - our own notebook
-    return printed.getvalue()
+    return stream.getvalue()
 
 
 def test_its_cells_run_and_print_what_it_keeps(
@@ -48,11 +50,10 @@ def test_its_cells_run_and_print_what_it_keeps(
     with plt.rc_context({"backend": "Agg"}):
         for cell in CELLS:
             if cell["cell_type"] == "code":
-                printed = run_cell("".join(cell["source"]), names)
-                kept = "".join(
-                    line for output in cell["outputs"] for line in output.get("text", [])
-                )
-                assert not kept or printed == kept
+                text = run_cell("".join(cell["source"]), names)
+                lines = chain.from_iterable(output.get("text", []) for output in cell["outputs"])
+                stored = "".join(lines)
+                assert not stored or text == stored
         plt.close("all")
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "raw.jp2",
@@ -60,14 +61,13 @@ def test_its_cells_run_and_print_what_it_keeps(
         "restored.tif",
     ]
     truth = names["pair"].reference
-    errors = {
-        name: np.abs(gain_of(names[name], truth) - truth).mean() for name in ("before", "restored")
-    }
-    assert errors["restored"] < 0.7 * errors["before"]
+    before = np.abs(gain_of(names["before"], truth) - truth).mean()
+    after = np.abs(gain_of(names["restored"], truth) - truth).mean()
+    assert after < 0.7 * before
 
 
 def gain_of(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """An image in the digital numbers of another sensor, by the line that fits best."""
+    """Return an image in the digital numbers of another sensor, by the line that fits best."""
     slope, offset = np.polyfit(image.ravel(), truth.ravel(), 1)
     scaled: np.ndarray = slope * image + offset
     return scaled
@@ -75,20 +75,12 @@ def gain_of(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 def test_it_is_small_and_shows_a_picture() -> None:
     assert NOTEBOOK.stat().st_size < MOST_BYTES
-    kinds = [
-        kind
-        for cell in CELLS
-        for output in cell.get("outputs", [])
-        for kind in output.get("data", {})
-    ]
-    assert kinds.count("image/png") == 1
+    outputs = chain.from_iterable(cell.get("outputs", []) for cell in CELLS)
+    pictures = ["image/png" in output.get("data", {}) for output in outputs]
+    assert sum(pictures) == 1
 
 
 def test_the_pages_beside_it_are_there() -> None:
-    import re
-
-    words = "".join(
-        line for cell in CELLS if cell["cell_type"] == "markdown" for line in cell["source"]
-    )
-    for target in re.findall(r"\]\(([^)]+)\)", words):
+    texts = ["".join(cell["source"]) for cell in CELLS if cell["cell_type"] == "markdown"]
+    for target in re.findall(r"\]\(([^)]+)\)", "".join(texts)):
         assert (NOTEBOOK.parent / target).is_file(), target

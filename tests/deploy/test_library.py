@@ -38,9 +38,9 @@ def of_file(
     planes: dict[str, Any] = (
         {"photometric": "rgb", "planarconfig": "separate"} if pixels.shape[0] == 3 else {}
     )
-    stored = pixels if pixels.ndim == 2 or planes else pixels[0]
+    plane = pixels if pixels.ndim == 2 or planes else pixels[0]
     tifffile.imwrite(
-        folder / "in.tif", stored, extratags=tags, **(planes if pixels.ndim == 3 else {})
+        folder / "in.tif", plane, extratags=tags, **(planes if pixels.ndim == 3 else {})
     )
     restore_file(folder / "in.tif", folder / "out.tif", options)
     return tifffile.imread(folder / "out.tif").reshape(pixels.shape)
@@ -94,10 +94,10 @@ def test_a_dask_array_of_any_chunks_gives_the_same(
 
 
 def test_nothing_is_read_before_it_is_asked_for_and_no_more_than_that(da: Any, model: Path) -> None:
-    read: list[tuple[int, ...]] = []
+    chunks_read: list[tuple[int, ...]] = []
 
     def counted(block: np.ndarray, block_info: Any = None) -> np.ndarray:
-        read.append(block_info[0]["chunk-location"])
+        chunks_read.append(block_info[0]["chunk-location"])
         return block
 
     pixels = noise(200, 200)
@@ -105,10 +105,10 @@ def test_nothing_is_read_before_it_is_asked_for_and_no_more_than_that(da: Any, m
         counted, dtype=np.uint16, meta=np.empty((0, 0), np.uint16)
     )
     lazy = restore(chunks, model, tile=40)
-    assert read == []
+    assert chunks_read == []
     corner = lazy[:30, :30].compute(scheduler="synchronous")
     np.testing.assert_array_equal(corner, restore(pixels, model, tile=40)[:30, :30])
-    assert read == [(0, 0)]
+    assert chunks_read == [(0, 0)]
 
 
 @pytest.mark.slow
@@ -134,11 +134,11 @@ def test_a_data_array_keeps_what_it_says(lazy: bool, da: Any, model: Path) -> No
     xarray = pytest.importorskip("xarray")
     pixels = noise(1, 60, 50)
     pixels[0, 10:20, 10:20] = 9
-    held = da.from_array(pixels, chunks=(1, 32, 32)) if lazy else pixels
+    data = da.from_array(pixels, chunks=(1, 32, 32)) if lazy else pixels
     places = {"y": np.arange(60.0), "x": np.arange(50.0), "band": [1], "spatial_ref": 0}
     attributes = {"_FillValue": 9, "units": "DN"}
     image = xarray.DataArray(
-        held, dims=("band", "y", "x"), coords=places, attrs=attributes, name="scene"
+        data, dims=("band", "y", "x"), coords=places, attrs=attributes, name="scene"
     )
     restored = restore(image, model, tile=23)
     assert hasattr(restored.data, "__dask_graph__") == lazy
@@ -187,10 +187,10 @@ def test_a_full_scale_left_open_is_asked_for(da: Any, model: Path) -> None:
     with pytest.raises(ImageError, match=r"^image: .*full_scale"):
         lazy.compute()
     for image, full_scale in ((shares, 1), (eight, 255)):
-        whole = restore(image, model, tile=23, full_scale=full_scale)
-        assert whole.max() <= full_scale
+        expected = restore(image, model, tile=23, full_scale=full_scale)
+        assert expected.max() <= full_scale
         lazy = restore(da.from_array(image, chunks=20), model, tile=23, full_scale=full_scale)
-        np.testing.assert_array_equal(lazy.compute(), whole)
+        np.testing.assert_array_equal(lazy.compute(), expected)
 
 
 @pytest.mark.parametrize(
@@ -209,9 +209,9 @@ def test_what_is_no_image_is_refused(image: Any, model: Path) -> None:
 
 
 def test_a_dask_array_of_unknown_size_is_refused(da: Any, model: Path) -> None:
-    known = da.from_array(noise(20, 20))
+    array = da.from_array(noise(20, 20))
     with pytest.raises(ImageError, match="sizes known"):
-        restore(known[known[:, 0] > 2000], model)
+        restore(array[array[:, 0] > 2000], model)
     with pytest.raises(ImageError, match="without a mask"):
         restore(da.ma.masked_equal(da.zeros((9, 9)), 0), model)
 
@@ -219,15 +219,15 @@ def test_a_dask_array_of_unknown_size_is_refused(da: Any, model: Path) -> None:
 def test_options_and_models_are_refused_before_anything_is_computed(
     da: Any, model: Path, tmp_path: Path
 ) -> None:
-    wrong: dict[str, Any] = {
+    cases: dict[str, Any] = {
         "runtime: expected onnxruntime or openvino": "tensorrt",
         "tile": 10,
         "halo": -1,
     }
     for image in (noise(40, 40), da.from_array(noise(40, 40), chunks=20)):
-        for said, value in wrong.items():
-            with pytest.raises(OptionError, match=said):
-                restore(image, model, **{said.split(":")[0]: value})
+        for message, value in cases.items():
+            with pytest.raises(OptionError, match=message):
+                restore(image, model, **{message.split(":")[0]: value})
         with pytest.raises(ModelError, match="no such file"):
             restore(image, tmp_path / "none.onnx")
 
@@ -238,5 +238,7 @@ def test_importing_it_brings_nothing_that_only_other_work_needs() -> None:
         f"import sys; from beers_deploy.library import restore; print([m for m in {names} if "
         "m in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert process.stdout.strip() == "[]"

@@ -38,18 +38,18 @@ def test_an_argument_that_tifffile_does_not_know(
 ) -> None:
     tifffile.imwrite(tmp_path / "raw.tif", PIXELS)
     monkeypatch.setitem(tiff.PLAIN, "is_of_the_future", False)
-    said = done("info", tmp_path / "raw.tif", code=CRASHED)
-    assert f"tifffile {version('tifffile')}" in said
-    assert "is_of_the_future" in said
-    assert "whole image" not in said
+    message = done("info", tmp_path / "raw.tif", code=CRASHED)
+    assert f"tifffile {version('tifffile')}" in message
+    assert "is_of_the_future" in message
+    assert "whole image" not in message
 
 
 def test_a_name_that_pillow_lacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Image.fromarray(PIXELS).save(tmp_path / "raw.png")
     monkeypatch.setattr(PngImagePlugin.PngImageFile, "_open", lambda self: self.of_the_future)
-    said = done("info", tmp_path / "raw.png", code=CRASHED)
-    assert f"pillow {version('pillow')}" in said
-    assert "of_the_future" in said
+    message = done("info", tmp_path / "raw.png", code=CRASHED)
+    assert f"pillow {version('pillow')}" in message
+    assert "of_the_future" in message
 
 
 @pytest.mark.parametrize("kind", CODE_FAULTS)
@@ -76,8 +76,8 @@ def test_a_name_that_a_module_lacks_is_no_contradiction_of_a_network() -> None:
 def test_a_fault_of_this_program_names_no_library() -> None:
     with pytest.raises(TypeError) as caught:
         printable(None)  # type: ignore[arg-type]
-    said, code = ending(caught.value, restore)
-    assert (code, said.partition(",")[0]) == (CRASHED, "a fault of this program")
+    message, code = ending(caught.value, restore)
+    assert (code, message.partition(",")[0]) == (CRASHED, "a fault of this program")
 
 
 def test_a_run_of_onnxruntime_that_fails_is_no_fault_of_the_file(
@@ -91,10 +91,10 @@ def test_a_run_of_onnxruntime_that_fails_is_no_fault_of_the_file(
     monkeypatch.setattr(onnxruntime.InferenceSession, "run", moved)
     int8_adds_exactly.cache_clear()
     try:
-        said = done("gate", "convbeers-xs", "--patches", 1, code=CRASHED)
+        message = done("gate", "convbeers-xs", "--patches", 1, code=CRASHED)
     finally:
         int8_adds_exactly.cache_clear()
-    assert f"onnxruntime {version('onnxruntime')}" in said or "fault of this program" in said
+    assert f"onnxruntime {version('onnxruntime')}" in message or "fault of this program" in message
 
 
 def test_a_fault_of_the_writer_is_no_missing_codec(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@ the last byte.
 """
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -21,11 +22,11 @@ def test_threads_and_processes_are_at_most_the_cores(
     cores: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "cpu_count", lambda: cores)
-    for asked in (0, 1, cores):
-        require_cores("--threads", asked)
-    for asked in (-1, cores + 1, 100_000):
+    for count in (0, 1, cores):
+        require_cores("--threads", count)
+    for count in (-1, cores + 1, 100_000):
         with pytest.raises(OptionError, match=f"threads: expected 0 to {cores}, the cores"):
-            require_cores("--threads", asked)
+            require_cores("--threads", count)
 
 
 @pytest.mark.parametrize(
@@ -47,11 +48,16 @@ def test_a_command_says_how_many(
     assert [path.name for path in tmp_path.iterdir()] == ["raw.tif"]
 
 
-BOUNDED = [(name, each.label) for name in COMMANDS for each in parameters(name) if each.info.max]
+def bounded_options() -> Iterator[tuple[str, str]]:
+    """Yield the command and the label of every option that has a largest value."""
+    for name in COMMANDS:
+        for parameter in parameters(name):
+            if parameter.info.max:
+                yield name, parameter.label
 
 
-@pytest.mark.parametrize(("command", "option"), BOUNDED)
+@pytest.mark.parametrize(("command", "option"), list(bounded_options()))
 def test_a_huge_number_is_refused_at_once(command: str, option: str) -> None:
-    said = refused(command, option, HUGE)
-    assert "less than or equal to" in said
-    assert option in said
+    message = refused(command, option, HUGE)
+    assert "less than or equal to" in message
+    assert option in message

@@ -45,11 +45,11 @@ KNOWN = load_sensor(SENSOR)
 
 
 def test_a_network_is_written_once_for_a_sensor(conditioned: Path) -> None:
-    first = float_file(conditioned, KNOWN)
-    written = first.stat().st_mtime_ns
-    assert float_file(conditioned, KNOWN) == first
-    assert first.stat().st_mtime_ns == written
-    assert metadata(onnx.load(first))["sensor"] == SENSOR
+    path = float_file(conditioned, KNOWN)
+    time_ns = path.stat().st_mtime_ns
+    assert float_file(conditioned, KNOWN) == path
+    assert path.stat().st_mtime_ns == time_ns
+    assert metadata(onnx.load(path))["sensor"] == SENSOR
 
 
 def test_the_same_numbers_are_the_same_sensor_and_others_are_not(
@@ -106,9 +106,9 @@ def test_weights_of_ones_own_are_calibrated_by_quantize_alone(conditioned: Path)
 @pytest.mark.parametrize("name", shipped_names())
 def test_the_shipped_int8_files_are_of_these_weights(name: str) -> None:
     """Other weights need other files: docs/make/int8.py makes them."""
-    said = metadata(load_onnx(SHIPPED / f"{name}{INT8}.onnx"))
-    assert said[WEIGHTS] == sha256(shipped_weights(name))
-    assert said["variant"] == name
+    header = metadata(load_onnx(SHIPPED / f"{name}{INT8}.onnx"))
+    assert header[WEIGHTS] == sha256(shipped_weights(name))
+    assert header["variant"] == name
     assert metadata(load_onnx(int8_file(Path(name), KNOWN)))["sensor"] == SENSOR
 
 
@@ -134,14 +134,14 @@ def test_blind_is_the_middle_of_a_range_of_sensors() -> None:
 
 
 def test_what_lies_outside_is_said_each_time(conditioned: Path, tmp_path: Path) -> None:
-    said = list[str]()
+    messages = list[str]()
     sensor = load_sensor(str(own_sensor(tmp_path, ("value = 0.07", "value = 0.004"))))
     for _ in range(2):
-        float_file(conditioned, sensor, said.append)
-    assert len(said) == 4
+        float_file(conditioned, sensor, messages.append)
+    assert len(messages) == 4
     assert all(
         re.match("warning: mtf_(across|along) 0.004 is outside 0.015 to 0.15", sentence)
-        for sentence in said
+        for sentence in messages
     )
 
 
@@ -167,10 +167,10 @@ def test_restoring_for_a_sensor_needs_no_torch_and_is_what_the_sensor_makes_of_i
         f"import sys; from beers_deploy.cli import app; {call}; print({{'torch', 'skimage'}} "
         "& set(sys.modules))"
     )
-    ran = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
     )
-    assert ran.stdout.splitlines()[-1] == "set()"
+    assert process.stdout.splitlines()[-1] == "set()"
     other = [*words[:2], str(tmp_path / "other.tif"), *words[3:5], "--sensor", SENSOR]
     done(*other)
     restored = [tifffile.imread(tmp_path / name).astype(int) for name in ("out.tif", "other.tif")]
@@ -194,11 +194,11 @@ def test_a_sensors_name_cannot_leave_the_folder(conditioned: Path) -> None:
 
 
 def test_what_several_networks_have_to_say_is_said_once() -> None:
-    said: list[str] = []
-    tell = once(said.append)
+    messages: list[str] = []
+    tell = once(messages.append)
     for sentence in ("a", "b", "a", "b", "c"):
         tell(sentence)
-    assert said == ["a", "b", "c"]
+    assert messages == ["a", "b", "c"]
 
 
 @pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-s"])
@@ -211,7 +211,8 @@ def test_a_name_is_the_shipped_network(
     assert network_file(Path(f"{name}-int8"), KNOWN) == int8
     assert weights_file(Path(name)) == shipped_weights(name)
     monkeypatch.chdir(tmp_path)
-    Path(name).write_bytes(b"mine")  # a file of that name is what was meant
+    # If a file has the name of a shipped network, the file is meant.
+    Path(name).write_bytes(b"mine")
     assert (
         int8_file(Path(name), KNOWN)
         == float_file(Path(name), KNOWN)
@@ -233,16 +234,16 @@ def test_commands_take_the_name(tmp_path: Path) -> None:
     )
     for model in ("convbeers-xs-int8", str(shipped_pair("convbeers-xs", "blind")[1])):
         out = tmp_path / f"{len(model)}.tif"
-        said = done("restore", tmp_path / "in.tif", out, "--network", model)
-        assert ("network: convbeers-xs-int8, told no sensor" in said) == (
+        output = done("restore", tmp_path / "in.tif", out, "--network", model)
+        assert ("network: convbeers-xs-int8, told no sensor" in output) == (
             model == "convbeers-xs-int8"
         )
     first, second = (
         tifffile.imread(path) for path in tmp_path.glob("*.tif") if path.name != "in.tif"
     )
     np.testing.assert_array_equal(first, second)
-    said = refused("restore", tmp_path / "in.tif", tmp_path / "x.tif", "--network", "huge")
-    assert "a shipped network (convbeers, convbeers-half" in said
+    output = refused("restore", tmp_path / "in.tif", tmp_path / "x.tif", "--network", "huge")
+    assert "a shipped network (convbeers, convbeers-half" in output
 
 
 @pytest.mark.parametrize(
@@ -269,32 +270,15 @@ def test_export_writes_a_shipped_networks_integers_for_the_host_and_the_board(
     assert metadata(load_onnx(tmp_path / "net.onnx"))["variant"] == "convbeers-xs"
     host = str(tmp_path / "int8.onnx")
     board = str(tmp_path / "core.onnx")
-    words = [
-        "export",
-        "--network",
-        "convbeers-half-xs-int8",
-        "--sensor",
-        "blind",
-        "--tile",
-        "64",
-        "--out",
-        host,
-    ]
-    done(*words, "--board-file", board)
+    network = ("--network", "convbeers-half-xs-int8", "--sensor", "blind")
+    done("export", *network, "--tile", "64", "--out", host, "--board-file", board)
     assert metadata(load_onnx(Path(host)))["sensor"] == "blind"
     for path in (host, board):
         done("check", path)
 
 
 def test_a_tile_that_a_network_cannot_rearrange_is_refused(tmp_path: Path) -> None:
-    words = [
-        "export",
-        "--network",
-        "convbeers-half-xs-int8",
-        "--tile",
-        "65",
-        "--out",
-        str(tmp_path / "x.onnx"),
-    ]
-    assert "--tile: expected a multiple of 2 px, got 65 px" in refused(*words)
-    assert not (tmp_path / "x.onnx").exists()
+    out = tmp_path / "x.onnx"
+    words = ("--network", "convbeers-half-xs-int8", "--tile", "65", "--out", out)
+    assert "--tile: expected a multiple of 2 px, got 65 px" in refused("export", *words)
+    assert not out.exists()

@@ -51,7 +51,8 @@ def no_sockets(monkeypatch: pytest.MonkeyPatch) -> list[tuple[object, ...]]:
 
 def done(*arguments: object) -> None:
     result = runner.invoke(app, [str(argument) for argument in arguments])
-    assert result.exit_code in (0, 1), result.output  # 1: a gate of so small a network
+    # The gate ends with 1 for so small a network.
+    assert result.exit_code in (0, 1), result.output
 
 
 def test_the_chain_opens_no_socket(tmp_path: Path, no_sockets: list[tuple[object, ...]]) -> None:
@@ -96,7 +97,7 @@ def alone(home: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
     )
 
 
-def kept(home: Path) -> list[str]:
+def files_below(home: Path) -> list[str]:
     return sorted(str(path.relative_to(home)) for path in home.rglob("*") if path.is_file())
 
 
@@ -113,7 +114,7 @@ def test_no_native_library_opens_one_or_keeps_an_identifier(tmp_path: Path, runt
     result = alone(home, "-m", "tests.deploy.sealed", "restore", raw, out, "--runtime", runtime)
     assert result.returncode == 0, result.stderr
     assert tifffile.imread(out).shape == (37, 61)
-    assert kept(home) == []
+    assert files_below(home) == []
 
 
 @needs_filters

@@ -117,19 +117,19 @@ def test_no_command_takes_such_weights(tmp_path: Path, command: str) -> None:
 def test_a_network_whose_sums_overflow_is_refused_where_it_runs(
     tmp_path: Path, command: str, scenes: Path
 ) -> None:
-    said = spoken(command.replace("{2}", str(scenes)), written(tmp_path, overflowing, ".onnx"))
-    assert "NaN" in said
-    assert "finite" in said
+    message = spoken(command.replace("{2}", str(scenes)), written(tmp_path, overflowing, ".onnx"))
+    assert "NaN" in message
+    assert "finite" in message
 
 
 def test_the_gate_fails_a_network_whose_sums_overflow(tmp_path: Path, scenes: Path) -> None:
-    said = spoken(
+    output = spoken(
         f"gate {{0}} {INT8} --images {scenes} --patches 1",
         written(tmp_path, overflowing, ".onnx"),
         exit_code=1,
     )
-    assert "gate FAILED" in said
-    assert "MAE nan" in said
+    assert "gate FAILED" in output
+    assert "MAE nan" in output
 
 
 def test_an_infinite_pixel_is_no_full_scale_to_the_gate() -> None:

@@ -34,7 +34,8 @@ class Net(torch.nn.Module):
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "notebook.md"
 
 
-@pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")  # between rioxarray and affine
+# The warning is between rioxarray and affine.
+@pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")
 def test_the_page_gives_what_the_command_gives(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

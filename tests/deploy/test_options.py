@@ -2,7 +2,9 @@
 must not meet.
 """
 
+from collections.abc import Iterator
 from enum import StrEnum
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -11,12 +13,15 @@ from typer.testing import CliRunner
 from beers_deploy.cli import COMMANDS, app
 from docs.make.options import PATHS, REFUSED, UNITS, WORDS, Parameter, Refused, parameters
 
-CASES = [
-    (name, option, case)
-    for name, cases in REFUSED.items()
-    for case in cases
-    for option in case.options
-]
+
+def refused_options() -> Iterator[tuple[str, str, Refused]]:
+    """Yield a command, one of its options, and a combination in which the option is refused."""
+    for name, cases in REFUSED.items():
+        for case in cases:
+            for option in case.options:
+                yield name, option, case
+
+
 GIVEN = {
     "add": "haze",
     "dpu": "C32B3",
@@ -34,39 +39,48 @@ GIVEN = {
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_option_is_known(name: str) -> None:
     """A KeyError of `kind` is an option that the tables of docs/make/options.py lack."""
-    known = parameters(name)
-    assert all(each.kind for each in known)
-    names = {each.name for each in known}
+    known_parameters = parameters(name)
+    assert all(parameter.kind for parameter in known_parameters)
+    names = {parameter.name for parameter in known_parameters}
     paths = PATHS[name]
     assert {*paths.written, *paths.read, *paths.also_read} <= names
-    assert {option for case in REFUSED.get(name, ()) for option in case.options} <= names
-    read = {*paths.read, *paths.also_read}
-    assert all(not each.kind.startswith("output") for each in known if each.name in read)
+    for case in REFUSED.get(name, ()):
+        assert set(case.options) <= names
+    inputs = {*paths.read, *paths.also_read}
+    assert all(
+        not parameter.kind.startswith("output")
+        for parameter in known_parameters
+        if parameter.name in inputs
+    )
 
 
 def test_the_tables_hold_nothing_else() -> None:
-    used = {each.name for name in COMMANDS for each in parameters(name)}
-    assert {*UNITS, *WORDS} <= used
+    every_parameter = chain.from_iterable(parameters(name) for name in COMMANDS)
+    names = {parameter.name for parameter in every_parameter}
+    assert {*UNITS, *WORDS} <= names
     assert set(REFUSED) <= set(PATHS) == set(COMMANDS)
 
 
-@pytest.mark.parametrize(("name", "option", "case"), CASES, ids=lambda each: str(each))
+@pytest.mark.parametrize(("name", "option", "case"), list(refused_options()), ids=str)
 def test_a_combination_is_refused(
     name: str, option: str, case: Refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    known = {each.name: each for each in parameters(name)}
+    by_name = {parameter.name: parameter for parameter in parameters(name)}
     beside = [_file(word) if word.isupper() else word for word in case.beside.split()]
-    needed = [word for each in known.values() if each.required for word in _given(each)]
-    command = [name, *needed, *beside, *_given(known[option])]
+    needed: list[str] = []
+    for parameter in by_name.values():
+        if parameter.required:
+            needed += _given(parameter)
+    command = [name, *needed, *beside, *_given(by_name[option])]
     before = sorted(tmp_path.rglob("*"))
-    done = CliRunner().invoke(app, command)
-    assert done.exit_code == 2, (command, done.output)
-    sentence = done.stderr.removeprefix("beers-deploy: ")
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 2, (command, result.output)
+    sentence = result.stderr.removeprefix("beers-deploy: ")
     assert sentence.startswith(
-        (known[option].label, *case.without.split(), *(b for b in beside if b[0] == "-"))
+        (by_name[option].label, *case.without.split(), *(b for b in beside if b[0] == "-"))
     )
-    assert done.stderr.count("\n") == 1, done.stderr
+    assert result.stderr.count("\n") == 1, result.stderr
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -85,8 +99,8 @@ def _given(parameter: Parameter) -> list[str]:
 
 def _value(parameter: Parameter) -> str:
     if parameter.hint is Path:
-        written = parameter.kind.startswith("output")
-        return f"new-{parameter.name}.svg" if written else _file(f"{parameter.name}.tif")
+        is_output = parameter.kind.startswith("output")
+        return f"new-{parameter.name}.svg" if is_output else _file(f"{parameter.name}.tif")
     if parameter.hint in (int, float):
         least = parameter.info.min or 0
         most = parameter.info.max

@@ -8,7 +8,7 @@ import os
 import socket
 import stat
 from collections.abc import Callable, Iterable, Iterator
-from itertools import combinations, cycle
+from itertools import chain, combinations, cycle
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -43,7 +43,16 @@ BESIDE = {
     ("tradeoff", "detector"): ("--labelled", "pictures"),
 }
 """What an option is refused without."""
-WRITERS = [(name, option) for name, paths in PATHS.items() for option in paths.written]
+
+
+def outputs_of_commands() -> Iterator[tuple[str, str]]:
+    """Yield every command with each option that names an output."""
+    for name, paths in PATHS.items():
+        for option in paths.written:
+            yield name, option
+
+
+WRITERS = list(outputs_of_commands())
 TELLS_CI = ("gate", "junit")
 """What is written where nothing could be judged, too: a CI job then shows why."""
 FILES = [(name, option) for name, option in WRITERS if PATHS[name].written[option] == FILE]
@@ -85,27 +94,27 @@ def arguments(name: str, values: dict[str, Path]) -> list[str]:
             positional += [str(value)] if value else []
         elif value is not None:
             options += [parameter.opts[0], str(value)]
-    more = [word for option in values for word in BESIDE.get((name, option), ())]
+    more = chain.from_iterable(BESIDE.get((name, option), ()) for option in values)
     return [name, *MORE.get(name, ()), *positional, *options, *more]
 
 
-def given(name: str, folder: Path, **values: Path) -> list[str]:
+def command_with(name: str, folder: Path, **values: Path) -> list[str]:
     """As `arguments`: an input for each argument, an output for each that must be given, unless
     told otherwise.
     """
     paths = PATHS[name]
-    whole = dict(values)
+    all_values = dict(values)
     for key, parameter in parameters(name).items():
-        if key in whole:
+        if key in all_values:
             continue
         if parameter.param_type_name == "argument" and key in paths.read:
-            whole[key] = kept(folder / f"input-{key}{suffix_of(name)}")
+            all_values[key] = existing(folder / f"input-{key}{suffix_of(name)}")
         elif key in paths.written and parameter.required:
-            whole[key] = folder / f"output-{key}{suffix_of(name)}"
-    return arguments(name, whole)
+            all_values[key] = folder / f"output-{key}{suffix_of(name)}"
+    return arguments(name, all_values)
 
 
-def kept(path: Path) -> Path:
+def existing(path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(f"what was in {path.name}")
     return path
@@ -121,24 +130,24 @@ def output_at(name: str, option: str, folder: Path) -> tuple[Path, Path]:
 
 def state(folder: Path) -> dict[str, bytes | str]:
     """Every entry: bytes of files, kinds of others."""
-    found: dict[str, bytes | str] = {}
+    entries: dict[str, bytes | str] = {}
     for path in sorted(folder.rglob("*")):
         mode = path.lstat().st_mode
         if stat.S_ISREG(mode):
-            found[str(path.relative_to(folder))] = path.read_bytes()
+            entries[str(path.relative_to(folder))] = path.read_bytes()
         else:
-            found[str(path.relative_to(folder))] = f"kind {stat.S_IFMT(mode)}"
-    return found
+            entries[str(path.relative_to(folder))] = f"kind {stat.S_IFMT(mode)}"
+    return entries
 
 
 def refused(command: list[str], folder: Path, *words: str) -> None:
     before = state(folder)
-    done = CliRunner().invoke(app, command)
-    assert done.exit_code == 2, (command, done.output)
-    assert done.stderr.startswith("beers-deploy: "), done.stderr
-    assert done.stderr.count("\n") == 1, done.stderr
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 2, (command, result.output)
+    assert result.stderr.startswith("beers-deploy: "), result.stderr
+    assert result.stderr.count("\n") == 1, result.stderr
     for word in words:
-        assert word in done.stderr, (command, done.stderr)
+        assert word in result.stderr, (command, result.stderr)
     assert state(folder) == before, command
 
 
@@ -157,7 +166,7 @@ def device(path: Path) -> None:
 
 def link(path: Path) -> None:
     try:
-        path.symlink_to(kept(path.parent / "linked-to"))
+        path.symlink_to(existing(path.parent / "linked-to"))
     except OSError:
         pytest.skip("this account cannot make links")
 
@@ -178,25 +187,25 @@ STANDS: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
-@pytest.mark.parametrize(("name", "option", "what"), in_turn(WRITERS, STANDS))
+@pytest.mark.parametrize(("name", "option", "kind"), in_turn(WRITERS, STANDS))
 def test_only_a_regular_file_is_written_over(
-    name: str, option: str, what: str, tmp_path: Path
+    name: str, option: str, kind: str, tmp_path: Path
 ) -> None:
     value, file = output_at(name, option, tmp_path)
     file.parent.mkdir(parents=True, exist_ok=True)
-    make, word = STANDS[what]
+    make, word = STANDS[kind]
     make(file)
-    refused(given(name, tmp_path, **{option: value}), tmp_path, str(file), word)
+    refused(command_with(name, tmp_path, **{option: value}), tmp_path, str(file), word)
 
 
 @pytest.mark.parametrize(
-    ("name", "option", "make"), in_turn(FOLDERS, [kept, pipe, device, dangling])
+    ("name", "option", "make"), in_turn(FOLDERS, [existing, pipe, device, dangling])
 )
 def test_an_output_folder_is_a_folder(
     name: str, option: str, make: Callable[[Path], object], tmp_path: Path
 ) -> None:
     make(tmp_path / "place")
-    refused(given(name, tmp_path, **{option: tmp_path / "place"}), tmp_path, "place")
+    refused(command_with(name, tmp_path, **{option: tmp_path / "place"}), tmp_path, "place")
 
 
 @pytest.mark.parametrize(
@@ -205,9 +214,9 @@ def test_an_output_folder_is_a_folder(
 def test_what_is_refused_for_its_input_leaves_no_new_folder(
     name: str, option: str, tmp_path: Path
 ) -> None:
-    source = kept(tmp_path / f"source{suffix_of(name)}")
+    source = existing(tmp_path / f"source{suffix_of(name)}")
     value, _ = output_at(name, option, tmp_path / "new" / "below")
-    command = given(name, tmp_path, **{option: value, PATHS[name].read[0]: source})
+    command = command_with(name, tmp_path, **{option: value, PATHS[name].read[0]: source})
     before = state(tmp_path)
     assert CliRunner().invoke(app, command).exit_code == 2, command
     assert state(tmp_path) == before, command
@@ -228,12 +237,12 @@ def test_no_output_is_an_input(
 ) -> None:
     value, file = output_at(name, option, tmp_path)
     file.parent.mkdir(parents=True, exist_ok=True)
-    source_path = kept(file if how == "itself" else tmp_path / f"source{suffix_of(name)}")
+    source_path = existing(file if how == "itself" else tmp_path / f"source{suffix_of(name)}")
     if how == "symbolic link":
         file.symlink_to(source_path)
     elif how == "hard link":
         file.hardlink_to(source_path)
-    command = given(name, tmp_path, **{option: value, source: source_path})
+    command = command_with(name, tmp_path, **{option: value, source: source_path})
     refused(command, tmp_path, str(file), "an input of this run")
 
 
@@ -248,55 +257,58 @@ FOLDERS_READ = [
 def test_no_output_is_a_file_of_an_input_folder(
     name: str, option: str, source: str, tmp_path: Path
 ) -> None:
-    scene = kept(tmp_path / "scenes" / ("scene.tif" if suffix_of(name) == ".json" else "scene.png"))
+    scene = existing(
+        tmp_path / "scenes" / ("scene.tif" if suffix_of(name) == ".json" else "scene.png")
+    )
     if source == "pairs":
-        scene = kept(tmp_path / "scenes" / "reference" / "scene.tif")
-    command = given(name, tmp_path, **{option: scene, source: tmp_path / "scenes"})
+        scene = existing(tmp_path / "scenes" / "reference" / "scene.tif")
+    command = command_with(name, tmp_path, **{option: scene, source: tmp_path / "scenes"})
     refused(command, tmp_path, str(scene), "an input of this run")
 
 
 def test_figures_of_an_earlier_run_beside_the_images_are_renewed(tmp_path: Path) -> None:
     """The rule does not stop a job that is run twice: it gets as far as reading the images."""
-    kept(tmp_path / "scenes" / "scene.png")
-    figures = kept(tmp_path / "scenes" / "figures.json")
-    done = CliRunner().invoke(
+    existing(tmp_path / "scenes" / "scene.png")
+    figures = existing(tmp_path / "scenes" / "figures.json")
+    result = CliRunner().invoke(
         app, ["evaluate", "--images", str(figures.parent), "--json", str(figures)]
     )
-    assert done.exit_code == 2
-    assert "scene.png" in done.stderr
+    assert result.exit_code == 2
+    assert "scene.png" in result.stderr
 
 
 @pytest.mark.parametrize("command", ["evaluate", "simulate"])
 def test_pictures_do_not_go_where_images_are_read(command: str, tmp_path: Path) -> None:
-    scene = kept(tmp_path / "scenes" / "degraded" / "scene.tif")
-    wanted = {
+    scene = existing(tmp_path / "scenes" / "degraded" / "scene.tif")
+    arguments_of = {
         "evaluate": ["--images", str(scene.parent), "--out", str(scene.parent)],
         "simulate": [str(scene), "--out", str(tmp_path / "scenes")],
     }
-    refused([command, *wanted[command]], tmp_path, "the folder of an input")
+    refused([command, *arguments_of[command]], tmp_path, "the folder of an input")
 
 
-PAIRS = [
-    (name, one, other)
-    for name, paths in PATHS.items()
-    for one, other in combinations(paths.written, 2)
-]
+def pairs_of_outputs() -> Iterator[tuple[str, str, str]]:
+    """Yield every command with each two of its outputs."""
+    for name, paths in PATHS.items():
+        for one, other in combinations(paths.written, 2):
+            yield name, one, other
 
 
-@pytest.mark.parametrize(("name", "one", "other"), PAIRS)
+@pytest.mark.parametrize(("name", "one", "other"), list(pairs_of_outputs()))
 def test_no_two_outputs_are_one(name: str, one: str, other: str, tmp_path: Path) -> None:
     value, file = output_at(name, one, tmp_path)
     if (name, other) in FOLDERS:
-        (value, file), (one, other) = output_at(name, other, tmp_path), (other, one)
+        value, file = output_at(name, other, tmp_path)
+        one, other = other, one
     words = str(tmp_path), "another output"
-    refused(given(name, tmp_path, **{one: value, other: file}), tmp_path, *words)
+    refused(command_with(name, tmp_path, **{one: value, other: file}), tmp_path, *words)
     (tmp_path / "detour").mkdir(exist_ok=True)
     around = tmp_path / "detour" / ".." / file.relative_to(tmp_path)
-    refused(given(name, tmp_path, **{one: value, other: around}), tmp_path, *words)
+    refused(command_with(name, tmp_path, **{one: value, other: around}), tmp_path, *words)
 
 
 def test_the_curves_of_bit_flips_are_an_output_too(tmp_path: Path) -> None:
-    core = kept(tmp_path / "curves.svg")
+    core = existing(tmp_path / "curves.svg")
     command = ["stress", "--bit-flips", str(core), str(core), "--out", str(tmp_path / "curves.md")]
     refused(command, tmp_path, "curves.svg", "an input of this run")
 
@@ -304,7 +316,8 @@ def test_the_curves_of_bit_flips_are_an_output_too(tmp_path: Path) -> None:
 def test_a_socket_is_no_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if not hasattr(socket, "AF_UNIX"):
         pytest.skip("this system has no such sockets")
-    monkeypatch.chdir(tmp_path)  # a socket's name is short
-    with socket.socket(socket.AF_UNIX) as here:
-        here.bind("figures.json")
+    # The path of a socket must be short, so the name is relative.
+    monkeypatch.chdir(tmp_path)
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind("figures.json")
         refused(["bench", "--json", "figures.json"], tmp_path, "no regular file")

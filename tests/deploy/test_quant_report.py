@@ -37,11 +37,11 @@ def float_file(path: Path) -> str:
     return str(path)
 
 
-@pytest.mark.parametrize("given", ["-1", "many", "2.5"])
-def test_steps_of_fine_tuning_are_whole_or_auto(given: str) -> None:
+@pytest.mark.parametrize("text", ["-1", "many", "2.5"])
+def test_steps_of_fine_tuning_are_whole_or_auto(text: str) -> None:
     assert (steps_of("auto"), steps_of(20), steps_of("0")) == (None, 20, 0)
     with pytest.raises(OptionError, match="finetune: expected auto, or whole steps from 0"):
-        steps_of(given)
+        steps_of(text)
 
 
 @pytest.mark.slow
@@ -59,23 +59,9 @@ def test_quantize_reports_layers(tmp_path: Path) -> None:
     float_file(tmp_path / "f.onnx")
     dn = procedural_scene(640, 700, np.random.default_rng(0)).radiance * 4095 / 400
     write_tiff(tmp_path / "scenes" / "drawn.tif", np.rint(dn).astype(np.uint16))
-    options = [
-        "--out",
-        str(tmp_path / "i.onnx"),
-        "--patches",
-        "4",
-        "--json",
-        str(tmp_path / "q.json"),
-    ]
-    options += [
-        "--patch",
-        "96",
-        "--report",
-        str(tmp_path / "r"),
-        "--images",
-        str(tmp_path / "scenes"),
-    ]
-    done("quantize", tmp_path / "f.onnx", *options)
+    outputs = ["--out", tmp_path / "i.onnx", "--json", tmp_path / "q.json"]
+    patches = ["--images", tmp_path / "scenes", "--patches", 4, "--patch", 96]
+    done("quantize", tmp_path / "f.onnx", *outputs, "--report", tmp_path / "r", *patches)
     document = valid(tmp_path / "q.json")
     tables = [row["table"] for row in document["rows"]]
     assert tables.count("integer layers") == 8
@@ -137,8 +123,9 @@ def test_labels_of_the_histogram_can_be_read_on_the_narrowest_page(farthest: int
     assert width <= PHONE_PX
     assert FONT_PX >= 12
     across = list[tuple[float, float]]()
-    for text in (each for each in root.iter() if each.tag.endswith("text")):
-        if text.get("transform"):  # upright
+    for text in (element for element in root.iter() if element.tag.endswith("text")):
+        # The width of upright text is no horizontal extent.
+        if text.get("transform"):
             continue
         wide = text_width(text.text or "")
         x = float(text.get("x") or 0)
@@ -157,10 +144,10 @@ def test_what_the_profile_gave_is_no_measurement() -> None:
     sensor = replace(profile.nominal(), mtf_nyquist=0.05)
     scene = procedural_scene(700, 700, np.random.default_rng(0))
     patches = draw_patches([scene], profile, reference_for(profile), 1, 0)
-    for along, said in ((None, "5 %"), (0.03, "5 % across the track, 3 % along it")):
+    for along, expected in ((None, "5 %"), (0.03, "5 % across the track, 3 % along it")):
         views = [replace(patches.views[0], degraded=replace(sensor, mtf_nyquist_along=along))]
         row = worst_row(0, replace(patches, views=views), spread(np.zeros(9)))
-        assert row.text["MTF at Nyquist, drawn from the profile"] == said
+        assert row.text["MTF at Nyquist, drawn from the profile"] == expected
         assert not any("MTF" in key for key in row.figures)
 
 
@@ -173,32 +160,19 @@ def test_the_ratio_is_put_into_words() -> None:
 def test_a_report_on_samples_shows_the_worst_of_them(tmp_path: Path) -> None:
     save_onnx(to_onnx(plain(Variant(1, 4)), {}), tmp_path / "f.onnx")
     np.save(tmp_path / "s.npy", np.random.default_rng(0).random((8, 1, 40, 48), np.float32))
-    options = [
-        "--samples",
-        tmp_path / "s.npy",
-        "--out",
-        tmp_path / "i.onnx",
-        "--report",
-        tmp_path / "r",
-    ]
+    samples = ["--samples", tmp_path / "s.npy"]
+    options = [*samples, "--out", tmp_path / "i.onnx", "--report", tmp_path / "r"]
     assert "none together with --samples" in refused(
         "quantize", tmp_path / "f.onnx", *options, "--patches", 3
     )
     assert "dB" not in done("quantize", tmp_path / "f.onnx", *options).splitlines()[-1]
     document = json.loads((tmp_path / "r" / "report.json").read_text())
     rows = document["rows"]
-    assert [each["name"] for each in document["inputs"]] == ["f.onnx", "i.onnx", "samples s.npy"]
+    assert [entry["name"] for entry in document["inputs"]] == ["f.onnx", "i.onnx", "samples s.npy"]
     assert {row["name"] for row in rows if row["table"] == "worst samples"} == {
         "sample 0",
         "sample 1",
     }
-    judged = done(
-        "gate",
-        tmp_path / "f.onnx",
-        tmp_path / "i.onnx",
-        "--samples",
-        tmp_path / "s.npy",
-        "--max-mae",
-        "0.1",
-    )
-    assert "6 of the 8 samples were its calibration" in judged
+    pair = (tmp_path / "f.onnx", tmp_path / "i.onnx")
+    output = done("gate", *pair, *samples, "--max-mae", "0.1")
+    assert "6 of the 8 samples were its calibration" in output

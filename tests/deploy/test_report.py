@@ -38,12 +38,6 @@ def test_the_page_asks_the_network_for_nothing() -> None:
         assert word not in page
 
 
-def test_words_are_escaped() -> None:
-    page = render(report())
-    assert "no counter on this &lt;machine&gt;" in page
-    assert "network &amp; more" in page
-
-
 def test_the_busiest_window_lies_on_the_texture() -> None:
     dn = np.full((90, 130), 500.0)
     dn[50:80, 90:120] += np.random.default_rng(0).integers(0, 800, (30, 30))

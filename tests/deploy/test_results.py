@@ -30,18 +30,18 @@ def document(**figures: Figure) -> dict[str, object]:
 
 
 def test_every_mode_validates() -> None:
-    whole = document(
+    content = document(
         a=measured(1.5, "s", "here"),
         b=predicted(2, "s", (1, 3), "a model"),
         c=published(42, "s", "the paper"),
         d=unavailable("W", "no counter"),
     )
-    jsonschema.validate(whole, SCHEMA)
-    assert json.loads(json.dumps(whole)) == whole
+    jsonschema.validate(content, SCHEMA)
+    assert json.loads(json.dumps(content)) == content
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "figure",
     [
         Figure(2.0, "s", "predicted", "a model"),
         Figure(None, "s", "measured", "here"),
@@ -50,9 +50,9 @@ def test_every_mode_validates() -> None:
         Figure(1.0, "s", "published", "a paper", (0.0, 2.0)),
     ],
 )
-def test_a_figure_without_what_its_mode_needs_is_invalid(wrong: Figure) -> None:
+def test_a_figure_without_what_its_mode_needs_is_invalid(figure: Figure) -> None:
     with pytest.raises(jsonschema.ValidationError):
-        jsonschema.validate(document(a=wrong), SCHEMA)
+        jsonschema.validate(document(a=figure), SCHEMA)
 
 
 def test_inputs_are_named_by_their_digest(tmp_path: Path) -> None:
@@ -88,10 +88,10 @@ def strictly(text: str) -> object:
 
 def test_what_is_written_is_the_document(tmp_path: Path) -> None:
     row = Row("t", "row", {"a": measured(1.5, "s", "here")}, {"remedy": "none"})
-    whole = Table("test", {"seed": 0, "json": None}, (), (row,))
-    assert whole.save(tmp_path / "made" / "a.json") == tmp_path / "made" / "a.json"
-    read = strictly((tmp_path / "made" / "a.json").read_text())
-    jsonschema.validate(read, SCHEMA)
+    table = Table("test", {"seed": 0, "json": None}, (), (row,))
+    assert table.save(tmp_path / "made" / "a.json") == tmp_path / "made" / "a.json"
+    content = strictly((tmp_path / "made" / "a.json").read_text())
+    jsonschema.validate(content, SCHEMA)
     assert [p.name for p in (tmp_path / "made").iterdir()] == ["a.json"]
 
 
@@ -142,10 +142,10 @@ def judged(*checks: Check, command: str = "gate") -> dict[str, Any]:
 
 @pytest.mark.parametrize(("checks", "verdict"), [(CHECKS[:1], "passed"), (CHECKS, "failed")])
 def test_a_verdict_stands_beside_its_checks(checks: tuple[Check, ...], verdict: str) -> None:
-    whole = judged(*checks)
-    jsonschema.validate(strictly(json.dumps(whole, allow_nan=False)), SCHEMA)
-    assert whole["verdict"] == verdict
-    assert [check["passed"] for check in whole["checks"]] == [True, False][: len(checks)]
+    content = judged(*checks)
+    jsonschema.validate(strictly(json.dumps(content, allow_nan=False)), SCHEMA)
+    assert content["verdict"] == verdict
+    assert [check["passed"] for check in content["checks"]] == [True, False][: len(checks)]
     first = {
         "name": "MAE",
         "value": 6e-4,
@@ -153,8 +153,8 @@ def test_a_verdict_stands_beside_its_checks(checks: tuple[Check, ...], verdict: 
         "unit": "of full scale",
         "bound": "at most",
     }
-    assert whole["checks"][0] == {**first, "passed": True, "detail": ""}
-    assert whole["checks"][-1]["value"] == (6e-4 if verdict == "passed" else None)
+    assert content["checks"][0] == {**first, "passed": True, "detail": ""}
+    assert content["checks"][-1]["value"] == (6e-4 if verdict == "passed" else None)
 
 
 @pytest.mark.parametrize("command", ["gate", "check"])
@@ -165,7 +165,7 @@ def test_a_command_that_judges_has_a_verdict(command: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "change",
     [
         {"verdict": "failed"},
         {"verdict": "perhaps"},
@@ -176,18 +176,18 @@ def test_a_command_that_judges_has_a_verdict(command: str) -> None:
         {"host": {"system": "Linux"}},
     ],
 )
-def test_a_verdict_that_its_checks_do_not_bear_out_is_invalid(wrong: dict[str, object]) -> None:
-    sound = judged(CHECKS[0])
-    jsonschema.validate(sound, SCHEMA)
+def test_a_verdict_that_its_checks_do_not_bear_out_is_invalid(change: dict[str, object]) -> None:
+    content = judged(CHECKS[0])
+    jsonschema.validate(content, SCHEMA)
     with pytest.raises(jsonschema.ValidationError):
-        jsonschema.validate({**sound, **wrong}, SCHEMA)
+        jsonschema.validate({**content, **change}, SCHEMA)
 
 
 def test_a_host_of_version_2_says_which_kernels_it_took() -> None:
-    sound = judged(CHECKS[0])
-    del sound["host"]["kernels"]
+    content = judged(CHECKS[0])
+    del content["host"]["kernels"]
     with pytest.raises(jsonschema.ValidationError, match="'kernels' is a required"):
-        jsonschema.validate(sound, SCHEMA)
+        jsonschema.validate(content, SCHEMA)
 
 
 def test_a_printed_table_shows_its_figures_and_notes() -> None:

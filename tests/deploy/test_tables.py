@@ -126,8 +126,10 @@ def test_a_tag_is_a_word_and_no_unit() -> None:
         assert " m " not in text
         alike = shown([mixed[0]] * 2, width)
         assert alike.count("measured") == 2, "in the heading, and in the legend"
-        one = next(line for line in shown(mixed[:1], width).splitlines() if "1.586" in line)
-        assert [cell.strip() for cell in one.split("│")[1:-1]] in (
+        line_of_ours = next(
+            line for line in shown(mixed[:1], width).splitlines() if "1.586" in line
+        )
+        assert [cell.strip() for cell in line_of_ours.split("│")[1:-1]] in (
             ["time", "s", "measured", "1.586"],
             ["ours", "1.586"],
         )

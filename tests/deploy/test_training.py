@@ -84,7 +84,7 @@ def test_a_run_is_not_resumed_with_other_data(images: Path, tmp_path: Path) -> N
     pixels = np.array(Image.open(image))
     pixels.flat[pixels.size // 2] ^= 1
     Image.fromarray(pixels).save(image)
-    begun = [
+    command = [
         "train",
         "--out",
         tmp_path / "a",
@@ -102,19 +102,19 @@ def test_a_run_is_not_resumed_with_other_data(images: Path, tmp_path: Path) -> N
         [*same, "--sensor", "dior-high"],
         [*same, "--drawn", 1],
     ):
-        said = refused(*begun, *words)
-        assert "a checkpoint of these images, sensors and first weights" in said
+        message = refused(*command, *words)
+        assert "a checkpoint of these images, sensors and first weights" in message
 
 
 def test_a_checkpoint_with_a_flipped_bit_is_refused(images: Path, tmp_path: Path) -> None:
     run(images, tmp_path / "a")
     path = tmp_path / "a" / "checkpoint.safetensors"
-    whole = path.read_bytes()
+    content = path.read_bytes()
     for damaged in (
-        whole[:-3000] + bytes([whole[-3000] ^ 1]) + whole[-2999:],
-        whole.replace(b'"step":"4"', b'"step":"2"'),
+        content[:-3000] + bytes([content[-3000] ^ 1]) + content[-2999:],
+        content.replace(b'"step":"4"', b'"step":"2"'),
     ):
-        assert damaged != whole
+        assert damaged != content
         path.write_bytes(damaged)
         with pytest.raises(AssertionError, match="does not match its digest"):
             run(images, tmp_path / "a", "--resume")
@@ -144,21 +144,23 @@ def test_a_run_with_the_roundings_of_int8_differs_from_one_without_and_resumes_t
     options = ["--variant", name, "--conditioned", "--start", name]
     run(images, tmp_path / "plain", *options)
     run(images, tmp_path / "a", *options, "--rounding", f"{name}-int8")
-    first, plain = (weights_of(tmp_path / each / f"{name}.safetensors") for each in ("a", "plain"))
-    assert not torch.equal(first["tail.weight"], plain["tail.weight"])
+    rounded, plain = (
+        weights_of(tmp_path / folder / f"{name}.safetensors") for folder in ("a", "plain")
+    )
+    assert not torch.equal(rounded["tail.weight"], plain["tail.weight"])
     run(images, tmp_path / "a", *options, "--rounding", f"{name}-int8", "--resume")
     assert all(
-        torch.equal(value, first[k])
+        torch.equal(value, rounded[k])
         for k, value in weights_of(tmp_path / "a" / f"{name}.safetensors").items()
     )
-    said = refused(
+    message = refused(
         "train", "--images", images, "--out", tmp_path / "a", *options, "--steps", 4, "--resume"
     )
-    assert "another recipe" in said
+    assert "another recipe" in message
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "words"),
     [
         (["--start", "convbeers-xs"], "--conditioned and --start"),
         (["--conditioned"], "--conditioned and --start"),
@@ -175,7 +177,7 @@ def test_a_run_with_the_roundings_of_int8_differs_from_one_without_and_resumes_t
     ],
 )
 def test_roundings_of_anything_but_the_start_are_refused(
-    options: list[str], said: str, images: Path, tmp_path: Path
+    options: list[str], words: str, images: Path, tmp_path: Path
 ) -> None:
     command = [
         "train",
@@ -188,7 +190,7 @@ def test_roundings_of_anything_but_the_start_are_refused(
         "--rounding",
         "convbeers-xs-int8",
     ]
-    assert said in refused(*command, *options)
+    assert words in refused(*command, *options)
     assert not (tmp_path / "r").exists()
 
 
@@ -200,8 +202,8 @@ def banked_weights(folder: Path) -> Path:
 
 def restored(path: Path, image: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
     with torch.inference_mode():
-        found: torch.Tensor = told(load_network(path)[0], vector)(image)
-    return found
+        result: torch.Tensor = told(load_network(path)[0], vector)(image)
+    return result
 
 
 def test_a_run_at_half_resolution_starts_from_a_network_at_full_resolution(
@@ -236,8 +238,8 @@ def test_a_run_at_half_resolution_starts_from_a_network_at_full_resolution(
 
 def test_a_plain_run_takes_no_conditioned_weights(images: Path, tmp_path: Path) -> None:
     options = ["--images", str(images), "--out", str(tmp_path / "b"), "--steps", "1"]
-    said = refused("train", *options, "--start", banked_weights(tmp_path))
-    assert "expected weights: a plain network's" in said
+    message = refused("train", *options, "--start", banked_weights(tmp_path))
+    assert "expected weights: a plain network's" in message
 
 
 def weights_of(path: Path) -> dict[str, torch.Tensor]:
@@ -305,19 +307,19 @@ def test_pairs_bring_their_sensor_and_its_full_scale(
     ]
     options += ["--patch", "17", "--out", str(tmp_path / "r")]
     for contradiction in (["--sensor", "pleiades-degraded"], ["--reference", "dior-medium"]):
-        said = refused("train", *options, *contradiction)
-        assert f"{contradiction[0]}: expected the sensor that made the pairs" in said
+        message = refused("train", *options, *contradiction)
+        assert f"{contradiction[0]}: expected the sensor that made the pairs" in message
         assert not list(tmp_path.glob("r/*"))
-    made = list[StoredPairs]()
+    stores = list[StoredPairs]()
 
-    def kept(*values: Any, **named: Any) -> StoredPairs:
-        made.append(StoredPairs(*values, **named))
-        return made[0]
+    def kept(*values: Any, **keywords: Any) -> StoredPairs:
+        stores.append(StoredPairs(*values, **keywords))
+        return stores[0]
 
     monkeypatch.setattr(training, "StoredPairs", kept)
     done("train", *options)
     assert load_network(tmp_path / "r" / "convbeers-xs.safetensors")[1]["degraded"] == "mine"
-    assert (made[0].max_dn, made[0].quarters) == (16383, False)
+    assert (stores[0].max_dn, stores[0].quarters) == (16383, False)
 
 
 def test_a_loss_of_nothing_but_lpips_needs_its_weights(
@@ -341,9 +343,9 @@ def test_a_run_that_ends_in_nan_leaves_no_weights(
         *["--conditioned"] * conditioned,
     ]
     options = ["--variant", "convbeers-xs", "--steps", "2", "--batch", "2", "--patch", "32", *more]
-    said = refused("train", "--images", images, "--out", tmp_path / "r", *options)
-    assert "lower the learning rate" in said
-    assert "wrote" not in said
+    message = refused("train", "--images", images, "--out", tmp_path / "r", *options)
+    assert "lower the learning rate" in message
+    assert "wrote" not in message
     assert not list((tmp_path / "r").glob("convbeers*"))
 
 

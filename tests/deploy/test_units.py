@@ -61,23 +61,22 @@ def evaluated(bits: int, dimmer: float, offset_dn: float) -> tuple[np.ndarray, i
     methods = [method_named(name, degraded, reference) for name in METHODS]
     instruments = Instruments({}, degraded.nominal().max_dn)
     scores = [instruments.score(method.restore(pair.degraded), pair) for method in methods]
-    return np.array([each["PSNR"] for each in scores]), pair.degraded.size
+    return np.array([image["PSNR"] for image in scores]), pair.degraded.size
 
 
 def rounding_db(psnr_db: np.ndarray, bits: int, pixels: int) -> np.ndarray:
-    """How far rounding to whole DN, of 12 bits here and of `bits` there, may move these PSNRs.
-
-    A step q leaves an error of q / sqrt(12): in the reference, in what is restored, and in the
-    input, where the restoration amplifies it as white noise, by the ratio of the MTFs over all
-    frequencies (rms). The noise dithers it, so it is independent of the error that a method leaves:
-    the squares add, and the mean product of the two stays within four standard deviations; errors
-    are alike within a patch of 5 x 5 pixels.
-    """
+    """Return how far rounding to integers, of 12 bits and of `bits`, may move these PSNRs in dB."""
+    # A step q leaves an error of q / sqrt(12).
     steps = np.hypot(1 / 4095, 1 / (2**bits - 1)) / np.sqrt(12)
     fx = np.fft.fftfreq(64)[None]
     fy = np.fft.fftfreq(64)[:, None]
     ratio = mtf(fx, fy, (0.25, 0.25)) / mtf(fx, fy, (0.07, 0.07))
+    # The error is in the reference, in the restored image, and in the input, where the restoration
+    # amplifies it as white noise by the ratio of the MTFs over all frequencies (rms).
     share = steps * np.sqrt(float(np.square(ratio).mean()) + 2) / 10 ** (-psnr_db / 20)
+    # The noise dithers the input, so this error is independent of the one that a method leaves. The
+    # squares add, and the mean product of the two stays within four standard deviations. Errors are
+    # alike within a patch of 5 x 5 pixels.
     return np.asarray(10 * np.log10(1 + share**2 + 2 * 4 * share / np.sqrt(pixels / 25)))
 
 
@@ -86,24 +85,26 @@ def rounding_db(psnr_db: np.ndarray, bits: int, pixels: int) -> np.ndarray:
 def test_radiance_gain_and_bits_scaled_together_change_nothing_but_rounding(
     bits: int, dimmer: float, offset_dn: float
 ) -> None:
-    (usual, pixels), (found, _) = evaluated(12, 1, offset_dn), evaluated(bits, dimmer, offset_dn)
-    allowed = rounding_db(usual, bits, pixels)
-    assert np.all(np.abs(found - usual) <= allowed), (found - usual, allowed)
-    assert allowed.max() < 0.18 < np.diff(np.sort(usual)).min() / 2  # so the ranking is settled
-    assert np.argsort(found).tolist() == np.argsort(usual).tolist()
+    usual_db, pixels = evaluated(12, 1, offset_dn)
+    scaled_db, _ = evaluated(bits, dimmer, offset_dn)
+    allowed_db = rounding_db(usual_db, bits, pixels)
+    assert np.all(np.abs(scaled_db - usual_db) <= allowed_db), (scaled_db - usual_db, allowed_db)
+    # Methods differ by more than rounding may move them, so their ranking is the same.
+    assert allowed_db.max() < 0.18 < np.diff(np.sort(usual_db)).min() / 2
+    assert np.argsort(scaled_db).tolist() == np.argsort(usual_db).tolist()
 
 
 def test_a_named_reference_of_other_units_is_converted_in_sight() -> None:
-    said = list[str]()
+    messages = list[str]()
     degraded = with_units(DEGRADED, 40, 14, offset_dn=5)
-    assert reference_beside(degraded, None, said.append).units == (40, 14, 5)
-    assert said == []
-    assert reference_beside(degraded, "pleiades-reference", said.append).units == (40, 14, 5)
-    (sentence,) = said
+    assert reference_beside(degraded, None, messages.append).units == (40, 14, 5)
+    assert messages == []
+    assert reference_beside(degraded, "pleiades-reference", messages.append).units == (40, 14, 5)
+    (sentence,) = messages
     assert "pleiades-reference (10.2375 DN per W/m2/sr/um, 12 bits)" in sentence
     assert "40 DN per W/m2/sr/um, 14 bits, 5 DN of offset" in sentence
-    reference_beside(DEGRADED, "pleiades-reference", said.append)
-    assert len(said) == 1
+    reference_beside(DEGRADED, "pleiades-reference", messages.append)
+    assert len(messages) == 1
 
 
 def test_recipes_refuse_a_reference_of_other_units() -> None:

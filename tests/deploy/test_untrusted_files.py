@@ -45,11 +45,13 @@ runner = CliRunner()
 
 def document(path: Path, value: object, name: str = "int8") -> Path:
     """Results with one figure of any value."""
-    asked = dict.fromkeys(PATCHES)
+    arguments = dict.fromkeys(PATCHES)
     row = Row("gate", name, {"MAE": measured(1.0, "", "here")})
     check = Check("MAE", 0.5, 2.0, "of full scale")
-    made = Table("gate", asked, (), (row,), (check,)).to_dict()
-    path.write_text(json.dumps(made).replace('"value": 1.0', f'"value": {value}'), encoding="utf-8")
+    content = Table("gate", arguments, (), (row,), (check,)).to_dict()
+    path.write_text(
+        json.dumps(content).replace('"value": 1.0', f'"value": {value}'), encoding="utf-8"
+    )
     return path
 
 
@@ -79,13 +81,13 @@ def test_a_deep_header_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_name_too_long_for_the_disk_is_a_sentence(tmp_path: Path) -> None:
-    for read, name in ((load_onnx, "a" * 5000 + ".onnx"), (read_pixels, "a" * 5000 + ".tif")):
+    for reader, name in ((load_onnx, "a" * 5000 + ".onnx"), (read_pixels, "a" * 5000 + ".tif")):
         with pytest.raises(BeersError, match="too long"):
-            read(tmp_path / name)
+            reader(tmp_path / name)
 
 
 @pytest.mark.parametrize(
-    ("line", "changed"),
+    ("line", "replacement"),
     [
         ("\ncpb = {", "\ncpbb = {"),
         ("\nbatch_handlers = { value = 3,", "\nbatch_handlers = { value = 0,"),
@@ -93,14 +95,14 @@ def test_a_name_too_long_for_the_disk_is_a_sentence(tmp_path: Path) -> None:
     ],
 )
 def test_a_target_with_constants_that_no_board_has_is_refused(
-    line: str, changed: str, tmp_path: Path
+    line: str, replacement: str, tmp_path: Path
 ) -> None:
     shipped = (HERE / "targets" / "vck190.toml").read_text(encoding="utf-8")
     assert line in shipped
     path = tmp_path / "mine.toml"
     path.write_text(shipped)
     load_dpu(str(path))
-    path.write_text(shipped.replace(line, changed))
+    path.write_text(shipped.replace(line, replacement))
     with pytest.raises(ProfileError, match="a board can have"):
         load_dpu(str(path))
 
@@ -129,8 +131,8 @@ def test_a_spoilt_checkpoint_is_refused(spoil: Spoil, tmp_path: Path) -> None:
     path = tmp_path / "c.safetensors"
     path.write_bytes(checkpoint_seeds(tmp_path)[1])
     go_on(path)
-    found, header = read_weights(path)
-    tensors = {name: torch.from_numpy(array) for name, array in found.items()}
+    by_name, header = read_weights(path)
+    tensors = {name: torch.from_numpy(array) for name, array in by_name.items()}
     spoil(tensors)
     write_tensors(path, arrays(tensors), header)
     with pytest.raises(ModelError, match="checkpoint of this network"):
@@ -147,8 +149,8 @@ def test_an_array_larger_than_its_archive_is_refused(tmp_path: Path) -> None:
     stream = io.BytesIO()
     np.save(stream, np.ones((2, 3), np.float32))
     assert read_tensors(archive(tmp_path / "a.npz", stream.getvalue()), ["a"])["a"].shape == (2, 3)
-    stated: dict[str, object] = {"descr": "<f4", "fortran_order": False, "shape": (1 << 40,)}
-    np.lib.format.write_array_header_1_0(head := io.BytesIO(), stated)
+    description: dict[str, object] = {"descr": "<f4", "fortran_order": False, "shape": (1 << 40,)}
+    np.lib.format.write_array_header_1_0(head := io.BytesIO(), description)
     with pytest.raises(ModelError, match="arrays"):
         read_tensors(archive(tmp_path / "b.npz", head.getvalue() + bytes(24)), ["a"])
 
@@ -245,16 +247,16 @@ POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize
         (["profiles", "{}"], "sensor.toml"),
     ],
 )
-@pytest.mark.parametrize("what", ["pointer", "folder"])
+@pytest.mark.parametrize("kind", ["pointer", "folder"])
 def test_what_stands_in_place_of_a_file_is_named(
-    command: list[str], name: str, what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: list[str], name: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     path = tmp_path / name
-    path.mkdir() if what == "folder" else path.write_text(POINTER)
-    said = refused(*(word.format(path) for word in command))
-    assert name in said
-    assert ("got a folder" if what == "folder" else "'git lfs pull'") in said
+    path.mkdir() if kind == "folder" else path.write_text(POINTER)
+    message = refused(*(word.format(path) for word in command))
+    assert name in message
+    assert ("got a folder" if kind == "folder" else "'git lfs pull'") in message
 
 
 def test_a_mark_at_the_beginning_of_a_text_is_no_part_of_it(tmp_path: Path) -> None:
@@ -267,6 +269,6 @@ def test_a_mark_at_the_beginning_of_a_text_is_no_part_of_it(tmp_path: Path) -> N
 @pytest.mark.parametrize("name", ["out.png", "out.jpg", "out", "out.tif.gz"])
 def test_no_tiff_is_written_under_another_name(name: str, tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "raw.tif", np.full((20, 20), 500, np.uint16))
-    said = refused("restore", tmp_path / "raw.tif", tmp_path / name)
-    assert f"expected a TIFF's name, such as restored.tif, got {name}" in said
+    message = refused("restore", tmp_path / "raw.tif", tmp_path / name)
+    assert f"expected a TIFF's name, such as restored.tif, got {name}" in message
     assert not (tmp_path / name).exists()

@@ -65,7 +65,8 @@ class Runner:
             f'echo "$*" >> "{self.calls}"; case "$1" in {" ".join(lines)} esac',
             '"$@"',
         )
-        self.command("pipx", "shift 3", '"${@:2}"')  # pipx run --spec . beers-deploy ...
+        # The call is "pipx run --spec . beers-deploy ...".
+        self.command("pipx", "shift 3", '"${@:2}"')
 
     @property
     def temporary(self) -> Path:
@@ -89,23 +90,25 @@ class Runner:
         path.write_text(f'#!/usr/bin/env bash\n{before}\nexec "{real}" {arguments}\n')
         path.chmod(0o755)
 
-    def run_action(self, given: dict[str, str]) -> dict[str, str]:
+    def run_action(self, values: dict[str, str]) -> dict[str, str]:
         """The action with these inputs; its outputs."""
         action = read_yaml(ACTION)
         inputs = {name: str(about.get("default", "")) for name, about in action["inputs"].items()}
-        assert given.keys() <= inputs.keys()
-        inputs.update(given)
+        assert values.keys() <= inputs.keys()
+        inputs.update(values)
         context = {f"inputs.{name}": text for name, text in inputs.items()} | {
             "github.action_path": str(ROOT)
         }
-        context["steps.python.outputs.python-path"] = sys.executable  # of a step that is left out
-        own = Runner(self.folder)  # its steps have ids of their own
+        # The step that would set this output is left out.
+        context["steps.python.outputs.python-path"] = sys.executable
+        # An action's steps have ids of their own.
+        own = Runner(self.folder)
         own.run_steps(action["runs"]["steps"], context)
         self.red = own.red
         self.stderr = own.stderr
         self.stdout = self.stdout + own.stdout
-        known = context | own.outputs
-        return {name: value_of(about["value"], known) for name, about in action["outputs"].items()}
+        names = context | own.outputs
+        return {name: value_of(about["value"], names) for name, about in action["outputs"].items()}
 
     def run_steps(self, steps: list[dict[str, Any]], context: dict[str, str]) -> None:
         """Every step that its condition lets run."""
@@ -114,11 +117,11 @@ class Runner:
             if condition != "always()" and (self.red or not holds(condition, context)):
                 continue
             if step.get("uses") == "./":
-                given = {
+                inputs = {
                     name: value_of(str(text), context | self.outputs)
                     for name, text in step["with"].items()
                 }
-                outputs = self.run_action(given)
+                outputs = self.run_action(inputs)
                 self.outputs |= {
                     f"steps.{step['id']}.outputs.{name}": text for name, text in outputs.items()
                 }
@@ -127,20 +130,20 @@ class Runner:
 
     def run_shell(self, step: dict[str, Any], context: dict[str, str]) -> None:
         """One step's script; what it writes to its outputs is kept even when it fails."""
-        written = self.temporary / "outputs"
-        written.write_text("")
-        known = context | self.outputs
-        given = {name: value_of(str(text), known) for name, text in step.get("env", {}).items()}
+        file = self.temporary / "outputs"
+        file.write_text("")
+        names = context | self.outputs
+        variables = {name: value_of(str(text), names) for name, text in step.get("env", {}).items()}
         assert "${{" not in step["run"], "values reach the shell by its environment"
-        done = subprocess.run(
-            [*BASH, step["run"]], cwd=self.folder, env=self.environment | given, **KEPT
+        process = subprocess.run(
+            [*BASH, step["run"]], cwd=self.folder, env=self.environment | variables, **KEPT
         )
-        lines = [line.partition("=") for line in written.read_text(encoding="utf-8").splitlines()]
+        lines = [line.partition("=") for line in file.read_text(encoding="utf-8").splitlines()]
         self.outputs |= {f"steps.{step['id']}.outputs.{name}": text for name, _, text in lines}
-        self.stdout += done.stdout
-        if done.returncode:
+        self.stdout += process.stdout
+        if process.returncode:
             self.red = True
-            self.stderr = done.stderr
+            self.stderr = process.stderr
 
     @property
     def environment(self) -> dict[str, str]:
@@ -160,31 +163,33 @@ class Runner:
 KEPT: dict[str, Any] = {"capture_output": True, "text": True, "check": False}
 
 
-def value_of(text: str, known: dict[str, str]) -> str:
+def value_of(text: str, context: dict[str, str]) -> str:
     """A text with its expressions replaced: names, or the first of several that is not empty."""
 
-    def replaced(found: re.Match[str]) -> str:
-        names = found[1].split(" || ")
-        return next((value for value in (lookup(name, known) for name in names) if value), "")
+    def replaced(match: re.Match[str]) -> str:
+        names = match[1].split(" || ")
+        return next((value for value in (lookup(name, context) for name in names) if value), "")
 
     return EXPRESSION.sub(replaced, text)
 
 
-def lookup(name: str, known: dict[str, str]) -> str:
+def lookup(name: str, context: dict[str, str]) -> str:
     """A name's value, or a text in quotes; of an output that no step wrote, nothing, as GitHub has
     it.
     """
     if name.startswith("'"):
         return name.strip("'")
     return (
-        known.get(name, "") if re.fullmatch(r"steps\.\w+\.outputs\.[\w-]+", name) else known[name]
+        context.get(name, "")
+        if re.fullmatch(r"steps\.\w+\.outputs\.[\w-]+", name)
+        else context[name]
     )
 
 
-def holds(condition: str, known: dict[str, str]) -> bool:
+def holds(condition: str, context: dict[str, str]) -> bool:
     """Whether a step runs: without a condition, or where an input is empty."""
     if not condition:
         return True
-    found = IS_EMPTY.fullmatch(condition)
-    assert found, condition
-    return lookup(found[1], known) == ""
+    match = IS_EMPTY.fullmatch(condition)
+    assert match, condition
+    return lookup(match[1], context) == ""

@@ -51,7 +51,8 @@ LEFT_OUT = {
 SHORTER = {
     r"--provider Vitis\S+ --option \S+": "--provider CPUExecutionProvider --tile 64",
     r"--frames 300": "--frames 4",
-    r"--out board\.json": "--out processor.json",  # bench takes a board's runs alone
+    # The command bench accepts only runs of a board.
+    r"--out board\.json": "--out processor.json",
     r"(beers-deploy gate)": r"\1 --patches 4",
     r"(characterise\.py .*)--sensors 10": r"\1--sensors 1",
     r"(edge_curves\.py .*)--repeats 3": r"\1--repeats 1",
@@ -93,8 +94,8 @@ def sittings(text: str) -> Iterator[Sitting]:
 
 def _is_command(code: str, line: str) -> bool:
     words = code.split()
-    named = words[0] == NAME and len(words) == 2 and not line.startswith("|")
-    return words[0] in PROGRAMS and len(words) > 1 and not named
+    names_command = words[0] == NAME and len(words) == 2 and not line.startswith("|")
+    return words[0] in PROGRAMS and len(words) > 1 and not names_command
 
 
 def _is_json(block: str) -> bool:
@@ -123,6 +124,6 @@ def outputs(command: str) -> list[Path]:
     if not command.startswith(NAME):
         return [Path(name) for name in re.findall(r"--out (\S+)", command)]
     name = shlex.split(command)[1]
-    given = context_of(command).params
-    named = [(key, kind) for key, kind in PATHS[name].written.items() if given[key]]
-    return [given[key] / INSIDE[name] if kind == FOLDER else given[key] for key, kind in named]
+    values = context_of(command).params
+    pairs = [(key, kind) for key, kind in PATHS[name].written.items() if values[key]]
+    return [values[key] / INSIDE[name] if kind == FOLDER else values[key] for key, kind in pairs]

@@ -14,9 +14,12 @@ from PIL import Image
 from beers_deploy.board import MEASURE
 from beers_deploy.model.convbeers import save_network
 from beers_deploy.model.shipped import SHIPPED
+from beers_deploy.model.simulator.acquire import acquire
+from beers_deploy.model.simulator.detector import Draw, to_uint16
+from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.toml import HERE as PROFILES
-from tests.deploy.studies.characterise.test_characterise import acquisition
+from tests.deploy.studies.characterise.test_characterise import RATIO, SENSOR, SIDE, landscape
 from tests.deploy.studies.detection.folders import Object, dior
 from tests.deploy.studies.detection.networks import detector, raw
 from tests.docs.walk import ROOT, Walk
@@ -47,8 +50,8 @@ def prepare(folder: Path) -> None:
         other_formats(folder)
     walk = Walk(folder)
     for command in MADE.split("\n")[1:-1]:
-        done = walk.run(command)
-        assert done.returncode == 0, f"{command}\n{done.stdout}"
+        process = walk.run(command)
+        assert process.returncode == 0, f"{command}\n{process.stdout}"
     shutil.copy(next((folder / "made" / "degraded").glob("*.tif")), folder / "raw.tif")
 
 
@@ -91,7 +94,10 @@ def scenes(folder: Path) -> None:
             Image.fromarray(scene[:FEW_PX, :FEW_PX]).save(folder / "aerial" / f"site{site}.png")
     shutil.copy(folder / "aerial" / "site0.png", folder / "scene.png")
     for number in (1, 2):
-        tifffile.imwrite(folder / f"raw{number}.tif", acquisition(number - 1, board=number == 1))
+        seed = number - 1
+        spectrum = scene_spectrum(landscape(seed, board=number == 1))
+        signal = acquire(spectrum, SIDE, SENSOR, RATIO, Draw(seed), "degraded")
+        tifffile.imwrite(folder / f"raw{number}.tif", to_uint16(signal))
 
 
 def faulty_frames(folder: Path) -> None:

@@ -63,7 +63,8 @@ def refusal(line: str) -> str:
     if name not in group.commands:
         return f"{line}: no command {name}"
     if not words:
-        return ""  # a command's name, within a sentence
+        # A command's name within a sentence is no call.
+        return ""
     try:
         context_of(line)
     except typer.Exit:
@@ -75,5 +76,5 @@ def refusal(line: str) -> str:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_command_of_a_page_is_read_by_the_command_line(page: Path) -> None:
-    found = [] if page.name == GENERATED_FROM_IT else [*commands(page.read_text(encoding="utf-8"))]
-    assert [said for said in map(refusal, found) if said] == []
+    lines = [] if page.name == GENERATED_FROM_IT else [*commands(page.read_text(encoding="utf-8"))]
+    assert [message for message in map(refusal, lines) if message] == []

@@ -16,12 +16,12 @@ from tests.docs.walk import Walk
 pytestmark = pytest.mark.slow
 
 FOUND = {page.stem: [*sittings(page.read_text(encoding="utf-8"))] for page in PAGES}
-RUN = {
-    f"{page}, {commands[0]}": commands
-    for page, found in FOUND.items()
-    for sitting in found
-    if (commands := tuple(command for command in sitting if command not in LEFT_OUT))
-}
+RUN: dict[str, Sitting] = {}
+for page, all_commands in FOUND.items():
+    for sitting in all_commands:
+        commands = tuple(command for command in sitting if command not in LEFT_OUT)
+        if commands:
+            RUN[f"{page}, {commands[0]}"] = commands
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_it_runs_and_writes_what_it_names(sitting: Sitting, files: Path) -> None:
     for package in packages(sitting):
         pytest.importorskip(package, reason=f"no {package}")
-    # Beside the folders of the others, where studies share what they measured.
+    # The folder lies next to those of the other tests, where studies share what they measured.
     with tempfile.TemporaryDirectory(dir=files.parent) as folder, small_studies():
         walk = Walk(Path(shutil.copytree(files, folder, dirs_exist_ok=True)))
         for command in sitting:
@@ -47,13 +47,13 @@ def test_it_runs_and_writes_what_it_names(sitting: Sitting, files: Path) -> None
 def run(walk: Walk, command: str) -> None:
     """Run it as it is short; what it writes was not there before."""
     short = shortened(command)
-    written = [walk.folder / path for path in outputs(short)]
-    for path in written:
+    paths = [walk.folder / path for path in outputs(short)]
+    for path in paths:
         path.unlink(missing_ok=True)
-    done = walk.run(short)
-    assert done.returncode == 0, f"{command}\nrun as {short}\n{done.stdout}"
-    assert [path for path in written if not path.is_file()] == [], (
-        f"{command}\nrun as {short}\n{done.stdout}"
+    process = walk.run(short)
+    assert process.returncode == 0, f"{command}\nrun as {short}\n{process.stdout}"
+    assert [path for path in paths if not path.is_file()] == [], (
+        f"{command}\nrun as {short}\n{process.stdout}"
     )
     if command.startswith("rio cogeo validate"):
-        assert "is a valid cloud optimized GeoTIFF" in done.stdout
+        assert "is a valid cloud optimized GeoTIFF" in process.stdout

@@ -20,13 +20,13 @@ def figure(value: float | None, unit: str, interval: list[float] | None = None) 
 
 
 def row(table: str, name: str, **figures: Any) -> dict[str, Any]:
-    named = {key.replace("_", " "): value for key, value in figures.items()}
-    return {"table": table, "name": name, "figures": named, "text": {"sensor": "known"}}
+    cells = {key.replace("_", " "): value for key, value in figures.items()}
+    return {"table": table, "name": name, "figures": cells, "text": {"sensor": "known"}}
 
 
 def fill(table: str, heading: str, *rows: dict[str, Any]) -> str:
     page = f"before\n<!-- {table} -->\n{heading}\n|---|\n| old |\n<!-- end -->\nafter\n"
-    return MARKED.sub(lambda found: filled({table: list(rows)}, found), page)
+    return MARKED.sub(lambda match: filled({table: list(rows)}, match), page)
 
 
 @pytest.mark.parametrize("table", ["mean", "mean, radiance x 0.25"])
@@ -62,4 +62,4 @@ def test_targets_are_filled_likewise() -> None:
 
 def test_what_the_document_lacks_stays() -> None:
     page = "<!-- targets -->\n| method |\n|---|\n| old |\n<!-- end -->\n"
-    assert MARKED.sub(lambda found: filled({"mean": []}, found), page) == page
+    assert MARKED.sub(lambda match: filled({"mean": []}, match), page) == page

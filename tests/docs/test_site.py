@@ -106,27 +106,28 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "--site-dir",
         str(folder),
     ]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stderr
     return folder
 
 
 class Server(SimpleHTTPRequestHandler):
     """Serves the site, a page with a script in it, and takes what the script tells."""
 
-    def __init__(self, script: str, told: "Queue[Any]", *given: Any, directory: str) -> None:
+    def __init__(
+        self, script: str, messages: "Queue[Any]", *arguments: Any, directory: str
+    ) -> None:
         self.script = script
-        self.told = told
-        super().__init__(*given, directory=directory)
+        self.told = messages
+        super().__init__(*arguments, directory=directory)
 
     def log_message(self, *_: object) -> None:
         """Say nothing."""
 
     def do_GET(self) -> None:
         if self.path.endswith("search_index.json") and self.script.startswith(LOOK[:20]):
-            return self.answer(
-                404, b""
-            )  # a megabyte that every page would read, and look for nothing in it
+            # Every page would load the search index, a megabyte, without searching in it.
+            return self.answer(404, b"")
         if self.path != "/harness":
             return super().do_GET()
         return self.answer(200, (HARNESS % self.script).encode())
@@ -148,8 +149,8 @@ def run(site: Path, tmp_path: Path) -> Run:
     """What a script answers in a page of the site."""
 
     def answer(script: str, *, dark: bool = False) -> Any:
-        told: Queue[Any] = Queue()
-        handler = partial(Server, script, told, directory=str(site))
+        messages: Queue[Any] = Queue()
+        handler = partial(Server, script, messages, directory=str(site))
         browse = command(tmp_path, dark=dark)
         with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
             thread = Thread(target=server.serve_forever)
@@ -157,7 +158,7 @@ def run(site: Path, tmp_path: Path) -> Run:
             address = f"http://127.0.0.1:{server.server_address[1]}/harness"
             started = subprocess.Popen([*browse, address], stderr=subprocess.DEVNULL)
             try:
-                report = told.get(timeout=TIMEOUT_S)
+                report = messages.get(timeout=TIMEOUT_S)
             finally:
                 started.terminate()
                 started.wait()
@@ -196,13 +197,13 @@ def test_no_page_is_wider_than_its_window_and_every_picture_loads_from_here(
     looks = run(LOOK % (json.dumps(pages(site)), json.dumps(WIDTHS_PX)))
     assert len(looks) == len(pages(site)) * len(WIDTHS_PX) > 80
     assert [
-        (each["address"], each["width"], each["over"]) for each in looks if each["over"] > 0
+        (look["address"], look["width"], look["over"]) for look in looks if look["over"] > 0
     ] == []
-    assert [(each["address"], each["broken"]) for each in looks if each["broken"]] == []
+    assert [(look["address"], look["broken"]) for look in looks if look["broken"]] == []
     elsewhere = [
-        each["elsewhere"]
-        for each in looks
-        if each["elsewhere"] and "architecture" not in each["address"]
+        look["elsewhere"]
+        for look in looks
+        if look["elsewhere"] and "architecture" not in look["address"]
     ]
     assert elsewhere == [], (
         "pages ask other places for Mermaid alone, which the published site has: see mkdocs.yml"
@@ -220,11 +221,11 @@ def test_the_colours_are_those_that_the_reader_prefers(
 
 
 def brightness(colour: str) -> float:
-    return sum(float(each) for each in re.findall(r"[\d.]+", colour)[:3])
+    return sum(float(level) for level in re.findall(r"[\d.]+", colour)[:3])
 
 
 def test_the_search_finds_what_readers_look_for(run: Run) -> None:
-    found = run(SEARCH % json.dumps([*ASKED]))
-    for words, wanted in ASKED.items():
-        first = [*dict.fromkeys(urlsplit(address).path for address in found[words])][:FIRST]
-        assert any(path.endswith(f"/{wanted}/") for path in first), (words, first)
+    results = run(SEARCH % json.dumps([*ASKED]))
+    for words, page in ASKED.items():
+        first = [*dict.fromkeys(urlsplit(address).path for address in results[words])][:FIRST]
+        assert any(path.endswith(f"/{page}/") for path in first), (words, first)

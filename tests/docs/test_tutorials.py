@@ -92,11 +92,11 @@ def test_gate_in_ci(tmp_path: Path) -> None:
         yaml.safe_load(path.read_text(encoding="utf-8"))
         for path in (ROOT / "action.yml", tmp_path / ".github" / "workflows" / "gate.yml")
     )
-    (given,) = (
+    (inputs,) = (
         step["with"] for step in workflow["jobs"]["gate"]["steps"] if step.get("id") == "gate"
     )
-    assert set(given) <= set(action["inputs"])
-    assert all((tmp_path / path.removeprefix("protected/")).is_file() for path in given.values())
+    assert set(inputs) <= set(action["inputs"])
+    assert all((tmp_path / path.removeprefix("protected/")).is_file() for path in inputs.values())
     assert 'failures="5"' in (tmp_path / "gate.xml").read_text(encoding="utf-8")
 
 

@@ -28,6 +28,7 @@ import subprocess
 import sys
 from contextlib import chdir
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 
 from typer.testing import CliRunner
@@ -88,7 +89,9 @@ class Walk:
             if comment:
                 self._note(comment)
             elif title:
-                self._write(title, body)
+                path = self.folder / title
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(body, encoding="utf-8")
             elif language == "bash":
                 self._run_all(body)
             elif language == "text":
@@ -105,28 +108,23 @@ class Walk:
             self.shorter[long, short] = False
         elif comment == "figures vary":
             self._vary = True
-        elif found := re.fullmatch(r"exits (\d)", comment):
-            self._code = int(found[1])
+        elif match := re.fullmatch(r"exits (\d)", comment):
+            self._code = int(match[1])
         else:
             raise PageError(f"no such comment: {comment}")
-
-    def _write(self, name: str, text: str) -> None:
-        path = self.folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
 
     def _run_all(self, block: str) -> None:
         expected = self._code
         self._code = 0
         self._last = ""
         for command in block.replace("\\\n", " ").splitlines():
-            done = self.run(command)
-            if done.returncode != expected:
+            process = self.run(command)
+            if process.returncode != expected:
                 raise PageError(
-                    f"{command}\nended with {done.returncode}, not {expected}:\n{done.stdout}"
+                    f"{command}\nended with {process.returncode}, not {expected}:\n{process.stdout}"
                 )
-            self.printed[command] = done.stdout
-            self._last += done.stdout
+            self.printed[command] = process.stdout
+            self._last += process.stdout
 
     def run(self, command: str) -> Done:
         """One command with its substitutions.
@@ -154,7 +152,9 @@ class Walk:
         return Done(words, result.exit_code, result.output)
 
     def _started(self, words: list[str]) -> Done:
-        kept = {name: os.environ[name] for name in ("SYSTEMROOT", "TEMP") if name in os.environ}
+        system_variables = {
+            name: os.environ[name] for name in ("SYSTEMROOT", "TEMP") if name in os.environ
+        }
         ours = {
             "PYTHONPATH": str(ROOT),
             "PYTHONUNBUFFERED": "1",
@@ -164,19 +164,21 @@ class Walk:
         return subprocess.run(
             [*PROGRAMS[words[0]], *words[1:]],
             cwd=self.folder,
-            env=kept | ours | environment(self.folder),
+            env=system_variables | ours | environment(self.folder),
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             encoding="utf-8",
             check=False,
         )
 
-    def _compare(self, shown: str) -> None:
+    def _compare(self, page_text: str) -> None:
         lines = iter(plain(self._last))
         vary = self._vary
         self._vary = False
-        for line in plain(shown):
-            if line != "..." and not any(agrees(line, found, vary) for found in lines):
+        for line in plain(page_text):
+            if line != "..." and not any(
+                agrees(line, printed_line, vary) for printed_line in lines
+            ):
                 raise PageError(
                     f"not printed, or not in this place:\n{line}\nwhat was printed:\n{self._last}"
                 )
@@ -194,7 +196,7 @@ def plain(text: str) -> list[str]:
     ]
 
 
-def agrees(shown: str, found: str, vary: bool) -> bool:
+def agrees(expected_line: str, printed_line: str, vary: bool) -> bool:
     """Whether a line of the page is what a command printed: the same words, and numbers that are
     close.
 
@@ -203,14 +205,14 @@ def agrees(shown: str, found: str, vary: bool) -> bool:
         found: the command's.
         vary: numbers may be any.
     """
-    parts = shown.split("...")
+    parts = expected_line.split("...")
     texts = (
         re.escape(NUMBER.sub("\0", part)).replace("\0", f"({NUMBER.pattern})") for part in parts
     )
-    match = re.fullmatch(".*?".join(texts), found)
+    match = re.fullmatch(".*?".join(texts), printed_line)
     if match is None or vary:
         return match is not None
-    wanted = (number for part in parts for number in NUMBER.findall(part))
-    pairs = zip(wanted, match.groups(), strict=True)
+    page_numbers = chain.from_iterable(map(NUMBER.findall, parts))
+    pairs = zip(page_numbers, match.groups(), strict=True)
     numbers = ([float(number.replace(",", "")) for number in pair] for pair in pairs)
     return all(math.isclose(*pair, rel_tol=RELATIVE) for pair in numbers)

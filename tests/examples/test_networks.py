@@ -36,15 +36,15 @@ def differences(
     network: nn.Module, model: onnx.ModelProto, sizes: list[tuple[int, int, int, int]]
 ) -> list[float]:
     session = open_session(model)
-    found = []
+    lines = []
     for size in sizes:
         image = np.random.default_rng(0).random(size, dtype=np.float32)
         with torch.inference_mode():
             expected = network(torch.from_numpy(image)).numpy()
         (output,) = session.run(None, {"input": image})
         assert output.shape == expected.shape
-        found.append(float(np.abs(output - expected).max()))
-    return found
+        lines.append(float(np.abs(output - expected).max()))
+    return lines
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -60,16 +60,16 @@ def test_sizes_and_channels_are_those_that_the_example_states(name: str) -> None
     for size in shapes(name):
         with torch.inference_mode():
             output = network(torch.rand(size, generator=torch.Generator().manual_seed(0)))
-        whole = (*(side * example.scale for side in size[2:]),) if not example.side_px else ()
-        assert output.shape == (size[0], example.outputs, *whole)
+        sides = (*(side * example.scale for side in size[2:]),) if not example.side_px else ()
+        assert output.shape == (size[0], example.outputs, *sides)
 
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_the_same_seed_gives_the_same_bytes_and_another_gives_others(name: str) -> None:
-    first, again, other = (
+    first, repeated, other = (
         to_onnx(name, made(name, seed)).SerializeToString() for seed in (0, 0, 1)
     )
-    assert first == again
+    assert first == repeated
     assert first != other
 
 

@@ -17,20 +17,20 @@ from examples.samples import GAINS, batches, bright, main
 from examples.train_network import criterion
 
 
-# One network for each kind of batch: the others take what the first one takes.
+# There is one network for each kind of batch. The other networks read what the first one reads.
 @pytest.mark.parametrize("name", ["dncnn", "espcn", "edsr4", "segment", "classifier"])
 def test_batches_fit_the_network_and_come_again_with_the_seed(
     name: str, scenes: list[Scene]
 ) -> None:
-    (image, wanted), (again, _), (other, _) = (
+    (image, reference), (repeated, _), (other, _) = (
         next(batches(name, scenes, seed)) for seed in (0, 0, 1)
     )
     with torch.inference_mode():
-        loss = criterion(name)(build(name, torch.Generator().manual_seed(0))(image), wanted)
+        loss = criterion(name)(build(name, torch.Generator().manual_seed(0))(image), reference)
     assert loss.isfinite()
     assert image.shape[1] == NETWORKS[name].inputs
     assert 0 <= float(image.min()) < float(image.max()) <= 1
-    assert torch.equal(image, again)
+    assert torch.equal(image, repeated)
     assert not torch.equal(image, other)
 
 
@@ -39,11 +39,11 @@ def test_bands_show_one_ground_with_a_gain_and_a_noise_of_their_own(scenes: list
     levels = reference.mean((0, 2, 3))
     assert torch.allclose(levels / levels[0], torch.tensor(GAINS) / GAINS[0], rtol=0.01)
     noise = (image / torch.tensor(GAINS).view(1, -1, 1, 1)).transpose(0, 1).flatten(1)
-    between = noise - noise.mean(0)  # the ground is in each band, and cancels
+    # The ground is the same in each band, so the difference leaves the noise.
+    between = noise - noise.mean(0)
     assert float(between.std(1).min()) > 0
-    assert (
-        float(torch.corrcoef(between[2:])[0, 1]) < 0.5
-    )  # one noise in every band would leave nothing but rounding
+    # One noise in every band would cancel and leave only rounding.
+    assert float(torch.corrcoef(between[2:])[0, 1]) < 0.5
 
 
 def test_images_too_small_for_four_bands_are_refused() -> None:

@@ -16,9 +16,9 @@ from examples.train_network import judge, main, train
 
 @pytest.mark.parametrize("name", ["espcn", "segment"])
 def test_a_few_steps_help_on_other_patches(name: str, scenes: list[Scene]) -> None:
-    made = list(islice(batches(name, scenes, 0), 10))
-    untrained = judge(name, build(name, torch.Generator().manual_seed(0)), iter(made[6:]))
-    trained = judge(name, train(name, iter(made[:6]), 6, seed=0), iter(made[6:]))
+    drawn_batches = list(islice(batches(name, scenes, 0), 10))
+    untrained = judge(name, build(name, torch.Generator().manual_seed(0)), iter(drawn_batches[6:]))
+    trained = judge(name, train(name, iter(drawn_batches[:6]), 6, seed=0), iter(drawn_batches[6:]))
     assert trained[0] > untrained[0]
     assert trained[1:] == untrained[1:]
 

@@ -18,10 +18,10 @@ GREY = np.full((*SIZE_PX, 3), 90, np.uint8)
 
 def label_seeds(folder: Path, make: Callable[[Path], Path], suffix: str) -> list[bytes]:
     """The files of labels in a folder of some layout."""
-    found = sorted(
+    labels = sorted(
         path for path in make(folder / "made").rglob(f"*{suffix}") if path.stem != "data"
     )
-    return [path.read_bytes() for path in found]
+    return [path.read_bytes() for path in labels]
 
 
 def names_seeds(_: Path) -> list[bytes]:
@@ -31,19 +31,21 @@ def names_seeds(_: Path) -> list[bytes]:
 
 def read_beside(path: Path) -> None:
     """Labels, beside the images that they are of: one file of all, or a copy for each."""
-    with TemporaryDirectory() as made:
+    with TemporaryDirectory() as folder:
         for stem in OBJECTS:
-            Image.fromarray(GREY).save(Path(made) / f"{stem}.png")
+            Image.fromarray(GREY).save(Path(folder) / f"{stem}.png")
             shutil.copy(
-                path, Path(made) / f"{'labels' if path.suffix == '.json' else stem}{path.suffix}"
+                path, Path(folder) / f"{'labels' if path.suffix == '.json' else stem}{path.suffix}"
             )
-        (Path(made) / "classes.txt").write_text("Expressway-Service-area\nship\n", encoding="utf-8")
-        read_labelled(Path(made))
+        (Path(folder) / "classes.txt").write_text(
+            "Expressway-Service-area\nship\n", encoding="utf-8"
+        )
+        read_labelled(Path(folder))
 
 
 def read_names(path: Path) -> None:
-    with TemporaryDirectory() as made:
-        yolo_names([Path(shutil.copy(path, made)).parent])
+    with TemporaryDirectory() as folder:
+        yolo_names([Path(shutil.copy(path, folder)).parent])
 
 
 def detector_seeds(folder: Path) -> list[bytes]:

@@ -154,7 +154,9 @@ def of_xml(content: bytes, rng: Rng) -> bytes:
         root = ET.fromstring(content)  # noqa: S314 - our own seeds, damaged
     except (ET.ParseError, ValueError, LookupError):
         return content
-    pairs = [(parent, child) for parent in root.iter() for child in parent]
+    pairs = []
+    for parent in root.iter():
+        pairs += [(parent, child) for child in parent]
     if not pairs:
         return content
     (parent, child), (_, other) = (pick(pairs, rng) for _ in range(2))
@@ -164,7 +166,8 @@ def of_xml(content: bytes, rng: Rng) -> bytes:
     if kind < 0.1:
         parent.remove(child)
     elif kind < 0.2:
-        parent.append(deepcopy(other))  # an element within itself is no tree
+        # A copy is appended, because an element within itself would be no tree.
+        parent.append(deepcopy(other))
     elif kind < 0.3:
         child.tag = other.tag
     elif child.attrib and kind < 0.65:
@@ -176,6 +179,7 @@ def of_xml(content: bytes, rng: Rng) -> bytes:
 
 def of_safetensors(content: bytes, rng: Rng) -> bytes:
     """Change the header, or the JSON within its metadata, and its length with it."""
+    # A safetensors file begins with the length of its header, 8 bytes little-endian.
     size = int.from_bytes(content[:8], "little")
     header = of_json(content[8 : 8 + size], rng)
     if rng.random() < 0.5:
@@ -193,6 +197,8 @@ def of_safetensors(content: bytes, rng: Rng) -> bytes:
 def of_png(content: bytes, rng: Rng) -> bytes:
     """Change a chunk's kind or bytes, and its checksum with them."""
     chunks = []
+    # A PNG file begins with a signature of 8 bytes. A chunk adds 12 bytes to its data: length, kind
+    # and checksum.
     at = 8
     while at + 12 <= len(content):
         size = int.from_bytes(content[at : at + 4])
@@ -214,6 +220,8 @@ def of_tiff(content: bytes, rng: Rng) -> bytes:
     """
     if content[:4] != b"II*\0" or len(content) < 8:
         return content
+    # Bytes 4 to 7 of a classic TIFF are the place of its first directory, a count and entries of 12
+    # bytes.
     start = int.from_bytes(content[4:8], "little")
     count = int.from_bytes(content[start : start + 2], "little")
     if not 0 < count < 100:

@@ -35,7 +35,7 @@ SMALL = Variant(1, 2)
 def onnx_seeds(folder: Path) -> list[bytes]:
     """The three encodings of a small network, one of them fixed to a tile."""
     encodings = (float_convbeers, integer_convbeers, board_convbeers)
-    made = [
+    paths = [
         written(partial(encoding, blocks=1, features=2), folder / "a.onnx")
         for encoding in encodings
     ]
@@ -45,7 +45,7 @@ def onnx_seeds(folder: Path) -> list[bytes]:
             value.type.tensor_type.shape.dim, (1, 1, SIDE_PX, SIDE_PX), strict=True
         ):
             dim.dim_value = size
-    return [*made, fixed.SerializeToString()]
+    return [*paths, fixed.SerializeToString()]
 
 
 def exported_seeds(_: Path) -> list[bytes]:

@@ -175,9 +175,9 @@ def read_results(path: Path) -> None:
 
 
 def measurement_seeds(folder: Path) -> list[bytes]:
-    kept = Measurements(folder / "measurements.json")
-    kept.make("a", lambda: [{"PSNR": 30.0, "LPIPS": None}])
-    return [kept.path.read_bytes()]
+    store = Measurements(folder / "measurements.json")
+    store.make("a", lambda: [{"PSNR": 30.0, "LPIPS": None}])
+    return [store.path.read_bytes()]
 
 
 def journal_seeds(_: Path) -> list[bytes]:
@@ -242,8 +242,8 @@ XML = ("VRT", "DIMAP")
 def of_gdal(kind: str, name: str) -> Parser:
     """What GDAL reads, with the tiles that an index names beside it."""
     seeds = partial(gdal_seeds, name=name)
-    read = partial(read_with_tiles, name=name)
-    return Parser(kind, Path(name).suffix.lower(), seeds, read, of_xml if kind in XML else None)
+    reader = partial(read_with_tiles, name=name)
+    return Parser(kind, Path(name).suffix.lower(), seeds, reader, of_xml if kind in XML else None)
 
 
 PARSERS: tuple[Parser, ...] = (

@@ -41,12 +41,12 @@ def tiff_seeds(folder: Path) -> list[bytes]:
         (grey, {"imagej": True}),
         (grey, {"ome": True}),
     ]
-    made = [
-        written(partial(tifffile.imwrite, data=pixels, **given), path)  # type: ignore[arg-type]
-        for pixels, given in kinds
+    paths = [
+        written(partial(tifffile.imwrite, data=pixels, **options), path)  # type: ignore[arg-type]
+        for pixels, options in kinds
     ]
     return [
-        *made,
+        *paths,
         *(
             image_of(kind)
             for kind in ({"format": "TIFF", "compression": c} for c in ("jpeg", "tiff_lzw"))
@@ -54,10 +54,10 @@ def tiff_seeds(folder: Path) -> list[bytes]:
     ]
 
 
-def image_of(given: dict[str, str]) -> bytes:
+def image_of(options: dict[str, str]) -> bytes:
     stream = io.BytesIO()
     pixels = np.random.default_rng(1).integers(0, 256, (17, 19)).astype(np.uint8)
-    Image.fromarray(pixels).save(stream, **given)
+    Image.fromarray(pixels).save(stream, **options)
     return stream.getvalue()
 
 

@@ -50,9 +50,8 @@ def test_details_have_sum_0_and_noise_makes_planes_of_one_size(
 ) -> None:
     bank = network_bank(sensor(across, along, snr))
     assert bank.details.shape == (FILTERS, SIDE_PX, SIDE_PX)
-    assert (
-        np.abs(bank.details.sum((1, 2))).max() < 1e-12
-    )  # so every restoration, and the image beside it, is 1 at DC
+    # Details without a mean keep the gain of every restoration 1 at DC.
+    assert np.abs(bank.details.sum((1, 2))).max() < 1e-12
     noise = bank.sigma * np.sqrt(np.square(bank.planes).sum((1, 2)))
     np.testing.assert_allclose(noise, 1 / UNIT, rtol=1e-12)
     assert bank.unit == pytest.approx(UNIT * bank.sigma * np.linalg.norm(bank.analytic))
@@ -73,14 +72,18 @@ def test_a_sensor_whose_axes_change_places_has_its_kernels_transposed(
 def test_a_lopsided_point_spread_transposed_has_its_kernels_transposed() -> None:
     point = lopsided_point()
     other = point_spread(unpacked(point).T, point.samples_per_px)
-    upright, turned = (network_bank(with_response(NOMINAL, each)) for each in (point, other))
+    upright, turned = (
+        network_bank(with_response(NOMINAL, point_spread)) for point_spread in (point, other)
+    )
     np.testing.assert_allclose(turned.details.transpose(0, 2, 1), upright.details, atol=1e-6)
-    assert np.abs(upright.details - upright.details[:, ::-1, ::-1]).max() > 0.01  # it does lean
+    # The control: the kernels are not symmetric, or the test would prove nothing.
+    assert np.abs(upright.details - upright.details[:, ::-1, ::-1]).max() > 0.01
 
 
 def test_smear_is_undone_along_the_track_alone() -> None:
     plain, smeared = (
-        network_bank(each) for each in (NOMINAL, replace(NOMINAL, effects={"smear": Smear(0.9)}))
+        network_bank(instrument)
+        for instrument in (NOMINAL, replace(NOMINAL, effects={"smear": Smear(0.9)}))
     )
     down, across = (
         np.abs(smeared.analytic.sum(axis) - plain.analytic.sum(axis)).max() for axis in (1, 0)
@@ -95,19 +98,20 @@ def frequencies() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def response(kernel: np.ndarray) -> np.ndarray:
     """Of a kernel (7, 7), at the frequencies of the grid."""
-    whole = np.zeros((GRID, GRID))
-    whole[:SIDE_PX, :SIDE_PX] = kernel
-    return np.fft.fft2(np.roll(whole, (-(SIDE_PX // 2),) * 2, (0, 1)))
+    transfer = np.zeros((GRID, GRID))
+    transfer[:SIDE_PX, :SIDE_PX] = kernel
+    return np.fft.fft2(np.roll(transfer, (-(SIDE_PX // 2),) * 2, (0, 1)))
 
 
-def error(kernel: np.ndarray, made: Instrument, epsilon: float) -> float:
+def error(kernel: np.ndarray, instrument: Instrument, epsilon: float) -> float:
     """What a restoration of scenes of power 1 / r^2 errs, noise of power epsilon counted."""
     fy, fx, r = frequencies()
-    blur, target = (sensor_mtf(fx[:1], fy[:, :1], each) for each in (made, REFERENCE))
+    blur, target = (sensor_mtf(fx[:1], fy[:, :1], camera) for camera in (instrument, REFERENCE))
     gain = response(kernel)
-    seen = r > 0
+    nonzero = r > 0
     errors = (
-        np.abs(gain * blur - target)[seen] ** 2 / r[seen] ** 2 + epsilon * np.abs(gain[seen]) ** 2
+        np.abs(gain * blur - target)[nonzero] ** 2 / r[nonzero] ** 2
+        + epsilon * np.abs(gain[nonzero]) ** 2
     )
     return float(errors.mean())
 
@@ -118,33 +122,33 @@ def test_no_other_kernel_of_its_size_restores_better(
     across: float, along: float, snr: float, seed: int
 ) -> None:
     """Any change of a kernel that keeps its sum makes the error larger."""
-    made = sensor(across, along, snr)
+    instrument = sensor(across, along, snr)
     generator = np.random.default_rng(seed)
-    bank = network_bank(made)
+    bank = network_bank(instrument)
     itself = np.zeros((SIDE_PX, SIDE_PX))
     itself[SIDE_PX // 2, SIDE_PX // 2] = 1
     for k in range(FILTERS):
         kernel = itself + bank.details[k:].sum(0)
         epsilon = EPSILON_PER_SIGMA * bank.sigma * STEP ** (k - 1)
-        least = error(kernel, made, epsilon)
+        least = error(kernel, instrument, epsilon)
         change = generator.standard_normal(kernel.shape)
         change -= change.mean()
         for size in (-0.01, 0.01):
-            assert error(kernel + size * change, made, epsilon) > least
+            assert error(kernel + size * change, instrument, epsilon) > least
 
 
 @pytest.mark.parametrize("contrast", [0.02, 0.07, 0.12])
 def test_the_fitted_kernel_errs_less_than_the_pipelines_filter_cut_small(contrast: float) -> None:
-    made = sensor(contrast, contrast)
-    epsilon = EPSILON_PER_SIGMA * noise_over_full_scale(made)
-    whole = compensation_kernel(contrast, REFERENCE.blur, epsilon).numpy()
-    middle = len(whole) // 2
+    instrument = sensor(contrast, contrast)
+    epsilon = EPSILON_PER_SIGMA * noise_over_full_scale(instrument)
+    uncut = compensation_kernel(contrast, REFERENCE.blur, epsilon).numpy()
+    middle = len(uncut) // 2
     radius = SIDE_PX // 2
-    near = whole[middle - radius : middle + radius + 1, middle - radius : middle + radius + 1]
+    near = uncut[middle - radius : middle + radius + 1, middle - radius : middle + radius + 1]
     itself = np.zeros((SIDE_PX, SIDE_PX))
     itself[radius, radius] = 1
-    assert error(itself + network_bank(made).analytic, made, epsilon) < 0.9 * error(
-        near / near.sum(), made, epsilon
+    assert error(itself + network_bank(instrument).analytic, instrument, epsilon) < 0.9 * error(
+        near / near.sum(), instrument, epsilon
     )
 
 
@@ -158,9 +162,8 @@ def test_noise_beyond_what_was_trained_counts_as_the_nearest_end_of_it(
 
 
 def test_more_noise_asks_for_less_sharpening() -> None:
-    row = np.tile([-1.0, 1.0], 4)[:SIDE_PX][None].repeat(
-        SIDE_PX, 0
-    )  # Nyquist across, -1 in the middle
+    # The row alternates at the Nyquist frequency across the track, with -1 in the middle.
+    row = np.tile([-1.0, 1.0], 4)[:SIDE_PX][None].repeat(SIDE_PX, 0)
     gains = [
         abs((network_bank(sensor(0.07, 0.07, snr)).analytic * row).sum()) for snr in (220, 110, 35)
     ]
@@ -182,9 +185,9 @@ def test_in_places_of_pixels_the_filters_give_the_same(scale: int) -> None:
     places = torch.from_numpy(in_places(kernels, scale))
     around = places.shape[-1] // 2
     planes = conv2d(image, torch.from_numpy(kernels)[:, None], padding=SIDE_PX // 2)
-    found = conv2d(pixel_unshuffle(image, scale), places)
-    wanted = pixel_unshuffle(planes, scale)[..., around:-around, around:-around]
-    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-12)
+    actual = conv2d(pixel_unshuffle(image, scale), places)
+    expected = pixel_unshuffle(planes, scale)[..., around:-around, around:-around]
+    torch.testing.assert_close(actual, expected, rtol=0, atol=1e-12)
 
 
 @settings(max_examples=20)
@@ -192,8 +195,8 @@ def test_in_places_of_pixels_the_filters_give_the_same(scale: int) -> None:
 def test_a_sensor_vector_tells_the_bank_of_its_sensor(
     across: float, along: float, snr: float
 ) -> None:
-    made = sensor(across, along, snr)
-    told = bank_of_vector(sensor_vector(made).values)
-    own = network_bank(made)
-    assert told.sigma == pytest.approx(own.sigma)
-    np.testing.assert_allclose(told.details, own.details, atol=1e-9)
+    instrument = sensor(across, along, snr)
+    from_vector = bank_of_vector(sensor_vector(instrument).values)
+    own = network_bank(instrument)
+    assert from_vector.sigma == pytest.approx(own.sigma)
+    np.testing.assert_allclose(from_vector.details, own.details, atol=1e-9)

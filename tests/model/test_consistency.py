@@ -98,12 +98,13 @@ def scene() -> NDArray[np.float32]:
 def blurred(restored: Pixels, sensor: Instrument) -> NDArray[np.float64]:
     """Compute H x, the image mirrored at its borders."""
     height, width = restored.shape
+    # A mirrored image of twice the size repeats without a seam, as the transform assumes.
     mirrored = np.pad(restored.astype(np.float64), ((0, height), (0, width)), mode="symmetric")
     fy = np.fft.fftfreq(2 * height)[:, None]
     fx = np.fft.fftfreq(2 * width)[None]
     ratio = sensor_mtf(fx, fy, sensor) / sensor_mtf(fx, fy, REFERENCE)
-    found = np.fft.ifft2(np.fft.fft2(mirrored) * ratio / ratio[0, 0]).real
-    return np.asarray(found[:height, :width])
+    blurred_image = np.fft.ifft2(np.fft.fft2(mirrored) * ratio / ratio[0, 0]).real
+    return np.asarray(blurred_image[:height, :width])
 
 
 def sigma_dn(sensor: Instrument, signal_dn: float) -> float:
@@ -134,7 +135,8 @@ def corrected_in_part(
     """Compute the correction of rows and columns of an image, from as many pixels around them as it
     must have.
     """
-    (height, width), (top, bottom, left, right) = restored.shape, cut
+    height, width = restored.shape
+    top, bottom, left, right = cut
     first = max(top - REACH_PX, 0), max(left - REACH_PX, 0)
     first_raw = max(top - RAW_REACH_PX, 0), max(left - RAW_REACH_PX, 0)
     part = restored[first[0] : bottom + REACH_PX, first[1] : right + REACH_PX]
@@ -170,7 +172,8 @@ def test_any_part_is_corrected_as_the_whole_image_is_bit_for_bit(
     name: str, down: tuple[int, int, int], across: tuple[int, int, int], lacks: set[str], seed: int
 ) -> None:
     generator = np.random.default_rng(seed)
-    (height, top, bottom), (width, left, right) = down, across
+    height, top, bottom = down
+    width, left, right = across
     raw, restored = (generator.random((2, height, width)) * 4000).astype(np.float32)
     some = generator.integers(0, height, 3), generator.integers(0, width, 3)
     if "pixels" in lacks:
@@ -179,11 +182,11 @@ def test_any_part_is_corrected_as_the_whole_image_is_bit_for_bit(
         restored[height // 3 : height // 2, width // 4 : width // 2] = np.nan
     if "saturated" in lacks:
         raw[some[0][::-1], some[1]] = FULL_SCALE
-    whole = corrected(step_for(name), raw, restored)
+    uncut = corrected(step_for(name), raw, restored)
     step = step_for(name)
     part = corrected_in_part(step, raw, restored, (top, bottom, left, right))
-    np.testing.assert_array_equal(part, whole[top:bottom, left:right])
-    assert np.isfinite(whole).all()
+    np.testing.assert_array_equal(part, uncut[top:bottom, left:right])
+    assert np.isfinite(uncut).all()
 
 
 @pytest.mark.parametrize(
@@ -197,17 +200,17 @@ def test_no_pixel_farther_than_the_reach_matters_and_the_farthest_does(
     step = step_for("formula")
     images = generator.random((2, 333, 301)) * 2000 + 1000
     before = corrected(step, *images)
-    seen = []
-    for at in (
-        *range(8),
-        *range(150, 158),
-    ):  # how far a pixel reaches depends on where in its block it lies
+    changed_sides = []
+    # How far a pixel reaches depends on its place in its block, so all places of a block are tried.
+    for at in (*range(8), *range(150, 158)):
         for further_px in (0, 1):
             changed = images.copy()
             changed[changes, at + reach_px + further_px, 150] = value
-            seen.append((further_px, bool(corrected(step, *changed)[at, 150] != before[at, 150])))
-    assert (0, True) in seen
-    assert (1, True) not in seen
+            changed_sides.append(
+                (further_px, bool(corrected(step, *changed)[at, 150] != before[at, 150]))
+            )
+    assert (0, True) in changed_sides
+    assert (1, True) not in changed_sides
 
 
 @settings(max_examples=40)
@@ -242,7 +245,8 @@ def test_a_consistent_pair_stays(name: str) -> None:
 @pytest.mark.parametrize("name", OTHERS)
 def test_a_pair_of_another_blur_is_not_consistent(name: str) -> None:
     """The control of the test above: it tells a swapped axis and a turned point-spread function."""
-    restored, (other, times) = scene(), OTHERS[name]
+    restored = scene()
+    other, times = OTHERS[name]
     raw = blurred(restored, SENSORS[name])
     own = rms(corrected(step_for(name), raw, restored)[INSIDE])
     assert rms(corrected(Consistency.of(other, REFERENCE), raw, restored)[INSIDE]) > times * own
@@ -273,8 +277,8 @@ def test_smooth_errors_are_removed_in_noise_and_once_is_enough(name: str, error:
     change = corrected(step, raw, restored)
     rest = (change - without + wrong)[INSIDE]
     assert rms(rest) < 0.02 * rms(wrong[INSIDE])
-    again = corrected(step, raw, restored + change) - corrected(step, raw, scene() + without)
-    assert rms(again[INSIDE]) < 0.01 * sigma_dn(sensor, 1500)
+    repeated = corrected(step, raw, restored + change) - corrected(step, raw, scene() + without)
+    assert rms(repeated[INSIDE]) < 0.01 * sigma_dn(sensor, 1500)
 
 
 def test_a_gain_error_of_all_detail_is_removed_from_the_mean() -> None:
@@ -358,20 +362,20 @@ def holed(name: str) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[
     sensor = SENSORS[name]
     raw = noisy(blurred(scene(), sensor), sensor)
     restored = scene() + np.float32(5)
-    whole = corrected(step_for(name), raw, restored)
+    without_hole = corrected(step_for(name), raw, restored)
     restored[HOLE] = np.nan
-    return raw, restored, whole
+    return raw, restored, without_hole
 
 
 @pytest.mark.parametrize("name", ["formula", "lopsided point"])
 def test_missing_pixels_change_nothing_farther_than_the_reach(name: str) -> None:
-    raw, restored, whole = holed(name)
+    raw, restored, without_hole = holed(name)
     change = corrected(step_for(name), raw, restored)
     far = ~around_hole(REACH_PX)
     far[HOLE] = False
-    np.testing.assert_array_equal(change[far], whole[far])
+    np.testing.assert_array_equal(change[far], without_hole[far])
     assert far.sum() > 10_000
-    assert (change != whole)[around_hole(24)].any()
+    assert (change != without_hole)[around_hole(24)].any()
 
 
 @pytest.mark.parametrize("name", ["formula", "lopsided point"])
@@ -381,7 +385,7 @@ def test_around_a_hole_the_correction_is_nearly_the_one_without_it(name: str) ->
 
     Nearer than 8 px most pixels have no block whose residual is known, and their correction is 0.
     """
-    raw, restored, whole = holed(name)
+    raw, restored, without_hole = holed(name)
     change = corrected(step_for(name), raw, restored)
     sigma = sigma_dn(SENSORS[name], 1500)
     assert np.isfinite(change).all()
@@ -392,8 +396,8 @@ def test_around_a_hole_the_correction_is_nearly_the_one_without_it(name: str) ->
         (40, REACH_PX, 0.03),
     ):
         ring = around_hole(farther_px) & ~around_hole(nearer_px)
-        assert rms((change - whole)[ring]) < most * sigma
-    assert np.abs(change).max() < np.abs(whole).max() + sigma
+        assert rms((change - without_hole)[ring]) < most * sigma
+    assert np.abs(change).max() < np.abs(without_hole).max() + sigma
 
 
 @pytest.mark.parametrize("value", [0.0, 7.0, FULL_SCALE, 1e9, np.inf, np.nan])
@@ -444,8 +448,8 @@ def test_noise_clipped_at_zero_keeps_the_mean_of_the_dark(offset_dn: float, sigm
     noise = np.random.default_rng(8).normal(0, sigma_dn(sensor, signal_dn), (400, 400))
     raw = np.clip(np.rint(signal_dn + noise), 0, FULL_SCALE)
     start = np.full(raw.shape, raw.mean())
-    found = start + corrected(Consistency.of(sensor, REFERENCE), raw, start)
+    corrected_dark = start + corrected(Consistency.of(sensor, REFERENCE), raw, start)
     light = signal_dn - offset_dn
-    assert found.mean() - offset_dn == pytest.approx(light, abs=0.05 * dark_dn)
+    assert corrected_dark.mean() - offset_dn == pytest.approx(light, abs=0.05 * dark_dn)
     if offset_dn == 0 and sigmas < 1:
         assert raw.mean() > 1.5 * signal_dn

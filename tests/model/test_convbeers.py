@@ -27,7 +27,8 @@ def test_the_radius_is_how_far_a_gradient_reaches(blocks: int, scale: int) -> No
     network = plain(variant)
     for module in network.modules():
         if isinstance(module, torch.nn.Conv2d) and module.bias is not None:
-            torch.nn.init.constant_(module.bias, 0.5)  # keep the ReLUs open
+            # A positive bias keeps the ReLUs open.
+            torch.nn.init.constant_(module.bias, 0.5)
     network(image)[0, 0, middle, middle].backward()
     assert image.grad is not None
     rows = image.grad[0, 0].abs().sum(1).nonzero().flatten()
@@ -55,8 +56,8 @@ def test_without_the_scaling_it_would_be_far_from_it() -> None:
 
 
 def test_the_same_seed_gives_the_same_network() -> None:
-    first, again, other = (list(plain(Variant(2, 4), seed).parameters()) for seed in (0, 0, 1))
-    assert all(map(torch.equal, first, again))
+    first, repeated, other = (list(plain(Variant(2, 4), seed).parameters()) for seed in (0, 0, 1))
+    assert all(map(torch.equal, first, repeated))
     assert not all(map(torch.equal, first, other))
 
 
@@ -76,18 +77,18 @@ def test_at_half_resolution_a_shift_by_a_place_shifts_the_result_and_a_pixel_doe
     side = 32
     image = torch.rand(1, 1, side, side, generator=torch.Generator().manual_seed(1))
     inner = slice(12, -12)
-    whole = network(image)
-    apart = [
+    output = network(image)
+    deviations = [
         float(
-            (network(image.roll(step, -1)).roll(-step, -1) - whole)[..., inner, inner]
+            (network(image.roll(step, -1)).roll(-step, -1) - output)[..., inner, inner]
             .detach()
             .abs()
             .max()
         )
         for step in (2, 1)
     ]
-    assert apart[0] < 1e-6
-    assert apart[1] > 1e-4
+    assert deviations[0] < 1e-6
+    assert deviations[1] > 1e-4
 
 
 VECTORS = torch.tensor([[-0.9, -0.8, 0.3, 0.2], [0.5, 0.1, -0.7, -0.6], [0.0, 0.9, 0.8, 0.9]])
@@ -115,6 +116,8 @@ def test_a_body_that_adds_nothing_leaves_the_analytic_restoration(scale: int) ->
     kernel = torch.from_numpy(bank_of_vector(tuple(VECTORS[1].tolist())).analytic).float()[
         None, None
     ]
-    wanted = image + conv2d(pad(image, [3] * 4, mode="reflect"), kernel)
+    expected = image + conv2d(pad(image, [3] * 4, mode="reflect"), kernel)
     with torch.inference_mode():
-        torch.testing.assert_close(network(image, told_of(VECTORS[1:2])), wanted, rtol=0, atol=1e-6)
+        torch.testing.assert_close(
+            network(image, told_of(VECTORS[1:2])), expected, rtol=0, atol=1e-6
+        )

@@ -38,18 +38,18 @@ def test_a_pupil_has_its_closed_form(obscuration: float) -> None:
     """Of a clear pupil: 2 / pi (arccos s - s sqrt(1 - s^2)); an obscuration lowers the middle
     frequencies.
     """
-    found = pupil_contrast(0.2, obscuration)
-    assert found[-1] == pytest.approx(0.2, abs=1e-3)
-    assert (np.diff(found) <= 1e-9).all()
+    contrast = pupil_contrast(0.2, obscuration)
+    assert contrast[-1] == pytest.approx(0.2, abs=1e-3)
+    assert (np.diff(contrast) <= 1e-9).all()
     clear = pupil_contrast(0.2, 0.0)
     if obscuration:
-        assert found[len(found) // 2] < clear[len(found) // 2]
+        assert contrast[len(contrast) // 2] < clear[len(contrast) // 2]
         return
     shares = np.linspace(0, 1, 4001)
     closed = 2 / np.pi * (np.arccos(shares) - shares * np.sqrt(1 - shares**2))
     cutoff = float(np.interp(0.2, closed[::-1], shares[::-1]))
     np.testing.assert_allclose(
-        found, np.interp(FREQUENCIES / 0.5 * cutoff, shares, closed), atol=0.005
+        contrast, np.interp(FREQUENCIES / 0.5 * cutoff, shares, closed), atol=0.005
     )
 
 
@@ -83,16 +83,16 @@ def test_curves_that_no_training_drew_are_said() -> None:
     ):
         sensor = of_curve(formula * (1 + bend * hill))
         assert [departure(sensor, "cut") != "", departure(sensor, "fitted") != ""] == [cut, fitted]
-    said = departure(of_curve(formula * (1 - 0.45 * hill)), "fitted")
-    assert said.startswith("the MTF across the track is 0.1")
-    assert "where the network was trained on" in said
+    message = departure(of_curve(formula * (1 - 0.45 * hill)), "fitted")
+    assert message.startswith("the MTF across the track is 0.1")
+    assert "where the network was trained on" in message
 
 
 def test_a_family_draws_other_curves_in_their_share_and_none_is_outside_the_ranges() -> None:
     family = SensorFamily(load_sensor("pleiades-degraded").nominal(), other_curves=0.5)
     generator = np.random.default_rng(0)
-    drawn = [family.draw(generator) for _ in range(400)]
-    assert np.mean([sensor.response is not None for sensor in drawn]) == pytest.approx(
+    curves = [family.draw(generator) for _ in range(400)]
+    assert np.mean([sensor.response is not None for sensor in curves]) == pytest.approx(
         0.5, abs=0.08
     )
-    assert all(sensor_vector(sensor).outside == () for sensor in drawn)
+    assert all(sensor_vector(sensor).outside == () for sensor in curves)

@@ -71,9 +71,9 @@ def test_a_brightened_sensor_has_more_gain_and_is_otherwise_the_same(factor: int
     sensor = load_sensor("pleiades-variable")
     other = brightened(sensor, factor)
     changed = {
-        each.name
-        for each in fields(sensor)
-        if getattr(sensor, each.name) != getattr(other, each.name)
+        item.name
+        for item in fields(sensor)
+        if getattr(sensor, item.name) != getattr(other, item.name)
     }
     assert changed == {"gain_dn_per_radiance"}
     assert other.gain_dn_per_radiance.low == factor * sensor.gain_dn_per_radiance.low
@@ -101,16 +101,16 @@ def test_a_pixel_takes_the_highest_factor_that_leaves_headroom(
     """By a loop over pixels; so HEADROOM holds everywhere within the radius."""
     image = image_of(seed, height, width)
     factors = (1, 4, 8)
-    chosen = choose_factors(image, factors, radius_px, FULL_SCALE, offset)
+    selected = choose_factors(image, factors, radius_px, FULL_SCALE, offset)
     for row, column in np.random.default_rng(seed).integers(0, (height, width), (20, 2)):
         around = image[max(row - radius_px, 0) : row + radius_px + 1, max(column - radius_px, 0) :]
         brightest = float(around[:, : min(column, radius_px) + radius_px + 1].max())
         fitting = [
-            each
-            for each in factors
-            if (brightest - offset) * each + offset <= HEADROOM * FULL_SCALE
+            factor
+            for factor in factors
+            if (brightest - offset) * factor + offset <= HEADROOM * FULL_SCALE
         ]
-        assert chosen[row, column] == max(fitting, default=1)
+        assert selected[row, column] == max(fitting, default=1)
 
 
 @settings(max_examples=60)
@@ -127,17 +127,19 @@ def test_a_part_chooses_as_the_whole_image_does(
     row = max(top - radius_px, 0)
     column = max(left - radius_px, 0)
     part = image[row : bottom + radius_px, column : right + radius_px]
-    found = choose_factors(part, factors, radius_px, FULL_SCALE, 0.0)[top - row :, left - column :]
-    whole = choose_factors(image, factors, radius_px, FULL_SCALE, 0.0)[top:bottom, left:right]
-    np.testing.assert_array_equal(found[: bottom - top, : right - left], whole)
+    in_part = choose_factors(part, factors, radius_px, FULL_SCALE, 0.0)[
+        top - row :, left - column :
+    ]
+    in_image = choose_factors(image, factors, radius_px, FULL_SCALE, 0.0)[top:bottom, left:right]
+    np.testing.assert_array_equal(in_part[: bottom - top, : right - left], in_image)
 
 
 def test_with_a_pixel_less_around_it_a_part_may_choose_otherwise() -> None:
     image = np.full((1, 30), 10, np.float32)
     image[0, 20] = 4000
-    whole = choose_factors(image, (1, 8), 5, FULL_SCALE, 0.0)
-    assert whole[0].tolist() == [8] * 15 + [1] * 11 + [8] * 4
-    assert (choose_factors(image[:, :20], (1, 8), 5, FULL_SCALE, 0.0) != whole[:, :20]).any()
+    in_image = choose_factors(image, (1, 8), 5, FULL_SCALE, 0.0)
+    assert in_image[0].tolist() == [8] * 15 + [1] * 11 + [8] * 4
+    assert (choose_factors(image[:, :20], (1, 8), 5, FULL_SCALE, 0.0) != in_image[:, :20]).any()
 
 
 @settings(max_examples=40)
@@ -148,7 +150,8 @@ def test_a_brighter_image_takes_no_higher_factor(
     image = image_of(seed, height, width)
     brighter = image + np.float32(more) * (np.arange(width) % 3 == 0).astype(np.float32)
     before, after = (
-        choose_factors(each, (1, 4, 8), radius_px, FULL_SCALE, offset) for each in (image, brighter)
+        choose_factors(scene, (1, 4, 8), radius_px, FULL_SCALE, offset)
+        for scene in (image, brighter)
     )
     assert (after <= before).all()
 
@@ -164,6 +167,7 @@ def test_the_offset_is_no_light() -> None:
     np.testing.assert_array_equal(shifted, plain)
     counted_as_light = choose_factors(image + 100, (1, 4, 8), 0, FULL_SCALE + 100 / HEADROOM, 0.0)
     assert (counted_as_light <= plain).all()
+    # The control: with the offset counted as light some factors are lower.
     assert (counted_as_light < plain).any()
 
 

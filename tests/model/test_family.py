@@ -23,9 +23,8 @@ def drawn(seed: int) -> Instrument:
 
 
 def test_the_values_of_a_sensor_known_by_hand() -> None:
-    values = sensor_values(
-        NOMINAL
-    )  # SNR 50 at 25 and 110 at 100 W/m2/sr/um, 400 of them full scale
+    # The nominal sensor has SNR 50 at 25 and SNR 110 at 100 W/m2/sr/um. Its full scale is 400.
+    values = sensor_values(NOMINAL)
     assert values["mtf_across"] == values["mtf_along"] == 0.07
     assert values["sigma_dark"] == pytest.approx(25 / 50 / 400, rel=2e-3)
     assert values["sigma_bright"] == pytest.approx(100 / 110 / 400, rel=1e-3)
@@ -54,23 +53,25 @@ def test_the_ends_of_the_ranges_are_minus_one_and_one() -> None:
     ],
 )
 def test_what_lies_outside_is_moved_to_the_end_and_said(sensor: Instrument, name: str) -> None:
-    known = sensor_vector(sensor)
-    assert max(map(abs, known.values)) == 1
-    said = [sentence for sentence in known.outside if sentence.startswith(name)]
-    assert len(said) == 1
-    assert "outside" in said[0]
+    vector = sensor_vector(sensor)
+    assert max(map(abs, vector.values)) == 1
+    sentences = [sentence for sentence in vector.outside if sentence.startswith(name)]
+    assert len(sentences) == 1
+    assert "outside" in sentences[0]
 
 
 @pytest.mark.parametrize(
-    ("along", "said"), [(0.027, True), (0.029, False), (0.15, False), (0.07, False)]
+    ("along", "warned"), [(0.027, True), (0.029, False), (0.15, False), (0.07, False)]
 )
-def test_axes_further_apart_than_any_in_training_are_said(along: float, said: bool) -> None:
+def test_axes_further_apart_than_any_in_training_are_said(along: float, warned: bool) -> None:
     for sensor in (
         replace(NOMINAL, mtf_nyquist_along=along),
         replace(NOMINAL, mtf_nyquist=along, mtf_nyquist_along=0.07),
     ):
-        known = sensor_vector(sensor)
-        assert [sentence.startswith("the lower MTF") for sentence in known.outside] == [True] * said
+        vector = sensor_vector(sensor)
+        assert [sentence.startswith("the lower MTF") for sentence in vector.outside] == [
+            True
+        ] * warned
 
 
 @given(st.integers(0, 2**20))

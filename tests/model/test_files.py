@@ -35,7 +35,7 @@ def test_where_no_folder_can_be_made_is_said_before_any_is(
     with pytest.raises(MachineError) as caught:
         require_writable(path)
     assert (caught.value.expected, caught.value.got) == ("a place to write to", reason)
-    assert sorted(each.name for each in tmp_path.iterdir()) == ["file", "link"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "link"]
 
 
 @pytest.mark.parametrize("below", ["out", "new/out", "new/below/out"])

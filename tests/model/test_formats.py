@@ -71,10 +71,10 @@ def test_commands_say_what_to_do_with_a_file_of_pytorch(
     path = tmp_path / "network.pth"
     torch.save(STATE, path)
     command, *options = words
-    given = ("--network", path) if command == "export" else (path,)
-    said = refused(command, *given, *options)
-    assert "got a file of PyTorch" in said
-    assert "torch.onnx.export" in said
+    arguments = ("--network", path) if command == "export" else (path,)
+    message = refused(command, *arguments, *options)
+    assert "got a file of PyTorch" in message
+    assert "torch.onnx.export" in message
 
 
 def test_weights_in_another_format_are_named(tmp_path: Path) -> None:

@@ -61,7 +61,8 @@ def test_scenes_become_radiance(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         radiance[:2], np.array([0, 400], np.float32), rtol=1.3e-6, atol=1e-5, strict=True
     )
-    assert float(radiance[2]) == pytest.approx(200, rel=0.02)  # 188 is half the light in sRGB
+    # The sRGB value 188 is half the light of 255.
+    assert float(radiance[2]) == pytest.approx(200, rel=0.02)
     tifffile.imwrite(tmp_path / "dn.tif", np.full((5, 7), 2048, np.uint16))
     assert float(read_scene(tmp_path / "dn.tif", SENSOR).radiance[0, 0]) == pytest.approx(
         2048 / 10.2375

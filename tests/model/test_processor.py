@@ -32,9 +32,11 @@ def convolved(image: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray
     ends = [
         helper.make_tensor_value_info(name, TensorProto.UINT8, None) for name in ("image", "result")
     ]
-    held = [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()]
+    initializers = [
+        numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()
+    ]
     node = helper.make_node("QLinearConv", feeds, ["result"], pads=[1, 1, 1, 1])
-    graph = helper.make_graph([node], "one", ends[:1], ends[1:], held)
+    graph = helper.make_graph([node], "one", ends[:1], ends[1:], initializers)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     return np.asarray(session.run(None, {"image": image})[0])

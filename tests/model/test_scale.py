@@ -10,15 +10,16 @@ from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.sensor import MAX_DN
 
 
-def settled(kind: str, *largest: float, asked: float | None = None) -> float:
+def settled(kind: str, *largest: float, requested: float | None = None) -> float:
     return settled_scale(
-        "x.tif", np.dtype(kind), (Extent(each, whole=True) for each in largest), asked
+        "x.tif", np.dtype(kind), (Extent(value, whole=True) for value in largest), requested
     )
 
 
 @pytest.mark.parametrize("kind", ["uint16", "int16", "uint32", "int32"])
 def test_integers_of_more_than_8_bits_are_12_bit_digital_numbers(kind: str) -> None:
-    for brightest in (0, 1, 255, 4095, 60000):  # what lies beyond is refused where pixels are read
+    # Values above the scale are not refused here, but where pixels are read.
+    for brightest in (0, 1, 255, 4095, 60000):
         assert settled(kind, brightest) == MAX_DN
 
 
@@ -44,23 +45,25 @@ def test_black_says_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "asked"), [("uint8", 255), ("float32", 0.5), ("float32", 4095), ("uint16", 1023)]
+    ("kind", "requested"), [("uint8", 255), ("float32", 0.5), ("float32", 4095), ("uint16", 1023)]
 )
-def test_what_was_asked_for_settles_it(kind: str, asked: float) -> None:
-    assert settled(kind, 0.7, asked=asked) == asked
+def test_what_was_asked_for_settles_it(kind: str, requested: float) -> None:
+    assert settled(kind, 0.7, requested=requested) == requested
 
 
 IMPOSSIBLE = (0, -1, float("nan"), float("inf"))
 
 
 @pytest.mark.parametrize(
-    ("kind", "words", "asked"),
+    ("kind", "words", "requested"),
     [("uint16", "whole number", (*IMPOSSIBLE, 0.5)), ("float32", "above 0", IMPOSSIBLE)],
 )
-def test_no_image_has_such_a_full_scale(kind: str, words: str, asked: tuple[float, ...]) -> None:
-    for full_scale in asked:
+def test_no_image_has_such_a_full_scale(
+    kind: str, words: str, requested: tuple[float, ...]
+) -> None:
+    for full_scale in requested:
         with pytest.raises(OptionError, match=f"full_scale.*{words}"):
-            settled(kind, 1000, asked=full_scale)
+            settled(kind, 1000, requested=full_scale)
 
 
 def test_no_more_is_looked_at_than_decides() -> None:

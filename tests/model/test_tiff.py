@@ -35,10 +35,13 @@ def tiff(path: Path, data: bytes, **changed: int) -> Path:
     entries = {256: 16, 257: 16, 258: 8, 259: 1, 262: 1, 273: 0, 277: 1, 278: 16, 279: len(data)}
     entries |= {names[name]: value for name, value in changed.items()}
     place = 273
-    if 322 in entries:  # tiles have tags of their own
-        place, entries[325] = 324, entries.pop(279)
+    if 322 in entries:  # Tiles have tags of their own for places and lengths, 324 and 325.
+        place = 324
+        entries[325] = entries.pop(279)
         del entries[273], entries[278]
         entries[place] = 0
+    # The pixels come behind the header of 8 bytes, the count of 2 and the directory of 12 bytes an
+    # entry, which 4 bytes end.
     entries[place] = 8 + 2 + 12 * len(entries) + 4
     listed = b"".join(
         struct.pack("<HHII", tag, 4, 1, value) for tag, value in sorted(entries.items())
@@ -60,9 +63,9 @@ def little_memory() -> Iterator[None]:
 def refused(path: Path, error: type[BeersError], word: str) -> None:
     """By both readers, in a sentence and without memory."""
     with little_memory():
-        for read in (read_pixels, rows):
+        for reader in (read_pixels, rows):
             with pytest.raises(error, match=word):
-                read(path)
+                reader(path)
 
 
 def rows(path: Path) -> np.ndarray:
@@ -93,14 +96,16 @@ def test_a_strip_beyond_the_end_is_refused_before_it_is_read(tmp_path: Path) -> 
 
 def test_a_size_that_is_no_whole_number_is_refused(tmp_path: Path) -> None:
     path = tiff(tmp_path / "a.tif", GREY.tobytes())
-    whole = struct.pack("<HHII", 257, 4, 1, 16)
-    broken = struct.pack("<HHIf", 257, 11, 1, 16.0)
-    assert whole in path.read_bytes()
-    path.write_bytes(path.read_bytes().replace(whole, broken))
+    # In a TIFF entry, type 4 is a 32-bit integer and type 11 a float.
+    integer_entry = struct.pack("<HHII", 257, 4, 1, 16)
+    float_entry = struct.pack("<HHIf", 257, 11, 1, 16.0)
+    assert integer_entry in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(integer_entry, float_entry))
     refused(path, ImageError, "readable|whole numbers")
     path = tiff(tmp_path / "b.tif", GREY.tobytes())
-    many = struct.pack("<HHII", 257, 4, 20, 8)  # a list, of what stands at the file's begin
-    path.write_bytes(path.read_bytes().replace(whole, many))
+    # The entry is a list of 20 values that begins at byte 8, over the file's own tags.
+    many = struct.pack("<HHII", 257, 4, 20, 8)
+    path.write_bytes(path.read_bytes().replace(integer_entry, many))
     refused(path, ImageError, "readable")
 
 
@@ -157,6 +162,7 @@ def test_a_chunk_stated_longer_than_the_file_takes_no_memory(tmp_path: Path) -> 
     Image.fromarray(GREY).save(path)
     content = bytearray(path.read_bytes())
     at = content.find(b"IDAT")
+    # The length of a PNG chunk is the 4 bytes before its kind.
     content[at - 4 : at] = struct.pack(">I", 2**31 - 1)
     path.write_bytes(content)
     with little_memory(), suppress(ImageError):
@@ -170,6 +176,7 @@ def test_a_gigantic_png_header_allocates_nothing(side: int, tmp_path: Path) -> N
     header = struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)
     Image.fromarray(GREY).save(path)
     content = bytearray(path.read_bytes())
+    # The IHDR chunk has its own checksum, so that only the size is absurd.
     content[16:33] = header + struct.pack(">I", zlib.crc32(b"IHDR" + header))
     path.write_bytes(content)
     with little_memory(), pytest.raises(MachineError, match="free memory"):

@@ -33,18 +33,19 @@ def conditioned() -> BankedConvBEERS:
 
 
 @pytest.mark.parametrize(
-    "written", [*(plain(Variant(*size)) for size in ((0, 1), (1, 4, 2), (3, 5))), conditioned()]
+    "network", [*(plain(Variant(*size)) for size in ((0, 1), (1, 4, 2), (3, 5))), conditioned()]
 )
-def test_a_network_comes_back_as_it_was(written: Network, tmp_path: Path) -> None:
+def test_a_network_comes_back_as_it_was(network: Network, tmp_path: Path) -> None:
     path = tmp_path / "made" / "w.safetensors"
-    save_network(path, written, {"loss": "L1", "steps": 7})
-    read, recipe = load_network(path)
-    assert type(read) is type(written)
-    assert read.variant == written.variant
+    save_network(path, network, {"loss": "L1", "steps": 7})
+    loaded, recipe = load_network(path)
+    assert type(loaded) is type(network)
+    assert loaded.variant == network.variant
     assert recipe == {"loss": "L1", "steps": 7}
-    assert not read.training
+    assert not loaded.training
     assert all(
-        torch.equal(value, read.state_dict()[name]) for name, value in written.state_dict().items()
+        torch.equal(value, loaded.state_dict()[name])
+        for name, value in network.state_dict().items()
     )
     assert [p.name for p in path.parent.iterdir()] == ["w.safetensors"]
 
@@ -64,9 +65,9 @@ def test_tensors_of_any_layout_and_kind_come_back(tmp_path: Path) -> None:
         "one": np.array(3.5),
     }
     write_tensors(tmp_path / "t.safetensors", tensors, {"step": 3, "name": "a b"})
-    read, header = read_tensors(tmp_path / "t.safetensors")
+    loaded, header = read_tensors(tmp_path / "t.safetensors")
     assert header == {"step": 3, "name": "a b"}
-    assert all(np.array_equal(read[name], value) for name, value in tensors.items())
+    assert all(np.array_equal(loaded[name], value) for name, value in tensors.items())
 
 
 @pytest.mark.parametrize(
@@ -153,10 +154,10 @@ def test_the_shipped_weights_load_and_say_how_they_were_made(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "read", [lambda path: read_tensors(path)[0], lambda path: perceptual.read_tensors(path, "ab")]
+    "reader", [lambda path: read_tensors(path)[0], lambda path: perceptual.read_tensors(path, "ab")]
 )
 def test_what_was_read_is_a_copy(
-    read: Callable[[Path], Mapping[str, np.ndarray]], tmp_path: Path
+    reader: Callable[[Path], Mapping[str, np.ndarray]], tmp_path: Path
 ) -> None:
     """Windows replaces no file that is held, such as a checkpoint, and who writes into it changes
     nothing.
@@ -167,10 +168,11 @@ def test_what_was_read_is_a_copy(
         "b": np.arange(20_000, dtype=np.float32).reshape(100, 200),
     }
     write_tensors(path, tensors, {})
-    found = read(path)
+    loaded = reader(path)
+    # The file is overwritten in place. A memory map of it would change as well.
     with path.open("r+b") as file:
         file.write(bytes(path.stat().st_size))
-    assert all(np.array_equal(np.asarray(found[name]), value) for name, value in tensors.items())
+    assert all(np.array_equal(np.asarray(loaded[name]), value) for name, value in tensors.items())
     write_tensors(path, tensors, {})
 
 
@@ -214,12 +216,16 @@ def test_conditioned_weights_need_their_header(
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("missing", ["tail.bias", "body.0.first.weight", "bias.weight"])
-def test_conditioned_weights_that_lack_a_tensor_are_refused(missing: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("tensor_name", ["tail.bias", "body.0.first.weight", "bias.weight"])
+def test_conditioned_weights_that_lack_a_tensor_are_refused(
+    tensor_name: str, tmp_path: Path
+) -> None:
     path = tmp_path / "w.safetensors"
     save_network(path, conditioned(), {})
     tensors, header = read_tensors(path)
-    write_tensors(path, {name: value for name, value in tensors.items() if name != missing}, header)
+    write_tensors(
+        path, {name: value for name, value in tensors.items() if name != tensor_name}, header
+    )
     with pytest.raises(ModelError, match=r"w\.safetensors"):
         load_network(path)
 
@@ -235,6 +241,6 @@ def test_the_same_weights_are_the_same_bytes(tmp_path: Path) -> None:
         write_tensors(tmp_path / f"{number}", tensors, header)
         contents.add((tmp_path / f"{number}").read_bytes())
     assert len(contents) == 1
-    found, known = read_tensors(tmp_path / "0")
-    assert known == header
-    assert all(np.array_equal(found[name], value) for name, value in tensors.items())
+    loaded, loaded_header = read_tensors(tmp_path / "0")
+    assert loaded_header == header
+    assert all(np.array_equal(loaded[name], value) for name, value in tensors.items())

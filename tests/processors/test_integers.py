@@ -39,12 +39,12 @@ def image(draw: Draw, shape: tuple[int, int], seed: int = 0) -> np.ndarray:
 def test_both_encodings_are_the_integer_reference(
     shape: tuple[int, int], draw: Draw, optimise: bool, shipped: Encodings
 ) -> None:
-    seen = image(draw, shape)
-    planes = shipped.core.ends.split(seen)
+    pixels = image(draw, shape)
+    planes = shipped.core.ends.split(pixels)
     tensors, _ = run_core(shipped.core, planes, half_even=True)
-    restored = np.clip(seen + merged_correction(shipped.core, tensors), 0, 1)
+    restored = np.clip(pixels + merged_correction(shipped.core, tensors), 0, 1)
     np.testing.assert_array_equal(
-        run(open_session(shipped.host, optimise=optimise), seen), restored
+        run(open_session(shipped.host, optimise=optimise), pixels), restored
     )
     feed = {PLANES: planes.astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
     by_board = open_session(shipped.board, optimise=optimise).run(None, feed)[0]
@@ -52,8 +52,8 @@ def test_both_encodings_are_the_integer_reference(
 
 
 def test_every_layer_is_that_of_the_integer_reference(shipped: Encodings) -> None:
-    found = agreement(shipped.core, shipped.host, image(noise, (29, 31)))
-    assert {layer.report.name: layer.unequal for layer in found.layers if layer.unequal} == {}
+    layers = agreement(shipped.core, shipped.host, image(noise, (29, 31)))
+    assert {layer.report.name: layer.unequal for layer in layers.layers if layer.unequal} == {}
 
 
 def test_the_board_s_core_is_the_host_file_s(shipped: Encodings) -> None:
@@ -81,7 +81,8 @@ def harsh_core(seed: int, channels: int) -> IntCore:
 
     first = conv("first", PLANES, "inner", (channels, 3, 3, 3), relu=bool(seed % 2))
     last = conv("last", "inner", CORRECTION, (1, channels, 3, 3), relu=False)
-    inner = PLANES_FRAC_BITS + 10 - 9  # product - cut
+    # The map has the product's fractional bits, less those that the shift cuts.
+    inner = PLANES_FRAC_BITS + 10 - 9
     return IntCore(
         (first, last), {PLANES: PLANES_FRAC_BITS, "inner": inner, CORRECTION: inner + 10 - 10}
     )
@@ -91,17 +92,17 @@ def harsh_core(seed: int, channels: int) -> IntCore:
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
 def test_the_largest_products_are_added_exactly(seed: int, channels: int) -> None:
     core = harsh_core(seed, channels)
-    seen = image(edges, (13, 21), seed)
-    whole = correction(core, split(seen), half_even=True)
-    assert len(np.unique(whole)) > 40
-    restored = np.clip(seen + whole, 0, 1)
-    feed = {PLANES: split(seen).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
+    pixels = image(edges, (13, 21), seed)
+    expected = correction(core, split(pixels), half_even=True)
+    assert len(np.unique(expected)) > 40
+    restored = np.clip(pixels + expected, 0, 1)
+    feed = {PLANES: split(pixels).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
     for optimise in (True, False):
         np.testing.assert_array_equal(
-            run(open_session(host_model(core, {}), optimise=optimise), seen), restored
+            run(open_session(host_model(core, {}), optimise=optimise), pixels), restored
         )
         by_board = open_session(board_model(core, {}), optimise=optimise).run(None, feed)[0]
-        np.testing.assert_array_equal(by_board, whole)
+        np.testing.assert_array_equal(by_board, expected)
 
 
 def saturating_sums(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -121,9 +122,9 @@ def test_saturated_sums_would_show() -> None:
         last = core.ops[-1]
         assert isinstance(last, IntConv)
         tensors, _ = run_core(core, split(image(edges, (13, 21), seed)), half_even=True)
-        weights = last.weight[0, :, 1, 1].astype(np.int64)  # the middle tap, over its channels
-        stored = (
-            np.moveaxis(tensors["inner"], 1, -1).astype(np.int64) + 128
-        )  # as the host's file holds them
+        # One tap over all channels is what one dot product of a kernel adds.
+        weights = last.weight[0, :, 1, 1].astype(np.int64)
+        # The host's file stores activations as UINT8, 128 above their value.
+        stored = np.moveaxis(tensors["inner"], 1, -1).astype(np.int64) + 128
         exact = (stored * weights).sum(-1)
         assert (saturating_sums(stored, weights) != exact).mean() > 0.3

@@ -25,8 +25,8 @@ def stored(folder: Path, kind: str) -> Path:
 
 def test_the_content_tells_an_archive_from_an_array(tmp_path: Path) -> None:
     np.testing.assert_array_equal(load_arrays(stored(tmp_path, "npy"))[ALONE], HELD["image"])
-    found = load_arrays(stored(tmp_path, "npz"))
-    assert {name: values.shape for name, values in found.items()} == {
+    arrays = load_arrays(stored(tmp_path, "npz"))
+    assert {name: values.shape for name, values in arrays.items()} == {
         "image": (4, 10),
         "reference": (7,),
     }

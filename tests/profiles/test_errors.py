@@ -30,10 +30,10 @@ from beers_deploy.profiles.errors import (
     "kind", [BeersError, ImageError, MachineError, ModelError, OptionError, ProfileError]
 )
 def test_an_error_survives_the_way_between_processes(kind: type[BeersError]) -> None:
-    sent = kind("a.tif", expected="rows", got="none", remedy="give some")
-    come = ForkingPickler.loads(ForkingPickler.dumps(sent))
+    error = kind("a.tif", expected="rows", got="none", remedy="give some")
+    come = ForkingPickler.loads(ForkingPickler.dumps(error))
     assert type(come) is kind
-    assert str(come) == str(sent) == "a.tif: expected rows, got none; give some."
+    assert str(come) == str(error) == "a.tif: expected rows, got none; give some."
     assert (come.where, come.expected, come.got, come.remedy) == (
         "a.tif",
         "rows",
@@ -58,10 +58,10 @@ def test_sizes_that_differ_look_different(counts_bytes: list[int]) -> None:
 
 @given(st.text(max_size=40))
 def test_visible_text_keeps_its_lines_and_nothing_that_is_obeyed(text: str) -> None:
-    found = visible(text)
-    assert all(c.isprintable() or c in "\n\t" for c in found)
-    assert found.count("\n") == text.count("\n")
-    assert visible(found) == found
+    shown_text = visible(text)
+    assert all(c.isprintable() or c in "\n\t" for c in shown_text)
+    assert shown_text.count("\n") == text.count("\n")
+    assert visible(shown_text) == shown_text
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """What a user may write into a profile by mistake: each is one sentence that says what to do."""
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,9 @@ from beers_deploy.profiles.errors import ProfileError
 from beers_deploy.profiles.sensor import TABLES, noise_from_snr, snr_0_bounds
 from tests.profiles.own_sensor import SHIPPED, own_sensor
 
-KEYS = [(table, key) for table, ways in TABLES.items() for key in ways[0][0]]
+KEYS: list[tuple[str, str]] = []
+for name, ways in TABLES.items():
+    KEYS += product([name], ways[0][0])
 
 
 def refusal(path: Path) -> ProfileError:
@@ -31,8 +34,8 @@ def refusal(path: Path) -> ProfileError:
 
 @pytest.mark.parametrize(("table", "key"), KEYS)
 def test_a_missing_key_is_named_with_its_table(table: str, key: str, tmp_path: Path) -> None:
-    kept = [line for line in SHIPPED.splitlines() if not line.startswith(f"{key} =")]
-    error = refusal(own_sensor(tmp_path, text="\n".join(kept)))
+    lines = [line for line in SHIPPED.splitlines() if not line.startswith(f"{key} =")]
+    error = refusal(own_sensor(tmp_path, text="\n".join(lines)))
     assert f"[{table}]" in error.where
     assert repr(key) in error.expected
 
@@ -74,8 +77,8 @@ def test_a_range_is_drawn_from_or_refused(old: str, new: str, tmp_path: Path) ->
         profile = load_sensor(str(own_sensor(tmp_path, (old, new))))
     except ProfileError:
         return
-    drawn = [profile.draw(np.random.default_rng(seed)) for seed in range(8)]
-    assert any(sensor != drawn[0] for sensor in drawn)
+    sensors = [profile.draw(np.random.default_rng(seed)) for seed in range(8)]
+    assert any(sensor != sensors[0] for sensor in sensors)
 
 
 @pytest.mark.parametrize(

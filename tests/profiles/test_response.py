@@ -98,20 +98,20 @@ def test_a_point_spread_is_its_transform_about_its_centroid(tmp_path: Path) -> N
     shift = np.exp(2j * np.pi * f[:, None] * (row + 11.5) / 4) * np.exp(
         2j * np.pi * f * (column + 15.5) / 4
     )
-    wanted = np.fft.fft2(samples, (96, 96)) * shift / samples.sum()
+    expected = np.fft.fft2(samples, (96, 96)) * shift / samples.sum()
     assert sensor.response is not None
-    assert np.abs(sensor.response.at(f[None], f[:, None]) - wanted).max() < 3e-6
-    across = abs(wanted[0, 12])
-    along = abs(wanted[12, 0])
+    assert np.abs(sensor.response.at(f[None], f[:, None]) - expected).max() < 3e-6
+    across = abs(expected[0, 12])
+    along = abs(expected[12, 0])
     assert sensor.mtf_axes == pytest.approx((across, along), abs=3e-6)
 
 
 def test_beyond_its_own_sampling_a_point_spread_says_nothing(tmp_path: Path) -> None:
     response = with_psf(tmp_path, lopsided()).response
     assert response is not None
-    found = response.at(np.array([[1.9, 2.1, 4.0]]), np.zeros((1, 1)))[0]
-    assert abs(found[0]) > 0
-    assert (found[1:] == 0).all()
+    contrasts = response.at(np.array([[1.9, 2.1, 4.0]]), np.zeros((1, 1)))[0]
+    assert abs(contrasts[0]) > 0
+    assert (contrasts[1:] == 0).all()
 
 
 @settings(max_examples=25)
@@ -272,10 +272,8 @@ def test_alpha_and_beta_are_the_noise_itself(tmp_path: Path) -> None:
         str(sensor_file(tmp_path, "mtf_nyquist = 0.07", f"alpha = {alpha}\nbeta = {beta}"))
     )
     assert profile.nominal() == plain.nominal()
-    assert (profile.radiance_0.low, profile.radiance_1.low) == (
-        25,
-        100,
-    )  # of the shipped full scale, 400
+    # The radiances are shares of the shipped full scale, 400.
+    assert (profile.radiance_0.low, profile.radiance_1.low) == (25, 100)
     ranged = load_sensor(
         str(
             sensor_file(
@@ -283,11 +281,11 @@ def test_alpha_and_beta_are_the_noise_itself(tmp_path: Path) -> None:
             )
         )
     )
-    drawn = [ranged.draw_counted(np.random.default_rng(seed)) for seed in range(20)]
+    sensors = [ranged.draw_counted(np.random.default_rng(seed)) for seed in range(20)]
     assert all(
-        0.1 <= sensor.alpha <= 0.2 and sensor.beta == rejected == 0 for sensor, rejected in drawn
+        0.1 <= sensor.alpha <= 0.2 and sensor.beta == rejected == 0 for sensor, rejected in sensors
     )
-    assert len({sensor.alpha for sensor, _ in drawn}) == 20
+    assert len({sensor.alpha for sensor, _ in sensors}) == 20
     assert ranged.nominal().noise_sigma(60) == pytest.approx(math.sqrt(0.15 * 60))
     assert (ranged.radiance_0.low, ranged.nominal().radiance_1) == (15, 60)
 

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ def test_the_promised_profiles_are_shipped() -> None:
 @pytest.mark.parametrize("name", SHIPPED)
 def test_every_sensor_constant_has_a_source(name: str) -> None:
     profile = load_sensor(name)
-    for key in (key for ways in TABLES.values() for key in ways[0][0]):
+    for key in chain.from_iterable(ways[0][0] for ways in TABLES.values()):
         constant = getattr(profile, key)
         assert constant.source.strip()
         assert constant.status in ("published", "inferred", "assumed")
@@ -41,7 +42,8 @@ def test_every_sensor_constant_has_a_source(name: str) -> None:
 def test_every_target_constant_has_a_source(name: str) -> None:
     target = load_target(name)
     tables = [*target.tables.values(), *target.configurations.values()]
-    assert all(constant.source.strip() for table in tables for constant in table.values())
+    for table in tables:
+        assert all(constant.source.strip() for constant in table.values())
 
 
 @pytest.mark.parametrize(
@@ -104,8 +106,8 @@ def test_missing_profiles_and_files(tmp_path: Path) -> None:
 
 
 def test_a_bare_number_is_the_users_own_statement(tmp_path: Path) -> None:
-    stated = '{ value = 0.07, status = "published", source = "paper, table 1: Sim-Degraded-Fixed" }'
-    constant = load_sensor(str(own_sensor(tmp_path, (stated, "0.08")))).mtf_nyquist
+    entry = '{ value = 0.07, status = "published", source = "paper, table 1: Sim-Degraded-Fixed" }'
+    constant = load_sensor(str(own_sensor(tmp_path, (entry, "0.08")))).mtf_nyquist
     assert (constant.value, constant.status) == (0.08, "stated")
 
 
@@ -119,8 +121,8 @@ def test_every_draw_is_physical_and_within_its_ranges(name: str, seed: int) -> N
     for radiance, snr in zip(
         (profile.radiance_0, profile.radiance_1), profile.snr_pair, strict=True
     ):
-        drawn = radiance.low / sensor.noise_sigma(radiance.low)
-        assert snr.low * (1 - 1e-9) <= drawn <= snr.high * (1 + 1e-9)
+        ratio = radiance.low / sensor.noise_sigma(radiance.low)
+        assert snr.low * (1 - 1e-9) <= ratio <= snr.high * (1 + 1e-9)
     assert sensor == profile.draw(np.random.default_rng(seed))
 
 
@@ -129,7 +131,8 @@ def test_impossible_pairs_are_counted() -> None:
     rng = np.random.default_rng(0)
     rejected = sum(profile.draw_counted(rng)[1] for _ in range(400))
     share = rejected / (rejected + 400)
-    assert 0.70 < share < 0.80  # 24.9 % of the pairs are valid
+    # Of the pairs, 24.9 % are valid.
+    assert 0.70 < share < 0.80
 
 
 @given(st.floats(10, 200), st.floats(0.0, 1.0))
@@ -149,8 +152,8 @@ def with_table(folder: Path, table: str) -> Path:
 
 def test_a_table_calls_for_its_effect(tmp_path: Path) -> None:
     profile = load_sensor(str(with_table(tmp_path, "[smear]\nlength_px = [0.2, 0.4]\n")))
-    drawn = [profile.draw(np.random.default_rng(s)).effects["smear"] for s in range(5)]
-    lengths = {effect.length_px for effect in drawn if isinstance(effect, Smear)}
+    smears = [profile.draw(np.random.default_rng(s)).effects["smear"] for s in range(5)]
+    lengths = {effect.length_px for effect in smears if isinstance(effect, Smear)}
     assert len(lengths) == 5
     assert all(0.2 <= length <= 0.4 for length in lengths)
 
@@ -181,8 +184,11 @@ def test_the_units_of_another_sensor_bring_its_offset_and_no_other_effect(tmp_pa
             )
         )
     )
-    for found in (own.in_units_of(other).nominal(), own.nominal().in_units_of(other.nominal())):
-        assert (found.smear_px, found.offset_dn, set(found.effects)) == (
+    for instrument in (
+        own.in_units_of(other).nominal(),
+        own.nominal().in_units_of(other.nominal()),
+    ):
+        assert (instrument.smear_px, instrument.offset_dn, set(instrument.effects)) == (
             0.5,
             64,
             {"smear", "offset"},

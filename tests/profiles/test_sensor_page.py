@@ -3,6 +3,7 @@
 import math
 import re
 import tomllib
+from itertools import chain
 from pathlib import Path
 from typing import get_args
 
@@ -26,9 +27,12 @@ ROWS = dict(re.findall(r"^- `(\[\w+\] \w+)` \(.+?; (.+?)\): .+$", PAGE, re.MULTI
 
 
 def test_the_page_has_every_key_and_no_other() -> None:
-    wanted = {f"[{table}] {key}" for table in TABLES for key in table_keys(table)}
-    wanted |= {f"[{name}] {key}" for name, effect in EFFECTS.items() for key in effect.limits()}
-    assert set(ROWS) == wanted
+    keys = set[str]()
+    for table in TABLES:
+        keys |= {f"[{table}] {key}" for key in table_keys(table)}
+    for name, effect in EFFECTS.items():
+        keys |= {f"[{name}] {key}" for key in effect.limits()}
+    assert set(ROWS) == keys
 
 
 @pytest.mark.parametrize("name", EFFECTS)
@@ -38,7 +42,9 @@ def test_the_page_gives_the_ranges_of_effects(name: str) -> None:
 
 
 def test_the_page_says_where_a_range_is_refused_and_what_bounds_the_mtf() -> None:
-    single = {f"[{table}] {key}" for table in TABLES for key in table_keys(table) if key in SINGLE}
+    single = set[str]()
+    for table in TABLES:
+        single |= {f"[{table}] {key}" for key in table_keys(table) if key in SINGLE}
     assert {key for key, allowed in ROWS.items() if "no range" in allowed} == {
         *single,
         "[offset] offset_dn",
@@ -96,20 +102,16 @@ def test_the_pages_commands_are_understood_and_use_what_was_written_before() -> 
     """
     (block,) = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
     group = get_command(app)
-    known = {"scene.png", "raw.tif", "my-sensor.toml"}
+    files = {"scene.png", "raw.tif", "my-sensor.toml"}
     assert isinstance(group, TyperGroup)
     lines = [line.split()[1:] for line in block.splitlines()]
     for name, *words in lines:
         context = group.commands[name].make_context(name, [*words])
-        paths = {
-            word
-            for part in words
-            for word in part.split(",")
-            if re.search(r"\.(png|tif|toml|onnx)$", word)
-        }
+        parts = chain.from_iterable(word.split(",") for word in words)
+        paths = {part for part in parts if re.search(r"\.(png|tif|toml|onnx)$", part)}
         outputs = {str(context.params.get(key)) for key in ("out", "output", "board_file")} & {
             *words
         }
-        assert paths - outputs <= known, (name, paths - outputs - known)
-        known |= outputs
+        assert paths - outputs <= files, (name, paths - outputs - files)
+        files |= outputs
     assert [name for name, *_ in lines].count("restore") == 2

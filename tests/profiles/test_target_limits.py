@@ -14,10 +14,9 @@ from beers_deploy.profiles.target_limits import CONFIGURATION, TABLES, Limits
 from docs.make.target_file import BUILD, KEYS
 from tests.deploy.command_line import done, refused
 
-LIMITS: dict[tuple[str, str], Limits] = {
-    **{(table, key): limits for table, keys in TABLES.items() for key, limits in keys.items()},
-    **{(BUILD, key): limits for key, limits in CONFIGURATION.items()},
-}
+LIMITS: dict[tuple[str, str], Limits] = {}
+for place, entries in (*TABLES.items(), (BUILD, CONFIGURATION)):
+    LIMITS |= {(place, key): limits for key, limits in entries.items()}
 ANY_KEY = st.sampled_from(sorted(LIMITS))
 NOT_NUMBERS = (
     "nan",
@@ -55,7 +54,7 @@ def outside(draw: st.DrawFn, limits: Limits) -> float:
         st.floats(limits.high, 1e300, exclude_min=True),
     ]
     if limits.whole:
-        kinds.append(st.integers(int(limits.low), 1000).map(lambda whole: whole + 0.5))
+        kinds.append(st.integers(int(limits.low), 1000).map(lambda integer: integer + 0.5))
     return draw(st.one_of(kinds))
 
 
@@ -70,21 +69,21 @@ def test_a_number_that_no_board_has_is_refused(
     data: st.DataObject, place: tuple[str, str], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     value = data.draw(outside(LIMITS[place]))
-    for written in (f"{value!r}", f"[{min(value, 1.0)!r}, {max(value, 1.0)!r}]"):
-        said = refusal(board(tmp_path_factory.mktemp("board"), *place, written))
-        assert "my-board" in said
-        assert place[1] in said
-        assert f"{value:.12g}" in said
-        assert said.isprintable()
+    for text in (f"{value!r}", f"[{min(value, 1.0)!r}, {max(value, 1.0)!r}]"):
+        message = refusal(board(tmp_path_factory.mktemp("board"), *place, text))
+        assert "my-board" in message
+        assert place[1] in message
+        assert f"{value:.12g}" in message
+        assert message.isprintable()
 
 
 @given(place=ANY_KEY, value=st.sampled_from(NOT_NUMBERS))
 def test_what_is_no_number_is_refused(
     place: tuple[str, str], value: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    said = refusal(board(tmp_path_factory.mktemp("board"), *place, value))
-    assert "my-board" in said
-    assert place[1] in said
+    message = refusal(board(tmp_path_factory.mktemp("board"), *place, value))
+    assert "my-board" in message
+    assert place[1] in message
 
 
 @given(data=st.data(), place=ANY_KEY)
@@ -93,8 +92,8 @@ def test_every_number_within_the_limits_is_taken(
 ) -> None:
     limits = LIMITS[place]
     real = st.floats(limits.low, limits.high)
-    whole = st.integers(int(limits.low), int(limits.high))
-    value = float(data.draw(whole if limits.whole else real))
+    integers = st.integers(int(limits.low), int(limits.high))
+    value = float(data.draw(integers if limits.whole else real))
     profile = load_target(board(tmp_path_factory.mktemp("board"), *place, repr(value)))
     constants = profile.configuration("C32B3")[1] if place[0] == BUILD else profile.tables[place[0]]
     assert constants[place[1]].value == value
@@ -109,30 +108,27 @@ def test_commands_name_file_key_and_value(key: str, value: str, tmp_path: Path) 
         ("bench", "--target", path),
         ("profiles", path),
     ):
-        said = refused(*words)
+        message = refused(*words)
         assert (
             f"my-board.toml [configurations.C32B3] {key}: expected a whole number of at least 1"
-            in said
+            in message
         )
-        assert f"got {value}" in said
+        assert f"got {value}" in message
 
 
 def test_every_key_of_the_reference_has_limits() -> None:
-    documented = {(table, key) for table, keys in KEYS.items() for key in keys}
-    assert documented <= set(LIMITS)
+    for table, keys in KEYS.items():
+        assert {(table, key) for key in keys} <= set(LIMITS)
 
 
 @pytest.mark.parametrize("name", target_names())
 def test_shipped_targets_state_no_key_without_limits(name: str) -> None:
     target = load_target(name)
-    stated = {
-        (table, key)
-        for table, keys in target.tables.items()
-        for key in keys
-        if "published" not in table
-    }
-    stated |= {(BUILD, key) for keys in target.configurations.values() for key in keys}
-    assert stated <= set(LIMITS)
+    for table, keys in target.tables.items():
+        if "published" not in table:
+            assert {(table, key) for key in keys} <= set(LIMITS)
+    for keys in target.configurations.values():
+        assert {(BUILD, key) for key in keys} <= set(LIMITS)
 
 
 def test_a_published_figure_is_above_0(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ def test_hostile_toml_is_a_sentence_in_a_moment(name: str, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("text", "shown"),
+    ("text", "line"),
     [
         ("a = 1\nsnr_0 = 32 dB\nb = 2\n", "line 2, 'snr_0 = 32 dB': Expected newline"),
         ("a = 1\r\n\r\n  b = 1,5\r\n", "line 3, 'b = 1,5': Expected newline"),
@@ -56,14 +56,14 @@ def test_hostile_toml_is_a_sentence_in_a_moment(name: str, tmp_path: Path) -> No
     ],
 )
 def test_the_line_that_is_no_toml_is_quoted_wherever_a_user_s_toml_is_read(
-    text: str, shown: str, tmp_path: Path
+    text: str, line: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "mine.toml"
     path.write_bytes(text.encode())
     for load in (load_sensor, load_target, load_scene_call, limits_of):
         with pytest.raises(BeersError) as caught:
             load(str(path))
-        assert shown in str(caught.value)
+        assert line in str(caught.value)
         assert str(caught.value).isprintable()
 
 

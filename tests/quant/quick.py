@@ -38,10 +38,12 @@ def image(height: int = 37, width: int = 53, seed: int = 0) -> np.ndarray:
     return dn.astype(np.float32) / np.float32(4095)
 
 
-def patches_of(seen: list[np.ndarray]) -> Patches:
+def patches_of(images: list[np.ndarray]) -> Patches:
     """These images, each its own reference."""
     return Patches(
-        [], Remade(lambda k: (seen[k], seen[k]), len(seen)), Remade(lambda k: seen[k], len(seen))
+        [],
+        Remade(lambda k: (images[k], images[k]), len(images)),
+        Remade(lambda k: images[k], len(images)),
     )
 
 
@@ -71,11 +73,11 @@ def with_relu6(size: float) -> Graph:
 
 
 def in_float(
-    graph: Graph, seen: np.ndarray, ends: Ends = ONE_CHANNEL, name: str = CORRECTION
+    graph: Graph, image: np.ndarray, ends: Ends = ONE_CHANNEL, name: str = CORRECTION
 ) -> np.ndarray:
     """What a plane-reading float graph makes of an image, or another of its tensors."""
     session = open_session(graph_to_onnx(graph, [name], ends.planes * ends.channels))
-    return np.asarray(session.run(None, {PLANES: planes_of(seen, ends)})[0])
+    return np.asarray(session.run(None, {PLANES: planes_of(image, ends)})[0])
 
 
 def behind_conv(write: Callable[[GraphWriter], object]) -> onnx.ModelProto:

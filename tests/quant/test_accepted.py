@@ -35,10 +35,12 @@ def graph(float_onnx: onnx.ModelProto) -> Graph:
 
 def with_conv(graph: Graph, name: str, **changes: Callable[[Any], Any]) -> Graph:
     """The graph in which one convolution has other arrays, or another input."""
-    found = next(op for op in graph if op.name == name)
-    assert isinstance(found, Conv)
-    other = replace(found, **{key: change(getattr(found, key)) for key, change in changes.items()})
-    return tuple(other if op is found else op for op in graph)
+    operator = next(op for op in graph if op.name == name)
+    assert isinstance(operator, Conv)
+    other = replace(
+        operator, **{key: change(getattr(operator, key)) for key, change in changes.items()}
+    )
+    return tuple(other if op is operator else op for op in graph)
 
 
 def twice(values: np.ndarray) -> np.ndarray:
@@ -46,7 +48,7 @@ def twice(values: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "said"),
+    ("spoil", "message"),
     [
         (lambda _: (), "no operation"),
         (
@@ -66,10 +68,10 @@ def twice(values: np.ndarray) -> np.ndarray:
     ],
 )
 def test_what_cannot_be_quantised_is_refused(
-    spoil: Callable[[Graph], Graph], said: str, graph: Graph
+    spoil: Callable[[Graph], Graph], message: str, graph: Graph
 ) -> None:
     check_network(Network(graph))
-    with pytest.raises(ModelError, match=said):
+    with pytest.raises(ModelError, match=message):
         check_network(Network(spoil(graph)))
 
 
@@ -82,8 +84,8 @@ def test_a_layer_that_never_fires_costs_nothing(
 
     def mae(model: onnx.ModelProto) -> float:
         with one_guess():
-            made = quantise_model(model, patches, {}).host
-        return compare(open_session(model), open_session(made), unseen.pairs).mae
+            int8 = quantise_model(model, patches, {}).host
+        return compare(open_session(model), open_session(int8), unseen.pairs).mae
 
     assert mae(dead) < 1.5 * mae(float_onnx)
 

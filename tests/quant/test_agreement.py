@@ -29,14 +29,14 @@ def test_every_layer_of_a_shipped_file_is_equal(path: Path) -> None:
     model = load_onnx(path)
     core = read_core(model)
     height, width = (size - size % core.ends.place_px for size in IMAGE.shape[2:])
-    found = agreement(core, model, IMAGE[:1, :, :height, :width])
-    assert {layer.unequal for layer in found.layers} == {0.0}
-    assert (found.up != found.even).any()
+    layers = agreement(core, model, IMAGE[:1, :, :height, :width])
+    assert {layer.unequal for layer in layers.layers} == {0.0}
+    assert (layers.up != layers.even).any()
 
 
 def test_a_layer_that_computes_something_else_is_found(quantised: Quantised) -> None:
-    spoilt = changed(quantised.host, "body.0.second.bias", lambda bias: bias * 2 + 900)
-    layers = agreement(quantised.core, spoilt, IMAGE).layers
+    corrupted = changed(quantised.host, "body.0.second.bias", lambda bias: bias * 2 + 900)
+    layers = agreement(quantised.core, corrupted, IMAGE).layers
     unequal = {layer.report.name: layer.unequal > 0 for layer in layers}
     assert not unequal["body.0.first"]
     assert unequal["body.0.second"]
@@ -44,12 +44,12 @@ def test_a_layer_that_computes_something_else_is_found(quantised: Quantised) -> 
 
 
 def test_what_the_rule_moves_is_counted(quantised: Quantised) -> None:
-    found = agreement(quantised.core, quantised.host, IMAGE)
+    layers = agreement(quantised.core, quantised.host, IMAGE)
     up, even = (run_core(quantised.core, split(IMAGE), half_even=rule)[0] for rule in (False, True))
-    for layer, op in zip(found.layers, quantised.core.ops, strict=True):
+    for layer, op in zip(layers.layers, quantised.core.ops, strict=True):
         difference = up[op.output] - even[op.output]
         assert layer.moved == pytest.approx(np.count_nonzero(difference) / difference.size)
         assert layer.moved_by == np.abs(difference).max()
-    np.testing.assert_array_equal(found.up, merged_correction(quantised.core, up))
-    np.testing.assert_array_equal(found.even, merged_correction(quantised.core, even))
-    assert max(layer.moved for layer in found.layers) > 0
+    np.testing.assert_array_equal(layers.up, merged_correction(quantised.core, up))
+    np.testing.assert_array_equal(layers.even, merged_correction(quantised.core, even))
+    assert max(layer.moved for layer in layers.layers) > 0

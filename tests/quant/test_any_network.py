@@ -43,7 +43,7 @@ def images(name: str, count: int = 3, side_px: int = SIDE_PX) -> list[np.ndarray
     side = NETWORKS[name].side_px or side_px
     generator = np.random.default_rng(7)
     rows, columns = np.mgrid[:side, :side] / side
-    found = []
+    patches = []
     for k in range(count):
         waves = (
             0.3
@@ -52,8 +52,8 @@ def images(name: str, count: int = 3, side_px: int = SIDE_PX) -> list[np.ndarray
         )
         bands = [waves * share for share in np.linspace(1, 0.5, NETWORKS[name].inputs)]
         noisy = np.stack(bands) + 0.01 * generator.standard_normal((len(bands), side, side))
-        found.append(np.clip(noisy, 0, 1).astype(np.float32)[None])
-    return found
+        patches.append(np.clip(noisy, 0, 1).astype(np.float32)[None])
+    return patches
 
 
 def float_network(name: str) -> onnx.ModelProto:
@@ -67,28 +67,28 @@ def quantised(name: str) -> Quantised:
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_int8_stays_near_float(name: str) -> None:
-    made = quantised(name)
-    seen = images(name)[1]
-    wanted = made.core.ends.clipped(result_of(open_session(float_network(name)), seen))
-    found = result_of(open_session(made.host), seen)
-    assert found.shape == wanted.shape
-    assert np.abs(found - wanted).mean() < 0.15 * max(float(wanted.std()), 0.05)
+    int8 = quantised(name)
+    image = images(name)[1]
+    expected = int8.core.ends.clipped(result_of(open_session(float_network(name)), image))
+    actual = result_of(open_session(int8.host), image)
+    assert actual.shape == expected.shape
+    assert np.abs(actual - expected).mean() < 0.15 * max(float(expected.std()), 0.05)
 
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_the_integer_reference_is_the_runtime_bit_for_bit(name: str) -> None:
-    made = quantised(name)
-    seen = images(name)[2]
-    found = agreement(made.core, made.host, seen)
-    assert [layer.report.name for layer in found.layers if layer.unequal] == []
-    whole = result_of(open_session(made.host), seen)
-    np.testing.assert_array_equal(made.core.ends.finished(seen, found.even), whole)
+    int8 = quantised(name)
+    image = images(name)[2]
+    layers = agreement(int8.core, int8.host, image)
+    assert [layer.report.name for layer in layers.layers if layer.unequal] == []
+    result = result_of(open_session(int8.host), image)
+    np.testing.assert_array_equal(int8.core.ends.finished(image, layers.even), result)
 
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_what_is_trained_computes_the_reference_s_whole_numbers(name: str) -> None:
-    made = quantised(name)
-    hold_to_reference(moved(made.core), made.core.ends.split(images(name, 4)[3]))
+    int8 = quantised(name)
+    hold_to_reference(moved(int8.core), int8.core.ends.split(images(name, 4)[3]))
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -103,53 +103,56 @@ def test_no_image_leaves_the_proven_bounds(name: str) -> None:
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_a_file_is_read_back_as_the_core_it_was_written_from(name: str) -> None:
-    made = quantised(name)
-    again = read_core(made.host)
-    assert encoding_faults(made.host) == []
-    for one, other in zip(again.convolutions, made.core.convolutions, strict=True):
+    int8 = quantised(name)
+    core = read_core(int8.host)
+    assert encoding_faults(int8.host) == []
+    for one, other in zip(core.convolutions, int8.core.convolutions, strict=True):
         np.testing.assert_array_equal(one.weight, other.weight)
         assert (one.window, one.groups, one.activation) == (
             other.window,
             other.groups,
             other.activation,
         )
-    planes = made.core.ends.split(images(name)[0])
+    planes = int8.core.ends.split(images(name)[0])
     np.testing.assert_array_equal(
-        run_core(again, planes)[0]["correction"], run_core(made.core, planes)[0]["correction"]
+        run_core(core, planes)[0]["correction"], run_core(int8.core, planes)[0]["correction"]
     )
 
 
 def test_a_weight_that_is_not_what_the_file_says_is_a_fault() -> None:
-    spoilt = copied(quantised("unet").host)
-    node = next(each for each in spoilt.graph.node if each.op_type == "ConvInteger")
+    corrupted = copied(quantised("unet").host)
+    node = next(
+        candidate for candidate in corrupted.graph.node if candidate.op_type == "ConvInteger"
+    )
     node.attribute[0].ints[0] += 1
-    assert encoding_faults(spoilt) == [f"node {node.name}"]
+    assert encoding_faults(corrupted) == [f"node {node.name}"]
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        lambda said: said["ops"][0].update(kind="Sort"),
-        lambda said: said["ops"][0]["window"].update(strides=[10**9, 10**9]),
-        lambda said: said["ends"].update(planes="three"),
-        lambda said: said["frac_bits"].update(planes=10**9),
-        lambda said: said["ops"][0].pop("weight"),
-        lambda said: said.pop("ends"),
-        lambda said: said["ops"].clear(),
+        lambda description: description["ops"][0].update(kind="Sort"),
+        lambda description: description["ops"][0]["window"].update(strides=[10**9, 10**9]),
+        lambda description: description["ends"].update(planes="three"),
+        lambda description: description["frac_bits"].update(planes=10**9),
+        lambda description: description["ops"][0].pop("weight"),
+        lambda description: description.pop("ends"),
+        lambda description: description["ops"].clear(),
     ],
 )
 def test_a_description_of_something_else_is_one_sentence(
     change: Callable[[dict[str, Any]], object],
 ) -> None:
-    spoilt = copied(quantised("unet").host)
-    entry = next(each for each in spoilt.metadata_props if each.key == KEY)
-    said = json.loads(entry.value)
-    change(said)
-    entry.value = json.dumps(said)
-    with suppress(ModelError):  # read or refused, by nothing else
-        assert encoding_faults(spoilt)
+    corrupted = copied(quantised("unet").host)
+    entry = next(candidate for candidate in corrupted.metadata_props if candidate.key == KEY)
+    description = json.loads(entry.value)
+    change(description)
+    entry.value = json.dumps(description)
+    # The file may be read or refused with ModelError. No other error may come out.
     with suppress(ModelError):
-        as_on_board(spoilt)
+        assert encoding_faults(corrupted)
+    with suppress(ModelError):
+        as_on_board(corrupted)
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -188,15 +191,17 @@ def one_convolution(weight: float, bias: float) -> onnx.ModelProto:
 def test_windows_make_a_result_finer_than_8_bits(
     weight: float, bias: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen = images("ffdnet")
-    patches = patches_of(seen)
+    image_list = images("ffdnet")
+    patches = patches_of(image_list)
     model = one_convolution(weight, bias)
     errors = []
     for dual in (True, False):
         if not dual:
             monkeypatch.setattr("beers_deploy.quant.quantise.takes_gains", lambda _: False)
-        made = quantise_model(model, patches, {})
-        wanted = result_of(open_session(model), seen[0])
-        errors.append(float(np.abs(result_of(open_session(made.host), seen[0]) - wanted).mean()))
-        assert encoding_faults(made.host) == []
+        int8 = quantise_model(model, patches, {})
+        expected = result_of(open_session(model), image_list[0])
+        errors.append(
+            float(np.abs(result_of(open_session(int8.host), image_list[0]) - expected).mean())
+        )
+        assert encoding_faults(int8.host) == []
     assert errors[0] < 0.4 * errors[1]

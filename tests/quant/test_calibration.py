@@ -4,6 +4,7 @@ in pieces.
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 import pytest
@@ -45,11 +46,11 @@ def drawn(scenes: list[Scene]) -> Patches:
 
 def test_patches_are_the_same_however_they_are_asked_for(drawn: Patches) -> None:
     passes = [list(drawn.pairs), list(drawn.pairs)]
-    for number, (once, again) in enumerate(zip(*passes, strict=True)):
+    for number, (once, second) in enumerate(zip(*passes, strict=True)):
         alone = drawn.degraded[number]
         assert alone.shape == once[1].shape == (1, 1, 40, 40)
         assert alone.dtype == once[1].dtype == np.float32
-        np.testing.assert_array_equal(once, again)
+        np.testing.assert_array_equal(once, second)
         np.testing.assert_array_equal(alone, once[0])
     with pytest.raises(IndexError):
         drawn.pairs[12]
@@ -76,10 +77,10 @@ def test_the_ranges_are_covered_without_gaps(scenes: list[Scene]) -> None:
     views = draw_patches(scenes, VARIABLE, REFERENCE, count=40, seed=0, patch_px=40).views
     low = VARIABLE.mtf_nyquist.low
     high = VARIABLE.mtf_nyquist.high
-    found = (np.sort([view.degraded.mtf_nyquist for view in views]) - low) / (high - low)
-    assert found[0] < 2 / 40
-    assert found[-1] > 1 - 2 / 40
-    assert np.diff(found).max() < 3 / 40
+    positions = (np.sort([view.degraded.mtf_nyquist for view in views]) - low) / (high - low)
+    assert positions[0] < 2 / 40
+    assert positions[-1] > 1 - 2 / 40
+    assert np.diff(positions).max() < 3 / 40
 
 
 def test_a_whole_response_stays_with_every_view(scenes: list[Scene]) -> None:
@@ -96,8 +97,8 @@ def test_a_whole_response_stays_with_every_view(scenes: list[Scene]) -> None:
 def test_each_group_gives_one(count: int, size: int, seed: int) -> None:
     generator = np.random.default_rng(seed)
     candidates = [float(k) for k in generator.permutation(count * size)]
-    chosen = stratified(candidates, lambda value: value, count, generator)
-    assert sorted(int(value) // size for value in chosen) == list(range(count))
+    picks = stratified(candidates, lambda value: value, count, generator)
+    assert sorted(int(value) // size for value in picks) == list(range(count))
 
 
 def test_light_blur_and_noise_are_matched_at_random(scenes: list[Scene]) -> None:
@@ -122,22 +123,25 @@ def test_scenes_too_small_for_a_patch_are_refused(scenes: list[Scene]) -> None:
 def test_pieces_hold_what_the_whole_image_gives(graph: Graph, shape: tuple[int, int]) -> None:
     """And no run returns more than a piece with its halo, which bounds memory."""
     names = tensors(graph)
-    whole = image(*shape)
+    full_image = image(*shape)
     halo_px = halo_of(graph)
     assert halo_px is not None
     session = open_session(graph_to_onnx(graph, names))
-    wanted = session.run(names, {PLANES: planes_of(whole)})
-    pieces, without_halo = (list(tensor_values(session, names, whole, px)) for px in (halo_px, 0))
-    for k, tensor in enumerate(wanted):
+    expected = session.run(names, {PLANES: planes_of(full_image)})
+    pieces, without_halo = (
+        list(tensor_values(session, names, full_image, px)) for px in (halo_px, 0)
+    )
+    for k, tensor in enumerate(expected):
         assert sum(piece[k].size for piece in pieces) == tensor.size
         assert max(np.abs(piece[k]).max() for piece in pieces) == pytest.approx(
             np.abs(tensor).max(), rel=1e-5
         )
         assert energy(piece[k] for piece in pieces) == pytest.approx(energy([tensor]), rel=1e-5)
-    assert max(each.base.shape[2] for piece in pieces for each in piece) <= TILE_PX + 2 * halo_px  # type: ignore[union-attr]
+    sides_px = [array.base.shape[2] for array in chain.from_iterable(pieces)]  # type: ignore[union-attr]
+    assert max(sides_px) <= TILE_PX + 2 * halo_px
     if len(pieces) > 1:
         assert energy(piece[-1] for piece in without_halo) != pytest.approx(
-            energy(wanted[-1:]), rel=1e-5
+            energy(expected[-1:]), rel=1e-5
         )
 
 
@@ -146,23 +150,22 @@ def energy(parts: Iterable[np.ndarray]) -> float:
 
 
 def test_crops_tile_the_image() -> None:
-    whole = image(2 * TILE_PX + 5, TILE_PX)
-    found = crops(whole)
-    assert [max(crop.shape) <= TILE_PX for crop in found] == [True] * 3
-    np.testing.assert_array_equal(np.concatenate(found, axis=2), whole)
+    full_image = image(2 * TILE_PX + 5, TILE_PX)
+    pieces = crops(full_image)
+    assert [max(crop.shape) <= TILE_PX for crop in pieces] == [True] * 3
+    np.testing.assert_array_equal(np.concatenate(pieces, axis=2), full_image)
 
 
 def test_positions_of_a_large_image_are_those_of_its_whole(
     graph: Graph, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In pieces or at once: found here by hand from whole tensors."""
-    whole = image(TILE_PX + 21, 50)
-    monkeypatch.setattr(
-        "beers_deploy.quant.quantise._errors", lambda *_: np.zeros(1)
-    )  # the scale that clips nothing
-    frac_bits = choose_frac_bits(graph, [whole])
+    full_image = image(TILE_PX + 21, 50)
+    # Without errors to weigh up, calibration takes the scale that clips nothing.
+    monkeypatch.setattr("beers_deploy.quant.quantise._errors", lambda *_: np.zeros(1))
+    frac_bits = choose_frac_bits(graph, [full_image])
     names = tensors(graph)
-    values = open_session(graph_to_onnx(graph, names)).run(names, {PLANES: planes_of(whole)})
+    values = open_session(graph_to_onnx(graph, names)).run(names, {PLANES: planes_of(full_image)})
     for name, tensor in zip(names, values, strict=True):
         largest = float(np.abs(tensor).max())
         assert largest * 2.0 ** frac_bits[name] <= 127 < largest * 2.0 ** (frac_bits[name] + 1)

@@ -42,34 +42,34 @@ def network(dead: int, seed: int = 0) -> Graph:
 
 
 def results(graph: Graph, name: str = CORRECTION) -> np.ndarray:
-    return np.concatenate([in_float(graph, each, name=name) for each in SEEN])
+    return np.concatenate([in_float(graph, view, name=name) for view in SEEN])
 
 
 @pytest.mark.parametrize("dead", [1, 3, 5])
 def test_the_network_stays_and_dead_channels_are_those_that_cost_most(dead: int) -> None:
     graph = network(dead)
-    found, copies = with_copies(graph, lone_tensors(graph), SEEN, Ends())
-    np.testing.assert_allclose(results(found), results(graph), atol=1e-5)
+    duplicated, copies = with_copies(graph, lone_tensors(graph), SEEN, Ends())
+    np.testing.assert_allclose(results(duplicated), results(graph), atol=1e-5)
     count = min(dead, 7 - dead)
     assert {name: list(channels) for name, channels in copies.items() if name != "c"} == {
         name: list(range(1, 1 + count)) for name in "ab"
     }
     for name in "ab":
-        values = results(found, name)
+        values = results(duplicated, name)
         assert all(
             (values[:, [c]] == np.delete(values, c, 1)).all((0, 2, 3)).any() for c in copies[name]
         )
     size = results(graph, "b").max((0, 2, 3))
     weights = np.square(graph[2].weight).sum((0, 2, 3))  # type: ignore[attr-defined]
     most = int(np.argmax(np.square(size) * weights))
-    np.testing.assert_allclose(found[2].weight[:, most], graph[2].weight[:, most] / 2)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(duplicated[2].weight[:, most], graph[2].weight[:, most] / 2)  # type: ignore[attr-defined]
 
 
 def test_without_dead_channels_nothing_changes() -> None:
     graph = network(0)
     graph = (*graph[:2], replace(graph[2], bias=np.full(4, 10, np.float32)), graph[3])  # type: ignore[type-var]
-    found, copies = with_copies(graph, lone_tensors(graph), SEEN, Ends())
-    assert found is graph
+    duplicated, copies = with_copies(graph, lone_tensors(graph), SEEN, Ends())
+    assert duplicated is graph
     assert copies == {}
 
 
@@ -77,8 +77,8 @@ def test_a_run_ends_at_dense_convolutions_that_alone_read_it() -> None:
     graph = network(1)
     assert runs(graph, ["a", "b", "c"]) == [["a", "b"], ["c"]]
     assert runs(graph, ["a", "c"]) == [["c"]]
-    beside = *graph[:2], replace(graph[1], name="d.conv", output="d"), *graph[2:]  # type: ignore[type-var]
-    assert runs((*beside, Add("sum", ("d", "d"), "e")), ["a", "b", "c"]) == [["c"]]
+    branched = *graph[:2], replace(graph[1], name="d.conv", output="d"), *graph[2:]  # type: ignore[type-var]
+    assert runs((*branched, Add("sum", ("d", "d"), "e")), ["a", "b", "c"]) == [["c"]]
 
 
 def test_copies_have_ranges_of_their_own() -> None:

@@ -28,33 +28,36 @@ def moments_of(*parts: np.ndarray) -> Moments:
     return moments
 
 
-def squared(whole: np.ndarray, wanted: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    error = whole - wanted
+def squared(rounded: np.ndarray, target: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    error = rounded - target
     return np.asarray(((error @ covariance) * error).sum(axis=1))
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 7), st.integers(1, 12))
 def test_no_channel_errs_more_than_rounded_to_nearest(seed: int, channels: int, size: int) -> None:
     generator = np.random.default_rng(seed)
-    wanted = generator.uniform(-127, 127, (channels, size))
+    target = generator.uniform(-127, 127, (channels, size))
     windows = generator.normal(0, 1, (3 * size, size)) + generator.normal(0, 3, (3 * size, 1))
     covariance = windows.T @ windows / len(windows) + 1e-6 * np.eye(size)
-    nearest = np.rint(wanted)
-    found = descend(wanted, covariance)
-    assert (squared(found, wanted, covariance) <= squared(nearest, wanted, covariance) + 1e-9).all()
-    assert (found == np.rint(found)).all()
-    assert np.abs(found).max() <= 128
+    nearest = np.rint(target)
+    integers = descend(target, covariance)
+    assert (
+        squared(integers, target, covariance) <= squared(nearest, target, covariance) + 1e-9
+    ).all()
+    assert (integers == np.rint(integers)).all()
+    assert np.abs(integers).max() <= 128
 
 
 def test_weights_that_meet_the_same_pixel_keep_their_sum() -> None:
-    wanted = np.full((1, 9), 0.3)
-    found = descend(wanted, np.ones((9, 9)) + 1e-3 * np.eye(9))
-    assert found.sum() == 3  # nearest to 2.7; each by itself rounds to 0
+    target = np.full((1, 9), 0.3)
+    integers = descend(target, np.ones((9, 9)) + 1e-3 * np.eye(9))
+    # The sum is the integer nearest to 2.7. Each weight rounded separately would be 0.
+    assert integers.sum() == 3
 
 
 def test_of_weights_that_meet_unrelated_values_the_nearest_stay() -> None:
-    wanted = np.random.default_rng(2).uniform(-120, 120, (4, 18))
-    assert (descend(wanted, np.diag(np.arange(1.0, 19))) == np.rint(wanted)).all()
+    target = np.random.default_rng(2).uniform(-120, 120, (4, 18))
+    assert (descend(target, np.diag(np.arange(1.0, 19))) == np.rint(target)).all()
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(-4, -1), st.integers(1, 5))
@@ -63,15 +66,17 @@ def test_weights_of_a_channel_that_hardly_changes_stay_near(
 ) -> None:
     generator = np.random.default_rng(seed)
     spread = np.where(np.arange(12) < still, 10.0**exponent, 1.0)
-    seen, other = (
+    calm, other = (
         generator.normal(0, 1, (400, 12)) + generator.normal(0, 2, (400, 1)) for _ in range(2)
     )
-    moments = moments_of((3 + spread * seen).astype(np.float32)[:, None])
-    wanted = generator.uniform(-100, 100, (24, 12))
-    found = descend(wanted, moments.covariance[0])
-    assert np.abs(found - wanted).max() <= 4
+    moments = moments_of((3 + spread * calm).astype(np.float32)[:, None])
+    target = generator.uniform(-100, 100, (24, 12))
+    integers = descend(target, moments.covariance[0])
+    assert np.abs(integers - target).max() <= 4
     covariance = np.cov(spread * other, rowvar=False)
-    errors = [squared(whole, wanted, covariance).mean() for whole in (found, np.rint(wanted))]
+    errors = [
+        squared(rounded, target, covariance).mean() for rounded in (integers, np.rint(target))
+    ]
     assert errors[0] <= errors[1]
 
 
@@ -90,19 +95,21 @@ def test_each_group_is_fitted_to_what_it_reads_in_int8_and_to_its_float_mean(
 ) -> None:
     generator = np.random.default_rng(seed)
     exact = generator.normal(0, 1, (500, groups, 6)) + generator.normal(2, 2, (500, groups, 1))
-    read = np.floor(2 * exact) / 2
+    in_int8 = np.floor(2 * exact) / 2
     unit = 2.0**-3
     weight = generator.uniform(-10, 10, (outputs * groups, 6, 1, 1)).astype(np.float32)
     moments = Moments.of_none(groups, 6)
-    moments.add(read.astype(np.float32), exact.astype(np.float32))
-    fitted, raised = fit(weight, unit, moments)
-    wanted, found = (values.reshape(groups, outputs, 6) for values in (weight, unit * fitted))
-    lost = np.einsum("kgn,gon->kgo", read, found) - np.einsum("kgn,gon->kgo", exact, wanted)
-    assert_allclose(raised, lost.mean(axis=0).ravel(), atol=1e-3)
-    for each, meant, covariance in zip(
-        found / unit, wanted / unit, moments.covariance, strict=True
+    moments.add(in_int8.astype(np.float32), exact.astype(np.float32))
+    fitted, bias_change = fit(weight, unit, moments)
+    target, result = (values.reshape(groups, outputs, 6) for values in (weight, unit * fitted))
+    deviation = np.einsum("kgn,gon->kgo", in_int8, result) - np.einsum(
+        "kgn,gon->kgo", exact, target
+    )
+    assert_allclose(bias_change, deviation.mean(axis=0).ravel(), atol=1e-3)
+    for group, group_target, covariance in zip(
+        result / unit, target / unit, moments.covariance, strict=True
     ):
-        assert (each == descend(meant, covariance)).all()
+        assert (group == descend(group_target, covariance)).all()
 
 
 @pytest.mark.parametrize("depthwise", [False, True])
@@ -115,14 +122,14 @@ def test_every_layer_errs_less(
     exact = open_session(graph_to_onnx(graph, tensors(graph)))
     errors = np.zeros((2, len(graph)))
     for image in unseen.degraded:
-        wanted = exact.run(None, {PLANES: planes_of(image)})
+        expected = exact.run(None, {PLANES: planes_of(image)})
         for k, core in enumerate((nearest, fitted)):
-            found, _ = run_core(core, core.ends.split(image))
-            scaled = (found[op.output] * core.scale(op.output) for op in core.ops)
-            errors[k] += [np.square(a - b).mean() for a, b in zip(scaled, wanted, strict=True)]
-    behind = (
-        1 if depthwise else 0
-    )  # the first of so few channels errs by chance, and reads nothing that is rounded
+            results, _ = run_core(core, core.ends.split(image))
+            scaled = (results[op.output] * core.scale(op.output) for op in core.ops)
+            errors[k] += [np.square(a - b).mean() for a, b in zip(scaled, expected, strict=True)]
+    # The first layer reads the image, which is not rounded. With so few channels its error is down
+    # to chance.
+    behind = 1 if depthwise else 0
     assert (errors[1] < errors[0])[behind:].all()
 
 

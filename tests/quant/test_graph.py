@@ -93,8 +93,10 @@ def test_one_number_a_channel_behind_an_activation_is_a_convolution(
 
     last = read_network(behind_conv(write)).graph[-1]
     assert isinstance(last, Conv)
-    each = np.broadcast_to(value.ravel(), 2)
-    factor, offset = {"Add": (1, each), "Sub": (1, -each), "Mul": (each, 0)}[kind]
+    per_channel = np.broadcast_to(value.ravel(), 2)
+    factor, offset = {"Add": (1, per_channel), "Sub": (1, -per_channel), "Mul": (per_channel, 0)}[
+        kind
+    ]
     assert (last.weight.ravel() == factor).all()
     assert (last.bias == offset).all()
 
@@ -119,11 +121,11 @@ def test_a_nearest_resize_is_taken_where_it_makes_blocks(
 
     model = behind_conv(write)
     pixels = np.random.default_rng(0).random((1, 1, 5, 7), np.float32)
-    found = result_of(open_session(model), pixels)[:, :1]
+    result = result_of(open_session(model), pixels)[:, :1]
     # With aligned corners the places depend on the image's size: right for this one is not right
     # for all.
     if where != "align_corners" and np.array_equal(
-        found, pixels.repeat(factor, 2).repeat(factor, 3)
+        result, pixels.repeat(factor, 2).repeat(factor, 3)
     ):
         last = read_network(model).graph[-1]
         assert isinstance(last, Resize)
@@ -134,7 +136,7 @@ def test_a_nearest_resize_is_taken_where_it_makes_blocks(
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("attributes", "message"),
     [
         ({"strides": [2, 1]}, "one stride"),
         ({"strides": [2, 2], "dilations": [2, 2]}, "one stride"),
@@ -143,7 +145,7 @@ def test_a_nearest_resize_is_taken_where_it_makes_blocks(
     ],
 )
 def test_transposed_convolutions_that_the_dpu_lacks_are_refused(
-    given: dict[str, Any], said: str
+    attributes: dict[str, Any], message: str
 ) -> None:
     def write(w: GraphWriter) -> None:
         w.node(
@@ -151,10 +153,10 @@ def test_transposed_convolutions_that_the_dpu_lacks_are_refused(
             "restored",
             ["x", w.constant("t", np.ones((2, 2, 2, 2), np.float32))],
             "up",
-            **given,
+            **attributes,
         )
 
-    with pytest.raises(ModelError, match=f"{said}.* at ConvTranspose up"):
+    with pytest.raises(ModelError, match=f"{message}.* at ConvTranspose up"):
         read_network(behind_conv(write))
 
 

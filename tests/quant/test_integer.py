@@ -90,7 +90,8 @@ def test_products_saturate_at_int8_s_ends() -> None:
 def test_bias_is_aligned_and_relu_comes_before_the_shift() -> None:
     op = one_conv(1, 3, 1, Activation.relu).ops[0]
     assert isinstance(op, IntConv)
-    aligned = IntCore((replace(op, bias_frac_bits=-2),), {PLANES: 0, CORRECTION: -1})  # 3 << 2 = 12
+    # The bias is aligned to the product: 3 << 2 = 12.
+    aligned = IntCore((replace(op, bias_frac_bits=-2),), {PLANES: 0, CORRECTION: -1})
     assert values(aligned, [-20, -12, -10, 0, 10]) == [0, 0, 1, 6, 11]
 
 
@@ -102,5 +103,6 @@ def test_an_add_aligns_to_the_finer_scale() -> None:
         add,
     )
     core = IntCore(ops, {PLANES: 0, "x": 0, "y": 1, CORRECTION: 0})
-    # x = v with no fractional bit, y = v with one, which is v / 2: 1.5 v, half up
+    # x is v without a fractional bit. y is v with one, which is v / 2. The sum is 1.5 v, rounded
+    # half up.
     assert values(core, [-3, -1, 0, 1, 2, 3, 100]) == [-4, -1, 0, 2, 3, 5, 127]

@@ -81,20 +81,22 @@ def convolution(
         helper.make_tensor_value_info(name, element, ["N", None, "H", "W"])
         for name in ("image", "result")
     ]
-    held = [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()]
+    initializers = [
+        numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()
+    ]
     node = helper.make_node("QLinearConv", feeds, ["result"], name="convolution", group=groups)
-    graph = helper.make_graph([node], "one", ends[:1], ends[1:], held)
+    graph = helper.make_graph([node], "one", ends[:1], ends[1:], initializers)
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
 
 
 def by_definition(model: onnx.ModelProto, image: np.ndarray) -> np.ndarray:
     """What such a convolution is, tap by tap in int64: no padding, half to even."""
-    held = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
+    values = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
     groups = model.graph.node[0].attribute[0].i
-    shifted = image.astype(np.int64) - int(held["middle"])
+    shifted = image.astype(np.int64) - int(values["middle"])
     weight = (
-        held["weight"].astype(np.int64)
-        - held["weight_middle"].astype(np.int64).reshape(-1, *([1] * 3))[:1]
+        values["weight"].astype(np.int64)
+        - values["weight_middle"].astype(np.int64).reshape(-1, *([1] * 3))[:1]
     )
     per_group = weight.shape[1]
     kernel = weight.shape[2]
@@ -103,10 +105,12 @@ def by_definition(model: onnx.ModelProto, image: np.ndarray) -> np.ndarray:
     for o in range(len(weight)):
         first = o // (len(weight) // groups) * per_group
         for dy, dx in np.ndindex(kernel, kernel):
-            seen = shifted[:, first : first + per_group, dy : dy + height, dx : dx + width]
-            sums[:, o] += np.einsum("nchw,c->nhw", seen, weight[o, :, dy, dx])
-    scale = held["weight_unit"].astype(np.float64).reshape(-1, 1, 1) / float(held["result_unit"])
-    result = np.rint((sums + held["bias"][:, None, None]) * scale) + int(held["middle"])
+            window = shifted[:, first : first + per_group, dy : dy + height, dx : dx + width]
+            sums[:, o] += np.einsum("nchw,c->nhw", window, weight[o, :, dy, dx])
+    scale = values["weight_unit"].astype(np.float64).reshape(-1, 1, 1) / float(
+        values["result_unit"]
+    )
+    result = np.rint((sums + values["bias"][:, None, None]) * scale) + int(values["middle"])
     limits = np.iinfo(image.dtype)
     return np.asarray(np.clip(result, limits.min, limits.max), image.dtype)
 
@@ -129,7 +133,8 @@ def test_any_convolution_is_added_exactly(
     generator = np.random.default_rng(seed)
     outputs, inputs, kernel, groups = shape
     weight = generator.integers(-128, 128, (outputs, inputs, kernel, kernel)).astype(np.int8)
-    if large:  # as many as can be at the ends of what they hold
+    # Weights at the ends of INT8 make the sums as large as they can be.
+    if large:
         weight = np.where(weight > 0, np.int8(127), np.int8(-128))
     limits = np.iinfo(kind)
     image = generator.choice([limits.min, limits.max, 0], (2, inputs * groups, 7, 9)).astype(kind)
@@ -182,11 +187,15 @@ def test_what_is_proven_holds_for_the_worst_activations(
 @pytest.mark.parametrize(
     ("pair", "largest", "proven"),
     [
-        ((64, 64), 255, True),  # 32 640
-        ((64, 65), 255, False),  # 32 895
-        ((127, -128), 255, True),  # each by itself
+        # 2 x 64 x 255 = 32 640 fits int16, which ends at 32 767.
+        ((64, 64), 255, True),
+        # (64 + 65) x 255 = 32 895 does not.
+        ((64, 65), 255, False),
+        # Weights of opposite signs do not add up.
+        ((127, -128), 255, True),
         ((-64, -65), 255, False),
-        ((127, 127), 127, True),  # behind a ReLU, 32 258
+        # Behind a ReLU activations end at 127, and 2 x 127 x 127 = 32 258 fits.
+        ((127, 127), 127, True),
         ((-128, -128), 127, True),
     ],
 )
@@ -204,11 +213,11 @@ def test_shipped_networks_are_those_of_the_integer_reference(path: Path, optimis
     model = load_onnx(path)
     generator = np.random.default_rng(5)
     core = read_core(model)
-    drawn = generator.random((1, 1, 37, 53)), generator.integers(0, 2, (1, 1, 24, 41))
-    for image in (each.astype(np.float32) for each in drawn):
+    images = generator.random((1, 1, 37, 53)), generator.integers(0, 2, (1, 1, 24, 41))
+    for image in (pixels.astype(np.float32) for pixels in images):
         tensors, _ = run_core(core, core.ends.split(image), half_even=True)
-        wanted = np.clip(image + merged_correction(core, tensors), 0, 1)
-        assert np.array_equal(run(open_session(model, 1, optimise, exact=True), image), wanted)
+        expected = np.clip(image + merged_correction(core, tensors), 0, 1)
+        assert np.array_equal(run(open_session(model, 1, optimise, exact=True), image), expected)
 
 
 @pytest.mark.parametrize("path", SMALL, ids=lambda path: path.stem)
@@ -238,13 +247,13 @@ def test_products_of_matrices_are_added_exactly_too() -> None:
     generator = np.random.default_rng(1)
     weight = generator.choice([-128, 127], (33, 17)).astype(np.int8)
     image = generator.choice([0, 255], (5, 33)).astype(np.uint8)
-    given_, wanted = (
+    given_, sums_info = (
         helper.make_tensor_value_info(name, kind, None)
         for name, kind in (("image", TensorProto.UINT8), ("sums", TensorProto.INT32))
     )
     node = helper.make_node("MatMulInteger", ["image", "weight"], ["sums"])
-    held = [numpy_helper.from_array(weight, "weight")]
-    graph = helper.make_graph([node], "one", [given_], [wanted], held)
+    initializers = [numpy_helper.from_array(weight, "weight")]
+    graph = helper.make_graph([node], "one", [given_], [sums_info], initializers)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     sums = open_session(model, 1, exact=True).run(None, {"image": image})[0]
     assert np.array_equal(sums, image.astype(np.int64) @ weight.astype(np.int64))
@@ -296,7 +305,7 @@ def test_files_of_other_makers_give_the_same_numbers_in_these_ways(
 
 
 def shapes_of_weights(model: onnx.ModelProto) -> list[tuple[int, ...]]:
-    shapes = {each.name: tuple(each.dims) for each in model.graph.initializer}
+    shapes = {tensor.name: tuple(tensor.dims) for tensor in model.graph.initializer}
     return [shapes[node.input[3]] for node in model.graph.node if node.op_type == "QLinearConv"]
 
 

@@ -59,19 +59,20 @@ def correction(graph: Graph, ends: Ends) -> np.ndarray:
 def test_levelling_leaves_the_float_network_as_it_was(name: str) -> None:
     _, graph, ends, chain = read(name)
     factors = np.random.default_rng(1).uniform(0.2, 5, sum(chain.widths))
-    wanted = correction(graph, ends)
+    expected = correction(graph, ends)
     np.testing.assert_allclose(
-        correction(chain.scaled(graph, factors), ends), wanted, atol=2e-5 * np.abs(wanted).max()
+        correction(chain.scaled(graph, factors), ends), expected, atol=2e-5 * np.abs(expected).max()
     )
-    moved = zip(chain.scaled(graph, factors), graph, strict=True)
-    assert any(isinstance(op, Conv) and not np.allclose(op.weight, was.weight) for op, was in moved)  # type: ignore[attr-defined]
+    pairs = zip(chain.scaled(graph, factors), graph, strict=True)
+    assert any(isinstance(op, Conv) and not np.allclose(op.weight, was.weight) for op, was in pairs)  # type: ignore[attr-defined]
 
 
 def test_what_others_read_or_factors_do_not_pass_is_left_alone() -> None:
     _, graph, _, chain = read("unet")
-    pooled = {
-        tensor for op in graph if not isinstance(op, Conv) for tensor in (*op.inputs, op.output)
-    }
+    pooled = set[str]()
+    for op in graph:
+        if not isinstance(op, Conv):
+            pooled |= {*op.inputs, op.output}
     assert pooled
     assert not pooled & set(chain.tensors)
     _, graph, _, chain = read("segment")
@@ -87,8 +88,10 @@ def test_relu6_is_the_end_of_int8_whatever_the_factors(seed: int, size: float) -
     chain = Chain(tuple(lone_tensors(graph)), (5, 5, 4))
     assert chain.tensors == ("a", "b", "c")
     scaled = chain.scaled(graph, np.random.default_rng(seed).lognormal(-2, 1, 14))
-    wanted = correction(graph, ends)
-    np.testing.assert_allclose(correction(scaled, ends), wanted, atol=2e-5 * np.abs(wanted).max())
+    expected = correction(graph, ends)
+    np.testing.assert_allclose(
+        correction(scaled, ends), expected, atol=2e-5 * np.abs(expected).max()
+    )
     core = build_core(
         scaled, {PLANES: PLANES_FRAC_BITS, CORRECTION: 4} | dict.fromkeys("abc", STREAM_FRAC_BITS)
     )
@@ -115,8 +118,8 @@ class Bowl:
     def _sizes(graph: Graph) -> np.ndarray:
         return np.asarray(np.abs(graph[0].weight).sum((1, 2, 3)))  # type: ignore[attr-defined]
 
-    def __call__(self, tried: Graph) -> Costs:
-        off = np.square(np.log(self._sizes(tried) / self.sizes / self.lowest)).sum()
+    def __call__(self, candidate: Graph) -> Costs:
+        off = np.square(np.log(self._sizes(candidate) / self.sizes / self.lowest)).sum()
         return lambda crops: np.array([1.0, 2.0])[slice(None) if crops is None else crops] * off
 
 
@@ -130,8 +133,11 @@ def test_the_search_never_ends_above_its_start(most: int, monkeypatch: pytest.Mo
         np.ones(sum(chain.widths)),
         np.concatenate([trial.lowest, np.ones(chain.widths[1])]),
     ):
-        found = level.level(graph, chain, ranges, start, trial)
-        before, after = (trial(chain.scaled(graph, each))(None).sum() for each in (start, found))
+        factors = level.level(graph, chain, ranges, start, trial)
+        before, after = (
+            trial(chain.scaled(graph, trial_factors))(None).sum()
+            for trial_factors in (start, factors)
+        )
         assert after <= before
 
 
@@ -149,9 +155,9 @@ def test_what_calibration_sees_is_not_clipped_where_the_image_itself_passes(
         "beers_deploy.quant.quantise.level", lambda _g, _c, ranges, *_: loud * FULL / ranges
     )
     model, _, _, chain = read("espcn")
-    made = quickly(model, patches_of(images()))
-    assert made.core.ends.offsets
-    assert chain_ranges(made.graph, chain, images(), made.core.ends, quantile=1.0).max() <= FULL * (
+    int8 = quickly(model, patches_of(images()))
+    assert int8.core.ends.offsets
+    assert chain_ranges(int8.graph, chain, images(), int8.core.ends, quantile=1.0).max() <= FULL * (
         1 + 1e-5
     )
 
@@ -162,9 +168,8 @@ def test_unequal_channels_err_half_as_much_once_they_are_levelled(
     """A network whose channels differ thirtyfold, as training with batch
     normalisation leaves them.
     """
-    monkeypatch.setattr(
-        level, "MOST_CHANNELS", 0
-    )  # the first guesses alone: channel by channel takes half a minute
+    # Only the first guesses are tried, because the search of each channel takes half a minute.
+    monkeypatch.setattr(level, "MOST_CHANNELS", 0)
     network = build("dncnn", torch.Generator().manual_seed(0))
     layers = [
         layer
@@ -178,13 +183,13 @@ def test_unequal_channels_err_half_as_much_once_they_are_levelled(
             norm.bias.mul_(factors)  # type: ignore[union-attr]
             conv.weight.div_(factors[:, None, None])
     model = simplest(to_onnx("dncnn", network), "dncnn")
-    seen = images()
-    patches = patches_of(seen)
+    image_list = images()
+    patches = patches_of(image_list)
 
     def mae() -> float:
-        made = quickly(model, patches)
+        int8 = quickly(model, patches)
         return compare(
-            open_session(model), open_session(made.host), patches.pairs, simulated=False
+            open_session(model), open_session(int8.host), patches.pairs, simulated=False
         ).mae
 
     levelled = mae()

@@ -76,15 +76,16 @@ def test_default_patches_cover_the_range_and_those_of_the_gate_as_well() -> None
     """As scenes are drawn, 99.9 % of their pixels lie in the lower half of the range."""
     calibration = Calibration(SENSOR, None, patches=32, patch_px=48, seed=0)
     for patches in (calibration.drawn, unseen_patches(SENSOR, None, 32, 0)):
-        found = range_of(patches.degraded)
-        assert found.p99_9 > 0.75
-        assert found.p1 < 0.05
+        sample_range = range_of(patches.degraded)
+        assert sample_range.p99_9 > 0.75
+        assert sample_range.p1 < 0.05
 
 
 def test_light_changes_nothing_but_the_light() -> None:
     scenes = [procedural_scene(500, 520, np.random.default_rng(1))]
     lit, plain = (
-        draw_patches(scenes, SENSOR, REFERENCE, 16, 3, 40, lightings=each) for each in (JUDGING, ())
+        draw_patches(scenes, SENSOR, REFERENCE, 16, 3, 40, lightings=lightings)
+        for lightings in (JUDGING, ())
     )
     ratios = set()
     for one, other in zip(lit.views, plain.views, strict=True):
@@ -96,8 +97,8 @@ def test_light_changes_nothing_but_the_light() -> None:
         ratios.add(round(one.ground.exposure / other.ground.exposure, 6))
     assert 1 in ratios
     assert len(ratios) > 4
-    again = draw_patches(scenes, SENSOR, REFERENCE, 16, 3, 40, lightings=JUDGING)
-    assert again.digest == lit.digest != plain.digest
+    repeated = draw_patches(scenes, SENSOR, REFERENCE, 16, 3, 40, lightings=JUDGING)
+    assert repeated.digest == lit.digest != plain.digest
 
 
 def test_the_radiance_of_full_scale_leaves_the_offset_out() -> None:

@@ -103,10 +103,10 @@ def test_behind_relu_and_read_without_padding() -> None:
 @given(st.integers(0, 99), st.integers(2, 9), st.sampled_from([0.3, 3.0]))
 def test_the_float_network_stays(seed: int, frac_bits: int, size: float) -> None:
     for graph, name in ((network(seed), "c"), (with_relu6(size), "b")):
-        wanted = result(graph)
-        found = result(lowered(graph, name, frac_bits))
+        expected = result(graph)
+        actual = result(lowered(graph, name, frac_bits))
         np.testing.assert_allclose(
-            found, wanted, atol=1e-4 * max(np.abs(wanted).max(), 2.0**-frac_bits)
+            actual, expected, atol=1e-4 * max(np.abs(expected).max(), 2.0**-frac_bits)
         )
 
 
@@ -114,18 +114,20 @@ def test_the_float_network_stays(seed: int, frac_bits: int, size: float) -> None
 @given(st.integers(0, 99))
 def test_every_file_holds_the_references_integers(seed: int) -> None:
     core = core_of(both_lowered(network(seed)))
-    seen = image(19, 19, seed)
+    pixels = image(19, 19, seed)
     assert shift_faults(core) == []
     host = host_model(core, {})
-    assert not any(layer.unequal for layer in agreement(core, host, seen).layers)
-    wanted = correction(core, core.ends.split(seen), half_even=True)
+    assert not any(layer.unequal for layer in agreement(core, host, pixels).layers)
+    expected = correction(core, core.ends.split(pixels), half_even=True)
     for model in (board_model(core, {}), vint8_model(core, {}, 19)):
-        (found,) = open_session(model).run(None, {PLANES: planes_of(seen, core.ends)})
-        np.testing.assert_array_equal(found, wanted)
-    tensors, _ = run_core(core, core.ends.split(seen))
+        (result,) = open_session(model).run(None, {PLANES: planes_of(pixels, core.ends)})
+        np.testing.assert_array_equal(result, expected)
+    tensors, _ = run_core(core, core.ends.split(pixels))
     trained = TrainableCore(core)
-    found = trained.tensors(torch.from_numpy(core.ends.split(seen).astype(np.float32)))[CORRECTION]
-    np.testing.assert_array_equal(found.detach().numpy(), tensors[CORRECTION])
+    result = trained.tensors(torch.from_numpy(core.ends.split(pixels).astype(np.float32)))[
+        CORRECTION
+    ]
+    np.testing.assert_array_equal(result.detach().numpy(), tensors[CORRECTION])
 
 
 def test_a_file_counts_its_relus_and_not_their_zeros_as_saturated() -> None:
@@ -137,9 +139,9 @@ def test_a_file_counts_its_relus_and_not_their_zeros_as_saturated() -> None:
     assert [op.activation for op in read_core(model).convolutions][1:3] == [
         Activation.saturated_relu
     ] * 2
-    wanted = count_relus(plain).explicit
-    assert count_relus(model).off_by(wanted) == 0
-    assert count_relus(model).off_by(wanted + 1) == 1
+    expected = count_relus(plain).explicit
+    assert count_relus(model).off_by(expected) == 0
+    assert count_relus(model).off_by(expected + 1) == 1
     shares = saturated_shares(model, [image()])
     _, reports = run_core(read_core(model), Ends().split(image()))
     assert max(shares["b"], shares["c"], *(report.saturated for report in reports[1:3])) < 0.05
@@ -162,36 +164,38 @@ def crops(count: int) -> Remade[np.ndarray]:
 
 def test_the_layer_errs_half_as_much() -> None:
     graph = network()
-    seen = crops(4)
-    lost = []
-    for each in (graph, lowered(graph, "b", 6)):
-        core = build_core(each, BITS | {"b": 5}, ends=Ends(planes=3, adds_image=False))
-        layers, _ = layer_errors(each, core, seen)
-        lost.append(layers[1].network.squared)
-    assert lost[1] < 0.6 * lost[0]
+    samples = crops(4)
+    errors = []
+    for variant in (graph, lowered(graph, "b", 6)):
+        core = build_core(variant, BITS | {"b": 5}, ends=Ends(planes=3, adds_image=False))
+        layers, _ = layer_errors(variant, core, samples)
+        errors.append(layers[1].network.squared)
+    assert errors[1] < 0.6 * errors[0]
 
 
 def test_fitted_biases_give_back_what_was_taken() -> None:
-    seen = crops(8)
+    samples = crops(8)
     ends = Ends(planes=3, adds_image=False)
-    wanted = np.mean([in_float(network(), each, ends) for each in seen])
+    expected = np.mean([in_float(network(), sample, ends) for sample in samples])
     graph = both_lowered(network())
-    core = fit_weights(graph, build_core(graph, BITS, ends=ends), seen)
-    found = np.mean([correction(core, core.ends.split(each)) for each in seen])
-    assert abs(found - wanted) < core.scale(CORRECTION)
+    core = fit_weights(graph, build_core(graph, BITS, ends=ends), samples)
+    actual = np.mean([correction(core, core.ends.split(sample)) for sample in samples])
+    assert abs(actual - expected) < core.scale(CORRECTION)
 
 
 @pytest.mark.parametrize(
-    ("costs", "kept"), [((3, 4, 4, 2), "bc"), ((3, 2, 4, 5), "b"), ((3, 4, 4, 3), "")]
+    ("costs", "lowered_names"), [((3, 4, 4, 2), "bc"), ((3, 2, 4, 5), "b"), ((3, 4, 4, 3), "")]
 )
-def test_only_where_it_costs_less(costs: tuple[int, ...], kept: str) -> None:
+def test_only_where_it_costs_less(costs: tuple[int, ...], lowered_names: str) -> None:
     """The costs of none of the two tensors lowered, of either, and of both."""
 
     def names(graph: Graph) -> str:
         return "".join(op.output for op in graph if isinstance(op, Conv) and op.offset)
 
-    known = dict(zip(("", "b", "c", "bc"), costs, strict=True))
+    cost_by_names = dict(zip(("", "b", "c", "bc"), costs, strict=True))
     assert (
-        names(lower(network(), BITS, lambda graph: lambda _: np.array([known[names(graph)]])))
-        == kept
+        names(
+            lower(network(), BITS, lambda graph: lambda _: np.array([cost_by_names[names(graph)]]))
+        )
+        == lowered_names
     )

@@ -1,5 +1,7 @@
 """What a user measures results by, and the gate that speaks of it."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 import torch
@@ -23,16 +25,19 @@ def measured(name: str, results: list[np.ndarray], references: list[np.ndarray])
     arrays(np.int64, (2, 5, 7), elements=st.integers(0, 3)),
     arrays(np.int64, (2, 5, 7), elements=st.integers(0, 3)),
 )
-def test_classes_of_pixels_are_counted_as_by_hand(said: np.ndarray, meant: np.ndarray) -> None:
-    results = [np.eye(4, dtype=np.float32)[each].transpose(2, 0, 1)[None] for each in said]
-    references = [each[None].astype(np.float32) for each in meant]
+def test_classes_of_pixels_are_counted_as_by_hand(predicted: np.ndarray, truth: np.ndarray) -> None:
+    results = [
+        np.eye(4, dtype=np.float32)[classes].transpose(2, 0, 1)[None] for classes in predicted
+    ]
+    references = [classes[None].astype(np.float32) for classes in truth]
     both = [
-        (((said == k) & (meant == k)).sum(), ((said == k) | (meant == k)).sum()) for k in range(4)
+        (((predicted == k) & (truth == k)).sum(), ((predicted == k) | (truth == k)).sum())
+        for k in range(4)
     ]
     assert measured("iou", results, references) == pytest.approx(
         np.mean([a / b for a, b in both if b])
     )
-    assert measured("top1", results, references) == pytest.approx((said == meant).mean())
+    assert measured("top1", results, references) == pytest.approx((predicted == truth).mean())
 
 
 def test_images_are_measured_as_everywhere_else() -> None:
@@ -45,8 +50,8 @@ def test_images_are_measured_as_everywhere_else() -> None:
     assert measured("mae", results, references) == pytest.approx(
         np.mean([np.abs(a - b).mean() for a, b in pairs])
     )
-    each = [ssim(a[0, k], b[0, k], 1.0) for a, b in pairs for k in range(2)]
-    assert measured("ssim", results, references) == pytest.approx(np.mean(each))
+    similarities = [ssim(a[0, k], b[0, k], 1.0) for (a, b), k in product(pairs, range(2))]
+    assert measured("ssim", results, references) == pytest.approx(np.mean(similarities))
 
 
 @pytest.mark.parametrize(
@@ -78,14 +83,14 @@ def test_a_gate_speaks_of_classes() -> None:
     assert verdict
     assert figures["iou float"].value == 1
     assert figures["iou lost"].value == pytest.approx(1 - float(figures["iou INT8"].value or 0))
-    broken = bd.gate(
+    refused_verdict = bd.gate(
         int8,
         samples=(samples[0], 1 - samples[1]),
         metric="top1",
         limits={"mae": 0.1},
         progress=False,
     )
-    assert broken.rows[0].figures["top1 float"].value == 0
+    assert refused_verdict.rows[0].figures["top1 float"].value == 0
     with pytest.raises(OptionError, match="one beside the limit metric_loss"):
         bd.gate(int8, samples=samples, limits={"metric_loss": 0.1}, progress=False)
     with pytest.raises(OptionError, match=f"metric: expected one of {', '.join(METRICS)}"):

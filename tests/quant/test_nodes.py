@@ -57,17 +57,17 @@ RESHAPED = [[0, 6, -1], [-1, 3, 0, 10], [1, 3, 2, 20]]
 @given(st.permutations(range(4)), st.sampled_from(RESHAPED), st.sampled_from([0, 2]))
 def test_moves_are_those_of_onnx(perm: list[int], sizes: list[int], axis: int) -> None:
     image = np.arange(120).reshape(1, 6, 4, 5)
-    for kind, stated in {
+    for kind, attribute in {
         "Transpose": perm,
         "Reshape": sizes,
         "Unsqueeze": [axis],
         "Squeeze": [0],
     }.items():
         if kind == "Transpose":
-            node = helper.make_node(kind, ["x"], ["y"], perm=stated)
+            node = helper.make_node(kind, ["x"], ["y"], perm=attribute)
             feeds = {"x": image}
         else:
             node = helper.make_node(kind, ["x", "s"], ["y"])
-            feeds = {"x": image, "s": np.array(stated)}
+            feeds = {"x": image, "s": np.array(attribute)}
         (expected,) = list(ReferenceEvaluator(node).run(None, feeds))
-        np.testing.assert_array_equal(MOVES[kind][1](image, stated), expected)
+        np.testing.assert_array_equal(MOVES[kind][1](image, attribute), expected)

@@ -33,14 +33,14 @@ class Sketch(GraphWriter):
         shape: Sequence[int],
         size: float = 0.3,
         kind: str = "Conv",
-        **given: Any,
+        **attributes: Any,
     ) -> str:
         generator = np.random.default_rng(len(self.nodes))
         weight = (size * generator.standard_normal(tuple(shape))).astype(np.float32)
         outputs = shape[1] if kind == "ConvTranspose" else shape[0]
         bias = (0.1 * generator.standard_normal(outputs)).astype(np.float32)
         feeds = [source, self.constant(f"{name}.w", weight), self.constant(f"{name}.b", bias)]
-        return self.node(kind, name, feeds, **given)
+        return self.node(kind, name, feeds, **attributes)
 
     def model(self, outputs: int, side_px: int | None = None) -> onnx.ModelProto:
         sides: list[str | int | None] = [side_px or "H", side_px or "W"]
@@ -197,19 +197,19 @@ def test_near_float_equal_to_the_reference_and_without_faults(
 ) -> None:
     model = make(Sketch())
     rows, columns = np.mgrid[:48, :36] / 40
-    seen = [
+    samples = [
         (0.4 + 0.3 * np.sin(7 * rows + k) * np.cos(5 * columns)).astype(np.float32)[None, None]
         for k in range(3)
     ]
-    patches = patches_of(seen)
-    made = quantise_model(model, patches, {})
-    wanted = made.core.ends.clipped(result_of(open_session(model), seen[1]))
-    found = result_of(open_session(made.host), seen[1])
-    assert np.abs(found - wanted).mean() < 0.06 * wanted.std()
-    assert not any(layer.unequal for layer in agreement(made.core, made.host, seen[2]).layers)
-    hold_to_reference(moved(made.core), made.core.ends.split(seen[2]))
-    assert [str(check) for check in structure_checks(model, made.host) if not check.passed] == []
-    assert saturated_shares(made.host, seen).get("correction", 0) < 0.01
+    patches = patches_of(samples)
+    int8 = quantise_model(model, patches, {})
+    expected = int8.core.ends.clipped(result_of(open_session(model), samples[1]))
+    actual = result_of(open_session(int8.host), samples[1])
+    assert np.abs(actual - expected).mean() < 0.06 * expected.std()
+    assert not any(layer.unequal for layer in agreement(int8.core, int8.host, samples[2]).layers)
+    hold_to_reference(moved(int8.core), int8.core.ends.split(samples[2]))
+    assert [str(check) for check in structure_checks(model, int8.host) if not check.passed] == []
+    assert saturated_shares(int8.host, samples).get("correction", 0) < 0.01
 
 
 def unshuffled_inside(w: Sketch) -> onnx.ModelProto:
@@ -252,7 +252,7 @@ def flattened_elsewhere(w: Sketch) -> onnx.ModelProto:
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (unshuffled_inside, "Reshape|pixel unshuffle of several channels at the image alone"),
         (column_by_column, "one number a channel, got one of 36 at Mul out"),
@@ -262,7 +262,7 @@ def flattened_elsewhere(w: Sketch) -> onnx.ModelProto:
     ],
 )
 def test_what_would_be_computed_wrongly_is_refused(
-    make: Callable[[Sketch], onnx.ModelProto], said: str
+    make: Callable[[Sketch], onnx.ModelProto], message: str
 ) -> None:
-    with pytest.raises(ModelError, match=said):
+    with pytest.raises(ModelError, match=message):
         read_network(make(Sketch()))

@@ -1,6 +1,7 @@
 """The passes: each leaves the float network as it was, and does to the integer one what it says."""
 
 from dataclasses import replace
+from itertools import chain, product
 
 import numpy as np
 import onnx
@@ -71,8 +72,10 @@ def test_ranges_are_levelled_to_the_stream_s_own(graph: Graph, patches: Patches)
     assert ranges.shape == (8,)
     factors = first_guess(ranges, 1.0, 1.0)
     np.testing.assert_allclose(ranges * factors, 127 * 2.0**-STREAM_FRAC_BITS)
-    again = channel_ranges(equalise(graph, stream_of(graph), factors), stream_of(graph), images)
-    np.testing.assert_allclose(again, ranges * factors, rtol=1e-4)
+    new_ranges = channel_ranges(
+        equalise(graph, stream_of(graph), factors), stream_of(graph), images
+    )
+    np.testing.assert_allclose(new_ranges, ranges * factors, rtol=1e-4)
 
 
 def test_a_dead_channel_is_not_blown_up(graph: Graph, patches: Patches) -> None:
@@ -120,7 +123,7 @@ def test_a_stream_goes_through_pools_enlargements_and_concats() -> None:
     graph = skipping()
     fine = slice(2, 5)
     coarse = slice(0, 2)
-    wanted = {
+    expected = {
         "head": fine,
         "inner": fine,
         "sum": fine,
@@ -128,16 +131,16 @@ def test_a_stream_goes_through_pools_enlargements_and_concats() -> None:
         "deep": coarse,
         "up": coarse,
     }
-    assert stream_of(graph) == wanted | {"both": slice(0, 5)}
+    assert stream_of(graph) == expected | {"both": slice(0, 5)}
     planes = {PLANES: np.random.default_rng(1).normal(0, 3, (1, 3, 6, 10)).astype(np.float32)}
-    found = [
-        open_session(graph_to_onnx(each, [CORRECTION])).run(None, planes)[0]
-        for each in (
+    results = [
+        open_session(graph_to_onnx(variant, [CORRECTION])).run(None, planes)[0]
+        for variant in (
             graph,
             equalise(graph, stream_of(graph), np.random.default_rng(2).lognormal(-1, 1, 5)),
         )
     ]
-    np.testing.assert_allclose(found[1], found[0], atol=1e-4)
+    np.testing.assert_allclose(results[1], results[0], atol=1e-4)
 
 
 def test_a_tensor_that_would_have_two_places_is_in_no_stream() -> None:
@@ -150,19 +153,19 @@ def test_a_tensor_that_would_have_two_places_is_in_no_stream() -> None:
 @pytest.mark.parametrize(("bits", "beyond"), [(5, False), (4, True)])
 def test_sums_beyond_a_relu6_are_told_by_their_scale(bits: int, beyond: bool) -> None:
     graph = skipping()
-    known = dict.fromkeys(stream_of(graph), 5) | {"sum": bits}
-    assert exceeds_six(graph, stream_of(graph), known) is beyond
+    frac_bits = dict.fromkeys(stream_of(graph), 5) | {"sum": bits}
+    assert exceeds_six(graph, stream_of(graph), frac_bits) is beyond
     plain = tuple(
         replace(op, activation=Activation.relu) if op.output == "head" else op  # type: ignore[type-var]
         for op in graph
     )
-    assert not exceeds_six(plain, stream_of(plain), known)
+    assert not exceeds_six(plain, stream_of(plain), frac_bits)
 
 
 def largest(graph: Graph, images: list[np.ndarray]) -> np.ndarray:
     """(C,) of the last sum."""
     sizes = channel_sizes(graph, [graph[-2].output], images, quantile=1.0)
-    return np.asarray(np.max([found for (found,) in sizes], axis=0))
+    return np.asarray(np.max([size for (size,) in sizes], axis=0))
 
 
 @pytest.mark.parametrize("loud", [0.1, 3.0, 40.0])
@@ -179,10 +182,10 @@ def test_the_last_sum_has_room_for_the_largest_values(
     after = largest(roomy, images)
     assert (after * ROOM <= 127 * step * (1 + 1e-5)).all()
     assert (after <= before * (1 + 1e-5)).all()
-    for name in sorted(
-        stream_of(graph).keys() & {name for op in roomy for name in op.inputs}
-    ):  # the blocks keep their step
-        first, second = ([op for op in each if op.output == name] for each in (paired, roomy))
+    inputs = chain.from_iterable(op.inputs for op in roomy)
+    # The blocks keep their step.
+    for name in sorted(stream_of(graph).keys() & set(inputs)):
+        first, second = ([op for op in variant if op.output == name] for variant in (paired, roomy))
         assert all(
             a is b or np.array_equal(a.weight, b.weight)  # type: ignore[attr-defined]
             for a, b in zip(first, second, strict=True)
@@ -204,24 +207,26 @@ def searched(graph: Graph, weights: np.ndarray) -> tuple[list[float], float, lis
     sizes = np.abs(graph[0].weight).sum((1, 2, 3))  # type: ignore[attr-defined]
     runs: list[int] = []
 
-    def costs(tried: Graph) -> np.ndarray:
-        factors = np.abs(tried[0].weight).sum((1, 2, 3)) / sizes  # type: ignore[attr-defined]
+    def costs(candidate: Graph) -> np.ndarray:
+        factors = np.abs(candidate[0].weight).sum((1, 2, 3)) / sizes  # type: ignore[attr-defined]
         return np.asarray(np.square(np.log(factors / np.geomspace(0.1, 3, 8))).sum() * weights)
 
-    def trial(tried: Graph) -> Costs:
+    def trial(candidate: Graph) -> Costs:
         runs.append(0)
 
         def of(crops: np.ndarray | None) -> np.ndarray:
-            chosen = costs(tried) if crops is None else costs(tried)[crops]
-            runs[-1] += len(chosen)
-            return chosen
+            crop_costs = costs(candidate) if crops is None else costs(candidate)[crops]
+            runs[-1] += len(crop_costs)
+            return crop_costs
 
         return of
 
     factors = search(graph, stream_of(graph), RANGES, trial)
-    guesses = [first_guess(RANGES, g, h) for g in (0.5, 0.75, 1.0) for h in (0.64, 0.8, 1.0, 1.25)]
+    pairs = product((0.5, 0.75, 1.0), (0.64, 0.8, 1.0, 1.25))
+    guesses = [first_guess(RANGES, g, h) for g, h in pairs]
     ends = [
-        float(costs(equalise(graph, stream_of(graph), each)).sum()) for each in (*guesses, factors)
+        float(costs(equalise(graph, stream_of(graph), factor)).sum())
+        for factor in (*guesses, factors)
     ]
     return ends[:-1], ends[-1], runs
 
@@ -229,12 +234,10 @@ def searched(graph: Graph, weights: np.ndarray) -> tuple[list[float], float, lis
 def test_the_search_ends_below_its_best_guess_and_drops_a_trial_that_fails_on_its_first_crops(
     graph: Graph,
 ) -> None:
-    guesses, found, runs = searched(graph, np.arange(1.0, CROPS + 1))
-    assert found < min(guesses)
-    assert set(runs) == {
-        FIRST_CROPS,
-        CROPS,
-    }  # every crop says the same here: it fails at once or not at all
+    guesses, cost, runs = searched(graph, np.arange(1.0, CROPS + 1))
+    assert cost < min(guesses)
+    # Every crop gives the same verdict here, so a trial fails on the first crops or not at all.
+    assert set(runs) == {FIRST_CROPS, CROPS}
     assert runs[0] == CROPS
     assert runs.count(FIRST_CROPS) > len(runs) / 3
 
@@ -243,8 +246,8 @@ def test_a_wide_stream_is_not_searched_channel_by_channel(
     graph: Graph, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("beers_deploy.quant.passes.equalise.MOST_CHANNELS", 7)
-    guesses, found, runs = searched(graph, np.arange(1.0, CROPS + 1))
-    assert found == min(guesses)
+    guesses, cost, runs = searched(graph, np.arange(1.0, CROPS + 1))
+    assert cost == min(guesses)
     assert len(runs) == len(guesses)
 
 
@@ -252,8 +255,8 @@ def test_a_trial_that_the_costliest_crops_favour_still_has_to_win_on_all(graph: 
     """What the first crops call better and the others worse is not taken: the last look knows no
     margin.
     """
-    guesses, found, _ = searched(graph, np.array([3.0, 2.0, -1.0, -2.0, -3.0]))
-    assert found <= guesses[0]
+    guesses, cost, _ = searched(graph, np.array([3.0, 2.0, -1.0, -2.0, -3.0]))
+    assert cost <= guesses[0]
 
 
 def test_a_shared_residual_scale_adds_without_rounding(quantised: Quantised) -> None:
@@ -286,8 +289,8 @@ def test_the_fine_gain_is_believed_until_its_end() -> None:
 def test_all_passes_lose_far_less_than_none(
     float_onnx: onnx.ModelProto, patches: Patches, quantised: Quantised
 ) -> None:
-    def mae(made: Quantised) -> float:
-        return compare(open_session(float_onnx), open_session(made.host), patches.pairs).mae
+    def mae(int8: Quantised) -> float:
+        return compare(open_session(float_onnx), open_session(int8.host), patches.pairs).mae
 
     few = Passes(half_lsb_pair=False, dual_range=False, equalising=False, fitted_weights=False)
     rounded = quantise_model(float_onnx, patches, {}, passes=few)
@@ -298,6 +301,6 @@ def test_all_passes_lose_far_less_than_none(
 
 
 def test_each_step_is_told(float_onnx: onnx.ModelProto, patches: Patches) -> None:
-    told: list[str] = []
-    quickly(float_onnx, patches, log=told.append)
-    assert [step.split(" ")[0] for step in told] == ["scale", "equalising", "rounding"]
+    messages: list[str] = []
+    quickly(float_onnx, patches, log=messages.append)
+    assert [step.split(" ")[0] for step in messages] == ["scale", "equalising", "rounding"]

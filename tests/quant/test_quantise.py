@@ -49,9 +49,9 @@ def test_unreachable_positions_are_moved_to_legal_ones(
 
 def test_every_convolution_is_an_integer_kernel(quantised: Quantised) -> None:
     kinds = [node.op_type for node in quantised.host.graph.node]
-    assert (
-        kinds.count("QLinearConv") == 8
-    )  # head, two of each of two blocks, head and end for the half-LSB pair, tail
+    # These are the head, two in each of two blocks, head and end for the half-LSB pair, and the
+    # tail.
+    assert kinds.count("QLinearConv") == 8
     assert "Conv" not in kinds
 
 
@@ -66,8 +66,8 @@ def test_int8_stays_close_to_float(
 def test_the_same_patches_give_the_same_bytes(
     float_onnx: onnx.ModelProto, quantised: Quantised, patches: Patches
 ) -> None:
-    again = quantise_model(float_onnx, patches, {"seed": "5"})
-    assert again.host.SerializeToString() == quantised.host.SerializeToString()
+    repeated = quantise_model(float_onnx, patches, {"seed": "5"})
+    assert repeated.host.SerializeToString() == quantised.host.SerializeToString()
 
 
 def test_the_file_says_what_it_was_calibrated_on(quantised: Quantised, patches: Patches) -> None:

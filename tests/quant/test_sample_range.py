@@ -18,23 +18,31 @@ def test_percentiles_are_those_of_all_pixels_however_they_are_divided(
     pixels: list[int], parts: int
 ) -> None:
     values = np.array(pixels, np.float32) / np.float32(4095)
-    found = range_of(np.array_split(values, parts))
+    sample_range = range_of(np.array_split(values, parts))
     expected = np.quantile(values, [0.01, 0.5, 0.99, 0.999], method="inverted_cdf")
     np.testing.assert_allclose(
-        [found.p1, found.p50, found.p99, found.p99_9], expected, atol=2 / 4096
+        [sample_range.p1, sample_range.p50, sample_range.p99, sample_range.p99_9],
+        expected,
+        atol=2 / 4096,
     )
-    assert found.saturated == pytest.approx(np.mean(np.array(pixels) == 4095))
+    assert sample_range.saturated == pytest.approx(np.mean(np.array(pixels) == 4095))
 
 
 @given(st.lists(st.floats(0, 1), min_size=4, max_size=4), st.floats(0, 1))
 def test_what_is_recorded_is_read_back(values: list[float], saturated: float) -> None:
     p1, p50, p99, p99_9 = sorted(values)
-    found = SampleRange(p1, p50, p99, p99_9, saturated)
-    again = recorded_range({KEY: found.to_words()})
-    assert again is not None
+    sample_range = SampleRange(p1, p50, p99, p99_9, saturated)
+    stored = recorded_range({KEY: sample_range.to_words()})
+    assert stored is not None
     np.testing.assert_allclose(
-        [again.p1, again.p50, again.p99, again.p99_9, again.saturated],
-        [found.p1, found.p50, found.p99, found.p99_9, found.saturated],
+        [stored.p1, stored.p50, stored.p99, stored.p99_9, stored.saturated],
+        [
+            sample_range.p1,
+            sample_range.p50,
+            sample_range.p99,
+            sample_range.p99_9,
+            sample_range.saturated,
+        ],
         atol=1e-6,
     )
 

@@ -18,9 +18,9 @@ RAMP = np.linspace(0, 1, 3 * 2 * 150 * 137, dtype=np.float32).reshape(3, 2, 150,
 
 def test_large_samples_are_cut_to_patches_on_the_lattice(tmp_path: Path) -> None:
     np.save(tmp_path / "ramp.npy", RAMP)
-    found = read_samples(tmp_path / "ramp.npy", 2, None, 4)
-    assert [image.shape for image in found.degraded] == [(1, 2, 128, 128)] * 3
-    np.testing.assert_array_equal(found.degraded[1][0], RAMP[1, :, :128, :128])
+    samples = read_samples(tmp_path / "ramp.npy", 2, None, 4)
+    assert [image.shape for image in samples.degraded] == [(1, 2, 128, 128)] * 3
+    np.testing.assert_array_equal(samples.degraded[1][0], RAMP[1, :, :128, :128])
     np.save(tmp_path / "small.npy", RAMP[:, :, :50, :37])
     assert read_samples(tmp_path / "small.npy", 2, None, 4).degraded[0].shape == (1, 2, 48, 36)
     assert len(read_samples(tmp_path / "ramp.npy", 2, 32).pairs) == 3 * 4 * 4
@@ -28,11 +28,11 @@ def test_large_samples_are_cut_to_patches_on_the_lattice(tmp_path: Path) -> None
 
 def test_references_stay_with_their_images(tmp_path: Path) -> None:
     np.savez(tmp_path / "both.npz", image=RAMP[:, :1, :20, :24], reference=RAMP[:, :1, :40, :48])
-    for (image, reference), whole in zip(
+    for (image, reference), ramp in zip(
         read_samples(tmp_path / "both.npz", 1, None).pairs, RAMP, strict=True
     ):
-        np.testing.assert_array_equal(image[0], whole[:1, :20, :24])
-        np.testing.assert_array_equal(reference[0], whole[:1, :40, :48])
+        np.testing.assert_array_equal(image[0], ramp[:1, :20, :24])
+        np.testing.assert_array_equal(reference[0], ramp[:1, :40, :48])
 
 
 @pytest.mark.parametrize(("kind", "full_scale"), [(np.uint8, 255), (np.uint16, 4095)])
@@ -53,10 +53,10 @@ def test_every_fourth_sample_is_kept_from_calibration(tmp_path: Path) -> None:
         tmp_path / "nine.npy",
         np.arange(9, dtype=np.float32).reshape(9, 1, 1, 1).repeat(8, 2).repeat(8, 3) / 9,
     )
-    seen, unseen = split_samples(read_samples(tmp_path / "nine.npy", 1, None))
+    calibration, unseen = split_samples(read_samples(tmp_path / "nine.npy", 1, None))
     assert [round(9 * float(image[0, 0, 0, 0])) for image in unseen.degraded] == [3, 7]
-    assert len(seen.pairs) == 7
-    assert seen.digest != unseen.digest
+    assert len(calibration.pairs) == 7
+    assert calibration.digest != unseen.digest
     few = read_samples(tmp_path / "nine.npy", 1, None, 8)
     assert split_samples(split_samples(few)[1])[0].digest == split_samples(few)[1].digest
 
@@ -97,7 +97,7 @@ def with_reference(
 
 
 @pytest.mark.parametrize(
-    ("write", "said"),
+    ("write", "message"),
     [
         (of(RAMP), "expected 1 channels"),
         (of(RAMP[:, :1] * 300), "values in"),
@@ -132,9 +132,9 @@ def with_reference(
     ],
 )
 def test_what_are_no_samples_is_refused(
-    write: Callable[[Path], Path], said: str, tmp_path: Path
+    write: Callable[[Path], Path], message: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(ImageError, match=said):
+    with pytest.raises(ImageError, match=message):
         read_samples(write(tmp_path), 1, None, 4)
 
 
@@ -149,9 +149,9 @@ def test_networks_that_simulated_patches_do_not_suit_ask_for_samples(tmp_path: P
     assert samples_of(network(1), None) is None
     with pytest.raises(OptionError, match="4 channels"):
         samples_of(network(4), None)
-    found = samples_of(network(4), tmp_path)
-    assert found is not None
-    assert (found.channels, found.fixed_px, found.multiple_px) == (4, None, 1)
+    samples = samples_of(network(4), tmp_path)
+    assert samples is not None
+    assert (samples.channels, samples.fixed_px, samples.multiple_px) == (4, None, 1)
     pooled = network(1)
     pooled.graph.node[0].op_type = "GlobalAveragePool"
     for value in (*pooled.graph.input, *pooled.graph.output):

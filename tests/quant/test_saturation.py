@@ -39,7 +39,7 @@ def qdq(scale: float, zero_point: np.ndarray | None, relu: bool = False) -> onnx
 
 
 @pytest.mark.parametrize(
-    ("zero_point", "relu", "lost"),
+    ("zero_point", "relu", "expected_lost"),
     [
         (np.array(0, np.int8), False, lambda v: (v >= 126.5) | (v <= -127.5)),
         (np.array(128, np.uint8), False, lambda v: (v >= 126.5) | (v <= -127.5)),
@@ -50,12 +50,14 @@ def qdq(scale: float, zero_point: np.ndarray | None, relu: bool = False) -> onnx
     ids=["int8", "uint8 around 128", "uint8 from 0", "no zero point", "a ReLU reads it"],
 )
 def test_shares_are_those_of_the_values(
-    zero_point: np.ndarray | None, relu: bool, lost: Lost
+    zero_point: np.ndarray | None, relu: bool, expected_lost: Lost
 ) -> None:
     scale = 1 / 400
     signed = (IMAGE - 0.5) * 2
     shares = saturated_shares(qdq(scale, zero_point, relu), [signed[:1], signed[1:]])
-    assert shares == {"whole": pytest.approx(lost(signed / np.float32(scale)).mean(), abs=1e-3)}
+    assert shares == {
+        "whole": pytest.approx(expected_lost(signed / np.float32(scale)).mean(), abs=1e-3)
+    }
     assert shares["whole"] > 0.1
     assert saturated_shares(qdq(1 / 120, zero_point, relu), [IMAGE]) == {"whole": 0.0}
 
@@ -75,16 +77,17 @@ def test_a_relu_between_two_roundings_reads_the_first() -> None:
     )
     signed = (IMAGE - 0.5) * 2
     shares = saturated_shares(model, [signed])
-    lost = float((signed * 400 >= 126.5).mean())
+    lost_share = float((signed * 400 >= 126.5).mean())
     assert shares == {
-        "whole": pytest.approx(lost, abs=1e-3),
-        "again": pytest.approx(lost, abs=1e-3),
+        "whole": pytest.approx(lost_share, abs=1e-3),
+        "again": pytest.approx(lost_share, abs=1e-3),
     }
 
 
 def test_the_shipped_file_saturates_as_the_integer_reference_says() -> None:
     model = load_onnx(shipped_pair("convbeers-xs")[1])
-    harsh = np.where(IMAGE > 0.5, 1.0, 0.0).astype(np.float32)  # every edge as strong as can be
+    # Edges between 0 and 1 are the strongest that an image can have.
+    harsh = np.where(IMAGE > 0.5, 1.0, 0.0).astype(np.float32)
     shares = saturated_shares(model, [harsh])
     core = read_core(model)
     _, reports = run_core(core, core.ends.split(harsh), half_even=True)

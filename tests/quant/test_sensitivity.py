@@ -31,10 +31,10 @@ def test_layers_lose_together_what_the_int8_file_loses_and_adds_hardly_anything(
     sessions = open_session(float_onnx), open_session(quantised.host)
     differences = [np.subtract(*(np.clip(run(s, crop), 0, 1) for s in sessions)) for crop in crops]
     assert together.mae == pytest.approx(float(np.mean(np.abs(differences))), rel=1e-3)
-    lost = {layer.name: layer.network.squared for layer in layers}
-    assert sum(lost.values()) == pytest.approx(together.squared, rel=0.4)
-    adds = sum(lost.pop(op.name) for op in quantised.core.ops if isinstance(op, Add))
-    assert adds < 0.1 * sum(lost.values())
+    squared_errors = {layer.name: layer.network.squared for layer in layers}
+    assert sum(squared_errors.values()) == pytest.approx(together.squared, rel=0.4)
+    adds = sum(squared_errors.pop(op.name) for op in quantised.core.ops if isinstance(op, Add))
+    assert adds < 0.1 * sum(squared_errors.values())
 
 
 @pytest.fixture(scope="module")
@@ -86,22 +86,22 @@ def test_one_gain_is_attributed_as_two_are(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("beers_deploy.quant.quantise.takes_gains", lambda _: False)
-    made = quickly(float_onnx, patches)
-    layers, _ = layer_errors(made.graph, made.core, crops)
+    int8 = quickly(float_onnx, patches)
+    layers, _ = layer_errors(int8.graph, int8.core, crops)
     tail = layers[-1]
     assert tail.alone.sqnr_db == pytest.approx(tail.network.sqnr_db, abs=1)
 
 
 def test_loss_is_that_of_its_definition() -> None:
-    wanted = np.array([3.0, -4.0, 0.5])
+    target = np.array([3.0, -4.0, 0.5])
     loss = Loss()
-    loss.add(wanted[:2] + 0.1, wanted[:2])
-    loss.add(wanted[2:] - 0.2, wanted[2:])
+    loss.add(target[:2] + 0.1, target[:2])
+    loss.add(target[2:] - 0.2, target[2:])
     assert loss.mae == pytest.approx(0.4 / 3)
     assert loss.squared == pytest.approx(0.06 / 3)
     assert loss.sqnr_db == pytest.approx(10 * np.log10(25.25 / 0.06))
     same = Loss()
-    same.add(wanted, wanted)
+    same.add(target, target)
     assert same.sqnr_db == np.inf
 
 

@@ -65,49 +65,48 @@ def test_the_tail_begins_behind_the_last_convolution() -> None:
     )
     behind = {"Slice", "Exp", "Sigmoid", "Add", "Mul", "Concat", "Reshape"}
     assert {node.op_type for node in network.tail.graph.node} == behind
-    assert len(network.tail.graph.node) + 10 + len(network.graph) == len(
-        model.graph.node
-    )  # 10 ReLUs are fused
+    # The reader fuses 10 ReLUs with the convolutions before them.
+    assert len(network.tail.graph.node) + 10 + len(network.graph) == len(model.graph.node)
 
 
 def test_the_tail_by_itself_is_what_the_runtime_computes() -> None:
     model = detector()
-    seen = images()[0]
+    image = images()[0]
     tail = read_network(model).tail
     assert tail is not None
     last = next(node for node in reversed(model.graph.node) if node.op_type == "Conv").output[0]
-    wanted = result_of(open_session(model), seen)
+    expected = result_of(open_session(model), image)
     model.graph.output.append(helper.make_tensor_value_info(last, TensorProto.FLOAT, None))
-    found = open_session(model).run([last], {"images": seen})[0]
-    np.testing.assert_allclose(tail(np.asarray(found)), wanted, rtol=1e-5, atol=1e-5)
+    actual = open_session(model).run([last], {"images": image})[0]
+    np.testing.assert_allclose(tail(np.asarray(actual)), expected, rtol=1e-5, atol=1e-5)
 
 
 def test_int8_gives_boxes_and_scores_as_float_does() -> None:
-    seen = images()[1]
-    wanted, found = (
-        result_of(open_session(model), seen) for model in (detector(), quantised().host)
+    image = images()[1]
+    expected, actual = (
+        result_of(open_session(model), image) for model in (detector(), quantised().host)
     )
-    assert found.shape == wanted.shape == (1, 6, (SIDE_PX // 4) ** 2)
-    for row, spread in zip(np.abs(found - wanted)[0], wanted[0].std(axis=1), strict=True):
+    assert actual.shape == expected.shape == (1, 6, (SIDE_PX // 4) ** 2)
+    for row, spread in zip(np.abs(actual - expected)[0], expected[0].std(axis=1), strict=True):
         assert row.mean() < 0.15 * max(float(spread), 1e-6)
 
 
 def test_the_file_is_read_back_with_its_tail() -> None:
-    made = quantised()
-    again = read_core(made.host)
-    assert encoding_faults(made.host) == []
-    assert again.ends == made.core.ends
-    seen = images()[2]
-    found = agreement(again, made.host, seen)
-    assert [layer.report.name for layer in found.layers if layer.unequal] == []
-    whole = result_of(open_session(made.host), seen)
-    np.testing.assert_allclose(again.ends.finished(seen, found.even), whole, rtol=1e-5, atol=1e-5)
-    assert {entry.key: entry.value for entry in made.host.metadata_props}["kept"] == "said"
+    int8 = quantised()
+    core = read_core(int8.host)
+    assert encoding_faults(int8.host) == []
+    assert core.ends == int8.core.ends
+    image = images()[2]
+    layers = agreement(core, int8.host, image)
+    assert [layer.report.name for layer in layers.layers if layer.unequal] == []
+    result = result_of(open_session(int8.host), image)
+    np.testing.assert_allclose(core.ends.finished(image, layers.even), result, rtol=1e-5, atol=1e-5)
+    assert {entry.key: entry.value for entry in int8.host.metadata_props}["kept"] == "said"
 
 
 def test_a_network_of_one_size_is_looked_at_whole() -> None:
-    made = quantised()
-    *layers, _ = integer_rows(detector(), made.core, made.host, images())
+    int8 = quantised()
+    *layers, _ = integer_rows(detector(), int8.core, int8.host, images())
     assert {row.figures["as onnxruntime"].value for row in layers} == {100.0}
 
 
@@ -119,19 +118,19 @@ def test_the_core_and_the_float_file_are_legal_on_the_dpu(target: str) -> None:
 
 
 def test_a_tail_that_was_changed_is_a_fault() -> None:
-    spoilt = copied(quantised().host)
-    node = next(each for each in spoilt.graph.node if each.op_type == "Exp")
+    corrupted = copied(quantised().host)
+    node = next(candidate for candidate in corrupted.graph.node if candidate.op_type == "Exp")
     node.op_type = "Sqrt"
-    assert encoding_faults(spoilt) == [f"node {node.name}"]
+    assert encoding_faults(corrupted) == [f"node {node.name}"]
 
 
 def graph_text(kind: str) -> str:
-    read, result = (
+    map_info, result = (
         helper.make_tensor_value_info(n, TensorProto.FLOAT, None) for n in (CORRECTION, "restored")
     )
     node = helper.make_node(kind, [CORRECTION], ["restored"])
     return base64.b64encode(
-        helper.make_graph([node], "t", [read], [result]).SerializeToString()
+        helper.make_graph([node], "t", [map_info], [result]).SerializeToString()
     ).decode()
 
 
@@ -139,13 +138,13 @@ def graph_text(kind: str) -> str:
     "text", [graph_text("Loop"), graph_text("Conv"), "bm8gZ3JhcGg=", "not base64"]
 )
 def test_a_description_with_another_tail_is_one_sentence(text: str) -> None:
-    spoilt = copied(quantised().host)
+    corrupted = copied(quantised().host)
     ends = quantised().core.ends
-    entry = next(each for each in spoilt.metadata_props if each.key == KEY)
+    entry = next(candidate for candidate in corrupted.metadata_props if candidate.key == KEY)
     assert ends.tail is not None
     entry.value = entry.value.replace(ends.tail.text, text)
     with pytest.raises(ModelError, match="contradict"):
-        encoding_faults(spoilt)
+        encoding_faults(corrupted)
 
 
 def sigmoid_then_conv(w: GraphWriter) -> None:

@@ -53,12 +53,12 @@ def spoilt(core: IntCore) -> IntCore:
 
 def error(core: IntCore, patches: Patches) -> float:
     """Mean squared difference of the correction from the one that restores wholly."""
-    found = []
-    for seen, meant in patches.pairs:
-        tensors, _ = run_core(core, core.ends.split(seen))
-        wanted = core.ends.correction_of(seen, meant)
-        found.append(float(np.square(merged_correction(core, tensors) - wanted).mean()))
-    return float(np.mean(found))
+    errors = []
+    for degraded, reference in patches.pairs:
+        tensors, _ = run_core(core, core.ends.split(degraded))
+        expected = core.ends.correction_of(degraded, reference)
+        errors.append(float(np.square(merged_correction(core, tensors) - expected).mean()))
+    return float(np.mean(errors))
 
 
 def alone(patches: Patches) -> Remade[tuple[np.ndarray, np.ndarray]]:
@@ -75,17 +75,17 @@ def difference(core: IntCore, other: IntCore, patches: Patches) -> float:
     """Mean squared difference between two cores' corrections."""
     results = [
         [
-            merged_correction(each, run_core(each, each.ends.split(seen))[0])
-            for seen in patches.degraded
+            merged_correction(variant, run_core(variant, variant.ends.split(image))[0])
+            for image in patches.degraded
         ]
-        for each in (core, other)
+        for variant in (core, other)
     ]
     return float(np.mean([np.square(a - b).mean() for a, b in zip(*results, strict=True)]))
 
 
 def test_it_begins_with_the_core_s_own_numbers(quantised: Quantised) -> None:
-    again = TrainableCore(quantised.core).core()
-    for one, other in zip(quantised.core.convolutions, again.convolutions, strict=True):
+    unchanged = TrainableCore(quantised.core).core()
+    for one, other in zip(quantised.core.convolutions, unchanged.convolutions, strict=True):
         np.testing.assert_array_equal(one.weight, other.weight)
         np.testing.assert_array_equal(one.bias, other.bias)
 
@@ -153,17 +153,17 @@ def test_without_references_it_comes_back_towards_the_float_network(
     quantised: Quantised, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
 ) -> None:
     bad = spoilt(quantised.core)
-    found = trained(bad, float_onnx, Tuning(alone(patches), 40, rate=0.3))
-    assert difference(found, quantised.core, unseen) < 0.7 * difference(bad, quantised.core, unseen)
-    assert shift_faults(found) == []
-    assert found.frac_bits == quantised.core.frac_bits
+    tuned = trained(bad, float_onnx, Tuning(alone(patches), 40, rate=0.3))
+    assert difference(tuned, quantised.core, unseen) < 0.7 * difference(bad, quantised.core, unseen)
+    assert shift_faults(tuned) == []
+    assert tuned.frac_bits == quantised.core.frac_bits
 
 
 def test_what_comes_out_worse_is_not_kept(
     quantised: Quantised, float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
-    found = trained(quantised.core, float_onnx, Tuning(alone(patches), 2, rate=60.0))
-    assert found is quantised.core
+    tuned = trained(quantised.core, float_onnx, Tuning(alone(patches), 2, rate=60.0))
+    assert tuned is quantised.core
 
 
 @pytest.mark.parametrize(("rate", "steps"), [(0.0, 12), (0.3, 14)])
@@ -184,8 +184,8 @@ def test_it_goes_on_by_itself_while_held_out_pairs_gain(
 def test_a_reference_of_another_size_is_one_sentence(
     quantised: Quantised, float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
-    seen, meant = patches.pairs[0]
-    short = Remade(lambda _: (seen, meant[..., :-2]), 2)
+    degraded, reference = patches.pairs[0]
+    short = Remade(lambda _: (degraded, reference[..., :-2]), 2)
     with pytest.raises(
         ImageError, match=r"reference: expected one of 1 x 1 x 128 x 128, got 1 x 1 x 128 x 126"
     ):
@@ -197,13 +197,13 @@ def test_the_same_seed_gives_the_same_numbers(
     float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
     def made(seed: int) -> bytes:
-        told: list[str] = []
+        messages: list[str] = []
         tuning = Tuning(patches.pairs, 3, rate=0.3, seed=seed)
-        model = quantise_model(float_onnx, patches, {}, tuning=tuning, log=told.append)
-        assert told[-1].startswith("fine-tuning, step 3 of 3: ")
-        assert {each.key: each.value for each in model.host.metadata_props}["finetune"].startswith(
-            "3 steps"
-        )
+        model = quantise_model(float_onnx, patches, {}, tuning=tuning, log=messages.append)
+        assert messages[-1].startswith("fine-tuning, step 3 of 3: ")
+        assert {entry.key: entry.value for entry in model.host.metadata_props}[
+            "finetune"
+        ].startswith("3 steps")
         return bytes(model.host.SerializeToString())
 
     assert made(1) == made(1)
@@ -240,6 +240,7 @@ def test_slopes_pass_roundings_and_stop_where_int8_ends(
     trainable(planes).square().mean().backward()
     assert all(bool(weight.grad.abs().max() > 0) for weight in trainable.weights)
     with torch.no_grad():
+        # INT8 ends at 127, so these weights are clipped and get no slope.
         trainable.weights[0].fill_(200.0)
     trainable.zero_grad()
     trainable(planes).square().mean().backward()
@@ -260,13 +261,13 @@ def test_the_correction_of_a_result_makes_it(
     )
     ends = Ends(back=back, adds_image=adds)
     image, result = (generator.random((1, 1, 36, 72)).astype(np.float32) for _ in range(2))
-    found = ends.finished(image, ends.correction_of(image, result))
-    np.testing.assert_allclose(found, result, atol=2e-7)
+    result_again = ends.finished(image, ends.correction_of(image, result))
+    np.testing.assert_allclose(result_again, result, atol=2e-7)
 
 
 @pytest.mark.slow
 def test_training_on_references_pays_on_others(
     quantised: Quantised, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
 ) -> None:
-    found = trained(quantised.core, float_onnx, Tuning(patches.pairs, 20, rate=0.3))
-    assert error(found, unseen) < 0.97 * error(quantised.core, unseen)
+    tuned = trained(quantised.core, float_onnx, Tuning(patches.pairs, 20, rate=0.3))
+    assert error(tuned, unseen) < 0.97 * error(quantised.core, unseen)

@@ -46,16 +46,16 @@ def test_sound_files_of_every_encoding_run(encoding: Callable[..., Path], tmp_pa
     assert run(open_session(path, 1), IMAGE).shape == IMAGE.shape
 
 
-@pytest.mark.parametrize("apart", [True, False], ids=["apart", "beside the weights themselves"])
+@pytest.mark.parametrize("external", [True, False], ids=["apart", "beside the weights themselves"])
 @pytest.mark.parametrize(
     "place", ["/etc/passwd", "../secret.bin", "beside.bin", "a/../../b", "link.bin", ""]
 )
 def test_weights_in_other_files_are_never_looked_for(
-    place: str, apart: bool, model: onnx.ModelProto
+    place: str, external: bool, model: onnx.ModelProto
 ) -> None:
     tensor = model.graph.initializer[0]
     tensor.external_data.add(key="location", value=place)
-    if apart:
+    if external:
         tensor.ClearField("raw_data")
         tensor.data_location = TensorProto.EXTERNAL
     with patch("onnx.checker.check_model") as checker:
@@ -125,7 +125,8 @@ def ends(*names: str, kind: int = TensorProto.BOOL) -> list[onnx.ValueInfoProto]
 
 INPUTS = [*ends("i", kind=TensorProto.INT64), *ends("cond")]
 LOOP = helper.make_graph([node("Identity", "cond", to="again")], "body", INPUTS, ends("again"))
-SIZE_5000, SIZE_3000 = constant("n", 5000), constant("n", 3000)
+SIZE_5000 = constant("n", 5000)
+SIZE_3000 = constant("n", 3000)
 
 
 def filled(to: str, by: str = "n") -> onnx.NodeProto:
@@ -185,7 +186,8 @@ def test_what_a_runtime_would_do_for_an_untrusted_file_is_refused(
     model.opset_import.extend(
         helper.make_opsetid(domain, 1) for domain in {n.domain for n in nodes if n.domain}
     )
-    with patch("onnx.checker.check_model"):  # some are refused by it too, in other words
+    # ONNX's own checker would refuse some of these first, with other words.
+    with patch("onnx.checker.check_model"):
         assert words in refusal(model)
 
 
@@ -200,9 +202,9 @@ def test_unknown_opsets_are_refused_and_batches_where_images_come_singly(
         with pytest.raises(ModelError, match="opset"):
             load_onnx(tmp_path / "opset.onnx", to_run)
     four.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 4
-    for read in (tiling_of, partial(network_of, tile_px=64)):
+    for reader in (tiling_of, partial(network_of, tile_px=64)):
         with pytest.raises(ModelError, match=r"4"):
-            read(four)
+            reader(four)
 
 
 def test_functions_and_sparse_weights_are_refused(model: onnx.ModelProto) -> None:
@@ -223,7 +225,8 @@ def test_functions_and_sparse_weights_are_refused(model: onnx.ModelProto) -> Non
 def test_a_file_of_absurd_size_is_not_read(tmp_path: Path) -> None:
     path = tmp_path / "huge.onnx"
     with path.open("wb") as stream:
-        stream.truncate(FILE_BYTES + 1)  # sparse: it takes no disk
+        # The file is sparse, so it takes no disk space.
+        stream.truncate(FILE_BYTES + 1)
     with (
         patch.object(Path, "read_bytes", side_effect=AssertionError),
         pytest.raises(ModelError, match="more than"),
@@ -275,8 +278,10 @@ def test_weights_without_sizes_are_one_sentence(tmp_path: Path) -> None:
 def test_an_unknown_operator_of_two_tensors_hides_the_shape(tmp_path: Path) -> None:
     sketch = Sketch(1)
     scale = sketch.constant(np.array(0.5, np.float32))
-    odd = sketch.node("QLinearMystery", "image", scale, "image", domain="com.microsoft")
-    assert read_network(sketch.save(tmp_path / "a.onnx", odd), 32).operations[0].out_shape is None
+    unknown = sketch.node("QLinearMystery", "image", scale, "image", domain="com.microsoft")
+    assert (
+        read_network(sketch.save(tmp_path / "a.onnx", unknown), 32).operations[0].out_shape is None
+    )
 
 
 def test_a_long_chain_of_activations_is_followed_in_a_moment(tmp_path: Path) -> None:

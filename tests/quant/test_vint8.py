@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -79,12 +80,12 @@ def test_the_host_files_bits(
     model = vint8_model(core, {}, tile_px)
     host = host_model(core, {})
     for optimise in (True, False):
-        found = open_session(model, optimise=optimise).run(None, {PLANES: planes_of(image)})[0]
+        result = open_session(model, optimise=optimise).run(None, {PLANES: planes_of(image)})[0]
         np.testing.assert_array_equal(
-            found, correction(core, core.ends.split(image), half_even=True)
+            result, correction(core, core.ends.split(image), half_even=True)
         )
         by_host = run(open_session(host, optimise=optimise), image)
-        np.testing.assert_array_equal(core.ends.finished(image, found), by_host)
+        np.testing.assert_array_equal(core.ends.finished(image, result), by_host)
 
 
 @NETWORKS
@@ -94,25 +95,26 @@ def test_the_layout_of_amds_quantiser(network: Callable[[], Graph]) -> None:
     )
     model = vint8_model(core, {}, 9)
     onnx.checker.check_model(model, full_check=True)
-    assert [(each.domain, each.version) for each in model.opset_import] == [("", 17)]
+    assert [(opset.domain, opset.version) for opset in model.opset_import] == [("", 17)]
     assert model.producer_name == "beers-deploy"
-    assert all(
-        d.dim_value
-        for v in (*model.graph.input, *model.graph.output)
-        for d in v.type.tensor_type.shape.dim
-    )
+    for info in (*model.graph.input, *model.graph.output):
+        assert all(side.dim_value for side in info.type.tensor_type.shape.dim)
     nodes = model.graph.node
-    held = constants(model)
-    readers = Counter(name for node in nodes for name in node.input)
-    written = {name: node.op_type for node in nodes for name in node.output}
+    values = constants(model)
+    readers = Counter(chain.from_iterable(node.input for node in nodes))
+    writers = dict[str, str]()
     for node in nodes:
-        if node.op_type in PAIR:  # one reader each, a scale a tensor, around 0
+        writers |= dict.fromkeys(node.output, node.op_type)
+    for node in nodes:
+        # Each pair has one reader and one scale per tensor, symmetric around 0, as AMD's quantiser
+        # writes them.
+        if node.op_type in PAIR:
             assert readers[node.output[0]] == (node.output[0] != CORRECTION)
-            assert held[node.input[1]].shape == ()
-            assert held[node.input[2]].dtype == np.int8
-            assert node.input[0] not in held or held[node.input[0]].dtype == np.int8
+            assert values[node.input[1]].shape == ()
+            assert values[node.input[2]].dtype == np.int8
+            assert node.input[0] not in values or values[node.input[0]].dtype == np.int8
         else:
-            feeds = {written[name] for name in node.input if name in written}
+            feeds = {writers[name] for name in node.input if name in writers}
             assert feeds == {"Conv" if node.op_type == "LeakyRelu" else "DequantizeLinear"}
     scaled = {(node.input[1], node.input[0]) for node in nodes if node.op_type == "QuantizeLinear"}
     assert (

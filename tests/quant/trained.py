@@ -2,8 +2,6 @@
 have become.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 
@@ -29,29 +27,22 @@ def hold_to_reference(trainable: TrainableCore, planes: np.ndarray) -> None:
     holds it.
     """
     core = trainable.core()
-    wanted, _ = run_core(core, planes)
+    expected, _ = run_core(core, planes)
     with torch.no_grad():
-        found = trainable.tensors(torch.from_numpy(planes.astype(np.float32)))
+        tensors = trainable.tensors(torch.from_numpy(planes.astype(np.float32)))
         result = trainable(torch.from_numpy(planes.astype(np.float32))).numpy()
     ends = core.ends
-    whole = merged_correction(core, wanted)
-    for name, values in wanted.items():
+    correction = merged_correction(core, expected)
+    for name, values in expected.items():
         if name != CORRECTION or ends.copies == 1:
-            np.testing.assert_array_equal(found[name].numpy(), values, err_msg=name)
+            np.testing.assert_array_equal(tensors[name].numpy(), values, err_msg=name)
     if ends.copies == 1:
-        np.testing.assert_allclose(result, whole, rtol=1e-6)
+        np.testing.assert_allclose(result, correction, rtol=1e-6)
         return
-    fine = _fine(
-        np.split(np.abs(wanted[CORRECTION]), ends.copies, axis=1), windows=bool(ends.offsets)
-    )
-    assert (
-        fine.any() or not ends.offsets
-    )  # windows hold all, the fine one of two gains what is small
-    assert np.abs(result - whole)[fine].max(initial=0) <= 0.501 * core.scale(CORRECTION)
-
-
-def _fine(sizes: Sequence[np.ndarray], windows: bool) -> np.ndarray:
-    """Where one of the fine copies holds the value: all but the first of windows, the first of two
-    gains.
-    """
-    return np.asarray(np.min(sizes[1:] if windows else sizes[:1], axis=0) <= FINE_MAX)
+    sizes = np.split(np.abs(expected[CORRECTION]), ends.copies, axis=1)
+    # All windows but the first are fine copies; of two gains, the first is the fine one.
+    fine_copies = sizes[1:] if ends.offsets else sizes[:1]
+    fine = np.min(fine_copies, axis=0) <= FINE_MAX
+    # Windows hold every value in a fine copy. Two gains hold only small values there.
+    assert fine.any() or not ends.offsets
+    assert np.abs(result - correction)[fine].max(initial=0) <= 0.501 * core.scale(CORRECTION)

@@ -31,10 +31,11 @@ def network() -> ConvBEERS:
 
 
 def small_network(variant: Variant) -> ConvBEERS:
-    made = plain(variant, seed=3)
+    created = plain(variant, seed=3)
     with torch.no_grad():
-        made.tail.weight.mul_(0.03)  # a trained network keeps flat ground; a new one nearly does
-    return made
+        # A trained network keeps flat ground. A small tail makes a new one nearly do so.
+        created.tail.weight.mul_(0.03)
+    return created
 
 
 @pytest.fixture(scope="session")

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -60,8 +61,8 @@ def test_the_shipped_networks_at_half_resolution_are_calm(variant: str) -> None:
     board = np.indices((96, 96)).sum(axis=0) % 2 * float(FULL_DN)
     assert subject.int8 is not None
     for network in (subject.float32, subject.int8):
-        moved = network.restore(board) - board
-        assert abs(float(moved[30:-30, 30:-30].mean())) < 0.08 * FULL_DN
+        change = network.restore(board) - board
+        assert abs(float(change[30:-30, 30:-30].mean())) < 0.08 * FULL_DN
 
 
 @pytest.mark.parametrize(
@@ -114,8 +115,8 @@ def test_a_network_with_a_nan_among_its_weights_is_not_opened(
 
 
 def test_a_broken_int8_network_fails(pair: list[Path], tmp_path: Path) -> None:
-    broken = changed(onnx.load(pair[1]), "tail.bias", lambda bias: bias + 10_000_000)
-    save_onnx(broken, tmp_path / "broken.onnx")
+    corrupted = changed(onnx.load(pair[1]), "tail.bias", lambda bias: bias + 10_000_000)
+    save_onnx(corrupted, tmp_path / "broken.onnx")
     results = look(open_subject(pair[0], tmp_path / "broken.onnx"), ["deciles"], ("INT8",))
     assert {"mean moved"} <= {measure.check for measure in results[0].failed}
 
@@ -124,11 +125,11 @@ def test_a_halo_one_pixel_short_fails(subject: Subject) -> None:
     """Of the network's receptive radius: tile plans differ."""
     image = BY_NAME["no noise"].draw(48, np.random.default_rng(0))[0]
     radius_px = subject.float32.tiling.halo_px
-    whole = subject.float32.restore(image)
+    at_once = subject.float32.restore(image)
     for halo_px, same in ((radius_px, True), (radius_px - 1, False)):
         plan = make_plan((1, *image.shape), 2 * radius_px + 9, halo_px, Tiling(halo_px))
         tiled = restore_floats(image, subject.float32.infer(), plan, FULL_DN)
-        assert differing("plans differ", tiled, whole).holds == same
+        assert differing("plans differ", tiled, at_once).holds == same
 
 
 def test_nan_never_holds_and_is_the_worst() -> None:
@@ -139,7 +140,7 @@ def test_nan_never_holds_and_is_the_worst() -> None:
 
 
 def test_a_limitation_explains_no_more_than_its_ceiling() -> None:
-    limit = next(known for known in LIMITATIONS if known.name == "border")
+    limit = next(limitation for limitation in LIMITATIONS if limitation.name == "border")
     for value, failed in ((limit.ceiling, 0), (limit.ceiling + 1, 1), (float("nan"), 1)):
         result = StageResult(BY_NAME["deciles"], "INT8", (Measure("border", value, 10),))
         assert len(result.failed) == failed
@@ -161,11 +162,11 @@ def test_ringing_is_what_leaves_the_range_around() -> None:
 @pytest.mark.parametrize("case", CASES, ids=lambda case: str(case.name))
 def test_cases_are_drawn_from_their_seed_and_say_what_is_wrong_with_them(case: Case) -> None:
     first, second = (case.draw(24, np.random.default_rng(7)) for _ in range(2))
-    for image, again in zip(first, second, strict=True):
-        np.testing.assert_array_equal(image, again)
+    for image, repeated in zip(first, second, strict=True):
+        np.testing.assert_array_equal(image, repeated)
         assert image.dtype == np.float32
-        sound = bool(np.isfinite(image).all()) and image.min() >= 0 and image.max() <= FULL_DN
-        assert sound == (case.pixels == "sound")
+        valid = bool(np.isfinite(image).all()) and image.min() >= 0 and image.max() <= FULL_DN
+        assert valid == (case.pixels == "sound")
 
 
 def test_the_command_writes_its_figures_and_fails_by_exit_code(
@@ -178,8 +179,8 @@ def test_the_command_writes_its_figures_and_fails_by_exit_code(
     tables = {row["table"] for row in document["rows"]}
     assert {"battery", "worst", "integer layers", "findings"} <= tables
     assert "## Integer layers" in (tmp_path / "s.md").read_text()
-    broken = changed(onnx.load(pair[0]), "tail.weight", lambda weight: 3000 * weight)
-    save_onnx(broken, tmp_path / "broken.onnx")
+    corrupted = changed(onnx.load(pair[0]), "tail.weight", lambda weight: 3000 * weight)
+    save_onnx(corrupted, tmp_path / "broken.onnx")
     failed = CliRunner().invoke(app, ["stress", str(tmp_path / "broken.onnx"), *few])
     assert failed.exit_code == 1
     assert "FAILED night, float32" in failed.output
@@ -205,10 +206,9 @@ def test_bad_input_is_one_sentence(arguments: list[str], words: str, pair: list[
 def test_the_page_of_stability_is_fresh() -> None:
     """It has each case, each stage and each limitation, and nothing that failed."""
     page = maker.TARGET.read_text(encoding="utf-8")
-    wanted = [maker.OPENING.strip(), *maker.stage_lines(), *maker.limitation_lines()]
-    assert [text for text in wanted if text.strip() not in page] == []
+    blocks = [maker.OPENING.strip(), *maker.stage_lines(), *maker.limitation_lines()]
+    assert [text for text in blocks if text.strip() not in page] == []
     lines = re.findall(rf"^- {': .+?, '.join(STAGES)}: .+?\. (.+)\.$", page, re.MULTILINE)
-    assert sorted(name for line in lines for name in line.split("; ")) == sorted(
-        case.name for case in CASES
-    )
+    names = chain.from_iterable(line.split("; ") for line in lines)
+    assert sorted(names) == sorted(case.name for case in CASES)
     assert "FAILED" not in page

@@ -66,9 +66,9 @@ def db(row: Row, guards: str) -> float:
 def test_flips_cost_more_the_more_there_are(rows: dict[str, Row]) -> None:
     clean = db(rows["none"], "no guard")
     for memory in ("weights", "maps", "image"):
-        found = [db(rows[name_of(memory, rate)], "no guard") for rate in MEMORIES[memory].rates]
-        assert found[0] == pytest.approx(clean, abs=0.2)
-        assert found[-1] < clean - 0.1
+        levels_db = [db(rows[name_of(memory, rate)], "no guard") for rate in MEMORIES[memory].rates]
+        assert levels_db[0] == pytest.approx(clean, abs=0.2)
+        assert levels_db[-1] < clean - 0.1
     assert db(rows[name_of("shifts", 10_000)], "no guard") <= clean
 
 
@@ -79,9 +79,9 @@ def test_scrubbing_and_majority_bring_the_fault_free_network_back(rows: dict[str
 
 
 def test_the_same_seed_flips_the_same_bits(target: FaultTarget, rows: dict[str, Row]) -> None:
-    again = {row.name: row for row in curve_rows(target, 2, seed=0)}
+    repeated = {row.name: row for row in curve_rows(target, 2, seed=0)}
     other = {row.name: row for row in curve_rows(target, 2, seed=1)}
-    assert again == rows
+    assert repeated == rows
     assert other != rows
 
 
@@ -103,12 +103,12 @@ def test_an_injection_leaves_the_target_alone(memory: str, target: FaultTarget) 
 def test_at_half_resolution_maps_have_a_bit_for_each_channel_of_each_place(coarse: Subject) -> None:
     target = make_target(coarse, SOURCE)
     image, _ = target.pairs[0]
-    sound = restored(Injected(target.core, SOUND, target.pairs[0][0], 0))
-    assert sound.shape == image.shape
-    assert np.abs(sound - image).max() > 0
+    result = restored(Injected(target.core, SOUND, target.pairs[0][0], 0))
+    assert result.shape == image.shape
+    assert np.abs(result - image).max() > 0
     every = MEMORIES["maps"].inject(target.core, image, 1e6, np.random.default_rng(0))
     assert every.flips == 8 * image.size // 4 * sum(map_channels(target.core).values())
-    assert (restored(every) != sound).mean() > 0.5
+    assert (restored(every) != result).mean() > 0.5
 
 
 @pytest.mark.parametrize("variant", ["convbeers-xs", "convbeers-s", "convbeers"])
@@ -121,16 +121,14 @@ def test_all_guards_cost_under_two_per_cent_on_the_board(variant: str) -> None:
     }
     dpu = load_dpu("vck190", None)
     target = FaultTarget(core, Guards(relus, 1024.0, checksums(core)), ())
-    found = price_rows(target, predict_file(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
-    *parts, together = (db(row, "time") for row in found)
+    prices = price_rows(target, predict_file(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
+    *parts, together = (db(row, "time") for row in prices)
     assert together == pytest.approx(sum(parts))
-    assert 0 < db(found[-1], "of a tile, if nothing hides") < 2
-    assert db(found[-1], "frame rate lost beside the DPU") == 0
-    assert all(
-        figure.mode == "predicted" and figure.interval
-        for row in found
-        for figure in row.figures.values()
-    )
+    assert 0 < db(prices[-1], "of a tile, if nothing hides") < 2
+    assert db(prices[-1], "frame rate lost beside the DPU") == 0
+    for row in prices:
+        assert all(figure.mode == "predicted" for figure in row.figures.values())
+        assert all(figure.interval for figure in row.figures.values())
 
 
 def test_the_command(pair: list[Path], tmp_path: Path) -> None:
@@ -146,7 +144,7 @@ def test_the_command(pair: list[Path], tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["FLOAT", "--bit-flips"], "INT8 network"),
         (["FLOAT", "INT8", "--bit-flips", "--cases", "snow"], "--bit-flips"),
@@ -160,14 +158,14 @@ def test_the_command(pair: list[Path], tmp_path: Path) -> None:
 )
 def test_wrong_arguments(
     arguments: list[str],
-    said: str,
+    message: str,
     pair: list[Path],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     files = {"FLOAT": str(pair[0]), "INT8": str(pair[1])}
-    assert said in refused("stress", *(files.get(text, text) for text in arguments))
+    assert message in refused("stress", *(files.get(text, text) for text in arguments))
 
 
 def test_the_page_is_fresh() -> None:

@@ -20,8 +20,8 @@ from beers_deploy.quant.session import open_session, run
 
 
 def images(seed: int, shape: tuple[int, int], binary: bool) -> np.ndarray:
-    drawn = np.random.default_rng(seed).random((1, 1, *shape))
-    return np.rint(drawn) if binary else drawn
+    noise = np.random.default_rng(seed).random((1, 1, *shape))
+    return np.rint(noise) if binary else noise
 
 
 def test_no_image_leaves_the_integer_bounds(quantised: Quantised) -> None:
@@ -52,11 +52,11 @@ def test_shipped_accumulators_cannot_overflow(path: Path) -> None:
 def test_a_core_is_read_back_from_its_file(quantised: Quantised) -> None:
     core = read_core(quantised.host)
     image = images(3, (19, 26), False).astype(np.float32)
-    whole = Ends(gains=2).merge(
+    merged = Ends(gains=2).merge(
         correction(core, split(image), half_even=True), core.scale(CORRECTION)
     )
     np.testing.assert_array_equal(
-        np.clip(image + whole, 0, 1), run(open_session(quantised.host), image)
+        np.clip(image + merged, 0, 1), run(open_session(quantised.host), image)
     )
 
 

@@ -80,11 +80,11 @@ def test_both_files_hold_every_bias_at_its_scale(
     core = biased(quantised.core, generator)
     image = generator.uniform(0.3, 0.7, (1, 1, *shape)).astype(np.float32)
     planes = split(image)
-    whole = correction(core, planes, half_even=True)
-    restored = np.clip(image + Ends(gains=2).merge(whole, core.scale(CORRECTION)), 0, 1)
+    expected = correction(core, planes, half_even=True)
+    restored = np.clip(image + Ends(gains=2).merge(expected, core.scale(CORRECTION)), 0, 1)
     np.testing.assert_array_equal(run(open_session(host_model(core, {})), image), restored)
     feed = {PLANES: planes.astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
-    np.testing.assert_array_equal(open_session(board_model(core, {})).run(None, feed)[0], whole)
+    np.testing.assert_array_equal(open_session(board_model(core, {})).run(None, feed)[0], expected)
 
 
 MTFS = st.floats(0.001, 0.63)

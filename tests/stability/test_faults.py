@@ -46,8 +46,8 @@ KINDS = {
 
 
 def flipped(a: np.ndarray, b: np.ndarray, bits: int) -> int:
-    apart = (a.astype(np.int64) ^ b.astype(np.int64)) & ((1 << bits) - 1)
-    return sum(int(value).bit_count() for value in apart.ravel())
+    difference = (a.astype(np.int64) ^ b.astype(np.int64)) & ((1 << bits) - 1)
+    return sum(int(value).bit_count() for value in difference.ravel())
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +65,8 @@ def test_so_many_bits_are_flipped_and_no_more(kind: str, seed: int, data: st.Dat
     assert flipped(values, injected, bits) == count
     assert injected.dtype == values.dtype
     assert low <= injected.min() <= injected.max() < high
-    again = flip_bits(values, count, np.random.default_rng(seed), bits)
-    np.testing.assert_array_equal(injected, again)
+    repeated = flip_bits(values, count, np.random.default_rng(seed), bits)
+    np.testing.assert_array_equal(injected, repeated)
 
 
 def test_the_rate_is_that_of_a_megabit() -> None:
@@ -93,12 +93,12 @@ def test_the_stored_bias_is_int8_and_the_network_the_same(quantised: Quantised) 
 
 def test_flips_fall_into_the_weights_of_all_layers(core: IntCore) -> None:
     injected = flip_weights(core, 200, np.random.default_rng(1))
-    apart = {
+    flips = {
         a.name: flipped(a.weight, b.weight, 8) + flipped(a.bias, b.bias, 8)
         for a, b in zip(core.convolutions, injected.convolutions, strict=True)
     }
-    assert sum(apart.values()) == 200
-    assert sum(count > 0 for count in apart.values()) > len(apart) / 2
+    assert sum(flips.values()) == 200
+    assert sum(count > 0 for count in flips.values()) > len(flips) / 2
 
 
 def test_every_shift_is_what_the_core_uses(core: IntCore) -> None:
@@ -113,11 +113,11 @@ def test_every_shift_is_what_the_core_uses(core: IntCore) -> None:
 
 def test_numbers_that_the_board_could_not_store_are_refused(quantised: Quantised) -> None:
     op = quantised.core.convolutions[0]
-    odd = replace(op, bias=np.full(len(op.bias), 100_001), bias_frac_bits=op.bias_frac_bits)
+    too_large = replace(op, bias=np.full(len(op.bias), 100_001), bias_frac_bits=op.bias_frac_bits)
     far = replace(
         op, weight_frac_bits=op.weight_frac_bits + 40, bias_frac_bits=op.bias_frac_bits + 40
     )
-    for wrong in (odd, far):
+    for wrong in (too_large, far):
         with pytest.raises(ModelError, match=op.name):
             as_stored(replace(quantised.core, ops=(wrong, *quantised.core.ops[1:])))
 
@@ -179,7 +179,7 @@ def test_a_clamped_result_keeps_its_bound_whatever_the_weights(core: IntCore) ->
 def test_faults_enter_memory_after_the_clamp(core: IntCore) -> None:
     name = next(op.output for op in core.convolutions if op.activation is Activation.relu)
     faults = Faults(
-        {}, lambda found, tensor: np.full_like(tensor, 127) if found == name else tensor
+        {}, lambda target, tensor: np.full_like(tensor, 127) if target == name else tensor
     )
     tensors, _ = run_core(core, split(image()), faults=guarded(faults, Guards({name: 3}, 1.0, {})))
     assert (tensors[name] == 127).all()
@@ -198,25 +198,26 @@ def test_every_single_flip_is_found_and_the_layer_scrubbed(core: IntCore, guards
 
 
 def test_two_copies_of_three_decide(core: IntCore) -> None:
-    meant = shifts_of(core)
-    one, other = (flip_shifts(meant, count, np.random.default_rng(count)) for count in (1, 4))
-    assert one != meant
-    assert voted((one, meant, meant)) == meant
-    assert voted((meant, one, meant)) == voted((meant, meant, other)) == meant
-    assert voted((one, one, meant)) == one  # the same bit twice is beyond triple modular redundancy
+    shifts = shifts_of(core)
+    one, other = (flip_shifts(shifts, count, np.random.default_rng(count)) for count in (1, 4))
+    assert one != shifts
+    assert voted((one, shifts, shifts)) == shifts
+    assert voted((shifts, one, shifts)) == voted((shifts, shifts, other)) == shifts
+    # Triple modular redundancy cannot correct the same bit flipped in two copies.
+    assert voted((one, one, shifts)) == one
 
 
 def test_a_wrong_shift_is_used(core: IntCore) -> None:
-    meant = shifts_of(core)
+    shifts = shifts_of(core)
     planes = split(image(seed=2))
-    sound = run_core(core, planes)[0][CORRECTION]
+    faultless = run_core(core, planes)[0][CORRECTION]
     np.testing.assert_array_equal(
-        run_core(core, planes, faults=Faults(meant))[0][CORRECTION], sound
+        run_core(core, planes, faults=Faults(shifts))[0][CORRECTION], faultless
     )
-    for key in (key for key in meant if key[1] == "shift_cut"):
+    for key in (key for key in shifts if key[1] == "shift_cut"):
         for wrong in (-32, 31):
             assert not np.array_equal(
-                run_core(core, planes, faults=Faults({key: wrong}))[0][CORRECTION], sound
+                run_core(core, planes, faults=Faults({key: wrong}))[0][CORRECTION], faultless
             )
 
 

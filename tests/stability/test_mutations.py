@@ -30,11 +30,13 @@ def test_the_page_is_fresh_and_all_ten_name_a_test() -> None:
 def test_what_would_be_broken_stands_there_once_and_the_tests_are_there(
     mutation: maker.Mutation,
 ) -> None:
-    sound = (ROOT / mutation.file).read_text(encoding="utf-8")
-    broken = maker.broken(sound, mutation)
-    compile(broken, mutation.file, "exec")
+    original = (ROOT / mutation.file).read_text(encoding="utf-8")
+    mutated = maker.broken(original, mutation)
+    compile(mutated, mutation.file, "exec")
     assert (
-        1 <= sum(a != b for a, b in zip(sound.splitlines(), broken.splitlines(), strict=True)) <= 2
+        1
+        <= sum(a != b for a, b in zip(original.splitlines(), mutated.splitlines(), strict=True))
+        <= 2
     )
     for file, name in (test.split("::") for test in mutation.tests):
         assert re.search(

@@ -145,8 +145,8 @@ def test_the_traditional_pipeline_is_calm(case: Case) -> None:
     chain = Chain(sensor_of(case), load_sensor(REFERENCE).nominal(), "fast")
     for image in images(case):
         result = restored(image, chain)
-        known = ~np.isnan(image)
-        assert 0 <= result[known].min() <= result[known].max() <= FULL_DN
+        valid = ~np.isnan(image)
+        assert 0 <= result[valid].min() <= result[valid].max() <= FULL_DN
         assert np.array_equal(result, restored(image, chain), equal_nan=True)
         torch.set_num_threads(2)
         assert np.array_equal(result, restored(image, chain), equal_nan=True)
@@ -156,7 +156,7 @@ def test_the_traditional_pipeline_is_calm(case: Case) -> None:
             list(restore_strips(strips, len(image), chain.fitted_to(strips)))
         ).numpy()
         assert np.array_equal(result, joined, equal_nan=True)
-        assert np.array_equal(result[~known], image[~known], equal_nan=True)
+        assert np.array_equal(result[~valid], image[~valid], equal_nan=True)
         if case.pixels == "sound":
             faithful(image, result, chain)
 
@@ -182,7 +182,7 @@ def noisy(image: np.ndarray) -> np.ndarray:
 
 def both(image: np.ndarray) -> tuple[Tensor, Tensor]:
     """The noisy image and itself, (1, 1, H, W) of full scale."""
-    parts = (np.asarray(each / FULL_DN, np.float32) for each in (noisy(image), image))
+    parts = (np.asarray(plane / FULL_DN, np.float32) for plane in (noisy(image), image))
     restored, reference = (torch.from_numpy(part)[None, None] for part in parts)
     return restored, reference
 
@@ -201,13 +201,13 @@ def test_the_loss_is_its_formula_and_its_gradient_is_bounded(case: Case) -> None
         noisy_one, reference = both(image)
         for other in (noisy_one, reference):
             value, gradient = with_gradient(other, reference)
-            again, gradient_again = with_gradient(other, reference)
-            assert value == again
+            repeated, gradient_again = with_gradient(other, reference)
+            assert value == repeated
             assert torch.equal(gradient, gradient_again)
             exact = by_formula(weights, other.double(), reference.double())
             assert value == pytest.approx(exact, rel=1e-4, abs=1e-4 * NOISE_DN / FULL_DN)
             # Of the mean size of F, orthonormal, each pixel moves every F by 1 / sqrt(pixels) at
-            # most: proven.
+            # most. This is proven, not measured.
             allowed = 1 + weights.fft * math.sqrt(gradient.numel())
             assert gradient.numel() * float(gradient.abs().max()) <= allowed * (1 + 1e-4)
 

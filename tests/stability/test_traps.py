@@ -4,6 +4,7 @@ sprung.
 
 import math
 import re
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -39,8 +40,8 @@ def trap_rows(page: str) -> dict[int, list[tuple[str, str]]]:
 
 def missing_tests(rows: dict[int, list[tuple[str, str]]]) -> list[str]:
     """Rows without a test, and tests that are not there."""
-    absent = [f"{number} has no test" for number, named in rows.items() if not named]
-    for path, name in (test for named in rows.values() for test in named):
+    absent = [f"{number} has no test" for number, tests in rows.items() if not tests]
+    for path, name in chain.from_iterable(rows.values()):
         file = ROOT / path
         if not file.is_file() or not re.search(
             rf"^def {name}\(", file.read_text(encoding="utf-8"), re.MULTILINE
@@ -61,7 +62,8 @@ def test_every_trap_has_a_test_and_every_test_is_there() -> None:
 def test_trap_2_the_diagonal_is_no_product_of_the_axes(mtf_nyquist: float, diagonal: float) -> None:
     value = float(mtf(0.5, 0.5, mtf_nyquist))
     assert value == pytest.approx(diagonal, rel=0.01)
-    assert value > 1.5 * mtf_nyquist**2  # what blurring rows and columns by themselves would leave
+    # Blurring rows and columns separately would leave the product of both contrasts.
+    assert value > 1.5 * mtf_nyquist**2
 
 
 def test_trap_3_a_filter_beside_an_uncalibrated_blur_leaves_half() -> None:
@@ -102,7 +104,8 @@ def test_trap_10_a_full_inverse_blows_up(mtf_nyquist: float, largest: float) -> 
 
 def groups(kind: str) -> Tensor:
     generator = torch.Generator().manual_seed(0)
-    if kind == "few":  # 15 patches of 25 pixels
+    # A covariance of 25 pixels from 15 patches has no full rank.
+    if kind == "few":
         return 100 + 12 * torch.randn(1, 15, 25, generator=generator)
     return torch.full((1, 35, 25), 4095.0 if kind == "saturated" else 0.0)
 
@@ -142,10 +145,10 @@ def test_trap_15_the_variance_in_float32_comes_out_negative() -> None:
     )
 
 
-@pytest.mark.parametrize("lost", [np.nan, np.inf, -np.inf])
-def test_trap_15_no_psnr_of_pixels_that_are_lost(lost: float) -> None:
+@pytest.mark.parametrize("pixel", [np.nan, np.inf, -np.inf])
+def test_trap_15_no_psnr_of_pixels_that_are_lost(pixel: float) -> None:
     image = np.full((12, 12), 5.0)
-    image[3, 3] = lost
+    image[3, 3] = pixel
     assert math.isnan(psnr_db(image, np.zeros((12, 12)), 4095))
 
 
@@ -159,7 +162,8 @@ def test_trap_18_one_generator_for_all_would_change_every_draw() -> None:
     def noise(first: bool) -> np.ndarray:
         shared = np.random.default_rng(0)
         if first:
-            shared.standard_normal(5)  # an effect that is left out in the other run
+            # The other run skips this effect, which moves all later draws.
+            shared.standard_normal(5)
         return shared.standard_normal(4)
 
     assert not np.array_equal(noise(True), noise(False))
@@ -177,7 +181,8 @@ def test_threads_change_no_bit_of_the_compensation() -> None:
     ]
     results = []
     for threads in (1, 2, 3):
-        torch.set_num_threads(threads)  # the fixture puts it back
+        # The fixture restores the number of threads.
+        torch.set_num_threads(threads)
         results.append(compensate(image, 0.07, 0.25, epsilon=0.004))
     assert torch.equal(results[0], results[1])
     assert torch.equal(results[0], results[2])

@@ -3,6 +3,7 @@
 import json
 import re
 import tomllib
+from itertools import chain
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -22,24 +23,27 @@ def instructions(dockerfile: str) -> list[tuple[str, str]]:
 
 
 def test_bases_are_pinned_packages_hashed_and_root_is_not_used() -> None:
-    found = instructions((ROOT / "Dockerfile").read_text())
-    stages = {rest.partition(" AS ")[2] for word, rest in found if word == "FROM"}
-    bases = {rest.partition(" AS ")[0] for word, rest in found if word == "FROM"}
+    dockerfile = instructions((ROOT / "Dockerfile").read_text())
+    stages = {rest.partition(" AS ")[2] for word, rest in dockerfile if word == "FROM"}
+    bases = {rest.partition(" AS ")[0] for word, rest in dockerfile if word == "FROM"}
     assert all(PINNED.fullmatch(base) for base in bases - stages)
     assert re.fullmatch(
-        r"[1-9]\d*(:[1-9]\d*)?", [rest for word, rest in found if word == "USER"][-1]
+        r"[1-9]\d*(:[1-9]\d*)?", [rest for word, rest in dockerfile if word == "USER"][-1]
     )
     assert not [
-        rest for word, rest in found if word == "ADD" or (word == "RUN" and FETCHES.search(rest))
+        rest
+        for word, rest in dockerfile
+        if word == "ADD" or (word == "RUN" and FETCHES.search(rest))
     ]
     copied = [
         rest.split()[:-1]
-        for word, rest in found
+        for word, rest in dockerfile
         if word == "COPY" and not rest.startswith("--from=")
     ]
-    assert not {".", "/", "*"} & {name for names in copied for name in names}
-    steps = [part.strip() for word, rest in found if word == "RUN" for part in rest.split("&&")]
-    assert all(SOUND_INSTALL.search(step) for step in steps if "pip install" in step)
+    assert not {".", "/", "*"} & {*chain.from_iterable(copied)}
+    commands = [rest for word, rest in dockerfile if word == "RUN"]
+    steps = chain.from_iterable(command.split("&&") for command in commands)
+    assert all(SOUND_INSTALL.search(step.strip()) for step in steps if "pip install" in step)
 
 
 def test_every_folder_of_the_package_reaches_the_image() -> None:
@@ -48,7 +52,10 @@ def test_every_folder_of_the_package_reaches_the_image() -> None:
         for word, rest in instructions((ROOT / "Dockerfile").read_text())
         if word == "COPY"
     ]
-    copied = {name for names in copies if not names[0].startswith("--") for name in names[:-1]}
+    copied = set[str]()
+    for names in copies:
+        if not names[0].startswith("--"):
+            copied |= {*names[:-1]}
     let_in = {
         line[1:]
         for line in (ROOT / ".dockerignore").read_text().splitlines()

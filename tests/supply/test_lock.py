@@ -19,37 +19,43 @@ PINNED = re.compile(r"(?m)^[\w.-]+==[\w.!]+")
 
 def asked_for(*extras: str) -> list[str]:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    wanted = [
-        each for extra in extras for each in project["project"]["optional-dependencies"][extra]
+    requirements = []
+    for extra in extras:
+        requirements += project["project"]["optional-dependencies"][extra]
+    return [
+        *project["project"]["dependencies"],
+        *requirements,
+        *project["build-system"]["requires"],
     ]
-    return [*project["project"]["dependencies"], *wanted, *project["build-system"]["requires"]]
 
 
-def faults(lock: str, wanted: list[str]) -> list[str]:
+def faults(lock: str, requirements: list[str]) -> list[str]:
     """What is wrong with a lock, a sentence each."""
     lines = [
         line
         for line in re.sub(r"\s*\\\n\s*", " ", lock).splitlines()
         if line and not line.startswith("#")
     ]
-    found = [f"no pin with its hashes: {line[:60]}" for line in lines if not PIN.fullmatch(line)]
+    sentences = [
+        f"no pin with its hashes: {line[:60]}" for line in lines if not PIN.fullmatch(line)
+    ]
     pins = {
         canonicalize_name(pin["name"]): pin["version"]
         for line in lines
         if (pin := PIN.fullmatch(line))
     }
-    for requirement in map(Requirement, wanted):
+    for requirement in map(Requirement, requirements):
         version = pins.get(canonicalize_name(requirement.name))
         if version is None or not requirement.specifier.contains(version, prereleases=True):
-            found.append(f"{requirement} is asked for, {version} is locked")
-    return found
+            sentences.append(f"{requirement} is asked for, {version} is locked")
+    return sentences
 
 
 def test_the_locks_satisfy_the_project() -> None:
-    whole, core = (
+    full, core = (
         (ROOT / name).read_text() for name in ("requirements.lock", "requirements-core.lock")
     )
-    assert faults(whole, asked_for("study", "torch")) == []
+    assert faults(full, asked_for("study", "torch")) == []
     assert faults(core, asked_for()) == []
-    assert set(PINNED.findall(core)) < set(PINNED.findall(whole))
+    assert set(PINNED.findall(core)) < set(PINNED.findall(full))
     assert "torch==" not in core

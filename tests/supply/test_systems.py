@@ -5,6 +5,7 @@ needs one of them.
 import ast
 import re
 import tomllib
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -39,7 +40,11 @@ def asked_for(name: str) -> SpecifierSet:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
         "optional-dependencies"
     ]
-    return next(found.specifier for found in map(Requirement, extras[name]) if found.name == name)
+    return next(
+        requirement.specifier
+        for requirement in map(Requirement, extras[name])
+        if requirement.name == name
+    )
 
 
 def pages() -> list[Path]:
@@ -47,21 +52,21 @@ def pages() -> list[Path]:
 
 
 def test_torch_is_asked_for_by_a_range_with_both_ends() -> None:
-    asked = asked_for("torch")
-    assert {specifier.operator for specifier in asked} == {">=", "<"}
-    assert [str(version) for version in VERSIONS if version in asked] == [
+    specifiers = asked_for("torch")
+    assert {specifier.operator for specifier in specifiers} == {">=", "<"}
+    assert [str(version) for version in VERSIONS if version in specifiers] == [
         "2.5.0",
         "2.9.1",
         "2.13.0",
         "2.13.1",
     ]
-    assert Version("2.13.0+cpu") in asked
+    assert Version("2.13.0+cpu") in specifiers
 
 
 def test_every_page_installs_a_torch_that_the_project_keeps() -> None:
-    found = {page.name: TORCH.findall(page.read_text(encoding="utf-8")) for page in pages()}
-    assert found["README.md"] == found["CONTRIBUTING.md"] == ["<2.14"]
-    assert {each for several in found.values() for each in several} == {"<2.14"}
+    versions = {page.name: TORCH.findall(page.read_text(encoding="utf-8")) for page in pages()}
+    assert versions["README.md"] == versions["CONTRIBUTING.md"] == ["<2.14"]
+    assert {*chain.from_iterable(versions.values())} == {"<2.14"}
 
 
 def test_the_workflow_and_its_page_name_the_same_systems() -> None:
@@ -82,9 +87,8 @@ def bound_to_a_system(source: str) -> list[str]:
     whatever code.
     """
     tree = ast.parse(source)
-    imported = [
-        alias.name for node in tree.body if isinstance(node, ast.Import) for alias in node.names
-    ]
+    imports = [node for node in tree.body if isinstance(node, ast.Import)]
+    imported = [alias.name for alias in chain.from_iterable(node.names for node in imports)]
     imported += [str(node.module) for node in tree.body if isinstance(node, ast.ImportFrom)]
     calls = [
         node
@@ -101,7 +105,7 @@ def bound_to_a_system(source: str) -> list[str]:
 
 
 def test_every_module_opens_on_every_system_and_says_its_encodings() -> None:
-    modules = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
-    found = {path: bound_to_a_system(path.read_text(encoding="utf-8")) for path in modules}
+    modules = list(chain.from_iterable((ROOT / package).rglob("*.py") for package in PACKAGES))
+    bindings = {path: bound_to_a_system(path.read_text(encoding="utf-8")) for path in modules}
     assert len(modules) > 100
-    assert {path: faults for path, faults in found.items() if faults} == {}
+    assert {path: faults for path, faults in bindings.items() if faults} == {}

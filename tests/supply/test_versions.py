@@ -44,7 +44,7 @@ def lowest_versions() -> list[str]:
     ]
     pins = []
     for requirement in map(Requirement, declared):
-        (lowest,) = (each.version for each in requirement.specifier if each.operator == ">=")
+        (lowest,) = (clause.version for clause in requirement.specifier if clause.operator == ">=")
         pins.append(f"{requirement.name}=={lowest}")
     return pins
 

@@ -53,9 +53,9 @@ def test_it_finds_what_it_never_saw(trained: tuple[DetectorNetwork, list[float]]
     for seed in range(100, 104):
         unseen = squares(seed)
         with torch.inference_mode():
-            (found,) = Decoding(network)(torch.from_numpy(unseen.image)[None] / 255)
+            (boxes,) = Decoding(network)(torch.from_numpy(unseen.image)[None] / 255)
         for kind, corners in enumerate(unseen.corners):
-            box = found[:4, found[4 + kind].argmax()].numpy()
+            box = boxes[:4, boxes[4 + kind].argmax()].numpy()
             np.testing.assert_allclose(box[:2], (corners[:2] + corners[2:]) / 2, atol=3)
             np.testing.assert_allclose(box[2:], corners[2:] - corners[:2], atol=5)
 
@@ -84,11 +84,11 @@ def test_the_file_says_what_the_network_says(
 ) -> None:
     session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     image = squares(7).image[None].astype(np.float32) / 255
-    (found,) = session.run(["output0"], {"images": image})
+    (result,) = session.run(["output0"], {"images": image})
     with torch.inference_mode():
-        wanted = Decoding(trained[0])(torch.from_numpy(image)).numpy()
-    assert found.shape == (1, 4 + len(NAMES), (SIDE_PX // 4) ** 2)
-    np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-3)
+        expected = Decoding(trained[0])(torch.from_numpy(image)).numpy()
+    assert result.shape == (1, 4 + len(NAMES), (SIDE_PX // 4) ** 2)
+    np.testing.assert_allclose(result, expected, rtol=1e-3, atol=1e-3)
 
 
 def test_a_drawn_picture_shows_its_objects_where_its_boxes_say() -> None:
@@ -98,5 +98,5 @@ def test_a_drawn_picture_shows_its_objects_where_its_boxes_say() -> None:
     assert picture.image.max() == 255
     assert len(picture.classes) == len(picture.corners) > 0
     assert picture.corners.max() <= 96
-    again = drawn_picture(96, seed=0, number=1)
-    np.testing.assert_array_equal(again.image, picture.image)
+    repeated = drawn_picture(96, seed=0, number=1)
+    np.testing.assert_array_equal(repeated.image, picture.image)

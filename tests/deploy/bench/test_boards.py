@@ -25,8 +25,8 @@ from examples.networks import build, to_onnx
 from tests.deploy.dpu.graphs import integer_convbeers
 
 
-def bench(model: Path, target: str = "vck190", **given: Any) -> BoardBench:
-    return bench_board(model, target, **{"size": "300x260", "tiles_px": [128], **given})
+def bench(model: Path, target: str = "vck190", **options: Any) -> BoardBench:
+    return bench_board(model, target, **{"size": "300x260", "tiles_px": [128], **options})
 
 
 @pytest.fixture(scope="module")
@@ -48,26 +48,26 @@ def names(rows: list[Row]) -> list[str]:
 def test_all_boards_stand_in_one_table_with_their_processors_and_the_papers_rows(
     network: Path,
 ) -> None:
-    found = bench(network, "all")
-    swept = [row for row in found.rows if row.table == "sweep"]
+    result = bench(network, "all")
+    swept = [row for row in result.rows if row.table == "sweep"]
     assert [name.split()[0] for name in names(swept)] == board_names()
     for row in swept:
         low, high = row.figures["latency"].interval or (0.0, 0.0)
         assert 0 < low < (row.figures["latency"].value or 0) < high
         assert {"throughput", "power", "efficiency"} <= set(row.figures)
-    processors = [row for row in found.rows if "processor of" in row.name]
+    processors = [row for row in result.rows if "processor of" in row.name]
     assert len(processors) == len(board_names())
     for row in processors:
         low, high = row.figures["latency"].interval or (0.0, 0.0)
         assert 0 < low < (row.figures["latency"].value or 0) < high < 4 * low
-    assert sum(name.startswith("paper") for name in names(found.rows)) == 2
+    assert sum(name.startswith("paper") for name in names(result.rows)) == 2
 
 
 @pytest.mark.slow
 def test_the_papers_rows_stand_beside_its_own_board_alone(network: Path) -> None:
-    found = bench(network, "kv260")
-    assert not any(name.startswith("paper") for name in names(found.rows))
-    assert any("kv260" in name for name in names(found.rows))
+    result = bench(network, "kv260")
+    assert not any(name.startswith("paper") for name in names(result.rows))
+    assert any("kv260" in name for name in names(result.rows))
 
 
 def test_the_smallest_dpu_that_meets_a_time_is_named(network: Path) -> None:
@@ -85,16 +85,17 @@ def test_the_smallest_dpu_that_meets_a_time_is_named(network: Path) -> None:
 
 
 def test_a_network_that_is_not_tiled_is_predicted_by_the_frame(classifier: Path) -> None:
-    found = bench(classifier, size=None)
-    (frame,) = [row for row in found.rows if row.table == "frames"]
+    result = bench(classifier, size=None)
+    (frame,) = [row for row in result.rows if row.table == "frames"]
     assert (frame.figures["throughput"].interval or (0, 0))[0] > 0
-    layers = [row for row in found.rows if row.table == "layers"]
+    layers = [row for row in result.rows if row.table == "layers"]
     work = math.fsum(row.figures["work"].value or 0 for row in layers if "work" in row.figures)
     assert frame.figures["work"].value == pytest.approx(work)
-    assert any("whole images" in note and "GlobalAveragePool" in note for note in found.notes)
-    assert not any("traditional" in name for name in names(found.rows))
+    assert any("whole images" in note and "GlobalAveragePool" in note for note in result.notes)
+    assert not any("traditional" in name for name in names(result.rows))
     with pytest.raises(ModelError, match="GlobalAveragePool"):
-        bench(classifier)  # a swath
+        # The default size is that of a swath.
+        bench(classifier)
 
 
 def test_a_frame_need_not_be_square(tmp_path: Path, classifier: Path) -> None:
@@ -122,8 +123,8 @@ def test_one_configuration_or_runs_beside_all_boards_are_refused(
 
 @pytest.mark.slow
 def test_a_stated_task_of_the_host_is_that_of_every_row(classifier: Path, network: Path) -> None:
-    found = bench(classifier, "all", size=None, host_task="softmax")
-    frames = [row for row in found.rows if row.table == "frames"]
+    result = bench(classifier, "all", size=None, host_task="softmax")
+    frames = [row for row in result.rows if row.table == "frames"]
     assert {row.text["host's task"] for row in frames} == {"softmax"}
     plain, ranked = (
         [row for row in bench(network, host_task=task).rows if "one-thread latency" in row.figures]
@@ -148,13 +149,13 @@ def test_the_exposures_of_an_image_are_counted_whatever_the_bits_of_the_sensor(
     sensor = load_sensor("pleiades-degraded")
     gain = sensor.gain_dn_per_radiance.low * 2 ** (bits - 12)
     sensor = sensor.replace(bits=bits, gain_dn_per_radiance=gain)
-    pixels = np.full(
-        (128, 256), 2000, np.uint16
-    )  # too bright for x4, unless full scale is that of 14 bits
-    pixels[:, :128] = 200  # dark enough for x8, far from bright ground as well
+    # These pixels are too bright for x4, unless full scale is that of 14 bits.
+    pixels = np.full((128, 256), 2000, np.uint16)
+    # These pixels are dark enough for x8, also far from bright ground.
+    pixels[:, :128] = 200
     tifffile.imwrite(tmp_path / "image.tif", pixels)
-    found = bench(network, size=None, image=tmp_path / "image.tif", full_scale=4095, sensor=sensor)
-    (words,) = (note for note in found.notes if "by exposure" in note)
+    result = bench(network, size=None, image=tmp_path / "image.tif", full_scale=4095, sensor=sensor)
+    (words,) = (note for note in result.notes if "by exposure" in note)
     shares = dict(re.findall(r"(x\d) (\d+)%", words))
     assert shares.keys() == {"x1", "x4", "x8"}
     assert int(shares["x1"]) > 0

@@ -37,8 +37,9 @@ def test_float_and_int8_are_interleaved() -> None:
         assert 0 <= value(row, "CPU load") <= 100
         assert value(row, "threads") == 1
     assert value(rows[2], "ratio") == pytest.approx(value(rows[1], "p50") / value(rows[0], "p50"))
-    modes = {figure.mode for row in rows for key, figure in row.figures.items() if key != "power"}
-    assert modes <= {"measured", "unavailable"}
+    for row in rows:
+        modes = {figure.mode for key, figure in row.figures.items() if key != "power"}
+        assert modes <= {"measured", "unavailable"}
 
 
 def test_turns_last_for_the_minimum_time_and_count(tmp_path: Path) -> None:
@@ -58,11 +59,11 @@ def test_the_other_precision_is_a_shipped_network_of_the_same_variant() -> None:
     back = other_precision(float32)
     assert back is not None
     assert is_quantised(back)
-    shapes = (
-        [t.dims for t in m.graph.initializer if len(t.dims) == 4]
-        for m in (float_model(shipped_pair()[0]), float32)
-    )
-    assert len({str(s) for s in shapes}) == 1
+    shapes = [
+        [tensor.dims for tensor in model.graph.initializer if len(tensor.dims) == 4]
+        for model in (float_model(shipped_pair()[0]), float32)
+    ]
+    assert str(shapes[0]) == str(shapes[1])
 
 
 def test_a_network_of_another_make_runs_alone(tmp_path: Path) -> None:
@@ -75,9 +76,8 @@ def test_a_network_of_another_make_runs_alone(tmp_path: Path) -> None:
 
 def test_memory_that_is_taken_is_seen() -> None:
     before = resident_bytes()
-    block = mmap(
-        -1, 40_000_000
-    )  # from the system: an allocator may still hold what earlier tests freed
+    # The block comes from the system: an allocator may still hold what earlier tests freed.
+    block = mmap(-1, 40_000_000)
     np.frombuffer(block, np.uint8).fill(1)
     assert 30e6 < resident_bytes() - before < 200e6
 

@@ -1,5 +1,6 @@
 import math
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -31,14 +32,15 @@ DPU = load_dpu("vck190")
 def test_a_swath_is_predicted_as_the_paper_counts_and_in_whole_tiles(tmp_path: Path) -> None:
     prediction = predict_file(float_convbeers(tmp_path / "f.onnx", 16, 64), DPU)
     swath = Swath(13600, 9016, 640, 35)
-    fraction, whole = predicted_rows("ConvBEERS", prediction, swath)
+    fraction, tiled = predicted_rows("ConvBEERS", prediction, swath)
     assert value(fraction, "latency") == pytest.approx(swath.frames / prediction.fps)
-    assert value(whole, "tiles") == 384
-    assert value(whole, "latency") == pytest.approx(128 * prediction.batch / prediction.fps)
-    for row in (fraction, whole):
+    assert value(tiled, "tiles") == 384
+    assert value(tiled, "latency") == pytest.approx(128 * prediction.batch / prediction.fps)
+    for row in (fraction, tiled):
         assert {figure.mode for figure in row.figures.values()} == {"predicted"}
         low, high = row.figures["latency"].interval or (0, 0)
         assert low < value(row, "latency") < high
+    # The paper publishes 42 s for this swath, and 98,965 pixels a second and watt.
     low, high = fraction.figures["latency"].interval or (0, 0)
     assert low < 42 < high
     low, high = fraction.figures["efficiency"].interval or (0, 0)
@@ -47,8 +49,8 @@ def test_a_swath_is_predicted_as_the_paper_counts_and_in_whole_tiles(tmp_path: P
 
 def test_a_last_batch_that_is_not_full_still_takes_its_time(tmp_path: Path) -> None:
     prediction = predict_file(float_convbeers(tmp_path / "f.onnx", 1, 16), DPU, 64)
-    _, whole = predicted_rows("net", prediction, Swath(64, 64, 64, 5))
-    assert value(whole, "latency") == pytest.approx(prediction.batch / prediction.fps)
+    _, tiled = predicted_rows("net", prediction, Swath(64, 64, 64, 5))
+    assert value(tiled, "latency") == pytest.approx(prediction.batch / prediction.fps)
 
 
 def test_published_rows_are_the_papers_and_agree_with_each_other() -> None:
@@ -75,9 +77,9 @@ def test_bench_writes_a_valid_document(tmp_path: Path) -> None:
     tifffile.imwrite(image, np.random.default_rng(0).integers(300, 900, (51, 63), dtype=np.uint16))
     model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
     done("bench", model, "--image", image, "--tile", 32, "--json", out)
-    written = valid(out)
-    assert [entry["name"] for entry in written["inputs"]] == ["net.onnx", "raw.tif"]
-    names = [str(row["name"]) for row in written["rows"]]
+    document = valid(out)
+    assert [entry["name"] for entry in document["inputs"]] == ["net.onnx", "raw.tif"]
+    names = [str(row["name"]) for row in document["rows"]]
     assert sum(name.startswith("paper, 13600 x 9016:") for name in names) == 2
     assert any("halo 5 px" in name for name in names)
     assert names[-1] == "traditional pipeline on this CPU"
@@ -113,8 +115,9 @@ def test_small_tiles_keep_maps_on_chip_and_cost_work(tmp_path: Path) -> None:
     assert [row.name for row in rows] == [
         f"vck190 C32B3, tiles of {tile}" for tile in (640, 128, 64)
     ]
-    kept, factors = ([value(row, key) for row in rows] for key in ("layers on chip", "work factor"))
-    assert kept[0] == 0 < kept[1] <= kept[2]
+    layers = [value(row, "layers on chip") for row in rows]
+    factors = [value(row, "work factor") for row in rows]
+    assert layers[0] == 0 < layers[1] <= layers[2]
     assert 1 < factors[1] < factors[2]
     for row in rows:
         assert value(row, "latency") >= value(row, "tiles") / value(row, "throughput") * (1 - 1e-12)
@@ -124,39 +127,27 @@ def test_small_tiles_keep_maps_on_chip_and_cost_work(tmp_path: Path) -> None:
 def test_all_configurations_are_swept(tmp_path: Path) -> None:
     model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
     out = tmp_path / "out.json"
-    done(
-        *(
-            "bench",
-            model,
-            "--size",
-            "41x33",
-            "--tile",
-            "64,32",
-            "--dpu",
-            "all",
-            "--no-traditional",
-            "--json",
-            out,
-        )
-    )
+    tiles = ("--size", "41x33", "--tile", "64,32")
+    done("bench", model, *tiles, "--dpu", "all", "--no-traditional", "--json", out)
     swept = [str(row["name"]) for row in valid(out)["rows"] if row["table"] == "sweep"]
     assert swept == [
-        f"vck190 {name}, tiles of {tile}" for name in DPU.target.configurations for tile in (64, 32)
+        f"vck190 {name}, tiles of {tile}"
+        for name, tile in product(DPU.target.configurations, (64, 32))
     ]
 
 
 @pytest.mark.parametrize(
-    ("parse", "said", "texts"),
+    ("parse", "message", "texts"),
     [
         (parse_size, "13600x9016", ["13600", "0x5", "ax5", "13600x", "1x2x3", "-4x4"]),
         (parse_tiles, "tile", ["", "640,", "640,8", "640;320", "-64"]),
     ],
 )
 def test_bad_sizes_and_tiles_are_refused(
-    parse: Callable[[str], object], said: str, texts: list[str]
+    parse: Callable[[str], object], message: str, texts: list[str]
 ) -> None:
     for text in texts:
-        with pytest.raises(OptionError, match=said):
+        with pytest.raises(OptionError, match=message):
             parse(text)
 
 
@@ -178,7 +169,7 @@ def test_bad_options_are_refused(tmp_path: Path) -> None:
     model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
     tifffile.imwrite(tmp_path / "colour.tif", np.zeros((8, 9, 3), np.uint8), photometric="rgb")
     tifffile.imwrite(tmp_path / "half.tif", np.full((8, 9), 0.5, np.float32))
-    for options, said in (
+    for options, message in (
         ("--dpu C1B1", "--dpu"),
         ("--tile 16 --halo 8", "--tile"),
         ("--image colour.tif", "one band"),
@@ -186,7 +177,7 @@ def test_bad_options_are_refused(tmp_path: Path) -> None:
         ("--target kv261", "kv261"),
     ):
         words = [tmp_path / word if word.endswith(".tif") else word for word in options.split()]
-        assert said in refused("bench", model, *words)
+        assert message in refused("bench", model, *words)
 
 
 def test_a_board_is_named_with_or_without_its_model(tmp_path: Path) -> None:
@@ -236,14 +227,14 @@ def test_a_file_that_is_replaced_during_the_run_is_refused(
     out = tmp_path / "out.json"
     predict = boards.bench_board
 
-    def replaced(*given: Any, **more: Any) -> Any:
-        found = predict(*given, **more)
+    def replaced(*arguments: Any, **options: Any) -> Any:
+        result = predict(*arguments, **options)
         model.write_bytes(model.read_bytes() + b"\0")
-        return found
+        return result
 
     monkeypatch.setattr(boards, "bench_board", replaced)
-    said = refused(
+    message = refused(
         "bench", model, "--size", "41x33", "--tile", 32, "--no-traditional", "--json", out
     )
-    assert "net.onnx: expected a file that stays as it is" in said
+    assert "net.onnx: expected a file that stays as it is" in message
     assert not out.exists()

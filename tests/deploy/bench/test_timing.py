@@ -21,6 +21,7 @@ def counter(root: Path, energy_uj: int, name: str = "package-0") -> Path:
     return domain / "energy_uj"
 
 
+# The counter starts again at max_energy_range_uj, so 100,000 uJ after 900,000 uJ are 0.2 J.
 @counters
 @pytest.mark.parametrize(
     ("before", "after", "joules"), [(200_000, 700_000, 0.5), (900_000, 100_000, 0.2)]
@@ -54,18 +55,18 @@ def test_without_counters_of_the_package_power_is_unavailable_with_a_reason(
 def test_calls_run_round_by_round_until_there_are_enough_and_they_took_long_enough(
     rounds: int, least_s: float
 ) -> None:
-    ran: list[str] = []
+    calls: list[str] = []
 
     def call(name: str) -> None:
-        ran.append(name)
+        calls.append(name)
         time.sleep(0.002)
 
-    found = interleaved([partial(call, name) for name in ("a", "b")], rounds, least_s)
-    count = len(found[0])
-    assert ran == ["a", "b"] * count
-    assert [len(taken) for taken in found] == [count, count]
+    series = interleaved([partial(call, name) for name in ("a", "b")], rounds, least_s)
+    count = len(series[0])
+    assert calls == ["a", "b"] * count
+    assert [len(timings) for timings in series] == [count, count]
     assert count == rounds if least_s == 0 else count > rounds
-    for times in ([time_s for time_s, _ in taken] for taken in found):
+    for times in ([time_s for time_s, _ in timings] for timings in series):
         assert sum(times) >= least_s
     if least_s:
-        assert min(sum(time_s for time_s, _ in taken[:-1]) for taken in found) < least_s
+        assert min(sum(time_s for time_s, _ in timings[:-1]) for timings in series) < least_s

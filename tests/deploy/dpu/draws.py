@@ -2,13 +2,14 @@
 the whole breaks.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from beers_deploy.dpu.board import Dpu, load_dpu
-from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.checker.placement import PlacedNode, place
 from beers_deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import Sketch, Value
 
@@ -18,11 +19,14 @@ TILE_PX = 288
 
 
 def broken_rules(path: Path, dpu: Dpu = DPU, tile_px: int = TILE_PX) -> list[str]:
-    return [
-        broken.rule
-        for node in place(read_network(path, tile_px), dpu).nodes
-        for broken in node.broken
-    ]
+    """Return the names of the rules that the nodes of a file break."""
+    return rules_of(place(read_network(path, tile_px), dpu).nodes)
+
+
+def rules_of(nodes: Iterable[PlacedNode]) -> list[str]:
+    """Return the names of the rules that nodes break, node by node."""
+    violations = chain.from_iterable(node.broken for node in nodes)
+    return [violation.rule for violation in violations]
 
 
 def between_convs(tmp_path: Path, draw: Draw, dpu: Dpu = DPU, channels: int = 8) -> list[str]:

@@ -38,8 +38,8 @@ class Sketch:
         return self.constant(np.zeros(shape, np.float32))
 
     def conv(self, source: str, weight: tuple[int, ...] = (8, 8, 3, 3), **attributes: Value) -> str:
-        given: Mapping[str, Value] = {"pads": [weight[2] // 2, weight[3] // 2] * 2, **attributes}
-        return self.node("Conv", source, self.weight(*weight), **given)
+        padded: Mapping[str, Value] = {"pads": [weight[2] // 2, weight[3] // 2] * 2, **attributes}
+        return self.node("Conv", source, self.weight(*weight), **padded)
 
     def save(self, path: Path, *results: str) -> Path:
         ends = [

@@ -24,6 +24,7 @@ from beers_deploy.model.variants import Variant
 from beers_deploy.network_files import shipped_pair
 from beers_deploy.quant.encodings import board_model
 from beers_deploy.quant.quantise import Quantised, quantise_model
+from tests.deploy.dpu.draws import rules_of
 from tests.deploy.dpu.graphs import IntegerSketch
 from tests.model.networks import plain
 from tests.quant.quick import changed, copied, drawn
@@ -37,9 +38,7 @@ def rules(model: onnx.ModelProto) -> set[str]:
     tool.
     """
     del model.metadata_props[:]
-    return {
-        broken.rule for node in place(network_of(model, 64), DPU).nodes for broken in node.broken
-    }
+    return set(rules_of(place(network_of(model, 64), DPU).nodes))
 
 
 @cache
@@ -59,7 +58,7 @@ def own_file() -> onnx.ModelProto:
     return copied(quantised(0.1).host)
 
 
-def kept(values: list[int]) -> bool:
+def fits_int8(values: list[int]) -> bool:
     bias = {"bias": np.array(values, np.int32)}
     scales = dict.fromkeys(("input 0", "weight", "output"), HALF)
     op = Operation(
@@ -74,29 +73,31 @@ def kept(values: list[int]) -> bool:
 )
 def test_a_bias_passes_where_some_shift_makes_it_int8(values: list[int], shift: int) -> None:
     values = [value << shift for value in values]
+    # The DPU shifts by 0 to 16 bits.
     shifts = [k for k in range(17) if all(v % 2**k == 0 and -128 <= v >> k <= 127 for v in values)]
-    assert kept(values) == bool(shifts)
+    assert fits_int8(values) == bool(shifts)
 
 
 @pytest.mark.parametrize(
-    ("bias", "broken"),
+    ("bias", "expected"),
     [
         ([127 << 16, -128 << 16, 0, 0], set()),
-        ([64 << 17, 0, 0, 0], {"int32 bias"}),  # a shift of 17 makes 128 of shift 16
+        # A shift of 16 is the largest, and with it the value is 128.
+        ([64 << 17, 0, 0, 0], {"int32 bias"}),
         ([129, 1, 0, 0], {"int32 bias"}),
         ([127, 1, 0, 0], set()),
         (np.random.default_rng(0).integers(-(2**30), 2**30, 4).tolist(), {"int32 bias"}),
     ],
 )
 def test_the_bias_of_an_integer_kernel_is_looked_at(
-    tmp_path: Path, bias: list[int], broken: set[str]
+    tmp_path: Path, bias: list[int], expected: set[str]
 ) -> None:
     s = IntegerSketch()
     inner = s.qconv(s.quantised("image"), (4, 1, 3, 3), bias=np.array(bias, np.int32))
     path = s.save(tmp_path / "b.onnx", s.node("DequantizeLinear", inner, *s.numbers))
-    failed = place(read_network(path, 20), DPU).failed
-    assert {b.rule for node in failed for b in node.broken} == broken
-    assert all("beers-deploy quantize" in node.broken[0].finding.remedy for node in failed)
+    nodes = place(read_network(path, 20), DPU).failed
+    assert set(rules_of(nodes)) == expected
+    assert all("beers-deploy quantize" in node.broken[0].finding.remedy for node in nodes)
 
 
 @pytest.mark.parametrize("name", shipped_names())
@@ -107,16 +108,16 @@ def test_the_shipped_files_keep_every_rule(name: str) -> None:
 @pytest.mark.parametrize("spread", [0.001, 0.1, 3.0])
 def test_what_quantize_writes_of_random_networks_keeps_every_rule(spread: float) -> None:
     """In both encodings, biases small and large beside the products."""
-    made = quantised(spread)
-    assert rules(made.host) == rules(board_model(made.core, {})) == set()
+    network = quantised(spread)
+    assert rules(network.host) == rules(board_model(network.core, {})) == set()
 
 
 def test_a_bias_with_one_more_on_a_value_is_refused() -> None:
     """Of those with a shift above 0: each has a largest value that needs its shift."""
     values = {tensor.name: numpy_helper.to_array(tensor) for tensor in own_file().graph.initializer}
-    named = [node.input[8] for node in own_file().graph.node if node.op_type == "QLinearConv"]
-    shifted = [name for name in named if not (values[name] % 2).any()]
-    assert len(shifted) > len(named) // 2
+    biases = [node.input[8] for node in own_file().graph.node if node.op_type == "QLinearConv"]
+    shifted = [name for name in biases if not (values[name] % 2).any()]
+    assert len(shifted) > len(biases) // 2
     for name in shifted:
         model = changed(own_file(), name, lambda bias: bias + (np.arange(len(bias)) == 0))
         assert rules(model) == {"int32 bias"}, name
@@ -141,7 +142,7 @@ def test_who_reads_a_tensor_otherwise_than_it_was_written_is_refused(
     value = numpy_helper.to_array(
         next(t for t in model.graph.initializer if t.name == node.input[place])
     )
-    spoilt = value * 4 if value.dtype == np.float32 else value - 1
-    model.graph.initializer.append(numpy_helper.from_array(spoilt.astype(value.dtype), "spoilt"))
+    altered = value * 4 if value.dtype == np.float32 else value - 1
+    model.graph.initializer.append(numpy_helper.from_array(altered.astype(value.dtype), "spoilt"))
     node.input[place] = "spoilt"
     assert "one format" in rules(model)

@@ -49,10 +49,10 @@ def test_the_interval_holds_the_published_figure(papers_prediction: Prediction) 
 @pytest.mark.parametrize("fps", [PAPER_FPS, 42.0, 98965.0])
 def test_no_constant_is_the_published_figure(fps: float) -> None:
     """What the model is compared with must not be in it."""
-    constants = [
-        c for table in ("cost", "array", "memory") for c in DPU.target.tables[table].values()
-    ]
-    assert not [c for c in constants if math.isclose(c.low, fps) or math.isclose(c.high, fps)]
+    for table in ("cost", "array", "memory"):
+        for name, constant in DPU.target.tables[table].items():
+            assert not math.isclose(constant.low, fps), name
+            assert not math.isclose(constant.high, fps), name
 
 
 @pytest.mark.parametrize("configuration", list(DPU.target.configurations))
@@ -112,12 +112,10 @@ def test_first_layers_gather_their_window(
     tmp_path: Path, board: str, taken_in: int, given_out: int
 ) -> None:
     """One channel by three columns fill what is taken in at a time, not three of them."""
-    head = (
-        predict_file(float_convbeers(tmp_path / "f.onnx", 1, 32), load_dpu(board), 96)
-        .layers[0]
-        .work
-    )
-    assert given_out == load_dpu(board).output_parallel
+    dpu = load_dpu(board)
+    prediction = predict_file(float_convbeers(tmp_path / "f.onnx", 1, 32), dpu, 96)
+    head = prediction.layers[0].work
+    assert given_out == dpu.output_parallel
     assert head.array_operations == 2 * 3 * taken_in * 32 * 96 * 96
 
 
@@ -133,17 +131,17 @@ def moved(works: tuple[Work, ...]) -> int:
 
 def test_what_three_branches_read_passes_through_memory(tmp_path: Path) -> None:
     """A module of three branches: its input read thrice; of two branches: not."""
-    found = {}
+    maps = {}
     burst = BURST_BYTES / 16
     for branches in (2, 3):
         s = Sketch(16)
         stem = s.conv("image", (16, 16, 3, 3))
         joined = s.node("Concat", *(s.conv(stem, (16, 16, 1, 1)) for _ in range(branches)), axis=1)
         works = works_of(s, s.conv(joined, (8, 16 * branches, 1, 1)), tmp_path / "n.onnx", 32)
-        found[branches] = moved(works) / (16 * 32 * 32)
+        maps[branches] = moved(works) / (16 * 32 * 32)
     image = 1
     result = 0.5
-    assert found == {2: image + 2 * burst + 2 + result, 3: image + 1 + 3 + 3 * burst + 3 + result}
+    assert maps == {2: image + 2 * burst + 2 + result, 3: image + 1 + 3 + 3 * burst + 3 + result}
 
 
 @pytest.mark.parametrize("channels", [(16, 48), (64, 100), (200, 3)])
@@ -153,9 +151,9 @@ def test_what_a_concat_joins_is_stored_in_bursts_and_read_back(
     s = Sketch(8)
     joined = s.node("Concat", *(s.conv("image", (count, 8, 3, 3)) for count in channels), axis=1)
     works = works_of(s, s.conv(joined, (8, sum(channels), 1, 1)), tmp_path / "n.onnx", 33)
-    stored = [BURST_BYTES * math.ceil(count / BURST_BYTES) for count in channels]
+    padded_channels = [BURST_BYTES * math.ceil(count / BURST_BYTES) for count in channels]
     assert [work.store_map_bytes for work in works] == [
-        33 * 33 * count for count in (*stored, 0, 8)
+        33 * 33 * count for count in (*padded_channels, 0, 8)
     ]
     assert works[-1].load_map_bytes == 33 * 33 * sum(channels)
 
@@ -183,15 +181,15 @@ def test_a_pixel_shuffle_costs_the_bursts_of_its_pieces(tmp_path: Path, block: i
     """Three channels of a pixel in a burst of their own; at the network's end it is left to the
     host.
     """
-    stored = {}
+    map_bytes = {}
     for place_in, ends in (("end", True), ("middle", False)):
         s = Sketch(3)
         x = s.node("DepthToSpace", s.conv("image", (3 * block**2, 3, 3, 3)), blocksize=block)
         works = works_of(s, x if ends else s.conv(x, (3, 3, 1, 1)), tmp_path / "n.onnx", 512)
         assert len(works) == (1 if ends else 2)
-        stored[place_in] = works[0].store_map_bytes
+        map_bytes[place_in] = works[0].store_map_bytes
     values = 3 * block**2 * 512 * 512
-    assert stored == {"end": values, "middle": values // 3 * BURST_BYTES}
+    assert map_bytes == {"end": values, "middle": values // 3 * BURST_BYTES}
 
 
 def test_a_transposed_convolution_runs_over_the_zeros_between_its_pixels(tmp_path: Path) -> None:
@@ -262,11 +260,11 @@ def test_a_task_that_is_stated_takes_the_place_of_what_the_file_tells(tmp_path: 
     """Heads that are read and no more, or ranked: the file is the same."""
     sketch = Sketch(8)
     path = sketch.save(tmp_path / "h.onnx", sketch.conv("image", (80, 8, 3, 3)))
-    read = predict_file(path, DPU, 96)
+    copied = predict_file(path, DPU, 96)
     ranked = predict_file(path, DPU, 96, "sort")
-    assert (read.task, ranked.task) == ("copy", "sort")
-    assert ranked.host_s > read.host_s
-    assert ranked.batch_time_s == read.batch_time_s
+    assert (copied.task, ranked.task) == ("copy", "sort")
+    assert ranked.host_s > copied.host_s
+    assert ranked.batch_time_s == copied.batch_time_s
 
 
 def test_regimes() -> None:
@@ -280,17 +278,17 @@ def test_latency_is_that_of_one_core_and_one_thread(tmp_path: Path) -> None:
     others.
     """
     path = float_convbeers(tmp_path / "n.onnx", 2, 16)
-    three = load_dpu("zcu102")
-    one = load_dpu("kv260")
-    found = predict_file(path, three)
-    single = predict_file(path, one)
-    assert (three.handlers, one.handlers) == (1, 1)
-    assert found.alone_s <= found.batch_time_s
+    zcu102 = load_dpu("zcu102")
+    kv260 = load_dpu("kv260")
+    prediction = predict_file(path, zcu102)
+    single = predict_file(path, kv260)
+    assert (zcu102.handlers, kv260.handlers) == (1, 1)
+    assert prediction.alone_s <= prediction.batch_time_s
     assert single.alone_s == pytest.approx(single.batch_time_s)
-    assert found.latency_s == pytest.approx(
-        found.alone_s + found.host_s * three.whole("cpu", "cores")
+    assert prediction.latency_s == pytest.approx(
+        prediction.alone_s + prediction.host_s * zcu102.whole("cpu", "cores")
     )
-    assert three.handlers / found.latency_s < found.fps
+    assert zcu102.handlers / prediction.latency_s < prediction.fps
 
 
 def test_energy_counts_products_and_bytes(tmp_path: Path) -> None:

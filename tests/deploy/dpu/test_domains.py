@@ -30,8 +30,8 @@ def network(path: Path, place: str, domain: str) -> Path:
     """A network of operators that a DPU takes and host parts, one of which is another's."""
     sketch = Sketch(8)
 
-    def node(here: str, op_type: str, *inputs: str) -> str:
-        return sketch.node(op_type, *inputs, domain=domain if here == place else "")
+    def node(position: str, op_type: str, *inputs: str) -> str:
+        return sketch.node(op_type, *inputs, domain=domain if position == place else "")
 
     scaled = node("front", "Mul", "image", sketch.constant(np.array(0.5, np.float32)))
     first = node("behind a convolution", "Relu", sketch.conv(scaled))
@@ -54,12 +54,12 @@ def test_a_foreign_domain_is_not_legal_and_not_run(
 ) -> None:
     path = network(tmp_path_factory.mktemp("foreign") / "a.onnx", place, domain)
     (node,) = (node for node in onnx.load_model(path).graph.node if node.domain == domain)
-    found = check(str(path), board, tile=64)
-    (broken,) = (placed for placed in found.failed if placed.op.name == node.name)
-    assert not found
-    assert f"{domain}::{node.op_type}" in broken.broken[0].finding.reason
-    for said in (refusal(found.network.model), refused_by_load(path)):
-        assert f"{node.op_type} {node.name} of {domain!r}" in said
+    result = check(str(path), board, tile=64)
+    (refusing,) = (placed for placed in result.failed if placed.op.name == node.name)
+    assert not result
+    assert f"{domain}::{node.op_type}" in refusing.broken[0].finding.reason
+    for message in (refusal(result.network.model), refused_by_load(path)):
+        assert f"{node.op_type} {node.name} of {domain!r}" in message
 
 
 def refused_by_load(path: Path) -> str:
@@ -89,8 +89,8 @@ def with_function(path: Path, domain: str) -> Path:
 @pytest.mark.parametrize("domain", ["local", ""])
 def test_a_function_of_the_file_is_no_operator_of_onnx(domain: str, tmp_path: Path) -> None:
     path = with_function(tmp_path / "a.onnx", domain)
-    said = done("check", path, "--tile", "64", code=1)
-    assert f"{domain}::Relu" in said
+    output = done("check", path, "--tile", "64", code=1)
+    assert f"{domain}::Relu" in output
     assert f"Relu of {domain!r}, a function of the file; inline" in refused_by_load(path)
 
 
@@ -122,8 +122,8 @@ def test_commands_refuse_it_in_one_sentence(command: str, tmp_path: Path) -> Non
         "restore": (tmp_path / "in.tif", tmp_path / "out.tif", "--network", path),
         "gate": (path, path),
     }
-    said = refused(command, *words[command])
-    assert "of 'my.ops'; export the network with operators of ONNX itself." in said
+    message = refused(command, *words[command])
+    assert "of 'my.ops'; export the network with operators of ONNX itself." in message
 
 
 def test_onnxruntimes_optimised_file_names_the_remedy(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ import pytest
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.operators import forms, fully_connected
 from beers_deploy.dpu.checker.placement import PlacedNode, place
-from beers_deploy.dpu.graph import Operation
 from beers_deploy.dpu.reading import read_network
 from tests.deploy.dpu.graphs import Sketch
 
@@ -19,39 +18,34 @@ def placed(path: Path, weight: tuple[int, ...], tile_px: int) -> PlacedNode:
     return place(read_network(path, tile_px), DPU).nodes[-1]
 
 
-def shape(op: Operation) -> tuple[tuple[int, int], tuple[int, int]]:
-    return op.window.kernel, op.channels
-
-
 def test_a_layer_as_large_as_its_map_is_also_one_pixel_of_all_its_values(tmp_path: Path) -> None:
     op = placed(tmp_path / "n.onnx", (10, 8, 20, 20), 20).op
     assert fully_connected(op)
-    assert [shape(form) for form in forms(op, DPU)][1:] == [
-        ((20, 20), (8, 10)),
-        ((1, 1), (3200, 10)),
-    ]
+    shapes = [(form.window.kernel, form.channels) for form in forms(op, DPU)]
+    assert shapes[1:] == [((20, 20), (8, 10)), ((1, 1), (3200, 10))]
 
 
 @pytest.mark.parametrize(
     ("weight", "tile_px", "rules"),
     [
-        ((10, 8, 20, 20), 20, set()),  # larger than any kernel, 3200 values
-        (
-            (10, 8, 20, 20),
-            21,
-            {"conv kernel", "conv window"},
-        ),  # the same kernel, but a result of four pixels
-        ((10, 11, 20, 20), 20, {"conv kernel", "conv window"}),  # 4400 values
-        ((14472, 16, 1, 1), 1, set()),  # in four parts
+        # The kernel is larger than any that the DPU has; the layer reads 3200 values.
+        ((10, 8, 20, 20), 20, set()),
+        # The kernel is the same, but the result has four pixels.
+        ((10, 8, 20, 20), 21, {"conv kernel", "conv window"}),
+        # This layer reads 4400 values.
+        ((10, 11, 20, 20), 20, {"conv kernel", "conv window"}),
+        # The DPU computes this layer in four parts.
+        ((14472, 16, 1, 1), 1, set()),
         ((14472, 16, 1, 1), 2, {"conv channels"}),
-        ((64, 512, 7, 7), 7, set()),  # as VGG's first of 4096: fits as it is, and not laid flat
+        # VGG's first layer of 4096 is like this: it fits as it is, but not laid flat.
+        ((64, 512, 7, 7), 7, set()),
     ],
 )
 def test_a_fully_connected_layer_is_taken_in_any_form_that_fits(
     tmp_path: Path, weight: tuple[int, ...], tile_px: int, rules: set[str]
 ) -> None:
     node = placed(tmp_path / "n.onnx", weight, tile_px)
-    assert {broken.rule for broken in node.broken} == rules
+    assert {violation.rule for violation in node.broken} == rules
     assert node.device == ("CPU" if rules else "DPU")
 
 

@@ -16,7 +16,8 @@ from beers_deploy.export import to_onnx
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.target import board_names
 from tests.deploy.command_line import done, refused
-from tests.deploy.documents import valid
+from tests.deploy.documents import figures_of, valid
+from tests.deploy.dpu.draws import rules_of
 from tests.deploy.dpu.graphs import QdqSketch
 from tests.model.networks import plain
 
@@ -61,9 +62,9 @@ def written(path: Path, draw: Draw, opset: int = 17, side: int | None = 31) -> P
     return path
 
 
-def faults(found: Checked) -> set[str]:
-    broken = {rule.rule for node in found.failed for rule in node.broken}
-    return broken | {each.name for each in found.checks[1:] if not each.passed}
+def faults(checked: Checked) -> set[str]:
+    failed_checks = {check.name for check in checked.checks[1:] if not check.passed}
+    return failed_checks | set(rules_of(checked.failed))
 
 
 # What DPUs must keep too is in test_number_graphs.py; that it applies here is told in
@@ -77,11 +78,11 @@ REFUSED: dict[str, tuple[Draw, Draw]] = {
 
 @pytest.mark.parametrize("rule", REFUSED)
 def test_each_case_is_refused_for_its_rule_and_passes_without_it(rule: str, tmp_path: Path) -> None:
-    wrong, right = (
+    faulty, remedied = (
         bd.check(written(tmp_path / "n.onnx", draw), "vek385") for draw in REFUSED[rule]
     )
-    assert (faults(wrong), bool(wrong)) == ({rule}, False)
-    assert (faults(right), bool(right)) == (set(), True)
+    assert (faults(faulty), bool(faulty)) == ({rule}, False)
+    assert (faults(remedied), bool(remedied)) == (set(), True)
 
 
 def test_an_open_size_and_a_new_opset_are_refused(tmp_path: Path) -> None:
@@ -89,10 +90,10 @@ def test_an_open_size_and_a_new_opset_are_refused(tmp_path: Path) -> None:
         "sizes left open"
     }
     assert bd.check(written(tmp_path / "n.onnx", conv(), opset=20), "vek385")
-    said = done(
+    output = done(
         "check", written(tmp_path / "n.onnx", conv(), opset=21), "--target", "vek385", code=1
     )
-    assert "check FAILED: opset 21 (Xilinx" in said.splitlines()[-1]
+    assert "check FAILED: opset 21 (Xilinx" in output.splitlines()[-1]
 
 
 def mixed(s: QdqSketch, x: str) -> str:
@@ -108,22 +109,16 @@ def mixed(s: QdqSketch, x: str) -> str:
 
 
 def test_what_is_legal_but_worth_knowing_is_a_note(tmp_path: Path) -> None:
-    said = done(
-        "check",
-        written(tmp_path / "n.onnx", mixed),
-        "--target",
-        "vek385",
-        "--json",
-        tmp_path / "o.json",
-    )
+    path = written(tmp_path / "n.onnx", mixed)
+    output = done("check", path, "--target", "vek385", "--json", tmp_path / "o.json")
     rows = valid(tmp_path / "o.json")["rows"]
     devices = {row["text"]["device"] for row in rows if row["table"] == "nodes"}
     by_default = "float, BF16 by the compiler's default"
     assert devices == {"host", "NPU by AMD's table", "not read in AMD's table", by_default}
     remarks = [row["name"] for row in rows if row["table"] == "remarks"]
     assert remarks == ["unread", "depthwise", "float_islands", "unknown"]
-    assert "no limits published" in said
-    assert " runs" not in said
+    assert "no limits published" in output
+    assert " runs" not in output
 
 
 def test_no_limit_of_a_dpu_is_applied(tmp_path: Path) -> None:
@@ -148,46 +143,29 @@ def test_nothing_is_predicted_and_what_is_published_is_quoted(tmp_path: Path) ->
     done("bench", "convbeers-xs", "--target", "vek385", "--json", tmp_path / "o.json")
     own, *quoted = valid(tmp_path / "o.json")["rows"]
     assert {figure["mode"] for figure in own["figures"].values()} == {"unavailable"}
-    found = [
-        (figure["mode"], figure["value"]) for row in quoted for figure in row["figures"].values()
-    ]
-    assert found == [("published", value) for value in (10.69, 23.363, 1.56, 265.49)]
+    figures = [(figure["mode"], figure["value"]) for figure in figures_of(quoted)]
+    assert figures == [("published", value) for value in (10.69, 23.363, 1.56, 265.49)]
 
 
 def test_quantize_writes_vint8_and_what_the_compiler_is_told(tmp_path: Path) -> None:
     network, samples, core = (tmp_path / name for name in ("f.onnx", "s.npy", "core.onnx"))
     onnx.save(to_onnx(plain(Variant(blocks=1, features=4), seed=3), {}), network)
     np.save(samples, np.random.default_rng(0).random((4, 1, 48, 48), np.float32))
-    words = [
-        "quantize",
-        network,
-        "--samples",
-        samples,
-        "--out",
-        tmp_path / "i.onnx",
-        "--target",
-        "vek385",
-    ]
+    files = ["--samples", samples, "--out", tmp_path / "i.onnx"]
+    words = ["quantize", network, *files, "--target", "vek385"]
     assert "--tile" in refused(*words, "--board-file", core)
     assert "--board-file" in refused(*words, "--tile", 33)
     done(*words, "--board-file", core, "--tile", 33)
     assert "check passed" in done("check", core, "--target", "vek385")
-    told = json.loads((tmp_path / "vitisai_config.json").read_text(encoding="utf-8"))
-    assert told["passes"][1]["vaiml_config"] == {"device": "ve2-xc2ve3858", "optimize_level": 2}
-    judged = bd.gate(tmp_path / "i.onnx", network, board="vek385", samples=samples).checks
-    assert "nodes that break a rule" in {each.name for each in judged if each.passed}
+    config = json.loads((tmp_path / "vitisai_config.json").read_text(encoding="utf-8"))
+    assert config["passes"][1]["vaiml_config"] == {"device": "ve2-xc2ve3858", "optimize_level": 2}
+    checks = bd.gate(tmp_path / "i.onnx", network, board="vek385", samples=samples).checks
+    assert "nodes that break a rule" in {check.name for check in checks if check.passed}
 
 
 def test_export_writes_vint8_of_a_shipped_network(tmp_path: Path) -> None:
-    words = [
-        "export",
-        "--network",
-        "convbeers-half-xs-int8",
-        "--out",
-        tmp_path / "i.onnx",
-        "--target",
-        "vek385",
-    ]
+    files = ["--network", "convbeers-half-xs-int8", "--out", tmp_path / "i.onnx"]
+    words = ["export", *files, "--target", "vek385"]
     core = ["--board-file", tmp_path / "core.onnx"]
     assert "--board-file" in refused(*words)
     assert "--tile" in refused(*words, *core)

@@ -26,9 +26,9 @@ def conv(**numbers: object) -> Draw:
     return lambda s, x: s.qdq_conv(x, **numbers)  # type: ignore[arg-type]
 
 
-def added(one: float, other: float, output: float) -> Draw:
+def added(first: float, second: float, output: float) -> Draw:
     return lambda s, x: s.pair(
-        s.node("Add", s.qdq_conv(x, output=one), s.qdq_conv(x, output=other)), output
+        s.node("Add", s.qdq_conv(x, output=first), s.qdq_conv(x, output=second)), output
     )
 
 
@@ -49,12 +49,12 @@ def read(frac_bits: float, zero: int = 0) -> Draw:
     return lambda s, x: s.qdq_conv(s.pair(s.node("Relu", x), 6, read=(frac_bits, zero)))
 
 
-def twice(one: float, other: float) -> Draw:
+def twice(first: float, second: float) -> Draw:
     """A sum that is quantised once for each of its two readers."""
 
     def draw(s: QdqSketch, x: str) -> str:
         total = s.node("Add", x, x)
-        return s.pair(s.node("Add", s.pair(total, one), s.pair(total, other)))
+        return s.pair(s.node("Add", s.pair(total, first), s.pair(total, second)))
 
     return draw
 
@@ -94,20 +94,22 @@ def remedies(path: Path, draw: Draw) -> dict[str, str]:
     sketch = QdqSketch(4)
     end = draw(sketch, sketch.qdq_conv(sketch.pair("image")))
     nodes = place(read_network(sketch.save(path, end), 32), DPU).nodes
-    return {b.rule: b.finding.remedy for node in nodes for b in node.broken}
+    by_rule: dict[str, str] = {}
+    for node in nodes:
+        by_rule |= {violation.rule: violation.finding.remedy for violation in node.broken}
+    return by_rule
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_each_rule_refuses_its_file_alone_and_following_the_remedy_passes(
     tmp_path: Path, case: str
 ) -> None:
-    (found, sound), rule = (
-        (remedies(tmp_path / "n.onnx", draw) for draw in CASES[case]),
-        case.split(":")[0],
-    )
-    assert list(found) == [rule]
-    assert (MOVE if rule.startswith("shift") else AGAIN) in found[rule]
-    assert sound == {}
+    breaking, remedied = CASES[case]
+    rule = case.split(":")[0]
+    by_rule = remedies(tmp_path / "n.onnx", breaking)
+    assert list(by_rule) == [rule]
+    assert (MOVE if rule.startswith("shift") else AGAIN) in by_rule[rule]
+    assert remedies(tmp_path / "n.onnx", remedied) == {}
 
 
 def test_two_nodes_may_read_the_same_constant_at_two_scales(tmp_path: Path) -> None:
@@ -119,8 +121,8 @@ def test_two_nodes_may_read_the_same_constant_at_two_scales(tmp_path: Path) -> N
         weight = s.constant(np.ones((4, 4, 3, 3), np.int8))
         bias = s.stored(np.zeros(4, np.int8))
         for frac_bits in (7, 5):
-            seen = s.node("DequantizeLinear", weight, *s.scale(frac_bits))
-            x = s.pair(s.node("Conv", x, seen, bias, pads=[1] * 4))
+            dequantised = s.node("DequantizeLinear", weight, *s.scale(frac_bits))
+            x = s.pair(s.node("Conv", x, dequantised, bias, pads=[1] * 4))
         return x
 
     assert remedies(tmp_path / "n.onnx", draw) == {}
@@ -136,15 +138,15 @@ def test_weights_that_other_nodes_compute_are_refused(tmp_path: Path) -> None:
 
 
 def test_only_a_bias_may_be_int32() -> None:
-    for role, kept in (("bias", True), ("input 0", False), ("output", False)):
+    for role, legal in (("bias", True), ("input 0", False), ("output", False)):
         op = Operation(
             "op", "Conv", "conv", ("in",), ("out",), scales={role: Scale((0.5,), (0,), "int32")}
         )
-        assert (number_rules.symmetric(op, DPU) is None) == kept
+        assert (number_rules.symmetric(op, DPU) is None) == legal
 
 
 @pytest.mark.parametrize(
-    ("rule", "scale", "kept"),
+    ("rule", "scale", "legal"),
     [
         (number_rules.symmetric, Scale((0.5,), (128,), "uint8"), True),
         (number_rules.symmetric, Scale((0.5,), (0,), "uint8"), False),
@@ -158,6 +160,6 @@ def test_only_a_bias_may_be_int32() -> None:
         (number_rules.power_of_two, Scale((float("nan"),), (0,), "int8"), False),
     ],
 )
-def test_formats(rule: Rule, scale: Scale, kept: bool) -> None:
+def test_formats(rule: Rule, scale: Scale, legal: bool) -> None:
     op = Operation("op", "Conv", "conv", ("in",), ("out",), integer=True, scales={"weight": scale})
-    assert (rule(op, DPU) is None) == kept
+    assert (rule(op, DPU) is None) == legal

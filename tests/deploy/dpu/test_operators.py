@@ -135,8 +135,8 @@ def test_wide_layers(tmp_path: Path, rule: str, draw: Draw, channels: int) -> No
 def test_too_many_channels_for_sums_and_shuffles(tmp_path: Path) -> None:
     sketch = Sketch(8)
     half = sketch.conv("image", (2049, 8, 1, 1))
-    whole = sketch.node("Concat", half, half, axis=1)
-    assert broken_rules(sketch.save(tmp_path / "w.onnx", sketch.node("Add", whole, whole))) == [
+    joined = sketch.node("Concat", half, half, axis=1)
+    assert broken_rules(sketch.save(tmp_path / "w.onnx", sketch.node("Add", joined, joined))) == [
         "elementwise channels"
     ]
     sketch = Sketch(8)
@@ -177,16 +177,18 @@ def test_a_tile_that_the_memory_cannot_hold(tmp_path: Path) -> None:
         tmp_path / "m.onnx", sketch.conv(sketch.conv("image", (64, 1, 3, 3)), (1, 64, 3, 3))
     )
     node = place(read_network(path, 7001), DPU).nodes[0]
-    assert [broken.rule for broken in node.broken] == ["map in memory"]
+    assert [violation.rule for violation in node.broken] == ["map in memory"]
     allowed_px = int(7001 * float(node.broken[0].finding.remedy.split()[-4]))
-    assert broken_rules(path, tile_px=allowed_px - 70) == []  # the remedy names two digits
-    assert broken_rules(path, load_dpu("vck190", "C32B1"), 7001) == []  # one image at a time
+    # The remedy states its factor to two digits only.
+    assert broken_rules(path, tile_px=allowed_px - 70) == []
+    # This DPU has one image at a time in memory.
+    assert broken_rules(path, load_dpu("vck190", "C32B1"), 7001) == []
 
 
 def test_all_broken_rules_of_a_node_are_listed(tmp_path: Path) -> None:
     draw = conv(8, 4, 17, 9, group=2, strides=[9, 1], pads=[0, 0, 20, 0])
-    found = between_convs(tmp_path, draw)
-    assert found == ["conv kernel", "conv stride", "conv padding", "conv window", "conv groups"]
+    rules = between_convs(tmp_path, draw)
+    assert rules == ["conv kernel", "conv stride", "conv padding", "conv window", "conv groups"]
 
 
 def test_a_wider_array_needs_more_of_the_weight_bank(tmp_path: Path) -> None:
@@ -207,13 +209,13 @@ def test_a_float_convolution_in_a_quantised_file_is_refused(tmp_path: Path) -> N
 
 
 def test_rules_read_with_the_targets_limits() -> None:
-    said = rule_text(conv_kernel, DPU)
-    assert said == "Kernel height and width are 1 to 16 (UG1414 3.5, DPUCVDX8G, conv2d)."
+    text = rule_text(conv_kernel, DPU)
+    assert text == "Kernel height and width are 1 to 16 (UG1414 3.5, DPUCVDX8G, conv2d)."
 
 
 def test_findings_name_the_numbers_and_a_remedy(tmp_path: Path) -> None:
     sketch = Sketch(8)
     path = sketch.save(tmp_path / "k.onnx", sketch.conv("image", (8, 8, 17, 1)))
-    (broken,) = place(read_network(path, TILE_PX), DPU).nodes[0].broken
-    assert broken.finding.reason == "kernel (1 x 17) is not in the DPU's range 1 to 16"
-    assert "at most 16" in broken.finding.remedy
+    (violation,) = place(read_network(path, TILE_PX), DPU).nodes[0].broken
+    assert violation.finding.reason == "kernel (1 x 17) is not in the DPU's range 1 to 16"
+    assert "at most 16" in violation.finding.remedy

@@ -45,9 +45,9 @@ def test_each_part_is_corrected_by_the_runs_that_it_bounds(folder: Path) -> None
     """One run tells more of its network than of the board: of the logarithm, a fourth is the
     board's.
     """
-    found = runs_of(folder, deep=0.5, flat=2.0)
-    assert (found.dpu_factor, found.host_factor) == pytest.approx((0.5**0.25, 2.0**0.25))
-    for row in found.run_rows():
+    runs = runs_of(folder, deep=0.5, flat=2.0)
+    assert (runs.dpu_factor, runs.host_factor) == pytest.approx((0.5**0.25, 2.0**0.25))
+    for row in runs.run_rows():
         before, after = (
             abs(row.figures[f"{key} is off by"].value or 0) for key in ("shipped", "corrected")
         )
@@ -65,10 +65,10 @@ def test_more_runs_move_a_factor_further(folder: Path, count: int) -> None:
 
 
 def test_a_part_without_runs_keeps_its_constants(folder: Path) -> None:
-    found = runs_of(folder, deep=0.5)
-    assert found.host_factor == 1.0
+    runs = runs_of(folder, deep=0.5)
+    assert runs.host_factor == 1.0
     before, after = (
-        predict_file(folder / "deep.onnx", dpu, 320) for dpu in (DPU, found.applied(DPU))
+        predict_file(folder / "deep.onnx", dpu, 320) for dpu in (DPU, runs.applied(DPU))
     )
     assert after.batch_time_s == pytest.approx(2**0.25 * before.batch_time_s)
     assert after.host_s == pytest.approx(before.host_s)

@@ -1,5 +1,5 @@
 import re
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -55,34 +55,34 @@ def test_every_word_is_seen_on_a_phone(blocks: int, tmp_path: Path) -> None:
     """At its own size: a wider picture is cut off at 390 pixels, or its words scaled down."""
     sketch = Sketch(8)
     conv = sketch.node("Sigmoid", sketch.conv("image", (8, 8, 17, 33)))
-    broken = placed(sketch.save(tmp_path / "s.onnx", sketch.conv(conv)))
+    refused = placed(sketch.save(tmp_path / "s.onnx", sketch.conv(conv)))
     deep = placed(float_convbeers(tmp_path / "f.onnx", blocks, 8))
-    for placement in (broken, deep):
+    for placement in (refused, deep):
         root = drawn(placement, "a-network-with-quite-a-long-name.onnx on vck190 C32B3, tile 640")
         assert float(root.get("width") or 0) <= 390
         texts = list(root.iter(f"{SVG}text"))
         for text in texts:
             assert float(text.get("x") or 0) + text_width(text.text or "", 13) <= 390
         rows = [float(text.get("y") or 0) for text in of_class(root, "beside", "text")]
-        assert all(other - one >= 13 for one, other in pairwise(rows)), "lines below each other"
+        assert all(lower - upper >= 13 for upper, lower in pairwise(rows)), "lines below each other"
         assert float(root.get("height") or 0) > max(rows)
         for path in of_class(root, "edge", "path"):
             assert all(
                 float(number) >= 0 for number in re.findall(r"-?[0-9.]+", path.get("d") or "")
             )
-    for node in broken.nodes:
-        assert node.op.name in draw(broken, "net")
+    for node in refused.nodes:
+        assert node.op.name in draw(refused, "net")
 
 
 def test_edges_join_writers_to_readers(tmp_path: Path) -> None:
     placement = placed(float_convbeers(tmp_path / "f.onnx", 2, 8))
-    written = {name for node in placement.nodes for name in node.op.outputs}
-    reads = sum(name in written for node in placement.nodes for name in node.op.inputs)
+    outputs = set(chain.from_iterable(node.op.outputs for node in placement.nodes))
+    inputs = chain.from_iterable(node.op.inputs for node in placement.nodes)
+    reads = sum(name in outputs for name in inputs)
     edges = of_class(drawn(placement), "edge", "path")
     assert len(edges) == reads
-    assert (
-        sum("C" in (edge.get("d") or "") for edge in edges) == 3
-    )  # two blocks' skips and the long one
+    curves = ["C" in (edge.get("d") or "") for edge in edges]
+    assert sum(curves) == 3, "the skips of two blocks and the long one"
 
 
 def test_fills_are_light_enough_for_black_text_and_apart_in_brightness() -> None:

@@ -21,12 +21,6 @@ def placed(path: Path, tile_px: int = 21) -> Placement:
     return place(read_network(path, tile_px), DPU)
 
 
-def cut_in_two(path: Path) -> Path:
-    """By an operator that the DPU does not have."""
-    sketch = Sketch(8)
-    return sketch.save(path, sketch.conv(sketch.node("Sigmoid", sketch.conv("image"))))
-
-
 def test_the_integer_file_has_three_parts_and_one_subgraph(tmp_path: Path) -> None:
     placement = placed(integer_convbeers(tmp_path / "i.onnx", 2, 8), 53)
     parts = [node.part for node in placement.nodes]
@@ -59,7 +53,9 @@ def test_the_board_file_is_all_core_but_its_conversions(tmp_path: Path) -> None:
 
 
 def test_an_operator_in_the_middle_cuts_the_core_in_two(tmp_path: Path) -> None:
-    placement = placed(cut_in_two(tmp_path / "s.onnx"))
+    sketch = Sketch(8)
+    middle = sketch.node("Sigmoid", sketch.conv("image"))
+    placement = placed(sketch.save(tmp_path / "s.onnx", sketch.conv(middle)))
     assert placement.dpu_subgraphs == 2
     assert remarks_on(placement, DPU, 21)["subgraphs"].startswith("2 DPU subgraphs")
     assert [node.device for node in placement.nodes] == ["DPU", "CPU", "DPU"]
@@ -77,12 +73,8 @@ def test_a_branch_past_the_cpu_does_not_join_what_it_parts(tmp_path: Path) -> No
 
 def test_two_heads_of_one_input_are_two_subgraphs(tmp_path: Path) -> None:
     sketch = Sketch(8)
-    assert (
-        placed(
-            sketch.save(tmp_path / "t.onnx", sketch.conv("image"), sketch.conv("image"))
-        ).dpu_subgraphs
-        == 2
-    )
+    path = sketch.save(tmp_path / "t.onnx", sketch.conv("image"), sketch.conv("image"))
+    assert placed(path).dpu_subgraphs == 2
 
 
 def test_scaling_in_front_is_the_hosts_but_other_operators_are_refused(tmp_path: Path) -> None:
@@ -137,6 +129,7 @@ def test_a_relu_behind_the_last_convolution_stays_on_the_dpu(tmp_path: Path) -> 
 def test_maps_stream_from_the_tile_on_that_the_remark_names(tmp_path: Path) -> None:
     path = integer_convbeers(tmp_path / "i.onnx", 1, 32)
     text = remarks_on(placed(path, 640), DPU, 640)["streaming"]
-    assert "tiles of 181 px and less" in text  # 32 channels at 181 x 181 are the last below 1 MiB
+    # Maps of 32 channels at 181 x 181 are the largest below 1 MiB.
+    assert "tiles of 181 px and less" in text
     assert "streaming" not in remarks_on(placed(path, 181), DPU, 181)
     assert "streaming" in remarks_on(placed(path, 182), DPU, 182)

@@ -138,8 +138,8 @@ def test_the_core_of_a_network_at_half_resolution_has_maps_of_half_the_tile(
     """In the host's file the core is only described, and the board's begins
     behind the rearranging.
     """
-    made = quantised_half_resolution()
-    model = board_model(made.core, {}) if on_board else made.host
+    network = quantised_half_resolution()
+    model = board_model(network.core, {}) if on_board else network.host
     save_onnx(model, tmp_path / "half.onnx")
     convolutions = [
         op for op in read_network(tmp_path / "half.onnx", 64).operations if op.kind == "conv"
@@ -162,10 +162,10 @@ def test_a_core_at_half_resolution_that_is_fixed_to_a_tile_is_fixed_to_half_of_i
         read_network(tmp_path / "fixed.onnx", 66)
 
 
-@pytest.mark.parametrize("said", ["0", "-2", "half", "1000000"])
-def test_places_that_cannot_be_are_refused(said: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("text", ["0", "-2", "half", "1000000"])
+def test_places_that_cannot_be_are_refused(text: str, tmp_path: Path) -> None:
     model = board_model(quantised_half_resolution().core, {})
-    next(each for each in model.metadata_props if each.key == PLACE_PX).value = said
+    next(entry for entry in model.metadata_props if entry.key == PLACE_PX).value = text
     save_onnx(model, tmp_path / "half.onnx")
     with pytest.raises(ModelError, match="contradict"):
         read_network(tmp_path / "half.onnx", 64)

@@ -91,18 +91,18 @@ def test_time_is_in_proportion_to_the_work_and_lies_between_peak_and_plain_code(
     assert refused_interval_s(ops[:1] * 3, dpu) == pytest.approx((3 * low, 3 * high))
     clock = dpu.limit("cpu", "clock_ghz")
     cores = dpu.whole("cpu", "cores")
-    written = 4 * ops[0].out_bytes
-    assert low * cores > written / dpu.limit("cpu", "moved_bytes_per_s").high
+    moved_bytes = 4 * ops[0].out_bytes
+    assert low * cores > moved_bytes / dpu.limit("cpu", "moved_bytes_per_s").high
     assert high * cores > ops[0].out_bytes / (1e9 * clock.low)
     assert low < between((low, high)) < high
     assert refused_interval_s([], dpu) == (0.0, 0.0)
 
 
 def test_what_it_runs_is_said_with_its_time(tmp_path: Path) -> None:
-    found = predicted(segmenter(tmp_path / "n.onnx", "half_pixel"))
-    _, said = host_words(found)
-    assert "vck190" in said
-    assert found.refused[0] in said
+    prediction = predicted(segmenter(tmp_path / "n.onnx", "half_pixel"))
+    _, sentence = host_words(prediction)
+    assert "vck190" in sentence
+    assert prediction.refused[0] in sentence
     assert len(host_words(predicted(segmenter(tmp_path / "d.onnx", "asymmetric")))) == 1
 
 
@@ -128,8 +128,8 @@ def test_several_heads_are_copied_and_are_no_image(tmp_path: Path, ends: tuple[s
     assert sum(cut.size_bytes or 0 for cut in placement.cuts if not cut.onto_dpu) == 255 * (
         32**2 + 16**2
     )
-    found = predict_file(path, DPU, 64)
-    assert (found.task, found.refused) == ("copy", ())
+    prediction = predict_file(path, DPU, 64)
+    assert (prediction.task, prediction.refused) == ("copy", ())
 
 
 def test_results_of_few_bands_become_an_image_and_scores_do_not(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import Placement, place
 from beers_deploy.dpu.reading import read_network
+from tests.deploy.dpu.draws import rules_of
 from tests.deploy.dpu.graphs import Sketch
 from tests.quant.quick import Calibration
 
@@ -50,16 +51,22 @@ def quantised(
     per_channel: bool = False,
     symmetric: bool = False,
 ) -> Path:
-    options = {"ActivationSymmetric": symmetric}
-    kinds = {"activation_type": kind, "weight_type": QuantType.QInt8}
-    given = {"quant_format": form, "per_channel": per_channel, "extra_options": options, **kinds}
     noise = list(np.random.default_rng(0).random((2, 1, 1, TILE_PX, TILE_PX), np.float32))
-    quantize_static(float_file(path.with_name("f.onnx")), path, Calibration(noise), **given)
+    quantize_static(
+        float_file(path.with_name("f.onnx")),
+        path,
+        Calibration(noise),
+        quant_format=form,
+        per_channel=per_channel,
+        activation_type=kind,
+        weight_type=QuantType.QInt8,
+        extra_options={"ActivationSymmetric": symmetric},
+    )
     return path
 
 
 def rules(placement: Placement) -> set[str]:
-    return {broken.rule for node in placement.nodes for broken in node.broken}
+    return set(rules_of(placement.nodes))
 
 
 @pytest.mark.parametrize(
@@ -111,10 +118,8 @@ def with_scales(model: onnx.ModelProto) -> onnx.ModelProto:
         if arrays[zero].dtype == np.uint8:
             arrays[zero] = np.full_like(arrays[zero], 128)
         if value in arrays and arrays[value].dtype == np.int32:
-            arrays[value], arrays[zero] = (
-                np.ones(arrays[value].shape, np.int8),
-                np.zeros((), np.int8),
-            )
+            arrays[value] = np.ones(arrays[value].shape, np.int8)
+            arrays[zero] = np.zeros((), np.int8)
             arrays[scale] = np.array(2.0**-7, np.float32)
     del model.graph.initializer[:]
     model.graph.initializer.extend(
@@ -132,5 +137,5 @@ def test_nodes_of_a_quantiser_that_onnx_does_not_know_are_named_with_a_remedy(
     model = onnx.load_model(path)
     model.opset_import.append(onnx.helper.make_opsetid("com.vai.quantize", 1))
     onnx.save_model(model, path)
-    (broken,) = place(read_network(path, TILE_PX), DPU).nodes[1].broken
-    assert "QDQ" in broken.finding.remedy
+    (violation,) = place(read_network(path, TILE_PX), DPU).nodes[1].broken
+    assert "QDQ" in violation.finding.remedy

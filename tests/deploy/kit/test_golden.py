@@ -78,32 +78,34 @@ Layer = Callable[[IntConv | Op, np.ndarray], np.ndarray]
 def board(
     core: IntCore,
     planes: np.ndarray,
-    layer: Layer = lambda _, whole: saturated(whole),
+    layer: Layer = lambda _, values: saturated(values),
     half_even: bool = False,
     cut: Mapping[str, int] | None = None,
 ) -> dict[str, np.ndarray]:
     """What a board writes of every tensor."""
-    made = {PLANES: planes.astype(np.int16)}
+    tensors = {PLANES: planes.astype(np.int16)}
     for op in core.ops:
-        sums, shift, _, _ = layer_sums(core, op, made)
-        whole, _ = rounded(sums, shift + (cut or {}).get(op.name, 0), half_even)
-        made[op.output] = layer(op, whole)
-    return made
+        sums, shift, _, _ = layer_sums(core, op, tensors)
+        values, _ = rounded(sums, shift + (cut or {}).get(op.name, 0), half_even)
+        tensors[op.output] = layer(op, values)
+    return tensors
 
 
-def wrapped(op: IntConv | Op, whole: np.ndarray) -> np.ndarray:
-    return ((whole + 128) % 256 - 128).astype(np.int16) if isinstance(op, Add) else saturated(whole)
+def wrapped(op: IntConv | Op, values: np.ndarray) -> np.ndarray:
+    return (
+        ((values + 128) % 256 - 128).astype(np.int16) if isinstance(op, Add) else saturated(values)
+    )
 
 
 def bordered(planes: np.ndarray) -> np.ndarray:
-    bare = np.zeros_like(planes)
-    bare[..., 3:-3, 3:-3] = planes[..., 3:-3, 3:-3]
-    return bare
+    inner = np.zeros_like(planes)
+    inner[..., 3:-3, 3:-3] = planes[..., 3:-3, 3:-3]
+    return inner
 
 
 def at_middle(core: IntCore, change: Callable[[np.ndarray], np.ndarray]) -> Layer:
-    return lambda op, whole: (
-        change(saturated(whole)) if op.name == middle(core).name else saturated(whole)
+    return lambda op, values: (
+        change(saturated(values)) if op.name == middle(core).name else saturated(values)
     )
 
 
@@ -160,22 +162,22 @@ FAULTS: dict[str, tuple[Board, str, str]] = {
 
 
 def results(
-    golden: Golden, folder: Path, run: Board, kept: Callable[[str], bool] = lambda _: True
+    golden: Golden, folder: Path, run: Board, wants: Callable[[str], bool] = lambda _: True
 ) -> Path:
     """What a board writes of some tensors, in a folder."""
-    for case, sound in golden.cases.items():
+    for case, tensors in golden.cases.items():
         (folder / case).mkdir(parents=True)
-        made = run(golden.core, sound[PLANES])
+        outputs = run(golden.core, tensors[PLANES])
         for name, file in files_of(golden.core).items():
-            if kept(name):
-                np.save(folder / case / file, made[name].astype(np.int8))
+            if wants(name):
+                np.save(folder / case / file, outputs[name].astype(np.int8))
     return folder
 
 
 def test_a_sound_board_differs_nowhere(vectors: Path, golden: Golden, tmp_path: Path) -> None:
-    found = compare_golden(vectors, results(golden, tmp_path / "r", board))
-    assert found
-    assert all(row.figures["differing"].value == 0 and not row.text for row in found)
+    comparison = compare_golden(vectors, results(golden, tmp_path / "r", board))
+    assert comparison
+    assert all(row.figures["differing"].value == 0 and not row.text for row in comparison)
     assert {"odd", "extremes", "black", "white"} < set(golden.cases)
 
 
@@ -184,21 +186,21 @@ def test_a_fault_is_named_at_its_first_layer(
     fault: str, vectors: Path, golden: Golden, tmp_path: Path
 ) -> None:
     run, place, words = FAULTS[fault]
-    found = compare_golden(vectors, results(golden, tmp_path / "r", run))
+    comparison = compare_golden(vectors, results(golden, tmp_path / "r", run))
     where = {"first": golden.core.ops[0].name, "middle": middle(golden.core).name}.get(place, place)
-    assert not found
-    assert f"the first to differ is {where}, as if" in found.checks[0].detail
-    assert words in found.checks[0].detail
+    assert not comparison
+    assert f"the first to differ is {where}, as if" in comparison.checks[0].detail
+    assert words in comparison.checks[0].detail
 
 
 def test_adds_that_wrap_are_named(tmp_path: Path) -> None:
     vectors = write_golden("convbeers-xs-int8", tmp_path / "golden", tile=TILE_PX)
     golden = read_golden(vectors)
-    seen = results(golden, tmp_path / "r", lambda core, planes: board(core, planes, wrapped))
+    folder = results(golden, tmp_path / "r", lambda core, planes: board(core, planes, wrapped))
     first = next(op.name for op in golden.core.ops if isinstance(op, Add))
     assert (
         f"{first}, as if results beyond int8 wrap around"
-        in compare_golden(vectors, seen).checks[0].detail
+        in compare_golden(vectors, folder).checks[0].detail
     )
 
 
@@ -207,57 +209,57 @@ def test_of_the_last_layer_alone_a_rule_is_still_named(
 ) -> None:
     run = FAULTS["ties"][0]
     last = golden.core.ops[-1].output
-    said = (
+    detail = (
         compare_golden(vectors, results(golden, tmp_path / "r", run, lambda name: name == last))
         .checks[0]
         .detail
     )
-    assert "were not handed out" in said
-    assert "ties are rounded to even instead of up, in every layer" in said
+    assert "were not handed out" in detail
+    assert "ties are rounded to even instead of up, in every layer" in detail
 
 
 def test_results_are_taken_as_boards_write_them(tmp_path: Path) -> None:
     """Channels last, uint8 around 128, and floats; other numbers, names and shapes are refused."""
     vectors = write_golden("convbeers-xs-int8", tmp_path / "golden", tile=TILE_PX)
-    seen = tmp_path / "r" / "noise"
+    folder = tmp_path / "r" / "noise"
     golden = read_golden(vectors)
     names = list(files_of(golden.core).items())
-    sound = golden.cases["noise"]
-    seen.mkdir(parents=True)
+    tensors = golden.cases["noise"]
+    folder.mkdir(parents=True)
     (first, one), (second, two), (third, three) = names[1:4]
-    np.save(seen / one, np.moveaxis(sound[first], 1, -1).astype(np.int8))
-    np.save(seen / two, (sound[second] + 128).astype(np.uint8))
-    np.save(seen / three, (sound[third] * golden.core.scale(third)).astype(np.float32))
+    np.save(folder / one, np.moveaxis(tensors[first], 1, -1).astype(np.int8))
+    np.save(folder / two, (tensors[second] + 128).astype(np.uint8))
+    np.save(folder / three, (tensors[third] * golden.core.scale(third)).astype(np.float32))
     assert compare_golden(vectors, tmp_path / "r")
-    for values, said in (
-        (sound[third][:, :1], "expected shape"),
-        (sound[third] + 0.3, "whole multiples"),
+    for values, message in (
+        (tensors[third][:, :1], "expected shape"),
+        (tensors[third] + 0.3, "whole multiples"),
     ):
-        np.save(seen / three, values)
-        with pytest.raises(BeersError, match=said):
+        np.save(folder / three, values)
+        with pytest.raises(BeersError, match=message):
             compare_golden(vectors, tmp_path / "r")
-    (seen / three).rename(seen / "other.npy")
+    (folder / three).rename(folder / "other.npy")
     with pytest.raises(BeersError, match=r"got noise/other.npy"):
         compare_golden(vectors, tmp_path / "r")
 
 
 def test_the_command_writes_and_compares(tmp_path: Path) -> None:
     out = tmp_path / "golden"
-    seen = tmp_path / "seen"
+    folder = tmp_path / "seen"
     done("golden", "convbeers-xs", "--tile", TILE_PX, "--out", out)
     for case in ("scene", "noise"):
-        shutil.copytree(out / case, seen / case)
-    assert "no layer differs: 20 compared" in done("golden", seen, "--compare", out)
-    path = next((seen / "noise").glob("19-*"))
+        shutil.copytree(out / case, folder / case)
+    assert "no layer differs: 20 compared" in done("golden", folder, "--compare", out)
+    path = next((folder / "noise").glob("19-*"))
     np.save(path, np.load(path) + 1)
-    assert "the first to differ is joined" in done("golden", seen, "--compare", out, code=1)
-    assert "expected one of --out and --compare" in refused("golden", seen)
-    assert "golden.json: expected the index" in refused("golden", seen, "--compare", seen)
+    assert "the first to differ is joined" in done("golden", folder, "--compare", out, code=1)
+    assert "expected one of --out and --compare" in refused("golden", folder)
+    assert "golden.json: expected the index" in refused("golden", folder, "--compare", folder)
     assert "multiple of 2 px" in refused(
         "golden", "convbeers-half-xs", "--tile", 33, "--out", tmp_path / "x"
     )
     np.save(out / "noise" / "00-planes.npy", np.zeros((1, 4, 38, 38), np.int8))
-    assert "other numbers in noise" in refused("golden", seen, "--compare", out)
+    assert "other numbers in noise" in refused("golden", folder, "--compare", out)
 
 
 @pytest.fixture(scope="module")
@@ -290,8 +292,8 @@ STRANGE = {
 def test_arrays_that_are_no_tensors_are_refused(kind: str, copied: Path, tmp_path: Path) -> None:
     planes = copied / "noise" / "00-planes.npy"
     (tmp_path / "seen" / "noise").mkdir(parents=True)
-    sound = np.load(planes)
-    shape = sound.shape if STRANGE[kind].ndim == 4 and kind != "size" else STRANGE[kind].shape
+    tensor = np.load(planes)
+    shape = tensor.shape if STRANGE[kind].ndim == 4 and kind != "size" else STRANGE[kind].shape
     strange = np.resize(STRANGE[kind], shape)
     np.save(tmp_path / "seen" / "noise" / planes.name, strange)
     refused("golden", tmp_path / "seen", "--compare", copied)
@@ -307,8 +309,8 @@ def test_an_index_leads_nowhere_else_and_its_claims_are_no_inputs(
     shutil.copytree(copied / "noise", tmp_path / "seen" / "noise")
     index = json.loads((copied / INDEX).read_text())
     (copied / INDEX).write_text(json.dumps(index | {"network": {"name": 5, "sha256": "0" * 64}}))
-    found = compare_golden(copied, tmp_path / "seen")
-    assert found.to_dict()["inputs"][0] == Network.load(copied / "int8.onnx").input._asdict()  # type: ignore[index]
+    comparison = compare_golden(copied, tmp_path / "seen")
+    assert comparison.to_dict()["inputs"][0] == Network.load(copied / "int8.onnx").input._asdict()  # type: ignore[index]
     shutil.copytree(copied / "noise", tmp_path / "noise")
     (copied / INDEX).write_text(
         json.dumps(index | {"cases": {"../noise": index["cases"]["noise"]}})

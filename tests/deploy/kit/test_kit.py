@@ -52,11 +52,11 @@ runpy.run_path("host.py", run_name="__main__")
 
 def behind_fitted_kernels() -> bd.Network:
     """A small network whose analytic restoration has a coarse copy."""
-    made = behind_a_bank(Variant(1, 8, 2), 0.1)
-    weights = Weights(arrays(made.state_dict()), made.variant, {}, conditioned=True)
+    net = behind_a_bank(Variant(1, 8, 2), 0.1)
+    weights = Weights(arrays(net.state_dict()), net.variant, {}, conditioned=True)
     middle = bank_of_vector((0.0,) * 4)
-    seen = [bank_results(textured(48, 48, k), middle, (0.0,) * 4, 2) for k in range(2)]
-    family = quantise_family(weights, middle, Remade(seen.__getitem__, len(seen)))
+    results = [bank_results(textured(48, 48, k), middle, (0.0,) * 4, 2) for k in range(2)]
+    family = quantise_family(weights, middle, Remade(results.__getitem__, len(results)))
     return bd.Network.load(host_model(family.core, {}))
 
 
@@ -81,13 +81,13 @@ def test_the_host_part_gives_the_host_files_bytes(name: str, tmp_path: Path) -> 
     lattice_px = int8.tiling.lattice_px
     scale = int(int8.tiling.scale)
     wide = np.pad(image, [(0, 0), *((0, -side % lattice_px) for side in image.shape[1:])], "edge")
-    whole = int8(wide[None])[0][:, : 131 * scale, : 203 * scale]
-    assert np.array_equal(np.load(tmp_path / "out.npy"), whole)
+    expected = int8(wide[None])[0][:, : 131 * scale, : 203 * scale]
+    assert np.array_equal(np.load(tmp_path / "out.npy"), expected)
     assert {"core.onnx", "measure.py", "README.md", "golden"} < {
         path.name for path in folder.iterdir()
     }
-    read = onnx.load(folder / "golden" / "core.onnx").graph.input[0].type.tensor_type.shape.dim
-    assert [side.dim_value for side in read][1:] == [
+    dims = onnx.load(folder / "golden" / "core.onnx").graph.input[0].type.tensor_type.shape.dim
+    assert [side.dim_value for side in dims][1:] == [
         *np.load(folder / "golden" / "noise" / "00-planes.npy").shape[1:]
     ]
 
@@ -166,9 +166,9 @@ def test_the_host_part_restores_as_restore_does(
 
 
 def test_each_exposure_has_a_core_and_a_unit(kit: Path, sensor: bd.Sensor) -> None:
-    said = facts(kit)
-    assert {1, *map(int, said["exposures"])} == FACTORS == {*factors_for(sensor.nominal())}
-    assert len({said["unit"], *said["exposures"].values()}) == len(FACTORS)
+    content = facts(kit)
+    assert {1, *map(int, content["exposures"])} == FACTORS == {*factors_for(sensor.nominal())}
+    assert len({content["unit"], *content["exposures"].values()}) == len(FACTORS)
     for factor, path in brighter_files(Path(NAME), sensor).items():
         expected = bd.Network.load(path).core("vck190", TILE_PX).model
         assert onnx.load(kit / f"core-x{factor}.onnx") == expected
@@ -185,9 +185,9 @@ def test_the_host_part_chooses_factors_and_takes_the_consistency_step_as_the_lib
     """Bit for bit, with saturated pixels and without."""
     host = runpy.run_path(str(kit / "host.py"))
     radius_px = facts(kit)["halo_px"]
-    chosen = choose_factors(image, sorted(FACTORS), radius_px, 1.0, OFFSET_DN / 4095)
-    assert {*np.unique(chosen)} == FACTORS
-    np.testing.assert_array_equal(host["factors"](image[None, None]), chosen)
+    factors = choose_factors(image, sorted(FACTORS), radius_px, 1.0, OFFSET_DN / 4095)
+    assert {*np.unique(factors)} == FACTORS
+    np.testing.assert_array_equal(host["factors"](image[None, None]), factors)
     restored = np.clip(image + np.random.default_rng(2).normal(0, 0.01, image.shape), 0, 1).astype(
         np.float32
     )
@@ -218,30 +218,30 @@ def test_a_sensor_that_does_not_exist_or_changes_nothing_is_one_sentence(tmp_pat
         board.kit(NAME, tmp_path / "kit", tile=TILE_PX, sensor="hubble")
     with pytest.raises(OptionError, match=r"sensor: expected none where .* got blind"):
         board.kit(in_memory, tmp_path / "kit", tile=TILE_PX, sensor="blind")
+    # ESPCN enlarges the image.
+    enlarging = network("espcn")
     with pytest.raises(OptionError, match="got pleiades-degraded"):
-        host_facts(
-            network("espcn"), TILE_PX, bd.Sensor.load("pleiades-degraded")
-        )  # it enlarges the image
+        host_facts(enlarging, TILE_PX, bd.Sensor.load("pleiades-degraded"))
     assert not (tmp_path / "kit").exists()
 
 
 def test_a_network_for_another_sensor_is_said(tmp_path: Path) -> None:
-    made = bd.Network.load(NAME, sensor="dior-medium")
+    other = bd.Network.load(NAME, sensor="dior-medium")
     with pytest.warns(UserWarning, match="made for dior-medium, not for pleiades-degraded"):
         bd.Board.load("vck190").kit(
-            made, tmp_path / "kit", tile=TILE_PX, sensor="pleiades-degraded"
+            other, tmp_path / "kit", tile=TILE_PX, sensor="pleiades-degraded"
         )
 
 
 def test_a_record_says_what_a_network_is_and_what_was_checked(tmp_path: Path) -> None:
     pair = "convbeers-xs", "convbeers-xs-int8"
     done("gate", *pair, "--patches", 2, "--record", tmp_path / "gate")
-    said = json.loads((tmp_path / "gate" / NAMES[0]).read_text(encoding="utf-8"))
-    assert said["passed"]
-    assert said["licence"] == "Apache-2.0"
-    assert len(said["training"]["images"]) >= 50
-    assert said["network"]["sha256"] in {each["sha256"] for each in said["results"]["inputs"]}
-    assert len(said["tool"]["code_sha256"]) == 64
+    record = json.loads((tmp_path / "gate" / NAMES[0]).read_text(encoding="utf-8"))
+    assert record["passed"]
+    assert record["licence"] == "Apache-2.0"
+    assert len(record["training"]["images"]) >= 50
+    assert record["network"]["sha256"] in {entry["sha256"] for entry in record["results"]["inputs"]}
+    assert len(record["tool"]["code_sha256"]) == 64
     text = (tmp_path / "gate" / NAMES[2]).read_text(encoding="utf-8")
     assert JsonStrictValidator(SchemaVersion.V1_6).validate_str(text) is None
     assert "All checks passed" in (tmp_path / "gate" / NAMES[1]).read_text(encoding="utf-8")
@@ -249,14 +249,14 @@ def test_a_record_says_what_a_network_is_and_what_was_checked(tmp_path: Path) ->
 
 def test_of_a_users_network_nothing_is_made_up(tmp_path: Path) -> None:
     folder = bd.Board.load("zcu102").kit(network("unet"), tmp_path / "kit", tile=32, record=True)
-    said = json.loads((folder / "record" / NAMES[0]).read_text(encoding="utf-8"))
+    record = json.loads((folder / "record" / NAMES[0]).read_text(encoding="utf-8"))
     assert (
-        said["training"],
-        said["licence"],
-        said["weights_sha256"],
-        said["sensors_in_range"],
+        record["training"],
+        record["licence"],
+        record["weights_sha256"],
+        record["sensors_in_range"],
     ) == (None,) * 4
-    assert len(said["says"]["calibration_samples"].split()) == 3
+    assert len(record["says"]["calibration_samples"].split()) == 3
     onnx.checker.check_model(onnx.load(folder / "core.onnx"))
 
 

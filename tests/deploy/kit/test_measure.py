@@ -19,28 +19,19 @@ def test_runs_are_added_to_the_list(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     model, out, rail = (tmp_path / name for name in ("core.onnx", "board.json", "power1_input"))
     board_convbeers(model, 1, 8)
     rail.write_text("22500000\n")
-    common = (
-        model,
-        "--provider",
-        "CPUExecutionProvider",
-        "--tile",
-        37,
-        "--frames",
-        7,
-        "--out",
-        out,
-    )
+    provider = ("--provider", "CPUExecutionProvider")
+    common = (model, *provider, "--tile", 37, "--frames", 7, "--out", out)
     assert run(monkeypatch, *common, "--configuration", "C32B1") == 0
     more = ("--threads", 3, "--batch", 2, "--power-file", rail, "--power-file", rail)
     assert run(monkeypatch, *common, *more) == 0
     first, second = json.loads(out.read_text())
-    said = {
+    settings = {
         "model": "core.onnx",
         "configuration": "C32B1",
         "tile_px": 37,
         "provider": "CPUExecutionProvider",
     }
-    assert first == {**said, "fps": first["fps"]}
+    assert first == {**settings, "fps": first["fps"]}
     assert set(second) == {*first, "power_w"}
     assert second["power_w"] == 45
     assert min(first["fps"], second["fps"]) > 0
@@ -50,16 +41,8 @@ def test_the_same_provider_gives_the_same_numbers(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     model = board_convbeers(tmp_path / "core.onnx", 1, 8)
-    options = (
-        "--provider",
-        "CPUExecutionProvider",
-        "--tile",
-        24,
-        "--frames",
-        3,
-        "--out",
-        tmp_path / "b.json",
-    )
+    provider = ("--provider", "CPUExecutionProvider")
+    options = (*provider, "--tile", 24, "--frames", 3, "--out", tmp_path / "b.json")
     assert run(monkeypatch, model, *options) == 0
     assert "0.0 % of values differ" in capsys.readouterr().out
 

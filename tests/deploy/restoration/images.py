@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -85,13 +86,13 @@ def write_cog(path: Path, pixels: np.ndarray) -> Path:
 
 def quarters(folder: Path, pixels: np.ndarray) -> list[tuple[str, int, int, int, int]]:
     """Four JPEG 2000 tiles in `folder`: name, row, column, height and width of each."""
-    found = []
+    tiles = []
     for row, rows in ((0, SPLIT[0]), (SPLIT[0], HEIGHT - SPLIT[0])):
         for column, columns in ((0, SPLIT[1]), (SPLIT[1], WIDTH - SPLIT[1])):
             name = f"R{row}C{column}.jp2"
             write_jp2(folder / name, pixels[:, row : row + rows, column : column + columns])
-            found.append((name, row, column, rows, columns))
-    return found
+            tiles.append((name, row, column, rows, columns))
+    return tiles
 
 
 def write_vrt(path: Path, pixels: np.ndarray, more: str = "") -> Path:
@@ -167,10 +168,9 @@ def write_dimap(path: Path, pixels: np.ndarray, bits: int = 12, more: str = "") 
 <Radiometric_Data>{more}<Radiometric_Calibration><Instrument_Calibration><Band_Measurement_List>{gains}
 </Band_Measurement_List></Instrument_Calibration></Radiometric_Calibration></Radiometric_Data></Dimap_Document>"""
     )
+    kinds = ("SAMP_NUM_COEFF", "SAMP_DEN_COEFF", "LINE_NUM_COEFF", "LINE_DEN_COEFF")
     coefficients = "".join(
-        f"<{kind}_{k}>{k / 7!r}</{kind}_{k}>"
-        for kind in ("SAMP_NUM_COEFF", "SAMP_DEN_COEFF", "LINE_NUM_COEFF", "LINE_DEN_COEFF")
-        for k in range(1, 21)
+        f"<{kind}_{k}>{k / 7!r}</{kind}_{k}>" for kind, k in product(kinds, range(1, 21))
     )
     offsets = (
         "LONG_SCALE LONG_OFF LAT_SCALE LAT_OFF HEIGHT_SCALE HEIGHT_OFF SAMP_SCALE "

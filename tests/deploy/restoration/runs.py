@@ -23,10 +23,10 @@ def noise(*shape: int, seed: int = 1) -> np.ndarray:
 
 
 def restored(
-    folder: Path, pixels: np.ndarray, options: Options, **written: Any
+    folder: Path, pixels: np.ndarray, options: Options, **tags: Any
 ) -> tuple[np.ndarray, Row]:
     """Write pixels, restore them, and read the result again."""
-    tifffile.imwrite(folder / "in.tif", pixels, **written)
+    tifffile.imwrite(folder / "in.tif", pixels, **tags)
     row = restore_file(folder / "in.tif", folder / "out.tif", options)
     return tifffile.imread(folder / "out.tif"), row
 

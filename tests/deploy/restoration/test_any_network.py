@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +69,8 @@ def whole(path: Path, pixels: np.ndarray) -> np.ndarray:
     """The result without the engine: the image extended by copies of its last row and column, and
     cut again.
     """
-    model, (height, width) = load_onnx(path), pixels.shape[-2:]
+    model = load_onnx(path)
+    height, width = pixels.shape[-2:]
     tiling = tiling_of(model)
     bands = pixels.reshape(-1, height, width)
     more = [-side % tiling.lattice_px for side in (height, width)]
@@ -79,10 +81,10 @@ def whole(path: Path, pixels: np.ndarray) -> np.ndarray:
     return np.asarray(np.rint(np.clip(cut, 0, 4095)).squeeze())
 
 
-def by_file(pixels: np.ndarray, folder: Path, options: Options, **written: Any) -> np.ndarray:
+def by_file(pixels: np.ndarray, folder: Path, options: Options, **tags: Any) -> np.ndarray:
     """As `restore` writes it."""
     planar: dict[str, Any] = {"planarconfig": "separate"} if pixels.ndim == 3 else {}
-    return restored(folder, pixels, options, photometric="minisblack", **planar, **written)[0]
+    return restored(folder, pixels, options, photometric="minisblack", **planar, **tags)[0]
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -111,8 +113,8 @@ def test_one_lattice_less_of_halo_shows_seams(path: Path, tmp_path: Path) -> Non
 @pytest.mark.parametrize("size", [(1, 1), (3, 50), (47, 2)])
 def test_tiny_images_are_extended_too(size: tuple[int, int], path: Path, tmp_path: Path) -> None:
     pixels = noise(path, size)
-    found = by_file(pixels, tmp_path, Options(path, 83, threads=1))
-    np.testing.assert_array_equal(found.squeeze(), whole(path, pixels))
+    result = by_file(pixels, tmp_path, Options(path, 83, threads=1))
+    np.testing.assert_array_equal(result.squeeze(), whole(path, pixels))
 
 
 def test_missing_pixels_stay_and_spoil_no_others(path: Path, tmp_path: Path) -> None:
@@ -122,10 +124,10 @@ def test_missing_pixels_stay_and_spoil_no_others(path: Path, tmp_path: Path) -> 
     pixels[..., -3:, -5:] = 0
     pixels[(0, 5, 5) if pixels.ndim == 3 else (5, 5)] = 0
     nodata: dict[str, Any] = {"extratags": [(42113, "s", 0, "0", True)]}
-    tiled, one = (
+    tiled, untiled = (
         by_file(pixels, tmp_path, Options(path, side, threads=1), **nodata) for side in (56, 500)
     )
-    np.testing.assert_array_equal(tiled, one)
+    np.testing.assert_array_equal(tiled, untiled)
     tiling = tiling_of(load_onnx(path))
     missing = pixels == 0
     if tiling.channels_in != tiling.channels_out:
@@ -226,20 +228,21 @@ def test_places_on_earth_stay_where_they_are(keys: tuple[int, ...]) -> None:
     larger = {tag[0]: tag[3] for tag in enlarged_tags((*tags, (34735, 3, 8, keys, True)), 2)}
     middle = 0.5 if keys is AREA else 0.0
 
-    def by_tie(given: dict[int, Any], column: float, row: float) -> list[float]:
-        point = given[33922]
-        size = given[33550]
+    def by_tie(tag_values: dict[int, Any], column: float, row: float) -> list[float]:
+        point = tag_values[33922]
+        size = tag_values[33550]
         return [
             point[3] + (column + middle - point[0]) * size[0],
             point[4] - (row + middle - point[1]) * size[1],
         ]
 
-    def by_matrix(given: dict[int, Any], column: float, row: float) -> list[float]:
-        m = given[34264]
+    def by_matrix(tag_values: dict[int, Any], column: float, row: float) -> list[float]:
+        m = tag_values[34264]
         return [m[k] * (column + middle) + m[k + 1] * (row + middle) + m[k + 3] for k in (0, 4)]
 
     for place in (by_tie, by_matrix):
-        four = [place(larger, 2 * 7 + i, 2 * 9 + j) for i in (0, 1) for j in (0, 1)]
+        corners = product((0, 1), repeat=2)
+        four = [place(larger, 2 * 7 + i, 2 * 9 + j) for i, j in corners]
         np.testing.assert_allclose(np.mean(four, axis=0), place(values, 7, 9))
     assert enlarged_tags(tags, 1) is tags
 
@@ -263,7 +266,7 @@ def test_a_larger_file_has_its_tags(tmp_path: Path) -> None:
 def test_a_one_band_network_still_takes_bands_one_by_one(tmp_path: Path) -> None:
     path = saved(espcn(), tmp_path)
     bands = np.random.default_rng(1).integers(0, 4096, (3, 41, 35)).astype(np.uint16)
-    found = by_file(bands, tmp_path, Options(path, 23))
-    assert found.shape == (3, 82, 70)
-    for band, result in zip(bands, found, strict=True):
-        np.testing.assert_array_equal(result, whole(path, band))
+    result = by_file(bands, tmp_path, Options(path, 23))
+    assert result.shape == (3, 82, 70)
+    for band, restored_band in zip(bands, result, strict=True):
+        np.testing.assert_array_equal(restored_band, whole(path, band))

@@ -18,18 +18,9 @@ SECOND = "blind"
 
 def restored(image: Path, sensor: str, *more: str) -> tuple[np.ndarray, str]:
     out = image.with_name("out.tif")
-    words = [
-        "restore",
-        str(image),
-        str(out),
-        "--network",
-        "convbeers-xs",
-        "--sensor",
-        sensor,
-        *more,
-    ]
-    said = done(*words)
-    return tifffile.imread(out), said
+    network = ("--network", "convbeers-xs", "--sensor", sensor)
+    output = done("restore", image, out, *network, *more)
+    return tifffile.imread(out), output
 
 
 @pytest.mark.parametrize("names", [("B0", "B1"), ("B1", "B0")])
@@ -37,11 +28,11 @@ def test_each_band_has_its_own_network(names: tuple[str, str], tmp_path: Path) -
     """Named in either order; the bands of the file are B0 and B1."""
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
     of = dict(zip(names, (FIRST, SECOND), strict=True))
-    both, _ = restored(image, f"{names[0]}={FIRST},{names[1]}={SECOND}", "--tile", "64")
+    result, _ = restored(image, f"{names[0]}={FIRST},{names[1]}={SECOND}", "--tile", "64")
     alone = {sensor: restored(image, sensor)[0] for sensor in (FIRST, SECOND)}
     assert (alone[FIRST] != alone[SECOND]).any()
     for band in (0, 1):
-        np.testing.assert_array_equal(both[band], alone[of[f"B{band}"]][band])
+        np.testing.assert_array_equal(result[band], alone[of[f"B{band}"]][band])
 
 
 def test_bands_without_names_are_taken_in_order(tmp_path: Path) -> None:
@@ -54,10 +45,12 @@ def test_bands_without_names_are_taken_in_order(tmp_path: Path) -> None:
     with open_source(tmp_path / "in.tif") as source:
         assert source.raster.bands == 2
         assert band_names(source.raster) == ()
-    both, _ = restored(tmp_path / "in.tif", f"red={SECOND},blue={FIRST}")
+    result, _ = restored(tmp_path / "in.tif", f"red={SECOND},blue={FIRST}")
     for band, sensor in ((0, SECOND), (1, FIRST)):
-        np.testing.assert_array_equal(both[band], restored(tmp_path / "in.tif", sensor)[0][band])
-    np.testing.assert_array_equal(restored(tmp_path / "in.tif", f"B1={FIRST},B0={SECOND}")[0], both)
+        np.testing.assert_array_equal(result[band], restored(tmp_path / "in.tif", sensor)[0][band])
+    np.testing.assert_array_equal(
+        restored(tmp_path / "in.tif", f"B1={FIRST},B0={SECOND}")[0], result
+    )
 
 
 def test_a_cog_names_the_sensors_in_the_order_of_the_bands(tmp_path: Path) -> None:
@@ -79,16 +72,8 @@ def test_a_cog_names_the_sensors_in_the_order_of_the_bands(tmp_path: Path) -> No
 )
 def test_what_does_not_fit_is_refused(sensor: str, words: str, tmp_path: Path) -> None:
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    arguments = [
-        "restore",
-        str(image),
-        str(tmp_path / "out.tif"),
-        "--network",
-        "convbeers-xs",
-        "--sensor",
-        sensor,
-    ]
-    assert words in refused(*arguments)
+    network = ("--network", "convbeers-xs", "--sensor", sensor)
+    assert words in refused("restore", image, tmp_path / "out.tif", *network)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]
 
 

@@ -55,7 +55,8 @@ def test_it_is_valid_and_holds_the_same(
         assert after.crs == rasterio.CRS.from_epsg(32631)
         assert (after.descriptions, after.scales) == (("B0", "B1"), (0.1, 0.2))
         assert after.overviews(1) == [2]
-        if compression is not Compression.none:  # GDAL 3.10 marks no file of uncompressed planes
+        # GDAL 3.10 marks no file of uncompressed planes as a COG.
+        if compression is not Compression.none:
             assert after.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
         names = {"zlib": "deflate", "zstd": "zstd", "lzw": "lzw", "none": None}
         assert (after.compression and after.compression.value.lower()) == names[compression.value]
@@ -67,12 +68,12 @@ def test_it_says_what_was_done(tmp_path: Path) -> None:
     int8 = shipped_pair("convbeers-xs")[1]
     _, cog = both(tmp_path, images.digital_numbers(), Options(int8, tile_px=64))
     with rasterio.open(cog) as file:
-        said = file.tags()
-    assert said["RESTORED_NETWORK_SHA256"] == sha256(int8)
-    assert said["RESTORED_NETWORK"] == "convbeers-xs"
-    assert said["RESTORED_SENSOR"] == "pleiades-degraded"
-    assert said["RESTORED_FULL_SCALE"] == "4095 (assumed: 12 bits)"
-    assert said["RESTORED_BY"].startswith("beers-deploy ")
+        tags = file.tags()
+    assert tags["RESTORED_NETWORK_SHA256"] == sha256(int8)
+    assert tags["RESTORED_NETWORK"] == "convbeers-xs"
+    assert tags["RESTORED_SENSOR"] == "pleiades-degraded"
+    assert tags["RESTORED_FULL_SCALE"] == "4095 (assumed: 12 bits)"
+    assert tags["RESTORED_BY"].startswith("beers-deploy ")
 
 
 def test_missing_pixels_are_kept(model: Path, tmp_path: Path) -> None:
@@ -151,14 +152,14 @@ def test_the_disk_is_asked_for_all_that_stands_on_it_at_a_time(
         restore_file(image, out, options)
     assert [path.name for path in tmp_path.iterdir()] == ["in.tif"]
     free = needed
-    taken = list[int]()
+    used_bytes = list[int]()
     replace_file = Path.replace
 
     def counted(self: Path, target: Path) -> Path:
         if target == out:
-            taken.append(sum(path.stat().st_size for path in self.parent.iterdir()))
+            used_bytes.append(sum(path.stat().st_size for path in self.parent.iterdir()))
         return replace_file(self, target)
 
     monkeypatch.setattr(Path, "replace", counted)
     restore_file(image, out, options)
-    assert 0.4 * needed < taken[0] < needed + 64_000
+    assert 0.4 * needed < used_bytes[0] < needed + 64_000

@@ -87,22 +87,23 @@ def test_however_rows_are_read_the_same_pixels_come(step_px: int, seed: int) -> 
     places = generator.integers((0, 0, 0), (WIDTH, HEIGHT, 3), (30, 3))
     faults = FaultList(tuple(Fault(*map(int, place)) for place in places))
     source = FixedSource(source_of(pixels), faults)
-    whole = source.read(0, HEIGHT)
-    np.testing.assert_array_equal(read(source, step_px), whole)
+    fixed = source.read(0, HEIGHT)
+    np.testing.assert_array_equal(read(source, step_px), fixed)
     mask = faults.mask(source.raster, 0, HEIGHT)
-    np.testing.assert_array_equal(whole[~mask], pixels[~mask])
-    assert (np.abs(whole[mask] - LEVEL) < 6 * NOISE).all()
+    np.testing.assert_array_equal(fixed[~mask], pixels[~mask])
+    assert (np.abs(fixed[mask] - LEVEL) < 6 * NOISE).all()
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int16, np.float32, np.float64])
 def test_a_plane_is_interpolated_exactly(dtype: type) -> None:
     rows, columns = np.indices((HEIGHT, WIDTH))
-    plane: np.ndarray = (rows // 2 + columns // 2 * 0 + 20).astype(dtype)  # constant along each row
-    spoilt = plane.copy()
-    spoilt[:, 50:52] = 0
-    spoilt[30, 20] = 99
+    # The plane is constant along each row.
+    plane: np.ndarray = (rows // 2 + columns // 2 * 0 + 20).astype(dtype)
+    damaged = plane.copy()
+    damaged[:, 50:52] = 0
+    damaged[30, 20] = 99
     faults = FaultList((Fault(50, -1), Fault(51, -1), Fault(20, 30)))
-    fixed = FixedSource(source_of(spoilt), faults).read(0, HEIGHT)[0]
+    fixed = FixedSource(source_of(damaged), faults).read(0, HEIGHT)[0]
     assert fixed.dtype == dtype
     np.testing.assert_allclose(fixed, plane, atol=0.5)
     np.testing.assert_allclose(fixed[:, 50:52], plane[:, 50:52], rtol=1e-6)
@@ -117,14 +118,18 @@ def test_missing_pixels_stay_missing_and_are_no_neighbours() -> None:
     np.testing.assert_array_equal(fixed[:, 60], pixels[:, 59])
     planes = np.stack([pixels, (pixels != 7).astype(np.uint16)])
     veiled = FixedSource(VeiledSource(source_of(planes), "unassalpha"), faults)
-    got = veiled.read(3, 9)
-    np.testing.assert_array_equal(np.ma.getmaskarray(got)[0], pixels[3:9] == 7)
-    np.testing.assert_array_equal(np.ma.getdata(got)[0], fixed[3:9])
+    rows = veiled.read(3, 9)
+    np.testing.assert_array_equal(np.ma.getmaskarray(rows)[0], pixels[3:9] == 7)
+    np.testing.assert_array_equal(np.ma.getdata(rows)[0], fixed[3:9])
 
 
 def test_a_replaced_pixel_never_falls_on_the_nodata_value() -> None:
     pixels = np.full((9, 9), 10, np.uint16)
-    pixels[4, :4], pixels[4, 5:], pixels[:4, 4], pixels[5:, 4] = 9, 11, 9, 11
+    # The four neighbours have a mean of 10, which is the nodata value below.
+    pixels[4, :4] = 9
+    pixels[4, 5:] = 11
+    pixels[:4, 4] = 9
+    pixels[5:, 4] = 11
     pixels[4, 4] = 99
     faults = FaultList((Fault(4, 4),))
     assert FixedSource(source_of(pixels), faults).read(0, 9)[0, 4, 4] == 10
@@ -153,9 +158,9 @@ def test_a_list_is_read_as_it_was_written(
     tmp_path_factory: pytest.TempPathFactory, faults: list[Fault]
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "list.csv"
-    written = FaultList(tuple(sorted(set(faults))))
-    path.write_text(written.text)
-    assert read_list(path, Raster(3, 8, 10, np.dtype(np.uint16))).faults == written.faults
+    fault_list = FaultList(tuple(sorted(set(faults))))
+    path.write_text(fault_list.text)
+    assert read_list(path, Raster(3, 8, 10, np.dtype(np.uint16))).faults == fault_list.faults
 
 
 @pytest.mark.parametrize(
@@ -205,10 +210,9 @@ def test_an_image_full_of_single_pixels_has_no_single_faults() -> None:
 def test_sentences_name_kind_place_and_remedy() -> None:
     pixels = faulty().astype(np.float64)
     pixels[:, ::2] *= 1.04
-    said = sentences(
-        look_at_detectors(source_of(np.rint(np.minimum(pixels, 4095)).astype(np.uint16)), 5000)
-    )
-    assert all("look at the detectors: " in sentence for sentence in said)
+    clipped = np.rint(np.minimum(pixels, 4095)).astype(np.uint16)
+    lines = sentences(look_at_detectors(source_of(clipped), 5000))
+    assert all("look at the detectors: " in sentence for sentence in lines)
     for words in (
         "1 dead column",
         "column 40",
@@ -217,7 +221,7 @@ def test_sentences_name_kind_place_and_remedy() -> None:
         "column 80, row 20",
         "alternate columns",
     ):
-        assert any(words in sentence for sentence in said), words
+        assert any(words in sentence for sentence in lines), words
     assert not sentences(look_at_detectors(source_of(ground(HEIGHT, WIDTH)), 4095))
 
 
@@ -275,14 +279,14 @@ def test_a_stopped_run_goes_on_with_the_same_faults_and_no_others(
 
 def test_commands_say_it(image: Path, model: Path, tmp_path: Path) -> None:
     network = ("--network", model)
-    said = done("info", image, *network)
-    assert "look at the detectors: 1 dead column" in said
-    assert "dead lines" in said
+    output = done("info", image, *network)
+    assert "look at the detectors: 1 dead column" in output
+    assert "dead lines" in output
     out = tmp_path / "out.tif"
     assert "look at the detectors: 1 dead column" in done("restore", image, out, *network)
-    said = done("restore", image, out, *network, "--fix-detectors", "found")
-    assert "2 pixels, 1 column, 1 row found" in said
-    assert "look at the detectors" not in said
+    output = done("restore", image, out, *network, "--fix-detectors", "found")
+    assert "2 pixels, 1 column, 1 row found" in output
+    assert "look at the detectors" not in output
     before = out.read_bytes()
     assert "--fix-detectors" in refused(
         "restore", image, out, *network, "--fix-detectors", tmp_path / "none.csv"

@@ -31,9 +31,9 @@ def running(infer: Infer, at_once: int, tick: Callable[[], None] = lambda: None)
     restorer = Restorer(raster, (ExposedNetwork({1: infer}),), 4095.0, Tiling(RADIUS_PX))
     result = np.empty(SHAPE, np.uint16)
     source = ArraySource(pixels, raster)
-    for row, kept, tally in restore_rows(source, plan, restorer, plan.rows, tick, at_once):
-        assert (tally.known, tally.clipped) == (kept.size, 0)
-        result[:, row.keep_start : row.keep_stop] = kept
+    for row, pixels_out, tally in restore_rows(source, plan, restorer, plan.rows, tick, at_once):
+        assert (tally.known, tally.clipped) == (pixels_out.size, 0)
+        result[:, row.keep_start : row.keep_stop] = pixels_out
     return result
 
 
@@ -72,7 +72,8 @@ def test_after_an_error_or_a_stop_no_further_tile_is_begun(
 
     def slow(image: np.ndarray) -> np.ndarray:
         calls.append(1)
-        if len(calls) > 2:  # a tile takes longer than the news of an error
+        # A tile takes longer than the news of an error, so later calls wait a little.
+        if len(calls) > 2:
             going.wait(0.2)
         return brighter(image) * np.float32(factor)
 
@@ -91,6 +92,6 @@ def test_tiles_share_the_threads_evenly(threads: int, tiles: int) -> None:
     assert 1 <= count <= min(AT_ONCE, max(tiles, 1))
     assert cores % count == 0
     if count > 1:
-        assert (
-            session_threads(threads, count) - 1 + count == cores
-        )  # onnxruntime's own threads, and the callers
+        # The caller of a session is one of its threads: onnxruntime starts one less of its own.
+        own_threads = session_threads(threads, count) - 1
+        assert own_threads + count == cores

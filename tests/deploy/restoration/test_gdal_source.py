@@ -68,10 +68,11 @@ def test_polynomials_bits_and_gains_of_a_dimap_are_kept(
         assert source.raster.bits == 10
     restore_file(image, tmp_path / "out.tif", Options(model, cog=cog))
     with rasterio.open(image) as before, rasterio.open(tmp_path / "out.tif") as after:
-        kept = after.rpcs.to_dict()
-        stated = before.rpcs.to_dict()
-        for key in stated.keys() - {"err_bias", "err_rand"}:
-            np.testing.assert_allclose(kept[key], stated[key], rtol=0, atol=1e-9)
+        after_rpcs = after.rpcs.to_dict()
+        before_rpcs = before.rpcs.to_dict()
+        # A DIMAP's model states its errors in other terms than GeoTIFF's tag.
+        for key in before_rpcs.keys() - {"err_bias", "err_rand"}:
+            np.testing.assert_allclose(after_rpcs[key], before_rpcs[key], rtol=0, atol=1e-9)
         assert [after.tags(band)["RADIANCE_GAIN"] for band in (1, 2)] == ["9.0", "9.1"]
         assert [after.tags(band)["RADIANCE_BIAS"] for band in (1, 2)] == ["0.0", "0.1"]
 
@@ -98,32 +99,33 @@ def test_ground_control_points_are_kept(model: Path, tmp_path: Path) -> None:
     restore_file(image, tmp_path / "out.tif", Options(model))
     with rasterio.open(image) as before, rasterio.open(tmp_path / "out.tif") as after:
         assert before.gcps[1] == after.gcps[1] == rasterio.CRS.from_epsg(4326)
-        found = [[(p.col, p.row, p.x, p.y) for p in file.gcps[0]] for file in (before, after)]
-    assert len(found[0]) == 5
-    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-9)
+        points_of = [[(p.col, p.row, p.x, p.y) for p in file.gcps[0]] for file in (before, after)]
+    assert len(points_of[0]) == 5
+    np.testing.assert_allclose(points_of[1], points_of[0], rtol=0, atol=1e-9)
 
 
 def test_missing_pixels_stay_missing(model: Path, tmp_path: Path) -> None:
     pixels = np.maximum(images.digital_numbers(), 1)
     pixels[:, 20:70, 30:90] = 0
-    written = [
+    paths = [
         images.write_tiff(tmp_path / "a.tif", pixels, nodata=0),
         images.write(tmp_path / "a.img", pixels, "HFA", nodata=0),
         images.write_vrt(tmp_path / "a.vrt", pixels, "<NoDataValue>0</NoDataValue>"),
     ]
-    assert not list(tmp_path.glob("*.img.aux.xml"))  # it is in the file
-    for image in written:
+    # The nodata value is in the file itself, so GDAL wrote no sidecar.
+    assert not list(tmp_path.glob("*.img.aux.xml"))
+    for image in paths:
         restore_file(image, tmp_path / f"{image.name}.tif", Options(model, tile_px=64))
-    first, *others = (tifffile.imread(tmp_path / f"{image.name}.tif") for image in written)
+    first, *rest = (tifffile.imread(tmp_path / f"{image.name}.tif") for image in paths)
     np.testing.assert_array_equal(first == 0, pixels == 0)
-    for other in others:
+    for other in rest:
         np.testing.assert_array_equal(other, first)
 
 
 def test_the_cache_is_counted_with_the_blocks_of_a_mosaic_s_tiles(tmp_path: Path) -> None:
     pixels = images.digital_numbers()
     rows = 1 << 20
-    one = images.write_jp2(tmp_path / "a.jp2", pixels)
+    jp2 = images.write_jp2(tmp_path / "a.jp2", pixels)
     images.write(tmp_path / "strip.tif", pixels, "GTiff", blockysize=140)
     size = f'rasterXSize="{images.WIDTH}" rasterYSize="{images.HEIGHT}"'
     bands = "".join(
@@ -132,7 +134,7 @@ def test_the_cache_is_counted_with_the_blocks_of_a_mosaic_s_tiles(tmp_path: Path
         for band in (1, 2)
     )
     (tmp_path / "a.vrt").write_text(f"<VRTDataset {size}>{bands}</VRTDataset>")
-    for image, block_px in ((one, images.TILE_PX), (tmp_path / "a.vrt", 140)):
+    for image, block_px in ((jp2, images.TILE_PX), (tmp_path / "a.vrt", 140)):
         with open_source(image) as source:
             assert (
                 source.held_bytes(rows) == (rows + 2 * block_px) * images.BANDS * images.WIDTH * 2
@@ -223,10 +225,10 @@ def test_a_cog_keeps_mask_and_alpha(model: Path, tmp_path: Path) -> None:
     hidden = np.zeros((images.HEIGHT, images.WIDTH), bool)
     hidden[30:50, 40:] = True
     tifffile.imwrite(tmp_path / "mask.tif", pixels)
-    both = np.stack([pixels, ~hidden * 4095]).astype(np.uint16)
+    planes = np.stack([pixels, ~hidden * 4095]).astype(np.uint16)
     tifffile.imwrite(
         tmp_path / "alpha.tif",
-        both,
+        planes,
         photometric="minisblack",
         planarconfig="separate",
         extrasamples=[2],

@@ -126,18 +126,18 @@ CODE = """<VRTDataset rasterXSize="9" rasterYSize="9">
 <PixelFunctionLanguage>Python</PixelFunctionLanguage>
 <PixelFunctionCode><![CDATA[
 def run(in_ar, out_ar, *rest, **more):
-    open({made!r}, "w").close()
+    open({marker!r}, "w").close()
 ]]></PixelFunctionCode>{source}</VRTRasterBand></VRTDataset>"""
 
 
 @pytest.mark.parametrize("trusted", [False, True])
 def test_code_in_an_index_is_never_run(trusted: bool, tmp_path: Path) -> None:
     index = folder_of(tmp_path) / "a.vrt"
-    made = tmp_path / "made"
-    index.write_text(CODE.format(made=str(made), source=ONE))
+    marker = tmp_path / "made"
+    index.write_text(CODE.format(marker=str(marker), source=ONE))
     with pytest.raises(ImageError), open_source(index, trusted=trusted) as source:
         source.read(0, 9)
-    assert not made.exists()
+    assert not marker.exists()
 
 
 @pytest.mark.parametrize(

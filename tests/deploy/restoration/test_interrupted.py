@@ -73,12 +73,14 @@ def test_rows_that_match_their_digests_are_kept_and_no_others(
             checkpoint.append(row)
         raw = part_folder(out) / "rows.raw"
         raw.write_bytes(damage(raw.read_bytes()))
-        left = Checkpoint(out, shape, np.dtype(kind), JOB, resume=True)
-        assert left.rows + left.damaged_rows == sum(heights)
-        assert left.rows in np.cumsum([0, *heights])
-        assert left.tally.known == bands * left.rows * width
+        resumed = Checkpoint(out, shape, np.dtype(kind), JOB, resume=True)
+        assert resumed.rows + resumed.damaged_rows == sum(heights)
+        assert resumed.rows in np.cumsum([0, *heights])
+        assert resumed.tally.known == bands * resumed.rows * width
         for band in range(bands):
-            np.testing.assert_array_equal(left.read(band, 0, left.rows), pixels[band, : left.rows])
+            np.testing.assert_array_equal(
+                resumed.read(band, 0, resumed.rows), pixels[band, : resumed.rows]
+            )
 
 
 @given(st.integers(0, 2**16))
@@ -91,10 +93,10 @@ def test_a_journal_with_any_bit_flipped_is_refused_or_the_same(bit: int) -> None
         journal = part_folder(out) / "journal.json"
         journal.write_bytes(flipped(journal.read_bytes(), bit))
         try:
-            left = Checkpoint(out, (1, 8, 5), np.dtype(np.uint16), JOB, resume=True)
+            resumed = Checkpoint(out, (1, 8, 5), np.dtype(np.uint16), JOB, resume=True)
         except OptionError:
             return
-        assert (left.rows, left.tally) == (checkpoint.rows, checkpoint.tally)
+        assert (resumed.rows, resumed.tally) == (checkpoint.rows, checkpoint.tally)
 
 
 @pytest.fixture
@@ -107,17 +109,19 @@ def image(tmp_path: Path) -> Path:
 def test_damaged_rows_are_made_again_and_it_is_said(
     image: Path, model: Path, tmp_path: Path
 ) -> None:
-    whole = tmp_path / "whole.tif"
+    expected = tmp_path / "whole.tif"
     out = tmp_path / "out.tif"
-    restore_file(image, whole, Options(model, TILE_PX))
+    restore_file(image, expected, Options(model, TILE_PX))
     with stopped_after(40):
         restore_file(image, out, Options(model, TILE_PX))
     raw = part_folder(out) / "rows.raw"
     raw.write_bytes(raw.read_bytes()[:-2000])
-    said: list[str] = []
-    restore_file(image, out, Options(model, TILE_PX, resume=True), said.append)
-    assert out.read_bytes() == whole.read_bytes()
-    assert any("do not match their digests: they are made again" in sentence for sentence in said)
+    messages: list[str] = []
+    restore_file(image, out, Options(model, TILE_PX, resume=True), messages.append)
+    assert out.read_bytes() == expected.read_bytes()
+    assert any(
+        "do not match their digests: they are made again" in sentence for sentence in messages
+    )
     assert not part_folder(out).exists()
 
 
@@ -175,7 +179,8 @@ def test_whatever_is_read_is_part_of_the_job(
     with pytest.raises(OptionError, match="the image, the model and the options"):
         restore_file(image, out, Options(model, TILE_PX, resume=True))
     assert not out.exists()
-    with same_size_and_time(tmp_path / name):  # back as it was: the run goes on
+    # With the file back as it was, the run goes on.
+    with same_size_and_time(tmp_path / name):
         (flip_the_middle if kind == "middle" else before)(image)
     restore_file(image, out, Options(model, TILE_PX, resume=True))
     restore_file(image, tmp_path / "whole.tif", Options(model, TILE_PX))
@@ -204,7 +209,8 @@ def test_an_image_that_is_replaced_while_it_is_read_is_refused(
         if touched:
             image.touch()
         else:
-            with suppress(FileNotFoundError):  # another thread was first
+            # Another thread may have replaced the image first.
+            with suppress(FileNotFoundError):
                 other.replace(image)
         return finish(self, *rest)  # type: ignore[arg-type]
 

@@ -47,9 +47,10 @@ def test_a_second_run_is_refused_and_the_first_one_unharmed(image: Path, tmp_pat
             with pytest.raises(MachineError, match=r"out.tif: expected no other run"):
                 restore(image, out, resume)
         assert first.poll() is None
-        restore(image, tmp_path / "other.tif")  # another output is nobody's business
-        said, _ = first.communicate(timeout=120)
-    assert first.returncode == 0, said
+        # The lock is on the output, so a run to another one is allowed.
+        restore(image, tmp_path / "other.tif")
+        output, _ = first.communicate(timeout=120)
+    assert first.returncode == 0, output
     assert out.read_bytes() == (tmp_path / "other.tif").read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.tif", "other.tif", "out.tif"]
 
@@ -108,7 +109,8 @@ def test_new_folders_above_go_with_it_unless_something_was_written_there(tmp_pat
     with pytest.raises(ZeroDivisionError), only_run(out):
         raise ZeroDivisionError
     assert list(tmp_path.iterdir()) == []
-    (tmp_path / "new").mkdir()  # empty, but not ours
+    # This folder is empty, but no run made it, so no run may remove it.
+    (tmp_path / "new").mkdir()
     with only_run(out):
         pass
     assert [path.name for path in tmp_path.rglob("*")] == ["new"]
@@ -129,14 +131,14 @@ def test_a_run_that_ends_just_then_takes_no_lock_along(
     import fcntl
 
     folder = tmp_path / ".out.part"
-    taken = fcntl.flock
+    flock = fcntl.flock
     ends = iter([True, True, False])
 
     def ending(handle: int, operation: int) -> None:
         if operation & fcntl.LOCK_EX and next(ends):
             (folder / lock.NAME).unlink()
             folder.rmdir()
-        taken(handle, operation)
+        flock(handle, operation)
 
     monkeypatch.setattr(fcntl, "flock", ending)
     with only_run(tmp_path / "out"):
@@ -149,7 +151,7 @@ def test_a_run_that_ends_just_then_takes_no_lock_along(
 def test_many_that_try_are_never_two_at_once(tmp_path: Path) -> None:
     inside = [0]
     most = [0]
-    refused = [0]
+    refusals = [0]
 
     def trying() -> None:
         for _ in range(100):
@@ -160,7 +162,7 @@ def test_many_that_try_are_never_two_at_once(tmp_path: Path) -> None:
                     time.sleep(0)
                     inside[0] -= 1
             except MachineError:
-                refused[0] += 1
+                refusals[0] += 1
 
     threads = [threading.Thread(target=trying) for _ in range(4)]
     for thread in threads:
@@ -168,7 +170,7 @@ def test_many_that_try_are_never_two_at_once(tmp_path: Path) -> None:
     for thread in threads:
         thread.join()
     assert most[0] == 1
-    assert refused[0] < 400
+    assert refusals[0] < 400
     assert not list(tmp_path.iterdir())
 
 

@@ -79,19 +79,19 @@ print(json.dumps(said | {"features": layer.featureCount()}))
 
 def answer(*command: str | Path) -> dict[str, Any]:
     """What a program prints as JSON."""
-    done = subprocess.run(
+    process = subprocess.run(
         list(map(str, command)), capture_output=True, text=True, check=True, timeout=300
     )
-    said: dict[str, Any] = json.loads(done.stdout)
-    return said
+    content: dict[str, Any] = json.loads(process.stdout)
+    return content
 
 
 @pytest.fixture
 def gdalinfo() -> str:
     """The path of the program."""
-    if (found := shutil.which("gdalinfo")) is None:
+    if (path := shutil.which("gdalinfo")) is None:
         pytest.skip("no gdalinfo: apt-get install gdal-bin")
-    return found
+    return path
 
 
 @pytest.fixture
@@ -120,13 +120,11 @@ def test_gdalinfo_finds_it_where_the_input_was(
     assert after["metadata"]["IMAGE_STRUCTURE"]["LAYOUT"] == "COG"
     assert after["metadata"][""]["RESTORED_BY"].startswith("beers-deploy ")
     for key, text in before["metadata"].get("RPC", {}).items():
-        if key not in (
-            "ERR_BIAS",
-            "ERR_RAND",
-        ):  # GeoTIFF's tag has places for both, a DIMAP's model other ones
+        # GeoTIFF's tag has places for both errors, a DIMAP's model has other ones.
+        if key not in ("ERR_BIAS", "ERR_RAND"):
             numbers = [
-                [float(word) for word in said.split()]
-                for said in (text, after["metadata"]["RPC"][key])
+                [float(word) for word in values.split()]
+                for values in (text, after["metadata"]["RPC"][key])
             ]
             assert numbers[1] == pytest.approx(numbers[0], rel=0, abs=1e-9)
     assert ("RPC" in before["metadata"]) == (name == "DIM.XML")
@@ -140,7 +138,9 @@ def test_gdalinfo_finds_bands_nodata_and_overviews(
     assert [band["description"] for band in bands] == ["B0", "B1"]
     assert [band["scale"] for band in bands] == [0.1, 0.2]
     assert [band["noDataValue"] for band in bands] == [0, 0]
-    assert [[each["size"] for each in band["overviews"]] for band in bands] == [[[354, 375]]] * 2
+    assert [[overview["size"] for overview in band["overviews"]] for band in bands] == [
+        [[354, 375]]
+    ] * 2
 
 
 def restore_with_a_hole(folder: Path, model: Path) -> np.ndarray:
@@ -156,23 +156,24 @@ def restore_with_a_hole(folder: Path, model: Path) -> np.ndarray:
 
 def test_qgis_shows_what_was_written(qgis: Path, model: Path, tmp_path: Path) -> None:
     restored = restore_with_a_hole(tmp_path, model)
-    said = answer(qgis, "-c", IN_QGIS.replace("{}", READ), tmp_path / "out.tif")
-    place, (_, height, width) = images.profile()["transform"], restored.shape
-    assert said["valid"]
-    assert said["crs"] == "EPSG:32631"
-    assert said["box"] == pytest.approx(
+    layer = answer(qgis, "-c", IN_QGIS.replace("{}", READ), tmp_path / "out.tif")
+    place = images.profile()["transform"]
+    _, height, width = restored.shape
+    assert layer["valid"]
+    assert layer["crs"] == "EPSG:32631"
+    assert layer["box"] == pytest.approx(
         [*(place * (0, 0)), *(place * (width, height))], rel=0, abs=1e-9
     )
-    assert said["names"] == ["Band 1: B0", "Band 2: B1"]
-    assert said["missing"] == [0, 0]
-    assert said["hole"] == [[row and column for column in (0, 1, 1, 0)] for row in (0, 1, 1, 0)]
-    assert said["overviews"] == [[354, 375]]
-    physical = restored[:, :90:7, :90:7] * np.reshape(
-        said["scales"], (-1, 1, 1)
-    )  # it applies the bands' gains
-    known = restored[:, :90:7, :90:7] > 0
-    np.testing.assert_allclose(np.asarray(said["values"])[known], physical[known], rtol=1e-6)
-    assert said["scales"] == [0.1, 0.2]
+    assert layer["names"] == ["Band 1: B0", "Band 2: B1"]
+    assert layer["missing"] == [0, 0]
+    assert layer["hole"] == [[row and column for column in (0, 1, 1, 0)] for row in (0, 1, 1, 0)]
+    assert layer["overviews"] == [[354, 375]]
+    sampled = restored[:, :90:7, :90:7]
+    # QGIS applies the bands' gains.
+    physical = sampled * np.reshape(layer["scales"], (-1, 1, 1))
+    present = sampled > 0
+    np.testing.assert_allclose(np.asarray(layer["values"])[present], physical[present], rtol=1e-6)
+    assert layer["scales"] == [0.1, 0.2]
 
 
 def test_qgis_s_toolbox_restores(qgis: Path, tmp_path: Path) -> None:
@@ -186,12 +187,12 @@ def test_qgis_s_toolbox_restores(qgis: Path, tmp_path: Path) -> None:
     program.chmod(0o755)
     script = ROOT / "examples" / "qgis_restore.py"
     outs = [tmp_path / "restored.tif", tmp_path / "restored.xyz"]
-    (done, _), (refused, why) = answer(
+    (first_done, _), (second_done, log) = answer(
         qgis, "-c", IN_QGIS.replace("{}", RUN), script, program, image, *outs
     )["runs"]
-    assert done
-    assert not refused
-    assert "expected a TIFF's name" in why
+    assert first_done
+    assert not second_done
+    assert "expected a TIFF's name" in log
     restore_file(image, tmp_path / "expected.tif", Options(shipped_pair(sensor=BLIND)[1]))
     with (
         images.rasterio.open(outs[0]) as ours,
@@ -206,8 +207,8 @@ def test_qgis_draws_the_footprint_of_a_stac_item(qgis: Path, model: Path, tmp_pa
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
     restore_file(image, tmp_path / "out.tif", Options(model, cog=True))
     write_item(tmp_path / "out.tif", tmp_path / "out.json")
-    said = answer(qgis, "-c", IN_QGIS.replace("{}", FOOTPRINT), tmp_path / "out.json")
-    assert (said["features"], said["crs"]) == (1, "EPSG:4326")
-    assert said["box"] == pytest.approx(
+    layer = answer(qgis, "-c", IN_QGIS.replace("{}", FOOTPRINT), tmp_path / "out.json")
+    assert (layer["features"], layer["crs"]) == (1, "EPSG:4326")
+    assert layer["box"] == pytest.approx(
         json.loads((tmp_path / "out.json").read_text())["bbox"], rel=0, abs=1e-9
     )

@@ -27,8 +27,8 @@ def tally(image: np.ndarray, result: np.ndarray) -> Tally:
     return Tally.of(image[None], result[None], None, None)
 
 
-def told(found: Tally) -> bool:
-    return any("the mean went from" in doubt for doubt in found.doubts)
+def doubts_the_mean(counts: Tally) -> bool:
+    return any("the mean went from" in doubt for doubt in counts.doubts)
 
 
 @given(
@@ -44,39 +44,40 @@ def test_three_percent_of_an_ordinary_scene_are_told_and_one_is_not(
     in daylight.
     """
     image = mean * (1 + contrast * np.random.default_rng(seed).uniform(-1, 1, (200, 200)))
-    assert told(tally(image, (1 + share) * image))
-    assert not told(tally(image, (1 + share / 3) * image))
+    assert doubts_the_mean(tally(image, (1 + share) * image))
+    assert not doubts_the_mean(tally(image, (1 + share / 3) * image))
 
 
 @given(st.integers(0, 2**20), st.floats(0.0006, 0.0072))
 def test_noise_that_was_clipped_at_0_may_be_added_or_taken_off(seed: int, sigma: float) -> None:
     noise = np.random.default_rng(seed).normal(0, sigma, (200, 200))
     raw = np.maximum(noise, 0)
-    for moved in (-0.35 * sigma, 0.35 * sigma):
-        assert not told(tally(raw, np.full_like(raw, raw.mean() + moved)))
-    assert told(tally(raw, raw + 0.02))
+    for shift in (-0.35 * sigma, 0.35 * sigma):
+        assert not doubts_the_mean(tally(raw, np.full_like(raw, raw.mean() + shift)))
+    assert doubts_the_mean(tally(raw, raw + 0.02))
 
 
 def test_parts_add_up_to_the_whole() -> None:
     image = np.random.default_rng(1).uniform(0, 0.1, (60, 50))
     parts = tally(image[:20], image[:20]) + tally(image[20:], image[20:])
-    whole = tally(image, image)
-    assert parts.dark == whole.dark > 0
-    assert parts.mean_bound == pytest.approx(whole.mean_bound)
+    total = tally(image, image)
+    assert parts.dark == total.dark > 0
+    assert parts.mean_bound == pytest.approx(total.mean_bound)
 
 
-@pytest.mark.filterwarnings("ignore:look at the sensor")  # that is another matter
+# The sensor check may doubt such images, which is not what this test is about.
+@pytest.mark.filterwarnings("ignore:look at the sensor")
 @settings(deadline=None, max_examples=12)
 @given(st.integers(0, 2**20), st.sampled_from([1.0, 0.25, 0.05, 0.01]), st.booleans())
-def test_shipped_networks_are_not_told(seed: int, light: float, known: bool) -> None:
+def test_shipped_networks_are_not_told(seed: int, light: float, has_sensor: bool) -> None:
     generator = np.random.default_rng(seed)
     radiance = light * procedural_scene(480, 480, generator).radiance
     raw = bd.simulate(radiance.astype(np.float32), SENSOR, seed=seed).degraded
-    seen: list[Tally] = []
+    tallies: list[Tally] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Tally, "require", lambda self, **_: seen.append(self))
-        bd.restore(raw, "convbeers-xs-int8", sensor=SENSOR if known else "blind")
-    assert not told(seen[0])
+        patch.setattr(Tally, "require", lambda self, **_: tallies.append(self))
+        bd.restore(raw, "convbeers-xs-int8", sensor=SENSOR if has_sensor else "blind")
+    assert not doubts_the_mean(tallies[0])
 
 
 @pytest.mark.parametrize(("factor", "is_told"), [(0.97, True), (1.0, False), (1.03, True)])
@@ -93,7 +94,7 @@ def test_a_network_that_brightens_or_darkens_by_three_percent_is_told(
     network.graph.node.append(onnx.helper.make_node("Mul", ["plain", "factor"], [last], "brighten"))
     onnx.save(network, tmp_path / "network.onnx")
     image = tmp_path / "in.tif"
-    said = list[str]()
+    messages = list[str]()
     tifffile.imwrite(image, bd.simulate(sensor=SENSOR, size=200, seed=1).degraded)
-    restore_file(image, tmp_path / "out.tif", Options(tmp_path / "network.onnx"), said.append)
-    assert any("the mean went from" in sentence for sentence in said) is is_told
+    restore_file(image, tmp_path / "out.tif", Options(tmp_path / "network.onnx"), messages.append)
+    assert any("the mean went from" in sentence for sentence in messages) is is_told

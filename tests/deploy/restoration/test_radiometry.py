@@ -28,26 +28,26 @@ def noise(bits: int) -> np.ndarray:
     return np.random.default_rng(bits).integers(1, 1 << bits, SHAPE).astype(np.uint16)
 
 
-def told(bits: int) -> dict[str, Sensor]:
+def sensors_of_bits(bits: int) -> dict[str, Sensor]:
     return {"": load_sensor("pleiades-degraded").replace(bits=bits)}
 
 
 def run(folder: Path, pixels: np.ndarray, options: Options) -> tuple[np.ndarray, Row, list[str]]:
     tifffile.imwrite(folder / "in.tif", pixels)
-    said: list[str] = []
-    row = restore_file(folder / "in.tif", folder / "out.tif", options, said.append)
-    return tifffile.imread(folder / "out.tif"), row, said
+    messages: list[str] = []
+    row = restore_file(folder / "in.tif", folder / "out.tif", options, messages.append)
+    return tifffile.imread(folder / "out.tif"), row, messages
 
 
-def scale(raster: Raster, asked: float | None = None, bits: int | None = None) -> FullScale:
-    return full_scale_of("x", raster, (), asked, bits)
+def scale(raster: Raster, option: float | None = None, bits: int | None = None) -> FullScale:
+    return full_scale_of("x", raster, (), option, bits)
 
 
 def test_the_user_goes_before_the_file_and_the_file_before_the_sensor() -> None:
     silent = Raster(1, 9, 9, np.dtype(np.uint16))
-    stated = replace(silent, bits=10)
-    assert scale(stated, 16383, 14) == FullScale(16383, "asked for")
-    assert scale(stated, None, 14) == FullScale(1023, "10 bits, as the file states")
+    ten_bits = replace(silent, bits=10)
+    assert scale(ten_bits, 16383, 14) == FullScale(16383, "asked for")
+    assert scale(ten_bits, None, 14) == FullScale(1023, "10 bits, as the file states")
     assert scale(silent, None, 14) == FullScale(16383, "14 bits, of the sensor")
     assert scale(silent) == FullScale(4095, "assumed: 12 bits", assumed=True)
 
@@ -60,7 +60,7 @@ def test_8_bit_pixels_need_it_stated_and_cannot_be_of_more() -> None:
     assert scale(eight, bits=8).value == 255
     assert scale(replace(eight, bits=6)).value == 63
     with pytest.raises(OptionError, match="at most 255 for uint8"):
-        scale(eight, asked=4095)
+        scale(eight, option=4095)
 
 
 def test_floats_of_digital_numbers_have_the_sensor_s_full_scale_and_shares_none() -> None:
@@ -78,20 +78,20 @@ def test_a_file_of_such_bits_is_restored_to_its_own_full_scale(
     12 bits.
     """
     full = 2**bits - 1
-    asked, row, _ = run(tmp_path, noise(bits), Options(model, 23, full_scale=full))
+    by_option, row, _ = run(tmp_path, noise(bits), Options(model, 23, full_scale=full))
     assert row.text["full scale from"] == "asked for"
-    assert asked.dtype == np.uint16
-    assert full / 2 < asked.max() <= full
-    profiled, row, _ = run(
-        tmp_path, noise(bits), Options(model, 23, sensors=told(bits), consistency=False)
+    assert by_option.dtype == np.uint16
+    assert full / 2 < by_option.max() <= full
+    by_sensor, row, _ = run(
+        tmp_path, noise(bits), Options(model, 23, sensors=sensors_of_bits(bits), consistency=False)
     )
     assert row.text["full scale"] == f"{full:g}"
     assert row.text["full scale from"] == f"{bits} bits, of the sensor"
-    np.testing.assert_array_equal(profiled, asked)
+    np.testing.assert_array_equal(by_sensor, by_option)
     if bits == 10:
-        _, row, said = run(tmp_path, noise(bits), Options(model, 23))
+        _, row, messages = run(tmp_path, noise(bits), Options(model, 23))
         assert row.text["full scale from"] == "assumed: 12 bits"
-        assert not any("clipped" in sentence for sentence in said)
+        assert not any("clipped" in sentence for sentence in messages)
     else:
         with pytest.raises(ImageError, match=r"0 to 4095.*full_scale"):
             run(tmp_path, noise(bits), Options(model, 23))
@@ -101,8 +101,8 @@ def test_a_file_of_such_bits_is_restored_to_its_own_full_scale(
 def test_a_file_states_its_bits(bits: int, model: Path, tmp_path: Path) -> None:
     images = pytest.importorskip("tests.deploy.restoration.images", exc_type=ImportError)
     pixels = images.digital_numbers(bits)
-    asked = Options(model, 64, full_scale=2**bits - 1)
-    restore_file(images.write_tiff(tmp_path / "a.tif", pixels), tmp_path / "out.tif", asked)
+    options = Options(model, 64, full_scale=2**bits - 1)
+    restore_file(images.write_tiff(tmp_path / "a.tif", pixels), tmp_path / "out.tif", options)
     expected = tifffile.imread(tmp_path / "out.tif")
     jp2 = images.write_jp2(tmp_path / "a.jp2", pixels, NBITS=bits)
     for image in (jp2, images.write_dimap(tmp_path / "DIM.XML", pixels, bits)):
@@ -114,7 +114,7 @@ def test_a_file_states_its_bits(bits: int, model: Path, tmp_path: Path) -> None:
 def test_a_container_states_nothing_and_a_product_s_range_does(tmp_path: Path) -> None:
     images = pytest.importorskip("tests.deploy.restoration.images", exc_type=ImportError)
     pixels = images.digital_numbers()
-    found = []
+    bits = []
     for image in (
         images.write_tiff(tmp_path / "a.tif", pixels),
         images.write_jp2(tmp_path / "a.jp2", pixels),
@@ -128,8 +128,8 @@ def test_a_container_states_nothing_and_a_product_s_range_does(tmp_path: Path) -
         ),
     ):
         with open_source(image) as source:
-            found.append(source.raster.bits)
-    assert found == [None, None, None, 12, 12]
+            bits.append(source.raster.bits)
+    assert bits == [None, None, None, 12, 12]
 
 
 def test_values_above_a_stated_full_scale_are_clipped_counted_and_told(
@@ -139,21 +139,24 @@ def test_values_above_a_stated_full_scale_are_clipped_counted_and_told(
     pixels = noise(10)
     pixels[5:9, 3:40] = 5000
     pixels[30, 30] = 1024
-    clipped, row, said = run(tmp_path, pixels, Options(model, 23, full_scale=1023))
+    clipped, row, messages = run(tmp_path, pixels, Options(model, 23, full_scale=1023))
     assert row.figures["clipped pixels"].value == 4 * 37 + 1
     assert (
-        sum("149 pixels above full scale, 1023 (asked for), were clipped" in each for each in said)
+        sum(
+            "149 pixels above full scale, 1023 (asked for), were clipped" in message
+            for message in messages
+        )
         == 1
     )
-    expected, row, said = run(
+    expected, row, messages = run(
         tmp_path, np.minimum(pixels, 1023), Options(model, 23, full_scale=1023)
     )
     np.testing.assert_array_equal(clipped, expected)
     assert row.figures["clipped pixels"].value == 0
-    assert not any("clipped" in each for each in said)
-    _, _, said = run(tmp_path, noise(10), Options(model, 23, full_scale=255))
-    (told,) = (each for each in said if "were clipped" in each)
-    assert told.endswith("% of the image; is that its full scale?")
+    assert not any("clipped" in message for message in messages)
+    _, _, messages = run(tmp_path, noise(10), Options(model, 23, full_scale=255))
+    (warning,) = (message for message in messages if "were clipped" in message)
+    assert warning.endswith("% of the image; is that its full scale?")
 
 
 def test_missing_pixels_are_not_above(model: Path, tmp_path: Path) -> None:
@@ -161,10 +164,10 @@ def test_missing_pixels_are_not_above(model: Path, tmp_path: Path) -> None:
     pixels[5:9, 3:40] = 65535
     pixels[30, 30] = 2000
     nodata = [(42113, "s", 0, "65535", True)]
-    found, row = restored(tmp_path, pixels, Options(model, 23, full_scale=1023), extratags=nodata)
+    result, row = restored(tmp_path, pixels, Options(model, 23, full_scale=1023), extratags=nodata)
     assert row.figures["clipped pixels"].value == 1
-    np.testing.assert_array_equal(found == 65535, pixels == 65535)
-    assert found[pixels != 65535].max() <= 1023
+    np.testing.assert_array_equal(result == 65535, pixels == 65535)
+    assert result[pixels != 65535].max() <= 1023
 
 
 def test_the_count_outlives_a_stop(
@@ -198,7 +201,7 @@ def test_8_bits_come_back_as_8_bits(model: Path, tmp_path: Path) -> None:
     eight = (noise(10) >> 2).astype(np.uint8)
     kinds: list[np.ndarray] = [eight, eight.astype(np.uint16)]
     narrow, wide = (
-        restored(tmp_path, each, Options(model, 23, full_scale=255))[0] for each in kinds
+        restored(tmp_path, image, Options(model, 23, full_scale=255))[0] for image in kinds
     )
     assert narrow.dtype == np.uint8
     np.testing.assert_array_equal(narrow, wide)

@@ -100,11 +100,15 @@ def test_bands_are_named_where_not_all_are() -> None:
 
 def test_what_cannot_be_seen_is_not_told(model: Path) -> None:
     smooth = PROCESSED["smoothed"](raw(1))
-    assert look(smooth[:100, :100]) == ""  # too few blocks
-    assert look(smooth.astype(np.float32) * np.float32(0.7)) == ""  # no whole numbers
-    assert look(np.full((300, 300), 900, np.uint16)) == ""  # filled
+    # There are too few blocks to judge.
+    assert look(smooth[:100, :100]) == ""
+    # These are no integers.
+    assert look(smooth.astype(np.float32) * np.float32(0.7)) == ""
+    # The image is filled with one value.
+    assert look(np.full((300, 300), 900, np.uint16)) == ""
     assert look(np.zeros((300, 300), np.uint16)) == ""
-    assert look(smooth, network=str(model)) == ""  # a network of another kind of image
+    # This network is for another kind of image.
+    assert look(smooth, network=str(model)) == ""
     assert look(raw(1) // 2, full_scale=2047) == ""
 
 
@@ -123,9 +127,9 @@ def test_the_command_says_it_and_goes_on(tmp_path: Path) -> None:
         "restore", image, out, "--network", NETWORK
     )
     assert out.exists()
-    said = done("restore", image, out, "--network", NETWORK, "--sensor", SENSOR.name)
-    assert "look at the image" not in said
-    assert "look at the sensor" in said
+    output = done("restore", image, out, "--network", NETWORK, "--sensor", SENSOR.name)
+    assert "look at the image" not in output
+    assert "look at the sensor" in output
     tifffile.imwrite(image, raw(1))
     assert "look at the image" not in done("restore", image, out, "--network", NETWORK)
 

@@ -41,7 +41,7 @@ def expected(image: Path, model: Path, tmp_path: Path) -> bytes:
     return (tmp_path / "expected.tif").read_bytes()
 
 
-def asked(model: Path) -> list[object]:
+def resume_options(model: Path) -> list[object]:
     return ["--network", model, "--tile", TILE_PX, "--resume"]
 
 
@@ -53,16 +53,16 @@ def test_killed_at_random_moments_it_is_resumed_to_the_same_bytes(
     out.write_bytes(b"old")
     finished = 0
     for _ in range(KILLS):
-        running = begin(image, out, *asked(model))
+        running = begin(image, out, *resume_options(model))
         until(running, rng.choice(["plan", "memory", "memory"]))
         time.sleep(rng.uniform(0, 0.8))
         running.kill()
         running.communicate()
         finished += running.returncode == 0
         assert out.read_bytes() in (b"old", expected)
-    last = begin(image, out, *asked(model))
-    said, _ = last.communicate(timeout=120)
-    assert last.returncode == 0, said
+    last = begin(image, out, *resume_options(model))
+    output, _ = last.communicate(timeout=120)
+    assert last.returncode == 0, output
     assert out.read_bytes() == expected
     assert sorted(p.name for p in tmp_path.iterdir()) == ["expected.tif", "in.tif", "out.tif"]
 
@@ -71,13 +71,13 @@ def test_killed_at_random_moments_it_is_resumed_to_the_same_bytes(
 def test_ctrl_c_says_how_to_go_on(
     image: Path, model: Path, expected: bytes, tmp_path: Path
 ) -> None:
-    running = begin(image, tmp_path / "out.tif", *asked(model))
+    running = begin(image, tmp_path / "out.tif", *resume_options(model))
     until(running, "memory")
     running.send_signal(signal.SIGINT)
-    said, _ = running.communicate(timeout=60)
+    output, _ = running.communicate(timeout=60)
     assert running.returncode not in (0, 2)
-    assert "--resume" in said
-    assert "Traceback" not in said
+    assert "--resume" in output
+    assert "Traceback" not in output
     assert not (tmp_path / "out.tif").exists()
     options = Options(model, TILE_PX, threads=1, resume=True)
     restore_file(image, tmp_path / "out.tif", options)
@@ -93,9 +93,9 @@ def test_finished_rows_are_not_restored_again(
         restore_file(image, out, options)
     with pytest.raises(OptionError, match="resume"):
         restore_file(image, out, replace(options, halo="3", resume=True))
-    seen: list[str] = []
+    messages: list[str] = []
     stop_after(50, monkeypatch, AssertionError("restored more than what was left"))
-    restore_file(image, out, replace(options, resume=True), seen.append)
+    restore_file(image, out, replace(options, resume=True), messages.append)
     assert out.read_bytes() == expected
 
 

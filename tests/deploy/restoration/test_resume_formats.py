@@ -29,21 +29,19 @@ def test_killed_among_its_rows_and_at_its_cog_it_is_resumed_to_the_same_bytes(
     before = {path.name for path in tmp_path.iterdir()}
     out.write_bytes(b"old")
     killed = []
-    for sign in (
-        "journal.json",
-        "out.tif",
-    ):  # some rows are finished; all are, and the TIFF is begun
+    # The journal is there when some rows are finished, the TIFF when all rows are.
+    for sign in ("journal.json", "out.tif"):
         running = begin(image, out, "--network", model, "--tile", TILE_PX, "--cog", "--resume")
         while running.poll() is None and not (part_folder(out) / sign).exists():
             time.sleep(0.001)
         running.kill()
-        said, _ = running.communicate()
+        output, _ = running.communicate()
         killed.append(running.returncode != 0)
-        assert running.returncode <= 0, said
+        assert running.returncode <= 0, output
         assert out.read_bytes() in (b"old", expected.read_bytes())
     assert killed[0]
     last = begin(image, out, "--network", model, "--tile", TILE_PX, "--cog", "--resume")
-    said, _ = last.communicate(timeout=120)
-    assert last.returncode == 0, said
+    output, _ = last.communicate(timeout=120)
+    assert last.returncode == 0, output
     assert out.read_bytes() == expected.read_bytes()
     assert {path.name for path in tmp_path.iterdir()} == before | {"out.tif"}

@@ -30,12 +30,12 @@ SHAPES = [(61, 83), (17, 130), (1, 40), (40, 1), (29, 29), (3, 5)]
 
 
 def restore(
-    folder: Path, pixels: np.ndarray, options: Options, **written: Any
+    folder: Path, pixels: np.ndarray, options: Options, **tags: Any
 ) -> tuple[np.ndarray, Row]:
     """Write, restore and read again."""
-    found = restored_by_file(folder, pixels, options, **written)
+    result = restored_by_file(folder, pixels, options, **tags)
     assert sorted(p.name for p in folder.iterdir()) == ["in.tif", "out.tif"]
-    return found
+    return result
 
 
 def whole_image(model: Path, pixels: np.ndarray) -> np.ndarray:
@@ -74,20 +74,19 @@ def test_one_pixel_less_than_the_radius_shows_seams_and_says_so(
 def test_the_seam_error_is_that_of_the_tile_in_the_middle(model: Path, tmp_path: Path) -> None:
     pixels = noise(60, 60).astype(np.float32)
     restored, row = restore(tmp_path, pixels, Options(model, tile_px=24, halo="2"))
-    middle = np.s_[21:40, 21:40]  # tiles of 23 keep rows 0-20, 21-39, 40-59
+    # Tiles of 23 pixels keep rows 0 to 20, 21 to 39 and 40 to 59.
+    middle = np.s_[21:40, 21:40]
     error = np.abs(restored.astype(np.float64) - whole_image(model, pixels))[middle]
     assert row.figures["seam error max"].value == pytest.approx(error.max())
     assert row.figures["seam error mean"].value == pytest.approx(error.mean())
 
 
-@pytest.mark.parametrize("written", [{"planarconfig": "separate"}, {"planarconfig": "contig"}])
-def test_bands_are_restored_one_by_one(
-    written: dict[str, str], model: Path, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("layout", [{"planarconfig": "separate"}, {"planarconfig": "contig"}])
+def test_bands_are_restored_one_by_one(layout: dict[str, str], model: Path, tmp_path: Path) -> None:
     bands = noise(3, 41, 35)
-    stored = bands if written["planarconfig"] == "separate" else np.moveaxis(bands, 0, 2)
+    pixels = bands if layout["planarconfig"] == "separate" else np.moveaxis(bands, 0, 2)
     restored, row = restore(
-        tmp_path, stored, Options(model, tile_px=23), photometric="rgb", **written
+        tmp_path, pixels, Options(model, tile_px=23), photometric="rgb", **layout
     )
     for band, result in zip(bands, restored, strict=True):
         np.testing.assert_array_equal(result, np.rint(whole_image(model, band)))
@@ -98,6 +97,7 @@ def test_full_scale_is_what_the_network_sees_as_one(model: Path, tmp_path: Path)
     pixels = noise(40, 30)
     twelve, _ = restore(tmp_path, pixels, Options(model, tile_px=23))
     fourteen, _ = restore(tmp_path, pixels * 4, Options(model, tile_px=23, full_scale=4095 * 4))
+    # Rounding moves the result of 12 bits by up to 0.5, and that of 14 bits by up to 0.5 / 4.
     assert np.abs(fourteen / 4 - twelve.astype(float)).max() <= 0.625
     unit, _ = restore(
         tmp_path, (pixels / 4095).astype(np.float32), Options(model, tile_px=23, full_scale=1)
@@ -124,9 +124,9 @@ def test_one_bright_row_at_the_end_makes_floats_digital_numbers(
 ) -> None:
     dark = np.full((70, 37), 0.5, np.float32)
     dark[-1, 3] = 900
-    one, row = restore(tmp_path, dark, Options(model, tile_px=23))
-    asked, _ = restore(tmp_path, dark, Options(model, tile_px=23, full_scale=4095))
-    np.testing.assert_array_equal(one, asked)
+    assumed, row = restore(tmp_path, dark, Options(model, tile_px=23))
+    scaled, _ = restore(tmp_path, dark, Options(model, tile_px=23, full_scale=4095))
+    np.testing.assert_array_equal(assumed, scaled)
     assert row.text["full scale"] == "4095"
 
 
@@ -139,6 +139,7 @@ def test_nodata_settles_no_scale(model: Path, tmp_path: Path) -> None:
 
 
 def test_georeference_and_rpcs_are_kept(model: Path, tmp_path: Path) -> None:
+    # GeoTIFF's tags begin with 33 and 34, GDAL's with 42; 50844 holds the rational polynomials.
     tags = [
         (33550, "d", 3, (0.5, 0.5, 0.0), True),
         (33922, "d", 6, (0.0, 0.0, 0.0, 3e5, 4.8e6, 0.0), True),
@@ -161,22 +162,24 @@ def test_georeference_and_rpcs_are_kept(model: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["nan", "tag"])
 def test_missing_pixels_stay_and_spoil_nothing(kind: str, model: Path, tmp_path: Path) -> None:
-    known = noise(70, 90).astype(np.float32)
+    ground = noise(70, 90).astype(np.float32)
     missing = np.zeros((70, 90), bool)
     missing[20:60, 30:75] = missing[3, 5] = True
     if kind == "nan":
-        spoilt = np.where(missing, np.nan, known).astype(np.float32)
+        pixels = np.where(missing, np.nan, ground).astype(np.float32)
         tags = []
     else:
-        spoilt = np.where(missing, 7, np.where(known == 7, 8, known)).astype(np.uint16)
+        pixels = np.where(missing, 7, np.where(ground == 7, 8, ground)).astype(np.uint16)
         tags = [(42113, "s", 0, "7", True)]
     options = [Options(model, tile_px=tile_px) for tile_px in (19, 31, 640)]
-    results = [restore(tmp_path, spoilt, each, extratags=tags)[0] for each in options]
+    results = [restore(tmp_path, pixels, option, extratags=tags)[0] for option in options]
     np.testing.assert_array_equal(results[0], results[2])
     np.testing.assert_array_equal(results[1], results[2])
-    np.testing.assert_array_equal(results[0][missing], spoilt[missing])
-    sound, _ = restore(tmp_path, np.where(missing, 999, known).astype(spoilt.dtype), Options(model))
-    differs = (results[0] != sound) & ~missing
+    np.testing.assert_array_equal(results[0][missing], pixels[missing])
+    filled, _ = restore(
+        tmp_path, np.where(missing, 999, ground).astype(pixels.dtype), Options(model)
+    )
+    differs = (results[0] != filled) & ~missing
     rows, columns = np.nonzero(missing)
     for row, column in np.argwhere(differs):
         assert np.maximum(np.abs(rows - row), np.abs(columns - column)).min() <= RADIUS_PX
@@ -210,10 +213,11 @@ def refused(
 @pytest.mark.parametrize(
     ("pixels", "words"),
     [
+        # The value above full scale is in the last row.
         (
             np.pad(noise(89, 40), ((0, 1), (0, 0)), constant_values=60000),
             ("60000", "full_scale"),
-        ),  # in the last row
+        ),
         (-noise(90, 40).astype(np.float32), ("-4", "add the offset")),
         (np.full((20, 20), np.inf, np.float32), ("inf", "write NaN")),
         (np.full((60, 40), np.nan, np.float32), ("NaN",)),
@@ -226,7 +230,7 @@ def test_values_that_cannot_be_leave_the_old_output(
 
 
 @pytest.mark.parametrize(
-    ("word", "wrong"),
+    ("word", "changes"),
     [
         ("tile", {"tile_px": 16, "halo": "8"}),
         ("halo", {"halo": "wide"}),
@@ -234,9 +238,11 @@ def test_values_that_cannot_be_leave_the_old_output(
     ],
 )
 def test_options_that_cannot_be_are_refused(
-    word: str, wrong: dict[str, Any], model: Path, tmp_path: Path
+    word: str, changes: dict[str, Any], model: Path, tmp_path: Path
 ) -> None:
-    refused(tmp_path, noise(40, 40), Options(model, **{"tile_px": 23, **wrong}), OptionError, word)
+    refused(
+        tmp_path, noise(40, 40), Options(model, **{"tile_px": 23, **changes}), OptionError, word
+    )
 
 
 def test_a_budget_that_does_not_suffice_is_refused_before_the_run(
@@ -255,15 +261,15 @@ def test_a_budget_that_does_not_suffice_is_refused_before_the_run(
 
 def test_memory_is_stated_before_anything_is_written(model: Path, tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", noise(80, 40))
-    said: list[str] = []
+    messages: list[str] = []
 
     def say(text: str) -> None:
-        said.append(text)
+        messages.append(text)
         assert not (tmp_path / "out.tif").exists()
 
     swath.restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=23), say)
-    assert "work factor" in said[0]
-    assert "memory" in said[1]
+    assert "work factor" in messages[0]
+    assert "memory" in messages[1]
 
 
 @pytest.mark.parametrize("compression", Compression)
@@ -283,7 +289,8 @@ def test_integers_are_packed_as_differences_and_gdal_reads_them(
     dtype: type, predictor: int, model: Path, tmp_path: Path
 ) -> None:
     rasterio = pytest.importorskip("rasterio")
-    pixels: np.ndarray = np.tile(noise(70, 90) // 20, (1, 4, 4)).astype(dtype)  # no whole square
+    # The image is not square.
+    pixels: np.ndarray = np.tile(noise(70, 90) // 20, (1, 4, 4)).astype(dtype)
     restored, _ = restore(tmp_path, pixels, Options(model, full_scale=255))
     with rasterio.open(tmp_path / "out.tif") as file:
         np.testing.assert_array_equal(file.read(), restored.reshape(-1, *restored.shape[-2:]))
@@ -303,10 +310,10 @@ def test_large_outputs_are_big_tiffs(
 def test_a_tile_without_known_pixels_costs_no_inference(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen: list[tuple[int, ...]] = []
+    shapes: list[tuple[int, ...]] = []
 
     def counting(window: np.ndarray, infer: Infer, full_scale: float) -> np.ndarray:
-        seen.append(window.shape)
+        shapes.append(window.shape)
         return restore_window(window, infer, full_scale)
 
     monkeypatch.setattr("beers_deploy.restoration.tiles.exposures.restore_window", counting)
@@ -314,7 +321,8 @@ def test_a_tile_without_known_pixels_costs_no_inference(
     pixels[:, 100:] = np.nan
     _, row = restore(tmp_path, pixels, Options(model, tile_px=30))
     assert row.figures["tiles"].value == 15
-    assert len(seen) == 5  # a tile keeps 25 columns, then 20
+    # The first tile keeps 25 columns, those after it 20.
+    assert len(shapes) == 5
 
 
 def test_openvino_gives_the_same_int8_numbers(tmp_path: Path) -> None:
@@ -322,11 +330,11 @@ def test_openvino_gives_the_same_int8_numbers(tmp_path: Path) -> None:
     pixels = np.concatenate(
         [noise(100, 110), np.linspace(0, 4095, 11000).reshape(100, 110).astype(np.uint16)]
     )
-    one, _ = restore(tmp_path, pixels, Options(shipped_pair()[1], tile_px=64))
-    other, row = restore(
+    by_onnxruntime, _ = restore(tmp_path, pixels, Options(shipped_pair()[1], tile_px=64))
+    by_openvino, row = restore(
         tmp_path, pixels, Options(shipped_pair()[1], tile_px=64, runtime=Runtime.openvino)
     )
-    np.testing.assert_array_equal(other, one)
+    np.testing.assert_array_equal(by_openvino, by_onnxruntime)
     assert row.text["runtime"].startswith("openvino")
 
 
@@ -347,11 +355,11 @@ def test_openvino_gives_the_same_float_numbers_within_a_hundredth_of_a_dn(
 ) -> None:
     pytest.importorskip("openvino")
     pixels = noise(61, 83).astype(np.float32)
-    one, _ = restore(tmp_path, pixels, Options(model, tile_px=30))
-    other, _ = restore(tmp_path, pixels, Options(model, tile_px=30, runtime=Runtime.openvino))
-    whole, _ = restore(tmp_path, pixels, Options(model, runtime=Runtime.openvino))
-    np.testing.assert_array_equal(other, whole)
-    assert np.abs(other - one).max() < 0.01
+    by_onnxruntime, _ = restore(tmp_path, pixels, Options(model, tile_px=30))
+    by_openvino, _ = restore(tmp_path, pixels, Options(model, tile_px=30, runtime=Runtime.openvino))
+    untiled, _ = restore(tmp_path, pixels, Options(model, runtime=Runtime.openvino))
+    np.testing.assert_array_equal(by_openvino, untiled)
+    assert np.abs(by_openvino - by_onnxruntime).max() < 0.01
 
 
 def test_a_missing_openvino_is_one_sentence(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,8 +38,8 @@ TILE_PX = 64
 
 @pytest.fixture(scope="module")
 def local() -> Iterator[Any]:
-    with local_cluster() as found:
-        yield found
+    with local_cluster() as workers:
+        yield workers
 
 
 @pytest.fixture
@@ -82,13 +82,13 @@ def test_and_with_a_network_for_each_band(
     )
     other = load_onnx(model)
     other.graph.initializer[0].raw_data = bytes(len(other.graph.initializer[0].raw_data))
-    save_onnx(other, other_path := tmp_path_factory.mktemp("networks") / "other.onnx")
+    other_path = tmp_path_factory.mktemp("networks") / "other.onnx"
+    save_onnx(other, other_path)
     options = Options(model, tile_px=48, bands={"a": model, "b": other_path})
     one, two = both(tmp_path, options, scheduler)
     assert two == one
-    assert (
-        tifffile.imread(tmp_path / "one.tif")[0] != tifffile.imread(tmp_path / "one.tif")[1]
-    ).any()
+    bands = tifffile.imread(tmp_path / "one.tif")
+    assert (bands[0] != bands[1]).any()
 
 
 @pytest.mark.parametrize(
@@ -127,7 +127,8 @@ def test_a_worker_that_is_killed_changes_nothing(
     restore_file(image, tmp_path / "expected.tif", options)
 
     def kill(text: str) -> None:
-        if text.startswith("memory:"):  # the first tiles are done
+        # This line is printed when the first tiles are done.
+        if text.startswith("memory:"):
             killed.append(local.workers[0].pid)
             os.kill(killed[0], signal.SIGKILL)
 
@@ -143,11 +144,11 @@ def call(
     meanwhile: Callable[[], object] = tuple,
 ) -> None:
     """Wait for what a call on a cluster returns, once something else was done."""
-    with open_cluster(scheduler) as there:
-        assert there
-        running = there.pool.submit(function, *arguments)
+    with open_cluster(scheduler) as client:
+        assert client
+        running = client.pool.submit(function, *arguments)
         meanwhile()
-        there.result(running)
+        client.result(running)
 
 
 def test_a_call_that_kills_its_workers_is_one_sentence(scheduler: str) -> None:
@@ -226,19 +227,12 @@ app(sys.argv[1:])
 
 def test_restores_where_torch_is_not_installed(image: Path, scheduler: str, tmp_path: Path) -> None:
     out = tmp_path / "out.tif"
-    words = (
-        "restore",
-        str(image),
-        str(out),
-        "--network",
-        "convbeers-xs-int8",
-        "--scheduler",
-        scheduler,
-    )
-    done = subprocess.run(
+    options = ("--network", "convbeers-xs-int8", "--scheduler", scheduler)
+    words = ("restore", str(image), str(out), *options)
+    process = subprocess.run(
         [sys.executable, "-c", WITHOUT_TORCH, *words], capture_output=True, text=True, check=False
     )
-    assert done.returncode == 0, done.stderr
+    assert process.returncode == 0, process.stderr
     assert tifffile.imread(out).shape == tifffile.imread(image).shape
 
 

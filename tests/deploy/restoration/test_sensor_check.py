@@ -39,15 +39,15 @@ def check(
 
 
 def test_the_true_sensor_is_found_again(raw: np.ndarray) -> None:
-    found = check(raw)
-    assert found.doubts == ()
-    assert found.text == {"sensor told": "agrees"}
-    low, high = found.figures["SNR seen"].interval or (0, 0)
+    result = check(raw)
+    assert result.doubts == ()
+    assert result.text == {"sensor told": "agrees"}
+    low, high = result.figures["SNR seen"].interval or (0, 0)
     assert 0 < high - low < 0.5 * high
     # Left-justified, and with missing pixels of any value: the same image of the same sensor.
     assert (
         check(raw * 16, full_scale=16 * 4095).figures["SNR seen"].value
-        == found.figures["SNR seen"].value
+        == result.figures["SNR seen"].value
     )
     holed = raw.copy()
     holed[100:140, 30:300] = 4000
@@ -100,10 +100,10 @@ def test_what_cannot_be_seen_is_no_contradiction() -> None:
         generator.random((400, 300)).astype(np.float32),
         generator.integers(400, 500, (19, 23)).astype(np.uint16),
     ):
-        found = check(image)
-        assert found.text["sensor told"] in ("cannot be seen", *found.doubts)
+        result = check(image)
+        assert result.text["sensor told"] in ("cannot be seen", *result.doubts)
         assert all(
-            figure.mode == "unavailable" and figure.reason for figure in found.figures.values()
+            figure.mode == "unavailable" and figure.reason for figure in result.figures.values()
         )
 
 
@@ -111,36 +111,36 @@ def test_commands_say_it_and_strict_refuses(raw: np.ndarray, tmp_path: Path) -> 
     image = tmp_path / "raw.tif"
     out = tmp_path / "out.tif"
     tifffile.imwrite(image, raw)
-    wrong = SENSOR.replace(snr_0=25, snr_1=55).save(tmp_path / "wrong.toml")
+    profile = SENSOR.replace(snr_0=25, snr_1=55).save(tmp_path / "wrong.toml")
     network = ("--network", "convbeers-xs-int8")
     assert "look at the sensor: noise at" in done(
-        "restore", image, out, *network, "--sensor", wrong
+        "restore", image, out, *network, "--sensor", profile
     )
     assert "look at the sensor" not in done("info", image, *network, "--sensor", NAME, "--strict")
     out.unlink()
     for words in (("restore", image, out, *network), ("info", image, *network)):
-        assert "expected an image of wrong" in refused(*words, "--sensor", wrong, "--strict")
-    refused("restore", image, out, "--method", "traditional", "--sensor", wrong, "--strict")
+        assert "expected an image of wrong" in refused(*words, "--sensor", profile, "--strict")
+    refused("restore", image, out, "--method", "traditional", "--sensor", profile, "--strict")
     assert not out.exists()
 
 
 def test_the_library_warns_and_strict_refuses(raw: np.ndarray) -> None:
-    wrong = SENSOR.replace(snr_0=25, snr_1=55)
+    noisy = SENSOR.replace(snr_0=25, snr_1=55)
     with pytest.warns(UserWarning, match="look at the sensor: noise at"):
-        bd.restore(raw, "convbeers-xs-int8", sensor=wrong)
+        bd.restore(raw, "convbeers-xs-int8", sensor=noisy)
     with pytest.raises(ValueError, match="expected an image of"):
-        bd.restore(raw, "convbeers-xs-int8", sensor=wrong, strict=True)
+        bd.restore(raw, "convbeers-xs-int8", sensor=noisy, strict=True)
 
 
 def test_pairs_that_are_evaluated_are_held_against_it(tmp_path: Path) -> None:
-    wrong = SENSOR.replace(snr_0=25, snr_1=55).save(tmp_path / "wrong.toml")
+    profile = SENSOR.replace(snr_0=25, snr_1=55).save(tmp_path / "wrong.toml")
     pairs = bd.simulate(sensor=SENSOR, size=320, seed=3).save(tmp_path / "pairs")
     (pairs / "recipe.json").unlink()
     words = ("evaluate", "--pairs", pairs, "--methods", "degraded")
-    assert "look at the sensor: noise at" in done(*words, "--sensor", wrong)
-    assert "expected an image of wrong" in refused(*words, "--sensor", wrong, "--strict")
-    found = bd.evaluate(["degraded"], pairs, sensor=SENSOR, strict=True, progress=False)
-    assert next(row for row in found.rows if "sensor" in row.table).text == {
+    assert "look at the sensor: noise at" in done(*words, "--sensor", profile)
+    assert "expected an image of wrong" in refused(*words, "--sensor", profile, "--strict")
+    result = bd.evaluate(["degraded"], pairs, sensor=SENSOR, strict=True, progress=False)
+    assert next(row for row in result.rows if "sensor" in row.table).text == {
         "sensor told": "agrees"
     }
 
@@ -156,12 +156,12 @@ def test_its_time_is_no_part_of_the_restoration_s(
         return SensorCheck()
 
     monkeypatch.setattr("beers_deploy.restoration.run.told_sensor", slow)
-    begun = time.perf_counter()
-    run = bd.restore(
+    start_s = time.perf_counter()
+    result = bd.restore(
         image, "convbeers-xs-int8", sensor=SENSOR, out=tmp_path / "out.tif", progress=False
     )
-    whole_s = time.perf_counter() - begun
-    (row,) = run.rows
+    whole_s = time.perf_counter() - start_s
+    (row,) = result.rows
     (check_s, time_s) = (row.figures[name].value or 0 for name in ("sensor check", "time"))
     assert check_s >= 2
     assert row.figures["throughput"].value == pytest.approx(raw.size / time_s / 1e6)

@@ -64,10 +64,10 @@ def test_compressions_of_imagecodecs_are_read(codec: str, tmp_path: Path) -> Non
 @pytest.mark.parametrize("storage", STORAGES)
 def test_bands_in_planes_or_interleaved(storage: str, tmp_path: Path) -> None:
     pixels = pixels_of("uint16", 3)
-    given = {"photometric": "rgb", **STORAGES[storage]}
-    tifffile.imwrite(tmp_path / "planes.tif", pixels, planarconfig="separate", **given)
+    options = {"photometric": "rgb", **STORAGES[storage]}
+    tifffile.imwrite(tmp_path / "planes.tif", pixels, planarconfig="separate", **options)
     tifffile.imwrite(
-        tmp_path / "mixed.tif", np.moveaxis(pixels, 0, 2), planarconfig="contig", **given
+        tmp_path / "mixed.tif", np.moveaxis(pixels, 0, 2), planarconfig="contig", **options
     )
     for name in ("planes", "mixed"):
         assert_rows_equal(tmp_path / f"{name}.tif", pixels)
@@ -128,12 +128,12 @@ def refused(path: Path, error: type[BeersError], word: str) -> None:
 
 
 def test_damage_is_one_sentence(tmp_path: Path) -> None:
-    whole = tmp_path / "whole.tif"
-    tifffile.imwrite(whole, pixels_of("uint16"), tile=(16, 16), compression="zlib")
-    content = whole.read_bytes()
+    intact = tmp_path / "whole.tif"
+    tifffile.imwrite(intact, pixels_of("uint16"), tile=(16, 16), compression="zlib")
+    content = intact.read_bytes()
     (tmp_path / "short.tif").write_bytes(content[: len(content) * 2 // 3])
     refused(tmp_path / "short.tif", ImageError, "cut short|readable")
-    with tifffile.TiffFile(whole) as file:
+    with tifffile.TiffFile(intact) as file:
         offset = file.pages.first.dataoffsets[9]
     (tmp_path / "tile.tif").write_bytes(content[:offset] + b"\xff" * 40 + content[offset + 40 :])
     refused(tmp_path / "tile.tif", ImageError, "rows 0 to 60")

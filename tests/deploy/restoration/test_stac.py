@@ -14,51 +14,44 @@ pystac: Any = pytest.importorskip("pystac")
 rasterio: Any = images.rasterio
 
 
-def restored(image: Path, item: Path, model: Path) -> dict[str, Any]:
+def restored_item(image: Path, item: Path, model: Path) -> dict[str, Any]:
     out = image.with_name("out.tif")
     done("restore", image, out, "--network", model, "--cog", "--stac", item)
-    found: dict[str, Any] = json.loads(item.read_text())
-    return found
+    content: dict[str, Any] = json.loads(item.read_text())
+    return content
 
 
 def test_an_item_is_valid_and_lies_where_the_image_does(model: Path, tmp_path: Path) -> None:
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    found = restored(image, tmp_path / "catalogue" / "item.json", model)
-    pystac.Item.from_dict(found).validate()
-    assert found["assets"]["restored"]["href"] == "../out.tif"
-    assert "cloud-optimized" in found["assets"]["restored"]["type"]
-    assert [band["name"] for band in found["assets"]["restored"]["bands"]] == ["B0", "B1"]
-    assert found["properties"]["restored_full_scale"] == "4095 (assumed: 12 bits)"
+    content = restored_item(image, tmp_path / "catalogue" / "item.json", model)
+    pystac.Item.from_dict(content).validate()
+    assert content["assets"]["restored"]["href"] == "../out.tif"
+    assert "cloud-optimized" in content["assets"]["restored"]["type"]
+    assert [band["name"] for band in content["assets"]["restored"]["bands"]] == ["B0", "B1"]
+    assert content["properties"]["restored_full_scale"] == "4095 (assumed: 12 bits)"
     with rasterio.open(image) as file:
         from rasterio.warp import transform_bounds
 
         expected = transform_bounds(file.crs, "EPSG:4326", *file.bounds)
-    assert found["bbox"] == pytest.approx(list(expected), abs=1e-8)
+    assert content["bbox"] == pytest.approx(list(expected), abs=1e-8)
 
 
 def test_an_image_that_lies_nowhere_has_no_geometry(model: Path, tmp_path: Path) -> None:
     image = images.write_tiff(
         tmp_path / "in.tif", images.digital_numbers(), crs=None, transform=None
     )
-    found = restored(image, tmp_path / "item.json", model)
-    pystac.Item.from_dict(found).validate()
-    assert found["geometry"] is None
-    assert "bbox" not in found
+    content = restored_item(image, tmp_path / "item.json", model)
+    pystac.Item.from_dict(content).validate()
+    assert content["geometry"] is None
+    assert "bbox" not in content
 
 
 def test_it_goes_with_a_cog_and_needs_its_package(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    words = (
-        "restore",
-        image,
-        tmp_path / "out.tif",
-        "--network",
-        model,
-        "--stac",
-        tmp_path / "i.json",
-    )
+    outputs = (tmp_path / "out.tif", "--stac", tmp_path / "i.json")
+    words = ("restore", image, *outputs, "--network", model)
     monkeypatch.setitem(sys.modules, "pystac", None)
     for more, sentence in (([], "--stac: expected --cog"), (["--cog"], "beers-deploy[gdal]")):
         assert sentence in refused(*words, *more)

@@ -74,17 +74,19 @@ def options(
     name: str, sensors: Mapping[str, Sensor] | None = None, exposure: bool = True, **more: Any
 ) -> Options:
     """Build what the command makes of --network, --sensor and --no-exposure."""
-    known = sensors or {"": SENSOR}
-    given = Path(name)
-    files = {band: network_file(given, sensor) for band, sensor in known.items()}
+    by_band = sensors or {"": SENSOR}
+    network = Path(name)
+    files = {band: network_file(network, sensor) for band, sensor in by_band.items()}
     brighter = (
-        {band: brighter_files(given, sensor) for band, sensor in known.items()} if exposure else {}
+        {band: brighter_files(network, sensor) for band, sensor in by_band.items()}
+        if exposure
+        else {}
     )
     return Options(
         next(iter(files.values())),
-        sensors=known,
+        sensors=by_band,
         bands={} if "" in files else files,
-        brighter={band: each for band, each in brighter.items() if each},
+        brighter={band: paths for band, paths in brighter.items() if paths},
         **more,
     )
 
@@ -97,9 +99,9 @@ def by_array(pixels: Any, name: str, **more: Any) -> Any:
         )
 
 
-def by_file(folder: Path, pixels: np.ndarray, how: Options, **written: Any) -> np.ndarray:
+def by_file(folder: Path, pixels: np.ndarray, how: Options, **tiff_options: Any) -> np.ndarray:
     tags = {"extratags": [(42113, "s", 0, f"{NODATA}", True)]} if pixels.dtype == np.uint16 else {}
-    return restored(folder, pixels, replace(how, full_scale=4095), **tags, **written)[0]
+    return restored(folder, pixels, replace(how, full_scale=4095), **tags, **tiff_options)[0]
 
 
 @pytest.mark.parametrize(("name", "floats"), [(FLOAT, True), (INT8, False)])
@@ -109,16 +111,16 @@ def test_tiles_and_files_give_the_whole_image_s_pixels(
     """With both steps, missing and saturated pixels, bit for bit."""
     pixels = as_floats(lacking()) if floats else lacking()
     nodata = None if floats else NODATA
-    whole = by_array(pixels, name, nodata=nodata)
-    assert (whole != by_array(pixels, name, nodata=nodata, consistency=False)).mean() > 0.5
+    untiled = by_array(pixels, name, nodata=nodata)
+    assert (untiled != by_array(pixels, name, nodata=nodata, consistency=False)).mean() > 0.5
     for tile_px in TILES_PX:
         tiled = by_array(pixels, name, nodata=nodata, tile=tile_px)
-        np.testing.assert_array_equal(tiled, whole, err_msg=f"tiles of {tile_px}")
+        np.testing.assert_array_equal(tiled, untiled, err_msg=f"tiles of {tile_px}")
     np.testing.assert_array_equal(
-        by_file(tmp_path, pixels, options(name, tile_px=TILES_PX[0])), whole
+        by_file(tmp_path, pixels, options(name, tile_px=TILES_PX[0])), untiled
     )
     missing = lacking() == NODATA
-    np.testing.assert_array_equal(np.isnan(whole) if floats else whole == NODATA, missing)
+    np.testing.assert_array_equal(np.isnan(untiled) if floats else untiled == NODATA, missing)
 
 
 def test_a_dask_array_gives_the_same_and_its_workers_read_no_files(
@@ -126,14 +128,14 @@ def test_a_dask_array_gives_the_same_and_its_workers_read_no_files(
 ) -> None:
     """A worker on another machine has none of the networks' files, of any exposure."""
     da = pytest.importorskip("dask.array", reason="the extra 'dask' is not installed")
-    whole = by_array(lacking(), INT8, nodata=NODATA)
+    untiled = by_array(lacking(), INT8, nodata=NODATA)
     lazy = by_array(da.from_array(lacking(), chunks=50), INT8, nodata=NODATA, tile=TILES_PX[0])
     for module in ("tiles.lazy", "steps"):
         monkeypatch.setattr(
             f"beers_deploy.restoration.{module}.load_onnx",
             lambda path: pytest.fail(f"reads {path}"),
         )
-    np.testing.assert_array_equal(lazy.compute(scheduler="synchronous"), whole)
+    np.testing.assert_array_equal(lazy.compute(scheduler="synchronous"), untiled)
 
 
 @pytest.mark.parametrize("floats", [False, True])
@@ -154,10 +156,10 @@ def test_each_band_takes_the_steps_of_its_own_sensor(
     """Also where one band's sensor allows no factor above 1, or is not known."""
     bands = np.stack([image(), image()[::-1]])
     separate: dict[str, Any] = {"planarconfig": "separate", "photometric": "minisblack"}
-    named = {f"B{number}": sensor for number, sensor in enumerate(sensors)}
-    both = by_file(tmp_path, bands, options(INT8, named, tile_px=64), **separate)
-    for band, sensor, found in zip(bands, sensors, both, strict=True):
-        np.testing.assert_array_equal(found, by_array(band, INT8, sensor=sensor, nodata=NODATA))
+    by_name = {f"B{number}": sensor for number, sensor in enumerate(sensors)}
+    results = by_file(tmp_path, bands, options(INT8, by_name, tile_px=64), **separate)
+    for band, sensor, result in zip(bands, sensors, results, strict=True):
+        np.testing.assert_array_equal(result, by_array(band, INT8, sensor=sensor, nodata=NODATA))
 
 
 def stopped(folder: Path, how: Options, tiles: int) -> Options:
@@ -247,16 +249,16 @@ def test_each_step_changes_what_it_is_for() -> None:
         "consistency": (True, False),
         "both": (True, True),
     }
-    found = {
+    results = {
         name: by_array(pixels, INT8, consistency=consistency, exposure=exposure)
         for name, (consistency, exposure) in switches.items()
     }
     end = BRIGHT_FROM - RADIUS_PX
-    changed = found["exposure"] != found["none"]
+    changed = results["exposure"] != results["none"]
     assert changed[:, :end].mean() > 0.9
     assert not changed[:, end:].any()
-    assert (found["consistency"] != found["none"]).mean() > 0.8
-    assert (found["both"] != found["exposure"]).mean() > 0.8
+    assert (results["consistency"] != results["none"]).mean() > 0.8
+    assert (results["both"] != results["exposure"]).mean() > 0.8
 
 
 @pytest.mark.parametrize("sensor", [(), ("--sensor", BLIND)])
@@ -266,16 +268,8 @@ def test_without_a_sensor_the_consistency_step_is_off(
     """The two mean the same."""
     tifffile.imwrite(tmp_path / "in.tif", image())
     results = tmp_path / "results.json"
-    done(
-        "restore",
-        tmp_path / "in.tif",
-        tmp_path / "out.tif",
-        "--network",
-        INT8,
-        *sensor,
-        "--json",
-        results,
-    )
+    files = (tmp_path / "in.tif", tmp_path / "out.tif", "--json", results)
+    done("restore", *files, "--network", INT8, *sensor)
     (row,) = json.loads(results.read_text(encoding="utf-8"))["rows"]
     assert row["text"]["consistency"] == "off: no sensor is named"
     assert CONSISTENCY not in row["figures"]
@@ -290,14 +284,14 @@ def test_a_network_of_the_user_s_gets_the_consistency_step_and_no_exposure(
     model: Path, tmp_path: Path
 ) -> None:
     own = Options(model, 23, sensors={"": SENSOR}, full_scale=4095)
-    found, row = restored(tmp_path, lacking().astype(np.float32), own)
+    tiled, row = restored(tmp_path, lacking().astype(np.float32), own)
     assert row.text["consistency"] == "on"
     assert "exposures" not in row.text
-    whole, _ = restored(tmp_path, lacking().astype(np.float32), replace(own, tile_px=512))
-    np.testing.assert_array_equal(found, whole)
-    plain, row = restored(tmp_path, lacking().astype(np.float32), replace(own, consistency=False))
+    untiled, _ = restored(tmp_path, lacking().astype(np.float32), replace(own, tile_px=512))
+    np.testing.assert_array_equal(tiled, untiled)
+    without, row = restored(tmp_path, lacking().astype(np.float32), replace(own, consistency=False))
     assert row.text["consistency"] == "off"
-    assert (found != plain).mean() > 0.8
+    assert (tiled != without).mean() > 0.8
 
 
 @pytest.mark.parametrize(("make", "bands"), [(espcn, 1), (lambda: four_bands(2), 4)])
@@ -306,16 +300,16 @@ def test_a_network_of_other_pixels_or_bands_gets_none(
 ) -> None:
     save_onnx(make(), tmp_path / "network.onnx")
     pixels = np.stack([image()] * bands) if bands > 1 else image()
-    written: dict[str, Any] = {"planarconfig": "separate"} if bands > 1 else {}
+    layout: dict[str, Any] = {"planarconfig": "separate"} if bands > 1 else {}
     how = Options(
         tmp_path / "network.onnx", 56, sensors={"": SENSOR}, full_scale=4095, any_result=True
     )
-    found, row = restored(tmp_path, pixels, how, photometric="minisblack", **written)
+    result, row = restored(tmp_path, pixels, how, photometric="minisblack", **layout)
     assert row.text["consistency"] == "off: the network makes other pixels or bands"
     without, _ = restored(
-        tmp_path, pixels, replace(how, consistency=False), photometric="minisblack", **written
+        tmp_path, pixels, replace(how, consistency=False), photometric="minisblack", **layout
     )
-    np.testing.assert_array_equal(found, without)
+    np.testing.assert_array_equal(result, without)
 
 
 @pytest.mark.parametrize("name", [FLOAT, INT8])
@@ -330,9 +324,9 @@ def test_the_mean_of_a_dark_image_is_kept(name: str) -> None:
     )
     noise = np.random.default_rng(0).normal(0, sigma, (97, 110))
     dark = np.rint(level_dn + noise).astype(np.float32)
-    kept = by_array(dark, name).mean() / dark.mean()
-    moved = by_array(dark, name, consistency=False, exposure=False).mean() / dark.mean()
-    assert abs(kept - 1) < 0.003 < 0.02 < abs(moved - 1)
+    with_steps = by_array(dark, name).mean() / dark.mean()
+    without_steps = by_array(dark, name, consistency=False, exposure=False).mean() / dark.mean()
+    assert abs(with_steps - 1) < 0.003 < 0.02 < abs(without_steps - 1)
 
 
 def test_few_rows_are_held_of_a_tall_image(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,7 +25,9 @@ from tests.deploy.restoration.runs import noise
 
 NODATA = 7
 HIDDEN = np.zeros((61, 83), bool)
-HIDDEN[:9], HIDDEN[20:33, 40:], HIDDEN[50, 3] = True, True, True
+HIDDEN[:9] = True
+HIDDEN[20:33, 40:] = True
+HIDDEN[50, 3] = True
 
 
 def restored(path: Path, model: Path, **options: Any) -> tuple[np.ndarray, np.ndarray | None]:
@@ -39,11 +41,11 @@ def restored(path: Path, model: Path, **options: Any) -> tuple[np.ndarray, np.nd
 
 def by_nodata(folder: Path, pixels: np.ndarray, model: Path) -> np.ndarray:
     """The same image restored, its hidden pixels told by a nodata value that no other has."""
-    seen = np.where(HIDDEN, NODATA, np.where(pixels == NODATA, NODATA + 1, pixels)).astype(
+    marked = np.where(HIDDEN, NODATA, np.where(pixels == NODATA, NODATA + 1, pixels)).astype(
         pixels.dtype
     )
     path = folder / "nodata.tif"
-    tifffile.imwrite(path, seen, extratags=[(42113, "s", 0, str(NODATA), True)])
+    tifffile.imwrite(path, marked, extratags=[(42113, "s", 0, str(NODATA), True)])
     return restored(path, model)[0]
 
 
@@ -75,11 +77,11 @@ def test_a_mask_is_missing_pixels_and_is_kept(
             )
     if beside:
         tifffile.imwrite(tmp_path / "in.tif.msk", mask)
-    found, kept = restored(tmp_path / "in.tif", model, compression=compression)
-    np.testing.assert_array_equal(found[HIDDEN], pixels[HIDDEN])
-    np.testing.assert_array_equal(found[~HIDDEN], by_nodata(tmp_path, pixels, model)[~HIDDEN])
-    assert kept is not None
-    np.testing.assert_array_equal(kept == 0, HIDDEN)
+    result, result_mask = restored(tmp_path / "in.tif", model, compression=compression)
+    np.testing.assert_array_equal(result[HIDDEN], pixels[HIDDEN])
+    np.testing.assert_array_equal(result[~HIDDEN], by_nodata(tmp_path, pixels, model)[~HIDDEN])
+    assert result_mask is not None
+    np.testing.assert_array_equal(result_mask == 0, HIDDEN)
 
 
 def test_what_gdal_keeps_beside_an_image_counts(model: Path, tmp_path: Path) -> None:
@@ -115,11 +117,11 @@ def test_alpha_goes_through_untouched(
 ) -> None:
     pixels = pixels_of_test()
     alpha = np.where(HIDDEN, 0, noise(61, 83, seed=3)).astype(np.uint16)
-    whole = np.stack([pixels] * bands + [alpha], axis=0 if planes == "separate" else 2)
+    planes_and_alpha = np.stack([pixels] * bands + [alpha], axis=0 if planes == "separate" else 2)
     photometric: Any = "rgb" if bands == 3 else "minisblack"
     tifffile.imwrite(
         tmp_path / "in.tif",
-        whole,
+        planes_and_alpha,
         photometric=photometric,
         planarconfig=planes,
         extrasamples=[kind],
@@ -128,14 +130,14 @@ def test_alpha_goes_through_untouched(
     restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=23))
     with tifffile.TiffFile(tmp_path / "out.tif") as file:
         page = file.pages.first
-        found = page.asarray()
-        said = (page.photometric, page.extrasamples)
-    assert said == (
+        result = page.asarray()
+        layout = (page.photometric, page.extrasamples)
+    assert layout == (
         {"rgb": 2, "minisblack": 1}[photometric],
         ({"assocalpha": 1, "unassalpha": 2}[kind],),
     )
-    np.testing.assert_array_equal(found[-1], alpha)
-    for band in found[:-1]:
+    np.testing.assert_array_equal(result[-1], alpha)
+    for band in result[:-1]:
         np.testing.assert_array_equal(band[HIDDEN], pixels[HIDDEN])
         np.testing.assert_array_equal(band[~HIDDEN], by_nodata(tmp_path, pixels, model)[~HIDDEN])
 
@@ -150,8 +152,8 @@ def test_alpha_of_a_png_is_no_light(mode: str, model: Path, tmp_path: Path) -> N
         np.testing.assert_array_equal(
             source.raster.missing(source.read(3, 9))[0], alpha[3:9, :, 0] == 0
         )
-    found, _ = restored(tmp_path / "in.png", model, full_scale=255)
-    np.testing.assert_array_equal(found[-1], alpha[..., 0])
+    result, _ = restored(tmp_path / "in.png", model, full_scale=255)
+    np.testing.assert_array_equal(result[-1], alpha[..., 0])
 
 
 def two_pages(path: Path, pixels: np.ndarray) -> None:
@@ -174,8 +176,10 @@ def two_sizes(path: Path, pixels: np.ndarray) -> None:
 
 
 def with_offset(path: Path, pixels: np.ndarray) -> None:
-    said = '<GDALMetadata><Item name="OFFSET" sample="0" role="offset">-1000</Item></GDALMetadata>'
-    tifffile.imwrite(path, pixels, extratags=[(42112, "s", 0, said, True)])
+    metadata = (
+        '<GDALMetadata><Item name="OFFSET" sample="0" role="offset">-1000</Item></GDALMetadata>'
+    )
+    tifffile.imwrite(path, pixels, extratags=[(42112, "s", 0, metadata, True)])
 
 
 def palette(path: Path, pixels: np.ndarray) -> None:
@@ -238,12 +242,12 @@ def write_png(path: Path, width: int, height: int, bits: int, rows: bytes) -> No
 
 def test_an_image_is_restored_once_unless_asked_again(model: Path, tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", noise(61, 83))
-    once, _ = restored(tmp_path / "in.tif", model)
+    first, _ = restored(tmp_path / "in.tif", model)
     (tmp_path / "out.tif").rename(tmp_path / "once.tif")
     with pytest.raises(ImageError, match="again"):
         restored(tmp_path / "once.tif", model)
-    again, _ = restored(tmp_path / "once.tif", model, again=True)
-    assert (again != once).any()
+    second, _ = restored(tmp_path / "once.tif", model, again=True)
+    assert (second != first).any()
 
 
 @pytest.fixture(scope="module")
@@ -251,9 +255,9 @@ def scaled(model: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[f
     """The network with another scale and offset of its output."""
 
     def make(factor: float, offset: float) -> Path:
-        found = onnx.load(model)
-        graph = found.graph
-        last = found.graph.output[0].name
+        network = onnx.load(model)
+        graph = network.graph
+        last = network.graph.output[0].name
         for node in graph.node:
             node.output[:] = [name if name != last else "plain" for name in node.output]
         for name, value in (("factor", factor), ("offset", offset)):
@@ -261,7 +265,7 @@ def scaled(model: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[f
         graph.node.append(onnx.helper.make_node("Mul", ["plain", "factor"], ["scaled"]))
         graph.node.append(onnx.helper.make_node("Add", ["scaled", "offset"], [last]))
         path = tmp_path_factory.mktemp("scaled") / "scaled.onnx"
-        onnx.save(found, path)
+        onnx.save(network, path)
         return path
 
     return make
@@ -292,25 +296,25 @@ def test_the_consistency_step_does_not_hide_a_network_that_does_not_fit(
     sensors = {"": load_sensor("pleiades-degraded")}
     with pytest.raises(ImageError, match=r"before the consistency step.*any_result"):
         restored(tmp_path / "in.tif", scaled(*how), sensors=sensors)
-    said: list[str] = []
+    messages: list[str] = []
     row = restore_file(
         tmp_path / "in.tif",
         tmp_path / "out.tif",
         Options(scaled(*how), any_result=True, sensors=sensors),
-        said.append,
+        messages.append,
     )
-    assert any("before the consistency step" in each for each in said)
+    assert any("before the consistency step" in message for message in messages)
     assert abs(row.figures["mean moved"].value or 0.0) < 1
 
 
 def test_a_small_departure_is_told(scaled: Callable[[float, float], Path], tmp_path: Path) -> None:
-    said: list[str] = []
+    messages: list[str] = []
     tifffile.imwrite(tmp_path / "in.tif", np.full((61, 83), 1500, np.uint16) + (noise(61, 83) >> 6))
-    moved = []
+    shifts = []
     for offset in (0.0, 0.05):
         row = restore_file(
-            tmp_path / "in.tif", tmp_path / "out.tif", Options(scaled(1.0, offset)), said.append
+            tmp_path / "in.tif", tmp_path / "out.tif", Options(scaled(1.0, offset)), messages.append
         )
-        moved.append(row.figures["mean moved"].value or 0.0)
-    assert moved[1] - moved[0] == pytest.approx(5, abs=0.1)
-    assert any("the mean went from" in each for each in said)
+        shifts.append(row.figures["mean moved"].value or 0.0)
+    assert shifts[1] - shifts[0] == pytest.approx(5, abs=0.1)
+    assert any("the mean went from" in message for message in messages)

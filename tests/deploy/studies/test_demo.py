@@ -12,7 +12,7 @@ from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.studies import demo
 from beers_deploy.studies.demo import load_sensors, read_input
 from tests.deploy.command_line import done
-from tests.deploy.documents import valid
+from tests.deploy.documents import figures_of, valid
 
 
 @pytest.mark.slow
@@ -31,8 +31,8 @@ def test_the_demo_takes_a_raw_image_through_the_whole_chain(
     out = tmp_path / "out"
     figures = tmp_path / "figures.json"
     done("demo", "--image", raw, "--out", out, "--json", figures, "--sensor", mine)
-    made = {path.name for path in out.iterdir()}
-    assert made == {
+    names = {path.name for path in out.iterdir()}
+    assert names == {
         "report.html",
         "float.onnx",
         "int8.onnx",
@@ -44,7 +44,7 @@ def test_the_demo_takes_a_raw_image_through_the_whole_chain(
     document = valid(figures)
     assert document["arguments"]["sensor"] == str(mine)
     assert metadata(onnx.load(out / "int8.onnx"))["sensor"] == "mine"
-    modes = {figure["mode"] for row in document["rows"] for figure in row["figures"].values()}
+    modes = {figure["mode"] for figure in figures_of(document["rows"])}
     assert {"measured", "predicted", "published"} <= modes
     page = (out / "report.html").read_text()
     assert "fits the DPU whole" in page

@@ -43,17 +43,20 @@ rounding = true
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    made = []
+    paths = []
     for number, site in enumerate(("coast_1", "town_1")):
         radiance = procedural_scene(420, 420, np.random.default_rng(number)).radiance
         grey = np.clip(255 * (radiance / 400) ** (1 / 2.2), 0, 255).astype(np.uint8)
-        made.append(tmp_path_factory.mktemp(site))
-        Image.fromarray(grey).save(made[-1] / f"{site}.png")
-    return made
+        paths.append(tmp_path_factory.mktemp(site))
+        Image.fromarray(grey).save(paths[-1] / f"{site}.png")
+    return paths
 
 
-def given(folders: list[Path]) -> list[str]:
-    return [word for folder in folders for word in ("--images", str(folder))]
+def image_options(folders: list[Path]) -> list[str]:
+    words: list[str] = []
+    for folder in folders:
+        words += ["--images", str(folder)]
+    return words
 
 
 @pytest.mark.slow
@@ -64,7 +67,7 @@ def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes
     recipe = tmp_path / "own.toml"
     out = tmp_path / "run"
     recipe.write_text(RECIPE)
-    command = ["train", "--recipe", recipe, *given(folders), "--out", out]
+    command = ["train", "--recipe", recipe, *image_options(folders), "--out", out]
     done(*command)
     names = [f"convbeers-half-xs{end}" for end in (".safetensors", "-int8.onnx", ".md")]
     first = [(out / name).read_bytes() for name in names]
@@ -115,7 +118,12 @@ def test_a_held_out_site_that_no_folder_shows_is_refused(
     folders: list[Path], tmp_path: Path
 ) -> None:
     (tmp_path / "own.toml").write_text(RECIPE)
-    said = refused(
-        "train", "--recipe", tmp_path / "own.toml", *given(folders[:1]), "--out", tmp_path / "run"
+    message = refused(
+        "train",
+        "--recipe",
+        tmp_path / "own.toml",
+        *image_options(folders[:1]),
+        "--out",
+        tmp_path / "run",
     )
-    assert "held out: expected images of town, got none" in said
+    assert "held out: expected images of town, got none" in message

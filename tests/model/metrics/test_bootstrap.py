@@ -5,9 +5,9 @@ from beers_deploy.model.metrics.bootstrap import LEAST_SITES, site_interval
 
 
 def interval(values: list[float], sites: list[str]) -> tuple[float, float]:
-    found, _ = site_interval(values, sites, np.random.default_rng(0))
-    assert found is not None
-    return found
+    bounds, _ = site_interval(values, sites, np.random.default_rng(0))
+    assert bounds is not None
+    return bounds
 
 
 def test_it_covers_the_mean_as_often_as_it_says() -> None:
@@ -15,7 +15,7 @@ def test_it_covers_the_mean_as_often_as_it_says() -> None:
     hits = 0
     for _ in range(200):
         offsets = generator.normal(40, 3, 25)
-        values = [offset + generator.normal(0, 0.2) for offset in offsets for _ in range(3)]
+        values = [offset + generator.normal(0, 0.2) for offset in np.repeat(offsets, 3).tolist()]
         low, high = interval(values, [f"s{k // 3}" for k in range(75)])
         hits += low <= 40 <= high
     assert 0.88 <= hits / 200 <= 0.99
@@ -25,7 +25,7 @@ def test_images_of_one_site_are_not_taken_for_many() -> None:
     """Ten copies of five figures tell no more than the five; drawn one by one
     they would seem to.
     """
-    values = [level for level in (38.0, 41.0, 44.0, 47.0, 50.0) for _ in range(10)]
+    values = np.repeat((38.0, 41.0, 44.0, 47.0, 50.0), 10).tolist()
     low, high = interval(values, [f"s{k // 10}" for k in range(50)])
     alone_low, alone_high = interval(values, [f"s{k}" for k in range(50)])
     assert high - low > 2 * (alone_high - alone_low)
@@ -42,11 +42,11 @@ def test_the_same_seed_gives_the_same_interval() -> None:
 def test_below_five_sites_there_is_no_interval_and_it_is_said(count: int) -> None:
     values = list(np.linspace(40, 44, 3 * count))
     sites = [f"s{k % count}" for k in range(3 * count)]
-    found, words = site_interval(values, sites, np.random.default_rng(0))
+    bounds, words = site_interval(values, sites, np.random.default_rng(0))
     if count < LEAST_SITES:
-        assert found is None
+        assert bounds is None
         assert "no interval" in words
         assert f"{count} site" in words
     else:
-        assert found == interval(values, sites)
+        assert bounds == interval(values, sites)
         assert "no interval" not in words

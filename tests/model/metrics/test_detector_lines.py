@@ -37,10 +37,10 @@ def noisy(image: np.ndarray, generator: np.random.Generator, noise: float = 4.0)
 @settings(deadline=None, max_examples=15)
 @given(seeds, st.integers(16, 180), st.floats(50, 3000), st.sampled_from([2.0, 4.0, 40.0]))
 def test_even_ground_has_no_lines(seed: int, width: int, level: float, noise: float) -> None:
-    found = judged(noisy(np.full((512, width), level), np.random.default_rng(seed), noise))
-    assert not found.seen
-    assert not found.off
-    assert not found.dead
+    faults = judged(noisy(np.full((512, width), level), np.random.default_rng(seed), noise))
+    assert not faults.seen
+    assert not faults.off
+    assert not faults.dead
 
 
 @settings(deadline=None, max_examples=15)
@@ -48,9 +48,9 @@ def test_even_ground_has_no_lines(seed: int, width: int, level: float, noise: fl
 def test_the_spread_of_the_gains_is_measured(seed: int, width: int, rms: float) -> None:
     generator = np.random.default_rng(seed)
     gains = 1 + rms * generator.standard_normal(width)
-    found = judged(noisy(600 * gains * np.ones((512, 1)), generator))
-    assert found.seen
-    assert found.spread == pytest.approx(rms, rel=0.5)
+    faults = judged(noisy(600 * gains * np.ones((512, 1)), generator))
+    assert faults.seen
+    assert faults.spread == pytest.approx(rms, rel=0.5)
 
 
 @settings(deadline=None, max_examples=20)
@@ -69,7 +69,8 @@ def test_a_single_column_is_found_with_its_gain(seed: int, column: int, gain: fl
 def test_a_blurred_road_along_the_columns_is_a_scene(
     sigma_px: float, width_px: int, shift_px: int
 ) -> None:
-    fine = np.full((512, 300), 600.0)  # thirds of a pixel
+    # One sample is a third of a pixel, so that the road can begin within a pixel.
+    fine = np.full((512, 300), 600.0)
     fine[:, 150 + shift_px : 150 + shift_px + 3 * width_px] = 900
     blurred = gaussian_filter(fine, (0, 3 * sigma_px), mode="nearest")
     image = blurred[:, 1::3]
@@ -83,9 +84,9 @@ def test_a_dead_column_is_found_and_its_neighbours_are_not(
 ) -> None:
     image = noisy(np.full((512, 100), 600.0), np.random.default_rng(seed))
     image[:, column] = value
-    found = judged(image)
-    assert found.dead == (column,)
-    assert not {line.index for line in found.off} & {column - 1, column, column + 1}
+    faults = judged(image)
+    assert faults.dead == (column,)
+    assert not {line.index for line in faults.off} & {column - 1, column, column + 1}
 
 
 def test_a_margin_and_a_constant_image_are_no_dead_columns() -> None:
@@ -112,5 +113,5 @@ def test_gains_grow_with_the_level_and_offsets_do_not(gains: bool) -> None:
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (5, 5), (3, 200), (200, 3), (64, 7)])
 @pytest.mark.parametrize("value", [0.0, 5.0, np.nan])
 def test_what_is_too_small_or_empty_says_nothing(shape: tuple[int, int], value: float) -> None:
-    found = judged(np.full(shape, value))
-    assert (found.seen, found.off, found.dead) == (False, (), ())
+    faults = judged(np.full(shape, value))
+    assert (faults.seen, faults.off, faults.dead) == (False, (), ())

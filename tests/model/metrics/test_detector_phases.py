@@ -1,5 +1,7 @@
 """A pattern of two pixels is found with its size, also where it changes its sign over the image."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,12 +20,11 @@ LEAST = 0.003
 def judged(image: np.ndarray, side_px: int = 64) -> dict[str, Pattern]:
     parts = [
         image[top : top + side_px, left : left + side_px].astype(np.float32)
-        for top in range(0, image.shape[0], side_px)
-        for left in range(0, image.shape[1], side_px)
+        for top, left in product(*(range(0, size, side_px) for size in image.shape))
     ]
     return {
-        found.name: found
-        for found in judge_phases([measure_phases(p, np.isfinite(p)) for p in parts], LEAST)
+        pattern.name: pattern
+        for pattern in judge_phases([measure_phases(p, np.isfinite(p)) for p in parts], LEAST)
     }
 
 
@@ -43,20 +44,20 @@ def test_a_pattern_is_found_with_its_size(
     shape = (192, 256)
     size = np.linspace(-1, 1, shape[0])[:, None] * np.sqrt(3) if turns else 1.0
     image = 500 * (1 + difference / 2 * size * signs(name, shape))
-    found = judged(image + np.random.default_rng(seed).normal(0, 4, shape))
-    assert found[name].seen
-    assert found[name].difference == pytest.approx(difference, rel=0.2, abs=0.0005)
-    assert not any(each.seen for other, each in found.items() if other != name)
+    patterns = judged(image + np.random.default_rng(seed).normal(0, 4, shape))
+    assert patterns[name].seen
+    assert patterns[name].difference == pytest.approx(difference, rel=0.2, abs=0.0005)
+    assert not any(pattern.seen for other, pattern in patterns.items() if other != name)
 
 
 @settings(deadline=None, max_examples=15)
 @given(st.integers(0, 2**20), st.integers(20, 150), st.integers(20, 150))
 def test_noise_has_none(seed: int, height: int, width: int) -> None:
     image = np.random.default_rng(seed).normal(500, 20, (height, width))
-    assert not any(found.seen for found in judged(image).values())
+    assert not any(pattern.seen for pattern in judged(image).values())
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (15, 40), (40, 15), (16, 16), (64, 17)])
 @pytest.mark.parametrize("value", [0.0, 5.0, np.nan])
 def test_what_is_small_constant_or_missing_has_none(shape: tuple[int, int], value: float) -> None:
-    assert not any(found.seen for found in judged(np.full(shape, value)).values())
+    assert not any(pattern.seen for pattern in judged(np.full(shape, value)).values())

@@ -54,19 +54,21 @@ def edges(mtf_nyquist: float, angle_deg: float, count: int, seed: int = 0) -> li
 @pytest.mark.parametrize("mtf_nyquist", [0.02, 0.05, 0.12])
 @pytest.mark.parametrize("angle_deg", [0.0, 4.0, 15.0, 30.0])
 def test_one_small_square_tells_the_blur(mtf_nyquist: float, angle_deg: float) -> None:
-    found = edges(mtf_nyquist, angle_deg, 30)
-    assert len(found) >= 25
-    off = np.array([edge.gamma for edge in found]) - gamma_from_mtf(mtf_nyquist)
+    blurs = edges(mtf_nyquist, angle_deg, 30)
+    assert len(blurs) >= 25
+    off = np.array([edge.gamma for edge in blurs]) - gamma_from_mtf(mtf_nyquist)
     assert abs(off.mean()) < 0.07
-    assert off.std() == pytest.approx(np.mean([edge.error for edge in found]), rel=0.5)
+    assert off.std() == pytest.approx(np.mean([edge.error for edge in blurs]), rel=0.5)
 
 
 @pytest.mark.parametrize("mtf_nyquist", [0.03, 0.1])
 def test_the_interval_of_a_few_edges_holds_the_truth(mtf_nyquist: float) -> None:
-    found = [combine(edges(mtf_nyquist, 6.0, 4, seed), []) for seed in range(20)]
-    assert sum(axis.interval[0] <= mtf_nyquist <= axis.interval[1] for axis in found) >= 18
-    assert np.median([axis.mtf_nyquist for axis in found]) == pytest.approx(mtf_nyquist, rel=0.05)
-    assert all(axis.interval[1] < 1.5 * axis.interval[0] for axis in found)
+    estimates = [combine(edges(mtf_nyquist, 6.0, 4, seed), []) for seed in range(20)]
+    assert sum(axis.interval[0] <= mtf_nyquist <= axis.interval[1] for axis in estimates) >= 18
+    assert np.median([axis.mtf_nyquist for axis in estimates]) == pytest.approx(
+        mtf_nyquist, rel=0.05
+    )
+    assert all(axis.interval[1] < 1.5 * axis.interval[0] for axis in estimates)
 
 
 def board(mtf_nyquist: Blur, lean_deg: float = 8.0, smear_px: float = 0.0) -> np.ndarray:
@@ -113,7 +115,8 @@ def test_a_landscape_has_no_such_edge() -> None:
     step.
     """
     scene = procedural_scene(1200, 1200, np.random.default_rng(3)).radiance.copy()
-    scene[:400] = scene[400:800]  # the drawn calibration site
+    # The landscape covers the calibration site that the scene draws.
+    scene[:400] = scene[400:800]
     image = blurred(scene, 0.07)
     image = image + SIGMA * np.random.default_rng(2).standard_normal(image.shape)
     assert len(find_blurs(image, noise, 4095)) + len(find_blurs(image.T, noise, 4095)) == 0
@@ -121,9 +124,9 @@ def test_a_landscape_has_no_such_edge() -> None:
 
 def refused(region: np.ndarray) -> str:
     region = region + SIGMA * np.random.default_rng(4).standard_normal(region.shape)
-    found = fit_blur(region, noise, POINTED_AT)
-    assert isinstance(found, Refusal), found
-    return found.reason
+    outcome = fit_blur(region, noise, POINTED_AT)
+    assert isinstance(outcome, Refusal), outcome
+    return outcome.reason
 
 
 def test_what_is_no_blurred_step_is_refused() -> None:

@@ -1,3 +1,5 @@
+from itertools import product
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -57,20 +59,21 @@ def drawn(
     left = 400 + generator.normal(0, 4) * y / height
     right = 1400 + generator.normal(0, 4) * y / height
     grain = generator.normal(size=(height + 2, width + 2))
-    smooth = sum(grain[i : i + height, j : j + width] for i in range(3) for j in range(3)) / 3
+    shifts = product(range(3), repeat=2)
+    smooth = sum(grain[i : i + height, j : j + width] for i, j in shifts) / 3
     pixels = left * (1 - share) + right * share + texture * 1000 * smooth
     return pixels + generator.normal(0, NOISE_DN, size), line
 
 
 def edges_of(weights: np.ndarray, count: int, seed: int, texture: float = 0.0) -> list[Edge]:
     generator = np.random.default_rng(seed)
-    found = []
+    edges = []
     for number in range(count):
         pixels, _ = drawn(weights, generator, texture)
         edge = edge_in(pixels, noise, f"edge {number}")
         assert not isinstance(edge, Refusal)
-        found.append(edge)
-    return found
+        edges.append(edge)
+    return edges
 
 
 @settings(max_examples=10)
@@ -104,7 +107,7 @@ def test_texture_widens_the_interval_which_holds_the_truth() -> None:
     weights = weights_of(CURVES["exponential"])
     truth = mtf_at(FREQUENCIES, weights)[SHOWN]
     widths = []
-    held = []
+    covered = []
     for seed in range(6):
         for texture in (0.0, 0.05):
             curve = measure_curve(
@@ -112,16 +115,18 @@ def test_texture_widens_the_interval_which_holds_the_truth() -> None:
             )
             assert isinstance(curve, MtfCurve)
             widths.append(curve.high[SHOWN] / curve.low[SHOWN])
-            held.append((curve.low[SHOWN] <= truth) & (truth <= curve.high[SHOWN]))
-    assert np.mean(held) >= 0.8
+            covered.append((curve.low[SHOWN] <= truth) & (truth <= curve.high[SHOWN]))
+    assert np.mean(covered) >= 0.8
     assert (np.median(widths[1::2], axis=0) > np.median(widths[::2], axis=0)).all()
 
 
 def test_edges_that_contradict_the_others_are_named() -> None:
     sharp = edges_of(weights_of(CURVES["exponential"]), 6, seed=3)
     soft = edges_of(weights_of(np.exp(-7.0 * CORNERS)), 1, seed=4)
-    odd = [(EdgePixels(pixels.values, pixels.variance, "the hedge"), line) for pixels, line in soft]
-    curve = measure_curve([*sharp, *odd], np.random.default_rng(0))
+    hedges = [
+        (EdgePixels(pixels.values, pixels.variance, "the hedge"), line) for pixels, line in soft
+    ]
+    curve = measure_curve([*sharp, *hedges], np.random.default_rng(0))
     assert isinstance(curve, MtfCurve)
     assert curve.contradicting == ("the hedge",)
 
@@ -138,11 +143,11 @@ def test_search_takes_the_sharpest_and_leaves_hedges() -> None:
 
 
 def test_few_edges_are_refused_with_their_number() -> None:
-    found = search_curve(
+    outcome = search_curve(
         edges_of(weights_of(CURVES["gaussian"]), 2, seed=7), np.random.default_rng(0)
     )
-    assert isinstance(found, Refusal)
-    assert "2 straight edges" in found.reason
+    assert isinstance(outcome, Refusal)
+    assert "2 straight edges" in outcome.reason
 
 
 @given(st.lists(st.floats(-2, 4), min_size=3, max_size=20), st.floats(-3, 3))
@@ -171,5 +176,5 @@ def test_axes_are_told_apart_by_how_the_edges_lean(
         contrast = detector * np.exp(-loss)
         return MtfCurve(contrast, contrast, contrast, 5, (), lean)
 
-    found = apart(seen(x, y, lean_x), seen(y, x, lean_y))
-    assert found.contrast == pytest.approx(detector * np.exp(-x * FREQUENCIES), abs=1e-6)
+    verdict = apart(seen(x, y, lean_x), seen(y, x, lean_y))
+    assert verdict.contrast == pytest.approx(detector * np.exp(-x * FREQUENCIES), abs=1e-6)

@@ -65,8 +65,8 @@ def test_solving_finds_a_smooth_curve_and_stays_within_what_any_curve_is(seed: i
     truth = weights_of(np.exp(-gamma * CORNERS))
     looks = generator.normal(size=(60, PARTS))
     gram = looks.T @ looks * 1e8
-    found = solve(gram, gram @ truth, truth, 0.8)
-    assert found == pytest.approx(truth, abs=1e-3)
+    solution = solve(gram, gram @ truth, truth, 0.8)
+    assert solution == pytest.approx(truth, abs=1e-3)
     nothing = solve(np.zeros((PARTS, PARTS)) + 1e-6 * np.eye(PARTS), np.zeros(PARTS), truth, 0.8)
     assert nothing.min() >= 0
     assert nothing.sum() == pytest.approx(1)

@@ -46,21 +46,21 @@ def fitted(blocks: Blocks) -> NoiseModel | Refusal:
 
 
 def model(blocks: Blocks) -> NoiseModel:
-    found = fitted(blocks)
-    assert isinstance(found, NoiseModel), found
-    return found
+    fit = fitted(blocks)
+    assert isinstance(fit, NoiseModel), fit
+    return fit
 
 
 @pytest.mark.parametrize("pair", PAIRS)
 def test_the_noise_of_a_textured_landscape_is_right(pair: tuple[float, float]) -> None:
-    found = [model(seen(pair, seed)) for seed in range(3)]
-    held = []
+    models = [model(seen(pair, seed)) for seed in range(3)]
+    covered = []
     for radiance, snr in zip(RADIANCES, pair, strict=True):
         true = (radiance * GAIN / snr) ** 2
-        at = [line.at(radiance * GAIN) for line in found]
+        at = [line.at(radiance * GAIN) for line in models]
         assert np.mean([math.sqrt(v.value / true) for v in at]) == pytest.approx(1, abs=0.07)
-        held += [v.interval[0] <= true <= v.interval[1] for v in at]
-    assert np.mean(held) > 0.8
+        covered += [v.interval[0] <= true <= v.interval[1] for v in at]
+    assert np.mean(covered) > 0.8
 
 
 def plain(shape: tuple[int, int] = (320, 320), low: float = 200, high: float = 2200) -> np.ndarray:
@@ -78,9 +78,9 @@ def noisy(sigma: float, image: np.ndarray | None = None, seed: int = 0) -> np.nd
 
 @pytest.mark.parametrize("sigma", [0.6, 5.0])
 def test_the_rounding_is_taken_off(sigma: float) -> None:
-    found = [model(cut_blocks(noisy(sigma, seed=seed), MAX_DN)) for seed in range(5)]
-    assert np.mean([line.at(1000).value for line in found]) == pytest.approx(sigma**2, rel=0.03)
-    assert found[0].total(np.array(1000.0)) == pytest.approx(sigma**2 + 1 / 12, rel=0.1)
+    models = [model(cut_blocks(noisy(sigma, seed=seed), MAX_DN)) for seed in range(5)]
+    assert np.mean([line.at(1000).value for line in models]) == pytest.approx(sigma**2, rel=0.03)
+    assert models[0].total(np.array(1000.0)) == pytest.approx(sigma**2 + 1 / 12, rel=0.1)
 
 
 def test_what_lies_beyond_the_blocks_is_less_sure() -> None:
@@ -93,19 +93,19 @@ def test_what_lies_beyond_the_blocks_is_less_sure() -> None:
 
 def test_clipped_pixels_are_left_out() -> None:
     image = noisy(5.0)
-    whole = model(cut_blocks(image, MAX_DN))
+    unclipped = model(cut_blocks(image, MAX_DN))
     image[:, 275:] = MAX_DN
     image[:20] = 0
     part = model(cut_blocks(image, MAX_DN))
-    assert part.blocks < whole.blocks
-    assert part.measured_dn[1] < 2000 < whole.measured_dn[1]
+    assert part.blocks < unclipped.blocks
+    assert part.measured_dn[1] < 2000 < unclipped.measured_dn[1]
     assert part.at(1000).value == pytest.approx(25, rel=0.08)
 
 
 def refused(image: np.ndarray) -> str:
-    found = fitted(cut_blocks(image, MAX_DN))
-    assert isinstance(found, Refusal), found
-    return found.reason
+    outcome = fitted(cut_blocks(image, MAX_DN))
+    assert isinstance(outcome, Refusal), outcome
+    return outcome.reason
 
 
 def test_what_cannot_be_known_is_refused() -> None:
@@ -176,8 +176,8 @@ def test_a_mosaic_of_unequal_channels_is_refused() -> None:
         np.kron(np.ones((160, 160)), [[1.0, 0.6], [0.6, 0.4]])
         * np.linspace(300, 3000, 320)[:, None]
     )
-    found = fit_noise_model(
+    outcome = fit_noise_model(
         cut_blocks(generator.poisson(channels), MAX_DN), np.random.default_rng(0), incomplete=True
     )
-    assert isinstance(found, Refusal)
-    assert "mosaic" in found.reason
+    assert isinstance(outcome, Refusal)
+    assert "mosaic" in outcome.reason

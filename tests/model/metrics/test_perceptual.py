@@ -147,11 +147,9 @@ def plain_dists(image: np.ndarray, reference: np.ndarray) -> float:
     )
     colours = [torch.from_numpy(np.stack([a] * 3))[None] for a in (image, reference)]
     stages = [[c, *vgg_maps((c - mean) / std, weights, hanning_pooled)] for c in colours]
-    channels = [
-        (a, b)
-        for stage in zip(*stages, strict=True)
-        for a, b in zip(*(x.numpy()[0] for x in stage), strict=True)
-    ]
+    channels = list[tuple[np.ndarray, np.ndarray]]()
+    for stage in zip(*stages, strict=True):
+        channels += zip(*(x.numpy()[0] for x in stage), strict=True)
     similar = 0.0
     for channel, (a, b) in enumerate(channels):
         means = (2 * a.mean() * b.mean() + 1e-6) / (a.mean() ** 2 + b.mean() ** 2 + 1e-6)
@@ -269,7 +267,7 @@ def test_published_weights_are_whole(file: str, total: float) -> None:
     assert f"`{file}.safetensors`" in (PUBLISHED / "README.md").read_text()
 
 
-# The files a user brings.
+# The tests below read weight files that a user brings.
 
 
 class Bomb:
@@ -355,7 +353,8 @@ def test_where_a_backbone_is_looked_for(
         monkeypatch.setenv(WEIGHTS_VARIABLE, str(place))
         assert find_backbone("vgg") == file
         assert find_backbone("vgg", tmp_path) is None
-    assert find_backbone("squeeze") is None  # the variable names VGG16's file
+    # The environment variable names the file of VGG16, not that of SqueezeNet.
+    assert find_backbone("squeeze") is None
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "nowhere"))
     assert [find_backbone(network) for network in BACKBONES] == [None] * 2
     for network, stem in STEMS.items():
@@ -364,7 +363,7 @@ def test_where_a_backbone_is_looked_for(
         )
 
 
-# The real SqueezeNet, where it lies beside the repository.
+# The tests below need the real SqueezeNet next to the repository.
 
 
 @pytest.fixture(scope="module")

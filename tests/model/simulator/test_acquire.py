@@ -60,7 +60,8 @@ def steepest_fall(ratio: int, mtf_nyquist: float) -> float:
 @pytest.mark.parametrize("mtf_nyquist", [0.03, 0.07, 0.25])
 @pytest.mark.parametrize("ratio", [1, 2, 3, 5])
 def test_a_step_rises_without_ringing(ratio: int, mtf_nyquist: float) -> None:
-    assert steepest_fall(ratio, mtf_nyquist) <= 1  # the digitiser's rounding
+    # A fall of one digital number comes from rounding alone.
+    assert steepest_fall(ratio, mtf_nyquist) <= 1
 
 
 def test_a_step_would_ring_where_the_scene_is_no_finer_than_the_sensor() -> None:
@@ -75,10 +76,10 @@ def test_the_two_noises_of_a_pair_are_independent() -> None:
 
 def test_the_same_draw_gives_the_same_pixels_and_another_does_not() -> None:
     scene = np.full((500, 470), 80.0, np.float32)
-    first, again, other = (
+    first, repeated, other = (
         simulate_pair(scene, DEGRADED, REFERENCE, 5, Draw(s)).degraded for s in (1, 1, 2)
     )
-    assert np.array_equal(first, again)
+    assert np.array_equal(first, repeated)
     assert not np.array_equal(first, other)
 
 
@@ -123,11 +124,11 @@ def test_padding_shifts_nothing() -> None:
     brings in.
     """
     radiance = procedural_scene(600, 600, np.random.default_rng(3)).radiance
-    whole = acquire_padded(radiance, QUIET, 3, Draw(0), "degraded")
+    padded = acquire_padded(radiance, QUIET, 3, Draw(0), "degraded")
     cropped = acquire(scene_spectrum(radiance), 600, QUIET, 3, Draw(0), "degraded")
-    inner = whole[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
+    inner = padded[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
     assert np.abs(inner - cropped).mean() < 2
-    shifted = whole[MARGIN_PX:-MARGIN_PX, MARGIN_PX + 1 : 1 - MARGIN_PX or None]
+    shifted = padded[MARGIN_PX:-MARGIN_PX, MARGIN_PX + 1 : 1 - MARGIN_PX or None]
     assert np.abs(shifted[:, :-1] - cropped[:, :-1]).mean() > 20
 
 
@@ -145,7 +146,7 @@ def test_drawn_scenes_are_physical_and_repeatable() -> None:
     )
 
 
-# On real images, where there are some beside the repository.
+# The tests below need real images next to the repository.
 
 
 @pytest.fixture(params=["aerial-test", "pleiades"])

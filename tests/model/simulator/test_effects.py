@@ -140,8 +140,8 @@ def test_the_noise_is_the_same_whether_a_pattern_is_applied_or_not(name: str) ->
     """What is added in DN is then all that differs, and it is the same in every row."""
     radiance = scene(93, 111)
     sensor = stages.plain_sensor(dsnu=Dsnu(3.0), striping=Striping(2.0), offset=Offset(64.0))
-    whole = stages.before_digitising(radiance, sensor, 3, Draw(5))
-    added = whole - stages.before_digitising(radiance, sensor, 3, Draw(5), {name})
+    full = stages.before_digitising(radiance, sensor, 3, Draw(5))
+    added = full - stages.before_digitising(radiance, sensor, 3, Draw(5), {name})
     np.testing.assert_allclose(added, np.broadcast_to(added[:1], added.shape), atol=1e-3)
     assert np.abs(added).min() > 0
 

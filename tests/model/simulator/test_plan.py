@@ -95,7 +95,8 @@ formula_sensors = st.builds(
 )
 EDGED = (1, 0.85, 0.75, 0.01)
 RESPONSES = (
-    MtfTable((0, 0.3, 0.4, 0.5), EDGED, EDGED),  # falls so steeply that it rings
+    # This curve falls so steeply that an edge rings.
+    MtfTable((0, 0.3, 0.4, 0.5), EDGED, EDGED),
     stages.formula_table(0.12, 0.05),
     stages.gaussian_pixel(0.3, 0.5, 4, 21),
     stages.formula_point(0.07, 2, 12, odd=True),
@@ -115,9 +116,9 @@ def change(radiance: np.ndarray, sensor: Instrument, ratio: int, name: str, seed
     """Largest change of any pixel before digitising when one effect is left out."""
     skip = {name, "smear", "antialias"} if name == "mtf" else {name}
     radiance = crop_divisible(radiance, ratio)
-    whole = stages.before_digitising(radiance, sensor, ratio, Draw(seed))
+    exact = stages.before_digitising(radiance, sensor, ratio, Draw(seed))
     return float(
-        np.abs(whole - stages.before_digitising(radiance, sensor, ratio, Draw(seed), skip)).max()
+        np.abs(exact - stages.before_digitising(radiance, sensor, ratio, Draw(seed), skip)).max()
     )
 
 
@@ -139,13 +140,14 @@ def test_the_plan_keeps_within_its_tolerance(
     scene = prepare_scene(radiance, ratio)
     radiance = scene.radiance
     plan = make_plan(sensor, scene.stats)
-    whole = stages.before_digitising(radiance, sensor, ratio, Draw(seed))
+    exact = stages.before_digitising(radiance, sensor, ratio, Draw(seed))
     planned = stages.before_digitising(radiance, sensor, ratio, Draw(seed), plan.skipped)
-    assert np.abs(whole - planned).max() <= TOLERANCE_DN + ROUNDING_DN
+    assert np.abs(exact - planned).max() <= TOLERANCE_DN + ROUNDING_DN
     products = [
         simulate_planned(scene, sensor, Draw(seed), p, margin_px=2) for p in (plan, ALL_APPLIED)
     ]
-    assert np.abs(products[0] - products[1]).max() <= 1  # two roundings of almost the same number
+    # Both are roundings of almost the same number, so they differ by at most one.
+    assert np.abs(products[0] - products[1]).max() <= 1
 
 
 def test_a_table_that_rings_is_bounded_by_its_own_ringing() -> None:
@@ -181,11 +183,13 @@ def test_a_quarter_of_any_bound_would_be_caught(name: str) -> None:
     radiance = np.zeros((90, 75), np.float32)
     radiance[10, :] = radiance[20:70, 10:50] = 200.0
     sensor = stages.plain_sensor(**{name: STRONG[name]} if name in TABLES else {})
-    if name == "smear":  # its bound leaves out how much a blur hides of it: so a sharp sensor
+    # The bound of smear ignores how much of it a blur hides. Only a sharp sensor comes near the
+    # bound.
+    if name == "smear":
         sensor = replace(sensor, mtf_nyquist=0.6)
     bound = effect_bounds(sensor, scene_stats(radiance, 1))[name]
-    found = change(radiance, sensor, 1, name, 0)
-    assert bound / 4 + ROUNDING_DN < found <= bound + ROUNDING_DN
+    error = change(radiance, sensor, 1, name, 0)
+    assert bound / 4 + ROUNDING_DN < error <= bound + ROUNDING_DN
 
 
 def test_the_bound_of_defects_holds_where_the_signal_is_above_full_scale() -> None:
@@ -218,8 +222,8 @@ WELL = stages.plain_sensor(full_well=FullWell(300.0, 0.3, 4.0))
 def test_what_a_scene_shows_decides(
     radiance: np.ndarray, sensor: Instrument, names: tuple[str, ...], choice: str
 ) -> None:
-    found = {d.effect: d.choice for d in make_plan(sensor, scene_stats(radiance, 2)).decisions}
-    assert {found[name] for name in names} == {choice}
+    choices = {d.effect: d.choice for d in make_plan(sensor, scene_stats(radiance, 2)).decisions}
+    assert {choices[name] for name in names} == {choice}
 
 
 def test_what_is_skipped_fits_the_tolerance_together() -> None:

@@ -38,14 +38,17 @@ BLURS: dict[str, tuple[Response | tuple[float, float], tuple[float, float]]] = {
 
 @pytest.mark.parametrize("name", [name for name in BLURS if name != "lopsided"])
 def test_a_slanted_edge_shows_both_contrasts(name: str) -> None:
-    (blur, wanted), side, ratio, middle = BLURS[name], 200, 4, slice(60, 140)
+    blur, contrasts = BLURS[name]
+    side = 200
+    ratio = 4
+    middle = slice(60, 140)
     scene = slanted_edge(side, ratio, 5.0)
     transfer = transfer_function(side * ratio, side * ratio, ratio, blur)
     upright, lying = (
         sample(scene_spectrum(s), transfer, side * ratio, ratio) for s in (scene, scene.T)
     )
     assert [edge_mtf(image[middle, middle], 5.0) for image in (upright, lying.T)] == pytest.approx(
-        wanted, abs=0.005
+        contrasts, abs=0.005
     )
 
 
@@ -64,9 +67,9 @@ def test_a_point_aslant_is_not_straightened() -> None:
     image = sample(
         scene_spectrum(stages.blob(192, 12.0)), transfer_function(192, 192, 4, point), 192, 4
     )
-    wanted = lean(unpacked(point)) / point.samples_per_px**2
-    assert abs(wanted) > 0.01
-    assert lean(image.astype(np.float64)) == pytest.approx(wanted, rel=0.01)
+    expected = lean(unpacked(point)) / point.samples_per_px**2
+    assert abs(expected) > 0.01
+    assert lean(image.astype(np.float64)) == pytest.approx(expected, rel=0.01)
 
 
 @pytest.mark.parametrize("ratio", [1, 2, 3, 5, 8])
@@ -119,7 +122,7 @@ def test_a_point_of_the_formula_gives_the_formulas_images(odd: bool, side: int) 
     point = stages.formula_point(UNEVEN, 4, 64, odd)
     radiance = 300 * np.random.default_rng(3).random((side * ratio, side * ratio), np.float32)
     radiance[: side * ratio // 2] *= 0.2
-    wanted, found = (
+    expected, actual = (
         sample(
             scene_spectrum(radiance),
             transfer_function(*radiance.shape, ratio, blur),
@@ -131,22 +134,22 @@ def test_a_point_of_the_formula_gives_the_formulas_images(odd: bool, side: int) 
     limit_dn = 5.0
     if side == 64:
         limit_dn = 0.2 if odd else 3.0
-    assert np.abs(wanted - found).max() * GAIN < limit_dn
+    assert np.abs(expected - actual).max() * GAIN < limit_dn
 
 
 @pytest.mark.parametrize("name", BLURS)
 def test_smear_comes_on_top_and_the_filter_is_part_of_it(name: str) -> None:
     blur, _ = BLURS[name]
-    whole = transfer_function(30, 36, 3, blur, 0.0, 1.5)
+    transfer = transfer_function(30, 36, 3, blur, 0.0, 1.5)
     plain = transfer_function(30, 36, 3, blur)
     smear = np.sinc(1.5 * np.fft.fftfreq(30, 1 / 3))[:, None]
-    np.testing.assert_allclose(whole, plain * smear, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(transfer, plain * smear, rtol=1e-5, atol=1e-7)
     if not isinstance(blur, tuple):
         sensor = stages.with_response(stages.plain_sensor(antialias=AntiAlias(0.1)), blur)
         with pytest.raises(OptionError, match="anti-alias filter"):
             sensor_transfer(30, 36, 3, sensor)
         smeared = replace(sensor, effects={"smear": Smear(1.5)})
-        assert np.array_equal(sensor_transfer(30, 36, 3, smeared), whole)
+        assert np.array_equal(sensor_transfer(30, 36, 3, smeared), transfer)
 
 
 @pytest.mark.parametrize("bits", [8, 10, 14])
@@ -159,9 +162,10 @@ def test_any_bits_digitise_the_same_radiance(name: str, bits: int) -> None:
     own = replace(sensor, bits=bits, gain_dn_per_radiance=(2**bits - 1) / 400)
     radiance = 50 + 250 * np.random.default_rng(1).random((120, 100), np.float32)
     spectrum = scene_spectrum(radiance)
-    wanted = sample(spectrum, sensor_transfer(120, 100, 2, sensor), 100, 2)
-    found = acquire(spectrum, 100, own, 2, Draw(0), "degraded", margin_px=0)
+    expected = sample(spectrum, sensor_transfer(120, 100, 2, sensor), 100, 2)
+    actual = acquire(spectrum, 100, own, 2, Draw(0), "degraded", margin_px=0)
     assert (
-        np.abs(found / own.gain_dn_per_radiance - wanted).max() <= 0.501 / own.gain_dn_per_radiance
+        np.abs(actual / own.gain_dn_per_radiance - expected).max()
+        <= 0.501 / own.gain_dn_per_radiance
     )
-    assert 0.5 * 2**bits < float(found.max()) <= 2**bits - 1
+    assert 0.5 * 2**bits < float(actual.max()) <= 2**bits - 1

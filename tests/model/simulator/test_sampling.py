@@ -121,9 +121,9 @@ def test_what_the_grid_does_not_divide_is_cropped() -> None:
 def test_an_offset_moves_the_grid_over_the_scene(ratio: int) -> None:
     radiance = scene(13 * ratio, 21 * ratio)
     transfer = transfer_function(13 * ratio, 21 * ratio, ratio, 0.07)
-    moved = sample(scene_spectrum(radiance), transfer, 21 * ratio, ratio, offset_px=(2.0, -3.0))
+    shifted = sample(scene_spectrum(radiance), transfer, 21 * ratio, ratio, offset_px=(2.0, -3.0))
     rolled = sample(scene_spectrum(np.roll(radiance, (-2, 3), (0, 1))), transfer, 21 * ratio, ratio)
-    np.testing.assert_allclose(moved, rolled, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(shifted, rolled, rtol=0, atol=1e-3)
 
 
 def test_a_stack_of_scenes_is_sampled_one_by_one() -> None:

@@ -93,46 +93,47 @@ def test_the_kernel_keeps_the_gain_off_dc(mtf_from: float) -> None:
     padded = torch.zeros(512, 512, dtype=torch.float64)
     padded[:129, :129] = kernel
     gain = torch.fft.rfft2(padded.roll((-64, -64), (0, 1)))
-    wanted = torch.from_numpy(compensation_gain(512, 512, mtf_from, 0.25, EPSILON))
+    expected = torch.from_numpy(compensation_gain(512, 512, mtf_from, 0.25, EPSILON))
     assert float(gain.imag.abs().max()) < 1e-9
-    error = (gain.real / wanted - 1).abs()
+    error = (gain.real / expected - 1).abs()
     assert float(error[8:240, 8:240].max()) < 2e-3
-    assert (
-        float(error.max()) < 0.04
-    )  # at the kink that the gain has where it is continued beyond Nyquist
+    # The largest error is at the kink of the gain, where it is continued beyond Nyquist.
+    assert float(error.max()) < 0.04
 
 
 def test_strips_and_blocks_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     image = texture(203, 187)
     kernel = compensation_kernel(0.07, 0.25, EPSILON)
-    whole = compensate(image, 0.07, 0.25, EPSILON)
+    at_once = compensate(image, 0.07, 0.25, EPSILON)
     strips = torch.cat(list(filter_strips(torch.split(image, 7), 203, kernel)))
-    assert torch.equal(strips, whole)
+    assert torch.equal(strips, at_once)
     monkeypatch.setattr(module, "BLOCK_PX", 60)
-    torch.testing.assert_close(compensate(image, 0.07, 0.25, EPSILON), whole, rtol=0, atol=0.01)
+    torch.testing.assert_close(compensate(image, 0.07, 0.25, EPSILON), at_once, rtol=0, atol=0.01)
 
 
 def test_missing_pixels_reach_no_further_than_the_filter() -> None:
     image = texture(203, 187)
     holed = image.clone()
     holed[:40, :30] = torch.nan
-    whole, restored = (compensate(each, 0.07, 0.25, EPSILON) for each in (image, holed))
+    without_hole, restored = (
+        compensate(variant, 0.07, 0.25, EPSILON) for variant in (image, holed)
+    )
     assert torch.equal(restored.isnan(), holed.isnan())
-    torch.testing.assert_close(restored[104:], whole[104:], rtol=0, atol=0.01)
-    torch.testing.assert_close(restored[:, 94:], whole[:, 94:], rtol=0, atol=0.01)
-    beside = (restored - whole)[40:44, :30].abs().mean()
+    torch.testing.assert_close(restored[104:], without_hole[104:], rtol=0, atol=0.01)
+    torch.testing.assert_close(restored[:, 94:], without_hole[:, 94:], rtol=0, atol=0.01)
+    nearby = (restored - without_hole)[40:44, :30].abs().mean()
     zeros = compensate(holed.nan_to_num(0), 0.07, 0.25, EPSILON)
-    assert float(beside) < 0.7 * float((zeros - whole)[40:44, :30].abs().mean())
+    assert float(nearby) < 0.7 * float((zeros - without_hole)[40:44, :30].abs().mean())
 
 
 def test_holes_are_filled_from_around() -> None:
     image = torch.arange(63.0)[None].expand(37, -1)
-    known = torch.ones_like(image, dtype=torch.bool)
-    known[5:20, 30:40] = False
-    filled = fill_with_local_means(image, known)
-    assert torch.equal(filled[known], image[known])
+    valid = torch.ones_like(image, dtype=torch.bool)
+    valid[5:20, 30:40] = False
+    filled = fill_with_local_means(image, valid)
+    assert torch.equal(filled[valid], image[valid])
     torch.testing.assert_close(filled, image, rtol=0, atol=10)
-    assert torch.equal(fill_with_local_means(image, ~known & False), torch.zeros_like(image))
+    assert torch.equal(fill_with_local_means(image, ~valid & False), torch.zeros_like(image))
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 200), (61, 75)])
@@ -145,11 +146,11 @@ def test_any_shape_comes_back_finite(shape: tuple[int, int]) -> None:
 def test_it_carries_one_blur_into_the_other() -> None:
     yy, xx = np.mgrid[:261, :275]
     scene = np.asarray(2000 + 1000 * np.sin(0.9 * xx + 0.4 * yy) * np.cos(0.07 * xx), np.float32)
-    seen = (
+    views = (
         sample(scene_spectrum(scene), transfer_function(261, 275, 1, m), 275, 1)
         for m in (0.07, 0.25)
     )
-    blurred, target = map(torch.from_numpy, seen)
+    blurred, target = map(torch.from_numpy, views)
     inside = slice(80, -80), slice(80, -80)
     before = (blurred - target)[inside].square().mean()
     after = (compensate(blurred, 0.07, 0.25, epsilon=0) - target)[inside].square().mean()

@@ -113,9 +113,9 @@ def test_an_offset_passes_through(camera: Tensor) -> None:
 
 def test_tiles_leave_no_trace(camera: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
     noisy = with_noise(camera[96:157, 160:235], SIGMA)
-    whole = nl_bayes(noisy, WHITE)
+    at_once = nl_bayes(noisy, WHITE)
     monkeypatch.setattr("beers_deploy.model.traditional.nl_bayes.TILE_REFERENCES", 7)
-    torch.testing.assert_close(nl_bayes(noisy, WHITE), whole, rtol=0, atol=0.05)
+    torch.testing.assert_close(nl_bayes(noisy, WHITE), at_once, rtol=0, atol=0.05)
 
 
 @pytest.mark.parametrize("height", [1, 37, 113])
@@ -152,11 +152,12 @@ def test_missing_pixels_stay_missing_and_nobody_sees_them(camera: Tensor) -> Non
     clean = camera[96:169, 160:235]
     noisy = with_noise(clean, SIGMA)
     restored = nl_bayes(with_hole(noisy), WHITE)
-    whole = nl_bayes(noisy, WHITE)
-    known = torch.isfinite(with_hole(noisy))
-    assert torch.equal(torch.isfinite(restored), known)
-    ring = known & (torch.nn.functional.max_pool2d((~known)[None, None].float(), 9, 1, 4)[0, 0] > 0)
-    assert psnr_db(restored[ring], clean[ring]) > psnr_db(whole[ring], clean[ring]) - 1
+    without_hole = nl_bayes(noisy, WHITE)
+    valid = torch.isfinite(with_hole(noisy))
+    assert torch.equal(torch.isfinite(restored), valid)
+    ring = valid & (torch.nn.functional.max_pool2d((~valid)[None, None].float(), 9, 1, 4)[0, 0] > 0)
+    assert psnr_db(restored[ring], clean[ring]) > psnr_db(without_hole[ring], clean[ring]) - 1
+    # The control: a hole filled with a value spoils its surroundings.
     far = nl_bayes(with_hole(noisy, 4095.0), WHITE)
     assert psnr_db(far[ring], clean[ring]) < psnr_db(restored[ring], clean[ring])
 
@@ -182,9 +183,9 @@ def test_coloured_noise_is_described_by_its_filter() -> None:
     noise = coloured_by(SHARPENER, 2.0)
     assert noise.sigma == pytest.approx(2 * 29**0.5)
     samples = 2 * torch.from_numpy(np.random.default_rng(3).standard_normal((701, 703)))
-    seen = high_pass(samples)[8:-8, 8:-8].unfold(0, 3, 5).unfold(1, 3, 5).reshape(-1, 9)
+    patches = high_pass(samples)[8:-8, 8:-8].unfold(0, 3, 5).unfold(1, 3, 5).reshape(-1, 9)
     torch.testing.assert_close(
-        torch.cov(seen.T), noise.covariance(3), rtol=0, atol=0.06 * noise.sigma**2
+        torch.cov(patches.T), noise.covariance(3), rtol=0, atol=0.06 * noise.sigma**2
     )
 
 
@@ -192,8 +193,8 @@ def test_knowing_the_colour_of_the_noise_pays(camera: Tensor) -> None:
     clean = camera[96:225, 160:289]
     noise = high_pass(with_noise(torch.zeros(129, 129), 3.0)).float()
     coloured = coloured_by(SHARPENER, 3.0)
-    told = psnr_db(nl_bayes(clean + noise, coloured), clean)
-    assert told > psnr_db(nl_bayes(clean + noise, Noise(coloured.sigma)), clean) + 1
+    with_colour = psnr_db(nl_bayes(clean + noise, coloured), clean)
+    assert with_colour > psnr_db(nl_bayes(clean + noise, Noise(coloured.sigma)), clean) + 1
 
 
 def test_white_is_the_colour_of_a_single_pixel(camera: Tensor) -> None:
@@ -207,10 +208,10 @@ def test_the_estimate_of_pass_2_is_the_posterior_mean() -> None:
     generator = np.random.default_rng(6)
     guide = torch.from_numpy(generator.normal(0, 40, (1, 60, 25)))
     noisy = guide + SIGMA * torch.from_numpy(generator.standard_normal((1, 60, 25)))
-    taken = torch.ones(1, 60, dtype=torch.float64)
-    taken[:, 50:] = 0
+    members = torch.ones(1, 60, dtype=torch.float64)
+    members[:, 50:] = 0
     estimates = estimate_groups(
-        noisy, guide, taken, WHITE, second_pass(SIGMA, QUALITIES["standard"])
+        noisy, guide, members, WHITE, second_pass(SIGMA, QUALITIES["standard"])
     )[0, :50]
     covariance = torch.cov(guide[0, :50].T, correction=0)
     gain = covariance @ torch.linalg.inv(

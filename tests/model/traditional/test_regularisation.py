@@ -56,18 +56,19 @@ def epsilon_of(strips: Sequence[Tensor], sensor: Instrument = DEGRADED) -> float
     return derived_epsilon(measure(strips, sensor), sensor)
 
 
-@given(shape=SIZES, rows=st.integers(1, 41), seed=SEEDS, lost=st.floats(0, 1))
+@given(shape=SIZES, rows=st.integers(1, 41), seed=SEEDS, lost_share=st.floats(0, 1))
 def test_strips_of_any_height_give_the_same_bits(
-    shape: tuple[int, int], rows: int, seed: int, lost: float
+    shape: tuple[int, int], rows: int, seed: int, lost_share: float
 ) -> None:
     dn = walk(shape, seed)
-    dn[torch.rand(shape, generator=torch.Generator().manual_seed(seed % 1000)) < lost] = torch.nan
+    generator = torch.Generator().manual_seed(seed % 1000)
+    dn[torch.rand(shape, generator=generator) < lost_share] = torch.nan
     assert epsilon_of([dn]) == epsilon_of(torch.split(dn, rows))
 
 
 def test_the_means_are_those_of_numpy() -> None:
     dn = walk((8 * BLOCK_PX, 7 * BLOCK_PX), step_dn=300.0)
-    found = measure(torch.split(dn, 5), DEGRADED)
+    statistics = measure(torch.split(dn, 5), DEGRADED)
     radiance = dn.double().numpy() / DEGRADED.gain_dn_per_radiance
     noise = (
         DEGRADED.alpha * radiance.mean()
@@ -75,11 +76,10 @@ def test_the_means_are_those_of_numpy() -> None:
         + 1 / (12 * DEGRADED.gain_dn_per_radiance**2)
     )
     squares = [float(np.square(np.diff(radiance, axis=axis)).mean()) for axis in (0, 1)]
-    assert found.noise == pytest.approx(noise, rel=1e-9)
-    assert found.contrast == pytest.approx(
-        sum(squares) / 2 - 2 * noise, rel=0.05
-    )  # the first row has fewer pairs
-    assert 0 < found.residual < found.noise
+    assert statistics.noise == pytest.approx(noise, rel=1e-9)
+    # The first row has fewer pairs than the others, so the mean is only approximate.
+    assert statistics.contrast == pytest.approx(sum(squares) / 2 - 2 * noise, rel=0.05)
+    assert 0 < statistics.residual < statistics.noise
 
 
 @given(seed=SEEDS, times=st.floats(1.1, 10))
@@ -109,8 +109,8 @@ def test_a_change_of_the_unit_of_radiance_leaves_epsilon(seed: int, factor: floa
 @given(seed=SEEDS)
 def test_missing_and_saturated_areas_do_not_count(seed: int) -> None:
     dn = walk((6 * BLOCK_PX, 31), seed)
-    for lost in (torch.nan, 4095.0):
-        below = torch.cat([dn, torch.full((9, 31), lost)])
+    for filler in (torch.nan, 4095.0):
+        below = torch.cat([dn, torch.full((9, 31), filler)])
         assert epsilon_of([below]) == epsilon_of([dn])
 
 
@@ -141,8 +141,8 @@ def test_images_without_contrast_get_a_finite_epsilon(dn: Tensor, sensor: Instru
 def test_epsilon_is_bounded_by_the_share_of_noise(seed: int, mean_dn: float) -> None:
     """So that faint patterns near Nyquist are not erased: see `LARGEST_PER_NOISE`."""
     dn = walk((23, 31), seed, step_dn=1.0, mean_dn=mean_dn)
-    found = measure([dn], DEGRADED)
-    share = float(found.noise) ** 0.5 / found.radiance
+    statistics = measure([dn], DEGRADED)
+    share = float(statistics.noise) ** 0.5 / statistics.radiance
     assert epsilon_of([dn]) <= max(LARGEST_PER_NOISE * share, 0) + 1e-12
 
 
@@ -168,10 +168,10 @@ def test_a_point_spread_counts_as_the_formula_it_was_made_of() -> None:
 
 def test_the_restored_mtf_comes_near_that_of_the_reference() -> None:
     """The reference has 25 %; the rule that knew the noise alone restored 16 % (measured)."""
-    found = [
+    mtfs = [
         restored_mtf(angle_deg, number) for number, angle_deg in enumerate((3.0, 5.0, 8.0, 11.0))
     ]
-    assert 0.20 < float(np.mean(found)) < 0.26
+    assert 0.20 < float(np.mean(mtfs)) < 0.26
 
 
 def restored_mtf(angle_deg: float, number: int) -> float:
@@ -181,9 +181,9 @@ def restored_mtf(angle_deg: float, number: int) -> float:
         scene_spectrum(scene), scene.shape[1], DEGRADED, 5, Draw(0, number), "degraded", margin_px=0
     )
     restored = restore_traditional(torch.from_numpy(edge), Chain(DEGRADED, REFERENCE)).numpy()
-    found = edge_mtf(restored[80:160, 80:160], angle_deg, DEGRADED.max_dn)
-    assert isinstance(found, float)
-    return found
+    mtf = edge_mtf(restored[80:160, 80:160], angle_deg, DEGRADED.max_dn)
+    assert isinstance(mtf, float)
+    return mtf
 
 
 def test_a_dark_scene_gets_more_regularisation_and_gains_from_it(camera: Tensor) -> None:
@@ -191,7 +191,7 @@ def test_a_dark_scene_gets_more_regularisation_and_gains_from_it(camera: Tensor)
     reference = replace(NOISE_FREE, gain_dn_per_radiance=DEGRADED.gain_dn_per_radiance)
     bright, dark = (seen_by(camera * share, DEGRADED, reference) for share in (1, 1 / 20))
     chain = Chain(DEGRADED, REFERENCE)
-    for_bright, for_dark = (chain.fitted_to([seen.degraded]) for seen in (bright, dark))
+    for_bright, for_dark = (chain.fitted_to([view.degraded]) for view in (bright, dark))
     assert for_bright.epsilon is not None
     assert for_dark.epsilon is not None
     assert for_dark.epsilon > 3 * for_bright.epsilon

@@ -10,13 +10,13 @@ from tests.model.networks import plain, told_of
 
 
 def network(features: int) -> ConvBEERS:
-    made = plain(Variant(blocks=2, features=features), seed=1)
+    created = plain(Variant(blocks=2, features=features), seed=1)
     with torch.no_grad():
-        for parameter in made.parameters():
+        for parameter in created.parameters():
             parameter.add_(
                 0.05 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(2))
             )
-    return made
+    return created
 
 
 LARGER = [Variant(2, 6), Variant(2, 18), Variant(3, 6), Variant(5, 12), Variant(4, 6)]
@@ -61,9 +61,9 @@ def test_a_network_behind_a_bank_grows_for_every_sensor(variant: Variant) -> Non
     for seed, parameter in enumerate(small.parameters()):
         torch.nn.init.normal_(parameter, 0.0, 0.1, torch.Generator().manual_seed(seed))
     vectors = torch.tensor([[-1.0, -0.5, 0.2, 0.9], [0.7, 0.7, -1.0, -0.6]])
-    known = told_of(vectors)
+    conditions = told_of(vectors)
     torch.testing.assert_close(
-        grown(small, variant)(image(), known), small(image(), known), atol=1e-5, rtol=1e-5
+        grown(small, variant)(image(), conditions), small(image(), conditions), atol=1e-5, rtol=1e-5
     )
 
 

@@ -58,7 +58,7 @@ def test_a_pass_shows_what_the_simulator_shows(name: str, ratio: int) -> None:
     phase = (0.3, -0.8)
     radiance = crop_divisible(scene.radiance, ratio)
     skip = ("noise", "digitising")
-    wanted = acquire(
+    expected = acquire(
         scene_spectrum(radiance),
         radiance.shape[1],
         sensor,
@@ -70,8 +70,8 @@ def test_a_pass_shows_what_the_simulator_shows(name: str, ratio: int) -> None:
         skip,
     )
     (signal,) = folded_signals(prepare(scene, ratio), (sensor,), Pass(ratio, phase, PLAIN, 8))
-    found = noiseless(signal, sensor) * sensor.max_dn
-    np.testing.assert_allclose(found.numpy(), wanted, atol=0.5)
+    actual = noiseless(signal, sensor) * sensor.max_dn
+    np.testing.assert_allclose(actual.numpy(), expected, atol=0.5)
 
 
 @settings(max_examples=20, deadline=None)
@@ -82,15 +82,18 @@ def test_a_look_keeps_the_mean_times_its_light_and_the_contrast_that_it_says(
     radiance = torch.rand(36, 44, generator=torch.Generator().manual_seed(0))
     fy = torch.fft.fftfreq(36)
     fx = torch.fft.rfftfreq(44)
-    made = looked(torch.fft.rfft2(radiance), Look(light, contrast, softness_px), fy, fx)
-    found = torch.fft.irfft2(made, s=radiance.shape)
-    assert float(found.mean()) == pytest.approx(light * float(radiance.mean()), rel=1e-4)
-    kept = float(found.std()) / (light * contrast * float(radiance.std()))
-    assert kept <= 1.0001
+    transformed = looked(torch.fft.rfft2(radiance), Look(light, contrast, softness_px), fy, fx)
+    looked_at = torch.fft.irfft2(transformed, s=radiance.shape)
+    assert float(looked_at.mean()) == pytest.approx(light * float(radiance.mean()), rel=1e-4)
+    contrast_ratio = float(looked_at.std()) / (light * contrast * float(radiance.std()))
+    assert contrast_ratio <= 1.0001
     if softness_px == 0:
-        assert kept == pytest.approx(1, rel=1e-4)
+        assert contrast_ratio == pytest.approx(1, rel=1e-4)
         torch.testing.assert_close(
-            found - found.mean(), light * contrast * (radiance - radiance.mean()), rtol=0, atol=1e-5
+            looked_at - looked_at.mean(),
+            light * contrast * (radiance - radiance.mean()),
+            rtol=0,
+            atol=1e-5,
         )
 
 
@@ -106,16 +109,16 @@ def test_softness_is_a_gaussian_of_that_width() -> None:
 
 def test_looks_reach_deep_shade_and_saturation_and_most_are_ordinary() -> None:
     generator = np.random.default_rng(0)
-    drawn = [VARIED.draw(generator) for _ in range(2000)]
-    lights = np.array([look.light for look in drawn])
+    looks = [VARIED.draw(generator) for _ in range(2000)]
+    lights = np.array([look.light for look in looks])
     assert lights.min() < 0.05
     assert lights.max() > 2
     ordinary = (lights >= 0.5) & (lights <= 1.25)
     assert ordinary.mean() > 0.6
-    assert np.mean([look.contrast < 1 for look in drawn]) == pytest.approx(
+    assert np.mean([look.contrast < 1 for look in looks]) == pytest.approx(
         VARIED.calm_share, abs=0.05
     )
-    assert np.mean([look.softness_px > 0 for look in drawn]) == pytest.approx(
+    assert np.mean([look.softness_px > 0 for look in looks]) == pytest.approx(
         VARIED.soft_share, abs=0.05
     )
 
@@ -123,16 +126,16 @@ def test_looks_reach_deep_shade_and_saturation_and_most_are_ordinary() -> None:
 @pytest.mark.parametrize("level", [0.0, 5.0, 100.0, 390.0])
 def test_noise_has_the_sensors_standard_deviation_at_every_level(level: float) -> None:
     signal = torch.full((300, 300), level)
-    found = detected(signal, NOMINAL, "degraded", np.random.default_rng(1)) * NOMINAL.max_dn
+    noisy = detected(signal, NOMINAL, "degraded", np.random.default_rng(1)) * NOMINAL.max_dn
     clipped = level == 0
-    wanted = float(np.hypot(NOMINAL.noise_sigma(level) * NOMINAL.gain_dn_per_radiance, 12**-0.5))
+    expected = float(np.hypot(NOMINAL.noise_sigma(level) * NOMINAL.gain_dn_per_radiance, 12**-0.5))
     if not clipped:
-        assert float(found.std()) == pytest.approx(wanted, rel=0.03)
-        assert float(found.mean()) == pytest.approx(
-            level * NOMINAL.gain_dn_per_radiance, abs=5 * wanted / 300
+        assert float(noisy.std()) == pytest.approx(expected, rel=0.03)
+        assert float(noisy.mean()) == pytest.approx(
+            level * NOMINAL.gain_dn_per_radiance, abs=5 * expected / 300
         )
-    assert float(found.min()) >= 0
-    assert torch.equal(found, found.round())
+    assert float(noisy.min()) >= 0
+    assert torch.equal(noisy, noisy.round())
 
 
 def test_effects_of_a_profile_are_the_simulators() -> None:
@@ -140,7 +143,8 @@ def test_effects_of_a_profile_are_the_simulators() -> None:
     sensor = replace(NOMINAL, effects={"offset": Offset(64.0)})
     signal = torch.full((40, 50), 80.0)
     plain, shifted = (
-        detected(signal, each, "degraded", np.random.default_rng(1)) for each in (NOMINAL, sensor)
+        detected(signal, instrument, "degraded", np.random.default_rng(1))
+        for instrument in (NOMINAL, sensor)
     )
     assert float((shifted - plain).mean() * NOMINAL.max_dn) == pytest.approx(64, abs=1)
     assert float(

@@ -52,14 +52,15 @@ PATCHES = "from tests.model.training.sources import source; made = source().batc
 @pytest.mark.slow
 def test_who_takes_the_patches_keeps_its_threads() -> None:
     """In processes of their own: a thread decides once how many it has."""
-    known = [threads_after(work) for work in ("pass", PATCHES)]
-    assert known[0] == known[1]
+    thread_counts = [threads_after(work) for work in ("pass", PATCHES)]
+    assert thread_counts[0] == thread_counts[1]
 
 
 def threads_after(work: str) -> str:
     code = f"import torch\n{work}\nprint(torch.get_num_threads())"
     root = Path(__file__).parents[3]
-    two = {**os.environ, "OMP_NUM_THREADS": "2"}  # the suite's own processes have one
+    # The suite's own processes have one thread, so a change of their number would not show there.
+    two = {**os.environ, "OMP_NUM_THREADS": "2"}
     command = [sys.executable, "-c", code]
     return subprocess.run(
         command, cwd=root, env=two, capture_output=True, text=True, check=True
@@ -98,24 +99,25 @@ def test_a_turned_patch_comes_with_the_sensor_as_it_lies() -> None:
     ways = set()
     for batch in islice(PatchSource([scene], recipe, 3, 0).batches(), 30):
         assert batch.told is not None
-        seen = zip(
+        samples = zip(
             batch.degraded, batch.reference, batch.told.vectors, batch.told.filters, strict=True
         )
-        for one, other, vector, filters in seen:
+        for one, other, vector, filters in samples:
             across, along = (a / b for a, b in zip(steps(one), steps(other), strict=True))
             assert (across > along) == bool(vector[0] > vector[1])
-            sharpened = steps(filters[-1])  # the axis that lost more is sharpened more
+            # The axis that lost more contrast is sharpened more.
+            sharpened = steps(filters[-1])
             assert (across > along) == (sharpened[0] < sharpened[1])
             ways.add(across > along)
     assert ways == {True, False}
 
 
 def test_conditioned_patches_come_with_vectors_of_many_sensors_and_the_same_again() -> None:
-    first, again = ([*islice(source(conditioned=True).batches(k), 20 - k)] for k in (0, 17))
+    first, repeated = ([*islice(source(conditioned=True).batches(k), 20 - k)] for k in (0, 17))
     vectors = torch.cat([batch.told.vectors for batch in first if batch.told is not None])
     assert vectors.shape == (60, 4)
     assert float(vectors.std(0).min()) > 0.3
-    assert all(equal(one, two) for one, two in zip(first[17:], again, strict=True))
+    assert all(equal(one, two) for one, two in zip(first[17:], repeated, strict=True))
 
 
 def test_dark_patches_are_those_of_a_brighter_sensor_as_a_restoration_shows_them() -> None:
@@ -124,18 +126,24 @@ def test_dark_patches_are_those_of_a_brighter_sensor_as_a_restoration_shows_them
     """
     family = Alike(replace(NOMINAL, alpha=0.0, beta=(100 / 200) ** 2))
     recipe = replace(source().recipe, family=family, looks=replace(VARIED, lit_share=1.0))
-    told = set()
+    applied = set()
     for batch in islice(PatchSource([small_scene()], recipe, 3, 0).batches(), 40):
         assert batch.told is not None
         for patch, vector in zip(batch.degraded, batch.told.vectors, strict=True):
             low, high = RANGES["sigma_bright"]
             sigma = low * (high / low) ** ((float(vector[3]) + 1) / 2)
             factor = round(sigma / noise_over_full_scale(family.like))
-            told.add(factor)
-            larger = [each for each in factors_for(family.like) if each > factor]
-            assert all(float(patch.max()) * each / factor > HEADROOM for each in larger)
+            applied.add(factor)
+            larger = [
+                larger_factor
+                for larger_factor in factors_for(family.like)
+                if larger_factor > factor
+            ]
+            assert all(
+                float(patch.max()) * larger_factor / factor > HEADROOM for larger_factor in larger
+            )
             assert factor == 1 or float(patch.max()) <= HEADROOM
-    assert len(told) > 1
+    assert len(applied) > 1
 
 
 def test_a_blind_network_sees_the_axes_of_one_sensor_as_they_are() -> None:
@@ -146,8 +154,8 @@ def test_a_blind_network_sees_the_axes_of_one_sensor_as_they_are() -> None:
     anisotropic = replace(profile, mtf_nyquist=across, mtf_nyquist_along=along)
     recipe = replace(source().recipe, degraded=anisotropic, oversamplings=(2,))
     for batch in islice(PatchSource([scene], recipe, 3, 0).batches(), 30):
-        kept = [a / b for a, b in zip(steps(batch.degraded), steps(batch.reference), strict=True)]
-        assert kept[0] > kept[1]
+        ratios = [a / b for a, b in zip(steps(batch.degraded), steps(batch.reference), strict=True)]
+        assert ratios[0] > ratios[1]
 
 
 def test_a_lopsided_blur_is_neither_mirrored_nor_turned() -> None:
@@ -238,9 +246,9 @@ def test_stored_pairs_of_two_different_axes_keep_them(quarters: bool, tmp_path: 
     """Rows of one brightness each stay rows, unless a patch may be turned by a quarter."""
     rows = np.repeat(np.arange(41, dtype=np.uint16)[:, None] * 45, 53, 1)
     patches, *_ = next(replace(stored(tmp_path, rows), batch=32, quarters=quarters).batches())
-    kept = [bool((patch == patch[..., :1]).all()) for patch in patches]
-    assert any(kept)
-    assert all(kept) is not quarters
+    flat = [bool((patch == patch[..., :1]).all()) for patch in patches]
+    assert any(flat)
+    assert all(flat) is not quarters
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,8 @@ WHOLE = f'variant = "convbeers-xs"\n{STAGE}'
 def test_a_shipped_recipe_is_that_of_the_network_of_its_name(name: str) -> None:
     recipe = load_recipe(name)
     assert recipe.variant == name
-    assert recipe.patch_px % (8 * VARIANTS[name].scale) == 0  # whole blocks of the consistency step
+    # The consistency step reads whole blocks of 8 pixels at the network's resolution.
+    assert recipe.patch_px % (8 * VARIANTS[name].scale) == 0
     assert recipe.stages[-1].rounding
     assert recipe.start in ("", *shipped_names())
     assert recipe.held_out

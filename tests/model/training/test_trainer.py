@@ -62,11 +62,11 @@ def train(
 def test_a_conditioned_run_moves_every_part_and_what_it_makes_of_a_sensor(tmp_path: Path) -> None:
     before = Trainer(VARIANT, TrainingRecipe(steps=8), conditioned=True)
     after = train(tmp_path, conditioned=True)
-    moved = {
+    changed = {
         name.split(".")[0]: not torch.equal(value, after.network.state_dict()[name])
         for name, value in before.network.state_dict().items()
     }
-    assert moved == dict.fromkeys(("head", "body", "body_end", "tail", "bias"), True)
+    assert changed == dict.fromkeys(("head", "body", "body_end", "tail", "bias"), True)
 
 
 def test_plain_and_conditioned_checkpoints_are_not_taken_for_one_another(tmp_path: Path) -> None:
@@ -134,9 +134,9 @@ class Poisoned(PatchSource):
 
 
 def poisoned(bad: frozenset[int] | None = None) -> Poisoned:
-    made = Poisoned([small_scene()], source().recipe, 3, 0)
-    made.bad = bad
-    return made
+    batches = Poisoned([small_scene()], source().recipe, 3, 0)
+    batches.bad = bad
+    return batches
 
 
 def copies(trainer: Trainer) -> list[Tensor]:
@@ -153,11 +153,11 @@ def test_nan_batches_stop_the_run_and_touch_no_weight(tmp_path: Path) -> None:
 
 def test_one_nan_batch_is_skipped_and_the_run_goes_on(tmp_path: Path) -> None:
     trainer = Trainer(VARIANT, TrainingRecipe(steps=6, batch=3))
-    seen = []
-    schedule = Schedule(1, report=lambda *_: seen.append(copies(trainer)))
+    states = []
+    schedule = Schedule(1, report=lambda *_: states.append(copies(trainer)))
     trainer.run(poisoned(frozenset({2})).batches, tmp_path / "c", schedule)
-    moved = [not all(map(torch.equal, one, other)) for one, other in pairwise(seen)]
-    assert moved == [True, False, True, True, True]
+    changed = [not all(map(torch.equal, one, other)) for one, other in pairwise(states)]
+    assert changed == [True, False, True, True, True]
     assert trainer.guards.bad_steps == 1
 
 
@@ -196,9 +196,9 @@ def test_a_second_ctrl_c_stops_at_once() -> None:
                 signal.raise_signal(signal.SIGINT)
             return interrupt.asked
 
-    before = signal.getsignal(
-        signal.SIGINT
-    )  # ignored where the tests were started in the background
+    # A shell that starts the tests in the background ignores SIGINT, so the handler before may not
+    # be Python's own.
+    before = signal.getsignal(signal.SIGINT)
     assert ask(1)
     with pytest.raises(KeyboardInterrupt):
         ask(2)
@@ -210,7 +210,8 @@ def test_a_loss_that_runs_away_stops_the_run() -> None:
     for step in range(WINDOW_STEPS):
         guards.passed(step, 0.01)
     for step in range(WINDOW_STEPS):
-        guards.passed(step, 0.04)  # four times the best: a hard batch of scenes
+        # Four times the best loss can come from hard scenes, so the guard lets it pass.
+        guards.passed(step, 0.04)
     for step in range(WINDOW_STEPS - 1):
         guards.passed(step, 0.06)
     with pytest.raises(ModelError, match="diverged"):
@@ -218,20 +219,20 @@ def test_a_loss_that_runs_away_stops_the_run() -> None:
 
 
 def test_guards_survive_a_resume(tmp_path: Path) -> None:
-    trainer, again = (Trainer(VARIANT, TrainingRecipe(steps=8)) for _ in range(2))
+    trainer, resumed = (Trainer(VARIANT, TrainingRecipe(steps=8)) for _ in range(2))
     for guards in (Guards(), Guards(3, 0.01, 0.07, 7)):
         trainer.guards = guards
         trainer.save(tmp_path / "c")
-        again.resume(tmp_path / "c")
-        assert again.guards == guards
+        resumed.resume(tmp_path / "c")
+        assert resumed.guards == guards
 
 
 def test_fine_tuning_starts_from_the_weights_given(tmp_path: Path) -> None:
     first = train(tmp_path, 4).averaged()
-    again = Trainer(VARIANT, TrainingRecipe(steps=4), start=first)
+    tuned = Trainer(VARIANT, TrainingRecipe(steps=4), start=first)
     assert all(
         torch.equal(a, b)
-        for a, b in zip(first.parameters(), again.network.parameters(), strict=True)
+        for a, b in zip(first.parameters(), tuned.network.parameters(), strict=True)
     )
 
 
@@ -251,12 +252,12 @@ def test_a_run_goes_on_in_the_other_format_and_the_loss_with_it(
     """Begun on one processor and resumed on another."""
     other: Precision = "float32" if first == "bfloat16" else "bfloat16"
     checkpoint = tmp_path / "checkpoint.safetensors"
-    seen = list[tuple[int, float]]()
+    records = list[tuple[int, float]]()
     recipe = TrainingRecipe(steps=40, batch=3, warm_up_steps=2, learning_rate=3e-3)
 
     def note(step: int, terms: Mapping[str, float], _: Speed) -> None:
-        seen.append((step, terms["l1"]))
-        if len(seen) == 2:
+        records.append((step, terms["l1"]))
+        if len(records) == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -266,8 +267,8 @@ def test_a_run_goes_on_in_the_other_format_and_the_loss_with_it(
     resumed = Trainer(VARIANT, recipe, precision=other)
     resumed.resume(checkpoint)
     resumed.run(source().batches, checkpoint, Schedule(10, 0.0, report=note))
-    assert [step for step, _ in seen[1:]] == [20, 20, 30, 40]
-    assert seen[-1][1] < seen[0][1]
+    assert [step for step, _ in records[1:]] == [20, 20, 30, 40]
+    assert records[-1][1] < records[0][1]
 
 
 WORKER = """
@@ -292,8 +293,8 @@ class Together:
     """The batches of two workers as one."""
 
     def batches(self, first: int = 0) -> Iterator[Batch]:
-        each = [source(rank=rank, workers=2).batches(first) for rank in range(2)]
-        for one, other in zip(*each, strict=True):
+        batches = [source(rank=rank, workers=2).batches(first) for rank in range(2)]
+        for one, other in zip(*batches, strict=True):
             degraded, reference = (torch.cat(both) for both in zip(one[:2], other[:2], strict=True))
             yield Batch(degraded, reference)
 
@@ -311,14 +312,14 @@ def test_two_workers_do_the_steps_of_one_with_a_batch_twice_as_large(tmp_path: P
         "OMP_NUM_THREADS": "1",
         "PYTHONPATH": str(Path(__file__).parents[3]),
     }
-    told: dict[str, Any] = {
+    options: dict[str, Any] = {
         "env": environment,
         "capture_output": True,
         "text": True,
         "timeout": 240,
         "check": False,
     }
-    result = subprocess.run([*command, str(script), str(tmp_path / "two")], **told)
+    result = subprocess.run([*command, str(script), str(tmp_path / "two")], **options)
     assert result.returncode == 0, result.stderr[-2000:]
     recipe = TrainingRecipe(steps=3, batch=3, warm_up_steps=1)
     alone, two = (Trainer(VARIANT, recipe, precision="float32") for _ in range(2))
@@ -326,8 +327,8 @@ def test_two_workers_do_the_steps_of_one_with_a_batch_twice_as_large(tmp_path: P
     two.resume(tmp_path / "two")
     start = Trainer(VARIANT, recipe)
     for name, value in alone.network.state_dict().items():
-        moved = float((value - start.network.state_dict()[name]).abs().max())
-        torch.testing.assert_close(two.network.state_dict()[name], value, rtol=0, atol=0.1 * moved)
+        change = float((value - start.network.state_dict()[name]).abs().max())
+        torch.testing.assert_close(two.network.state_dict()[name], value, rtol=0, atol=0.1 * change)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -335,11 +336,11 @@ def test_two_workers_do_the_steps_of_one_with_a_batch_twice_as_large(tmp_path: P
 def test_a_recorded_step_learns_as_the_processor_does(conditioned: bool, tmp_path: Path) -> None:
     losses: dict[str, list[float]] = {}
     for device in ("cpu", "cuda"):
-        seen = losses.setdefault(device, [])
+        values = losses.setdefault(device, [])
         trainer = Trainer(
             VARIANT, TrainingRecipe(steps=60, batch=3), device=device, conditioned=conditioned
         )
-        note = Schedule(20, report=lambda _, terms, __, seen=seen: seen.append(terms["l1"]))  # type: ignore[misc]
+        note = Schedule(20, report=lambda _, terms, __, values=values: values.append(terms["l1"]))  # type: ignore[misc]
         # Patches of the processor for both: a GPU draws other noise.
         trainer.run(source(conditioned=conditioned).batches, tmp_path / device, note)
     np.testing.assert_allclose(losses["cuda"], losses["cpu"], rtol=0.02)

@@ -18,9 +18,9 @@ EYES = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
 
 
 def test_whole_sites_are_held_out_the_smallest_first_in_any_order() -> None:
-    kept, held = split_by_site(NAMES)
-    assert sorted(kept + held) == list(range(41))
-    assert {NAMES[k].split("_")[0] for k in held} == {"dunes.jpg", "forest"}
+    training, validation = split_by_site(NAMES)
+    assert sorted(training + validation) == list(range(41))
+    assert {NAMES[k].split("_")[0] for k in validation} == {"dunes.jpg", "forest"}
     order = list(reversed(NAMES))
     assert {order[k] for k in split_by_site(order)[1]} == {
         NAMES[k] for k in split_by_site(NAMES)[1]
@@ -38,7 +38,8 @@ def test_a_new_network_is_judged_like_its_input_also_on_odd_sides_at_half_resolu
 ) -> None:
     scenes = [procedural_scene(side, side, np.random.default_rng(side)) for side in (303, 460, 90)]
     validation = Validation(scenes, *EYES)
-    assert len(validation.pairs) == 2  # the third is too small
+    # The third scene is too small for a pair.
+    assert len(validation.pairs) == 2
     assert all(side % 2 for side in validation.pairs[0][0].shape[-2:])
     network = ConvBEERS(Variant(1, 4, scale)).eval()
     for parameter in network.tail.parameters():
@@ -47,5 +48,5 @@ def test_a_new_network_is_judged_like_its_input_also_on_odd_sides_at_half_resolu
     assert validation.restore(network)[0].shape == validation.pairs[0][0].shape[-2:]
     assert judged["psnr_db"] == judged["degraded_psnr_db"]
     assert 0.5 < judged["ssim"] < 1
-    again = Validation(scenes, *EYES).judge(network)
-    assert again == judged
+    repeated = Validation(scenes, *EYES).judge(network)
+    assert repeated == judged

@@ -46,31 +46,33 @@ SENSORS = [
 
 
 def network(scale: int) -> BankedConvBEERS:
-    made = BankedConvBEERS(Variant(2, 8, scale))
+    created = BankedConvBEERS(Variant(2, 8, scale))
     generator = torch.Generator().manual_seed(scale)
-    initialise(made, generator)
+    initialise(created, generator)
     with torch.no_grad():
-        for parameter in made.parameters():
+        for parameter in created.parameters():
             parameter.add_(0.04 * torch.randn(parameter.shape, generator=generator))
-    return made.eval()
+    return created.eval()
 
 
-def weights_of(made: BankedConvBEERS) -> Weights:
+def weights_of(network: BankedConvBEERS) -> Weights:
     return Weights(
-        {name: value.numpy() for name, value in made.state_dict().items()}, made.variant, {}
+        {name: value.numpy() for name, value in network.state_dict().items()}, network.variant, {}
     )
 
 
 @pytest.fixture(scope="module", params=[1, 2])
 def pair(request: pytest.FixtureRequest) -> tuple[BankedConvBEERS, Family]:
-    made = network(request.param)
+    float_network = network(request.param)
     scale = int(request.param)
     images = [
-        bank_results(textured(48, 48, k), bank_of_vector(each), each, scale)
-        for k, each in enumerate(SENSORS)
+        bank_results(textured(48, 48, k), bank_of_vector(vector), vector, scale)
+        for k, vector in enumerate(SENSORS)
     ]
     middle = bank_of_vector((0.0, 0.0, 0.0, 0.0))
-    return made, quantise_family(weights_of(made), middle, Remade(images.__getitem__, len(images)))
+    return float_network, quantise_family(
+        weights_of(float_network), middle, Remade(images.__getitem__, len(images))
+    )
 
 
 def core_of(family: Family, vector: tuple[float, ...]) -> IntCore:
@@ -81,16 +83,19 @@ def core_of(family: Family, vector: tuple[float, ...]) -> IntCore:
 def test_int8_is_near_the_float_network_for_every_sensor(
     pair: tuple[BankedConvBEERS, Family], vector: tuple[float, ...]
 ) -> None:
-    made, family = pair
-    image = 0.3 + 0.3 * textured(
-        46, 58, 9
-    )  # within eight units of the quietest sensor, where int8 ends
+    float_network, family = pair
+    # The texture stays within eight units of the quietest sensor, where INT8 ends.
+    image = 0.3 + 0.3 * textured(46, 58, 9)
     with torch.inference_mode():
-        wanted = made(torch.from_numpy(image), told_of(torch.tensor([vector]))).clamp(0, 1).numpy()
-    found = run(open_session(host_model(core_of(family, vector), {})), image)
+        expected = (
+            float_network(torch.from_numpy(image), told_of(torch.tensor([vector])))
+            .clamp(0, 1)
+            .numpy()
+        )
+    actual = run(open_session(host_model(core_of(family, vector), {})), image)
     unit = bank_of_vector(vector).unit
-    assert np.sqrt(np.square(found - wanted).mean()) < 0.05 * unit
-    assert np.sqrt(np.square(image - wanted).mean()) > 0.1 * unit
+    assert np.sqrt(np.square(actual - expected).mean()) < 0.05 * unit
+    assert np.sqrt(np.square(image - expected).mean()) > 0.1 * unit
 
 
 @pytest.mark.parametrize("vector", SENSORS)
@@ -100,55 +105,65 @@ def test_points_and_saturated_edges_are_corrected_as_far_as_in_float(
     """Also where the fine copies of the analytic restoration end, which they do behind blurred
     sensors.
     """
-    made, family = pair
+    float_network, family = pair
     image = np.full((1, 1, 46, 58), 0.1, np.float32)
     image[..., 10:30, 20:40] = 1.0
     image[..., 38, 8] = 0.5
     with torch.inference_mode():
-        wanted = made(torch.from_numpy(image), told_of(torch.tensor([vector]))).clamp(0, 1).numpy()
-    found = run(open_session(host_model(core_of(family, vector), {})), image)
+        expected = (
+            float_network(torch.from_numpy(image), told_of(torch.tensor([vector])))
+            .clamp(0, 1)
+            .numpy()
+        )
+    actual = run(open_session(host_model(core_of(family, vector), {})), image)
     bank = bank_of_vector(vector)
-    most = np.abs(wanted - image).max()
+    most = np.abs(expected - image).max()
     reach = LARGEST * bank.unit / bank.gain
     assert vector != SENSORS[0] or most > 1.3 * reach
-    assert np.abs(found - wanted).max() < 0.3 * most
-    assert np.abs(found - image).max() > 0.9 * most
+    assert np.abs(actual - expected).max() < 0.3 * most
+    assert np.abs(actual - image).max() > 0.9 * most
 
 
 @pytest.mark.parametrize("vector", SENSORS)
 def test_a_float_network_rounded_as_its_file_errs_as_that_does(
     pair: tuple[BankedConvBEERS, Family], vector: tuple[float, ...]
 ) -> None:
-    made, family = pair
+    float_network, family = pair
     image = 0.3 + 0.3 * textured(46, 58, 9)
-    told = told_of(torch.tensor([vector]))
+    condition = told_of(torch.tensor([vector]))
     stream, *inner = (
-        torch.from_numpy(each)[:, None, None] for each in map_steps(family, weights_of(made))
+        torch.from_numpy(values)[:, None, None]
+        for values in map_steps(family, weights_of(float_network))
     )
     with torch.inference_mode():
-        plain = made(torch.from_numpy(image), told)
-        steps = Rounding(stream, tuple(inner)).steps(told.gains)
-        rounded = made(torch.from_numpy(image), told, steps=steps)
+        plain = float_network(torch.from_numpy(image), condition)
+        steps = Rounding(stream, tuple(inner)).steps(condition.gains)
+        rounded = float_network(torch.from_numpy(image), condition, steps=steps)
     file = run(open_session(host_model(core_of(family, vector), {})), image)
     errors = file - plain.clamp(0, 1).numpy(), (rounded - plain).numpy()
     ratio = np.linalg.norm(errors[1]) / np.linalg.norm(errors[0])
-    assert 0.4 < ratio < 1.1  # weights, the bank and the last sum are rounded in the file alone
+    # Only the file rounds weights, the bank and the last sum, so the ratio is not 1.
+    assert 0.4 < ratio < 1.1
 
 
 def test_the_steps_of_maps_turn_float_weights_into_the_files(
     pair: tuple[BankedConvBEERS, Family],
 ) -> None:
-    made, family = pair
-    stream, *inner = map_steps(family, weights_of(made))
+    float_network, family = pair
+    stream, *inner = map_steps(family, weights_of(float_network))
     convolutions = {op.name: op for op in family.core.convolutions}
-    for k, read in enumerate(inner):  # what the steps were not found by
+    # These layers were not used to find the steps.
+    for k, read_steps in enumerate(inner):
         op = convolutions[f"body.{k}.second"]
-        given = made.state_dict()[f"body.{k}.second.weight"].numpy()
+        weight = float_network.state_dict()[f"body.{k}.second.weight"].numpy()
         bits = (
             op.weight_frac_bits + family.core.frac_bits[op.input] - family.core.frac_bits[op.output]
         )
-        wanted = (given * (read * 2.0**bits / stream[:, None])[:, :, None, None]).clip(-128, 127)
-        assert np.sqrt(np.square(op.weight - wanted).mean()) < 1  # of 127; without levelling tens
+        expected = (weight * (read_steps * 2.0**bits / stream[:, None])[:, :, None, None]).clip(
+            -128, 127
+        )
+        # One step of 127 is allowed. Without equalization the error would be tens of steps.
+        assert np.sqrt(np.square(op.weight - expected).mean()) < 1
 
 
 def test_the_file_is_what_its_integers_ask_for_and_the_reference_gives_the_same(
@@ -158,9 +173,9 @@ def test_the_file_is_what_its_integers_ask_for_and_the_reference_gives_the_same(
     image = textured(30, 34, 5)
     file = host_model(core, {"precision": "int8 legal"})
     assert encoding_faults(file) == []
-    again = read_core(file)
-    tensors, _ = run_core(again, again.ends.split(image), half_even=True)
-    mine = again.ends.finished(image, merged_correction(again, tensors))
+    core_again = read_core(file)
+    tensors, _ = run_core(core_again, core_again.ends.split(image), half_even=True)
+    mine = core_again.ends.finished(image, merged_correction(core_again, tensors))
     np.testing.assert_allclose(mine, run(open_session(file), image), atol=1e-7)
 
 
@@ -173,9 +188,9 @@ def test_a_sensor_changes_the_first_layer_biases_and_the_unit_alone(
     for one, other in zip(first.ops, second.ops, strict=True):
         if isinstance(one, IntConv) and isinstance(other, IntConv):
             assert np.array_equal(one.weight, other.weight) == (one.name != "bank")
-            told = replace(one, weight=other.weight, weight_frac_bits=other.weight_frac_bits)
+            conditioned = replace(one, weight=other.weight, weight_frac_bits=other.weight_frac_bits)
             assert (
-                replace(told, bias=other.bias, bias_frac_bits=other.bias_frac_bits) == other
+                replace(conditioned, bias=other.bias, bias_frac_bits=other.bias_frac_bits) == other
                 or one.name != "bank"
             )
 
@@ -197,12 +212,12 @@ def test_a_body_finer_by_its_gain_makes_what_it_makes_at_a_gain_of_one(
 def test_the_file_of_any_sensor_can_be_told_another(pair: tuple[BankedConvBEERS, Family]) -> None:
     family = pair[1]
     first, second = (
-        host_model(core_of(family, each), {FAMILY: family.to_words()}) for each in SENSORS[:2]
+        host_model(core_of(family, vector), {FAMILY: family.to_words()}) for vector in SENSORS[:2]
     )
-    again = family_of(first)
-    assert again is not None
-    found = host_model(core_of(again, SENSORS[1]), {FAMILY: again.to_words()})
-    assert found.SerializeToString(deterministic=True) == second.SerializeToString(
+    stored_family = family_of(first)
+    assert stored_family is not None
+    rebuilt = host_model(core_of(stored_family, SENSORS[1]), {FAMILY: stored_family.to_words()})
+    assert rebuilt.SerializeToString(deterministic=True) == second.SerializeToString(
         deterministic=True
     )
 
@@ -212,14 +227,14 @@ def test_a_delta_makes_any_sensors_file_that_sensors_to_the_byte(
 ) -> None:
     family = pair[1]
     first, second = (
-        host_model(core_of(family, each), {FAMILY: family.to_words(), "sensor": str(k)})
-        for k, each in enumerate(SENSORS[:2])
+        host_model(core_of(family, vector), {FAMILY: family.to_words(), "sensor": str(k)})
+        for k, vector in enumerate(SENSORS[:2])
     )
     delta = delta_of_file(second)
     assert len(delta) < 3000
     core, name = with_delta(required_family(first).core, delta)
-    found = host_model(core, {FAMILY: family.to_words(), "sensor": name})
-    assert found.SerializeToString(deterministic=True) == second.SerializeToString(
+    rebuilt = host_model(core, {FAMILY: family.to_words(), "sensor": name})
+    assert rebuilt.SerializeToString(deterministic=True) == second.SerializeToString(
         deterministic=True
     )
 
@@ -259,7 +274,7 @@ def test_tiles_give_the_whole_images_result(pair: tuple[BankedConvBEERS, Family]
     image = textured(96, 80, 6)
     session = open_session(file)
     tiling = tiling_of(file)
-    whole = run(session, image)
+    at_once = run(session, image)
     halo = tiling.halo_px
     assert tiling.lattice_px == pair[0].variant.scale
     for top, left in ((0, 0), (32, 24), (64, 48)):
@@ -270,8 +285,8 @@ def test_tiles_give_the_whole_images_result(pair: tuple[BankedConvBEERS, Family]
         tile = run(
             session, np.ascontiguousarray(image[..., above : bottom + halo, before : right + halo])
         )
-        kept = tile[..., top - above : bottom - above, left - before : right - before]
-        np.testing.assert_array_equal(kept, whole[..., top:bottom, left:right])
+        core_rows = tile[..., top - above : bottom - above, left - before : right - before]
+        np.testing.assert_array_equal(core_rows, at_once[..., top:bottom, left:right])
 
 
 def test_no_image_leaves_the_bounds_that_are_proven(pair: tuple[BankedConvBEERS, Family]) -> None:

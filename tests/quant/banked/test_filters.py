@@ -32,8 +32,8 @@ def sums(image: np.ndarray, own: Bank) -> np.ndarray:
     """What the first convolution makes of an image (1, 1, H, W), in steps, before anything is
     rounded or added.
     """
-    whole = whole_bank(own, 1, own.gain)
-    return convolve(split_planes(image), whole.weight, Window()) / 2.0**whole.frac_bits
+    bank = whole_bank(own, 1, own.gain)
+    return convolve(split_planes(image), bank.weight, Window()) / 2.0**bank.frac_bits
 
 
 def textured(rows: int, columns: int, seed: int = 0) -> np.ndarray:
@@ -60,11 +60,11 @@ def textured(rows: int, columns: int, seed: int = 0) -> np.ndarray:
 @example(MAX_DN)
 @given(st.integers(0, MAX_DN))
 def test_the_planes_hold_every_number(dn: int) -> None:
-    found = split_planes(np.full((1, 1, 1, 1), dn / MAX_DN, np.float32))[0, :, 0, 0].astype(int)
-    coarse, again, remainder, part = found
-    assert coarse == again
-    assert (found >= PLANE_ENDS[0]).all()
-    assert (found <= PLANE_ENDS[1]).all()
+    planes = split_planes(np.full((1, 1, 1, 1), dn / MAX_DN, np.float32))[0, :, 0, 0].astype(int)
+    coarse, coarse_copy, remainder, part = planes
+    assert coarse == coarse_copy
+    assert (planes >= PLANE_ENDS[0]).all()
+    assert (planes <= PLANE_ENDS[1]).all()
     assert MIDDLE_DN + STEP_DN * coarse + remainder == dn
     assert abs(PART * part - remainder) <= PART / 2
 
@@ -76,9 +76,9 @@ def test_flat_ground_leaves_nothing_but_its_own_brightness(
 ) -> None:
     flat = np.full((1, 1, SIDE_PX, SIDE_PX), dn / MAX_DN, np.float32)
     own = bank_of_vector(vector)
-    found = sums(flat, own)[0, :, 0, 0]
-    np.testing.assert_array_equal(found[COPIES[0] :], 0)
-    assert abs(found[0] - (dn - MIDDLE_DN) * own.gain / IMAGE_STEP_DN) <= 0.5 * own.gain
+    response = sums(flat, own)[0, :, 0, 0]
+    np.testing.assert_array_equal(response[COPIES[0] :], 0)
+    assert abs(response[0] - (dn - MIDDLE_DN) * own.gain / IMAGE_STEP_DN) <= 0.5 * own.gain
 
 
 @settings(max_examples=15)
@@ -86,19 +86,18 @@ def test_flat_ground_leaves_nothing_but_its_own_brightness(
 def test_the_weights_are_int8_and_near_the_filters(vector: tuple[float, ...]) -> None:
     own = bank_of_vector(vector)
     gain = own.gain
-    whole = whole_bank(own, 1, gain)
-    coarse_pair = whole.weight[:, :2].astype(int)
-    assert (
-        62 <= np.abs(coarse_pair).max() < 127
-    )  # no finer scale would hold them, and none is cut off
+    bank = whole_bank(own, 1, gain)
+    coarse_pair = bank.weight[:, :2].astype(int)
+    # No finer scale would hold the weights, and none of them is clipped.
+    assert 62 <= np.abs(coarse_pair).max() < 127
     assert np.ptp(coarse_pair, axis=1).max() <= 1
     for channel, (kernel, _) in enumerate(channels()):
         steps_per_dn = gain * (UNIT_STEPS / MAX_DN if kernel else 1 / IMAGE_STEP_DN)
-        known = own.kernels[-1] / WIDE if kernel == COARSE else own.kernels[kernel]
-        wanted = known * steps_per_dn * 2.0**whole.frac_bits
-        one, two, fine, part = whole.weight[channel].astype(float)
-        assert np.abs((one + two) / STEP_DN - wanted).max() < 5 / STEP_DN
-        assert kernel == 0 or np.abs(fine + part / PART - wanted).max() < 5 / PART
+        kernel_values = own.kernels[-1] / WIDE if kernel == COARSE else own.kernels[kernel]
+        expected = kernel_values * steps_per_dn * 2.0**bank.frac_bits
+        one, two, fine, part = bank.weight[channel].astype(float)
+        assert np.abs((one + two) / STEP_DN - expected).max() < 5 / STEP_DN
+        assert kernel == 0 or np.abs(fine + part / PART - expected).max() < 5 / PART
 
 
 @settings(max_examples=8)
@@ -112,14 +111,16 @@ def test_the_mean_of_the_copies_is_what_the_filter_gives(vector: tuple[float, ..
     centred = np.lib.stride_tricks.sliding_window_view(
         image[0, 0].astype(np.float64), (SIDE_PX, SIDE_PX)
     )
-    found = sums(image, own)[0]
-    read = [kernel for kernel, _ in channels()]
+    responses = sums(image, own)[0]
+    kernels = [kernel for kernel, _ in channels()]
     for kernel in range(1, COARSE + 1):
-        known = own.kernels[-1] / WIDE if kernel == COARSE else own.kernels[kernel]
-        wanted = own.gain * UNIT_STEPS * np.einsum("ijkl,kl->ij", centred, known)
-        mean = found[[place for place, each in enumerate(read) if each == kernel]].mean(0)
-        assert np.sqrt(np.square(mean - wanted).mean()) < 0.3 + 0.05 * np.sqrt(
-            np.square(wanted).mean()
+        kernel_values = own.kernels[-1] / WIDE if kernel == COARSE else own.kernels[kernel]
+        expected = own.gain * UNIT_STEPS * np.einsum("ijkl,kl->ij", centred, kernel_values)
+        mean = responses[
+            [place for place, channel_kernel in enumerate(kernels) if channel_kernel == kernel]
+        ].mean(0)
+        assert np.sqrt(np.square(mean - expected).mean()) < 0.3 + 0.05 * np.sqrt(
+            np.square(expected).mean()
         )
 
 
@@ -140,13 +141,14 @@ def test_at_half_resolution_the_same_filters_meet_the_same_pixels() -> None:
     assert fine.frac_bits == coarse.frac_bits
     planes = split_planes(image)
     blocks = planes.reshape(1, 4, 16, 2, 18, 2).transpose(0, 1, 3, 5, 2, 4).reshape(1, 16, 16, 18)
-    found = convolve(blocks, coarse.weight, Window())  # of places 2 .. 13
+    # The result is that of places 2 to 13.
+    actual = convolve(blocks, coarse.weight, Window())
     first = [kernel for kernel, _ in channels()].index(1)
-    wanted = convolve(planes, fine.weight, Window())[0, first, 1:-1, 1:-1]
+    expected = convolve(planes, fine.weight, Window())[0, first, 1:-1, 1:-1]
     mine = (
-        found[0]
-        .reshape(-1, 2, 2, *found.shape[2:])[first]
+        actual[0]
+        .reshape(-1, 2, 2, *actual.shape[2:])[first]
         .transpose(2, 0, 3, 1)
-        .reshape(wanted.shape)
+        .reshape(expected.shape)
     )
-    np.testing.assert_array_equal(mine, wanted)
+    np.testing.assert_array_equal(mine, expected)

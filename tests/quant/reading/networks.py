@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import cache
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -27,27 +28,27 @@ WEIGHTS: dict[str, tuple[int, ...]] = {
 def values() -> dict[str, np.ndarray]:
     """Numbers of no special value: none is 0 or 1."""
     rng = np.random.default_rng(3)
-    found = {
+    tensors = {
         name: rng.uniform(0.3, 0.9, shape).astype(np.float32) for name, shape in WEIGHTS.items()
     }
-    found |= {
+    tensors |= {
         name: rng.uniform(0.5, 2, (4,)).astype(np.float32)
         for name in ("gain", "offset", "mean", "variance")
     }
-    found |= {
+    tensors |= {
         "six": np.array(6, np.float32),
         "zero": np.array(0, np.float32),
         "pads": np.array([0, 0, 1, 1, 0, 0, 1, 1]),
     }
-    found |= {
+    tensors |= {
         "around": np.array([0, 0, 1, 2, 0, 0, 2, 1]),
         "twice": np.array([1, 1, 2, 2], np.float32),
     }
-    found |= {"small": np.array([2, 4, 2, 3]), "rows": np.array([0, -1])}
-    found |= {"two": np.array([2]), "four": np.array([4])}
-    found |= {"map again": np.array([-1, 4, 1, 1])}
-    found |= {"axes": np.array([2, 3]), "roi": np.zeros(0, np.float32)}
-    return found
+    tensors |= {"small": np.array([2, 4, 2, 3]), "rows": np.array([0, -1])}
+    tensors |= {"two": np.array([2]), "four": np.array([4])}
+    tensors |= {"map again": np.array([-1, 4, 1, 1])}
+    tensors |= {"axes": np.array([2, 3]), "roi": np.zeros(0, np.float32)}
+    return tensors
 
 
 def made(
@@ -59,15 +60,15 @@ def made(
     """A network from `x` (N, 4, H, W) to `y`, with the named numbers it reads as initializers of
     this kind.
     """
-    read = {name for node in nodes for name in node.input}
-    held = [
-        numpy_helper.from_array(value, name) for name, value in values().items() if name in read
+    inputs = set(chain.from_iterable(node.input for node in nodes))
+    initializers = [
+        numpy_helper.from_array(value, name) for name, value in values().items() if name in inputs
     ]
     if kind != TensorProto.FLOAT:
-        held = [tensor_as(tensor, kind) for tensor in held]
+        initializers = [tensor_as(tensor, kind) for tensor in initializers]
     x = helper.make_tensor_value_info("x", kind, ["N", CHANNELS, "H", "W"])
     ends = [helper.make_tensor_value_info(name, kind, ["N", "C", "H2", "W2"]) for name in outputs]
-    graph = helper.make_graph(list(nodes), "made", [x], ends, held)
+    graph = helper.make_graph(list(nodes), "made", [x], ends, initializers)
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8)
 
 

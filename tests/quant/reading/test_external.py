@@ -53,19 +53,19 @@ def rewritten(path: Path, change: Damage) -> Path:
 def stating(key: str, value: str) -> Damage:
     def change(model: onnx.ModelProto) -> None:
         entries = model.graph.initializer[1].external_data
-        kept = [(e.key, e.value) for e in entries if e.key != key]
+        entries_left = [(e.key, e.value) for e in entries if e.key != key]
         del entries[:]
-        for name, text in (*kept, (key, value)):
+        for name, text in (*entries_left, (key, value)):
             entries.add(key=name, value=text)
 
     return change
 
 
 def test_the_same_network_apart_and_whole_computes_the_same(saved: Path) -> None:
-    whole = load_onnx(saved.parents[1] / "whole.onnx")
-    apart = load_onnx(saved)
-    assert apart.graph.initializer == whole.graph.initializer
-    expected, result = (run(open_session(model, 1), IMAGE) for model in (whole, apart))
+    one_file = load_onnx(saved.parents[1] / "whole.onnx")
+    two_files = load_onnx(saved)
+    assert two_files.graph.initializer == one_file.graph.initializer
+    expected, result = (run(open_session(model, 1), IMAGE) for model in (one_file, two_files))
     np.testing.assert_array_equal(result, expected)
     assert result.std() > 0
 
@@ -86,6 +86,7 @@ def test_no_file_outside_the_models_folder_is_opened(
     (saved.parents[1] / "weights.bin").write_bytes((saved.parent / "weights.bin").read_bytes())
     rewritten(saved, stating("location", place))
     model = onnx.load_model(saved, load_external_data=False)
+    # Only the tensor with the changed place stays, so that no other tensor opens a file.
     model.graph.initializer.pop(0)
     monkeypatch.setattr(Path, "open", lambda *_: pytest.fail("opened"))
     with pytest.raises(ModelError, match="outside the model's folder"):
@@ -153,9 +154,9 @@ def test_a_digest_tells_networks_apart_that_differ_in_the_file_beside_alone(save
     before = network_sha256(saved)
     own = sha256(saved)
     assert before != own
-    beside = saved.parent / "weights.bin"
-    beside.write_bytes(beside.read_bytes()[::-1])
+    weights_file = saved.parent / "weights.bin"
+    weights_file.write_bytes(weights_file.read_bytes()[::-1])
     assert sha256(saved) == own
     assert network_sha256(saved) != before
-    whole = saved.parents[1] / "whole.onnx"
-    assert network_sha256(whole) == sha256(whole)
+    one_file = saved.parents[1] / "whole.onnx"
+    assert network_sha256(one_file) == sha256(one_file)

@@ -95,7 +95,7 @@ def test_names_and_what_is_said_of_a_network_stay() -> None:
         [conv(), node("Identity", "c", to="i"), node("Relu", "i"), conv("c", "z")],
         outputs=("y", "z"),
     )
-    # the first is named by its output, were it free
+    # A node without a name would get the name of its output, if another node did not have it.
     model.graph.node[0].name = ""
     model.graph.node[2].name = "c"
     helper.set_model_props(model, {"variant": "mine"})
@@ -131,8 +131,8 @@ def test_the_same_file_gives_the_same_bytes_and_is_not_changed() -> None:
     short = simplest(model, "a.onnx")
     assert short.SerializeToString() == simplest(model, "b.onnx").SerializeToString()
     assert model.SerializeToString() == before
-    again = simplest(short, "a.onnx")
-    assert again.SerializeToString() == short.SerializeToString()
+    repeated = simplest(short, "a.onnx")
+    assert repeated.SerializeToString() == short.SerializeToString()
 
 
 def test_files_that_need_nothing_stay_as_they_are(tmp_path: Path) -> None:

@@ -31,10 +31,10 @@ def saved(model: onnx.ModelProto, folder: Path) -> Path:
 
 
 def branch(name: str, value: float) -> onnx.GraphProto:
-    chosen = helper.make_tensor(name, TensorProto.FLOAT, [1], [value])
+    constant = helper.make_tensor(name, TensorProto.FLOAT, [1], [value])
     result = helper.make_tensor_value_info(name, TensorProto.FLOAT, [1])
     return helper.make_graph(
-        [helper.make_node("Constant", [], [name], value=chosen)], name, [], [result]
+        [helper.make_node("Constant", [], [name], value=constant)], name, [], [result]
     )
 
 
@@ -64,8 +64,8 @@ def test_what_no_runtime_of_ours_may_get_is_named_and_may_be_looked_at(
     with pytest.raises(ModelError, match=words):
         load_onnx(path)
     refused = [
-        found.op.op_type.rpartition("::")[2]
-        for found in place(read_network(path, 32), load_dpu("vck190")).failed
+        placement.op.op_type.rpartition("::")[2]
+        for placement in place(read_network(path, 32), load_dpu("vck190")).failed
     ]
     assert words.split()[0] in refused
 
@@ -92,7 +92,9 @@ def test_any_batch_is_read(batch: str | int, tmp_path: Path) -> None:
     assert short.graph.input[0].type.tensor_type.shape.dim[0] == first
     count = 2 if isinstance(batch, str) else batch
     image = np.random.default_rng(1).random((count, 4, 5, 7)).astype(np.float32)
-    before, after = (tensors_of(open_session(each, 1), None, image)[0] for each in (model, short))
+    before, after = (
+        tensors_of(open_session(network, 1), None, image)[0] for network in (model, short)
+    )
     np.testing.assert_allclose(after, before, rtol=1e-5, atol=1e-5)
 
 

@@ -24,14 +24,14 @@ def constant(value: object, name: str) -> NodeProto:
 
 
 def dropout(*mode: NodeProto, **about: Any) -> list[NodeProto]:
-    given = ["c", "ratio", "mode"] if mode else ["c"]
+    inputs = ["c", "ratio", "mode"] if mode else ["c"]
     ratio = [helper.make_node("Constant", [], ["ratio"], value=RATIO)] if mode else []
-    return [*ratio, *mode, helper.make_node("Dropout", given, ["d"], name="drop", **about)]
+    return [*ratio, *mode, helper.make_node("Dropout", inputs, ["d"], name="drop", **about)]
 
 
 def normalisation(*more: str, **about: Any) -> list[NodeProto]:
-    given = ["c", "gain", "offset", "mean", "variance"]
-    return [helper.make_node("BatchNormalization", given, ["d", *more], name="normalise", **about)]
+    inputs = ["c", "gain", "offset", "mean", "variance"]
+    return [helper.make_node("BatchNormalization", inputs, ["d", *more], name="normalise", **about)]
 
 
 def network(nodes: list[NodeProto], opset: int = 17) -> onnx.ModelProto:
@@ -60,9 +60,9 @@ IN_USE = {
 def test_training_mode_is_refused_in_one_sentence(name: str, tmp_path: Path) -> None:
     path = tmp_path / "network.onnx"
     path.write_bytes(TRAINING[name].SerializeToString())
-    with pytest.raises(ModelError, match=r"in training mode.*model\.eval") as raised:
+    with pytest.raises(ModelError, match=r"in training mode.*model\.eval") as caught:
         load_onnx(path)
-    assert str(raised.value).isprintable()
+    assert str(caught.value).isprintable()
     load_onnx(path, to_run=False)
 
 

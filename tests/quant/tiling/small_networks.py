@@ -37,6 +37,7 @@ def whole(name: str, *values: int) -> onnx.TensorProto:
 
 def taps(name: str, *shape: int) -> onnx.TensorProto:
     """Weights of small whole numbers, whose sums are exact in any order."""
+    # Sums of small integers are exact in float32, whatever order a runtime adds in.
     values = np.random.default_rng(list(name.encode())).choice([-2, -1, 1, 2, 3], shape)
     return numpy_helper.from_array(values.astype(np.float32), name)
 
@@ -216,10 +217,8 @@ class Builder(Row):
         """By itself, then used up by a window; or moved, cut off on the one side that was not
         padded.
         """
-        mode, before, behind = (
-            self.draw(st.sampled_from(["constant", "edge", "reflect"])),
-            *self.pads(2)[::2],
-        )
+        mode = self.draw(st.sampled_from(["constant", "edge", "reflect"]))
+        before, behind = self.pads(2)[::2]
         self.add("Pad", whole("pads", 0, 0, before, before, 0, 0, behind, behind), mode=mode)
         if before == behind or self.draw(st.booleans()):
             self.convolve(3)
@@ -411,12 +410,10 @@ def check_tiles(
         for top, bottom, low, high in sides[0]:
             row = []
             for left, right, west, east in sides[1]:
-                found = result_of(
-                    session, np.ascontiguousarray(image[:, :, top:bottom, left:right])
-                )
+                tile = result_of(session, np.ascontiguousarray(image[:, :, top:bottom, left:right]))
                 ends = [
                     int(n * tiling.scale) for n in (low - top, high - top, west - left, east - left)
                 ]
-                row.append(found[:, :, ends[0] : ends[1], ends[2] : ends[3]])
+                row.append(tile[:, :, ends[0] : ends[1], ends[2] : ends[3]])
             rows.append(np.concatenate(row, axis=3))
         np.testing.assert_array_equal(np.concatenate(rows, axis=2), expected)

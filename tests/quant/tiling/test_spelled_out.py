@@ -111,9 +111,9 @@ def test_moves_between_integers_are_of_integers() -> None:
         helper.make_node("QuantizeLinear", ["less", *unit], ["moved"]),
         helper.make_node("DequantizeLinear", ["moved", *unit], ["restored"]),
     ]
-    held = {"unit": np.float32(0.5), "zero": np.int8(0), "at": np.array([2])}
+    values = {"unit": np.float32(0.5), "zero": np.int8(0), "at": np.array([2])}
     model = graph(
-        nodes, *(numpy_helper.from_array(np.asarray(value), name) for name, value in held.items())
+        nodes, *(numpy_helper.from_array(np.asarray(value), name) for name, value in values.items())
     )
     kinds = [(op.kind, op.integer) for op in network_of(model, 8).operations]
     assert kinds == [("quantise", True), ("pixel shuffle", True), ("dequantise", False)]

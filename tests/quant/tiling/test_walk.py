@@ -86,7 +86,8 @@ EXACT = {
         .add("Pad", pad(1, 0), mode="reflect")
         .add("Slice", *cut((0, 0), -1))
         .model(),
-        Tiling(3, least_px=2),  # a mirror needs pixels
+        # Mirrored padding needs as many pixels as it mirrors.
+        Tiling(3, least_px=2),
     ),
     "looks back, copied and moved": (
         looking([2, 2, 0, 0])

@@ -42,19 +42,15 @@ def landscape(seed: int, board: bool) -> np.ndarray:
     return radiance
 
 
-def acquisition(seed: int, board: bool) -> np.ndarray:
-    return to_uint16(
-        acquire(scene_spectrum(landscape(seed, board)), SIDE, SENSOR, RATIO, Draw(seed), "degraded")
-    )
-
-
 @pytest.fixture(scope="module")
 def raw(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Two raw images of one sensor, the checkerboard in the first."""
     folder = tmp_path_factory.mktemp("raw")
     paths = folder / "board.tif", folder / "plain.tif"
     for seed, path in enumerate(paths):
-        tifffile.imwrite(path, acquisition(seed, board=seed == 0))
+        spectrum = scene_spectrum(landscape(seed, board=seed == 0))
+        signal = acquire(spectrum, SIDE, SENSOR, RATIO, Draw(seed), "degraded")
+        tifffile.imwrite(path, to_uint16(signal))
     return paths
 
 
@@ -87,13 +83,14 @@ def test_the_profile_is_that_of_the_sensor(raw: tuple[Path, Path], tmp_path: Pat
     }
     done("characterise", *raw, *options, "--out", tmp_path / "again.toml")
     assert (tmp_path / "again.toml").read_bytes() == out.read_bytes()
-    shown = valid(figures)["rows"][0]["figures"]
-    truths = [100 * c for mtf in SENSOR.mtf_axes for c in transfer(FREQUENCIES, mtf)] + list(SNRS)
-    assert {figure["mode"] for figure in shown.values()} == {"measured"}
-    intervals = [figure["interval"] for figure in shown.values()][: len(truths)]
-    assert (
-        sum(low <= true <= high for (low, high), true in zip(intervals, truths, strict=True)) >= 6
-    )
+    by_name = valid(figures)["rows"][0]["figures"]
+    contrasts = np.concatenate([transfer(FREQUENCIES, mtf) for mtf in SENSOR.mtf_axes])
+    truths = [*(100 * contrasts), *SNRS]
+    assert {figure["mode"] for figure in by_name.values()} == {"measured"}
+    intervals = [figure["interval"] for figure in by_name.values()][: len(truths)]
+    hits = [low <= truth <= high for (low, high), truth in zip(intervals, truths, strict=True)]
+    # A 95 % interval may miss its truth, so not all eight need to hold it.
+    assert sum(hits) >= 6
     assert f"95 % interval {intervals[6][0]:.3g} to {intervals[6][1]:.3g}" in out.read_text(
         encoding="utf-8"
     )
@@ -106,40 +103,40 @@ def transfer(frequencies: np.ndarray, mtf_nyquist: float) -> np.ndarray:
 
 def test_without_a_gain_the_noise_over_full_scale_stands(raw: tuple[Path, Path]) -> None:
     """To a network only that matters: any gain leaves it."""
-    stated = characterise(raw, stated=Stated(bits=12, gain=3.0))
-    assumed = characterise(raw, stated=Stated(bits=12))
-    assert assumed.gain == pytest.approx(4095 / 400)
-    for one, other in zip(stated.snrs, assumed.snrs, strict=True):
+    with_gain = characterise(raw, stated=Stated(bits=12, gain=3.0))
+    without_gain = characterise(raw, stated=Stated(bits=12))
+    assert without_gain.gain == pytest.approx(4095 / 400)
+    for one, other in zip(with_gain.snrs, without_gain.snrs, strict=True):
         assert one.value == pytest.approx(other.value)
-        assert one.radiance * 3.0 == pytest.approx(other.radiance * assumed.gain)
-    written = tomllib.loads(profile_toml(assumed))
-    assert written["digitiser"]["gain_dn_per_radiance"]["status"] == "assumed"
-    assert written["noise"]["radiance_1"]["value"] == pytest.approx(100)
-
-
-def edge_box(raw: tuple[Path, Path]) -> str:
-    """The upper half of the board's upright edge, in an image that has lost 32 pixels a side."""
-    middle = SIDE // RATIO // 2 - 32
-    return f"{raw[0]}:{middle - 11},{middle - 38},30,28"
+        assert one.radiance * 3.0 == pytest.approx(other.radiance * without_gain.gain)
+    profile = tomllib.loads(profile_toml(without_gain))
+    assert profile["digitiser"]["gain_dn_per_radiance"]["status"] == "assumed"
+    assert profile["noise"]["radiance_1"]["value"] == pytest.approx(100)
 
 
 def test_a_box_gives_one_axis_for_both(raw: tuple[Path, Path]) -> None:
-    found = characterise(raw, (edge_box(raw),), Stated(bits=12))
-    assert list(found.mtf.curves) == ["across"]
-    value, (low, high) = found.mtf.curves["across"].at(0.5)
+    # The box holds the upper half of the board's upright edge. The simulator cuts 32 pixels off
+    # each side of an image.
+    middle = SIDE // RATIO // 2 - 32
+    box = f"{raw[0]}:{middle - 11},{middle - 38},30,28"
+    result = characterise(raw, (box,), Stated(bits=12))
+    assert list(result.mtf.curves) == ["across"]
+    value, (low, high) = result.mtf.curves["across"].at(0.5)
     assert low <= 0.09 <= high < 2 * low
     assert low <= value <= high
-    table = tomllib.loads(profile_toml(found))["mtf"]
+    table = tomllib.loads(profile_toml(result))["mtf"]
     assert table["across"]["value"] == table["along"]["value"]
     assert "no curve along the track" in table["along"]["source"]
-    assert found.rows()[0].figures["MTF along at Nyquist"].mode == "unavailable"
+    assert result.rows()[0].figures["MTF along at Nyquist"].mode == "unavailable"
 
 
 def test_without_an_edge_the_mtf_is_assumed_and_said_so(tmp_path: Path) -> None:
     out = tmp_path / "mine.toml"
     ramp = np.linspace(200, 3000, 320)[:, None] + np.random.default_rng(1).normal(0, 20, (320, 320))
-    said = done("characterise", tiff(tmp_path, ramp.astype(np.uint16)), "--bits", 12, "--out", out)
-    assert "the profile's MTF is an assumption" in said
+    output = done(
+        "characterise", tiff(tmp_path, ramp.astype(np.uint16)), "--bits", 12, "--out", out
+    )
+    assert "the profile's MTF is an assumption" in output
     profile = load_sensor(str(out))
     assert profile.mtf_nyquist.status == "assumed"
     assert profile.snr_pair[1].status == "measured"
@@ -147,11 +144,11 @@ def test_without_an_edge_the_mtf_is_assumed_and_said_so(tmp_path: Path) -> None:
 
 def test_the_mtf_may_be_stated(raw: tuple[Path, Path], tmp_path: Path) -> None:
     out = tmp_path / "mine.toml"
-    said = done("characterise", raw[1], "--bits", 12, "--mtf", "0.08,0.04", "--out", out)
+    output = done("characterise", raw[1], "--bits", 12, "--mtf", "0.08,0.04", "--out", out)
     profile = load_sensor(str(out))
     assert profile.nominal().mtf_axes == (0.08, 0.04)
     assert profile.mtf_nyquist.status == "stated"
-    assert "assumption" not in said
+    assert "assumption" not in output
 
 
 def test_steps_and_a_black_level_change_nothing_but_the_units(
@@ -163,13 +160,17 @@ def test_steps_and_a_black_level_change_nothing_but_the_units(
     folder.mkdir()
     for path in raw:
         tifffile.imwrite(folder / path.name, ((tifffile.imread(path) + 200) * 8).astype(np.uint16))
-    found = characterise([folder], stated=Stated(bits=15, black_level=1600, mtf=(0.1, 0.1)))
-    assert (found.frames.step, found.frames.bits, found.frames.stored_full_scale) == (8, 12, 32760)
-    for one, other in zip(found.snrs, plain.snrs, strict=True):
+    result = characterise([folder], stated=Stated(bits=15, black_level=1600, mtf=(0.1, 0.1)))
+    assert (result.frames.step, result.frames.bits, result.frames.stored_full_scale) == (
+        8,
+        12,
+        32760,
+    )
+    for one, other in zip(result.snrs, plain.snrs, strict=True):
         assert one.value == pytest.approx(other.value, rel=0.02)
-    assert tomllib.loads(profile_toml(found))["offset"]["offset_dn"]["value"] == 200
-    assert any("--full-scale 32760" in note for note in found.notes())
-    assert not any("black level" in note for note in found.notes())
+    assert tomllib.loads(profile_toml(result))["offset"]["offset_dn"]["value"] == 200
+    assert any("--full-scale 32760" in note for note in result.notes())
+    assert not any("black level" in note for note in result.notes())
     hidden = characterise([folder], stated=Stated(bits=15, mtf=(0.1, 0.1)))
     assert any("black level" in note for note in hidden.notes())
 
@@ -183,9 +184,9 @@ def test_pairs_of_one_scene_give_the_noise_alone(tmp_path: Path) -> None:
         tifffile.imwrite(
             tmp_path / f"{number}.tif", np.clip(noisy.round(), 1, 4094).astype(np.uint16)
         )
-    found = characterise([tmp_path], stated=Stated(bits=12, mtf=(0.1, 0.1)))
-    assert found.noise.pairs == 1
-    assert found.noise.model.at(1000).value == pytest.approx(500, rel=0.05)
+    result = characterise([tmp_path], stated=Stated(bits=12, mtf=(0.1, 0.1)))
+    assert result.noise.pairs == 1
+    assert result.noise.model.at(1000).value == pytest.approx(500, rel=0.05)
     alone = characterise([tmp_path / "0.tif"], stated=Stated(bits=12, mtf=(0.1, 0.1)))
     assert alone.noise.model.at(1000).value > 1500
 
@@ -261,11 +262,11 @@ WRONG: dict[str, tuple[np.ndarray, tuple[str, ...], str]] = {
 def test_wrong_input_is_one_sentence(case: str, tmp_path: Path) -> None:
     pixels, options, words = WRONG[case]
     image = tiff(tmp_path, pixels)
-    written = "--out", tmp_path / "mine.toml", "--json", tmp_path / "mine.json"
-    said = refused("characterise", image, *options, *written)
+    outputs = "--out", tmp_path / "mine.toml", "--json", tmp_path / "mine.json"
+    message = refused("characterise", image, *options, *outputs)
     assert [p.name for p in tmp_path.iterdir()] == ["raw.tif"]
-    assert words in said
-    assert said.startswith("beers-deploy: ")
+    assert words in message
+    assert message.startswith("beers-deploy: ")
 
 
 def test_one_image_twice_is_refused(raw: tuple[Path, Path], tmp_path: Path) -> None:
@@ -278,18 +279,18 @@ def test_one_image_twice_is_refused(raw: tuple[Path, Path], tmp_path: Path) -> N
 def test_images_of_two_gains_are_refused(raw: tuple[Path, Path], tmp_path: Path) -> None:
     half = tmp_path / "half.tif"
     tifffile.imwrite(half, tifffile.imread(raw[0]) // 2)
-    said = refused("characterise", raw[0], half, "--bits", 12, "--out", tmp_path / "mine.toml")
-    assert "differ in gain" in said
-    assert f"DN^2 in {half.name}" in said
+    message = refused("characterise", raw[0], half, "--bits", 12, "--out", tmp_path / "mine.toml")
+    assert "differ in gain" in message
+    assert f"DN^2 in {half.name}" in message
 
 
 def test_pixels_clipped_at_full_scale_tell_the_bits(raw: tuple[Path, Path], tmp_path: Path) -> None:
     pixels = tifffile.imread(raw[0]).copy()
     pixels[:4, :4] = 4095
     image = tiff(tmp_path, pixels)
-    found = characterise((image, raw[1]))
-    assert found.frames.bits == 12
-    assert tomllib.loads(profile_toml(found))["digitiser"]["bits"]["status"] == "measured"
+    result = characterise((image, raw[1]))
+    assert result.frames.bits == 12
+    assert tomllib.loads(profile_toml(result))["digitiser"]["bits"]["status"] == "measured"
     with pytest.raises(BeersError, match="clipped pixels"):
         characterise((image, raw[1]), (f"{image}:0,0,30,30",))
     pixels[:4, :4] = 4000
@@ -309,13 +310,13 @@ def test_the_noise_of_a_bound_is_a_profile_that_loads(
     raw: tuple[Path, Path], tmp_path: Path
 ) -> None:
     """All noise in beta, or in alpha: decimals must not put the SNR beyond what physics allows."""
-    found = characterise(raw, stated=Stated(bits=12))
-    full_scale = 4095 / found.gain
+    result = characterise(raw, stated=Stated(bits=12))
+    full_scale = 4095 / result.gain
     for dark in (math.sqrt(1 / 4), 1 / 4):
-        bright = replace(found.snrs[1], radiance=full_scale / 4, value=100 / 3)
-        low = replace(found.snrs[0], radiance=full_scale / 16, value=dark * 100 / 3)
+        bright = replace(result.snrs[1], radiance=full_scale / 4, value=100 / 3)
+        low = replace(result.snrs[0], radiance=full_scale / 16, value=dark * 100 / 3)
         (tmp_path / "mine.toml").write_text(
-            profile_toml(replace(found, snrs=(low, bright))), encoding="utf-8"
+            profile_toml(replace(result, snrs=(low, bright))), encoding="utf-8"
         )
         sensor = load_sensor(str(tmp_path / "mine.toml")).nominal()
         assert min(sensor.alpha, sensor.beta) >= 0

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +75,7 @@ def dior(folder: Path, objects: dict[str, dict[str, list[Object]]]) -> Path:
 
 def coco(folder: Path) -> Path:
     """One file of JSON beside the images; its ids are in an order of their own."""
-    names = sorted({box[0] for boxes in OBJECTS.values() for box in boxes})
+    names = sorted({box[0] for box in chain.from_iterable(OBJECTS.values())})
     content: dict[str, list[dict[str, object]]] = {
         "images": [],
         "annotations": [],
@@ -105,7 +106,8 @@ def coco(folder: Path) -> Path:
 
 def yolo(folder: Path) -> Path:
     """Ultralytics' folders and data.yaml."""
-    names, (height, width) = ["Expressway-Service-area", "ship"], SIZE_PX
+    names = ["Expressway-Service-area", "ship"]
+    height, width = SIZE_PX
     for stem, objects in OBJECTS.items():
         image(folder / "images" / "val" / f"{stem}.png")
         lines = [
@@ -123,12 +125,14 @@ def labelled(folder: Path, count: int) -> Path:
     full_scale = load_sensor("pleiades-reference").nominal()
     folder.mkdir()
     for number in range(count):
-        one = synthetic_labelled(number, 0, np.arange(len(CLASSES)))
-        shown = Stretch(0, 4095 / full_scale.gain_dn_per_radiance).to_srgb(one.radiance(full_scale))
-        Image.fromarray(np.rint(255 * shown).astype(np.uint8)).save(folder / f"s{number}x.png")
+        scene = synthetic_labelled(number, 0, np.arange(len(CLASSES)))
+        picture = Stretch(0, 4095 / full_scale.gain_dn_per_radiance).to_srgb(
+            scene.radiance(full_scale)
+        )
+        Image.fromarray(np.rint(255 * picture).astype(np.uint8)).save(folder / f"s{number}x.png")
         boxes: list[Object] = [
             (SPELT[c], *corners.tolist())
-            for c, corners in zip(one.truth.classes, one.truth.corners, strict=True)
+            for c, corners in zip(scene.truth.classes, scene.truth.corners, strict=True)
         ]
         text(folder / f"s{number}x.xml", xml(boxes, (768, 768)))
     return folder

@@ -40,7 +40,7 @@ def detector(
         channels: of the input.
         about: metadata; None leaves one out.
     """
-    given = {"names": NAMES, "task": "detect", "stride": 32, "imgsz": [64, 64], **about}
+    metadata = {"names": NAMES, "task": "detect", "stride": 32, "imgsz": [64, 64], **about}
     sizes = ",".join(map(str, answer.shape))
     names = [f"output{i}" for i in range(outputs)]
     last = "sum" if cut is None else "suppressed"
@@ -65,7 +65,7 @@ def detector(
         numpy_helper.from_array(value, name) for name, value in constants.items()
     )
     helper.set_model_props(
-        model, {key: str(value) for key, value in given.items() if value is not None}
+        model, {key: str(value) for key, value in metadata.items() if value is not None}
     )
     onnx.save_model(model, path)
     return path
@@ -75,13 +75,13 @@ def raw(*rows: tuple[float, ...], anchors: int = 20) -> np.ndarray:
     """Centre, size and a score of each class, a row a box, as (1, 4 + classes, anchors); the rest
     is nothing.
     """
-    found = np.zeros((anchors, 4 + len(NAMES)), np.float32)
-    found[: len(rows)] = np.reshape(rows, (-1, found.shape[1]))
-    return found.T[None]
+    answer = np.zeros((anchors, 4 + len(NAMES)), np.float32)
+    answer[: len(rows)] = np.reshape(rows, (-1, answer.shape[1]))
+    return answer.T[None]
 
 
 def final(*rows: tuple[float, ...], count: int = 300) -> np.ndarray:
     """Corners, score and class, a row a box, as (1, 300, 6), padded with zeros."""
-    found = np.zeros((count, 6), np.float32)
-    found[: len(rows)] = np.reshape(rows, (-1, found.shape[1]))
-    return found[None]
+    answer = np.zeros((count, 6), np.float32)
+    answer[: len(rows)] = np.reshape(rows, (-1, answer.shape[1]))
+    return answer[None]

@@ -44,18 +44,21 @@ def drawn(rng: np.random.Generator, count: int, ties: bool = False, ignored: flo
     pairs = []
     for _ in range(count):
         truth = boxes(rng, int(rng.integers(0, 7)))
-        again = rng.integers(0, max(len(truth), 1), int(rng.integers(0, 12)) if len(truth) else 0)
-        near = truth.corners[again] + rng.normal(0, 1.5, (len(again), 4))
+        repeats = rng.integers(0, max(len(truth), 1), int(rng.integers(0, 12)) if len(truth) else 0)
+        near = truth.corners[repeats] + rng.normal(0, 1.5, (len(repeats), 4))
         near[:, 2:] = np.maximum(near[:, 2:], near[:, :2] + 1)
-        named = np.where(
-            rng.random(len(again)) < 0.8, truth.classes[again], rng.integers(0, 3, len(again))
+        labels = np.where(
+            rng.random(len(repeats)) < 0.8, truth.classes[repeats], rng.integers(0, 3, len(repeats))
         )
         false = boxes(rng, int(rng.integers(0, 6)))
         corners = np.vstack([near, false.corners])
-        classes = np.concatenate([named, false.classes])
-        passed = Boxes.of(truth.corners, truth.classes, ignored=rng.random(len(truth)) < ignored)
+        classes = np.concatenate([labels, false.classes])
+        labelled = Boxes.of(truth.corners, truth.classes, ignored=rng.random(len(truth)) < ignored)
         pairs.append(
-            (passed, Boxes.of(corners, classes, rng.random(len(corners)).round(1 if ties else 12)))
+            (
+                labelled,
+                Boxes.of(corners, classes, rng.random(len(corners)).round(1 if ties else 12)),
+            )
         )
     return pairs
 
@@ -68,7 +71,7 @@ def boxes(rng: np.random.Generator, count: int) -> Boxes:
 
 
 def hits_of(pairs: Pairs, classes: int = len(NAMES)) -> Hits:
-    return find_hits([truth for truth, _ in pairs], [found for _, found in pairs], classes)
+    return find_hits([truth for truth, _ in pairs], [detected for _, detected in pairs], classes)
 
 
 def scored(
@@ -92,15 +95,16 @@ def by_pycocotools(pairs: Pairs, size: str = "all") -> np.ndarray:
         evaluation.params.areaRngLbl = [size]
         evaluation.evaluate()
         evaluation.accumulate()
-    found = evaluation.eval["precision"][:, :, :, 0, 0].mean(axis=1).T  # overlap, recall, class
-    return np.where(found < 0, np.nan, found)
+    # The axes of the array are overlap, recall, class, area and number of detections.
+    precision = evaluation.eval["precision"][:, :, :, 0, 0].mean(axis=1).T
+    return np.where(precision < 0, np.nan, precision)
 
 
 def _table(images: Sequence[Boxes]) -> COCO:
     rows: list[dict[str, object]] = []
-    for number, each in enumerate(images):
+    for number, image_boxes in enumerate(images):
         for (left, top, right, bottom), kind, value, crowd in zip(
-            *vars(each).values(), strict=True
+            *vars(image_boxes).values(), strict=True
         ):
             box = [left, top, right - left, bottom - top]
             row = {"id": len(rows) + 1, "image_id": number, "category_id": int(kind), "bbox": box}
@@ -136,18 +140,20 @@ def test_average_precision_is_that_of_pycocotools(
 @given(SEEDS, st.lists(st.integers(0, 4), min_size=2, max_size=6))
 def test_a_weight_is_as_good_as_so_many_copies(seed: int, weights: list[int]) -> None:
     pairs = drawn(np.random.default_rng(seed), len(weights))
-    copies = [pair for pair, weight in zip(pairs, weights, strict=True) for _ in range(weight)]
-    found = score(hits_of(pairs), NAMES, np.array([weights]), 0.5)
+    copies: Pairs = []
+    for pair, weight in zip(pairs, weights, strict=True):
+        copies += [pair] * weight
+    figures = score(hits_of(pairs), NAMES, np.array([weights]), 0.5)
     if not copies:
-        assert np.isnan(found["mAP50"])
+        assert np.isnan(figures["mAP50"])
         return
     expected = by_pycocotools(copies)
-    np.testing.assert_allclose(found["mAP50"], mean_known(expected[:, :1]), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(figures["mAP50"], mean_known(expected[:, :1]), rtol=0, atol=1e-12)
     np.testing.assert_allclose(
-        found["mAP50-95"], mean_known(expected.mean(axis=1))[None], rtol=0, atol=1e-12
+        figures["mAP50-95"], mean_known(expected.mean(axis=1))[None], rtol=0, atol=1e-12
     )
     for name, value in scored(copies, NAMES, 0.5).items():
-        np.testing.assert_allclose(found[name][0], value, rtol=0, atol=1e-12, err_msg=name)
+        np.testing.assert_allclose(figures[name][0], value, rtol=0, atol=1e-12, err_msg=name)
 
 
 @settings(max_examples=30)
@@ -157,16 +163,16 @@ def test_precision_and_recall_are_those_of_what_is_left_at_a_confidence(
 ) -> None:
     pairs = drawn(np.random.default_rng(seed), 5)
     figures = scored(pairs, NAMES, confidence)
-    left = hits_of([(truth, found[found.scores >= confidence]) for truth, found in pairs])
+    hits = hits_of([(truth, detected[detected.scores >= confidence]) for truth, detected in pairs])
     precision = []
     recall = []
-    for kind, objects in enumerate(left.objects[0].sum(axis=1)):
+    for kind, objects in enumerate(hits.objects[0].sum(axis=1)):
         if objects:
-            mine = left.classes == kind
-            true = left.hits[0, 0, mine].sum()
-            counted = (~left.ignored[0, 0, mine]).sum()
-            precision.append(true / counted if counted else 1.0)
-            recall.append(true / objects)
+            mine = hits.classes == kind
+            true_positives = hits.hits[0, 0, mine].sum()
+            counted = (~hits.ignored[0, 0, mine]).sum()
+            precision.append(true_positives / counted if counted else 1.0)
+            recall.append(true_positives / objects)
     expected = (np.mean(precision), np.mean(recall)) if recall else (np.nan, np.nan)
     np.testing.assert_allclose(
         (figures["precision"], figures["recall"]), expected, rtol=0, atol=1e-12
@@ -176,11 +182,12 @@ def test_precision_and_recall_are_those_of_what_is_left_at_a_confidence(
 def test_each_object_is_found_once_by_the_surest_box_of_its_class() -> None:
     truth = Boxes.of([[0, 0, 10, 10], [20, 0, 30, 10], [40, 0, 50, 10]], [0, 0, 1])
     corners = [[1, 0, 11, 10], [0, 0, 10, 10], [20, 0, 30, 10], [40, 0, 50, 10]]
-    hits, ignored, taken = (
+    hits, ignored, matched = (
         flags[0, 0] for flags in match(truth, Boxes.of(corners, [0, 0, 1, 1], [0.5, 0.9, 0.9, 0.8]))
     )
-    assert hits.tolist() == [False, True, False, True]  # doubled, found, another class, found
-    assert taken.tolist() == [True, False, True]
+    # The first box doubles the second one, and the third has another class.
+    assert hits.tolist() == [False, True, False, True]
+    assert matched.tolist() == [True, False, True]
     assert not ignored.any()
 
 
@@ -197,25 +204,27 @@ def test_perfect_boxes_score_one_and_none_score_nothing() -> None:
 
 def test_sizes_are_told_apart_by_the_root_of_the_area() -> None:
     sides = (15.99, 16.0, 31.99, 32.0)
-    found = Boxes.of(
+    squares = Boxes.of(
         [[0, 100.0 * i, side, 100.0 * i + side] for i, side in enumerate(sides)], [0] * 4
     )
-    assert hits_of([(found, found)], 1).objects.sum(axis=(1, 2)).tolist() == [4, 1, 2, 1]
+    assert hits_of([(squares, squares)], 1).objects.sum(axis=(1, 2)).tolist() == [4, 1, 2, 1]
 
 
 def test_own_confidence_is_that_of_the_best_mean_f1() -> None:
     corners = np.vstack([ONE, ONE + 30, ONE + 60])
     pair = Boxes.of(corners[:2], [0, 0]), Boxes.of(corners, [0, 0, 0], [0.9, 0.6, 0.3])
-    found = scored([pair], confidence=0.7)
-    assert found["own confidence"] == pytest.approx(0.301)  # the false one no longer counts
-    assert (found["own precision"], found["own recall"]) == (1.0, 1.0)
-    assert (found["precision"], found["recall"]) == (1.0, 0.5)
+    figures = scored([pair], confidence=0.7)
+    # Just above 0.3 the false detection no longer counts.
+    assert figures["own confidence"] == pytest.approx(0.301)
+    assert (figures["own precision"], figures["own recall"]) == (1.0, 1.0)
+    assert (figures["precision"], figures["recall"]) == (1.0, 0.5)
 
 
 def test_every_row_is_read_at_the_first_one_s_confidence() -> None:
     pairs = drawn(np.random.default_rng(7), 10)
     halved = [
-        (truth, Boxes.of(found.corners, found.classes, found.scores / 2)) for truth, found in pairs
+        (truth, Boxes.of(detected.corners, detected.classes, detected.scores / 2))
+        for truth, detected in pairs
     ]
     rows = {"reference": hits_of(pairs), "halved": hits_of(halved)}
     figures, confidence = score_rows(rows, NAMES, site_weights(list("abcdefghij"), 0, 5))

@@ -34,21 +34,24 @@ def test_an_overlap_is_that_of_the_pixels_they_cover(seed: int) -> None:
 @given(st.integers(0, 2**32 - 1))
 def test_suppression_leaves_the_best_of_each_cluster(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    found = Boxes.of(
+    candidates = Boxes.of(
         drawn(rng, 20).repeat(4, axis=0) + rng.uniform(0, 3, (80, 4)),
         rng.integers(0, 2, 80),
         rng.random(80),
     )
-    kept = suppress(found)
-    assert (np.diff(kept.scores) <= 0).all()
-    same = kept.classes[:, None] == kept.classes[None, :]
-    assert (iou(kept.corners, kept.corners)[same & ~np.eye(len(kept), dtype=bool)] <= OVERLAP).all()
-    dropped = found[~np.isin(found.scores, kept.scores)]
-    assert len(dropped) + len(kept) == 80
-    better = (iou(dropped.corners, kept.corners) > OVERLAP) & (
-        dropped.scores[:, None] < kept.scores[None, :]
+    survivors = suppress(candidates)
+    assert (np.diff(survivors.scores) <= 0).all()
+    same_class = survivors.classes[:, None] == survivors.classes[None, :]
+    assert (
+        iou(survivors.corners, survivors.corners)[same_class & ~np.eye(len(survivors), dtype=bool)]
+        <= OVERLAP
+    ).all()
+    dropped = candidates[~np.isin(candidates.scores, survivors.scores)]
+    assert len(dropped) + len(survivors) == 80
+    better = (iou(dropped.corners, survivors.corners) > OVERLAP) & (
+        dropped.scores[:, None] < survivors.scores[None, :]
     )
-    assert (better & (dropped.classes[:, None] == kept.classes[None, :])).any(axis=1).all()
+    assert (better & (dropped.classes[:, None] == survivors.classes[None, :])).any(axis=1).all()
 
 
 def test_suppression_keeps_the_best_and_no_more_than_300() -> None:
@@ -67,10 +70,10 @@ def test_the_letterbox_takes_a_box_there_and_back(height: int, width: int, eight
     size = 32 * eighths + 1
     box = Letterbox(height, width, size)
     corners = np.array([[0, 0, width, height], [1.25, 2.5, width / 3, height]])
-    there = box.to_input(corners)
-    assert np.abs(box.to_image(there) - corners).max() < 0.01
-    assert there.min() >= -1e-9
-    assert there.max() <= size + 1e-9
+    in_input = box.to_input(corners)
+    assert np.abs(box.to_image(in_input) - corners).max() < 0.01
+    assert in_input.min() >= -1e-9
+    assert in_input.max() <= size + 1e-9
 
 
 @settings(max_examples=25)
@@ -85,9 +88,9 @@ def test_pixels_go_where_the_letterbox_takes_their_box(
     y, x = np.mgrid[0:height, 0:width] + 0.5
     image = np.stack([x / width, y / height, np.full(x.shape, 0.5)], axis=2).astype(np.float32)
     box = Letterbox(height, width, size)
-    found = box.image(image)
-    assert found.shape == (3, size, size)
-    assert found.dtype == np.float32
+    pixels = box.image(image)
+    assert pixels.shape == (3, size, size)
+    assert pixels.dtype == np.float32
     left, top, right, bottom = box.to_input(np.array([[0, 0, width, height]]))[0].astype(int)
     inside = np.zeros((size, size), bool)
     inside[top:bottom, left:right] = True
@@ -95,8 +98,8 @@ def test_pixels_go_where_the_letterbox_takes_their_box(
     middles = np.stack([columns, rows, columns, rows], axis=1) + 0.5
     # Between the middles of the outermost pixels: at the border it can only repeat the last one.
     on_scene = np.clip(box.to_image(middles), 0.5, np.array([width, height, width, height]) - 0.5)
-    assert np.abs(found[0][inside] * width - on_scene[:, 0]).max() < 0.01
-    assert np.abs(found[1][inside] * height - on_scene[:, 1]).max() < 0.01
+    assert np.abs(pixels[0][inside] * width - on_scene[:, 0]).max() < 0.01
+    assert np.abs(pixels[1][inside] * height - on_scene[:, 1]).max() < 0.01
 
 
 def test_an_image_of_which_nothing_would_be_left_is_refused() -> None:
@@ -108,9 +111,9 @@ def test_what_is_mostly_outside_is_ignored_and_what_is_outside_is_none() -> None
     corners = np.array(
         [[-8, 0, 2, 10], [-5, 0, 5, 10], [-20, 0, -10, 10], [95, 95, 120, 105], [10, 10, 20, 20]]
     )
-    found = Boxes.of(corners, range(5), ignored=[False, False, False, False, True]).clipped(
+    clipped_boxes = Boxes.of(corners, range(5), ignored=[False, False, False, False, True]).clipped(
         100, 100
     )
-    assert found.classes.tolist() == [0, 1, 3, 4]
-    assert found.ignored.tolist() == [True, False, True, True]
-    assert found.corners[:2].tolist() == [[0, 0, 2, 10], [0, 0, 5, 10]]
+    assert clipped_boxes.classes.tolist() == [0, 1, 3, 4]
+    assert clipped_boxes.ignored.tolist() == [True, False, True, True]
+    assert clipped_boxes.corners[:2].tolist() == [[0, 0, 2, 10], [0, 0, 5, 10]]

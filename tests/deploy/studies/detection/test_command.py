@@ -36,23 +36,16 @@ def test_synthetic_scenes_and_the_same_as_pictures_score_alike(tmp_path: Path) -
     """
     done("detect", *SMALL, "--drawn", 2, "--out", tmp_path / "a", "--json", tmp_path / "a.json")
     folder = labelled(tmp_path / "pictures", 2)
-    done(
-        "detect",
-        *SMALL,
-        "--images",
-        folder,
-        *MAP,
-        "--out",
-        tmp_path / "b",
-        "--json",
-        tmp_path / "b.json",
+    outputs = ("--out", tmp_path / "b", "--json", tmp_path / "b.json")
+    done("detect", *SMALL, "--images", folder, *MAP, *outputs)
+    tables, picture_tables = (document(tmp_path / name) for name in ("a.json", "b.json"))
+    scene_rows, picture_rows = (
+        document_tables["detection, dior-medium"] for document_tables in (tables, picture_tables)
     )
-    tables, others = (document(tmp_path / name) for name in ("a.json", "b.json"))
-    one, other = (each["detection, dior-medium"] for each in (tables, others))
-    assert one["reference"]["mAP50"] > 50
+    assert scene_rows["reference"]["mAP50"] > 50
     for row in ("reference", "degraded"):
-        assert other[row]["mAP50"] == pytest.approx(one[row]["mAP50"], abs=6)
-    assert one["degraded"]["loss to reference"] > 10
+        assert picture_rows[row]["mAP50"] == pytest.approx(scene_rows[row]["mAP50"], abs=6)
+    assert scene_rows["degraded"]["loss to reference"] > 10
     assert list(tables[PAPER_TABLE]) == [row.name for row in paper_rows()]
     assert {"mAP50 by class, dior-medium", "mAP50 by size, dior-medium"} <= set(tables)
     page = (tmp_path / "a" / "report.html").read_text()
@@ -65,17 +58,10 @@ def test_dior_s_tree_is_read_and_nothing_in_it_is_written_over(tmp_path: Path) -
     folder = dior(
         tmp_path / "dior", {"test": {"00001": boxes, "00002": boxes[:1]}, "val": {"00003": boxes}}
     )
-    command = [
-        *SMALL,
-        "--images",
-        folder,
-        "--classes",
-        "storagetank=tank",
-        "--out",
-        tmp_path / "out",
-    ]
+    names = ("--classes", "storagetank=tank")
+    command = [*SMALL, "--images", folder, *names, "--out", tmp_path / "out"]
     done("detect", *command, "--json", tmp_path / "found.json")
-    inputs = [each["name"] for each in valid(tmp_path / "found.json")["inputs"]]
+    inputs = [entry["name"] for entry in valid(tmp_path / "found.json")["inputs"]]
     assert inputs == ["detector.onnx", "00001.jpg", "00002.jpg"]
     label = folder / "Annotations" / "Horizontal Bounding Boxes" / "00001.xml"
     before = label.read_text()
@@ -101,7 +87,7 @@ def test_what_cannot_be_is_one_sentence(
     arguments: list[str], word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    said = refused("detect", *arguments, *([] if "--images" in arguments else ["--drawn", 2]))
-    assert said.count("beers-deploy: ") == 1
-    assert word in said.split("beers-deploy: ")[1]
+    message = refused("detect", *arguments, *([] if "--images" in arguments else ["--drawn", 2]))
+    assert message.count("beers-deploy: ") == 1
+    assert word in message.split("beers-deploy: ")[1]
     assert not (tmp_path / "detection" / "report.html").exists()

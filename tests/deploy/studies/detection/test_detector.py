@@ -18,20 +18,20 @@ IMAGE = np.full((32, 64, 3), 0.5, np.float32)
 
 def test_the_raw_layout_gives_the_boxes_of_every_class_that_scores(tmp_path: Path) -> None:
     answer = raw((20, 30, 10, 8, 0.9, 0.2), (21, 30, 10, 8, 0.8, 0.0), (50, 40, 6, 6, 0.0, 0.0005))
-    found = open_detector(detector(tmp_path / "a.onnx", answer), 1).detect(IMAGE)
-    assert found.corners.tolist() == [[15, 10, 25, 18], [15, 10, 25, 18]]
-    assert found.classes.tolist() == [0, 1]
-    assert not found.ignored.any()
-    np.testing.assert_allclose(found.scores, [0.9, 0.2], atol=1e-6)
+    boxes = open_detector(detector(tmp_path / "a.onnx", answer), 1).detect(IMAGE)
+    assert boxes.corners.tolist() == [[15, 10, 25, 18], [15, 10, 25, 18]]
+    assert boxes.classes.tolist() == [0, 1]
+    assert not boxes.ignored.any()
+    np.testing.assert_allclose(boxes.scores, [0.9, 0.2], atol=1e-6)
 
 
 def test_the_final_layout_gives_its_rows_and_not_its_padding(tmp_path: Path) -> None:
     answer = final((15, 26, 25, 34, 0.2, 1), (15, 26, 25, 34, 0.9, 0), (16, 26, 26, 34, 0.6, 0))
-    opened = open_detector(detector(tmp_path / "a.onnx", answer, end2end=True), 1)
-    found = opened.detect(IMAGE)
-    assert found.corners.tolist() == [[15, 10, 25, 18], [16, 10, 26, 18], [15, 10, 25, 18]]
-    assert found.classes.tolist() == [0, 0, 1]
-    assert (opened.names, opened.size_px, opened.flag) == (tuple(NAMES.values()), 64, "")
+    net = open_detector(detector(tmp_path / "a.onnx", answer, end2end=True), 1)
+    boxes = net.detect(IMAGE)
+    assert boxes.corners.tolist() == [[15, 10, 25, 18], [16, 10, 26, 18], [15, 10, 25, 18]]
+    assert boxes.classes.tolist() == [0, 0, 1]
+    assert (net.names, net.size_px, net.flag) == (tuple(NAMES.values()), 64, "")
 
 
 def test_suppression_inside_the_file_is_flagged_with_its_confidence(tmp_path: Path) -> None:
@@ -47,13 +47,13 @@ def test_the_size_is_the_file_s_or_the_one_asked_for(tmp_path: Path) -> None:
     answer = raw((32, 32, 16, 8, 0.9, 0))
     fixed = detector(tmp_path / "a.onnx", answer)
     free = detector(tmp_path / "b.onnx", answer, size_px="side")
-    assert [open_detector(fixed, 1, asked).size_px for asked in (None, 64)] == [64, 64]
-    assert [open_detector(free, 1, asked).size_px for asked in (None, 128)] == [64, 128]
+    assert [open_detector(fixed, 1, side).size_px for side in (None, 64)] == [64, 64]
+    assert [open_detector(free, 1, side).size_px for side in (None, 128)] == [64, 128]
     with pytest.raises(OptionError, match=r"side: expected 64, which a.onnx is fixed to, got 128"):
         open_detector(fixed, 1, 128)
     sizes: list[object] = [None, [64, 96], [[], []], "wide"]
-    for stated in sizes:
-        unsaid = detector(tmp_path / "c.onnx", answer, size_px="side", imgsz=stated)
+    for size in sizes:
+        unsaid = detector(tmp_path / "c.onnx", answer, size_px="side", imgsz=size)
         with pytest.raises(
             OptionError, match=r"the side of the detector's square input in px, got .*; say it"
         ):
@@ -61,7 +61,7 @@ def test_the_size_is_the_file_s_or_the_one_asked_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("answer", "given", "sentence"),
+    ("answer", "options", "sentence"),
     [
         (raw((1, 1, 1, 1, 0.5, 0)), {"names": None}, "the names of its classes in its metadata"),
         (raw((1, 1, 1, 1, 0.5, 0)), {"names": {1: "ship"}}, "the names of its classes"),
@@ -84,10 +84,10 @@ def test_the_size_is_the_file_s_or_the_one_asked_for(tmp_path: Path) -> None:
     ],
 )
 def test_another_layout_is_refused_by_what_is_read(
-    answer: np.ndarray, given: dict[str, Any], sentence: str, tmp_path: Path
+    answer: np.ndarray, options: dict[str, Any], sentence: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ModelError, match=sentence):
-        open_detector(detector(tmp_path / "a.onnx", answer, **given), 1)
+        open_detector(detector(tmp_path / "a.onnx", answer, **options), 1)
 
 
 UNSOUND = [
@@ -109,9 +109,9 @@ def test_an_answer_that_is_no_detection_is_refused(
     answer: np.ndarray, sentence: str, tmp_path: Path
 ) -> None:
     layout = final() if answer.shape[-1:] == (6,) else raw()
-    opened = open_detector(detector(tmp_path / "a.onnx", layout), 1)
+    net = open_detector(detector(tmp_path / "a.onnx", layout), 1)
     with pytest.raises(ModelError, match=sentence):
-        opened.decoded(answer)
+        net.decoded(answer)
 
 
 def test_no_more_than_300_boxes_are_given(tmp_path: Path) -> None:
@@ -124,8 +124,8 @@ def test_a_class_is_found_by_its_letters_or_by_what_the_user_says() -> None:
     labelled = ("car", "Storage-Tank", "minibus", "Tree")
     detector = ("ship", "vehicle", "storagetank")
     assert class_numbers(labelled, detector, {"car": "Vehicle"}).tolist() == [1, 2, -1, -1]
-    given = parse_classes(" car = vehicle, Mini-Bus=vehicle ")
-    assert class_numbers(("car", "minibus"), ("vehicle",), given).tolist() == [0, 0]
+    mapping = parse_classes(" car = vehicle, Mini-Bus=vehicle ")
+    assert class_numbers(("car", "minibus"), ("vehicle",), mapping).tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("text", ["", "car", "car=", "=ship", "car=a=b", "car=a,CAR=b", "-=ship"])
@@ -135,7 +135,7 @@ def test_another_text_is_refused(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("labelled", "detector", "given", "sentence"),
+    ("labelled", "detector", "mapping", "sentence"),
     [
         (
             ("Tree",),
@@ -154,7 +154,7 @@ def test_another_text_is_refused(text: str) -> None:
     ],
 )
 def test_classes_that_cannot_be_matched_are_refused(
-    labelled: tuple[str, ...], detector: tuple[str, ...], given: dict[str, str], sentence: str
+    labelled: tuple[str, ...], detector: tuple[str, ...], mapping: dict[str, str], sentence: str
 ) -> None:
     with pytest.raises(OptionError, match=sentence):
-        class_numbers(labelled, detector, given)
+        class_numbers(labelled, detector, mapping)

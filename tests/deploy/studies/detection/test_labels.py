@@ -31,13 +31,13 @@ LAYOUTS["dior"] = lambda folder: dior(folder, {"test": OBJECTS})
 SHIP = xml([("ship", 2, 3, 12, 9)])
 
 
-def boxes_of(found: LabelledSet) -> dict[str, list[tuple[object, ...]]]:
+def boxes_of(labelled: LabelledSet) -> dict[str, list[tuple[object, ...]]]:
     return {
         path.stem: [
-            (found.names[c], *corners.round(9))
+            (labelled.names[c], *corners.round(9))
             for c, corners in zip(truth.classes, truth.corners, strict=True)
         ]
-        for path, truth in found.images
+        for path, truth in labelled.images
     }
 
 
@@ -50,11 +50,11 @@ def refused(folder: Path, sentence: str) -> None:
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_every_layout_says_the_same_of_the_same_boxes(layout: str, tmp_path: Path) -> None:
-    found = read_labelled(LAYOUTS[layout](tmp_path))
-    assert found.names == ["Expressway-Service-area", "ship"]
-    assert boxes_of(found) == OBJECTS
-    assert not any(truth.ignored.any() for _, truth in found.images)
-    assert found.notes == []
+    labelled = read_labelled(LAYOUTS[layout](tmp_path))
+    assert labelled.names == ["Expressway-Service-area", "ship"]
+    assert boxes_of(labelled) == OBJECTS
+    assert not any(truth.ignored.any() for _, truth in labelled.images)
+    assert labelled.notes == []
 
 
 @pytest.mark.parametrize("layout", ["voc", "yolo", "coco"])
@@ -80,11 +80,12 @@ def test_dior_is_read_by_split_and_its_classes_by_their_letters(tmp_path: Path) 
         "val": {"00098": [("dam", 1, 1, 9, 9)]},
     }
     folder = dior(tmp_path, {**splits, "test": test})
-    found = read_labelled(folder)
-    assert boxes_of(found) == test
+    labelled = read_labelled(folder)
+    assert boxes_of(labelled) == test
     assert boxes_of(read_labelled(folder, split="val")) == splits["val"]
-    spelt = ("ship", "Storage Tank", "expressway toll station")  # as others spell and order them
-    assert class_numbers(found.names, spelt, {}).tolist() == [2, 1]
+    # Other folders spell and order the same classes like this.
+    spelt = ("ship", "Storage Tank", "expressway toll station")
+    assert class_numbers(labelled.names, spelt, {}).tolist() == [2, 1]
 
 
 def test_a_split_that_is_not_there_is_named_with_those_that_are(tmp_path: Path) -> None:
@@ -107,13 +108,13 @@ def test_the_four_photographs_are_read_with_their_boxes(shared_data: Path) -> No
     folder = shared_data / "detection"
     if not folder.is_dir():
         pytest.skip("no folder shared/data/detection beside the repository")
-    found = read_labelled(folder)
-    classes = np.concatenate([truth.classes for _, truth in found.images])
+    labelled = read_labelled(folder)
+    classes = np.concatenate([truth.classes for _, truth in labelled.images])
     assert [
-        int((classes == found.names.index(name)).sum()) for name in ("car", "minibus", "Tree")
+        int((classes == labelled.names.index(name)).sum()) for name in ("car", "minibus", "Tree")
     ] == [108, 3, 61]
-    assert found.images[0][1].corners[0].tolist() == [160.0, 97.0, 182.0, 138.0]
-    assert found.notes == []
+    assert labelled.images[0][1].corners[0].tolist() == [160.0, 97.0, 182.0, 138.0]
+    assert labelled.notes == []
 
 
 def test_without_labels_a_yolo_image_shows_nothing_and_a_voc_image_is_refused(
@@ -121,9 +122,9 @@ def test_without_labels_a_yolo_image_shows_nothing_and_a_voc_image_is_refused(
 ) -> None:
     folder = yolo(tmp_path / "yolo")
     image(folder / "images" / "val" / "00003.png")
-    found = read_labelled(folder)
-    assert boxes_of(found)["00003"] == []
-    assert found.notes == ["Images without a labelled object, all found there is false: 1 of 3."]
+    labelled = read_labelled(folder)
+    assert boxes_of(labelled)["00003"] == []
+    assert labelled.notes == ["Images without a labelled object, all found there is false: 1 of 3."]
     image(voc(tmp_path / "voc") / "00003.png")
     refused(
         tmp_path / "voc",
@@ -137,9 +138,9 @@ def test_boxes_outside_or_without_area_are_left_out_and_told(tmp_path: Path) -> 
         tmp_path / "a.xml",
         xml([("ship", 5, 5, 9, 9), ("ship", 70, 5, 90, 9), ("ship", 9, 9, 9, 20)]),
     )
-    found = read_labelled(tmp_path)
-    assert boxes_of(found)["a"] == [("ship", 5, 5, 9, 9)]
-    assert found.notes == [
+    labelled = read_labelled(tmp_path)
+    assert boxes_of(labelled)["a"] == [("ship", 5, 5, 9, 9)]
+    assert labelled.notes == [
         "Boxes left out, without area inside their image: 2, the first in a.xml."
     ]
 
@@ -178,12 +179,12 @@ def test_a_folder_without_labelled_images_is_refused(
 
 def test_a_missing_folder_or_file_of_labels_is_refused(tmp_path: Path) -> None:
     folder = voc(tmp_path)
-    for given, sentence in (
+    for labels, sentence in (
         (tmp_path / "none", "got no such folder"),
         (folder / "00001.xml", "got another file"),
     ):
         with pytest.raises(OptionError, match=sentence):
-            read_labelled(folder, given)
+            read_labelled(folder, labels)
 
 
 @pytest.mark.parametrize(
@@ -303,9 +304,9 @@ def test_what_coco_lists_and_the_folder_lacks_is_told_and_a_crowd_need_not_be_fo
     content["annotations"][-1]["iscrowd"] = 1
     path.write_text(json.dumps(content))
     (tmp_path / "00002.png").unlink()
-    found = read_labelled(tmp_path)
-    assert [path.stem for path, _ in found.images] == ["00001"]
-    assert found.notes == [
+    labelled = read_labelled(tmp_path)
+    assert [path.stem for path, _ in labelled.images] == ["00001"]
+    assert labelled.notes == [
         "1 of 2 images in labels.json are not in the folder.",
         "Boxes that count neither way, difficult, a crowd or visible by less than 30 %: 1.",
     ]

@@ -85,9 +85,9 @@ def test_every_object_lies_within_and_has_the_size_of_its_kind(scenes: list[Scen
 
 
 def test_the_seed_decides_all() -> None:
-    one, same, other = (
+    first, repeat, other = (
         synthetic_scene(np.random.default_rng(seed), 300, 300) for seed in (4, 4, 5)
     )
-    np.testing.assert_array_equal(one[0], same[0])
-    np.testing.assert_array_equal(one[1].corners, same[1].corners)
-    assert one[0].tobytes() != other[0].tobytes()
+    np.testing.assert_array_equal(first[0], repeat[0])
+    np.testing.assert_array_equal(first[1].corners, repeat[1].corners)
+    assert first[0].tobytes() != other[0].tobytes()

@@ -34,13 +34,13 @@ def pictures() -> list[Picture]:
 def score(int8: bool) -> float:
     """mAP50 on the pictures."""
     detector = open_detector(DETECTOR_INT8 if int8 else DETECTOR, 1)
-    found = [
+    boxes = [
         detector.detect((picture.image.astype(np.float32) / 255).transpose(1, 2, 0))
         for picture in pictures()
     ]
     truths = [Boxes.of(picture.corners, picture.classes) for picture in pictures()]
     return float(
-        map50(find_hits(truths, found, len(CLASSES)), np.ones((1, len(truths)), np.int64))[0]
+        map50(find_hits(truths, boxes, len(CLASSES)), np.ones((1, len(truths)), np.int64))[0]
     )
 
 

@@ -1,6 +1,7 @@
 """Pairs, methods, scores and targets of an evaluation."""
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ from beers_deploy.studies.evaluation.scores import (
     site_rows,
 )
 from tests.deploy.command_line import done, refused
-from tests.deploy.documents import valid
+from tests.deploy.documents import figures_of, valid
 
 DEGRADED = load_sensor("pleiades-degraded")
 REFERENCE = load_sensor("pleiades-reference")
@@ -79,9 +80,9 @@ def pair(name: str = "site_1.tif", seed: int = 0, noise_dn: float = 20) -> Named
 
 
 def write_pairs(folder: Path, pairs: list[NamedPair]) -> Path:
-    for each in pairs:
+    for item in pairs:
         for role in ("degraded", "reference"):
-            write_tiff(folder / role / each.name, getattr(each, role).astype(np.uint16))
+            write_tiff(folder / role / item.name, getattr(item, role).astype(np.uint16))
     return folder
 
 
@@ -116,10 +117,10 @@ def test_frames_of_one_site_are_told_by_their_names(name: str, site: str) -> Non
 
 
 def test_pairs_come_back_from_a_folder(tmp_path: Path) -> None:
-    written = [pair("a_1.tif", 1), pair("b_2.tif", 2)]
-    read = read_pairs(write_pairs(tmp_path, written))
-    assert [each.name for each in read] == ["a_1", "b_2"]
-    for one, other in zip(read, written, strict=True):
+    pairs = [pair("a_1.tif", 1), pair("b_2.tif", 2)]
+    read_back = read_pairs(write_pairs(tmp_path, pairs))
+    assert [item.name for item in read_back] == ["a_1", "b_2"]
+    for one, other in zip(read_back, pairs, strict=True):
         assert np.array_equal(one.degraded, other.degraded)
         assert np.array_equal(one.reference, other.reference)
 
@@ -165,9 +166,9 @@ def test_another_oversampling_than_the_profiles_is_said(
     profile = replace(DEGRADED, oversampling=Constant(own, "stated", "a test"))
     scenes = [procedural_scene(side, side, np.random.default_rng(0)) for side in sides]
     pairs, _ = simulate_pairs(scenes, profile, REFERENCE, 0, oversamplings_of(profile))
-    said = oversampling_note(pairs, profile)
-    assert words in said
-    assert bool(words) == bool(said)
+    note = oversampling_note(pairs, profile)
+    assert words in note
+    assert bool(words) == bool(note)
 
 
 @pytest.mark.parametrize("name", ["magic", "traditional-superb", "convbeers-huge", ""])
@@ -177,7 +178,7 @@ def test_an_unknown_method_is_refused(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "known"),
+    ("name", "expected"),
     [
         ("convbeers-xs", "known"),
         ("convbeers-xs-int8", "known"),
@@ -187,9 +188,9 @@ def test_an_unknown_method_is_refused(name: str) -> None:
     ],
 )
 def test_a_shipped_network_knows_the_images_sensor_unless_its_name_says_another(
-    name: str, known: str
+    name: str, expected: str
 ) -> None:
-    assert method_named(name, DEGRADED, REFERENCE).sensor_known == known
+    assert method_named(name, DEGRADED, REFERENCE).sensor_known == expected
 
 
 def test_a_shipped_network_restores_as_it_knows_the_sensor() -> None:
@@ -210,15 +211,15 @@ def test_a_chain_that_gets_to_know_a_sensor_is_the_one_made_for_it(name: str) ->
     """Its gain included: the reference that is aimed at then has it too."""
     dn = np.random.default_rng(0).integers(200, 1800, (40, 47)).astype(np.float32)
     method = method_without_network(name, *SENSORS)
-    made = method_without_network(name, OTHER, SENSORS[1].in_units_of(OTHER))
-    found = method.knowing(OTHER).restore(dn)
-    assert np.array_equal(found, made.restore(dn))
-    assert not np.array_equal(found, method.restore(dn))
+    other = method_without_network(name, OTHER, SENSORS[1].in_units_of(OTHER))
+    restored = method.knowing(OTHER).restore(dn)
+    assert np.array_equal(restored, other.restore(dn))
+    assert not np.array_equal(restored, method.restore(dn))
 
 
 def test_who_can_know_a_sensor_says_so_and_what_depends_on_none_stays_as_it_is() -> None:
-    for plain in (method_without_network("degraded", *SENSORS), Method("blind", np.sqrt, BLIND)):
-        assert plain.knowing(OTHER) is plain
+    for fixed in (method_without_network("degraded", *SENSORS), Method("blind", np.sqrt, BLIND)):
+        assert fixed.knowing(OTHER) is fixed
     method = Method("net", np.sqrt, BLIND, lambda _: np.abs)
     assert (method.knowing(OTHER).sensor_known, method.sensor_known) == (KNOWN, BLIND)
 
@@ -228,17 +229,18 @@ def test_clipped_pixels_do_not_count() -> None:
     one = pair()
     reference = one.reference.copy()
     degraded = one.degraded.copy()
-    reference[3:9, 5:11], degraded[20:25, 5:11] = 4095, 4095
+    reference[3:9, 5:11] = 4095
+    degraded[20:25, 5:11] = 4095
     restored = degraded.copy()
     before = fidelity_db(restored, reference, degraded)
-    restored[3:9, 5:11], restored[20:25, 5:11] = 100, 100
+    restored[3:9, 5:11] = 100
+    restored[20:25, 5:11] = 100
     assert fidelity_db(restored, reference, degraded) == before
     restored[30, 30] += 500
     assert fidelity_db(restored, reference, degraded) < before
     white = np.full((12, 13), 4095, np.float32)
-    assert fidelity_db(white - 1, white, white) == pytest.approx(
-        20 * np.log10(4095)
-    )  # all of it is clipped
+    # All of the image is clipped: then no pixel is left out.
+    assert fidelity_db(white - 1, white, white) == pytest.approx(20 * np.log10(4095))
 
 
 def test_the_degraded_input_gains_nothing_and_missing_figures_have_a_reason() -> None:
@@ -274,17 +276,18 @@ def test_the_reference_without_noise_is_the_same_acquisition_otherwise() -> None
     """
     scene = procedural_scene(700, 760, np.random.default_rng(3))
     (one,), _ = simulate_pairs([scene], DEGRADED, REFERENCE, 7)
-    same = simulate_pair(scene.radiance, *SENSORS, 4, Draw(7))
-    assert np.array_equal(one.degraded, same.degraded)
-    assert np.array_equal(one.reference, same.reference)
+    expected = simulate_pair(scene.radiance, *SENSORS, 4, Draw(7))
+    assert np.array_equal(one.degraded, expected.degraded)
+    assert np.array_equal(one.reference, expected.reference)
     assert one.noise_free is not None
     noise = one.reference - one.noise_free
     sensor = SENSORS[1]
     light = np.clip(one.noise_free / sensor.gain_dn_per_radiance, 0, None)
+    # Rounding to integers adds a variance of 1/12.
     variance = (sensor.alpha * light + sensor.beta) * sensor.gain_dn_per_radiance**2 + 1 / 12
-    sound = one.reference < sensor.max_dn
-    assert float((noise**2 / variance)[sound].mean()) == pytest.approx(1, abs=0.05)
-    assert abs(float(noise[sound].mean())) < 3 * float(np.sqrt(variance.mean() / noise.size))
+    unclipped = one.reference < sensor.max_dn
+    assert float((noise**2 / variance)[unclipped].mean()) == pytest.approx(1, abs=0.05)
+    assert abs(float(noise[unclipped].mean())) < 3 * float(np.sqrt(variance.mean() / noise.size))
 
 
 def test_errors_in_the_border_are_none_of_inner_pixels() -> None:
@@ -346,7 +349,8 @@ def test_clipped_pixels_and_the_offset_are_no_bias_and_black_has_none() -> None:
     level = np.full((40, 41), 500, np.float32)
     restored = level.copy()
     unclipped = np.ones(level.shape, bool)
-    restored[15:20, 15:20], unclipped[15:20, 15:20] = 4095, False
+    restored[15:20, 15:20] = 4095
+    unclipped[15:20, 15:20] = False
     assert bias_percent(restored, level, unclipped) == 0
     assert bias_percent(restored, level) > 1
     assert bias_percent(level + 4, level, offset_dn=100) == pytest.approx(1)
@@ -395,8 +399,8 @@ def test_strips_hold_every_method_and_black_below_the_reference() -> None:
 
 
 def test_one_pair_a_site_is_shown() -> None:
-    pairs = [pair(f"{site}_{k}.tif") for site in "abcdef" for k in range(2)]
-    assert [each.name for each in chosen_pairs(pairs)] == [
+    pairs = [pair(f"{site}_{k}.tif") for site, k in product("abcdef", range(2))]
+    assert [item.name for item in chosen_pairs(pairs)] == [
         "a_0.tif",
         "b_0.tif",
         "c_0.tif",
@@ -424,14 +428,12 @@ def test_the_command_on_a_folder_of_pairs(tmp_path: Path, monkeypatch: pytest.Mo
     files = "--json", tmp_path / "e.json", "--out", tmp_path / "out"
     done("evaluate", "--pairs", folder, "--methods", "traditional-fast", *files)
     document = valid(tmp_path / "e.json")
-    assert [each["name"] for each in document["inputs"]] == ["a_1.tif", "b_1.tif"] * 2
+    assert [entry["name"] for entry in document["inputs"]] == ["a_1.tif", "b_1.tif"] * 2
     names = [row["name"] for row in document["rows"] if row["table"] == "mean"]
     assert names == ["degraded", "traditional-fast", "paper: traditional", "paper: ConvBEERS"]
-    printed = [row["figures"] for row in document["rows"] if row["name"].startswith("paper")]
-    assert {figure["mode"] for figures in printed for figure in figures.values()} == {
-        "published",
-        "unavailable",
-    }
+    of_paper = [row for row in document["rows"] if row["name"].startswith("paper")]
+    modes = {figure["mode"] for figure in figures_of(of_paper)}
+    assert modes == {"published", "unavailable"}
     assert (tmp_path / "out" / "report.html").read_text().count("data:image/png") == 2
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.png", "b.png", "report.html"]
 
@@ -441,16 +443,16 @@ def test_brightness_scales_the_scenes_before_they_are_acquired() -> None:
     quarter of it.
     """
     scenes = [procedural_scene(400, 430, np.random.default_rng(3))]
-    (whole,), _ = simulate_pairs(scenes, DEGRADED, REFERENCE, 7)
+    (bright,), _ = simulate_pairs(scenes, DEGRADED, REFERENCE, 7)
     (dim,), _ = simulate_pairs(scenes_at(0.25, scenes), DEGRADED, REFERENCE, 7)
-    assert whole.noise_free is not None
+    assert bright.noise_free is not None
     assert dim.noise_free is not None
-    unclipped = whole.reference < SENSORS[1].max_dn
+    unclipped = bright.reference < SENSORS[1].max_dn
     np.testing.assert_allclose(
-        4 * dim.noise_free[unclipped], whole.noise_free[unclipped], rtol=1e-3, atol=0.1
+        4 * dim.noise_free[unclipped], bright.noise_free[unclipped], rtol=1e-3, atol=0.1
     )
     noise, dim_noise = (
-        float((each.reference - each.noise_free)[unclipped].std()) for each in (whole, dim)
+        float((item.reference - item.noise_free)[unclipped].std()) for item in (bright, dim)
     )
     assert noise / 4 < dim_noise < noise
 
@@ -469,8 +471,8 @@ def test_pairs_are_as_bright_as_they_are() -> None:
 @pytest.mark.parametrize("text", [",", "a quarter", "0.25,,0.05"])
 def test_a_brightness_that_is_no_number_is_one_sentence(text: str, tmp_path: Path) -> None:
     write_tiff(tmp_path / "scene.tif", np.ones((400, 400), np.uint16))
-    said = refused("evaluate", "--images", tmp_path, "--brightness", text)
-    assert said.startswith("beers-deploy: --brightness: expected numbers separated by commas")
+    message = refused("evaluate", "--images", tmp_path, "--brightness", text)
+    assert message.startswith("beers-deploy: --brightness: expected numbers separated by commas")
 
 
 def test_the_command_at_two_brightnesses_on_photographs(
@@ -481,30 +483,17 @@ def test_the_command_at_two_brightnesses_on_photographs(
     write_tiff(tmp_path / "scenes" / "zebra_DJI_0005.tif", scene)
     write_tiff(tmp_path / "scenes" / "zebra_DJI_0013.tif", scene[::-1])
     dim = ", radiance x 0.05"
-    done(
-        "evaluate",
-        "--images",
-        tmp_path / "scenes",
-        "--methods",
-        "degraded",
-        "--brightness",
-        "0.05",
-        "--json",
-        tmp_path / "e.json",
-    )
+    files = ("--images", tmp_path / "scenes", "--json", tmp_path / "e.json")
+    done("evaluate", *files, "--methods", "degraded", "--brightness", "0.05")
     document = valid(tmp_path / "e.json")
     assert document["arguments"]["brightness"] == "1,0.05"
-    tables = by_name(document["rows"])
+    tables: dict[str, list[dict[str, Any]]] = {}
+    for row in document["rows"]:
+        tables.setdefault(row["table"], []).append(row)
     assert list(tables)[:3] == ["mean", f"mean{dim}", "targets"]
     assert [row["name"] for row in tables["PSNR by site"]] == ["zebra"]
     assert len(tables["images"]) == len(tables[f"images{dim}"]) == 2
     means = [tables[name][0]["figures"] for name in ("mean", f"mean{dim}")]
-    assert means[1]["PSNR"]["value"] > means[0]["PSNR"]["value"] + 10  # over the same full scale
+    # PSNR is over the same full scale at both brightnesses, and noise falls with the light.
+    assert means[1]["PSNR"]["value"] > means[0]["PSNR"]["value"] + 10
     assert {"MTF at Nyquist", "SNR at 10 W/m2/sr/um"} <= set(means[0]) - set(means[1])
-
-
-def by_name(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    tables: dict[str, list[dict[str, Any]]] = {}
-    for row in rows:
-        tables.setdefault(row["table"], []).append(row)
-    return tables

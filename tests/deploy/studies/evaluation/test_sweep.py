@@ -41,10 +41,10 @@ WRONGLY = "sweep, sensor known wrongly", "sweep, lost by a sensor known wrongly"
 
 
 def test_every_condition_is_a_sensor_that_can_be() -> None:
-    found = conditions(NOMINAL, PROFILE)
-    assert found["nominal"] == NOMINAL
-    assert len(found) == 16
-    for sensor in found.values():
+    sensors = conditions(NOMINAL, PROFILE)
+    assert sensors["nominal"] == NOMINAL
+    assert len(sensors) == 16
+    for sensor in sensors.values():
         assert all(0 < mtf < 0.6 for mtf in sensor.mtf_axes)
         assert min(sensor.alpha, sensor.beta) >= 0
 
@@ -87,10 +87,10 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Swept:
     """One sweep under three conditions: its rows, and the sensors that the able
     network was given.
     """
-    given: list[Instrument] = []
+    specialised: list[Instrument] = []
 
     def specialise(sensor: Instrument) -> Restore:
-        given.append(sensor)
+        specialised.append(sensor)
         return lambda dn: dn + np.float32(1000 * sensor.mtf_nyquist)
 
     able = Method("able", half, BLIND, specialise)
@@ -98,7 +98,9 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Swept:
     scene = procedural_scene(500, 560, np.random.default_rng(5))
     tifffile.imwrite(folder / "scene.tif", scene.radiance)
     rows = run_sweep([Method("half", half, BLIND), able], folder, PROFILE, REFERENCE, 0).rows
-    return {table: {row.name: row for row in rows} for table, rows in by_table(rows).items()}, given
+    return {
+        table: {row.name: row for row in rows} for table, rows in by_table(rows).items()
+    }, specialised
 
 
 def few(_nominal: Instrument, _profile: Sensor) -> dict[str, Instrument]:
@@ -111,8 +113,8 @@ def psnr(swept: Swept, condition: str) -> Callable[[str], float]:
 
 def test_a_network_that_can_know_the_sensor_knows_that_of_each_condition(swept: Swept) -> None:
     """Then those that are supposed in its place; it never restores as it does by itself."""
-    wrong = suppositions(NOMINAL, PROFILE)
-    supposed = [list(wrong[name].values()) for name in ("nominal", "MTF 3%")]
+    supposed_for = suppositions(NOMINAL, PROFILE)
+    supposed = [list(supposed_for[name].values()) for name in ("nominal", "MTF 3%")]
     assert swept[1] == [NOMINAL, *supposed[0], DRIFTED, *supposed[1], DIM]
     at = psnr(swept, "nominal")
     assert at("half") < at("able") - 3
@@ -137,20 +139,20 @@ def test_another_gain_is_told_to_the_chains_and_kept(swept: Swept) -> None:
 
 
 def test_a_wrong_sensor_costs_the_methods_that_can_know_one(swept: Swept) -> None:
-    wrong, lost = (swept[0][name] for name in WRONGLY)
+    scores, losses = (swept[0][name] for name in WRONGLY)
     assert (
-        list(wrong)
-        == list(lost)
+        list(scores)
+        == list(losses)
         == ["nominal, supposed SNR x 1.33", "nominal, supposed SNR x 0.67", WRONG]
     )
-    assert list(wrong[WRONG].figures) == ["traditional", "able"]
-    assert (lost[WRONG].figures["traditional"].value or 0) > 1
+    assert list(scores[WRONG].figures) == ["traditional", "able"]
+    assert (losses[WRONG].figures["traditional"].value or 0) > 1
 
 
 SITES = ["a", "b", "c", "d", "e", "f"]
 
 
-def known() -> Found:
+def synthetic_sweep() -> Found:
     """Sites differ by 20 dB, the network's lead over the chain by nothing under one condition, a
     little under two.
     """
@@ -169,7 +171,8 @@ def known() -> Found:
 
 def test_the_interval_of_a_gain_is_that_of_differences_on_the_same_images() -> None:
     nominal, blurred = (
-        row.figures["net"] for row in by_table(known().rows)["sweep, gain over the pipeline"]
+        row.figures["net"]
+        for row in by_table(synthetic_sweep().rows)["sweep, gain over the pipeline"]
     )
     assert nominal.value == pytest.approx(0.75)
     assert nominal.interval == pytest.approx((0.75, 0.75))
@@ -178,7 +181,7 @@ def test_the_interval_of_a_gain_is_that_of_differences_on_the_same_images() -> N
 
 
 def test_over_all_conditions_mean_and_least_gain_are_named() -> None:
-    (row,) = by_table(known().rows)["sweep, gain over the pipeline, all conditions"]
+    (row,) = by_table(synthetic_sweep().rows)["sweep, gain over the pipeline, all conditions"]
     assert row.name == "net"
     assert row.figures["mean of 2 conditions"].value == pytest.approx((0.75 + 0.3) / 2)
     assert row.figures["least"].value == pytest.approx(0.3)
@@ -187,22 +190,22 @@ def test_over_all_conditions_mean_and_least_gain_are_named() -> None:
 
 def test_the_reference_without_noise_has_a_table_of_its_own() -> None:
     noisy, clean = (
-        by_table(known().rows)[f"sweep, PSNR{end}"][0].figures
+        by_table(synthetic_sweep().rows)[f"sweep, PSNR{end}"][0].figures
         for end in ("", ", reference without noise")
     )
     assert (clean["net"].value or 0) - (noisy["net"].value or 0) == pytest.approx(1)
 
 
 def test_tables_of_another_brightness_have_it_in_their_names_and_no_mtf() -> None:
-    found = replace(known(), brightness=0.25)
-    tables = by_table(found.rows)
+    result = replace(synthetic_sweep(), brightness=0.25)
+    tables = by_table(result.rows)
     assert all(name.endswith(", radiance x 0.25") for name in tables)
-    assert len(tables) == len(by_table(known().rows)) - 1
+    assert len(tables) == len(by_table(synthetic_sweep().rows)) - 1
     assert not [name for name in tables if "MTF" in name]
 
 
 def test_what_a_wrongly_known_sensor_costs_is_on_the_same_images() -> None:
-    (row,) = by_table(known().rows)["sweep, lost by a sensor known wrongly"]
+    (row,) = by_table(synthetic_sweep().rows)["sweep, lost by a sensor known wrongly"]
     assert row.name == "MTF 3%, supposed MTF 7%"
     assert row.figures["net"].value == pytest.approx(1.3)
     assert row.figures["net"].interval is not None
@@ -210,7 +213,7 @@ def test_what_a_wrongly_known_sensor_costs_is_on_the_same_images() -> None:
 
 
 def test_without_networks_there_are_no_gains() -> None:
-    one = known()
+    one = synthetic_sweep()
     chain = {key: values for key, values in one.psnr.items() if key[2] != "net"}
     assert not [row for row in Found(chain, one.mtf, SITES, 0).rows if "gain" in row.table]
 
@@ -218,28 +221,18 @@ def test_without_networks_there_are_no_gains() -> None:
 def test_the_command_sweeps_the_networks_alone_at_each_brightness(tmp_path: Path) -> None:
     scene = np.random.default_rng(0).integers(200, 1800, (500, 560)).astype(np.uint16)
     tifffile.imwrite(tmp_path / "scene.tif", scene)
-    found = tmp_path / "found.json"
+    document = tmp_path / "found.json"
     methods = "degraded,convbeers-xs"
-    done(
-        "evaluate",
-        "--images",
-        tmp_path,
-        "--methods",
-        methods,
-        "--sweep",
-        "--brightness",
-        0.1,
-        "--json",
-        found,
-    )
-    whole, dim = (
+    files = ("--images", tmp_path, "--json", document)
+    done("evaluate", *files, "--methods", methods, "--sweep", "--brightness", 0.1)
+    bright, dim = (
         {
             row["name"]: row["figures"]
-            for row in valid(found)["rows"]
+            for row in valid(document)["rows"]
             if row["table"] == f"sweep, PSNR{end}"
         }
         for end in ("", ", radiance x 0.1")
     )
-    assert list(whole) == list(dim) == ["nominal", "MTF 3%", "dim"]
-    assert set(whole["nominal"]) >= {NOMINAL_KNOWN, TRUTH_KNOWN, "convbeers-xs"}
-    assert dim["nominal"]["degraded"]["value"] > whole["nominal"]["degraded"]["value"] + 5
+    assert list(bright) == list(dim) == ["nominal", "MTF 3%", "dim"]
+    assert set(bright["nominal"]) >= {NOMINAL_KNOWN, TRUTH_KNOWN, "convbeers-xs"}
+    assert dim["nominal"]["degraded"]["value"] > bright["nominal"]["degraded"]["value"] + 5

@@ -44,19 +44,21 @@ def quick() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def seen() -> Targets:
+def raw_targets() -> Targets:
     """The targets as the degraded sensor sees them."""
     return acquire_targets(*SENSORS, 0)
 
 
 @pytest.fixture(scope="module")
-def perfect(seen: Targets) -> Targets:
+def perfect(raw_targets: Targets) -> Targets:
     """The targets as the reference sensor sees them without noise; the background of points keeps
     its noise.
     """
-    points = [replace(each, seen=each.flat + each.wanted) for each in seen.points]
+    points = [replace(target, seen=target.flat + target.wanted) for target in raw_targets.points]
     return replace(
-        seen, points=points, patterns=[replace(each, seen=each.wanted) for each in seen.patterns]
+        raw_targets,
+        points=points,
+        patterns=[replace(target, seen=target.wanted) for target in raw_targets.patterns],
     )
 
 
@@ -86,6 +88,7 @@ def test_a_blur_takes_contrast_and_leaves_the_flux(perfect: Targets) -> None:
     assert values(blurred, "%") == pytest.approx([100] * 6, abs=3)
     period_2, period_267, period_3, *plates = values(blurred, OF_REFERENCE)
     assert period_2 < period_267 < period_3 < 0.15
+    # A Gaussian of sigma 1 px leaves exp(-2 (pi f)^2) of the contrast at a frequency f, here 1/3.
     assert period_3 == pytest.approx(np.exp(-2 * (np.pi / 3) ** 2), rel=0.05)
     assert max(plates) < 0.1
 
@@ -105,8 +108,8 @@ def test_what_is_erased_is_nothing_and_reversed_contrast_is_below_zero(perfect: 
     assert max(values(target_row(reverse, perfect), OF_REFERENCE)) < -0.99
 
 
-def test_flux_and_contrast_of_the_raw_image_are_those_of_its_blur(seen: Targets) -> None:
-    row = target_row(IDENTITY, seen)
+def test_flux_and_contrast_of_the_raw_image_are_those_of_its_blur(raw_targets: Targets) -> None:
+    row = target_row(IDENTITY, raw_targets)
     bright = row.figures[flux_name(120, 100)]
     assert bright.value == pytest.approx(98, abs=2)
     assert bright.interval is not None
@@ -115,30 +118,30 @@ def test_flux_and_contrast_of_the_raw_image_are_those_of_its_blur(seen: Targets)
     assert all(0.2 < value < 0.5 for value in values(row, OF_REFERENCE))
 
 
-def test_points_and_their_flat_field_have_the_same_noise(seen: Targets) -> None:
-    for points in seen.points:
+def test_points_and_their_flat_field_have_the_same_noise(raw_targets: Targets) -> None:
+    for points in raw_targets.points:
         far = points.wanted < 0.2
         difference = points.seen - points.flat
         assert np.abs(difference[far]).max() <= 2
         assert float(points.flat.std()) > 2 * float(difference[far].std())
 
 
-def test_targets_measure_the_sensor_and_what_a_chain_makes_of_it(seen: Targets) -> None:
-    assert len(seen.edges) == 4
-    before = mean_figures(IDENTITY, seen)
+def test_targets_measure_the_sensor_and_what_a_chain_makes_of_it(raw_targets: Targets) -> None:
+    assert len(raw_targets.edges) == 4
+    before = mean_figures(IDENTITY, raw_targets)
     assert before["MTF at Nyquist"].value == pytest.approx(7, abs=0.7)
     assert snr_name(25) == "SNR at 25 W/m2/sr/um"
     sensor: Instrument = SENSORS[0]
     for radiance in (10, 25, 100):
         true_snr = radiance / sensor.noise_sigma(radiance)
         assert before[snr_name(radiance)].value == pytest.approx(true_snr, rel=0.06)
-    after = mean_figures(method_named("traditional-fast", DEGRADED, REFERENCE), seen)
+    after = mean_figures(method_named("traditional-fast", DEGRADED, REFERENCE), raw_targets)
     assert (after["MTF at Nyquist"].value or 0) > 12
     assert (after[snr_name(25)].value or 0) > 200
 
 
 def test_refused_edges_and_silent_fields_are_unavailable() -> None:
-    refused = mtf_figure([Refusal("a step of 3 in noise of 2")] * 3)
-    assert refused.value is None
-    assert refused.reason == "3 of 3 edges refused: a step of 3 in noise of 2"
+    figure = mtf_figure([Refusal("a step of 3 in noise of 2")] * 3)
+    assert figure.value is None
+    assert figure.reason == "3 of 3 edges refused: a step of 3 in noise of 2"
     assert flat_figure(np.full((9, 9), 100.0)).value is None

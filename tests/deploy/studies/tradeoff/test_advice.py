@@ -44,8 +44,8 @@ def test_no_point_beats_a_member_and_a_member_is_as_good_as_each_point(
 ) -> None:
     points = [at(number, *place) for number, place in enumerate(places)]
     front = pareto_front(points, COST)
-    known = {point.name: place for point, place in zip(points, places, strict=True)}
-    members = [known[point.name] for point in front]
+    place_of = {point.name: place for point, place in zip(points, places, strict=True)}
+    members = [place_of[point.name] for point in front]
     assert members == sorted(members)
     for cost, quality in members:
         assert not any(c <= cost and q >= quality and (c, q) != (cost, quality) for c, q in places)
@@ -54,43 +54,43 @@ def test_no_point_beats_a_member_and_a_member_is_as_good_as_each_point(
 
 
 def test_what_lacks_a_figure_or_was_published_is_not_on_the_front() -> None:
-    printed = Measured("paper", {COST: published(1, "s", ""), "PSNR": measured(99, "dB", "")}, {})
+    paper = Measured("paper", {COST: published(1, "s", ""), "PSNR": measured(99, "dB", "")}, {})
     lacking = Measured(
         "float", {COST: unavailable("s", "no board"), "PSNR": measured(99, "dB", "")}, {}
     )
-    found = pareto_front([printed, lacking, at(1, 2, 3)], COST)
-    assert [point.name for point in found] == ["1"]
+    front = pareto_front([paper, lacking, at(1, 2, 3)], COST)
+    assert [point.name for point in front] == ["1"]
 
 
 def test_differences_are_paired_and_reach_less_far_than_the_sites_differ() -> None:
     small = made("small", 45.0, 2.0)
     medium = made("medium", 45.5, 4.0)
-    found = COMPARE.difference(medium, small)
-    assert found.interval is not None
-    assert found.value == pytest.approx(0.5)
-    assert 0.4 < found.interval[0] < 0.5 < found.interval[1] < 0.6
-    assert verdict(found) == SIGNIFICANT
-    assert significant(found)
+    difference = COMPARE.difference(medium, small)
+    assert difference.interval is not None
+    assert difference.value == pytest.approx(0.5)
+    assert 0.4 < difference.interval[0] < 0.5 < difference.interval[1] < 0.6
+    assert verdict(difference) == SIGNIFICANT
+    assert significant(difference)
     assert not significant(COMPARE.difference(small, medium))
 
 
 def test_the_same_pictures_do_not_differ_on_however_few_sites() -> None:
     one = made("one", 45.0, 2.0)
     other = replace(made("one", 45.0, 2.0), name="other")
-    found = Comparison(("a",) * 6, 0).difference(one, other)
-    assert (found.value, found.interval) == (0.0, (0.0, 0.0))
+    difference = Comparison(("a",) * 6, 0).difference(one, other)
+    assert (difference.value, difference.interval) == (0.0, (0.0, 0.0))
 
 
 def test_below_five_sites_values_decide_beyond_a_margin() -> None:
     few = Comparison(("a", "a", "b", "b", "c", "c"), 0)
-    one = made("one", 45.0, 2.0)
+    base = made("one", 45.0, 2.0)
     better = made("better", 45.2, 3.0)
     alike = made("alike", 45.02, 3.0)
-    found = few.difference(better, one)
-    assert found.interval is None
-    assert verdict(found) == TOO_FEW
-    assert significant(found)
-    assert not significant(few.difference(alike, one))
+    difference = few.difference(better, base)
+    assert difference.interval is None
+    assert verdict(difference) == TOO_FEW
+    assert significant(difference)
+    assert not significant(few.difference(alike, base))
 
 
 def test_a_ratio_of_latencies_on_a_board_has_the_width_of_pairs() -> None:
@@ -98,19 +98,19 @@ def test_a_ratio_of_latencies_on_a_board_has_the_width_of_pairs() -> None:
     target = replace(DPU.target, tables={**DPU.target.tables, "cost": cost})
     dpu = replace(DPU, target=target)
     points = [made("small", 45.0, 2.0), made("large", 45.5, 6.0)]
-    one, other = (
-        replace(each, point=replace(each.point, board=target, dpu=dpu) if each.point else None)
-        for each in points
+    cheap, costly = (
+        replace(item, point=replace(item.point, board=target, dpu=dpu) if item.point else None)
+        for item in points
     )
-    found = cost_ratio(other, one, COST)
-    assert found.value == pytest.approx(3)
-    assert found.interval == pytest.approx((3 / math.exp(0.2), 3 * math.exp(0.2)))
+    ratio = cost_ratio(costly, cheap, COST)
+    assert ratio.value == pytest.approx(3)
+    assert ratio.interval == pytest.approx((3 / math.exp(0.2), 3 * math.exp(0.2)))
 
 
 def test_tiles_of_one_network_differ_by_their_count_alone() -> None:
     one = made("one", 45.0, 2.0, method="net")
-    found = cost_ratio(made("other", 45.0, 3.0, method="net"), one, COST)
-    assert found.interval == (found.value, found.value)
+    ratio = cost_ratio(made("other", 45.0, 3.0, method="net"), one, COST)
+    assert ratio.interval == (ratio.value, ratio.value)
     apart = cost_ratio(made("third", 45.0, 3.0, tile_px=176, method="net"), one, COST)
     assert apart.interval is not None
     assert apart.interval[0] < 1.5 < apart.interval[1]
@@ -130,7 +130,7 @@ def test_front_rows_compare_each_member_with_the_next_cheaper_one() -> None:
     assert rows[2].figures["board latency ratio"].value == pytest.approx(2)
 
 
-def asked(budget: str | None = None, need: str | None = None) -> tuple[str | None, str]:
+def recommendation(budget: str | None = None, need: str | None = None) -> tuple[str | None, str]:
     """The name of the point to take, and the line that says so."""
     limits = [
         parse_constraints(f"--{name}", text) for name, text in (("budget", budget), ("need", need))
@@ -146,8 +146,8 @@ def having(key: str, figure: Figure) -> Measured:
 @pytest.mark.parametrize("name", NAMES)
 def test_every_figure_can_be_limited_in_its_unit(name: str) -> None:
     key, unit = NAMES[name]
-    (found,) = parse_constraints("--budget", f"{name.upper()} <= 2.5e1 {unit}")
-    assert found == Constraint(key, True, 25.0, unit)
+    (constraint,) = parse_constraints("--budget", f"{name.upper()} <= 2.5e1 {unit}")
+    assert constraint == Constraint(key, True, 25.0, unit)
 
 
 def test_several_constraints_stand_with_commas() -> None:
@@ -176,10 +176,10 @@ def test_what_is_no_constraint_is_refused(text: str, words: str) -> None:
 def test_a_violation_is_0_where_the_value_keeps_the_limit(
     value: float, limit: float, at_most: bool
 ) -> None:
-    found = Constraint("PSNR", at_most, limit, "dB").violation(
+    violation = Constraint("PSNR", at_most, limit, "dB").violation(
         having("PSNR", measured(value, "dB", ""))
     )
-    assert (found == 0) == (value <= limit if at_most else value >= limit)
+    assert (violation == 0) == (value <= limit if at_most else value >= limit)
 
 
 def test_no_figure_keeps_no_limit_and_a_published_one_compares_with_none() -> None:
@@ -202,18 +202,18 @@ def test_no_figure_keeps_no_limit_and_a_published_one_compares_with_none() -> No
 def test_the_best_within_a_budget_is_taken_and_the_cheapest_for_a_need(
     budget: str | None, need: str | None, name: str
 ) -> None:
-    assert asked(budget, need)[0] == name
+    assert recommendation(budget, need)[0] == name
 
 
 def test_what_is_not_significantly_better_is_not_paid_for() -> None:
-    name, line = asked("latency<=60s")
+    name, line = recommendation("latency<=60s")
     assert name == "medium"
     assert "; large has 0.003 [" in line
     assert "dB more, not significant" in line
 
 
 def test_the_line_has_value_interval_and_mode_and_says_what_only_the_value_keeps() -> None:
-    line = asked("latency<=20s")[1]
+    line = recommendation("latency<=20s")[1]
     assert line.startswith(
         "recommended for board latency <= 20 s: medium: PSNR 45.5 [42.5, 48.5] dB (measured), "
     )
@@ -221,14 +221,14 @@ def test_the_line_has_value_interval_and_mode_and_says_what_only_the_value_keeps
     assert "not over" not in line
     assert (
         "board latency <= 5 s holds by value, not over the whole interval"
-        in asked("latency<=5s")[1]
+        in recommendation("latency<=5s")[1]
     )
 
 
 def test_where_nothing_keeps_the_limits_the_nearest_is_named() -> None:
-    name, line = asked("latency<=0.1s")
+    name, line = recommendation("latency<=0.1s")
     assert name is None
     assert line.startswith(
         "nothing to recommend for board latency <= 0.1 s; nearest is tiny: board latency 0.6"
     )
-    assert "no point has every figure" in asked("map50>=50")[1]
+    assert "no point has every figure" in recommendation("map50>=50")[1]

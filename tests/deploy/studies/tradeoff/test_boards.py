@@ -27,28 +27,28 @@ def weighed(
     budget: str | None = None,
     need: str | None = None,
 ) -> Tradeoff:
-    asked = Question(
+    question = Question(
         parse_constraints("--budget", budget), parse_constraints("--need", need), COMPARE
     )
-    return weigh(points, boards, asked, arguments={}, inputs=(), notes=())
+    return weigh(points, boards, question, arguments={}, inputs=(), notes=())
 
 
 def on_boards(costs: dict[str, float], psnr_db: dict[str, float]) -> list[Measured]:
     """One point for each network and board: its PSNR is the network's, its
     latency theirs together.
     """
-    found = []
+    points = []
     for board, factor in costs.items():
         for name, quality_db in psnr_db.items():
-            one = made(
+            point = made(
                 name,
                 quality_db,
                 factor * (1 + quality_db - 44),
                 board=board,
                 power_w=POWER_W[board],
             )
-            found.append(replace(one, name=f"{name} on {board}"))
-    return found
+            points.append(replace(point, name=f"{name} on {board}"))
+    return points
 
 
 NETWORKS = {"small": 44.0, "medium": 45.0, "large": 45.6}
@@ -80,23 +80,23 @@ def test_the_order_of_the_boards_changes_nothing(
     """Equal figures on purpose: a tie between two boards must not be won by the one that was named
     first.
     """
-    found = [
+    candidates = [
         replace(
             made("net", psnr_db, cost_s, board=board, power_w=POWER_W[board]),
             name=f"{board} {psnr_db} {cost_s}",
         )
         for board, psnr_db, cost_s in points
     ]
-    one = weighed(found, BOARDS, budget, need)
+    one = weighed(candidates, BOARDS, budget, need)
     other = weighed(
-        data.draw(st.permutations(found)), data.draw(st.permutations(BOARDS)), budget, need
+        data.draw(st.permutations(candidates)), data.draw(st.permutations(BOARDS)), budget, need
     )
     assert other.line == one.line
     assert (other.best and other.best.name) == (one.best and one.best.name)
     assert [row.name for row in other.front_rows] == [row.name for row in one.front_rows]
     rows = [
-        {row.name: (row.text, dict(row.figures)) for row in each.board_rows}
-        for each in (one, other)
+        {row.name: (row.text, dict(row.figures)) for row in study.board_rows}
+        for study in (one, other)
     ]
     assert rows[0] == rows[1]
 
@@ -104,12 +104,12 @@ def test_the_order_of_the_boards_changes_nothing(
 @given(st.permutations(BOARDS))
 def test_a_board_that_the_budget_excludes_hides_no_other(boards: Sequence[str]) -> None:
     points = on_boards({"fast": 1.0, "slow": 3.0, "frugal": 40.0}, NETWORKS)
-    found = weighed(points, boards, "latency<=10s,power<=20W")
-    assert found.best is not None
-    assert found.best.name == "large on slow"
-    assert found.board == "slow"
-    assert {point.text["board"] for point in found.front} == {"slow"}
-    words = dict(line.split(": ", 1) for line in str(found).splitlines()[1:])
+    study = weighed(points, boards, "latency<=10s,power<=20W")
+    assert study.best is not None
+    assert study.best.name == "large on slow"
+    assert study.board == "slow"
+    assert {point.text["board"] for point in study.front} == {"slow"}
+    words = dict(line.split(": ", 1) for line in str(study).splitlines()[1:])
     assert words.keys() == set(boards)
     assert words["fast"] == "no point within board power <= 20 W: the least is 30 W (small on fast)"
     assert (
@@ -120,16 +120,16 @@ def test_a_board_that_the_budget_excludes_hides_no_other(boards: Sequence[str]) 
 
 
 def test_power_and_energy_are_columns_of_the_front() -> None:
-    found = weighed(on_boards({"fast": 1.0}, NETWORKS), ["fast"])
-    for row in found.front_rows:
+    study = weighed(on_boards({"fast": 1.0}, NETWORKS), ["fast"])
+    for row in study.front_rows:
         assert {"PSNR", "board latency", "board power", "board energy"} <= row.figures.keys()
 
 
 def test_a_board_within_the_limits_is_compared_with_the_recommended_point() -> None:
-    found = weighed(
+    study = weighed(
         on_boards({"fast": 1.0, "slow": 3.0}, NETWORKS), ["slow", "fast"], "latency<=30s"
     )
-    rows = {row.name: row for row in found.board_rows}
+    rows = {row.name: row for row in study.board_rows}
     assert (
         rows["slow"].text["verdict"]
         == "the PSNR of the recommended point, for 3 times its board latency"
@@ -168,39 +168,39 @@ def test_a_board_within_the_limits_is_compared_with_the_recommended_point() -> N
 def test_a_board_without_a_point_says_which_limit_it_misses(
     budget: str | None, need: str | None, words: str
 ) -> None:
-    found = weighed(on_boards({"fast": 1.0}, NETWORKS), ["fast"], budget, need)
-    assert found.best is None
-    assert words in str(found).splitlines()[1]
+    study = weighed(on_boards({"fast": 1.0}, NETWORKS), ["fast"], budget, need)
+    assert study.best is None
+    assert words in str(study).splitlines()[1]
 
 
 def test_what_a_board_lacks_or_refuses_is_said_with_its_reason() -> None:
     points = on_boards({"fast": 1.0, "slow": 3.0}, NETWORKS)
     lacking = unavailable("W", "nobody measured it")
     points = [
-        replace(each, figures={**each.figures, "board power": lacking})
-        if each.text["board"] == "slow"
-        else each
-        for each in points
+        replace(point, figures={**point.figures, "board power": lacking})
+        if point.text["board"] == "slow"
+        else point
+        for point in points
     ]
     rows = {row.name: row for row in weighed(points, ["fast", "slow"], "power<=40").board_rows}
     assert rows["slow"].text["verdict"] == "no point has the figure board power: nobody measured it"
-    one = made("odd", 45.0, 1.0)
-    assert one.point is not None
-    refused = replace(
-        one,
-        figures={"PSNR": one.figures["PSNR"]},
-        text={**one.text, "board": "this machine"},
-        point=replace(one.point, reason="frugal: a sigmoid", refused_by="frugal"),
+    odd = made("odd", 45.0, 1.0)
+    assert odd.point is not None
+    misfit = replace(
+        odd,
+        figures={"PSNR": odd.figures["PSNR"]},
+        text={**odd.text, "board": "this machine"},
+        point=replace(odd.point, reason="frugal: a sigmoid", refused_by="frugal"),
     )
-    rows = {row.name: row for row in weighed([*points, refused], ["fast", "frugal"]).board_rows}
+    rows = {row.name: row for row in weighed([*points, misfit], ["fast", "frugal"]).board_rows}
     assert "odd does not fit its DPU: frugal: a sigmoid" in rows["frugal"].text["verdict"]
 
 
 def test_the_document_has_a_row_for_each_board() -> None:
-    found = weighed(
+    study = weighed(
         on_boards({"fast": 1.0, "slow": 3.0}, NETWORKS), ["slow", "fast"], "latency<=2s"
     )
-    document = json.loads(json.dumps(found.to_dict()))
+    document = json.loads(json.dumps(study.to_dict()))
     rows = [row for row in document["rows"] if row["table"] == "boards"]
     assert [row["name"] for row in rows] == ["slow", "fast"]
     assert rows[0]["text"]["point"] == "none"

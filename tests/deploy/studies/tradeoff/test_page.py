@@ -27,20 +27,22 @@ def study(
     budget: str | None = None,
     boards: tuple[str, ...] = BOARDS,
 ) -> Tradeoff:
-    found = list(family()) if points is None else points
-    asked = Question(parse_constraints("budget", budget), [], COMPARE)
-    return weigh(found, boards, asked, arguments={}, inputs=(), notes=("No board was used.",))
+    candidates = list(family()) if points is None else points
+    question = Question(parse_constraints("budget", budget), [], COMPARE)
+    return weigh(
+        candidates, boards, question, arguments={}, inputs=(), notes=("No board was used.",)
+    )
 
 
-def words_of(found: Tradeoff) -> list[str]:
+def words_of(result: Tradeoff) -> list[str]:
     """Return the words in a study's plot."""
-    root = ET.fromstring(plot_svg(found.drawn))  # noqa: S314 - our own
+    root = ET.fromstring(plot_svg(result.drawn))  # noqa: S314 - our own
     return [text.text or "" for text in root.iter(f"{SVG}text")]
 
 
 def page() -> str:
-    found = study()
-    return render(report_of(found, plot_svg(found.drawn)))
+    result = study()
+    return render(report_of(result, plot_svg(result.drawn)))
 
 
 def test_the_plot_numbers_the_members_of_the_front_and_the_table_names_them() -> None:
@@ -51,7 +53,7 @@ def test_the_plot_numbers_the_members_of_the_front_and_the_table_names_them() ->
 
 
 def test_every_series_has_a_look_of_its_own() -> None:
-    looks = [(each.colour, each.marker) for each in series(study().drawn)]
+    looks = [(line.colour, line.marker) for line in series(study().drawn)]
     assert len(set(looks)) == len(looks) == 5
 
 
@@ -60,16 +62,18 @@ def test_of_several_boards_a_network_keeps_its_colour_and_a_board_its_marker() -
         made(f"{name} {board}", 45.0, cost, method=name, board=board)
         for name, board, cost in PLACES
     ]
-    points = [replace(each, text={**each.text, "method": each.name.split()[0]}) for each in points]
-    found = list(series(study(points, boards=("vck190", "zcu104")).drawn))
+    points = [
+        replace(point, text={**point.text, "method": point.name.split()[0]}) for point in points
+    ]
+    lines = list(series(study(points, boards=("vck190", "zcu104")).drawn))
     assert (
-        len({(each.name, each.colour) for each in found})
-        == len({each.colour for each in found})
+        len({(line.name, line.colour) for line in lines})
+        == len({line.colour for line in lines})
         == 2
     )
     assert (
-        len({(each.board, each.marker) for each in found})
-        == len({each.marker for each in found})
+        len({(line.board, line.marker) for line in lines})
+        == len({line.marker for line in lines})
         == 2
     )
     words = words_of(study(points, boards=("vck190", "zcu104")))
@@ -89,12 +93,13 @@ def test_every_label_lies_within_the_picture(most_s: float) -> None:
     points = [*family(), made("a network with a rather long name", 44.0, most_s)]
     with look():
         figure = figure_of(study(points, "latency<=9s").drawn)
-        found = figure.get_tightbbox()  # in inches
+        # Both extents are in inches.
+        box = figure.get_tightbbox()
         width, height = figure.get_size_inches()
-    assert found.x0 >= 0
-    assert found.y0 >= 0
-    assert found.x1 <= width
-    assert found.y1 <= height
+    assert box.x0 >= 0
+    assert box.y0 >= 0
+    assert box.x1 <= width
+    assert box.y1 <= height
 
 
 def test_the_plot_marks_the_recommended_point_and_the_budget() -> None:
@@ -115,8 +120,8 @@ def test_a_study_without_points_has_a_page(tmp_path: Path) -> None:
 def test_the_pages_plot_is_the_file_beside_it(tmp_path: Path) -> None:
     study().report(tmp_path)
     html = (tmp_path / "tradeoff.html").read_text()
-    (shown,) = re.findall(r"data:image/svg\+xml;base64,([^\"]+)", html)
-    assert base64.b64decode(shown).decode() == (tmp_path / "tradeoff.svg").read_text()
+    (encoded,) = re.findall(r"data:image/svg\+xml;base64,([^\"]+)", html)
+    assert base64.b64decode(encoded).decode() == (tmp_path / "tradeoff.svg").read_text()
     assert not re.search(r'(src|href)="(?!data:)', html), "nothing is asked of the network"
 
 
@@ -126,10 +131,10 @@ def test_nothing_is_wider_than_the_window(width_px: int, tmp_path: Path) -> None
     look = """const image = document.images[0], root = document.documentElement;
     const width = image.getBoundingClientRect().width;
     return [root.scrollWidth - root.clientWidth, image.naturalWidth, width];"""
-    over, natural, shown = seen(page(), look, tmp_path, width_px=width_px)
-    assert over <= 0
-    assert natural == SIZE_PX[0]
-    assert shown > 340
+    overflow_px, natural_px, displayed_px = seen(page(), look, tmp_path, width_px=width_px)
+    assert overflow_px <= 0
+    assert natural_px == SIZE_PX[0]
+    assert displayed_px > 340
 
 
 @pytest.mark.slow

@@ -76,24 +76,24 @@ def test_all_boards_are_the_shipped_ones_the_default_first() -> None:
 
 
 def test_shipped_networks_come_in_both_precisions_with_the_sensors_profile() -> None:
-    found = network_variants(["convbeers-xs", "convbeers-xs"], SENSOR, refused, lambda _: None)
-    assert [variant.name for variant in found] == ["convbeers-xs float32", "convbeers-xs INT8"]
-    assert all(variant.file and variant.file.is_file() for variant in found)
+    variants = network_variants(["convbeers-xs", "convbeers-xs"], SENSOR, refused, lambda _: None)
+    assert [variant.name for variant in variants] == ["convbeers-xs float32", "convbeers-xs INT8"]
+    assert all(variant.file and variant.file.is_file() for variant in variants)
 
 
 def test_an_own_network_is_quantised_and_one_that_cannot_be_stays_float(tmp_path: Path) -> None:
     path = float_file(tmp_path / "net.onnx")
-    said = list[str]()
-    found = network_variants([str(path)], SENSOR, lambda file: file, said.append)
-    assert [variant.precision for variant in found] == [FLOAT, INT8]
-    found = network_variants([str(path)], SENSOR, refused, said.append)
-    assert [variant.precision for variant in found] == [FLOAT]
-    assert "compared in float32 alone: net: expected convolutions, got a sigmoid" in said[0]
+    messages = list[str]()
+    variants = network_variants([str(path)], SENSOR, lambda file: file, messages.append)
+    assert [variant.precision for variant in variants] == [FLOAT, INT8]
+    variants = network_variants([str(path)], SENSOR, refused, messages.append)
+    assert [variant.precision for variant in variants] == [FLOAT]
+    assert "compared in float32 alone: net: expected convolutions, got a sigmoid" in messages[0]
 
 
 def test_an_int8_file_is_taken_as_it_is(variant: Variant) -> None:
-    found = network_variants([str(variant.file)], SENSOR, refused, lambda _: None)
-    assert [each.precision for each in found] == [INT8]
+    variants = network_variants([str(variant.file)], SENSOR, refused, lambda _: None)
+    assert [item.precision for item in variants] == [INT8]
 
 
 def test_other_names_and_two_files_of_one_name_are_refused(tmp_path: Path) -> None:
@@ -117,15 +117,15 @@ def test_a_network_of_one_tile_size_is_refused(tmp_path: Path) -> None:
 def test_the_fastest_tile_is_a_multiple_of_the_step_and_no_other_is_faster(
     variant: Variant,
 ) -> None:
-    found = fastest_tile_px(variant, DPU, WHOLE)
+    tile_px = fastest_tile_px(variant, DPU, WHOLE)
     radius = radius_px(variant)
-    assert found % TILE_STEP_PX == 0
-    assert 2 * radius < found <= TILE_PX
+    assert tile_px % TILE_STEP_PX == 0
+    assert 2 * radius < tile_px <= TILE_PX
 
     def seconds(side: int) -> float:
         return dpu_latency(variant, DPU, replace(WHOLE, tile_px=side, halo_px=radius)).value or 0.0
 
-    assert seconds(found) == min(
+    assert seconds(tile_px) == min(
         seconds(side) for side in range(2 * radius + TILE_STEP_PX, 641, 1) if side % 16 == 0
     )
 
@@ -137,13 +137,13 @@ def test_int8_is_compared_on_every_board_and_configuration_in_several_tiles_and_
     points = network_points(variant, boards, WHOLE)
     assert len({point.name for point in points}) == len(points)
     for board in boards:
-        here = [point for point in points if point.board == board]
-        assert {point.dpu.name for point in here if point.dpu} == set(board.configurations)
-        assert {point.halo_px for point in here} == {
+        on_board = [point for point in points if point.board == board]
+        assert {point.dpu.name for point in on_board if point.dpu} == set(board.configurations)
+        assert {point.halo_px for point in on_board} == {
             None,
             *(halo for halo in HALOS_PX if halo < radius_px(variant)),
         }
-        assert TILE_PX in {point.tile_px for point in here}
+        assert TILE_PX in {point.tile_px for point in on_board}
     other = network_points(variant, boards[::-1], WHOLE)
     assert {point.name for point in other} == {point.name for point in points}
 
@@ -164,7 +164,8 @@ def test_a_smaller_halo_takes_less_time_and_figures_follow_from_the_latency(
         assert {key: figure.unit for key, figure in figures.items()} == UNITS
         return {key: figure.value or 0.0 for key, figure in figures.items()}
 
-    exact, none = at(None), at(0)
+    exact = at(None)
+    none = at(0)
     assert none["board latency"] < exact["board latency"]
     assert exact["board energy"] == pytest.approx(exact["board latency"] * exact["board power"])
     assert exact["board throughput"] == pytest.approx(
@@ -175,16 +176,20 @@ def test_a_smaller_halo_takes_less_time_and_figures_follow_from_the_latency(
 
 def test_a_chain_on_a_boards_processor_takes_the_stated_time_by_the_measured_ratio() -> None:
     chain = Variant("traditional-best")
-    stated = Constant((10.0, 40.0), "inferred", "a test")
-    tables = {**DPU.target.tables, "cpu": {**DPU.target.tables["cpu"], "chain_s_per_mpx": stated}}
+    time_s_per_mpx = Constant((10.0, 40.0), "inferred", "a test")
+    tables = {
+        **DPU.target.tables,
+        "cpu": {**DPU.target.tables["cpu"], "chain_s_per_mpx": time_s_per_mpx},
+    }
     board = replace(DPU.target, tables=tables)
     swath = Swath(1000, 2000)
     latency = board_figures(Point(chain, board), swath, slower=3.0)["board latency"]
     assert latency.value == pytest.approx(2 * 3 * 20)
     assert latency.interval == pytest.approx((60, 240))
-    bare = replace(DPU.target, tables={"cpu": {}})
+    untimed = replace(DPU.target, tables={"cpu": {}})
     assert (
-        board_figures(Point(chain, bare), swath, slower=3.0)["board latency"].mode == "unavailable"
+        board_figures(Point(chain, untimed), swath, slower=3.0)["board latency"].mode
+        == "unavailable"
     )
 
 
@@ -196,8 +201,8 @@ def test_what_was_measured_is_kept_by_what_it_depends_on(tmp_path: Path) -> None
         calls.append(1)
         return [len(calls)]
 
-    kept = Measurements.open(path)
-    assert kept.make(key_of(model="a"), measure) == [1]
+    store = Measurements.open(path)
+    assert store.make(key_of(model="a"), measure) == [1]
     assert Measurements.open(path).make(key_of(model="a"), measure) == [1]
     assert Measurements.open(path).make(key_of(model="b"), measure) == [2]
     assert len(json.loads(path.read_text())["measurements"]) == 2
@@ -211,8 +216,8 @@ def test_methods_are_timed_in_turns_after_a_run_for_warm_up() -> None:
         return dn
 
     names = ("one", "other")
-    found = host_times([partial(restore, name) for name in names], np.zeros((4, 4)))
-    assert [len(times) for times in found] == [ROUNDS, ROUNDS]
+    times_by_method = host_times([partial(restore, name) for name in names], np.zeros((4, 4)))
+    assert [len(times) for times in times_by_method] == [ROUNDS, ROUNDS]
     assert order == [*names] * (ROUNDS + 1)
 
 

@@ -67,9 +67,13 @@ def small() -> Iterator[None]:
 
 
 def studied(folder: Path, out: Path, **options: Any) -> Tradeoff:
-    given = {"images": folder / "images", "calibration": folder / "calibration", "sensor": SENSOR}
-    given |= {"reference": "pleiades-reference", "board": ("vck190",), "size": (1500, 1200)}
-    return tradeoff([str(folder / "narrow.safetensors")], cache=out, **{**given, **options})
+    arguments = {
+        "images": folder / "images",
+        "calibration": folder / "calibration",
+        "sensor": SENSOR,
+    }
+    arguments |= {"reference": "pleiades-reference", "board": ("vck190",), "size": (1500, 1200)}
+    return tradeoff([str(folder / "narrow.safetensors")], cache=out, **{**arguments, **options})
 
 
 @pytest.fixture(scope="module")
@@ -102,10 +106,10 @@ def test_exact_halos_give_one_picture_and_smaller_ones_show_seams(
 ) -> None:
     points = [point for point in study[0].points if "INT8" in point.name]
     exact = {point.value("PSNR") for point in points if point.text["halo"] == "exact"}
-    (cut,) = [point for point in points if point.text["halo"] == "0"]
+    (without_halo,) = [point for point in points if point.text["halo"] == "0"]
     assert len(exact) == 1
-    assert cut.value("PSNR") not in exact
-    assert cut.value(SEAM_ERROR) > 0
+    assert without_halo.value("PSNR") not in exact
+    assert without_halo.value(SEAM_ERROR) > 0
     assert all(SEAM_ERROR not in point.figures for point in points if point.text["halo"] == "exact")
 
 
@@ -118,18 +122,18 @@ def test_the_scores_are_those_of_the_method_that_evaluate_takes(
     pairs, _ = pairs_of_scenes(folder / "images", degraded, reference, 0)
     instruments = Instruments({})
     expected = [instruments.score(restore(pair.degraded), pair)["PSNR"] for pair in pairs]
-    found = next(point for point in study[0].points if point.name == "narrow float32")
-    assert [image["PSNR"] for image in found.images] == expected
+    narrow = next(point for point in study[0].points if point.name == "narrow float32")
+    assert [image["PSNR"] for image in narrow.images] == expected
 
 
 def test_two_sites_give_no_interval_and_it_is_said(study: tuple[Tradeoff, Path]) -> None:
-    found = study[0]
-    assert all(point.figures["PSNR"].interval is None for point in found.points)
-    assert {row.text["gain over the next cheaper"] for row in found.front_rows} <= {
+    result = study[0]
+    assert all(point.figures["PSNR"].interval is None for point in result.points)
+    assert {row.text["gain over the next cheaper"] for row in result.front_rows} <= {
         "cheapest",
         TOO_FEW,
     }
-    notes = " ".join(found.notes)
+    notes = " ".join(result.notes)
     assert "No interval over sites is shown: of 2, fewer than 5" in notes
     assert "Scene pixels per pixel: 2 (2 of 2 images), where pleiades-degraded states 5" in notes
 
@@ -137,10 +141,10 @@ def test_two_sites_give_no_interval_and_it_is_said(study: tuple[Tradeoff, Path])
 def test_a_stopped_run_goes_on_and_says_the_same(
     folder: Path, study: tuple[Tradeoff, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole, out = study
-    kept = json.loads((out / "measurements.json").read_text())
-    left = dict(list(kept["measurements"].items())[:2])
-    (tmp_path / "measurements.json").write_text(json.dumps({**kept, "measurements": left}))
+    unbroken, out = study
+    stored = json.loads((out / "measurements.json").read_text())
+    first_two = dict(list(stored["measurements"].items())[:2])
+    (tmp_path / "measurements.json").write_text(json.dumps({**stored, "measurements": first_two}))
     counts = list[bool]()
     score = Benchmark.score
 
@@ -151,9 +155,9 @@ def test_a_stopped_run_goes_on_and_says_the_same(
         return score(benchmark, restore, exact)
 
     monkeypatch.setattr(Benchmark, "score", counted)
-    again = studied(folder, tmp_path)
-    assert again.rows == whole.rows
-    assert json.loads((tmp_path / "measurements.json").read_text()) == kept
+    resumed = studied(folder, tmp_path)
+    assert resumed.rows == unbroken.rows
+    assert json.loads((tmp_path / "measurements.json").read_text()) == stored
     assert sum(counts) == 1
     studied(folder, tmp_path)
     assert sum(counts) == 1
@@ -181,9 +185,9 @@ def test_an_int8_file_is_made_once(folder: Path, tmp_path: Path) -> None:
         )
 
     path = made()
-    changed = path.stat().st_mtime_ns
+    time_ns = path.stat().st_mtime_ns
     assert made() == path
-    assert path.stat().st_mtime_ns == changed
+    assert path.stat().st_mtime_ns == time_ns
 
 
 def test_two_boards_give_the_same_answer_in_either_order(
@@ -193,7 +197,7 @@ def test_two_boards_give_the_same_answer_in_either_order(
     boards = ("vck190", "zcu104")
     budget = "latency<=60s,power<=20W"
     one, other = (
-        studied(folder, study[1], board=each, budget=budget) for each in (boards, boards[::-1])
+        studied(folder, study[1], board=order, budget=budget) for order in (boards, boards[::-1])
     )
     assert one.best is not None
     assert one.best.text["board"] == "zcu104"
@@ -207,15 +211,15 @@ def test_the_quality_is_measured_once_for_all_boards(
     folder: Path, study: tuple[Tradeoff, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Benchmark, "score", lambda *_: pytest.fail("measured again"))
-    found = studied(folder, study[1], board="all", budget="latency<=60s")
-    assert {row.name for row in found.board_rows} == set(board_names())
+    result = studied(folder, study[1], board="all", budget="latency<=60s")
+    assert {row.name for row in result.board_rows} == set(board_names())
     values = {
         point.value("PSNR")
-        for point in found.points
+        for point in result.points
         if "INT8" in point.name and point.text["halo"] == "exact"
     }
     assert len(values) == 1
-    assert all("board power" in row.figures for row in found.front_rows)
+    assert all("board power" in row.figures for row in result.front_rows)
 
 
 def test_a_board_named_twice_is_refused(folder: Path, tmp_path: Path) -> None:
@@ -226,10 +230,10 @@ def test_a_board_named_twice_is_refused(folder: Path, tmp_path: Path) -> None:
 def test_the_papers_runs_stand_beside_its_own_swath_and_compare_with_nothing(
     folder: Path, study: tuple[Tradeoff, Path]
 ) -> None:
-    found = studied(folder, study[1], size=(13600, 9016))
-    printed = [point for point in found.points if point.point is None]
-    assert sorted(point.figures["board latency"].value or 0 for point in printed) == [42, 1724]
-    assert all(math.isnan(point.value("board latency")) for point in printed)
+    result = studied(folder, study[1], size=(13600, 9016))
+    published = [point for point in result.points if point.point is None]
+    assert sorted(point.figures["board latency"].value or 0 for point in published) == [42, 1724]
+    assert all(math.isnan(point.value("board latency")) for point in published)
     assert not any(point.point is None for point in study[0].points)
 
 
@@ -241,14 +245,16 @@ def test_labelled_pictures_add_map50_beside_exact_halos(
 
     monkeypatch.setattr(Labelled, "open", opened)
     monkeypatch.setattr(Labelled, "measure", lambda *_: {"value": 0.5, "interval": None})
-    found = studied(folder, study[1], labelled=folder, need="map50>=40")
+    result = studied(folder, study[1], labelled=folder, need="map50>=40")
     values = {
-        point.text["halo"]: point.figures["mAP50"] for point in found.points if "INT8" in point.name
+        point.text["halo"]: point.figures["mAP50"]
+        for point in result.points
+        if "INT8" in point.name
     }
     assert values["exact"].value == 50
     assert values["0"].reason == "measured with exact halos alone"
-    assert "mAP50 50 % (measured)" in found.line
-    assert "labels" in found.notes
+    assert "mAP50 50 % (measured)" in result.line
+    assert "labels" in result.notes
 
 
 def test_a_detector_is_shown_what_each_method_restored(folder: Path, tmp_path: Path) -> None:
@@ -265,9 +271,11 @@ def test_a_detector_is_shown_what_each_method_restored(folder: Path, tmp_path: P
     (tmp_path / "labels.json").write_text(json.dumps(labels))
     degraded = load_sensor("dior-medium")
     benchmark = Benchmark([], degraded, reference_for(degraded), None, 0)
-    looked = Labelled.open(tmp_path, None, None, benchmark)
-    kept = Measurements(tmp_path / "measurements.json")
-    figure = looked.figure(Point(Variant("as it is")), Method("as it is", lambda dn: dn, ""), kept)
+    labelled = Labelled.open(tmp_path, None, None, benchmark)
+    store = Measurements(tmp_path / "measurements.json")
+    figure = labelled.figure(
+        Point(Variant("as it is")), Method("as it is", lambda dn: dn, ""), store
+    )
     assert figure.unit == "%"
     assert 0 <= (figure.value or 0.0) <= 100
     assert figure.interval is None
@@ -278,17 +286,10 @@ def test_the_command_recommends_in_one_line_and_writes_its_files(
     folder: Path, study: tuple[Tradeoff, Path], budget: str, code: int
 ) -> None:
     out = study[1]
-    given = (
-        "--network",
-        folder / "narrow.safetensors",
-        "--images",
-        folder / "images",
-        "--size",
-        "1500x1200",
-    )
-    calibrated = "--calibration", folder / "calibration"
-    said = done("tradeoff", *given, *calibrated, "--out", out, "--budget", budget, code=code)
-    lines = [line for line in said.splitlines() if "recommend" in line]
+    network = ("--network", folder / "narrow.safetensors", "--size", "1500x1200")
+    images = ("--images", folder / "images", "--calibration", folder / "calibration")
+    output = done("tradeoff", *network, *images, "--out", out, "--budget", budget, code=code)
+    lines = [line for line in output.splitlines() if "recommend" in line]
     assert len(lines) == 1
     assert lines[0].startswith(
         f"{'nothing to recommend' if code else 'recommended'} for board latency <= "
