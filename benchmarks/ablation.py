@@ -1,63 +1,128 @@
-"""What each pass of the legal quantisation buys: the gate's figures with all of them, and with each
-one left out.
+"""What each accuracy pass of the quantiser buys, in dB: the loss with all passes, and how much
+larger it is when one is left out.
 
-    python benchmarks/ablation.py NETWORK.onnx [--sensor pleiades-degraded] [--images DIR] \
-        [--patches 64] [--seed 0]
+    python -m benchmarks.ablation --images aerial-train/ --held-out aerial-test/ --keep networks/
 
-Patches are those of `quantize`, and the figures those of `gate` on patches that calibration did not
-see.
+The twelve small networks are those of `benchmarks.small_networks`, trained briefly. Shipped
+networks are quantised over their range of sensors and judged on `pleiades-degraded`. Prints a
+Markdown table; samples that judge were seen by neither training nor calibration.
 """
 
 import argparse
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
-from beers_deploy.export import float_model
-from beers_deploy.network_files import float_file
+import onnx
+
+from beers_deploy.model.shipped import SENSOR, shipped_names, shipped_weights
+from beers_deploy.network_files import Conditioned, told_int8
 from beers_deploy.profiles import load_sensor
-from beers_deploy.quant.calibration import Calibration
+from beers_deploy.quant.banked.calibrate import PASSES as BANKED
+from beers_deploy.quant.calibration import unseen_patches
 from beers_deploy.quant.gate import compare
+from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.passes.selection import ALL, Passes
 from beers_deploy.quant.quantise import quantise_model
-from beers_deploy.quant.samples import PATCH_PX
-from beers_deploy.quant.session import open_any_size
+from beers_deploy.quant.samples import samples_of
+from beers_deploy.quant.session import open_any_size, open_session, result_of
+from beers_deploy.quantise import family_model
+from benchmarks.small_networks import NETWORKS, SIDE_PX, Drawn, losses, save, slug, trained
+
+Loss = Callable[[Passes], float]
+"""Quantises a network with these passes; the mean loss of PSNR in dB (points, of a classifier)."""
+UNSEEN = 64
+"""Patches that judge a shipped network."""
+SAME_DB = 5e-4
+"""A smaller change is none: it is printed as 0.000."""
 
 
-def ablations() -> Iterator[tuple[str, Passes]]:
-    """Return all passes, and all but each one, with their names."""
-    yield "all passes", ALL
+def ablations(base: Passes) -> Iterator[tuple[str, Passes]]:
+    """Return the passes with each single one switched, by its name."""
     for field in fields(Passes):
-        yield f"without {field.name}", replace(ALL, **{field.name: False})
+        yield field.name, replace(base, **{field.name: not getattr(base, field.name)})
+
+
+def row(loss_of: Loss, base: Passes) -> list[str]:
+    """The loss with the passes of `base`, and what each one buys: the loss without it, less the
+    loss with it.
+    """
+    loss = loss_of(base)
+    cells = [f"{loss:.3f}"]
+    for name, passes in ablations(base):
+        gain = loss_of(passes) - loss
+        # A pass that is off by default is switched on here.
+        gain = gain if getattr(base, name) else -gain
+        cells.append("0" if abs(gain) < SAME_DB else f"{gain:+.3f}")
+    return cells
+
+
+def small(name: str, arguments: argparse.Namespace, folder: Path) -> Loss:
+    """Return the loss of a small network, which is trained unless the folder has it."""
+    kind, _ = NETWORKS[name]
+    path = folder / f"{slug(name)}.onnx"
+    if not path.exists():
+        side_px = SIDE_PX[kind] // (2 if kind == "espcn" else 1)
+        save(trained(name, arguments.images, arguments.steps), side_px, path)
+    model = load_onnx(path)
+    samples = samples_of(model, Drawn.of(kind, arguments.images, 5, arguments.batches).images)
+    assert samples is not None  # noqa: S101 - some were given
+    patches = samples.drawn
+    held = Drawn.of(kind, arguments.held_out, 6, arguments.batches)
+    in_float = partial(result_of, open_session(model))
+
+    def loss_of(passes: Passes) -> float:
+        host = quantise_model(model, patches, {}, passes=passes).host
+        in_int8 = partial(result_of, open_session(host))
+        return float(losses(in_float, in_int8, held).mean())
+
+    return loss_of
+
+
+def shipped(name: str, arguments: argparse.Namespace) -> Loss:
+    """Return the loss of a shipped network behind the bank of one sensor."""
+    network = Conditioned(name, shipped_weights(name))
+    sensor = load_sensor(SENSOR)
+    float_session = open_any_size(network.model(sensor, int8=False))
+    pairs = unseen_patches(sensor, arguments.held_out, UNSEEN, 0).pairs
+    folders = [arguments.images] if arguments.images else []
+
+    def loss_of(passes: Passes) -> float:
+        int8: onnx.ModelProto = told_int8(family_model(network, folders, passes=passes), sensor)
+        return float(compare(float_session, open_any_size(int8), pairs).drop_db)
+
+    return loss_of
 
 
 def main() -> None:
-    """Print a row an ablation."""
+    """Print a row a network, as each is done."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("network", type=Path)
-    parser.add_argument("--sensor", default="pleiades-degraded")
-    parser.add_argument("--images", type=Path)
-    parser.add_argument("--patches", type=int, default=64)
-    parser.add_argument("--patch", type=int, default=PATCH_PX)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--images", type=Path, help="folder of photographs to train on")
+    parser.add_argument("--held-out", type=Path, help="folder of photographs to judge on")
+    parser.add_argument("--steps", type=int, default=1500, help="of training a small network")
+    parser.add_argument("--batches", type=int, default=8, help="of eight samples each")
+    parser.add_argument("--only", default="", help="networks whose names this expression finds")
+    parser.add_argument("--keep", type=Path, help="folder of the small networks")
     arguments = parser.parse_args()
-    model = float_model(float_file(arguments.network, load_sensor(arguments.sensor)))
-    calibration = Calibration(
-        load_sensor(arguments.sensor),
-        arguments.images,
-        arguments.patches,
-        arguments.patch,
-        arguments.seed,
-    )
-    session = open_any_size(model)
-    unseen = calibration.unseen.pairs
-    print("| passes | MAE | PSNR drop, dB |\n|---|---|---|")
-    for name, passes in ablations():
-        made = quantise_model(model, calibration.drawn, {}, passes=passes)
-        found = compare(session, open_any_size(made.host), unseen)
-        print(f"| {name} | {found.mae:.3g} | {found.drop_db:.3f} |", flush=True)
+    names = [*NETWORKS, *shipped_names()]
+    print(f"| network | all | {' | '.join(field.name for field in fields(Passes))} |")
+    print("|---" * (len(fields(Passes)) + 2) + "|")
+    with TemporaryDirectory() as temporary:
+        folder = arguments.keep or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in names:
+            if not re.search(arguments.only, name):
+                continue
+            if name in NETWORKS:
+                cells = row(small(name, arguments, folder), ALL)
+            else:
+                cells = row(shipped(name, arguments), BANKED)
+            print(f"| {name} | {' | '.join(cells)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,7 @@ def build(root: Path) -> None:
     if not (root / "usr/bin/python3.11").exists():
         packages = ["--variant=minbase", "--include=python3,libstdc++6", "bookworm", str(root)]
         _call(["debootstrap", "--foreign", "--arch=arm64", *packages])
+        # Packages are unpacked and never run, so that no kernel support is needed.
         for package in sorted((root / "var/cache/apt/archives").glob("*.deb")):
             with subprocess.Popen(  # noqa: S603
                 ["dpkg-deb", "--fsys-tarfile", package],  # noqa: S607
@@ -69,7 +71,7 @@ def build(root: Path) -> None:
                 )
     if not _site(root).exists():
         names = [*(f"{name}=={version(name)}" for name in PINNED), *OTHERS]
-        platforms = [word for name in PLATFORMS for word in ("--platform", name)]
+        platforms = [f"--platform={name}" for name in PLATFORMS]
         options = [
             "--only-binary=:all:",
             "--python-version",
@@ -82,9 +84,12 @@ def build(root: Path) -> None:
     project = ["--no-deps", "--upgrade", "--target", str(_site(root)), str(PROJECT)]
     _call([sys.executable, "-m", "pip", "install", "--quiet", *project])
     proc = root / "proc"
-    if proc.is_symlink():  # to the host's, where debootstrap could not mount one
+    # Where debootstrap cannot mount /proc, it leaves a link to the host's.
+    if proc.is_symlink():
         proc.unlink()
     proc.mkdir(exist_ok=True)
+    # An emulated process would see the x86 host's processor, on which onnxruntime's ARM build
+    # crashes.
     (proc / "cpuinfo").write_text(CPUINFO, encoding="utf-8")
 
 
@@ -98,13 +103,15 @@ def on_arm(root: Path, processor: str, *arguments: str) -> None:
         str(root),
         str(root / "usr/bin/python3.11"),
     ]
-    told = {name: value for name, value in os.environ.items() if not name.startswith("OPENBLAS_")}
-    told |= {
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith("OPENBLAS_")
+    }
+    environment |= {
         "PYTHONPATH": f"{_site(root)}:{PROJECT}",
         "OPENBLAS_NUM_THREADS": "1",
         "PYTHONDONTWRITEBYTECODE": "1",
     }
-    _call([*emulator, *arguments], env=told, cwd=PROJECT)
+    _call([*emulator, *arguments], env=environment, cwd=PROJECT)
 
 
 def restored(networks: list[Path], out: Path) -> None:
@@ -125,19 +132,19 @@ def compare(root: Path, processors: tuple[str, ...]) -> dict[str, dict[str, floa
     processor and network.
     """
     with tempfile.TemporaryDirectory() as folder:
-        files = [file for name in NETWORKS for file in shipped_pair(name)]
+        files = list(chain.from_iterable(map(shipped_pair, NETWORKS)))
         here = Path(folder) / "here.npz"
         restored(files, here)
         expected = dict(np.load(here))
-        found = {}
+        differences = {}
         for processor in processors:
             out = Path(folder) / f"{processor}.npz"
             on_arm(root, processor, __file__, "--restore", str(out), *map(str, files))
             pixels = np.load(out)
-            found[processor] = {
+            differences[processor] = {
                 name: float(np.abs(pixels[name] - expected[name]).max()) for name in expected
             }
-    return found
+    return differences
 
 
 def _site(root: Path) -> Path:
@@ -159,31 +166,27 @@ def main() -> None:
     parser.add_argument(
         "--restore", nargs="+", type=Path, metavar=("OUT", "NETWORK"), help=argparse.SUPPRESS
     )
-    asked = parser.parse_args()
-    if asked.restore:
-        restored(asked.restore[1:], asked.restore[0])
+    arguments = parser.parse_args()
+    if arguments.restore:
+        restored(arguments.restore[1:], arguments.restore[0])
         return
-    root = asked.root.resolve()
+    root = arguments.root.resolve()
     build(root)
-    found = compare(root, tuple(asked.processors))
-    for processor, differences in found.items():
+    by_processor = compare(root, tuple(arguments.processors))
+    for processor, differences in by_processor.items():
         print(
             processor,
             ", ".join(f"{name}: {value:.3g} DN apart" for name, value in differences.items()),
         )
-    if asked.json:
-        asked.json.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(by_processor, indent=2) + "\n", encoding="utf-8")
     tests = [f"tests/processors/{name}" for name in TESTS]
-    for processor in asked.processors:
+    for processor in arguments.processors:
         print(f"integer tests as {processor}", flush=True)
         on_arm(root, processor, "-m", "pytest", "-p", "no:cacheprovider", *tests)
-    if any(
-        value
-        for differences in found.values()
-        for name, value in differences.items()
-        if name.endswith("int8")
-    ):
-        sys.exit(1)
+    for differences in by_processor.values():
+        if any(value for name, value in differences.items() if name.endswith("int8")):
+            sys.exit(1)
 
 
 if __name__ == "__main__":

@@ -33,15 +33,17 @@ def files(images: Path | None, variants: list[str]) -> None:
         for name in board_names():
             start = time.perf_counter()
             target = load_target(name)
-            made = family_model(network, [images] if images else [], shifts=target_shifts(target))
-            found = integers(made)
-            first = first or found
-            refused = len(place(network_of(made, 640), dpu_of(target)).failed)
+            network_family = family_model(
+                network, [images] if images else [], shifts=target_shifts(target)
+            )
+            digest = integers(network_family)
+            first = first or digest
+            refused = len(place(network_of(network_family, 640), dpu_of(target)).failed)
             print(
                 f"{variant:14} {name:8} {time.perf_counter() - start:5.0f} s, nodes refused "
                 f"{refused}, "
-                f"{found[:12]}, {'as' if found == first else 'NOT as'} the first board's, "
-                f"{'as' if found == shipped else 'not as'} shipped",
+                f"{digest[:12]}, {'as' if digest == first else 'NOT as'} the first board's, "
+                f"{'as' if digest == shipped else 'not as'} shipped",
                 flush=True,
             )
 
@@ -56,8 +58,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--images", type=Path, help="folder of scenes; drawn ones if none")
     parser.add_argument("--variants", nargs="+", default=shipped_names())
-    given = parser.parse_args()
-    files(given.images, given.variants)
+    arguments = parser.parse_args()
+    files(arguments.images, arguments.variants)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,8 @@ def measure(command: list[str]) -> tuple[float, float, float]:
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         raise SystemExit(f"{' '.join(command)} failed")
-    unit = 1 if sys.platform == "darwin" else 1024  # ru_maxrss is in bytes there, in KiB elsewhere
+    # ru_maxrss is in bytes on macOS and in KiB elsewhere.
+    unit = 1 if sys.platform == "darwin" else 1024
     return (
         usage.ru_maxrss * unit / 1e6,
         time.perf_counter() - started,
@@ -52,7 +53,7 @@ def main() -> None:
         network = str(arguments.float)
         int8 = str(Path(folder) / "int8.onnx")
         for patches, side in CASES:
-            drawn = [
+            options = [
                 "--sensor",
                 "pleiades-variable",
                 "--patches",
@@ -62,7 +63,7 @@ def main() -> None:
                 *scenes,
             ]
             peak, seconds, computing = measure(
-                [*COMMAND, "quantize", network, "--out", int8, *drawn]
+                [*COMMAND, "quantize", network, "--out", int8, *options]
             )
             work = f"{patches:5d} of {f'{side} x {side}':16s}"
             print(

@@ -71,19 +71,19 @@ def main() -> None:
         name: Findings()
         for name in ("photographs alone", "one with a checkerboard", "two boxes on it")
     }
-    lost = list[float]()
+    losses_db = list[float]()
     generator = np.random.default_rng(arguments.seed)
     for number in range(arguments.sensors):
         sensor = draw(generator, shaped=number % 2 == 1)
-        chosen = [scenes[i] for i in generator.permutation(len(scenes))[:SCENES]]
+        subset = [scenes[i] for i in generator.permutation(len(scenes))[:SCENES]]
         with tempfile.TemporaryDirectory() as folder:
-            found = look(ways, sensor, chosen, number, Path(folder))
-            if arguments.weights is not None and found is not None:
+            estimate = look(ways, sensor, subset, number, Path(folder))
+            if arguments.weights is not None and estimate is not None:
                 profile = Path(folder) / "found.toml"
-                profile.write_text(profile_toml(found), encoding="utf-8")
-                lost.append(
+                profile.write_text(profile_toml(estimate), encoding="utf-8")
+                losses_db.append(
                     psnr_lost(
-                        arguments.weights, chosen[0], sensor, load_sensor(str(profile)).nominal()
+                        arguments.weights, subset[0], sensor, load_sensor(str(profile)).nominal()
                     )
                 )
     print("| figure | images | found | error, median | mean, signed | worst | in the interval |")
@@ -91,10 +91,10 @@ def main() -> None:
     for name, findings in ways.items():
         for line in findings.lines(name):
             print(line)
-    if lost:
+    if losses_db:
         print(
-            f"\nPSNR lost, dB: mean {np.mean(lost):.3f}, median {np.median(lost):.3f}, worst "
-            f"{max(lost):.3f}"
+            f"\nPSNR lost, dB: mean {np.mean(losses_db):.3f}, median {np.median(losses_db):.3f}, "
+            f"worst {max(losses_db):.3f}"
         )
 
 
@@ -123,16 +123,16 @@ def boxes_on_target(path: Path) -> tuple[str, str]:
     return upright, f"{path}:{width // 2 + 16},{height // 2 - 10},34,28"
 
 
-def psnr_lost(weights: Path, scene: Scene, sensor: Instrument, found: Instrument) -> float:
+def psnr_lost(weights: Path, scene: Scene, sensor: Instrument, estimate: Instrument) -> float:
     """By a network that knows the sensor that was found, beside the same that knows the true one,
     in dB.
     """
     (pair,), _ = simulate_pairs([scene], sensor, REFERENCE.in_units_of(sensor), 0)
     image = torch.from_numpy(pair.degraded.astype(np.float32) / sensor.max_dn)[None, None]
     scores = []
-    for known in (sensor, found):
+    for profile in (sensor, estimate):
         with torch.inference_mode():
-            restored = torch_network(weights, known)(image)[0, 0] * sensor.max_dn
+            restored = torch_network(weights, profile)(image)[0, 0] * sensor.max_dn
         scores.append(
             fidelity_db(
                 restored.round().clamp(0, sensor.max_dn).numpy(), pair.reference, pair.degraded
@@ -211,12 +211,12 @@ class Findings:
         """Characterise one sensor."""
         self.asked += 2
         try:
-            found = characterise(paths, boxes, Stated(sensor.bits, sensor.gain_dn_per_radiance))
+            estimate = characterise(paths, boxes, Stated(sensor.bits, sensor.gain_dn_per_radiance))
         except ImageError as error:
             print(f"- {error}")
             return None
         for axis in AXES:
-            curve = found.mtf.curves.get(axis)
+            curve = estimate.mtf.curves.get(axis)
             if curve is None:
                 continue
             for words, frequency in SHOWN_CPX.items():
@@ -224,11 +224,11 @@ class Findings:
                 self.contrasts[words].append(
                     judged(value, interval, true_contrast(sensor, axis, frequency))
                 )
-        for snr in found.snrs:
+        for snr in estimate.snrs:
             self.snr.append(
                 judged(snr.value, snr.interval, snr.radiance / sensor.noise_sigma(snr.radiance))
             )
-        return found if found.mtf.curves else None
+        return estimate if estimate.mtf.curves else None
 
     def lines(self, name: str) -> Iterator[str]:
         """Rows of the table."""
@@ -238,13 +238,13 @@ class Findings:
                 yield f"| {figure} | {name} | 0 of {self.asked}, refused | | | | |"
                 continue
             errors = np.array([error for error, _ in pairs])
-            held = sum(inside for _, inside in pairs)
+            inside_count = sum(inside for _, inside in pairs)
             sizes = np.abs(errors)
-            shown = (
+            cells = (
                 f"{np.median(sizes):.1%} | {errors.mean():+.1%} | {sizes.max():.1%} | "
-                f"{held} of {len(pairs)}"
+                f"{inside_count} of {len(pairs)}"
             )
-            yield f"| {figure} | {name} | {len(pairs)} of {self.asked} | {shown} |"
+            yield f"| {figure} | {name} | {len(pairs)} of {self.asked} | {cells} |"
 
 
 def judged(value: float, interval: tuple[float, float], true: float) -> tuple[float, bool]:

@@ -36,7 +36,8 @@ class Chain:
         self, op_type: str, *inputs: str, domain: str = "", **attributes: int | list[int]
     ) -> str:
         """Append a node of these inputs, or of the last tensor, and return its result."""
-        self.last, sources = f"{op_type}{len(self.nodes)}", list(inputs or (self.last,))
+        sources = list(inputs or (self.last,))
+        self.last = f"{op_type}{len(self.nodes)}"
         node = helper.make_node(op_type, sources, [self.last], name=self.last, domain=domain)
         node.attribute.extend(
             helper.make_attribute(key, value) for key, value in attributes.items()
@@ -108,11 +109,13 @@ def integers(chain: Chain) -> None:
         )
         chain.then("QuantizeLinear", "image", "scale", "zero")
     before = chain.last
-    read = ("scale", "zero")
-    weights = ("weight", "scale", "weight_zero", *read, "bias")
-    chain.then("QLinearConv", before, *read, *weights, pads=[1] * 4)
+    constants = ("scale", "zero")
+    weights = ("weight", "scale", "weight_zero", *constants, "bias")
+    chain.then("QLinearConv", before, *constants, *weights, pads=[1] * 4)
     chain.then("Max", chain.last, "zero")
-    chain.then("QLinearAdd", before, *read, chain.last, *read, *read, domain="com.microsoft")
+    chain.then(
+        "QLinearAdd", before, *constants, chain.last, *constants, *constants, domain="com.microsoft"
+    )
 
 
 KINDS: tuple[Callable[[Chain], None], ...] = (residual, scaled, pointwise, shuffled, integers)

@@ -1,5 +1,5 @@
 """What makes code hard to own, counted: tokens, density, packed statements, comments, helpers with
-one caller.
+one caller, and how often an option is described.
 
     python benchmarks/counts.py [--check]
 
@@ -11,10 +11,12 @@ have risen above the limits below; whoever lowers them lowers the limits as well
 import argparse
 import ast
 import io
+import re
 import sys
 import tokenize
 from collections import Counter
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,9 +35,9 @@ LAYOUT = {
     tokenize.ENCODING,
     tokenize.ENDMARKER,
 }
-DENSITY_LIMITS = {"source": 6.21, "tests": 8.46}
+DENSITY_LIMITS = {"source": 6.11, "tests": 8.41}
 """Tokens a line that may land."""
-PAIRED_LIMITS = {"source": 44, "tests": 21}
+PAIRED_LIMITS = {"source": 1, "tests": 1}
 """Paired assignments that may land."""
 
 
@@ -68,10 +70,11 @@ def main() -> None:
     print(f"|---|{'---|' * len(counts)}")
     for measure, values in table(counts).items():
         print(f"| {measure} | {' | '.join(values)} |")
-    passed = list(over(counts))
-    for sentence in passed:
+    print(f"\ndescriptions of an option, in the mean: {descriptions_an_option():.1f}")
+    sentences = list(over(counts))
+    for sentence in sentences:
         print(sentence, file=sys.stderr)
-    if arguments.check and passed:
+    if arguments.check and sentences:
         sys.exit(1)
 
 
@@ -79,13 +82,13 @@ def table(counts: dict[str, Counts]) -> dict[str, list[str]]:
     """Return the cells of each row."""
     columns = counts.values()
     return {
-        "tokens": [f"{each.tokens:,}" for each in columns],
-        "tokens a line": [f"{each.density:.2f}" for each in columns],
-        "paired assignments": [f"{each.paired_assignments}" for each in columns],
-        "nested conditional expressions": [f"{each.nested_conditionals}" for each in columns],
-        "comprehensions of two loops": [f"{each.double_comprehensions}" for each in columns],
-        "comments a hundred lines": [f"{100 * each.comments / each.lines:.1f}" for each in columns],
-        "private functions with one caller": [f"{each.lone_helpers}" for each in columns],
+        "tokens": [f"{part.tokens:,}" for part in columns],
+        "tokens a line": [f"{part.density:.2f}" for part in columns],
+        "paired assignments": [f"{part.paired_assignments}" for part in columns],
+        "nested conditional expressions": [f"{part.nested_conditionals}" for part in columns],
+        "comprehensions of two loops": [f"{part.double_comprehensions}" for part in columns],
+        "comments a hundred lines": [f"{100 * part.comments / part.lines:.1f}" for part in columns],
+        "private functions with one caller": [f"{part.lone_helpers}" for part in columns],
     }
 
 
@@ -107,16 +110,15 @@ def over(counts: dict[str, Counts]) -> Iterator[str]:
 
 def counted(folders: tuple[str, ...]) -> Counts:
     """Count all Python files below some folders of the project."""
-    texts = [
-        path.read_text(encoding="utf-8")
-        for folder in folders
-        for path in sorted((ROOT / folder).rglob("*.py"))
-    ]
+    paths = list[Path]()
+    for folder in folders:
+        paths += sorted((ROOT / folder).rglob("*.py"))
+    texts = [path.read_text(encoding="utf-8") for path in paths]
     trees = [ast.parse(text) for text in texts]
     tokens, lines, comments = map(
         sum, zip(*(measured(*pair) for pair in zip(texts, trees, strict=True)), strict=True)
     )
-    nodes = [node for tree in trees for node in ast.walk(tree)]
+    nodes = list(chain.from_iterable(map(ast.walk, trees)))
     return Counts(
         tokens=tokens,
         lines=lines,
@@ -168,9 +170,50 @@ def lone_helpers(nodes: list[ast.AST]) -> int:
         for node in functions
         if node.name.startswith("_") and not node.name.endswith("__")
     ]
-    named = Counter(node.id for node in nodes if isinstance(node, ast.Name))
-    named += Counter(node.attr for node in nodes if isinstance(node, ast.Attribute))
-    return sum(named[name] == 1 for name, count in Counter(private).items() if count == 1)
+    mentions = Counter(node.id for node in nodes if isinstance(node, ast.Name))
+    mentions += Counter(node.attr for node in nodes if isinstance(node, ast.Attribute))
+    return sum(mentions[name] == 1 for name, count in Counter(private).items() if count == 1)
+
+
+def descriptions_an_option() -> float:
+    """Return how often an option of the command line is described, in the mean.
+
+    Counted are help texts of commands, lines of `Args:` and `Attributes:` of library functions of
+    the commands' names and of classes of options, and the tables of `docs/make/options.py`.
+    """
+    commands = functions_of(nodes_below(ROOT / "deploy" / "commands"))
+    options = list(chain.from_iterable(map(options_of, commands)))
+    descriptions = Counter(options)
+    verbs = {function.name for function in commands}
+    library = nodes_below(ROOT / "deploy")
+    classes = [node for node in library if isinstance(node, ast.ClassDef)]
+    described: list[ast.FunctionDef | ast.ClassDef] = [*functions_of(library), *classes]
+    for node in described:
+        if node.name in verbs or node.name.endswith("Options"):
+            text = ast.get_docstring(node) or ""
+            descriptions.update(re.findall(r"^ +(\w+): ", text, re.MULTILINE))
+    tables = ast.walk(ast.parse((ROOT / "docs/make/options.py").read_text(encoding="utf-8")))
+    constants = (node.value for node in tables if isinstance(node, ast.Constant))
+    descriptions.update(value for value in constants if isinstance(value, str))
+    names = set(options)
+    return sum(descriptions[name] for name in names) / len(names)
+
+
+def options_of(command: ast.FunctionDef) -> list[str]:
+    """Return the parameters of a command that Typer makes options or arguments of."""
+    types = {each.arg: each.annotation for each in command.args.args}
+    return [name for name, type_ in types.items() if type_ and "typer." in ast.unparse(type_)]
+
+
+def nodes_below(folder: Path) -> list[ast.AST]:
+    """Return every node of the Python files below a folder."""
+    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in sorted(folder.rglob("*.py"))]
+    return list(chain.from_iterable(map(ast.walk, trees)))
+
+
+def functions_of(nodes: list[ast.AST]) -> list[ast.FunctionDef]:
+    """Return the functions among some nodes."""
+    return [node for node in nodes if isinstance(node, ast.FunctionDef)]
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import argparse
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +49,8 @@ def main() -> None:
     parser.add_argument("--faulty", type=int, default=40)
     parser.add_argument("--seed", type=int, default=64)
     arguments = parser.parse_args()
-    scenes = [read_scene(path, LIKE) for folder in arguments.images for path in list_images(folder)]
+    paths = chain.from_iterable(map(list_images, arguments.images))
+    scenes = [read_scene(path, LIKE) for path in paths]
     scenes = [
         scene for scene in scenes if fitting_oversampling(scene.radiance, RATIOS, LEAST_SIDE_PX)
     ]
@@ -57,12 +58,12 @@ def main() -> None:
     alarms = Counter[tuple[str, str]]()
     worst = Counter[str]()
     for kind, image, sensor, words in acquisitions(scenes, arguments.count, arguments.seed):
-        found = kinds_of(look(image, sensor))
+        kinds = kinds_of(look(image, sensor))
         clean[kind] += 1
-        worst[kind] += bool(found)
-        alarms.update((kind, each) for each in found)
-        if found:
-            print(f"false alarm, {kind}, {words}: {found}", flush=True)
+        worst[kind] += bool(kinds)
+        alarms.update((kind, name) for name in kinds)
+        if kinds:
+            print(f"false alarm, {kind}, {words}: {kinds}", flush=True)
     print("| clean image | images | with a false alarm | of which |\n|---|---|---|---|")
     for kind, count in clean.items():
         words = ", ".join(f"{name} {n}" for (its, name), n in alarms.items() if its == kind)
@@ -77,7 +78,7 @@ def detections(scenes: Sequence[Scene], count: int, seed: int) -> None:
     """
     generator = np.random.default_rng(seed)
     kinds = {"one photograph": 1, f"{STACKED} below one another": STACKED}
-    seen = Counter[tuple[str, str]]()
+    counts = Counter[tuple[str, str]]()
     total = Counter[tuple[str, str]]()
     rows_px = dict[str, list[int]]()
     for number, kind in product(range(count), kinds):
@@ -88,22 +89,22 @@ def detections(scenes: Sequence[Scene], count: int, seed: int) -> None:
             faulty, detected = put(image.astype(np.float64), sensor, generator)
             stored = np.clip(np.rint(faulty), 0, sensor.max_dn).astype(np.uint16)
             hits, of = detected(look(stored, sensor))
-            seen[name, kind] += hits
+            counts[name, kind] += hits
             total[name, kind] += of
     heads = [f"{kind}, {np.median(rows_px[kind]):.0f} rows" for kind in kinds]
     print(f"| fault | put in, of each | {' | '.join(heads)} |\n|---|---|---|---|")
     for name in FAULTS:
-        shares = [f"{seen[name, kind] / total[name, kind]:.0%}" for kind in kinds]
+        shares = [f"{counts[name, kind] / total[name, kind]:.0%}" for kind in kinds]
         print(f"| {name} | {total[name, next(iter(kinds))]} | {' | '.join(shares)} |")
 
 
 def stacked(scenes: Sequence[Scene], count: int, generator: np.random.Generator) -> np.ndarray:
     """Return the radiance of photographs below one another, as wide as the narrowest of them."""
-    chosen = [
+    radiances = [
         scenes[int(number)].radiance for number in generator.integers(len(scenes), size=count)
     ]
-    width_px = min(each.shape[1] for each in chosen)
-    return np.concatenate([each[:, :width_px] for each in chosen])
+    width_px = min(radiance.shape[1] for radiance in radiances)
+    return np.concatenate([radiance[:, :width_px] for radiance in radiances])
 
 
 Detected = Callable[[BandFaults], tuple[int, int]]
@@ -115,7 +116,7 @@ def spread(rms: float) -> Fault:
 
     def put(image: Image, _: Instrument, generator: np.random.Generator) -> tuple[Image, Detected]:
         gains = 1 + rms * generator.standard_normal(image.shape[1])
-        return image * gains, lambda found: (int(found.columns.seen), 1)
+        return image * gains, lambda faults: (int(faults.columns.seen), 1)
 
     return put
 
@@ -127,7 +128,7 @@ def column(gain: float) -> Fault:
         place = int(generator.integers(3, image.shape[1] - 3))
         faulty = image.copy()
         faulty[:, place] *= 1 + gain
-        return faulty, lambda found: (int(place in {line.index for line in found.columns.off}), 1)
+        return faulty, lambda faults: (int(place in {line.index for line in faults.columns.off}), 1)
 
     return put
 
@@ -141,7 +142,7 @@ def dead_column(value: float) -> Fault:
         place = int(generator.integers(3, image.shape[1] - 3))
         faulty = image.copy()
         faulty[:, place] = value * sensor.max_dn
-        return faulty, lambda found: (int(place in found.columns.dead), 1)
+        return faulty, lambda faults: (int(place in faults.columns.dead), 1)
 
     return put
 
@@ -160,10 +161,10 @@ def pixels(sigmas: float) -> Fault:
                 * sensor.gain_dn_per_radiance
             )
             faulty[place] = image[place] + sigmas * noise if sigmas else 0
-        wanted = {tuple(map(int, place)) for place in places}
-        return faulty, lambda found: (
-            len(wanted & set(map(tuple, found.pixels.tolist()))),
-            len(wanted),
+        expected = {tuple(map(int, place)) for place in places}
+        return faulty, lambda faults: (
+            len(expected & set(map(tuple, faults.pixels.tolist()))),
+            len(expected),
         )
 
     return put
@@ -204,7 +205,7 @@ def acquisitions(
             radiance = DRAWN[kind](generator)
             name = "drawn"
         sensor = SensorFamily(LIKE, other_curves=0.3).draw(generator)
-        light, noise = (float(generator.choice(each)) for each in (LIGHTS, NOISES))
+        light, noise = (float(generator.choice(levels)) for levels in (LIGHTS, NOISES))
         quiet = replace(sensor, alpha=sensor.alpha * noise**2, beta=sensor.beta * noise**2)
         words = (
             f"number {number}, {name}, ratio {ratio}, light {light:g}, noise {noise:g}, MTF "
@@ -222,7 +223,8 @@ def acquired(radiance: np.ndarray, sensor: Instrument, number: int, ratio: int) 
 def along_the_axes(generator: np.random.Generator) -> np.ndarray:
     """Radiance of fields, crops, roofs and streets whose edges lie along columns and rows."""
     canvas = np.full((SIDE_PX, SIDE_PX), 80, np.float32)
-    for _ in range(int(generator.integers(2, 7))):  # edges and streets from side to side
+    # Edges and streets run from side to side.
+    for _ in range(int(generator.integers(2, 7))):
         start = int(generator.integers(SIDE_PX))
         width = int(generator.integers(1, 400))
         strip = (slice(None), slice(start, start + width))
@@ -237,7 +239,8 @@ def along_the_axes(generator: np.random.Generator) -> np.ndarray:
         lines = (np.arange(max(part.shape)) % period < share * period) * generator.uniform(
             -0.5, 1.0
         )
-        if generator.random() < 0.6:  # crops or the sheets of a roof
+        # Stripes look like crops or the sheets of a roof.
+        if generator.random() < 0.6:
             across = generator.random() < 0.5
             part *= 1 + (lines[None, : part.shape[1]] if across else lines[: part.shape[0], None])
     rough = texture(generator, SIDE_PX) / 100
@@ -258,17 +261,17 @@ def look(image: Image, sensor: Instrument) -> BandFaults:
     return look_at_detectors(ArraySource(image[None], raster), sensor.max_dn)[0]
 
 
-def kinds_of(found: BandFaults) -> list[str]:
+def kinds_of(faults: BandFaults) -> list[str]:
     """Return the kinds of faults that are reported."""
     reported = {
-        "columns' gains": found.columns.seen,
-        "rows' gains": found.rows.seen,
-        "single columns": found.columns.off,
-        "single rows": found.rows.off,
-        "dead columns": found.columns.dead,
-        "dead rows": found.rows.dead,
-        "patterns": [pattern for pattern in found.patterns if pattern.seen],
-        "pixels": len(found.pixels),
+        "columns' gains": faults.columns.seen,
+        "rows' gains": faults.rows.seen,
+        "single columns": faults.columns.off,
+        "single rows": faults.rows.off,
+        "dead columns": faults.columns.dead,
+        "dead rows": faults.rows.dead,
+        "patterns": [pattern for pattern in faults.patterns if pattern.seen],
+        "pixels": len(faults.pixels),
     }
     return [kind for kind, any_ in reported.items() if any_]
 

@@ -79,20 +79,20 @@ def main() -> None:
     everything = list[Outcome]()
     for name in CURVES:
         for count, length_px in SETS:
-            found = list(outcomes(name, count, length_px, arguments.repeats, textures))
-            print(row(f"{name} | {count} of {length_px} px", found), flush=True)
-            everything += found
+            judged_runs = list(outcomes(name, count, length_px, arguments.repeats, textures))
+            print(row(f"{name} | {count} of {length_px} px", judged_runs), flush=True)
+            everything += judged_runs
     print(row("all | all", everything))
 
 
-def row(title: str, found: Sequence[Outcome]) -> str:
+def row(title: str, runs: Sequence[Outcome]) -> str:
     """Return a row of the table."""
-    errors = np.sqrt(np.mean([each.errors**2 for each in found], axis=0))
-    held = np.mean([each.held for each in found], axis=0)
-    refused = np.mean([each.refused for each in found])
-    shown = ", ".join(f"{error:.1%}" for error in errors)
-    covered = ", ".join(f"{share:.0%}" for share in held)
-    return f"| {title} | {shown} | {covered} | {refused:.0%} |"
+    errors = np.sqrt(np.mean([run.errors**2 for run in runs], axis=0))
+    coverage = np.mean([run.held for run in runs], axis=0)
+    refused = np.mean([run.refused for run in runs])
+    errors_text = ", ".join(f"{error:.1%}" for error in errors)
+    covered = ", ".join(f"{share:.0%}" for share in coverage)
+    return f"| {title} | {errors_text} | {covered} | {refused:.0%} |"
 
 
 def outcomes(
@@ -116,15 +116,15 @@ def outcomes(
 def judged(curve: MtfCurve, truth: np.ndarray) -> Outcome:
     """Hold a curve against the true contrasts at SHOWN."""
     places = [int(np.argmin(np.abs(FREQUENCIES - frequency))) for frequency in SHOWN]
-    held = (curve.low[places] <= truth) & (truth <= curve.high[places])
-    return Outcome(curve.contrast[places] / truth - 1, held, curve.missing_edges > 0)
+    covered = (curve.low[places] <= truth) & (truth <= curve.high[places])
+    return Outcome(curve.contrast[places] / truth - 1, covered, curve.missing_edges > 0)
 
 
 def pixels_of(path: Path) -> np.ndarray:
     """Return a photograph's radiance (H, W), mirrored at its ends where it is too small."""
     radiance = np.squeeze(read_scene(path, LIKE).radiance).astype(np.float64)
-    missing = [(0, max(0, SIDE_PX * OVERSAMPLING + 1 - size)) for size in radiance.shape]
-    return np.pad(radiance, missing, mode="reflect")
+    padding = [(0, max(0, SIDE_PX * OVERSAMPLING + 1 - size)) for size in radiance.shape]
+    return np.pad(radiance, padding, mode="reflect")
 
 
 class Textures:

@@ -179,10 +179,10 @@ def conv(inputs: int, outputs: int, kernel: int = 3) -> nn.Conv2d:
 
 def build(name: str, generator: torch.Generator) -> Restoring:
     """The network of that name, with weights drawn from the generator."""
-    found = NAME.fullmatch(name)
-    if found is None:
+    match = NAME.fullmatch(name)
+    if match is None:
         raise SystemExit(f"expected names such as {FAMILIES}, got {name!r}")
-    blocks, features, scale = (int(found[part] or 1) for part in ("blocks", "features", "scale"))
+    blocks, features, scale = (int(match[part] or 1) for part in ("blocks", "features", "scale"))
     kinds: dict[str, Callable[[], Iterable[nn.Module]]] = {
         "": lambda: [*(ResidualBlock(features) for _ in range(blocks)), conv(features, features)],
         "k": lambda: [*(wide_block(features) for _ in range(blocks)), conv(features, features)],
@@ -192,7 +192,7 @@ def build(name: str, generator: torch.Generator) -> Restoring:
         "w": lambda: [*(widening_block(features) for _ in range(blocks)), conv(features, features)],
         "b": lambda: [Beside(blocks, features)],
     }
-    network = Restoring(features, scale, nn.Sequential(*kinds[found["kind"]]()))
+    network = Restoring(features, scale, nn.Sequential(*kinds[match["kind"]]()))
     for path, module in network.named_modules():
         if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
             small = 0.1 if path.endswith((*CORRECTIONS, f"body.{blocks}")) else 1.0
@@ -236,21 +236,22 @@ def psnr_cell(model: onnx.ModelProto, patches: Patches) -> str:
     """Mean PSNR of the patches, dB over full scale."""
     restore = Network.load(model)
     levels = [
-        psnr_db(restore(seen)[0, 0].clip(0, 1), meant[0, 0], 1.0) for seen, meant in patches.pairs
+        psnr_db(restore(degraded)[0, 0].clip(0, 1), reference[0, 0], 1.0)
+        for degraded, reference in patches.pairs
     ]
     return f"{np.mean(levels):.2f}"
 
 
 def swath_cell(model: onnx.ModelProto) -> str:
     """Predicted seconds of a swath, with interval, tile and configuration, where they are least."""
-    found = []
+    seconds = []
     for configuration, tile_px in product(CONFIGURATIONS, TILES_PX):
         if 2 * tiling_of(model).halo_px < tile_px:
             _, time_s, low_s, high_s = on_a_swath(model, load_dpu("vck190", configuration), tile_px)
-            found.append(
+            seconds.append(
                 (time_s, f"{time_s:.3g} [{low_s:.3g}, {high_s:.3g}] ({tile_px}, {configuration})")
             )
-    return min(found)[1]
+    return min(seconds)[1]
 
 
 def main() -> None:
@@ -267,17 +268,17 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     sensors = load_sensor(SENSOR), load_sensor(REFERENCE)
     scenes = [read_scene(file, sensors[1].nominal()) for file in list_images(arguments.images)]
-    apart = sorted({site_of(scene.name) for scene in scenes})[::HELD_OUT_EVERY]
-    held = [scene for scene in scenes if site_of(scene.name) in apart]
-    kept = [scene for scene in scenes if site_of(scene.name) not in apart]
-    judging = draw_patches(held, *sensors, HELD_OUT, 1)
+    held_out_sites = sorted({site_of(scene.name) for scene in scenes})[::HELD_OUT_EVERY]
+    held_out = [scene for scene in scenes if site_of(scene.name) in held_out_sites]
+    training = [scene for scene in scenes if site_of(scene.name) not in held_out_sites]
+    judging = draw_patches(held_out, *sensors, HELD_OUT, 1)
     source = PatchSource(
-        kept, PatchRecipe(*sensors, patch_px=PATCH_PX), BATCH, 0, device=arguments.device
+        training, PatchRecipe(*sensors, patch_px=PATCH_PX), BATCH, 0, device=arguments.device
     )
-    drawn = Calibration(load_sensor(SENSOR), None, 64, 128, 0).drawn
+    patches = Calibration(load_sensor(SENSOR), None, 64, 128, 0).drawn
     print(
         f"{processor_name()}, {arguments.steps * BATCH} patches each, judged by {HELD_OUT} of "
-        f"{len(apart)} sites"
+        f"{len(held_out_sites)} sites"
     )
     heads = "family", "1000 parameters", "halo, px", "float32 dB", "INT8 dB", "s a swath, best tile"
     print("|", " | ".join(heads), "|\n" + "|---" * len(heads) + "|")
@@ -285,10 +286,10 @@ def main() -> None:
         weights_file = arguments.out / f"{name}.safetensors"
         network = trained(name, source, arguments.steps, weights_file, arguments.device)
         model = Network.load(network).model
-        made = quantise_model(model, drawn, {}).host
-        scores = [psnr_cell(each, judging) for each in (model, made)]
+        int8 = quantise_model(model, patches, {}).host
+        scores = [psnr_cell(network, judging) for network in (model, int8)]
         weights = sum(parameter.numel() for parameter in network.parameters()) / 1e3
-        cells = [name, f"{weights:.0f}", str(tiling_of(made).halo_px), *scores, swath_cell(made)]
+        cells = [name, f"{weights:.0f}", str(tiling_of(int8).halo_px), *scores, swath_cell(int8)]
         print("|", " | ".join(cells), "|", flush=True)
 
 

@@ -50,8 +50,11 @@ def depthwise(features: int = 32) -> nn.Module:
 
 def dncnn(layers: int = 8, features: int = 32) -> nn.Module:
     """Convolutions with ReLU whose result is added to the image."""
-    middle = (each for _ in range(layers - 2) for each in (_conv(features, features), nn.ReLU()))
-    return Added(_conv(1, features), nn.ReLU(), *middle, _conv(features, 1))
+    # The first convolution comes first, because each one draws its weights as it is made.
+    parts: list[nn.Module] = [_conv(1, features), nn.ReLU()]
+    for _ in range(layers - 2):
+        parts += _conv(features, features), nn.ReLU()
+    return Added(*parts, _conv(features, 1))
 
 
 def _conv(inputs: int, outputs: int) -> nn.Conv2d:
@@ -109,8 +112,8 @@ def main() -> None:
         core = read_core(quantize(make(), patches=2, patch_px=64, progress=False).model)
         layouts = torch.contiguous_format, torch.channels_last
         steps = [tuning_step(core), *(float_step(make(), layout) for layout in layouts)]
-        taken = [[_seconds(step) for step in steps] for _ in range(turns)]
-        tuned, *both = 1e3 * np.min(taken, axis=0)
+        times_s = [[_seconds(step) for step in steps] for _ in range(turns)]
+        tuned, *both = 1e3 * np.min(times_s, axis=0)
         print(
             f"{name}: float {min(both):.0f} ms, tuning {tuned:.0f} ms, ratio "
             f"{tuned / min(both):.2f}",

@@ -17,7 +17,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +95,8 @@ def write_vrt(path: Path, pixels: np.ndarray) -> Path:
     """Four tiles of TIFF."""
     height, width = pixels.shape
     rows, columns = ((0, side // 2, side) for side in (height, width))
-    parts = [Window.from_slices(y, x) for y in pairwise(rows) for x in pairwise(columns)]
+    corners = product(pairwise(rows), pairwise(columns))
+    parts = [Window.from_slices(y, x) for y, x in corners]
     sources = ""
     for k, part in enumerate(parts):
         write_tiff(path.with_name(f"{k}.tif"), pixels[part.toslices()])
@@ -143,13 +144,13 @@ def restored(image: Path, model: str, *more: str) -> tuple[float, float, str]:
         str(figures),
         *more,
     ]
-    done = subprocess.run(  # noqa: S603
+    process = subprocess.run(  # noqa: S603
         [sys.executable, "-c", COUNTED, *words], capture_output=True, text=True, check=True
     )
     row = json.loads(figures.read_text())["rows"][0]["figures"]
     digest = hashlib.sha256(tifffile.imread(out).tobytes()).hexdigest()[:12]
     out.unlink()
-    return float(done.stderr.split()[-1]), float(row["peak memory"]["value"]), digest
+    return float(process.stderr.split()[-1]), float(row["peak memory"]["value"]), digest
 
 
 def decoding_s(image: Path) -> float:
@@ -171,7 +172,8 @@ def main() -> None:
     parser.add_argument("--model", default="convbeers-xs-int8")
     parser.add_argument("--repeats", type=int, default=1)
     arguments = parser.parse_args()
-    warnings.simplefilter("ignore")  # that tiles lie nowhere on Earth
+    # The tiles have no georeference, about which rasterio warns.
+    warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory() as name:
         pixels = scene(*parse_size(arguments.size))
         first = 0.0

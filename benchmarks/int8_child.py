@@ -26,7 +26,8 @@ takes 20 GB.
 
 def main() -> None:
     """Quantise and say what it took."""
-    way, network, stored, out = sys.argv[1], *map(Path, sys.argv[2:])
+    way = sys.argv[1]
+    network, stored, out = map(Path, sys.argv[2:])
     started = time.perf_counter()
     if way == "ours":
         ours(network, np.load(stored), out)

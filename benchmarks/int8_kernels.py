@@ -78,17 +78,18 @@ def print_times(
         "plain": open_session(integer, threads, exact=False),
     }
     calls = [partial(run, session, image) for session in sessions.values()]
-    found = interleaved(calls, turns + 1)
+    rounds = interleaved(calls, turns + 1)
     times_s = {
-        name: [time_s for time_s, _ in taken] for name, taken in zip(sessions, found, strict=True)
+        name: [time_s for time_s, _ in pairs] for name, pairs in zip(sessions, rounds, strict=True)
     }
-    fastest_s = {name: min(times[1:]) for name, times in times_s.items()}  # the first turn sets up
+    # The first turn sets up the session and is left out.
+    fastest_s = {name: min(times[1:]) for name, times in times_s.items()}
     spread = max(median(times[1:]) / fastest_s[name] for name, times in times_s.items())
-    shown = ", ".join(f"{name} {time_s:.3f} s" for name, time_s in fastest_s.items())
+    cells = ", ".join(f"{name} {time_s:.3f} s" for name, time_s in fastest_s.items())
     ratios = {name: fastest_s["float32"] / fastest_s[name] for name in ("int8", "ways")}
     cost = fastest_s["int8"] / fastest_s["plain"]
     print(
-        f"{variant}, {image.shape[-1]} x {image.shape[-1]}, {threads} threads: {shown}; "
+        f"{variant}, {image.shape[-1]} x {image.shape[-1]}, {threads} threads: {cells}; "
         f"float32 / int8 {ratios['int8']:.2f}, float32 / ways {ratios['ways']:.2f}, int8 / "
         f"plain {cost:.2f}; "
         f"median up to {spread:.2f} times the fastest"

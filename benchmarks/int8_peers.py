@@ -31,6 +31,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -76,7 +77,8 @@ def ways(adaround_iterations: int) -> list[Way]:
         Way("Quark XINT8 + AdaRound", False, QUARK, (), (str(adaround_iterations),)),
     ]
     ours = Way("beers-deploy", False, OURS, ("ours",))
-    return [ours, *(replace(peer, rewritten=graph) for peer in peers for graph in (False, True))]
+    kinds = product(peers, (False, True))
+    return [ours, *(replace(peer, rewritten=rewritten) for peer, rewritten in kinds)]
 
 
 @dataclass(frozen=True)
@@ -119,17 +121,18 @@ def scores(in_float: Restore, in_int8: Restore, pairs: list[Pair]) -> list[str]:
     std = float(difference.std())
     db_float, db_int8, similarity, same = np.mean(rows, axis=0)
     sizes = [f"{mae:.6f}", f"{std:.6f}", f"{np.abs(difference).max():.4f}", f"{std / mae:.2f}"]
-    found = (
+    cells = (
         f"{db_float:.2f}",
         f"{db_int8:.2f}",
         f"{db_float - db_int8:.3f}",
         f"{similarity:.4f}",
         f"{100 * same:.2f}",
     )
-    return [*sizes, *(cell.replace("nan", "") for cell in found)]
+    return [*sizes, *(cell.replace("nan", "") for cell in cells)]
 
 
 def _as_in_a_file(result: np.ndarray, image: np.ndarray) -> np.ndarray:
+    # A result with the image's channels is an image, which a file stores in [0, 1].
     return np.clip(result, 0, 1) if result.shape[1:2] == image.shape[1:2] else result
 
 
@@ -170,13 +173,16 @@ def quantise(
         if way.script == OURS
         else {**os.environ, "PYTHONPATH": ""}
     )
-    at = out.parent  # Quark drops files where it runs
-    done = subprocess.run(command, check=False, capture_output=True, text=True, env=paths, cwd=at)  # noqa: S603 - our own
-    if done.returncode:
-        last = (done.stderr.strip() or "no message").splitlines()[-1]
-        raise RuntimeError(f"exit {done.returncode}: {last}")
-    told = json.loads(done.stdout.strip().splitlines()[-1])
-    return told["seconds"], told["peak_mb"]
+    # Quark drops files into its working folder.
+    at = out.parent
+    process = subprocess.run(  # noqa: S603 - our own
+        command, check=False, capture_output=True, text=True, env=paths, cwd=at
+    )
+    if process.returncode:
+        last = (process.stderr.strip() or "no message").splitlines()[-1]
+        raise RuntimeError(f"exit {process.returncode}: {last}")
+    record = json.loads(process.stdout.strip().splitlines()[-1])
+    return record["seconds"], record["peak_mb"]
 
 
 def layout(path: Path) -> Counter[tuple[str, ...]]:
@@ -188,7 +194,8 @@ def layout(path: Path) -> Counter[tuple[str, ...]]:
         tensor.name: onnx.TensorProto.DataType.Name(tensor.data_type)
         for tensor in graph.initializer
     }
-    sources |= {name: node.op_type for node in graph.node for name in node.output}
+    for node in graph.node:
+        sources |= dict.fromkeys(node.output, node.op_type)
     return Counter(
         (node.op_type, *(sources.get(name, "input") for name in node.input)) for node in graph.node
     )
@@ -199,13 +206,13 @@ def vint8_words(host: Path, theirs: Path, tile_px: int, python: str) -> str:
     own.
     """
     ours = Network.load(host).core("vek385", tile_px).save(host.with_name("vint8.onnx"))
-    done = subprocess.run(  # noqa: S603
+    process = subprocess.run(  # noqa: S603
         [python, str(QUARK), "adjust", str(ours)], check=True, capture_output=True, text=True
     )
     one = layout(ours)
     other = layout(theirs)
     return (
-        f"VINT8: {done.stdout.strip().splitlines()[-1]}; ours alone {[*(one - other)]}, "
+        f"VINT8: {process.stdout.strip().splitlines()[-1]}; ours alone {[*(one - other)]}, "
         f"Quark's {[*(other - one)]}"
     )
 
@@ -271,7 +278,7 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
     in_float = network.runner(files[False][0])
     yield f"| {' | '.join(COLUMNS)} |"
     yield "|---" * len(COLUMNS) + "|"
-    made: dict[str, Path] = {}
+    created: dict[str, Path] = {}
     for number, way in enumerate(ways(arguments.adaround_iterations)):
         graph = "rewritten" if way.rewritten or way.name.startswith("beers") else "plain"
         if not re.search(arguments.only, f"{way.name}, {graph}"):
@@ -295,9 +302,9 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
             f"{peak_mb:.0f}",
         ]
         yield f"| {way.name} | {graph} | {' | '.join(cells)} |"
-        made[f"{way.name}, {graph}"] = out
-    host = made.get("beers-deploy, rewritten")
-    theirs = made.get("Quark VINT8, rewritten")
+        created[f"{way.name}, {graph}"] = out
+    host = created.get("beers-deploy, rewritten")
+    theirs = created.get("Quark VINT8, rewritten")
     if host and theirs:
         yield vint8_words(host, theirs, images.shape[2], arguments.quark_python)
 

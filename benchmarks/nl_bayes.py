@@ -74,11 +74,9 @@ def cell(
             list(nl_bayes_strips([noisy], len(noisy), Noise(sigma), QUALITIES[quality]))
         )
         times_s.append(time.perf_counter() - started)
-    level_db, time_s, (cpp_db, cpp_s) = (
-        psnr_db(denoised.numpy(), clean, 255),
-        min(times_s),
-        CPP[name, sigma],
-    )
+    level_db = psnr_db(denoised.numpy(), clean, 255)
+    time_s = min(times_s)
+    cpp_db, cpp_s = CPP[name, sigma]
     gain = level_db - cpp_db
     ratio = time_s / cpp_s
     print(

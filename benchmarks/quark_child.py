@@ -61,7 +61,8 @@ def config_of(how: str) -> QConfig | Config:
     """What Quark is asked for."""
     if how == "vint8":
         preset = get_default_config("VINT8")
-        preset.enable_npu_cnn, preset.extra_options["UseRandomData"] = True, False
+        preset.enable_npu_cnn = True
+        preset.extra_options["UseRandomData"] = False
         return Config(global_quant_config=preset)
     finetuning = [AdaRoundConfig(num_iterations=int(how))] if int(how) else []
     return QConfig(QLayerConfig(activation=XInt8Spec(), weight=XInt8Spec()), algo_config=finetuning)
@@ -78,8 +79,8 @@ def adjusted(model: onnx.ModelProto) -> dict[str, int]:
     convolutions = [node for node in model.graph.node if node.op_type in ("Conv", "ConvTranspose")]
     unseen = sum(any(find(node) is None for find in finders) for node in convolutions)
     adjust_quantize_info(ONNXModel(model))
-    moved = sum(tensor.SerializeToString() != before[tensor.name] for tensor in constants)
-    return {"moved": moved, "unseen": unseen, "convolutions": len(convolutions)}
+    changed = sum(tensor.SerializeToString() != before[tensor.name] for tensor in constants)
+    return {"moved": changed, "unseen": unseen, "convolutions": len(convolutions)}
 
 
 def peak_mb() -> float:

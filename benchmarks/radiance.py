@@ -10,6 +10,7 @@ and restored, and restored once more as they are. Inner pixels count, as in `eva
 """
 
 import argparse
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -36,9 +37,8 @@ def main() -> None:
     )
     parser.add_argument("--photographs", type=Path, required=True)
     parser.add_argument("--crops", type=Path, required=True)
-    parser.add_argument(
-        "--networks", default=",".join(name + end for name in shipped_names() for end in ("", INT8))
-    )
+    names = map("".join, product(shipped_names(), ("", INT8)))
+    parser.add_argument("--networks", default=",".join(names))
     arguments = parser.parse_args()
     aim = REFERENCE.nominal()
     scenes = {
@@ -74,10 +74,10 @@ def acquired(scenes: list[Scene]) -> list[NamedPair]:
     return simulate_pairs(scenes, DEGRADED, REFERENCE, SEED, oversamplings_of(DEGRADED))[0]
 
 
-def change(restored: np.ndarray, wanted: np.ndarray | None) -> float:
+def change(restored: np.ndarray, reference: np.ndarray | None) -> float:
     """Return the change of the mean of the inner pixels in %, clipped pixels among them."""
-    assert wanted is not None  # noqa: S101 - pairs simulated here have it
-    return bias_percent(restored, wanted)
+    assert reference is not None  # noqa: S101 - pairs simulated here have it
+    return bias_percent(restored, reference)
 
 
 if __name__ == "__main__":

@@ -95,18 +95,18 @@ def main() -> None:
 
 def roughness(flat: np.ndarray) -> float:
     """Return the standard deviation of flat ground (H, W) less its slow part, over its mean."""
-    apart = flat[:, 1:] - flat[:, :-1]
-    return float(apart.std() / np.sqrt(2) / flat.mean())
+    steps = flat[:, 1:] - flat[:, :-1]
+    return float(steps.std() / np.sqrt(2) / flat.mean())
 
 
 def edge_line(region: np.ndarray) -> EdgeLine:
     """Return where the edge of a region (H, W) runs."""
-    found = edge_in(
+    edge = edge_in(
         region, lambda values: np.full(values.shape, (0.02 * region.mean()) ** 2), "edge"
     )
-    if isinstance(found, Refusal):
-        raise SystemExit(found.reason)
-    return found[1]
+    if isinstance(edge, Refusal):
+        raise SystemExit(edge.reason)
+    return edge[1]
 
 
 def edge_width_px(region: np.ndarray, line: EdgeLine) -> float:
@@ -135,12 +135,12 @@ def edge_width_px(region: np.ndarray, line: EdgeLine) -> float:
 def side_by_side(crops: list[np.ndarray]) -> np.ndarray:
     """Return the crops (H, W) beside each other, enlarged, with the contrast of the first."""
     dark, bright = np.percentile(crops[0], PERCENTILES)
-    shown = []
+    panels = []
     for crop in crops:
         pixels = (np.clip((crop - dark) / (bright - dark), 0, 1) * 255).astype(np.uint8)
         large = np.kron(pixels, np.ones((ZOOM, ZOOM), np.uint8))
-        shown.append(np.pad(large, ((0, GAP_PX), (0, GAP_PX)), constant_values=255))
-    return np.concatenate(shown, axis=1)
+        panels.append(np.pad(large, ((0, GAP_PX), (0, GAP_PX)), constant_values=255))
+    return np.concatenate(panels, axis=1)
 
 
 if __name__ == "__main__":

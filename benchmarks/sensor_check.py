@@ -56,8 +56,8 @@ def told(
 def restored(image: Image, sensor: Instrument) -> Image:
     """By the shipped network, told the sensor."""
     network = Network.load("convbeers-xs-int8", sensor=told(sensor))
-    found = network(image[None, None].astype(np.float32) / sensor.max_dn)[0, 0]
-    return np.asarray(np.clip(np.rint(found * sensor.max_dn), 0, sensor.max_dn))
+    output = network(image[None, None].astype(np.float32) / sensor.max_dn)[0, 0]
+    return np.asarray(np.clip(np.rint(output * sensor.max_dn), 0, sensor.max_dn))
 
 
 def resampled(image: Image, _: Instrument) -> Image:
@@ -104,8 +104,8 @@ def main() -> None:
             if name == "right" and check.doubts:
                 print(f"false alarm, {kind}, MTF {sensor.mtf_axes}: {check.doubts}")
     print("| image and what is told | doubted | of |\n|---|---|---|")
-    for name, found in sorted(counts.items()):
-        print(f"| {name} | {sum(found)} | {len(found)} |")
+    for name, flags in sorted(counts.items()):
+        print(f"| {name} | {sum(flags)} | {len(flags)} |")
     for path in list_images(arguments.raw) if arguments.raw else ():
         with open_source(path) as source:
             print(f"{path.name}: {check_source(source, [BASE], LIKE.max_dn)}")

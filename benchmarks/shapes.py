@@ -12,6 +12,7 @@ of 13600 x 9016 is cut into whole tiles with exact seams. What a shape is worth 
 import argparse
 import math
 import re
+from itertools import chain
 from unittest.mock import patch
 
 import numpy as np
@@ -45,18 +46,17 @@ def main() -> None:
     parser.add_argument("--tile", type=int, default=640)
     arguments = parser.parse_args()
     boards = [load_dpu(*board.split(":")) for board in arguments.boards.split(",")]
-    heads = [
-        f"{dpu.target.name} {dpu.name}, {unit}"
-        for dpu in boards
-        for unit in ("frame/s", "s a swath")
-    ]
+    heads = list[str]()
+    for dpu in boards:
+        board = f"{dpu.target.name} {dpu.name}"
+        heads += f"{board}, frame/s", f"{board}, s a swath"
     print("| shape | 1000 products a pixel | halo, px |", " | ".join(heads), "|")
     print("|---|---|---|" + "---|" * len(heads))
     for text in arguments.shapes.split(","):
         variant = parse_shape(text)
         model = int8(variant)
         products = sum(9 * a * b for a, b in variant.convolutions.values()) / variant.pixels
-        cells = [cell for dpu in boards for cell in cells_of(model, dpu, arguments.tile)]
+        cells = chain.from_iterable(cells_of(model, dpu, arguments.tile) for dpu in boards)
         print(
             f"| {text} | {products / 1e3:.0f} | {tiling_of(model).halo_px} |",
             " | ".join(cells),
@@ -67,10 +67,10 @@ def main() -> None:
 
 def parse_shape(text: str) -> Variant:
     """A shape as the command line names it."""
-    found = SHAPE.fullmatch(text)
-    if found is None:
+    match = SHAPE.fullmatch(text)
+    if match is None:
         raise SystemExit(f"expected BLOCKSxFEATURES or BLOCKSxFEATURES@SCALE, got {text!r}")
-    blocks, features, scale = found.groups(default="1")
+    blocks, features, scale = match.groups(default="1")
     return Variant(int(blocks), int(features), int(scale))
 
 
@@ -78,11 +78,10 @@ def int8(variant: Variant) -> onnx.ModelProto:
     """An INT8 file of that shape."""
     network = ConvBEERS(variant)
     initialise(network, torch.Generator().manual_seed(0))
-    seen = np.random.default_rng(0).random((1, 1, SIDE_PX, SIDE_PX), dtype=np.float32)
-    patches = Patches([], Remade(lambda _: (seen, seen), 1), Remade(lambda _: seen, 1))
-    with patch(
-        "beers_deploy.quant.passes.equalise.MOST_CHANNELS", 0
-    ):  # no channel is tried by itself
+    image = np.random.default_rng(0).random((1, 1, SIDE_PX, SIDE_PX), dtype=np.float32)
+    patches = Patches([], Remade(lambda _: (image, image), 1), Remade(lambda _: image, 1))
+    # The search does not try channels one by one.
+    with patch("beers_deploy.quant.passes.equalise.MOST_CHANNELS", 0):
         return quantise_model(to_onnx(network.eval(), {}), patches, {}).host
 
 

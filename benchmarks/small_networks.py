@@ -85,8 +85,8 @@ class Added(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """The same shape."""
-        found: Tensor = self.inner(x)
-        return x + found
+        output: Tensor = self.inner(x)
+        return x + output
 
 
 def inverted(inputs: int, outputs: int) -> nn.Module:
@@ -168,9 +168,9 @@ class Drawn:
     @classmethod
     def of(cls, kind: str, folder: Path | None, seed: int, batches: int) -> "Drawn":
         """So many batches of what the examples learn from."""
-        found = list(islice(batches_of(kind, folder, seed), batches))
-        images, wanted = (torch.cat(each).numpy() for each in zip(*found, strict=True))
-        return cls(images, wanted)
+        samples = list(islice(batches_of(kind, folder, seed), batches))
+        images, references = (torch.cat(tensors).numpy() for tensors in zip(*samples, strict=True))
+        return cls(images, references)
 
 
 @torch.no_grad()
@@ -193,9 +193,9 @@ def trained(name: str, folder: Path | None, count: int) -> nn.Module:
         network.parameters(), lr=FAST if name.startswith(("depthwise", "plain")) else RATE
     )
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, count)
-    for image, wanted in islice(batches_of(kind, folder, 0), count):
+    for image, reference in islice(batches_of(kind, folder, 0), count):
         optimiser.zero_grad()
-        error(network(image[:BATCH]), wanted[:BATCH]).backward()  # type: ignore[no-untyped-call]
+        error(network(image[:BATCH]), reference[:BATCH]).backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimiser.step()
         schedule.step()
@@ -213,27 +213,27 @@ def save(network: nn.Module, side_px: int, path: Path) -> None:
     save_onnx(load_onnx(path), path)
 
 
-def losses(in_float: Restore, in_int8: Restore, held: Drawn) -> np.ndarray:
+def losses(in_float: Restore, in_int8: Restore, held_out: Drawn) -> np.ndarray:
     """(K,) what each sample loses: dB of PSNR, or of one that was classified rightly all, 100
     points.
     """
-    found = []
-    for image, wanted in zip(held.images, held.wanted, strict=True):
+    values = []
+    for image, reference in zip(held_out.images, held_out.wanted, strict=True):
         results = [run(image[None]) for run in (in_float, in_int8)]
-        if wanted.ndim:
-            scores = [psnr_db(np.clip(result, 0, 1), wanted[None], 1.0) for result in results]
+        if reference.ndim:
+            scores = [psnr_db(np.clip(result, 0, 1), reference[None], 1.0) for result in results]
         else:
-            scores = [100.0 * (result.argmax() == wanted) for result in results]
-        found.append(scores[0] - scores[1])
-    return np.array(found)
+            scores = [100.0 * (result.argmax() == reference) for result in results]
+        values.append(scores[0] - scores[1])
+    return np.array(values)
 
 
 def cells(
-    name: str, way: Way, python: str, folder: Path, drawn: dict[bool, Drawn], held: Drawn
+    name: str, way: Way, python: str, folder: Path, samples: dict[bool, Drawn], held_out: Drawn
 ) -> str:
     """What a way loses: the mean, and the worst sample's of images.
 
-    `drawn[True]` is what it tunes on.
+    `samples[True]` is what it tunes on.
     """
     path = folder / f"{slug(name)}.onnx"
     model = load_onnx(path)
@@ -241,25 +241,25 @@ def cells(
     patches = path.with_suffix(".npy")
     out = path.with_suffix(f".{slug(way.name)}.onnx")
     if way is TUNED:
-        seconds = fine_tune(path, drawn[True], out)
+        seconds = fine_tune(path, samples[True], out)
     else:
-        np.save(patches, drawn[False].images)
+        np.save(patches, samples[False].images)
         seconds, _ = quantise(way, {False: (path, patches)}, out, python)
-    lost = losses(network.runner(path), network.runner(out), held)
+    sample_losses = losses(network.runner(path), network.runner(out), held_out)
     print(name, way.name, f"{seconds:.0f} s", file=sys.stderr)
     return (
-        f"{lost.mean():.2f}, {lost.max():.2f}"
-        if held.wanted.ndim > 1
-        else f"{lost.mean():.1f} points"
+        f"{sample_losses.mean():.2f}, {sample_losses.max():.2f}"
+        if held_out.wanted.ndim > 1
+        else f"{sample_losses.mean():.1f} points"
     )
 
 
-def fine_tune(path: Path, drawn: Drawn, out: Path) -> float:
+def fine_tune(path: Path, tuning: Drawn, out: Path) -> float:
     """Quantise and fine-tune a network, with references where they are images; the processor time
     in seconds.
     """
     begun = time.process_time()
-    samples = (drawn.images, drawn.wanted) if drawn.wanted.ndim > 1 else drawn.images
+    samples = (tuning.images, tuning.wanted) if tuning.wanted.ndim > 1 else tuning.images
     save_onnx(quantize(path, samples, finetune="auto", progress=False).model, out)
     return time.process_time() - begun
 
@@ -285,18 +285,19 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
         if not re.search(arguments.only, name):
             continue
         path = folder / f"{slug(name)}.onnx"
+        # ESPCN doubles the size, so its images have half the side of its references.
         if not path.exists():
             save(
                 trained(name, arguments.images, arguments.steps),
                 SIDE_PX[kind] // (2 if kind == "espcn" else 1),
                 path,
             )
-        drawn = {False: Drawn.of(kind, arguments.images, 5, arguments.batches)}
+        samples = {False: Drawn.of(kind, arguments.images, 5, arguments.batches)}
         if arguments.tuned:
-            drawn[True] = Drawn.of(kind, arguments.images, 5, MORE * arguments.batches)
-        held = Drawn.of(kind, arguments.held_out, 6, arguments.batches)
-        found = [cells(name, way, python, folder, drawn, held) for way, python in ways]
-        yield f"| {name} | {' | '.join(found)} |"
+            samples[True] = Drawn.of(kind, arguments.images, 5, MORE * arguments.batches)
+        held_out = Drawn.of(kind, arguments.held_out, 6, arguments.batches)
+        columns = [cells(name, way, python, folder, samples, held_out) for way, python in ways]
+        yield f"| {name} | {' | '.join(columns)} |"
 
 
 def main() -> None:

@@ -42,7 +42,9 @@ def main() -> None:
     documents = [figures_of(path) for path in parser.parse_args().documents]
     tables = [name for name in documents[-1] if name.startswith("mean")]
     for key, title in SCORES.items():
-        lines = [line for table in tables for line in score_lines(documents, table, key)]
+        lines = list[list[str]]()
+        for table in tables:
+            lines += score_lines(documents, table, key)
         show(title, ["network, radiance", *COLUMNS], lines)
     for start, table in ((FLUX, "targets"), (SNR, "mean")):
         names = [key for key in first(documents[-1], table) if key.startswith(start)]

@@ -12,6 +12,7 @@ and --table puts the parts together.
 import argparse
 import json
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -74,27 +75,31 @@ def main() -> None:
 def measure(scenes: Sequence[Scene], networks: Sequence[str], out: Path, part: slice) -> None:
     """Write the scores after each sensor, so that a run that is stopped keeps what it has."""
     methods = {
-        (network, around): method_named(network, DEGRADED, REFERENCE, around=steps)
-        for network in networks
-        for around, steps in AROUND.items()
+        (network, around): method_named(network, DEGRADED, REFERENCE, around=AROUND[around])
+        for network, around in product(networks, AROUND)
     }
     scores: Scores = {}
     nominal = DEGRADED.nominal()
     aim = REFERENCE.nominal()
     for name, sensor in list(conditions(nominal, DEGRADED).items())[part]:
-        if name == NOMINAL:  # it is also MTF 7 %
+        # The nominal sensor is also the condition with an MTF of 7 %.
+        if name == NOMINAL:
             continue
         for brightness in BRIGHTNESSES:
-            seen = [Scene(scene.name, scene.radiance * np.float32(brightness)) for scene in scenes]
-            pairs, _ = simulate_pairs(seen, sensor, aim.in_units_of(sensor), SEED, OVERSAMPLINGS)
-            found: dict[str, dict[str, float]] = {network: {} for network in networks}
+            brightened = [
+                Scene(scene.name, scene.radiance * np.float32(brightness)) for scene in scenes
+            ]
+            pairs, _ = simulate_pairs(
+                brightened, sensor, aim.in_units_of(sensor), SEED, OVERSAMPLINGS
+            )
+            by_network: dict[str, dict[str, float]] = {network: {} for network in networks}
             for (network, around), method in methods.items():
                 assert method.specialise is not None  # noqa: S101 - shipped networks take any sensor
                 restore = method.specialise(sensor)
-                found[network][around] = float(
+                by_network[network][around] = float(
                     np.mean([inner_psnr_db(restore(p.degraded), p) for p in pairs])
                 )
-            scores[f"{brightness:g}, {name}"] = found
+            scores[f"{brightness:g}, {name}"] = by_network
         out.write_text(json.dumps(scores, indent=1))
         print(name, flush=True)
 
@@ -117,8 +122,8 @@ def show(parts: Sequence[Scores]) -> None:
     for brightness in BRIGHTNESSES:
         start = f"{brightness:g}, "
         sensors = {
-            name.removeprefix(start): found
-            for name, found in scores.items()
+            name.removeprefix(start): figures
+            for name, figures in scores.items()
             if name.startswith(start)
         }
         print(
@@ -138,7 +143,8 @@ def gain(
 ) -> str:
     """Mean over the sensors in dB, the least and its sensor."""
     gains = {
-        name: found[network][around] - found[network]["neither"] for name, found in sensors.items()
+        name: figures[network][around] - figures[network]["neither"]
+        for name, figures in sensors.items()
     }
     least = min(gains, key=lambda name: gains[name])
     return f"{np.mean(list(gains.values())):+.2f} ({gains[least]:+.2f}, {least})"

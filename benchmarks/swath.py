@@ -25,6 +25,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -104,9 +105,9 @@ def speed(folder: Path, options: Options, size: tuple[int, int], repeats: int) -
     network = onnx.load(options.model)
     tiling = tiling_of(network)
     plan = make_plan((1, *dn.shape), TILE_PX, tiling.halo_px, tiling)
-    seen = [dn[r.start : r.stop, c.start : c.stop] for r in plan.rows for c in plan.columns]
+    tiles = [dn[r.start : r.stop, c.start : c.stop] for r, c in product(plan.rows, plan.columns)]
     windows = [
-        np.ascontiguousarray(pixels, np.float32)[None, None] / np.float32(4095) for pixels in seen
+        np.ascontiguousarray(pixels, np.float32)[None, None] / np.float32(4095) for pixels in tiles
     ]
     infer, version = open_runtime(options.runtime, network, options.threads)
 
@@ -214,7 +215,8 @@ def overlapped(task: Task, way: str, chunks_at_once: int) -> Run:
             restored, depth=halo_px, boundary="none", meta=np.empty((0, 0), np.uint16)
         )
         pixels = lazy.compute(scheduler="threads", num_workers=chunks_at_once)
-        # As the engine writes, but for its strategy of zlib, which tifffile has no option for.
+        # The engine writes the same, except for its zlib strategy, for which tifffile has no
+        # option.
         packed: dict[str, Any] = {
             "compression": "zlib",
             "compressionargs": {"level": 1},
@@ -230,7 +232,7 @@ def child(task: Task, python: str) -> Iterator[Run]:
     """MONAI in its process, loaded and waiting; each call is one turn, and returns its seconds of
     the processor.
     """
-    given = (
+    words = (
         task.options.model,
         task.image,
         task.out("MONAI"),
@@ -238,7 +240,7 @@ def child(task: Task, python: str) -> Iterator[Run]:
         2 * task.halo_px / TILE_PX,
         task.cores,
     )
-    command = [python, str(Path(__file__).with_name("monai_child.py")), *map(str, given)]
+    command = [python, str(Path(__file__).with_name("monai_child.py")), *map(str, words)]
     with subprocess.Popen(  # noqa: S603
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
@@ -248,10 +250,10 @@ def child(task: Task, python: str) -> Iterator[Run]:
             assert process.stdout is not None  # noqa: S101
             process.stdin.write("go\n")
             process.stdin.flush()
-            said = process.stdout.readline()
-            if not said:
+            line = process.stdout.readline()
+            if not line:
                 raise RuntimeError(f"MONAI ended with {process.wait()}; its message stands above")
-            return float(json.loads(said)["cpu_seconds"])
+            return float(json.loads(line)["cpu_seconds"])
 
         yield turn
 
@@ -304,11 +306,12 @@ def write_swath(path: Path, height: int, width: int, known_rows: int) -> None:
     """
     ramp = np.arange(1, 257, dtype=np.uint16) * np.ones((256, 1), np.uint16)
     across = -(-width // 256)
-    known = -(-known_rows // 256) * across
+    block_count = -(-known_rows // 256) * across
     count = -(-height // 256) * across
     tifffile.imwrite(
         path,
-        (ramp + np.uint16(k % 3000) if k < known else None for k in range(count)),
+        # tifffile leaves a tile out of the file if it is None. Readers see nodata there.
+        (ramp + np.uint16(k % 3000) if k < block_count else None for k in range(count)),
         shape=(height, width),
         dtype=np.uint16,
         tile=(256, 256),

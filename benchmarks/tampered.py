@@ -126,10 +126,10 @@ def main() -> None:
                 f"{', '.join(failed) or '-'} |",
                 flush=True,
             )
-    passed = {key: len(TAMPERINGS) - count for key, count in stopped.items()}
+    undetected = {key: len(TAMPERINGS) - count for key, count in stopped.items()}
     print(
-        f"\nPassed: {passed['default']} of {len(TAMPERINGS)} by default, {passed['baseline']} "
-        "with a baseline."
+        f"\nPassed: {undetected['default']} of {len(TAMPERINGS)} by default, "
+        f"{undetected['baseline']} with a baseline."
     )
 
 

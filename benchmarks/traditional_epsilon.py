@@ -116,6 +116,7 @@ class Curve:
 
     @cached_property
     def _interpolated(self) -> PchipInterpolator:
+        # A logarithmic axis has no place for epsilon = 0, so it stands at ZERO.
         return PchipInterpolator(np.log(np.maximum(EPSILONS, ZERO)), self.psnr_db)
 
     @cached_property
@@ -155,9 +156,9 @@ def print_losses(curves: Sequence[Curve]) -> None:
     rows = {
         "shipped": [curve.loss_db(FIT) for curve in curves],
         "fitted": [curve.loss_db(fit) for curve in curves],
-        "fitted without the place": [
-            loss for place in places for loss in held_out_loss_db(curves, place)
-        ],
+        "fitted without the place": list(
+            chain.from_iterable(held_out_loss_db(curves, place) for place in places)
+        ),
         "before": [curve.best_db - float(curve.at(curve.before)) for curve in curves],
     }
     print(
@@ -197,6 +198,7 @@ def photographs(folders: Sequence[Path]) -> Iterator[Scene]:
     for place, path in firsts.items():
         radiance = read_scene(path, REFERENCE).radiance
         side = min(OVERSAMPLING * (SIDE_PX + 2 * MARGIN_PX), *radiance.shape)
+        # Smaller photographs leave too few pixels within the border.
         if side < LEAST_SIDE_PX:
             continue
         top, left = ((length - side) // 2 for length in radiance.shape)
@@ -252,6 +254,7 @@ def psnr_db(dn: torch.Tensor, pair: NamedPair, max_dn: int) -> float:
     inner = slice(BORDER_PX, -BORDER_PX), slice(BORDER_PX, -BORDER_PX)
     assert pair.noise_free is not None  # noqa: S101 - pairs simulated here have it
     error = (dn.numpy() - pair.noise_free)[inner]
+    # Saturated pixels have lost what the reference shows.
     usable = (pair.degraded < max_dn)[inner]
     return float(10 * np.log10(max_dn**2 / np.square(error[usable], dtype=np.float64).mean()))
 
@@ -263,13 +266,13 @@ def fitted_to(curves: Sequence[Curve]) -> Fit:
         fit = Fit(float(np.exp(logs[0])), float(logs[1]))
         return float(np.mean([curve.loss_db(fit) for curve in curves]))
 
-    found = minimize(
+    optimum = minimize(
         mean_loss_db,
         [np.log(FIT.scale), FIT.power],
         method="Nelder-Mead",
         options={"xatol": 1e-2, "fatol": 1e-5},
     ).x
-    return Fit(float(np.exp(found[0])), float(found[1]))
+    return Fit(float(np.exp(optimum[0])), float(optimum[1]))
 
 
 def held_out_loss_db(curves: Sequence[Curve], place: str) -> list[float]:

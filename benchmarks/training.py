@@ -57,18 +57,19 @@ def main() -> None:
     variant = VARIANTS[arguments.variant]
     steps = arguments.steps
     trainers = {name: Trainer(variant, recipe, precision=name) for name in get_args(Precision)}
-    made = list(islice(source.batches(), steps))
+    batch_list = list(islice(source.batches(), steps))
     batches = source.batches()
     bare: dict[str, list[float]] = {name: [] for name in trainers}
-    whole: dict[str, list[float]] = {name: [] for name in trainers}
+    seconds: dict[str, list[float]] = {name: [] for name in trainers}
     with tempfile.TemporaryDirectory() as folder:
         for _, (name, trainer) in product(range(TURNS + 1), trainers.items()):
             bare[name].append(
                 rate(
-                    steps, partial(bare_loop, Trainer(variant, recipe, precision=name), made, name)
+                    steps,
+                    partial(bare_loop, Trainer(variant, recipe, precision=name), batch_list, name),
                 )
             )
-            whole[name].append(
+            seconds[name].append(
                 rate(steps, partial(run, trainer, batches, steps, Path(folder) / "c"))
             )
     print(f"{arguments.variant} on {processor_name()}, {torch.get_num_threads()} threads")
@@ -81,13 +82,14 @@ def main() -> None:
         )
     for name in trainers:
         ratio = median(
-            ours / theirs for ours, theirs in zip(whole[name][1:], bare[name][1:], strict=True)
+            ours / theirs for ours, theirs in zip(seconds[name][1:], bare[name][1:], strict=True)
         )
         rates = (
             f"bare loop {median(bare[name][1:]):.1f} patches/s, training run "
-            f"{median(whole[name][1:]):.1f}"
+            f"{median(seconds[name][1:]):.1f}"
         )
-        print(f"{name}: {rates}, ratio {ratio:.2f}")  # the first turn warms up
+        # The first turn warms up and is left out.
+        print(f"{name}: {rates}, ratio {ratio:.2f}")
 
 
 def kinds_of_patches() -> dict[str, PatchRecipe]:

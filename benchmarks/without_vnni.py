@@ -104,8 +104,8 @@ def cpuid_places(library: Path) -> list[int]:
     assert section is not None  # noqa: S101
     address, offset = (int(number, 16) for number in section.groups())
     return [
-        int(found[1], 16) - address + offset
-        for found in re.finditer(r"(\w+):\t[^\t]*\tcpuid", code)
+        int(match[1], 16) - address + offset
+        for match in re.finditer(r"(\w+):\t[^\t]*\tcpuid", code)
     ]
 
 

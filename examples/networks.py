@@ -72,7 +72,8 @@ class ESPCN(nn.Sequential):
     """
 
     def __init__(self) -> None:
-        head, tail = nn.Conv2d(1, 64, 5, padding=2), nn.Conv2d(32, 4, 3, padding=1)
+        head = nn.Conv2d(1, 64, 5, padding=2)
+        tail = nn.Conv2d(32, 4, 3, padding=1)
         super().__init__(head, nn.ReLU(), _activated(64, 32, nn.ReLU()), tail, nn.PixelShuffle(2))
 
 
@@ -89,7 +90,8 @@ class SESR(nn.Module):
         self.body = nn.Sequential(
             *(_activated(features, features, nn.ReLU()) for _ in range(layers))
         )
-        self.tail, self.shuffle = nn.Conv2d(features, 4, 5, padding=2), nn.PixelShuffle(2)
+        self.tail = nn.Conv2d(features, 4, 5, padding=2)
+        self.shuffle = nn.PixelShuffle(2)
 
     def forward(self, image: Tensor) -> Tensor:
         """Images (N, 1, H, W) to (N, 1, 2 H, 2 W); the image is added to each
@@ -107,18 +109,18 @@ class UNet(nn.Module):
 
     def __init__(self, features: int = 16) -> None:
         super().__init__()
-        one, two, four = features, 2 * features, 4 * features
-        self.down_one, self.down_two, self.bottom = (
-            _twice(1, one),
-            _twice(one, two),
-            _twice(two, four),
-        )
-        self.up_two, self.up_one = (
-            nn.ConvTranspose2d(four, two, 2, stride=2),
-            nn.ConvTranspose2d(two, one, 2, stride=2),
-        )
-        self.join_two, self.join_one = _twice(four, two), _twice(two, one)
-        self.pool, self.tail = nn.MaxPool2d(2), nn.Conv2d(one, 1, 1)
+        one = features
+        two = 2 * features
+        four = 4 * features
+        self.down_one = _twice(1, one)
+        self.down_two = _twice(one, two)
+        self.bottom = _twice(two, four)
+        self.up_two = nn.ConvTranspose2d(four, two, 2, stride=2)
+        self.up_one = nn.ConvTranspose2d(two, one, 2, stride=2)
+        self.join_two = _twice(four, two)
+        self.join_one = _twice(two, one)
+        self.pool = nn.MaxPool2d(2)
+        self.tail = nn.Conv2d(one, 1, 1)
 
     def forward(self, image: Tensor) -> Tensor:
         """Restore images (N, 1, H, W) of sides that are multiples of 4; the shape is kept."""
@@ -187,10 +189,8 @@ class InvertedResidual(nn.Module):
         super().__init__()
         self.expand = _batch_normed(features, 2 * features, nn.ReLU6(), kernel=1)
         self.depthwise = _batch_normed(2 * features, 2 * features, nn.ReLU6(), groups=2 * features)
-        self.project, self.norm = (
-            nn.Conv2d(2 * features, features, 1, bias=False),
-            nn.BatchNorm2d(features),
-        )
+        self.project = nn.Conv2d(2 * features, features, 1, bias=False)
+        self.norm = nn.BatchNorm2d(features)
 
     def forward(self, x: Tensor) -> Tensor:
         """Features (N, F, H, W) to the same shape."""
@@ -337,8 +337,10 @@ def to_onnx(name: str, network: nn.Module, fold: bool = True, opset: int = 17) -
     axes = {0: "batch"} if example.side_px else {0: "batch", 2: "height", 3: "width"}
     outer = axes if example.side_px else {0: "batch", 2: "output_height", 3: "output_width"}
     mode = torch.onnx.TrainingMode.EVAL if fold else torch.onnx.TrainingMode.PRESERVE
-    image, file = torch.zeros(1, example.inputs, *[example.side_px or 32] * 2), io.BytesIO()
-    named = {
+    side_px = example.side_px or 32
+    image = torch.zeros(1, example.inputs, side_px, side_px)
+    file = io.BytesIO()
+    axis_options = {
         "input_names": ["input"],
         "output_names": ["output"],
         "dynamic_axes": {"input": axes, "output": outer},
@@ -347,7 +349,7 @@ def to_onnx(name: str, network: nn.Module, fold: bool = True, opset: int = 17) -
         "opset_version": opset,
         "training": mode,
         "do_constant_folding": fold,
-        **named,
+        **axis_options,
     }
     with warnings.catch_warnings():
         # The newer exporter wants onnxscript, a package more; this one is what most of today's

@@ -20,7 +20,10 @@ from qgis.core import (
     QgsProcessingParameterString,
 )
 
-PROGRAM, IMAGE, SENSOR, OUT = "PROGRAM", "IMAGE", "SENSOR", "OUT"
+PROGRAM = "PROGRAM"
+IMAGE = "IMAGE"
+SENSOR = "SENSOR"
+OUT = "OUT"
 
 
 class RestoreImage(QgsProcessingAlgorithm):
@@ -79,7 +82,7 @@ class RestoreImage(QgsProcessingAlgorithm):
             key: value for key, value in os.environ.items() if not key.startswith("PYTHON")
         }
         try:
-            done = subprocess.run(  # noqa: S603 - the user's own program
+            process = subprocess.run(  # noqa: S603 - the user's own program
                 command,
                 capture_output=True,
                 encoding="utf-8",
@@ -91,7 +94,7 @@ class RestoreImage(QgsProcessingAlgorithm):
             raise QgsProcessingException(
                 f"{program}: {error.strerror}; give its whole path"
             ) from error
-        if done.returncode:
-            raise QgsProcessingException(done.stderr)
-        feedback.pushInfo(done.stdout)
+        if process.returncode:
+            raise QgsProcessingException(process.stderr)
+        feedback.pushInfo(process.stdout)
         return {OUT: out}

@@ -13,7 +13,7 @@ import argparse
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from itertools import islice
+from itertools import islice, product
 from pathlib import Path
 
 import numpy as np
@@ -32,22 +32,32 @@ from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import BeersError, ImageError, OptionError
 from examples.networks import NETWORKS
 
-BATCH, PATCH_PX = 8, 64
-"""Images of a batch, and their side."""
+BATCH = 8
+"""Images of a batch."""
+PATCH_PX = 64
+"""Side of an image."""
 RECIPE = PatchRecipe(load_sensor("pleiades-degraded"), load_sensor("pleiades-reference"), PATCH_PX)
 
 GAINS = (0.7, 0.9, 1.0, 1.2)
 """Four bands of one ground, each as bright as this."""
-BRIGHT, AROUND_PX = 0.2, 9
+BRIGHT = 0.2
 """A pixel is bright where the mean of the square around it, in the reference, is above this share
 of full scale.
 """
-CYCLES, ANGLES, TURN_RAD, NOISE = (4.0, 8.0), 5, 0.1, 0.1
-"""The ten gratings: cycles of an image, directions of each, how far they stray, and the noise on
-them.
-"""
-MIXED, MOST = 4, 64
-"""Passes over scenes whose patches of four bands are mixed, and the most that one of them gives."""
+AROUND_PX = 9
+"""Side of that square."""
+CYCLES = (4.0, 8.0)
+"""Cycles of an image in the ten gratings."""
+ANGLES = 5
+"""Directions of the gratings with the same number of cycles."""
+TURN_RAD = 0.1
+"""How far a grating's direction strays."""
+NOISE = 0.1
+"""Noise on the gratings."""
+MIXED = 4
+"""Passes over scenes whose patches of four bands are mixed."""
+MOST = 64
+"""The most patches that one of these passes gives."""
 
 Batch = tuple[Tensor, Tensor]
 """What a network gets, (N, C, H, W) in [0, 1], and what it should give: as much, or classes of
@@ -110,9 +120,7 @@ def banded(scenes: Sequence[Scene], generator: np.random.Generator) -> Iterator[
     gain and noise.
     """
     ready = [prepare(scene, math.lcm(*RECIPE.oversamplings)) for scene in scenes]
-    passes = [
-        (scene, ratio) for scene in ready for ratio in RECIPE.oversamplings if _fits(scene, ratio)
-    ]
+    passes = [pair for pair in product(ready, RECIPE.oversamplings) if _fits(*pair)]
     if not passes:
         expected = f"images that hold a patch of {PATCH_PX} target pixels"
         raise ImageError(
@@ -122,10 +130,10 @@ def banded(scenes: Sequence[Scene], generator: np.random.Generator) -> Iterator[
             remedy="give larger images",
         )
     while True:
-        drawn = [passes[generator.integers(len(passes))] for _ in range(MIXED)]
+        mixed = [passes[generator.integers(len(passes))] for _ in range(MIXED)]
         pieces = [
             _mixed(_acquire_bands(scene, ratio, generator), generator)[:MOST]
-            for scene, ratio in drawn
+            for scene, ratio in mixed
         ]
         for patches in torch.split(_mixed(torch.cat(pieces), generator), BATCH):
             yield patches[:, : len(GAINS)], patches[:, len(GAINS) :]
@@ -193,9 +201,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--images", type=Path, metavar="DIR", help="photographs in place of drawn scenes"
     )
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     return reported(
-        lambda: write_samples(given.network, given.count, given.out, given.images, given.seed)
+        lambda: write_samples(
+            options.network, options.count, options.out, options.images, options.seed
+        )
     )
 
 
@@ -208,12 +218,14 @@ def write_samples(name: str, count: int, out: Path, folder: Path | None, seed: i
             "--out", expected="a name that ends in .npz", got=out.name, remedy="choose such a name"
         )
     require_writable(out)
-    drawn = list(islice(batches_of(name, folder, seed), -(-count // BATCH)))
-    image, wanted = (torch.cat(tensors)[:count].numpy() for tensors in zip(*drawn, strict=True))
+    batches = list(islice(batches_of(name, folder, seed), -(-count // BATCH)))
+    image, reference = (
+        torch.cat(tensors)[:count].numpy() for tensors in zip(*batches, strict=True)
+    )
     restores = NETWORKS[name].restores
     with whole_file(out) as temporary, temporary.open("wb") as file:
         if restores:
-            np.savez(file, image=image, reference=wanted)
+            np.savez(file, image=image, reference=reference)
         else:
             np.savez(file, image=image)
     shape = " x ".join(map(str, image.shape))

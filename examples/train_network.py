@@ -36,14 +36,15 @@ def train(name: str, source: Iterator[Batch], count: int, seed: int) -> nn.Modul
     """The network of that name after `count` steps of Adam over batches of `source`, in evaluation
     mode.
     """
-    network, error = build(name, torch.Generator().manual_seed(seed)), criterion(name)
+    network = build(name, torch.Generator().manual_seed(seed))
+    error = criterion(name)
     optimiser = torch.optim.Adam(network.parameters(), lr=LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, count)
     network.train()
     with steps(name, count) as progress:
-        for image, wanted in islice(source, count):
+        for image, reference in islice(source, count):
             optimiser.zero_grad()
-            loss = error(network(image), wanted)
+            loss = error(network(image), reference)
             loss.backward()  # type: ignore[no-untyped-call]
             nn.utils.clip_grad_norm_(network.parameters(), 1.0)
             optimiser.step()
@@ -68,18 +69,22 @@ def judge(name: str, network: nn.Module, source: Iterator[Batch]) -> tuple[float
     most frequent.
     """
     with torch.inference_mode():
-        found = [(network(image), image, wanted) for image, wanted in islice(source, JUDGED)]
-    output, image, wanted = (torch.cat(tensors) for tensors in zip(*found, strict=True))
+        outcomes = [
+            (network(image), image, reference) for image, reference in islice(source, JUDGED)
+        ]
+    output, image, reference = (torch.cat(tensors) for tensors in zip(*outcomes, strict=True))
     if not NETWORKS[name].restores:
-        right = (output.argmax(1) == wanted).double().mean()
+        right = (output.argmax(1) == reference).double().mean()
         return (
             float(100 * right),
-            float(100 * wanted.flatten().bincount().max() / wanted.numel()),
+            float(100 * reference.flatten().bincount().max() / reference.numel()),
             "% right",
         )
-    if image.shape != wanted.shape:
-        image = functional.interpolate(image, size=wanted.shape[-2:], mode="bilinear")
-    trained, before = (psnr_db(each.numpy(), wanted.numpy(), 1.0) for each in (output, image))
+    if image.shape != reference.shape:
+        image = functional.interpolate(image, size=reference.shape[-2:], mode="bilinear")
+    trained, before = (
+        psnr_db(result.numpy(), reference.numpy(), 1.0) for result in (output, image)
+    )
     return trained, before, "dB"
 
 
@@ -104,9 +109,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="photographs to judge on in place of drawn scenes",
     )
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args(arguments)
-    folders = given.images, given.held_out
-    return reported(lambda: run(given.network, given.steps, given.out, folders, given.seed))
+    options = parser.parse_args(arguments)
+    folders = options.images, options.held_out
+    return reported(lambda: run(options.network, options.steps, options.out, folders, options.seed))
 
 
 def run(

@@ -113,13 +113,14 @@ class Builder:
         a bare image.
         """
         window = _window(kernel, stride, valid or ceil, 1)
-        seen = x.shape
-        if ceil:  # as much padding behind the image as may be lost to a stride
+        shape = x.shape
+        # Pad behind the image by as much as a stride may lose.
+        if ceil:
             behind = window.stride[0] - 1, window.stride[1] - 1
             window = replace(window, pads=(0, 0, *behind))
-            seen = (x.channels, x.shape[1] + behind[0], x.shape[2] + behind[1])
+            shape = (x.channels, x.shape[1] + behind[0], x.shape[2] + behind[1])
         return self._append(
-            op_type, "pool", (x,), (x.channels, *_slide(seen, window, valid or ceil)), window
+            op_type, "pool", (x,), (x.channels, *_slide(shape, window, valid or ceil)), window
         )
 
     def global_mean(self, x: Tensor) -> Tensor:
@@ -136,8 +137,8 @@ class Builder:
 
     def mul(self, x: Tensor, other: Tensor) -> Tensor:
         """The product of two results of one shape, or of each channel with a number of its own."""
-        each = other.shape[1:] == (1, 1)
-        _require_same(x.shape, (other.channels, *x.shape[1:]) if each else other.shape)
+        per_channel = other.shape[1:] == (1, 1)
+        _require_same(x.shape, (other.channels, *x.shape[1:]) if per_channel else other.shape)
         return self._append("Mul", "mul", (x, other), x.shape)
 
     def concat(self, x: Tensor, *others: Tensor) -> Tensor:
@@ -186,10 +187,10 @@ class Builder:
         """Make a result one of the network's; the host reads `channels` of it,
         all if not stated.
         """
-        read = x.channels if channels is None else channels
-        if read > x.channels:
-            raise ValueError(f"{read} of {x.channels} channels read")
-        self._read_bytes[x.name] = read * x.shape[1] * x.shape[2]
+        channels_in = x.channels if channels is None else channels
+        if channels_in > x.channels:
+            raise ValueError(f"{channels_in} of {x.channels} channels read")
+        self._read_bytes[x.name] = channels_in * x.shape[1] * x.shape[2]
         return x
 
     def written(self, last: Tensor) -> Written:
@@ -258,10 +259,10 @@ def _slide(shape: Shape, window: Window, valid: int) -> tuple[int, int]:
     """Size / stride rounded up, of the whole input or of the positions where a
     window fits into it.
     """
-    lost = [
+    border_px = [
         (k - 1) * d if valid else 0 for k, d in zip(window.kernel, window.dilation, strict=True)
     ]
     height, width = (
-        -(-(s - n) // t) for s, n, t in zip(shape[1:], lost, window.stride, strict=True)
+        -(-(s - n) // t) for s, n, t in zip(shape[1:], border_px, window.stride, strict=True)
     )
     return height, width

@@ -86,6 +86,8 @@ def _rates(kernels: Mapping[str, Kernel]) -> dict[str, float]:
     """
     taken_s: dict[str, list[float]] = {name: [] for name in kernels}
     for _ in range(ROUNDS + 1):
+        # Each kernel is called once a turn, so that it finds the caches full of the other kernels'
+        # arrays, as in the chain.
         for name, kernel in kernels.items():
             start_s = CLOCK()
             kernel.call()
@@ -142,10 +144,8 @@ def _factorisations(generator: torch.Generator) -> Kernel:
 
 def _selection(generator: torch.Generator) -> Kernel:
     distances = torch.rand(GROUPS, WINDOW_PX**2, generator=generator).numpy()
-    ends = [
-        MEMBERS - 1,
-        MEMBERS - 1,
-    ]  # as the chain asks: numpy has a faster way for one place alone
+    # The place is listed twice, as the chain does: numpy has a faster way for a single place.
+    ends = [MEMBERS - 1, MEMBERS - 1]
     return Kernel(lambda: np.argpartition(distances, ends, axis=1), distances.size)
 
 
@@ -343,7 +343,7 @@ def s_per_mpx(
 
 def slowdowns(board: TargetProfile, rates: Rates) -> dict[str, Interval]:
     """How many times longer a core of the board takes for each kind of work: lowest, highest."""
-    clock, products, moved, integers = (
+    clock, products, bytes_per_s, integers = (
         board.constant("cpu", key)
         for key in (
             "clock_ghz",
@@ -354,7 +354,7 @@ def slowdowns(board: TargetProfile, rates: Rates) -> dict[str, Interval]:
     )
     there = {
         "products": (1e9 * clock.low * products.low, 1e9 * clock.high * products.high),
-        "memory": (moved.low, moved.high),
+        "memory": (bytes_per_s.low, bytes_per_s.high),
         "integers": (1e6 * clock.low * integers.low, 1e6 * clock.high * integers.high),
     }
     here = rates.resources

@@ -9,6 +9,7 @@ holds for all but a few groups in a hundred (measured).
 import math
 from collections import Counter
 from dataclasses import dataclass
+from itertools import product
 
 from scipy.fft import next_fast_len
 
@@ -90,21 +91,24 @@ class Tile:
 def chain_work(height: int, width: int, quality: Quality) -> Work:
     """Work of `restore_traditional` on (H, W), all of it."""
     passes = first_pass(WORKING_SIGMA), second_pass(WORKING_SIGMA, quality)
-    found = compensation_work(height, width)
+    total = compensation_work(height, width)
     for settings in passes:
         for tile, count in _tiles(height, width, quality.stride_px).items():
             work = tile_work(tile, settings)
-            found.update({kind: count * amount for kind, amount in work.items()})
-    found["passes"] += IMAGE_PASSES * FLOAT_BYTES * height * width
-    return found
+            total.update({kind: count * amount for kind, amount in work.items()})
+    total["passes"] += IMAGE_PASSES * FLOAT_BYTES * height * width
+    return total
 
 
 def _tiles(height: int, width: int, stride_px: int) -> Counter[Tile]:
     """The tiles of a pass, by their size: at most four sizes, however large the image."""
+    # An image has at most two lengths of tiles along each axis, so at most four sizes, however
+    # large it is.
     rows, columns = (Counter(map(len, reference_runs(size, stride_px))) for size in (height, width))
-    return Counter(
-        {Tile(r, c, stride_px): n * m for r, n in rows.items() for c, m in columns.items()}
-    )
+    tiles = Counter[Tile]()
+    for (height_px, count), (width_px, times) in product(rows.items(), columns.items()):
+        tiles[Tile(height_px, width_px, stride_px)] = count * times
+    return tiles
 
 
 def tile_work(tile: Tile, settings: PassSettings) -> Work:
@@ -125,7 +129,8 @@ def _search(tile: Tile, settings: PassSettings) -> Work:
             "passes": 5
             * FLOAT_BYTES
             * window
-            * squares,  # two read and one written, then squared in place
+            # Two maps are read and one is written, which is then squared in place.
+            * squares,
             "strided": 2 * FLOAT_BYTES * window * distances,
             "selection": tile.groups * window**2 if settings.similar < window**2 else 0,
             "calls": CALLS_A_WINDOW_ROW * window,
@@ -165,18 +170,18 @@ def _stack(tile: Tile, settings: PassSettings) -> Work:
 
 def compensation_work(height: int, width: int) -> Work:
     """Work of `compensate`: three transforms a block, and the filter's own."""
-    found = Work({"transforms": _transform(8 * RADIUS_PX, 8 * RADIUS_PX)})
+    work = Work({"transforms": _transform(8 * RADIUS_PX, 8 * RADIUS_PX)})
     for rows, count in _blocks(height).items():
         for columns, times in _blocks(width).items():
-            found["transforms"] += 3 * count * times * _transform(rows, columns)
-            found["passes"] += 10 * FLOAT_BYTES * count * times * rows * columns
-    return found
+            work["transforms"] += 3 * count * times * _transform(rows, columns)
+            work["passes"] += 10 * FLOAT_BYTES * count * times * rows * columns
+    return work
 
 
 def _blocks(size_px: int) -> Counter[int]:
     """Sides of the transforms along one axis, and how many of each."""
-    whole, rest = divmod(size_px, BLOCK_PX)
-    sides = Counter({next_fast_len(BLOCK_PX + 2 * RADIUS_PX, real=True): whole})
+    count, rest = divmod(size_px, BLOCK_PX)
+    sides = Counter({next_fast_len(BLOCK_PX + 2 * RADIUS_PX, real=True): count})
     return sides + Counter({next_fast_len(rest + 2 * RADIUS_PX, real=True): 1 if rest else 0})
 
 

@@ -123,8 +123,8 @@ class Cases:
     def weights(self) -> Array:
         """Weights of the rates with several and with one thread, (2 n,): a network counts once."""
         counts = Counter(row.network for row in self.rows)
-        each = np.array([1 / counts[row.network] for row in self.rows])
-        return np.concatenate([each, ALONE * each * ~np.isnan(self.observed_single)])
+        weights = np.array([1 / counts[row.network] for row in self.rows])
+        return np.concatenate([weights, ALONE * weights * ~np.isnan(self.observed_single)])
 
     def times(self, constants: Constants) -> Times:
         """What an image takes."""
@@ -170,7 +170,8 @@ class Cases:
     def only(self, keep: Sequence[bool] | NDArray[np.bool_]) -> "Cases":
         """The rows where `keep` (n,) is true."""
         return Cases(
-            tuple(row for row, kept in zip(self.rows, keep, strict=True) if kept), self.structure
+            tuple(row for row, selected in zip(self.rows, keep, strict=True) if selected),
+            self.structure,
         )
 
 
@@ -178,9 +179,11 @@ def fit(cases: Cases, near: Constants | None = None) -> Constants:
     """The constants that come nearest to the rates; `near` is where to begin,
     if not around START.
     """
+    # The cost has kinks where one part of a layer outruns another, so the nearest minimum need not
+    # be the lowest.
     begins = [logs_of(near)] if near else [logs_of(START) + shift for shift in SHIFTS]
-    found = [_descend(cases, logs) for logs in begins]
-    return from_logs(min(found, key=lambda end: end[1])[0])
+    minima = [_descend(cases, logs) for logs in begins]
+    return from_logs(min(minima, key=lambda end: end[1])[0])
 
 
 def _descend(cases: Cases, logs: Array) -> tuple[Array, float]:
@@ -190,6 +193,7 @@ def _descend(cases: Cases, logs: Array) -> tuple[Array, float]:
     normal, downhill = _slope(cases, logs)
     for _ in range(MOST):
         there = logs + np.linalg.solve(normal + damping * np.diag(np.diag(normal)), downhill)
+        # No array does more than its peak, so the logarithm of the efficiency ends at 0.
         there[PEAK] = min(there[PEAK], 0.0)
         new = _cost(cases, there)
         if new >= cost:
@@ -197,17 +201,19 @@ def _descend(cases: Cases, logs: Array) -> tuple[Array, float]:
             if damping > STUCK:
                 break
             continue
-        done = cost - new < ENOUGH * cost and damping < 1
+        # Along a kink steps grow ever smaller, so a step that gains this little is the last.
+        converged = cost - new < ENOUGH * cost and damping < 1
         logs = there
         cost = new
         damping = max(damping / 4, 1e-9)
-        if done:
+        if converged:
             break
         normal, downhill = _slope(cases, logs)
     return logs, cost
 
 
 def _cost(cases: Cases, logs: Array) -> float:
+    # With the soft L1 loss a rate far off counts linearly.
     soft = 2 * (np.sqrt(1 + (cases.residuals(from_logs(logs)) / SOFT) ** 2) - 1)
     return float(cases.weights @ soft + np.sum(((logs - logs_of(START)) / SPREAD) ** 2))
 
@@ -215,8 +221,8 @@ def _cost(cases: Cases, logs: Array) -> float:
 def _slope(cases: Cases, logs: Array) -> tuple[Array, Array]:
     """The normal matrix (11, 11) and minus half the gradient (11,)."""
     residuals = cases.residuals(from_logs(logs))
-    moved = [cases.residuals(from_logs(logs + STEP * unit)) for unit in np.eye(len(logs))]
-    slopes = (np.stack(moved, axis=1) - residuals[:, None]) / STEP
+    stepped = [cases.residuals(from_logs(logs + STEP * unit)) for unit in np.eye(len(logs))]
+    slopes = (np.stack(stepped, axis=1) - residuals[:, None]) / STEP
     weights = cases.weights / np.sqrt(1 + (residuals / SOFT) ** 2) / SOFT**2
     normal = slopes.T @ (weights[:, None] * slopes) + np.diag(1 / SPREAD**2)
     return normal, -(slopes.T @ (weights * residuals) + (logs - logs_of(START)) / SPREAD**2)

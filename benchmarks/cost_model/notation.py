@@ -200,22 +200,23 @@ class _Scope:
     @property
     def x(self) -> Tensor:
         """Where a line starts."""
-        found = self.names["x"]
-        assert isinstance(found, Tensor)  # noqa: S101 - x is kept by `run` alone
-        return found
+        tensor = self.names["x"]
+        assert isinstance(tensor, Tensor)  # noqa: S101 - x is kept by `run` alone
+        return tensor
 
     def run(self, line: str) -> None:
         """Take all steps of a line."""
         name, equals, steps = line.partition(" = ")
-        result, self.names["ch"] = self.x, self.x.channels
+        result = self.x
+        self.names["ch"] = result.channels
         for step in (steps if equals else line).split("|"):
             result = self._step(result, step.split())
         self.names[name if equals else "x"] = result
 
     def _step(self, x: Tensor, words: list[str]) -> Tensor:
         times = self._number(words.pop()[1:]) if words[-1].startswith("*") else 1
-        if len(words) == 1 and isinstance(kept := self.names.get(words[0]), Tensor):
-            return kept
+        if len(words) == 1 and isinstance(tensor := self.names.get(words[0]), Tensor):
+            return tensor
         for _ in range(times):
             x = self._call(x, words[0], words[1:])
         return x

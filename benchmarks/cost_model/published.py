@@ -107,10 +107,10 @@ def published_cases(board: str, *, slower: bool = False) -> tuple[Case, ...]:
     """The published rates of a board, or those of its SLOWER releases; one case a network and
     configuration.
     """
-    found = defaultdict(list)
+    cases = defaultdict(list)
     for rate in published_rates():
         if rate["board"] == board and (rate["release"] in SLOWER.get(board, ())) is slower:
-            found[rate["network"], rate["configuration"]].append(rate)
+            cases[rate["network"], rate["configuration"]].append(rate)
     return tuple(
         network_case(
             name,
@@ -118,7 +118,7 @@ def published_cases(board: str, *, slower: bool = False) -> tuple[Case, ...]:
             tuple(float(rate["fps"]) for rate in rates),
             tuple(float(rate["fps_single"]) for rate in rates if rate["fps_single"]),
         )
-        for (name, configuration), rates in found.items()
+        for (name, configuration), rates in cases.items()
     )
 
 
@@ -129,10 +129,14 @@ def network_case(
     net = written(name).network
     entry = NETWORKS[name]
     sizes = {op.output: op.out_bytes for op in net.operations}
-    taken = sum(math.prod(shape) for shape in net.inputs.values())
-    read = sum(written(name).read_bytes.values())
-    given = sum(sizes[result] for result in net.outputs)
-    host = host_work(taken, given, read, entry.host) if entry.host else host_work(0, 0, 0, "copy")
+    input_size = sum(math.prod(shape) for shape in net.inputs.values())
+    weight_bytes = sum(written(name).read_bytes.values())
+    output_size = sum(sizes[result] for result in net.outputs)
+    host = (
+        host_work(input_size, output_size, weight_bytes, entry.host)
+        if entry.host
+        else host_work(0, 0, 0, "copy")
+    )
     layers = Layers.of(count_work(net.operations, dpu), dpu)
     cores = dpu.whole("cpu", "cores")
     largest = largest_map_bytes(net.operations)

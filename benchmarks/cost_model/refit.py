@@ -56,30 +56,30 @@ def with_cost(profile: str, board: str) -> str:
 
 def cost_table(board: str) -> Iterator[tuple[str, str, str, str]]:
     """Key, value, status and source of each constant of a board's [cost]."""
-    found = nested(board)
-    source = FITTED.format(rows=len(found.cases.rows))
-    for key, value in asdict(rounded(fit(found.cases))).items():
+    validation = nested(board)
+    source = FITTED.format(rows=len(validation.cases.rows))
+    for key, value in asdict(rounded(fit(validation.cases))).items():
         yield key, f"{value:.4g}", "inferred", source
     yield (
         "overlap",
-        f"{found.cases.structure.overlap:g}",
+        f"{validation.cases.structure.overlap:g}",
         "assumed",
         "benchmarks/cost_model/validation.py, OVERLAP",
     )
-    yield "crowding", f"{found.cases.structure.crowding:g}", "inferred", CHOSEN
-    families = len(set(found.cases.families))
+    yield "crowding", f"{validation.cases.structure.crowding:g}", "inferred", CHOSEN
+    families = len(set(validation.cases.families))
     left_out = (
         "|ln(predicted / published)| that nine of ten families keep to, from "
         f"{families}, each left out once"
     )
-    for kind, width in found.widths.items():
+    for kind, width in validation.widths.items():
         yield WIDTHS[kind], f"{width:.3f}", "inferred", f"{left_out}; {kind}"
-    held = (
+    covered = (
         "share of the families, each left out of fit and widths, that their intervals held "
         "with every rate"
     )
-    yield "families_held", f"{coverage(found.rows)[1]:.2f}", "inferred", held
-    widest = max(*found.widths.values(), outside_width(found.cases))
+    yield "families_held", f"{coverage(validation.rows)[1]:.2f}", "inferred", covered
+    widest = max(*validation.widths.values(), outside_width(validation.cases))
     far = (
         "the widest, or the error of networks with the largest maps, predicted from those "
         "with a quarter"
@@ -95,15 +95,15 @@ def cost_table(board: str) -> Iterator[tuple[str, str, str, str]]:
         "inferred",
         f"{pairs}, each network left out once",
     )
-    for key, (low, high) in fitted_ranges(found).items():
+    for key, (low, high) in fitted_ranges(validation).items():
         range_of = "range of the fitted networks that the DPU bounds"
         yield f"fitted_{key}", f"[{low:.4g}, {high:.4g}]", "inferred", range_of
 
 
-def fitted_ranges(found: Nested) -> dict[str, tuple[float, float]]:
+def fitted_ranges(validation: Nested) -> dict[str, tuple[float, float]]:
     """Ranges of the networks that the DPU bounds: the others tell nothing of it."""
-    bound = {row.network for row in found.rows if row.regime != "host"}
-    maps = [row.map_bytes for row in found.cases.rows if row.network in bound]
+    bound = {row.network for row in validation.rows if row.regime != "host"}
+    maps = [row.map_bytes for row in validation.cases.rows if row.network in bound]
     works = [sum(op.operations for op in written(name).network.operations) for name in bound]
     return {"map_bytes": (min(maps), max(maps)), "operations": (min(works), max(works))}
 
@@ -113,17 +113,23 @@ def accuracy() -> Iterator[tuple[object, ...]]:
     errors = "median", "mean", "largest", "Spearman"
     yield "board", "networks", "families", "rates", *errors, "rates inside", "families"
     for board in boards():
-        found = nested(board)
-        off = by_network((row.network for row in found.rows), (row.rates for row in found.rows))
-        held, whole = coverage(found.rows)
-        counts = len(off), len(set(found.cases.families)), sum(len(row.rates) for row in found.rows)
+        validation = nested(board)
+        off = by_network(
+            (row.network for row in validation.rows), (row.rates for row in validation.rows)
+        )
+        covered, total = coverage(validation.rows)
+        counts = (
+            len(off),
+            len(set(validation.cases.families)),
+            sum(len(row.rates) for row in validation.rows),
+        )
         yield (
             board,
             *counts,
             *_spread(off),
-            f"{rank_correlation(found):.3f}",
-            _percent(held),
-            _percent(whole),
+            f"{rank_correlation(validation):.3f}",
+            _percent(covered),
+            _percent(total),
         )
 
 
@@ -149,10 +155,8 @@ def by_kind() -> Iterator[tuple[object, ...]]:
             errors = [row.network for row in rows], [row.rates for row in rows]
             off = by_network(*errors)
             bias = by_network(*errors, signed=True).mean()
-            counts, (median, mean, largest) = (
-                (len(off), sum(len(row.rates) for row in rows)),
-                _spread(off),
-            )
+            counts = len(off), sum(len(row.rates) for row in rows)
+            median, mean, largest = _spread(off)
             yield (
                 board,
                 kind,

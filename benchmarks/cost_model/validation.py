@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import combinations
+from itertools import chain, combinations
 from typing import get_args
 
 import numpy as np
@@ -93,9 +93,9 @@ def nested(board: str) -> Nested:
     out.
     """
     names = _trial(board, chosen(board)).names
-    found = [row for name in names for row in _trial(board, chosen(board, name)).left_out(name)]
+    predicted = [_trial(board, chosen(board, name)).left_out(name) for name in names]
     cases = _trial(board, chosen(board)).cases
-    by_case = {(row.network, row.configuration): row for row in found}
+    by_case = {(row.network, row.configuration): row for row in chain.from_iterable(predicted)}
     rows = [by_case[row.network, row.configuration] for row in cases.rows]
     errors = np.array([row.error for row in rows])
     return Nested(rows, cases, widths_of(errors, cases, [row.regime for row in rows]))
@@ -111,13 +111,13 @@ def chosen(board: str, left_out: str = "", *, seen: bool = True) -> float:
         left_out: a family.
         seen: whether the board's own rates count.
     """
-    alike = [
-        each
-        for each in boards()
-        if host_cores(each) == host_cores(board) and (seen or each != board)
+    similar = [
+        other
+        for other in boards()
+        if host_cores(other) == host_cores(board) and (seen or other != board)
     ]
     scores = [
-        np.mean([_trial(each, crowding).score(left_out) for each in alike])
+        np.mean([_trial(other, crowding).score(left_out) for other in similar])
         for crowding in CROWDINGS
     ]
     return CROWDINGS[int(np.argmin(scores))]
@@ -166,21 +166,21 @@ class Trial:
 
     def inner(self, left_out: str) -> tuple[Array, Cases, list[Regime]]:
         """Errors and regimes of all families but one, which no fit sees, by folds of the others."""
-        kept = self.cases.only(self.cases.families != left_out)
-        errors = np.zeros(len(kept.rows))
-        regimes = np.zeros(len(kept.rows), dtype=object)
+        training = self.cases.only(self.cases.families != left_out)
+        errors = np.zeros(len(training.rows))
+        regimes = np.zeros(len(training.rows), dtype=object)
         for fold in range(FOLDS):
             tested = self.names[fold::FOLDS]
-            mine = np.isin(kept.families, tested)
+            mine = np.isin(training.families, tested)
             constants = self.fit_without({*tested, left_out})
-            errors[mine] = kept.only(mine).errors(constants)
-            regimes[mine] = regimes_of(kept.only(mine), constants)
-        return errors, kept, list(regimes)
+            errors[mine] = training.only(mine).errors(constants)
+            regimes[mine] = regimes_of(training.only(mine), constants)
+        return errors, training, list(regimes)
 
     def score(self, left_out: str) -> float:
         """Mean over families of the mean error, all but one."""
-        errors, kept, _ = self.inner(left_out)
-        return family_mean(np.abs(errors), kept.families)
+        errors, training, _ = self.inner(left_out)
+        return family_mean(np.abs(errors), training.families)
 
 
 def widths_of(errors: Array, cases: Cases, regimes: Sequence[Regime]) -> Widths:
@@ -199,6 +199,7 @@ def widths_of(errors: Array, cases: Cases, regimes: Sequence[Regime]) -> Widths:
         mine = kinds == kind
         count = len(set(families[mine]))
         own = count * family_mean(sizes[mine], families[mine]) if count else 0.0
+        # A regime with few families is drawn to the mean of all regimes.
         scales[kind] = (own + SHRINK * overall) / (count + SHRINK)
     score = family_quantile(sizes / np.array([scales[kind] for kind in regimes]), families)
     return {kind: scale * score for kind, scale in scales.items()}
@@ -249,15 +250,15 @@ def pair_width(board: str) -> float:
             fit(cases.only(names != name), near=trial.near)
         )
     kinds = regimes_of(cases, trial.near)
-    kept = [
+    outcomes = [
         (row, e) for row, e, kind in zip(cases.rows, errors, kinds, strict=True) if kind != "host"
     ]
-    apart = [
+    distances = [
         abs(x - y)
-        for (a, x), (b, y) in combinations(kept, 2)
+        for (a, x), (b, y) in combinations(outcomes, 2)
         if a.family == b.family and a.network != b.network
     ]
-    return float(np.quantile(apart, SHARE))
+    return float(np.quantile(distances, SHARE))
 
 
 def outside_width(cases: Cases, share: float = 0.25) -> float:
@@ -277,11 +278,11 @@ def by_network(names: Iterable[str], errors: Iterable[Array], *, signed: bool = 
     """Mean |predicted / published - 1| of each network, or with its sign, over its configurations
     and rates.
     """
-    found: dict[str, list[float]] = {}
-    for name, each in zip(names, errors, strict=True):
-        off = np.expm1(each)
-        found.setdefault(name, []).extend((off if signed else np.abs(off)).tolist())
-    return np.array([np.mean(values) for values in found.values()])
+    by_name: dict[str, list[float]] = {}
+    for name, logs in zip(names, errors, strict=True):
+        off = np.expm1(logs)
+        by_name.setdefault(name, []).extend((off if signed else np.abs(off)).tolist())
+    return np.array([np.mean(values) for values in by_name.values()])
 
 
 def coverage(rows: Sequence[LeftOut]) -> tuple[float, float]:
@@ -296,10 +297,10 @@ def coverage(rows: Sequence[LeftOut]) -> tuple[float, float]:
     )
 
 
-def rank_correlation(found: Nested) -> float:
+def rank_correlation(validation: Nested) -> float:
     """Spearman's: does the model put networks in the right order."""
-    errors = np.array([row.error for row in found.rows])
-    return float(spearmanr(found.cases.observed, found.cases.observed + errors).statistic)
+    errors = np.array([row.error for row in validation.rows])
+    return float(spearmanr(validation.cases.observed, validation.cases.observed + errors).statistic)
 
 
 def one_thread(board: str) -> tuple[list[str], list[Array]]:
@@ -334,6 +335,7 @@ def owner_errors(board: str, *, slower: bool = False) -> list[float]:
         constants = trial.fit_without({name})
         errors[mine] = cases.only(mine).errors(constants)
         on_host[mine] = [kind == "host" for kind in regimes_of(cases.only(mine), constants)]
+    # A run of an owner corrects only cases of its own part, the DPU's or the host's.
     owners = errors[:, None] * (on_host[:, None] == on_host)
     others = cases.families[:, None] != cases.families
     return [
@@ -347,10 +349,10 @@ def transferred(source: str, target: str) -> tuple[list[str], list[Array]]:
     family of each.
     """
     crowding = chosen(target, seen=False)
-    wanted = _trial(target, crowding).cases
+    cases = _trial(target, crowding).cases
     trial = _trial(source, crowding)
-    errors = np.zeros(len(wanted.rows))
-    for name in dict.fromkeys(wanted.families):
-        mine = wanted.families == name
-        errors[mine] = wanted.only(mine).errors(trial.fit_without({name}))
-    return [row.network for row in wanted.rows], [np.array([error]) for error in errors]
+    errors = np.zeros(len(cases.rows))
+    for name in dict.fromkeys(cases.families):
+        mine = cases.families == name
+        errors[mine] = cases.only(mine).errors(trial.fit_without({name}))
+    return [row.network for row in cases.rows], [np.array([error]) for error in errors]

@@ -48,11 +48,11 @@ def main() -> None:
         "--held-out", type=int, default=60, help="of another seed, that both files are judged on"
     )
     parser.add_argument("--steps", type=int, default=RECIPE.steps)
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
-    files = [given.folder / path.name for path in (DETECTOR, DETECTOR_INT8)]
-    recipe = replace(RECIPE, steps=given.steps)
-    pictures = drawn(0, given.pictures)
+    files = [arguments.folder / path.name for path in (DETECTOR, DETECTOR_INT8)]
+    recipe = replace(RECIPE, steps=arguments.steps)
+    pictures = drawn(0, arguments.pictures)
     with steps("training", recipe.steps) as bar:
         network = train_detector(
             pictures, len(CLASSES), recipe, lambda loss: bar.advance(note=f"loss {loss:.2f}")
@@ -65,17 +65,17 @@ def main() -> None:
         detector_to_onnx(network, CLASSES, SIDE_PX, {**about, "recipe": str(recipe)}), files[0]
     )
     quantise(pictures[:SEEN], *files)
-    judge(drawn(1, given.held_out), files)
+    judge(drawn(1, arguments.held_out), files)
 
 
 def drawn(seed: int, count: int) -> list[Picture]:
     """Pictures of the reference sensor."""
-    made = list[Picture]()
+    pictures = list[Picture]()
     with steps("drawing", count) as bar:
         for number in range(count):
-            made.append(drawn_picture(SIDE_PX, seed, number))
+            pictures.append(drawn_picture(SIDE_PX, seed, number))
             bar.advance()
-    return made
+    return pictures
 
 
 def quantise(pictures: Sequence[Picture], file: Path, int8: Path) -> None:
@@ -95,11 +95,11 @@ def judge(pictures: Sequence[Picture], files: Sequence[Path]) -> None:
     hits = {}
     for file in files:
         detector = open_detector(file, 1)
-        found = [
-            detector.detect((each.image.astype(np.float32) / 255).transpose(1, 2, 0))
-            for each in pictures
+        detections = [
+            detector.detect((picture.image.astype(np.float32) / 255).transpose(1, 2, 0))
+            for picture in pictures
         ]
-        hits[file.stem] = find_hits(truths, found, len(CLASSES))
+        hits[file.stem] = find_hits(truths, detections, len(CLASSES))
     rows, _ = score_rows(
         hits, CLASSES, site_weights([str(number) for number in range(len(pictures))], 0)
     )

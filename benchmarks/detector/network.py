@@ -72,8 +72,8 @@ class Decoding(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """What Ultralytics calls the raw output, a column for each of the A cells."""
-        found = self.network(image)
-        return torch.cat([decoded(found[:, :4]), torch.sigmoid(found[:, 4:])], dim=1).flatten(2)
+        output = self.network(image)
+        return torch.cat([decoded(output[:, :4]), torch.sigmoid(output[:, 4:])], dim=1).flatten(2)
 
 
 def initialise(network: DetectorNetwork, generator: torch.Generator) -> None:
@@ -128,7 +128,7 @@ def detector_to_onnx(
             dynamo=False,
         )
     model: onnx.ModelProto = onnx.ModelProto.FromString(buffer.getvalue())
-    stated = {
+    metadata = {
         "task": "detect",
         "stride": MULTIPLE_PX,
         "batch": 1,
@@ -137,6 +137,6 @@ def detector_to_onnx(
         "names": dict(enumerate(names)),
     }
     onnx.helper.set_model_props(
-        model, {**{key: str(value) for key, value in stated.items()}, **about}
+        model, {**{key: str(value) for key, value in metadata.items()}, **about}
     )
     return model

@@ -69,10 +69,12 @@ class Condition:
     def scores(self, file: Path, scenes: Sequence[LabelledScene], seed: int) -> dict[str, float]:
         """What the detector of a file finds on this row's images of the scenes."""
         detector = open_detector(file)
-        found = [each.boxes(detector, self.method) for each in acquired(scenes, self.sensors, seed)]
-        hits = find_hits([scene.truth for scene in scenes], found, len(CLASSES))
+        predictions = [
+            scene.boxes(detector, self.method) for scene in acquired(scenes, self.sensors, seed)
+        ]
+        hits = find_hits([scene.truth for scene in scenes], predictions, len(CLASSES))
         figures = score(hits, CLASSES, np.ones((1, len(scenes)), np.int64))
-        return {shown: float(figures[key][0]) for shown, key in KEYS.items()}
+        return {title: float(figures[key][0]) for title, key in KEYS.items()}
 
 
 def main() -> None:
@@ -86,31 +88,34 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=RECIPE.steps)
     parser.add_argument("--seeds", type=int, default=3, help="detectors a row")
     parser.add_argument("--seed", type=int, default=0, help="of the scenes")
-    given = parser.parse_args()
-    given.folder.mkdir(parents=True, exist_ok=True)
-    recipes = [replace(RECIPE, steps=given.steps, seed=seed) for seed in range(given.seeds)]
-    rows = conditions(given.sensor.split(","), given.method)
-    files = train_missing(rows, recipes, given.scenes, given.seed, given.folder)
-    scenes, _ = synthetic_scenes(given.drawn, given.seed, CLASSES, {})
+    arguments = parser.parse_args()
+    arguments.folder.mkdir(parents=True, exist_ok=True)
+    recipes = [replace(RECIPE, steps=arguments.steps, seed=seed) for seed in range(arguments.seeds)]
+    rows = conditions(arguments.sensor.split(","), arguments.method)
+    files = train_missing(rows, recipes, arguments.scenes, arguments.seed, arguments.folder)
+    scenes, _ = synthetic_scenes(arguments.drawn, arguments.seed, CLASSES, {})
     scored = {
-        row.name: [row.scores(file, scenes, given.seed) for file in files[row.name]] for row in rows
+        row.name: [row.scores(file, scenes, arguments.seed) for file in files[row.name]]
+        for row in rows
     }
-    made = retrained_rows(scored)
-    print_rows(TABLE, made)
-    Table("retrain", vars(given), (), tuple(made)).save(given.folder / "figures.json")
+    scored_rows = retrained_rows(scored)
+    print_rows(TABLE, scored_rows)
+    Table("retrain", vars(arguments), (), tuple(scored_rows)).save(
+        arguments.folder / "figures.json"
+    )
 
 
 def conditions(sensors: Sequence[str], method: str) -> list[Condition]:
     """The reference, then degraded and restored images of each sensor."""
-    found: list[Condition] = []
+    result: list[Condition] = []
     for name in sensors:
         degraded = load_sensor(name)
         pair = SensorPair(degraded, reference_for(degraded))
-        if not found:
-            found.append(Condition(REFERENCE, pair, None))
-        methods = (method_named(each, pair.degraded, pair.reference) for each in (DEGRADED, method))
-        found += [Condition(f"{each.name}, {name}", pair, each) for each in methods]
-    return found
+        if not result:
+            result.append(Condition(REFERENCE, pair, None))
+        methods = (method_named(word, pair.degraded, pair.reference) for word in (DEGRADED, method))
+        result += [Condition(f"{candidate.name}, {name}", pair, candidate) for candidate in methods]
+    return result
 
 
 def train_missing(
@@ -130,19 +135,19 @@ def train_missing(
         folder: of the files.
     """
     files = {
-        row.name: [folder / f"{row.name.replace(', ', '-')}-{each.seed}.onnx" for each in recipes]
+        row.name: [
+            folder / f"{row.name.replace(', ', '-')}-{recipe.seed}.onnx" for recipe in recipes
+        ]
         for row in rows
     }
-    missing = [
-        (row, recipe, file)
-        for row in rows
-        for recipe, file in zip(recipes, files[row.name], strict=True)
-        if not file.exists()
-    ]
-    wanted = {row.name: row for row, *_ in missing}
-    pictures = training_pictures(list(wanted.values()), scenes if wanted else 0, seed)
-    with steps("training detectors", sum(recipe.steps for _, recipe, _ in missing)) as bar:
-        for row, recipe, file in missing:
+    absent = list[tuple[Condition, DetectorRecipe, Path]]()
+    for row in rows:
+        pairs = zip(recipes, files[row.name], strict=True)
+        absent += [(row, recipe, file) for recipe, file in pairs if not file.exists()]
+    needed = {row.name: row for row, *_ in absent}
+    pictures = training_pictures(list(needed.values()), scenes if needed else 0, seed)
+    with steps("training detectors", sum(recipe.steps for _, recipe, _ in absent)) as bar:
+        for row, recipe, file in absent:
             network = train_detector(
                 pictures[row.name], len(CLASSES), recipe, lambda _: bar.advance()
             )
@@ -154,27 +159,29 @@ def training_pictures(
     rows: Sequence[Condition], scenes: int, seed: int
 ) -> dict[str, list[Picture]]:
     """What the detectors are trained on, by row: each scene is drawn once for all."""
-    found: dict[str, list[Picture]] = {row.name: [] for row in rows}
+    pictures: dict[str, list[Picture]] = {row.name: [] for row in rows}
     with steps("drawing scenes to train on", scenes) as bar:
         for number in range(FIRST, FIRST + scenes):
             scene = synthetic_labelled(number, seed, np.arange(len(CLASSES)))
             for row in rows:
-                seen = AcquiredScene(scene, row.sensors, Draw(seed, number))
-                found[row.name].append(picture_from(seen, row.method))
+                acquired_scene = AcquiredScene(scene, row.sensors, Draw(seed, number))
+                pictures[row.name].append(picture_from(acquired_scene, row.method))
             bar.advance()
-    return found
+    return pictures
 
 
-def picture_from(seen: AcquiredScene, method: Method | None) -> Picture:
+def picture_from(acquired_scene: AcquiredScene, method: Method | None) -> Picture:
     """What a detector is trained on: an image as it would be shown, in its square input, and the
     boxes on it.
     """
-    rgb = seen.shown(method)
-    truth = seen.scene.truth
+    rgb = acquired_scene.shown(method)
+    truth = acquired_scene.scene.truth
     height, width, _ = rgb.shape
     box = Letterbox(height, width, SIDE_PX)
     return picture_of(
-        box.image(rgb), box.to_input(truth.corners / seen.sensors.oversampling), truth.classes
+        box.image(rgb),
+        box.to_input(truth.corners / acquired_scene.sensors.oversampling),
+        truth.classes,
     )
 
 
@@ -185,17 +192,17 @@ def retrained_rows(scored: Mapping[str, Sequence[Mapping[str, float]]]) -> list[
         scored: by row, reference first, then a degraded and a restored one for each sensor; figures
             of each seed.
     """
-    ap50 = {name: np.array([one["mAP50"] for one in each]) for name, each in scored.items()}
+    ap50 = {name: np.array([one["mAP50"] for one in runs]) for name, runs in scored.items()}
     names = list(scored)
-    made = list[Row]()
+    rows = list[Row]()
     for number, name in enumerate(names):
-        figures = {shown: _figure([each[shown] for each in scored[name]]) for shown in KEYS}
+        figures = {title: _figure([run[title] for run in scored[name]]) for title in KEYS}
         if number and number % 2 == 0:
             before = ap50[names[number - 1]]
             figures[GAIN] = _figure(list(ap50[name] - before), POINTS)
             figures[REGAINED] = _share(ap50[names[0]], before, ap50[name])
-        made.append(Row(TABLE, name, figures))
-    return made
+        rows.append(Row(TABLE, name, figures))
+    return rows
 
 
 def _figure(values: Sequence[float], unit: str = PERCENT) -> Figure:

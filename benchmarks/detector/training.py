@@ -92,6 +92,7 @@ def targets_of(
     weights = np.zeros((1, height, width), np.float32)
     boxes = np.zeros((4, height, width), np.float32)
     sizes = (corners[:, 2:] - corners[:, :2]).prod(1)
+    # The largest object comes first, so that the smaller one has the box where two claim a cell.
     for k in np.argsort(-sizes):
         (rows, columns), bump = _bump(corners[k] / STRIDE_PX, height, width)
         place = bumps[classes[k], rows, columns]
@@ -118,14 +119,15 @@ def _bump(corners: np.ndarray, height: int, width: int) -> tuple[tuple[slice, sl
     rows = slice(max(row - reach_y, 0), min(row + reach_y + 1, height))
     columns = slice(max(column - reach_x, 0), min(column + reach_x + 1, width))
     y, x = np.ogrid[rows, columns]
+    # An object smaller than a cell is learnt in one cell.
     sigma_x, sigma_y = np.maximum((2 * half + 1) / 6, LEAST_SIGMA)
     bump = np.exp(-((x - column) ** 2 / (2 * sigma_x**2) + (y - row) ** 2 / (2 * sigma_y**2)))
     return (rows, columns), bump.astype(np.float32)
 
 
-def loss_of(found: Tensor, targets: Targets) -> tuple[Tensor, Tensor]:
+def loss_of(output: Tensor, targets: Targets) -> tuple[Tensor, Tensor]:
     """The losses of classes and boxes, () each, of a map (N, 4 + classes, h, w)."""
-    return focal_loss(found[:, 4:], targets.bumps), BOX_WEIGHT * box_loss(found[:, :4], targets)
+    return focal_loss(output[:, 4:], targets.bumps), BOX_WEIGHT * box_loss(output[:, :4], targets)
 
 
 def focal_loss(logits: Tensor, bumps: Tensor) -> Tensor:
@@ -133,6 +135,7 @@ def focal_loss(logits: Tensor, bumps: Tensor) -> Tensor:
     score = torch.sigmoid(logits)
     centre = bumps.eq(1)
     at_centre = (1 - score) ** 2 * functional.logsigmoid(logits) * centre
+    # CenterNet lowers the penalty of a cell near a centre by (1 - bump)^4.
     elsewhere = score**2 * functional.logsigmoid(-logits) * (1 - bumps) ** 4 * ~centre
     return -(at_centre + elsewhere).sum() / centre.sum().clamp(min=1)
 
@@ -142,8 +145,8 @@ def box_loss(boxes: Tensor, targets: Targets) -> Tensor:
     1902.09630), weighed.
     """
     centre, size = torch.tensor_split(decoded(boxes), 2, dim=1)
-    found = torch.cat([centre - size / 2, centre + size / 2], dim=1)
-    overlap = generalised_iou(found, targets.boxes)
+    corners = torch.cat([centre - size / 2, centre + size / 2], dim=1)
+    overlap = generalised_iou(corners, targets.boxes)
     return (targets.weights * (1 - overlap)).sum() / targets.weights.sum().clamp(min=1)
 
 
@@ -152,7 +155,7 @@ def generalised_iou(one: Tensor, other: Tensor) -> Tensor:
     low = torch.maximum(one[:, :2], other[:, :2])
     high = torch.minimum(one[:, 2:], other[:, 2:])
     shared = (high - low).clamp(min=0).prod(1, keepdim=True)
-    areas = sum((each[:, 2:] - each[:, :2]).prod(1, keepdim=True) for each in (one, other))
+    areas = sum((boxes[:, 2:] - boxes[:, :2]).prod(1, keepdim=True) for boxes in (one, other))
     hull = (torch.maximum(one[:, 2:], other[:, 2:]) - torch.minimum(one[:, :2], other[:, :2])).prod(
         1, keepdim=True
     )
@@ -236,8 +239,9 @@ def _step(
     precision: str,
 ) -> float:
     with torch.autocast("cpu", dtype=torch.bfloat16, enabled=precision == "bfloat16"):
-        found = network(images)
-    loss = torch.stack(loss_of(found.float(), targets)).sum()
+        output = network(images)
+    # Only the convolutions are in bfloat16. The losses are computed in float32.
+    loss = torch.stack(loss_of(output.float(), targets)).sum()
     value = float(loss.detach())
     if not math.isfinite(value):
         remedy = "train with a lower learning rate, and look at the boxes"
@@ -263,13 +267,15 @@ def _batch(
     """Pictures drawn with replacement, each in one of the square's eight symmetries, a little
     lighter or darker.
     """
-    chosen = [
+    batch = [
         turned(pictures[int(k)], generator) for k in generator.integers(len(pictures), size=count)
     ]
-    images = np.stack([_lit(picture.image, generator) for picture in chosen])
+    images = np.stack([_lit(picture.image, generator) for picture in batch])
     height, width = (side // STRIDE_PX for side in images.shape[2:])
-    each = [targets_of(p.corners, p.classes, classes, height, width) for p in chosen]
-    bumps, boxes, weights = (torch.from_numpy(np.stack(kind)) for kind in zip(*each, strict=True))
+    targets = [targets_of(p.corners, p.classes, classes, height, width) for p in batch]
+    bumps, boxes, weights = (
+        torch.from_numpy(np.stack(kind)) for kind in zip(*targets, strict=True)
+    )
     return torch.from_numpy(images).contiguous(memory_format=torch.channels_last), Targets(
         bumps, boxes, weights
     )

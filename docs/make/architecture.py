@@ -30,23 +30,26 @@ def box_of(name: str) -> str:
 
 def modules() -> dict[str, Path]:
     """Every module by its name, but for the files that only say what a package offers."""
-    files = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
-    named = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in files}
-    return {name: path for name, path in named.items() if path.name != "__init__.py"}
+    paths = {}
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            if path.name != "__init__.py":
+                paths[".".join(path.relative_to(ROOT).with_suffix("").parts)] = path
+    return paths
 
 
-def imports_of(path: Path, known: dict[str, Path], *, late: bool = True) -> set[str]:
+def imports_of(path: Path, paths: dict[str, Path], *, late: bool = True) -> set[str]:
     """The modules of ours that a file imports: anywhere in it, or as it is loaded alone."""
-    found = set[str]()
+    imports = set[str]()
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in ast.walk(tree) if late else tree.body:
         if isinstance(node, ast.Import):
-            found |= {in_folder(alias.name) for alias in node.names}
+            imports |= {in_folder(alias.name) for alias in node.names}
         if isinstance(node, ast.ImportFrom) and node.module:
-            found |= {in_folder(f"{node.module}.{alias.name}") for alias in node.names} | {
+            imports |= {in_folder(f"{node.module}.{alias.name}") for alias in node.names} | {
                 in_folder(node.module)
             }
-    return found & known.keys()
+    return imports & paths.keys()
 
 
 def in_folder(module: str) -> str:
@@ -59,22 +62,24 @@ def in_folder(module: str) -> str:
 
 def arrows() -> dict[str, set[str]]:
     """From each box to those that it needs."""
-    known = modules()
-    found = defaultdict[str, set[str]](set)
-    for name, path in known.items():
-        found[box_of(name)] |= {box_of(other) for other in imports_of(path, known)} - {box_of(name)}
-    return dict(found)
+    paths = modules()
+    packages = defaultdict[str, set[str]](set)
+    for name, path in paths.items():
+        packages[box_of(name)] |= {box_of(other) for other in imports_of(path, paths)} - {
+            box_of(name)
+        }
+    return dict(packages)
 
 
 def beyond(box: str, edges: dict[str, set[str]]) -> set[str]:
     """All that a box needs by way of others."""
-    seen = set[str]()
+    reached = set[str]()
     waiting = list(edges.get(box, ()))
     while waiting:
-        for further in edges.get(waiting.pop(), set()) - seen:
-            seen.add(further)
+        for further in edges.get(waiting.pop(), set()) - reached:
+            reached.add(further)
             waiting.append(further)
-    return seen
+    return reached
 
 
 def chart() -> str:

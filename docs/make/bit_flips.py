@@ -5,6 +5,7 @@ words and rows fresh.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 
 from beers_deploy.model.io.files import write_text
@@ -65,11 +66,11 @@ def price_lines(networks: Mapping[str, Sequence[Row]]) -> Iterator[str]:
     """What all guards cost each network on the board."""
     for name, rows in networks.items():
         row = next(row for row in rows if row.table == "guards" and row.name == "all guards")
-        time, share, lost = (f"{figure} {figure.unit}" for figure in row.figures.values())
+        time, share, loss = (f"{figure} {figure.unit}" for figure in row.figures.values())
         yield (
             f"- All guards of {name} on a {BOARD.upper()} (predicted): {time}, or {share} of a "
             "tile if nothing "
-            f"hides; frame rate lost beside the DPU: {lost}."
+            f"hides; frame rate lost beside the DPU: {loss}."
         )
 
 
@@ -77,16 +78,15 @@ def table(networks: Mapping[str, Sequence[Row]]) -> Iterator[str]:
     """PSNR by kind of memory and rate, with no guard and with all of them, a
     column pair a network.
     """
-    shown = SETS[0], SETS[-1]
+    guard_sets = SETS[0], SETS[-1]
     yield "PSNR in dB (measured), mean over patches and injections:\n"
-    yield (
-        "| bit flips | "
-        f"{' | '.join(f'{name}, {guards}' for name in networks for guards in shown)} |"
-    )
-    yield "|---" * (1 + len(shown) * len(networks)) + "|"
+    heads = map(", ".join, product(networks, guard_sets))
+    yield f"| bit flips | {' | '.join(heads)} |"
+    yield "|---" * (1 + len(guard_sets) * len(networks)) + "|"
     columns = [[row for row in rows if row.table == "bit flips"] for rows in networks.values()]
     for rows in zip(*columns, strict=True):
-        cells = [f"{row.figures[guards].value:.1f}" for row in rows for guards in shown]
+        figures = [row.figures[guards] for row, guards in product(rows, guard_sets)]
+        cells = [f"{figure.value:.1f}" for figure in figures]
         yield f"| {rows[0].name} | {' | '.join(cells)} |"
 
 

@@ -38,7 +38,9 @@ SEVERAL = 3
 def reference() -> str:
     """The command reference as Markdown."""
     lines = {name: _lines(name) for name in COMMANDS}
-    counted = Counter(line for each in lines.values() for line in each.values())
+    counted = Counter[str]()
+    for entries in lines.values():
+        counted.update(entries.values())
     once = {line for line, commands in counted.items() if commands >= SEVERAL}
     shared = sorted(once)
     parts = [
@@ -46,9 +48,9 @@ def reference() -> str:
         *shared,
         "",
     ]
-    return "\n".join(
-        [*parts, *(line for name in COMMANDS for line in _section(name, lines[name], once))]
-    )
+    for name in COMMANDS:
+        parts += _section(name, lines[name], once)
+    return "\n".join(parts)
 
 
 def _section(name: str, lines: Mapping[str, str], once: Collection[str]) -> Iterator[str]:
@@ -62,8 +64,8 @@ def _section(name: str, lines: Mapping[str, str], once: Collection[str]) -> Iter
 def _lines(name: str) -> dict[str, str]:
     """The line of each argument and option of a command, by its name."""
     return {
-        _label(each.shown): _line(each.shown, each.kind.removeprefix("flag"))
-        for each in parameters(name)
+        _label(parameter.shown): _line(parameter.shown, parameter.kind.removeprefix("flag"))
+        for parameter in parameters(name)
     }
 
 
@@ -74,19 +76,19 @@ def _label(parameter: Any) -> str:
 
 def _line(parameter: Any, kind: str) -> str:
     default = parameter.default
-    shown = "" if default is None or callable(default) or default is False else f"`{default}`"
-    said = kind == "input" or parameter.name in ("sensor", "reference", "target")
+    value = "" if default is None or callable(default) or default is False else f"`{default}`"
+    fixed = kind == "input" or parameter.name in ("sensor", "reference", "target")
     takes = "; ".join(
-        filter(None, ["" if said else kind, "required" if parameter.required else shown])
+        filter(None, ["" if fixed else kind, "required" if parameter.required else value])
     )
-    given = f" ({takes})" if takes else ""
+    suffix = f" ({takes})" if takes else ""
     text = (
         (parameter.help or "")
         .replace(f": {RULED}", "")
         .replace(f": {BOARDS}", "")
         .replace(f" ({BOARDS})", "")
     )
-    return f"- `{_label(parameter)}`{given}: {text}"
+    return f"- `{_label(parameter)}`{suffix}: {text}"
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ Run `python docs/make/effects.py` after a change to the simulator.
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -73,13 +74,12 @@ The four shipped scenes under `pleiades-degraded` ask for these effects, with th
 
 def document() -> str:
     """The page as Markdown."""
-    shown = ", ".join(
-        f"{key} {value:g}" for values in SHOWN.values() for key, value in values.items()
-    )
+    parameters = chain.from_iterable(values.items() for values in SHOWN.values())
+    examples = ", ".join(f"{key} {value:g}" for key, value in parameters)
     scene = procedural_scene(1500, 1500, np.random.default_rng(0)).radiance
     order = ", ".join(ORDER[ORDER.index("sampling") + 1 :])
     count = len(TABLES)
-    head = HEAD.format(count=count, order=order, shown=shown, tolerance=TOLERANCE_DN)
+    head = HEAD.format(count=count, order=order, shown=examples, tolerance=TOLERANCE_DN)
     return head + "\n".join(bounds(scene)) + "\n"
 
 

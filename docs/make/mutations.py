@@ -16,6 +16,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from shutil import copyfile
 from xml.etree import ElementTree as ET
@@ -93,7 +94,8 @@ def repository_copy() -> Iterator[Path]:
             if (ROOT / name).is_file():
                 (copy / name).parent.mkdir(parents=True, exist_ok=True)
                 copyfile(ROOT / name, copy / name)
-        for name in ("model", "profiles", "quant"):  # the installed package, as links
+        # The installed package reaches these folders through links.
+        for name in ("model", "profiles", "quant"):
             (copy / "deploy" / name).symlink_to(copy / name)
         (copy / "beers_deploy").symlink_to(copy / "deploy")
         (copy / SUITE / PROBE_FILE).write_text(PROBE, encoding="utf-8")
@@ -103,12 +105,12 @@ def repository_copy() -> Iterator[Path]:
 def failures_of(copy: Path, mutation: Mutation, *selection: str) -> Failures:
     """Break the copy, run its stability tests, put it right again."""
     file = copy / mutation.file
-    sound = file.read_text(encoding="utf-8")
-    file.write_text(broken(sound, mutation), encoding="utf-8")
+    original = file.read_text(encoding="utf-8")
+    file.write_text(broken(original, mutation), encoding="utf-8")
     try:
         return failures(copy, *selection)
     finally:
-        file.write_text(sound, encoding="utf-8")
+        file.write_text(original, encoding="utf-8")
 
 
 def failures(copy: Path, *selection: str) -> Failures:
@@ -121,18 +123,19 @@ def failures(copy: Path, *selection: str) -> Failures:
     options = ["-n", "0", "-p", "no:cacheprovider", "--tb=no", "--hypothesis-seed=0"]
     options += [f"--junitxml={report}", *selection]
     environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
-    named = {name.partition("::")[0] for mutation in MUTATIONS for name in mutation.tests}
-    files = [f"{SUITE}/{name}" for name in sorted({PROBE_FILE, *named})]
+    names = chain.from_iterable(mutation.tests for mutation in MUTATIONS)
+    test_files = {name.partition("::")[0] for name in names}
+    files = [f"{SUITE}/{name}" for name in sorted({PROBE_FILE, *test_files})]
     command = [sys.executable, "-m", "pytest", *files, *options]
-    done = subprocess.run(  # noqa: S603
+    process = subprocess.run(  # noqa: S603
         command, cwd=copy, env=environment, capture_output=True, text=True, check=False
     )
-    if done.returncode not in (0, 1):
-        raise SystemExit(done.stdout + done.stderr)
-    found = read_report(report.read_text(encoding="utf-8"))
-    if any(name.startswith(PROBE_FILE) for name in found):
+    if process.returncode not in (0, 1):
+        raise SystemExit(process.stdout + process.stderr)
+    tests = read_report(report.read_text(encoding="utf-8"))
+    if any(name.startswith(PROBE_FILE) for name in tests):
         raise SystemExit(f"not the code of {copy} is what runs there")
-    return found
+    return tests
 
 
 def read_report(text: str) -> Failures:
@@ -147,11 +150,13 @@ def read_report(text: str) -> Failures:
     )
 
 
-def document(found: Mapping[str, Failures]) -> str:
+def document(failures_by: Mapping[str, Failures]) -> str:
     """The page as Markdown."""
     lines = [OPENING, "| mutation | file | tests that fail |", "|---|---|---|"]
     for mutation in MUTATIONS:
-        tests = ", ".join(f"`{name}` ({cases})" for name, cases in found[mutation.name].items())
+        tests = ", ".join(
+            f"`{name}` ({cases})" for name, cases in failures_by[mutation.name].items()
+        )
         lines.append(f"| {described(mutation)} | {tests or 'none'} |")
     return "\n".join([*lines, ""])
 
@@ -163,17 +168,17 @@ def described(mutation: Mutation) -> str:
 
 def main() -> int:
     """Run all, write the page, and say which versions survived."""
-    found = {}
+    by_mutation = {}
     with repository_copy() as copy, steps("breaking", len(MUTATIONS) + 1) as bar:
-        if sound := failures(copy):
-            raise SystemExit(f"unbroken, these fail: {', '.join(sound)}")
+        if failing := failures(copy):
+            raise SystemExit(f"unbroken, these fail: {', '.join(failing)}")
         bar.advance()
         for mutation in MUTATIONS:
-            found[mutation.name] = failures_of(copy, mutation)
+            by_mutation[mutation.name] = failures_of(copy, mutation)
             bar.advance(note=mutation.name)
-    TARGET.write_text(document(found), encoding="utf-8", newline="\n")
+    TARGET.write_text(document(by_mutation), encoding="utf-8", newline="\n")
     print(f"wrote {TARGET}")
-    survivors = [m.name for m in MUTATIONS if set(m.tests) - set(found[m.name])]
+    survivors = [m.name for m in MUTATIONS if set(m.tests) - set(by_mutation[m.name])]
     for name in survivors:
         print(f"SURVIVED: {name}")
     return 1 if survivors else 0

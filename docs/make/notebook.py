@@ -6,6 +6,7 @@ notebook itself stays beside it.
 """
 
 import json
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def page(notebook: dict[str, Any], name: str) -> str:
     """The notebook as Markdown, with a link to the file at its end."""
-    parts = [part for cell in notebook["cells"] for part in cell_parts(cell)]
+    parts = chain.from_iterable(map(cell_parts, notebook["cells"]))
     return "\n\n".join([*parts, f"[The notebook itself]({name}), to run."]) + "\n"
 
 

@@ -6,6 +6,7 @@ A test keeps it fresh.
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import chain
 from pathlib import Path
 
 from beers_deploy.dpu.board import Dpu, load_dpu, ruled
@@ -55,10 +56,11 @@ def document() -> str:
     parts += _rules("Sizes, for every node", SIZES)
     parts += _rules(
         "Numbers, in a quantised file",
-        [*NUMBERS, *dict.fromkeys(r for rules in SHIFTS.values() for r in rules)],
+        [*NUMBERS, *dict.fromkeys(chain.from_iterable(SHIFTS.values()))],
     )
     parts += _rules("Remarks, which break no rule", REMARKS)
-    parts += [line for name in npu_names() for line in _npu(ruled(load_target(name)))]
+    for name in npu_names():
+        parts += _npu(ruled(load_target(name)))
     parts += ["## What to use instead\n"]
     parts += [f"- {names}: {remedy}" for names, remedy in _alike(dict(sorted(INSTEAD.items())))]
     return "\n".join([*parts, ""])
@@ -84,8 +86,8 @@ def _boards() -> Iterator[str]:
     yield "A smaller configuration of a DPU has lower limits on channels.\n"
     yield f"| | {' | '.join(DPUS)} |"
     yield "|---" * (len(DPUS) + 1) + "|"
-    for title, shown in FIGURES.items():
-        yield f"| {title} | {' | '.join(map(shown, DPUS.values()))} |"
+    for title, cell in FIGURES.items():
+        yield f"| {title} | {' | '.join(map(cell, DPUS.values()))} |"
     yield ""
 
 
@@ -98,15 +100,16 @@ def _kinds() -> Iterator[str]:
     kinds: dict[tuple[Rule, ...], list[Kind]] = {}
     for kind, rules in RULES.items():
         kinds.setdefault(rules, []).append(kind)
-    for rules, alike in kinds.items():
-        names = [name for name, kind in KINDS.items() if kind in alike]
-        names += [name for kind in alike for name in SPELT.get(kind, ())]
-        yield from _rules(f"{', '.join(alike)}: {', '.join(names)}", rules)
+    for rules, group in kinds.items():
+        names = [name for name, kind in KINDS.items() if kind in group]
+        for kind in group:
+            names += SPELT.get(kind, ())
+        yield from _rules(f"{', '.join(group)}: {', '.join(names)}", rules)
 
 
 def _rules(title: str, rules: Iterable[Callable[..., object]]) -> list[str]:
     """A line for each rule, and for each wording where the boards differ in more than numbers."""
-    lines = [line for rule in rules for line in _lines(rule)]
+    lines = list(chain.from_iterable(map(_lines, rules)))
     return [f"## {title}\n", *(lines or ["Runs on every DPU."]), ""]
 
 
@@ -167,11 +170,11 @@ def _each(values: Mapping[str, str]) -> str:
 
 def _without_sources(text: str, dpu: Dpu) -> str:
     """A rule's text without its parentheses of sources, in which boards with one limit differ."""
-    stated = {
-        str(getattr(fact, "source", "")) for facts in dpu.tables.values() for fact in facts.values()
-    }
-    stated |= {str(getattr(fact, "source", "")) for fact in dpu.target.activations.values()}
-    for source in sorted(stated | {*dpu.target.documents.values()}, key=len, reverse=True):
+    sources = set[str]()
+    tables: list[Mapping[str, object]] = [*dpu.tables.values(), dpu.target.activations]
+    for facts in tables:
+        sources |= {str(getattr(fact, "source", "")) for fact in facts.values()}
+    for source in sorted(sources | {*dpu.target.documents.values()}, key=len, reverse=True):
         text = re.sub(rf" \({re.escape(source)}[^()]*\)", "", text) if source else text
     return text
 

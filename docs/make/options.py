@@ -278,25 +278,25 @@ class Parameter:
 def parameters(command: str) -> list[Parameter]:
     """Of a command, in the order of its help."""
     hints = get_type_hints(COMMANDS[command][0], include_extras=True)
-    found = []
-    for shown in get_command(app).commands[command].params:  # type: ignore[attr-defined]
-        if shown.name in hints:
-            hint, info = get_args(hints[shown.name])
-            is_option = shown.param_type_name == "option"
+    entries = []
+    for option in get_command(app).commands[command].params:  # type: ignore[attr-defined]
+        if option.name in hints:
+            hint, info = get_args(hints[option.name])
+            is_option = option.param_type_name == "option"
             label = (
-                max(shown.opts, key=len)
+                max(option.opts, key=len)
                 if is_option
-                else (shown.metavar or shown.name.upper()).strip("[]")
+                else (option.metavar or option.name.upper()).strip("[]")
             )
-            found.append(
-                Parameter(command, shown.name, label, shown.required, _plain(hint), info, shown)
+            entries.append(
+                Parameter(command, option.name, label, option.required, _plain(hint), info, option)
             )
-    return found
+    return entries
 
 
 def _plain(hint: Any) -> Any:
     """A hint without None and without the list around it."""
-    within = [each for each in get_args(hint) if each is not NoneType]
+    within = [kind for kind in get_args(hint) if kind is not NoneType]
     if not within:
         return hint
     return _plain(within[0]) if get_origin(hint) is list or len(within) == 1 else hint

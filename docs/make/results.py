@@ -15,6 +15,7 @@ import re
 import sys
 from collections.abc import Iterable, Mapping
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -52,29 +53,28 @@ def tables_of(path: Path) -> dict[str, list[Row]]:
     return tables
 
 
-def filled(tables: Mapping[str, list[Row]], found: re.Match[str]) -> str:
+def filled(tables: Mapping[str, list[Row]], match: re.Match[str]) -> str:
     """A marked table made anew, or as it stands where the document has none of that name."""
-    name = found["name"]
+    name = match["name"]
     if name not in tables:
-        return found[0]
-    wanted = [cell.strip() for cell in found["table"].split("\n")[0].strip("| ").split("|")]
+        return match[0]
+    columns = [cell.strip() for cell in match["table"].split("\n")[0].strip("| ").split("|")]
     kind = name.rpartition(": ")[2]
     by_method = kind.startswith("mean") or kind == "targets"
-    made = mean_table(tables[name], wanted) if by_method else plain_table(tables[name], wanted)
-    return f"{found[1]}{made}{found[4]}"
+    table = mean_table(tables[name], columns) if by_method else plain_table(tables[name], columns)
+    return f"{match[1]}{table}{match[4]}"
 
 
-def mean_table(rows: Iterable[Row], wanted: list[str]) -> str:
+def mean_table(rows: Iterable[Row], columns: list[str]) -> str:
     """Return a table with a row for each method and the columns that the page wants, without the
     paper's rows.
     """
     ours = [row for row in rows if not row["name"].startswith("paper")]
-    titles = {
-        key: f"{key} {unit(ours, key)}".replace(" ratio", "")
-        for row in ours
-        for key in row["figures"]
-    }
-    keys = [key for title in wanted for key in titles if titles[key] == title]
+    names = chain.from_iterable(row["figures"] for row in ours)
+    titles = {key: f"{key} {unit(ours, key)}".replace(" ratio", "") for key in names}
+    keys = []
+    for title in columns:
+        keys += [key for key in titles if titles[key] == title]
     head = ["method", "sensor", *(titles[key] for key in keys)]
     lines = []
     for row in ours:
@@ -86,11 +86,12 @@ def mean_table(rows: Iterable[Row], wanted: list[str]) -> str:
     return markdown(head, lines)
 
 
-def plain_table(rows: list[Row], wanted: list[str]) -> str:
+def plain_table(rows: list[Row], columns: list[str]) -> str:
     """A row a line, a column for each figure that the page wants; intervals of
     differences alone.
     """
-    keys = list(dict.fromkeys(key for row in rows for key in row["figures"] if key in wanted))
+    names = dict.fromkeys(chain.from_iterable(row["figures"] for row in rows))
+    keys = [key for key in names if key in columns]
     differences = "gain" in rows[0]["table"] or "lost" in rows[0]["table"]
     cells = ([shown(row["figures"].get(key), differences) for key in keys] for row in rows)
     return markdown(

@@ -38,8 +38,10 @@ the losses and the metrics.
 def document(subject: Subject, results: list[StageResult]) -> str:
     """The whole page as Markdown."""
     cases = ["## Cases and stages\n", NOTES["battery"], "", *case_lines(results)]
-    found = ["## What is found\n", *finding_lines(subject, results)]
-    return "\n".join([OPENING, *found, "", *stage_lines(), "", *limitation_lines(), "", *cases, ""])
+    findings = ["## What is found\n", *finding_lines(subject, results)]
+    return "\n".join(
+        [OPENING, *findings, "", *stage_lines(), "", *limitation_lines(), "", *cases, ""]
+    )
 
 
 def finding_lines(subject: Subject, results: list[StageResult]) -> Iterator[str]:
@@ -83,12 +85,12 @@ def stage_lines() -> Iterator[str]:
 
 def case_lines(results: list[StageResult]) -> Iterator[str]:
     """The cases that came out alike in every stage, a line each."""
-    alike: dict[str, list[str]] = {}
+    groups: dict[str, list[str]] = {}
     for row in battery_rows(results):
-        alike.setdefault(
+        groups.setdefault(
             ", ".join(f"{stage}: {word}" for stage, word in row.text.items()), []
         ).append(row.name)
-    yield from (f"- {words}. {'; '.join(names)}." for words, names in alike.items())
+    yield from (f"- {words}. {'; '.join(names)}." for words, names in groups.items())
 
 
 def limitation_lines() -> Iterator[str]:

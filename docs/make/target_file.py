@@ -157,7 +157,7 @@ file has its constants, so leave out what your DPU does not limit.
 
 def shipped() -> dict[str, dict[str, list[Constant]]]:
     """The constants of every shipped board with a DPU, by table and key."""
-    found: dict[str, dict[str, list[Constant]]] = defaultdict(lambda: defaultdict(list))
+    by_table: dict[str, dict[str, list[Constant]]] = defaultdict(lambda: defaultdict(list))
     for board in map(load_target, board_names()):
         tables = [
             *board.tables.items(),
@@ -165,8 +165,8 @@ def shipped() -> dict[str, dict[str, list[Constant]]]:
         ]
         for table, constants in tables:
             for key, constant in constants.items():
-                found[table][key].append(constant)
-    return found
+                by_table[table][key].append(constant)
+    return by_table
 
 
 def limits(table: str) -> Mapping[str, target_limits.Limits]:
@@ -204,15 +204,17 @@ def _constants() -> Iterator[str]:
         "that are accepted. A"
     )
     yield f"configuration may state these keys of other tables for itself: {_names((*SIZES,))}."
-    found = shipped()
+    constants = shipped()
     for table, keys in KEYS.items():
         yield f"\n### [{table}]\n"
         if table == "cost":
             yield "Fitted, where nothing else is said.\n"
-        shown = {key: stated for key, stated in keys.items() if table != BUILD or key not in SIZES}
+        selected = {
+            key: constant for key, constant in keys.items() if table != BUILD or key not in SIZES
+        }
         yield from (
-            line(key, *stated, limits(table)[key], found[table][key])
-            for key, stated in shown.items()
+            line(key, *constant, limits(table)[key], constants[table][key])
+            for key, constant in selected.items()
         )
 
 
