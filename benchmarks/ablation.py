@@ -36,6 +36,8 @@ Loss = Callable[[Passes], float]
 """Quantises a network with these passes; the mean loss of PSNR in dB (points, of a classifier)."""
 UNSEEN = 64
 """Patches that judge a shipped network."""
+NOT_BEHIND_A_BANK = {"dual_range", "copies"}
+"""Passes without effect there: the result has two ranges of its own, and no channel is dead."""
 SAME_DB = 5e-4
 """A smaller change is none: it is printed as 0.000."""
 
@@ -47,12 +49,15 @@ def ablations(base: Passes) -> Iterator[tuple[str, Passes]]:
 
 
 def row(loss_of: Loss, base: Passes) -> list[str]:
-    """The loss with the passes of `base`, and what each one buys: the loss without it, less the
-    loss with it.
+    """Return the loss with the passes of `base`, and what each one buys: the loss without it, less
+    the loss with it.
     """
     loss = loss_of(base)
     cells = [f"{loss:.3f}"]
     for name, passes in ablations(base):
+        if base is BANKED and name in NOT_BEHIND_A_BANK:
+            cells.append("-")
+            continue
         gain = loss_of(passes) - loss
         # A pass that is off by default is switched on here.
         gain = gain if getattr(base, name) else -gain

@@ -51,9 +51,11 @@ LEFT_OUT = {
 SHORTER = {
     r"--provider Vitis\S+ --option \S+": "--provider CPUExecutionProvider --tile 64",
     r"--frames 300": "--frames 4",
+    r"(\.kit\(.*)'\)": r"\1', tile=64)",
     # The command bench accepts only runs of a board.
     r"--out board\.json": "--out processor.json",
     r"(beers-deploy gate)": r"\1 --patches 4",
+    r"(training\.py .*)$": r"\1 --steps 4",
     r"(characterise\.py .*)--sensors 10": r"\1--sensors 1",
     r"(edge_curves\.py .*)--repeats 3": r"\1--repeats 1",
     r"raw1\.tif:412,300,28,34": "raw1.tif:114,82,28,34",
