@@ -21,11 +21,10 @@ from beers_deploy.model.curves import pupil_contrast
 from beers_deploy.model.io.images import list_images
 from beers_deploy.model.metrics.edge_curve import (
     FREQUENCIES,
-    Edge,
     MtfCurve,
-    edge_in,
     measure_curve,
 )
+from beers_deploy.model.metrics.edge_search import Edge, edge_in
 from beers_deploy.model.metrics.noise_line import ROUNDING
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.metrics.slanted_edge import slanted_edge

@@ -15,7 +15,7 @@ import numpy as np
 import tifffile
 from PIL import Image
 
-from beers_deploy.model.metrics.edge_curve import edge_in
+from beers_deploy.model.metrics.edge_search import edge_in
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.metrics.uneven_edge import EdgeLine
 

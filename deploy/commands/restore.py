@@ -82,7 +82,10 @@ def restore(
             "8-bit and 0..1 pixels need it."
         ),
     ] = None,
-    runtime: Annotated[Runtime, typer.Option(help="What runs the network.")] = Runtime.onnxruntime,
+    runtime: Annotated[
+        Runtime,
+        typer.Option(help="What runs the network; openvino is 1.0 to 1.9 times as fast."),
+    ] = Runtime.onnxruntime,
     threads: Annotated[
         int,
         typer.Option(

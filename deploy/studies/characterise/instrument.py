@@ -10,14 +10,12 @@ import numpy as np
 from beers_deploy.model.metrics.edge_curve import (
     MOST_MISSING,
     WIDEST,
-    Edge,
     MtfCurve,
     apart,
-    edge_in,
-    find_edges,
     measure_curve,
     search_curve,
 )
+from beers_deploy.model.metrics.edge_search import Edge, edge_in, find_edges
 from beers_deploy.model.metrics.noise_line import (
     Blocks,
     NoiseModel,

@@ -7,15 +7,13 @@ from hypothesis import strategies as st
 
 from beers_deploy.model.metrics.edge_curve import (
     FREQUENCIES,
-    Edge,
     MtfCurve,
     apart,
-    edge_in,
-    find_edges,
     measure_curve,
     search_curve,
     sharpest,
 )
+from beers_deploy.model.metrics.edge_search import Edge, edge_in, find_edges
 from beers_deploy.model.metrics.mtf_basis import (
     CORNERS,
     at_distances,

@@ -1,0 +1,95 @@
+"""Edges to measure an MTF on: searched in an image, or the one that crosses a box.
+
+An edge is a square or box of pixels and the line that runs through it; `edge_curve` fits both again
+together with the curve.
+"""
+
+import math
+
+import numpy as np
+
+from beers_deploy.model.metrics.edge_blur import THOROUGH, plain_squares
+from beers_deploy.model.metrics.edge_fit import (
+    ANY,
+    MAX_SLOPE,
+    EdgeBlur,
+    Limits,
+    Noise,
+    centroids,
+    fit_shape,
+)
+from beers_deploy.model.metrics.mtf_basis import CORNERS, weights_of
+from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.model.metrics.uneven_edge import EdgeLine, EdgePixels, fit_edge
+
+START = weights_of(np.exp(-4.0 * CORNERS))
+"""The curve to begin with: 8.6 % at Nyquist."""
+FIRST_PASSES = 6
+MOST_EDGES = 60
+"""The least uneven count; more take time and add little."""
+
+SEARCHED = Limits(20, 0.12, 0.8)
+MAX_ROUGHNESS = 0.15
+"""What a square must keep to be fitted: looser than for a target, because its planes and texture
+are fitted too.
+"""
+POINTED_STEP_SIGMA = 10.0
+POINTED_UNEVENNESS = 0.2
+
+Edge = tuple[EdgePixels, EdgeLine]
+
+
+def find_edges(image: np.ndarray, noise: Noise, clipped_at: float, label: str) -> list[Edge]:
+    """Squares around near-vertical edges of an image (H, W), and where the edges run; transpose it
+    for others.
+
+    Of more than MOST_EDGES, those that fit a blurred step best.
+
+    Args:
+        image: finite values.
+        noise: of the pixels.
+        clipped_at: values from here on are clipped, and so are those from 0 down.
+        label: names the image.
+    """
+    squares = plain_squares(image, noise, clipped_at, THOROUGH, MAX_ROUGHNESS)
+    if not squares.size:
+        return []
+    scaled = squares / np.sqrt(noise(squares).mean((1, 2)))[:, None, None]
+    fits = zip(squares, fit_shape(scaled, SEARCHED), strict=True)
+    blurs = [(fit, square) for square, fit in fits if isinstance(fit, EdgeBlur)]
+    blurs.sort(key=lambda pair: pair[0].chi2 / pair[0].count / float(np.ptp(pair[1])) ** 2)
+    return [
+        (EdgePixels(square, noise(square), label), EdgeLine(fit.place, fit.slope))
+        for fit, square in blurs[:MOST_EDGES]
+    ]
+
+
+def centre_line(region: np.ndarray) -> EdgeLine:
+    """The line through the centres of what rises in each row of a region (H, W)."""
+    rows, columns = (np.arange(size) - (size - 1) / 2 for size in region.shape)
+    lines = centroids(region[None], rows, columns)
+    return EdgeLine(float(lines.place[0]), float(np.clip(lines.slope[0], -MAX_SLOPE, MAX_SLOPE)))
+
+
+def edge_in(region: np.ndarray, noise: Noise, label: str) -> Edge | Refusal:
+    """The one near-vertical edge that crosses a region (H, W) from top to bottom, or why there is
+    none.
+    """
+    scale = math.sqrt(float(noise(region).mean()))
+    pixels = EdgePixels(region, noise(region), label)
+    fit = fit_shape(region[None] / scale, ANY)[0]
+    line = EdgeLine(fit.place, fit.slope) if isinstance(fit, EdgeBlur) else centre_line(region)
+    fitted = fit_edge(pixels, line, START, FIRST_PASSES)
+    if fitted is None or abs(fitted.line.slope) > MAX_SLOPE:
+        return Refusal("no straight edge near to an axis with 8 pixels on both sides")
+    if fitted.step < POINTED_STEP_SIGMA * scale:
+        return Refusal(
+            f"a step of {fitted.step / scale:.3g} times the noise, {POINTED_STEP_SIGMA:g} are "
+            "needed"
+        )
+    if fitted.unevenness > POINTED_UNEVENNESS:
+        return Refusal(
+            f"sides that are uneven by {fitted.unevenness:.0%} of the step, "
+            f"{POINTED_UNEVENNESS:.0%} at most"
+        )
+    return pixels, fitted.line
