@@ -2,6 +2,7 @@
 tells its name.
 """
 
+import os
 import platform
 import shutil
 import subprocess
@@ -108,7 +109,10 @@ def test_the_processor_beneath_an_emulated_one_lends_it_no_name(
 def test_under_a_real_emulator_there_is_no_name() -> None:
     ask = "from beers_deploy.model.processor import processor_name; print(processor_name())"
     command = ["qemu-x86_64", "-cpu", "Nehalem", sys.executable, "-c", ask]
-    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "None\n"
+    # Kernels that the environment chooses may need more than the emulated processor has.
+    plain = {key: value for key, value in os.environ.items() if not key.startswith("OPENBLAS_")}
+    process = subprocess.run(command, capture_output=True, text=True, check=True, env=plain)
+    assert process.stdout == "None\n"
 
 
 def test_a_system_that_cannot_be_asked_gives_none(monkeypatch: pytest.MonkeyPatch) -> None:
