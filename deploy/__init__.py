@@ -32,8 +32,7 @@ def __getattr__(name: str) -> Any:
     try:
         return _loaded(name)
     except ImportError as error:
-        from beers_deploy.profiles.errors import (
-            missing_extra,
-        )  # NumPy, which `__main__` has to survive without
+        # This loads NumPy, which `__main__` has to survive without.
+        from beers_deploy.profiles.errors import missing_extra
 
         raise missing_extra(error, name) from error

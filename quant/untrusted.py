@@ -13,6 +13,16 @@ from onnx import AttributeProto, NodeProto, TensorProto, helper, numpy_helper
 from beers_deploy.profiles.errors import BeersError, ModelError
 from beers_deploy.quant.domains import INLINE, MICROSOFT, STANDARD, foreign_remedy
 
+DAMAGE = (
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    RecursionError,
+    TypeError,
+    ValueError,
+)
+"""What reading a damaged description raises, of Python and of NumPy."""
+
 FILE_BYTES = 1 << 30
 VALUES = 1 << 28
 """Of one tensor that a file sizes without holding it: 1 GiB of float32."""
@@ -53,14 +63,7 @@ def contradictions(where: str) -> Iterator[None]:
         yield
     except BeersError:
         raise
-    except (
-        ArithmeticError,
-        AttributeError,
-        LookupError,
-        RecursionError,
-        TypeError,
-        ValueError,
-    ) as error:
+    except DAMAGE as error:
         if isinstance(getattr(error, "obj", None), ModuleType):
             # The installed library lacks what this program calls, whatever the file holds.
             raise

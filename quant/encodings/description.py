@@ -30,6 +30,7 @@ from beers_deploy.quant.graph import (
     Window,
 )
 from beers_deploy.quant.graph.tail import Tail
+from beers_deploy.quant.untrusted import DAMAGE
 
 KEY = "core"
 PLACE_PX = "place_px"
@@ -71,14 +72,7 @@ def described_core(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
     """
     try:
         return _described(text, constants)
-    except (
-        ArithmeticError,
-        AttributeError,
-        LookupError,
-        RecursionError,
-        TypeError,
-        ValueError,
-    ) as error:
+    except DAMAGE as error:
         got = f"damaged ones ({type(error).__name__}: {' '.join(str(error).split())[:80]})"
         expected = f"metadata {KEY!r} that describe its integers"
         raise ModelError(
