@@ -24,9 +24,9 @@ import torch
 
 from beers_deploy.model.curves import draw_table
 from beers_deploy.model.family import LEAST_ALONG, SensorFamily
-from beers_deploy.model.io.images import list_images
 from beers_deploy.model.metrics.fidelity import fidelity_db
 from beers_deploy.model.metrics.slanted_edge import slanted_edge
+from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.simulator.acquire import acquire, fitting_oversampling
 from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.mtf import mtf

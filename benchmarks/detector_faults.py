@@ -19,7 +19,9 @@ import numpy as np
 from sensor_check import texture
 
 from beers_deploy.model.family import SensorFamily
-from beers_deploy.model.io.images import list_images
+from beers_deploy.model.raster.facts import Raster
+from beers_deploy.model.raster.images import list_images
+from beers_deploy.model.raster.source import ArraySource
 from beers_deploy.model.simulator.acquire import acquire_padded, fitting_oversampling
 from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.procedural import procedural_scene
@@ -27,7 +29,6 @@ from beers_deploy.model.simulator.sampling import Scene, crop_divisible, read_sc
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.sensor import Instrument
 from beers_deploy.restoration.detectors.look import BandFaults, look_at_detectors
-from beers_deploy.restoration.source import ArraySource, Raster
 
 LIKE = load_sensor("pleiades-degraded").nominal()
 LEAST_SIDE_PX = 140

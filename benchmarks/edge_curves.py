@@ -18,7 +18,6 @@ import numpy as np
 
 from beers_deploy.model.curves import FREQUENCIES as TABULATED
 from beers_deploy.model.curves import pupil_contrast
-from beers_deploy.model.io.images import list_images
 from beers_deploy.model.metrics.edge_curve import (
     FREQUENCIES,
     MtfCurve,
@@ -28,6 +27,7 @@ from beers_deploy.model.metrics.edge_search import Edge, edge_in
 from beers_deploy.model.metrics.noise_line import ROUNDING
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.metrics.slanted_edge import slanted_edge
+from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.simulator.acquire import acquire
 from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.sampling import read_scene, scene_spectrum

@@ -37,10 +37,10 @@ from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.model.convbeers import ResidualBlock
-from beers_deploy.model.io.images import list_images, site_of
 from beers_deploy.model.metrics.fidelity import psnr_db
 from beers_deploy.model.processor import processor_name
 from beers_deploy.model.progress import steps
+from beers_deploy.model.raster.images import list_images, site_of
 from beers_deploy.model.simulator.sampling import read_scene
 from beers_deploy.model.training.losses import LossWeights, RestorationLoss
 from beers_deploy.model.training.patches import PatchRecipe

@@ -29,7 +29,7 @@ from rasterio.transform import from_origin
 from rasterio.windows import Window
 
 from beers_deploy.bench.swath import parse_size
-from beers_deploy.restoration.source import open_source
+from beers_deploy.model.raster.reader import open_raster
 
 BLOCK_PX = 1024
 STRIP_PX = 640
@@ -155,7 +155,7 @@ def restored(image: Path, model: str, *more: str) -> tuple[float, float, str]:
 
 def decoding_s(image: Path) -> float:
     """Processor time of reading every row once, threads that decode included."""
-    with open_source(image) as source:
+    with open_raster(image) as source:
         height_px = source.raster.height_px
         started = time.process_time()
         for top in range(0, height_px, STRIP_PX):

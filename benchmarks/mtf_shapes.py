@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from beers_deploy.model.io.images import site_of
+from beers_deploy.model.raster.images import site_of
 from beers_deploy.model.simulator.mtf import mtf
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.profiles import load_sensor

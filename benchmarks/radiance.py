@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.model.io.images import read_pixels, site_of
+from beers_deploy.model.raster.images import read_pixels, site_of
 from beers_deploy.model.shipped import INT8, SENSOR, shipped_names
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.model.simulator.sampling import Scene, scene_of

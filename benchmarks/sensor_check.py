@@ -19,7 +19,10 @@ import numpy as np
 from characterise import LEAST_SIDE_PX, LIKE, RATIO, draw
 from scipy.ndimage import gaussian_filter, shift
 
-from beers_deploy.model.io.images import list_images
+from beers_deploy.model.raster.facts import Raster
+from beers_deploy.model.raster.images import list_images
+from beers_deploy.model.raster.reader import open_raster
+from beers_deploy.model.raster.source import ArraySource
 from beers_deploy.model.simulator.acquire import acquire_padded, fitting_oversampling
 from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.procedural import procedural_scene
@@ -28,7 +31,6 @@ from beers_deploy.network import Network
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.restoration.sensor_check import SensorCheck, check_source
-from beers_deploy.restoration.source import ArraySource, Raster, open_source
 from beers_deploy.studies.evaluation.methods import profile_of
 
 BASE = load_sensor("pleiades-degraded")
@@ -107,7 +109,7 @@ def main() -> None:
     for name, flags in sorted(counts.items()):
         print(f"| {name} | {sum(flags)} | {len(flags)} |")
     for path in list_images(arguments.raw) if arguments.raw else ():
-        with open_source(path) as source:
+        with open_raster(path) as source:
             print(f"{path.name}: {check_source(source, [BASE], LIKE.max_dn)}")
     timed(image)
 

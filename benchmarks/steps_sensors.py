@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.model.io.images import site_of
 from beers_deploy.model.metrics.fidelity import fidelity_db
+from beers_deploy.model.raster.images import site_of
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.profiles import load_sensor

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import minimize
 
-from beers_deploy.model.io.images import list_images
 from beers_deploy.model.progress import steps
+from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.simulator.acquire import MARGIN_PX
 from beers_deploy.model.simulator.detector import to_dn, to_radiance
 from beers_deploy.model.simulator.sampling import Scene, read_scene

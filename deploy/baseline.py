@@ -12,7 +12,7 @@ from typing import Any
 
 from beers_deploy.differences import read_document
 from beers_deploy.model.io.files import sha256
-from beers_deploy.model.io.images import list_images
+from beers_deploy.model.raster.images import list_images
 from beers_deploy.profiles.errors import OptionError, encodable
 from beers_deploy.profiles.figures import Check
 from beers_deploy.profiles.sensor import Sensor, numbers_of

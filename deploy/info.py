@@ -6,10 +6,11 @@ time on the board is the cost model's.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from statistics import median
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import onnx
@@ -17,32 +18,22 @@ import onnx
 from beers_deploy.bench.swath import predict_file, swath_latency
 from beers_deploy.dpu.board import dpu_of
 from beers_deploy.model.progress import Log, no_log
+from beers_deploy.model.raster.facts import Raster
+from beers_deploy.model.raster.reader import open_raster
 from beers_deploy.profiles.errors import BeersError, ImageError
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.restoration.detectors.words import warn_of_detectors
-from beers_deploy.restoration.georeference import (
-    KEYS,
-    PIXEL_SCALE,
-    POLYNOMIALS,
-    TIE_POINTS,
-    TRANSFORMATION,
-    geo_keys,
-)
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.plan import Plan, plan_for
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
 from beers_deploy.restoration.run import plan_figures
 from beers_deploy.restoration.runtime import open_runtime, tiles_at_once
 from beers_deploy.restoration.sensor_check import SensorCheck, told_sensor
-from beers_deploy.restoration.source import Raster, open_source
 from beers_deploy.restoration.steps import keeps_pixels
 
 HEADER = "the file's own header"
-PROJECTED = 3072
-GEOGRAPHIC = 2048
-"""Keys of GeoTIFF that hold an EPSG code (OGC 19-008r4, annex D)."""
 RUNS = 3
 UNTIMED = "no tile was timed here: --measure times some"
 
@@ -60,7 +51,7 @@ def info_row(
         log: is told of faults of detectors, and where the image contradicts its sensor.
     """
     network = load_onnx(options.model)
-    with open_source(image, options.trust_index) as source:
+    with open_raster(image, options.trust_index) as source:
         raster = source.raster
         scale = known_scale(image.name, raster, options)
         check = SensorCheck()
@@ -98,8 +89,7 @@ def info_row(
 
 def missing_words(raster: Raster) -> str:
     """Which pixels are missing: those of the nodata value, and those that a mask or alpha hides."""
-    veil = "alpha" if raster.has_alpha else "mask"
-    hidden = [f"where its {veil} is 0"] if raster.veil else []
+    hidden = [f"where its {raster.mask_kind} is 0"] if raster.mask_kind else []
     valued = [] if raster.nodata is None else [f"{raster.nodata:g}"]
     return ", ".join([*valued, *hidden]) or "none"
 
@@ -118,25 +108,26 @@ def known_scale(name: str, raster: Raster, options: Options) -> FullScale | str:
 
 
 def place_words(raster: Raster) -> Mapping[str, str]:
-    """Where the image lies, as its tags say it."""
-    tags = {tag[0]: tag[3] for tag in raster.tags}
-    placed = PIXEL_SCALE in tags or TRANSFORMATION in tags
-    words = {"georeference": f"{_code(tags.get(KEYS, ()))}" if placed or KEYS in tags else "none"}
-    if PIXEL_SCALE in tags and TIE_POINTS in tags:
-        right, down = tags[PIXEL_SCALE][:2]
-        x, y = tags[TIE_POINTS][3:5]
-        words["georeference"] += (
-            f", first corner ({x:.9g}, {y:.9g}), pixels of {right:.9g} x {down:.9g}"
+    """Return where the image lies, in words."""
+    place = raster.place
+    words = "none"
+    if place.crs or place.transform or place.gcps:
+        words = _crs_name(place.crs)
+    if place.transform:
+        corner = place.transform
+        words += (
+            f", first corner ({corner.c:.9g}, {corner.f:.9g}), pixels of {abs(corner.a):.9g} x "
+            f"{abs(corner.e):.9g}"
         )
-    return words | {"rational polynomials": "yes" if POLYNOMIALS in tags else "none"}
+    if place.gcps:
+        words += f", {len(place.gcps)} ground control points"
+    return {"georeference": words, "rational polynomials": "yes" if place.rpcs else "none"}
 
 
-def _code(keys: Sequence[int]) -> str:
-    """The coordinate system among GeoTIFF's keys."""
-    values = geo_keys(keys)
-    code = values.get(PROJECTED, values.get(GEOGRAPHIC))
-    # GeoTIFF writes 32767 for a system that the user defines.
-    return f"EPSG:{code}" if code not in (None, 32767) else "a coordinate system without a code"
+def _crs_name(crs: Any) -> str:
+    """Return the EPSG code of a coordinate system, if it has one."""
+    code = crs.to_epsg() if crs else None
+    return f"EPSG:{code}" if code else "a coordinate system without a code"
 
 
 def time_here(network: onnx.ModelProto, plan: Plan, options: Options) -> Figure:

@@ -15,6 +15,15 @@ import numpy as np
 import onnx
 
 from beers_deploy.model.progress import Progress, no_log, reporting
+from beers_deploy.model.raster.facts import (
+    MaskKind,
+    Raster,
+    is_restored,
+    require_numbers,
+    require_raw,
+    usable_nodata,
+)
+from beers_deploy.model.raster.source import ArraySource
 from beers_deploy.model.shipped import INT8, VARIANT
 from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.network_files import brighter_files, conditioned, other_sensor
@@ -30,15 +39,6 @@ from beers_deploy.restoration.radiometry import full_scale_of
 from beers_deploy.restoration.run import check_sensor, restore_file, scale_of
 from beers_deploy.restoration.runtime import Packed, open_runtime, tiles_at_once
 from beers_deploy.restoration.sensor_check import told_sensor
-from beers_deploy.restoration.source import (
-    ArraySource,
-    Raster,
-    Veil,
-    is_restored,
-    require_numbers,
-    require_raw,
-    usable_nodata,
-)
 from beers_deploy.restoration.steps import consistency_steps, exposed_networks
 from beers_deploy.restoration.tiles.engine import NAME, Restorer, as_stored, checked_strip
 from beers_deploy.restoration.tiles.lazy import restore_lazily
@@ -113,7 +113,7 @@ def restore(
             standard error.
 
     Returns:
-        The same kind and scale, uint8 of uint8, uint16 of other integers, float32 of floats; of the
+        The same kind and scale, of the same type (float32 for float64); of the
             same shape,
         unless the network makes more pixels or other bands. Missing pixels stay as they are. Of a
             file a table of the
@@ -438,8 +438,9 @@ def _raster(bands: Any, nodata: float | None) -> Raster:
     count, height_px, width_px = bands.shape
     dtype = require_numbers(NAME, bands.dtype)
     value = None if nodata is None else float(nodata)
-    veil: Veil = "mask" if np.ma.isMaskedArray(bands) else ""
-    return Raster(count, height_px, width_px, dtype, usable_nodata(NAME, value, dtype), veil=veil)
+    mask_kind: MaskKind = "mask" if np.ma.isMaskedArray(bands) else ""
+    nodata = usable_nodata(value, dtype)
+    return Raster(count, height_px, width_px, dtype, nodata, mask_kind=mask_kind)
 
 
 def _runtime(name: str) -> Runtime:

@@ -13,8 +13,8 @@ import numpy as np
 
 from beers_deploy.model.io.files import write_text
 from beers_deploy.model.io.pictures import picture_url, stretch_of
-from beers_deploy.model.io.tiff import write_tiff
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
+from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import SensorLike
 from beers_deploy.profiles.errors import ImageError, OptionError

@@ -23,10 +23,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beers_deploy.model.io.files import sha256, write_text
-from beers_deploy.model.io.images import site_of
-from beers_deploy.model.io.tiff import write_tiff
 from beers_deploy.model.manifest import DIGESTS, ROLES, Line, image_of, line_text, matching_lines
 from beers_deploy.model.progress import Log, no_log
+from beers_deploy.model.raster.images import site_of
+from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.model.simulator.acquire import MARGIN_PX, prepare_scene, simulate_planned
 from beers_deploy.model.simulator.detector import Draw, to_uint16

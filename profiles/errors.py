@@ -150,8 +150,7 @@ EXTRAS = {
     "matplotlib": "study",
     "openvino": "openvino",
     "pandas": "notebook",
-    "pystac": "gdal",
-    "rasterio": "gdal",
+    "pystac": "stac",
     "skimage": "study",
     "torch": "torch",
 }

@@ -19,7 +19,7 @@ import numpy as np
 import onnx
 
 from beers_deploy.model.io.files import IMAGE_SUFFIXES
-from beers_deploy.model.io.images import read_pixels
+from beers_deploy.model.raster.images import read_pixels
 from beers_deploy.profiles.arrays import load_arrays
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.profiles.sensor import MAX_DN

@@ -13,7 +13,7 @@ NAMES = (
 LIGHT = (
     "beers_deploy",
     "beers_deploy.profiles",
-    "beers_deploy.model.io.images",
+    "beers_deploy.model.raster.images",
     "beers_deploy.quant",
 )
 """Looked at by commands that need no torch."""

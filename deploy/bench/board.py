@@ -33,7 +33,7 @@ from beers_deploy.dpu.cost.model import TASKS, Task
 from beers_deploy.dpu.cost.own_runs import read_own_runs
 from beers_deploy.dpu.reading import own_tile_px
 from beers_deploy.model.exposure import factors_for
-from beers_deploy.model.io.images import read_acquisition
+from beers_deploy.model.raster.images import read_acquisition
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import ModelError, OptionError

@@ -11,11 +11,11 @@ from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import Prediction, dpu_power, predict
 from beers_deploy.dpu.cost.model import Interval, Task, between
 from beers_deploy.dpu.reading import read_network
+from beers_deploy.model.raster.facts import SIDE_PX
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Figure, predicted, unavailable
 from beers_deploy.profiles.target import TILE_PX
 from beers_deploy.restoration.plan import plan_side
-from beers_deploy.restoration.source import SIDE_PX
 
 COST_SOURCE = "cost model fitted on published networks, docs/explanation/cost-model.md"
 HELD = 0.9

@@ -76,7 +76,7 @@ def evaluate(
     sensors' nominal figures; NAME@blind is told no sensor, NAME@SENSOR another one.
     """
     from beers_deploy.model.io.files import require_writable
-    from beers_deploy.model.io.images import list_images
+    from beers_deploy.model.raster.images import list_images
     from beers_deploy.results import print_rows
 
     if pairs is not None and (images is not None or sweep or brightness):

@@ -53,8 +53,8 @@ def info(
     """
     from beers_deploy.info import info_row
     from beers_deploy.model.io.files import require_writable
+    from beers_deploy.model.raster.index import index_files
     from beers_deploy.network_files import network_file
-    from beers_deploy.restoration.index_files import index_files
     from beers_deploy.results import Table, print_rows
 
     tiles = index_files(image, trust_index)

@@ -19,13 +19,14 @@ from beers_deploy.commands.shared import (
     save,
     say,
 )
+from beers_deploy.model.raster.compression import Compression
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import TILE_PX
-from beers_deploy.restoration.options import Compression, Options, Runtime
+from beers_deploy.restoration.options import Options, Runtime
 
 NETWORK_ONLY = (
     "network",
@@ -166,17 +167,17 @@ def restore(
     are compared with --sensor, and stripes, dead and hot columns and pixels are warned of. The
     consistency step keeps the mean and the flux of points; exposure lets INT8 restore dark parts as
     well as bright ones. --method traditional restores one band, about a minute a megapixel on two
-    cores, and is not resumable. JPEG 2000, NITF, HFA, VRT and DIMAP need the extra 'gdal'. Until
-    OUT is finished its rows lie in .OUT.part.
+    cores, and is not resumable. Until OUT is finished its rows
+    lie in .OUT.part.
     """
     from beers_deploy.model.io.files import require_writable, sha256
-    from beers_deploy.model.io.images import require_image_file
+    from beers_deploy.model.raster.reader import require_image_file
     from beers_deploy.model.shipped import INT8
     from beers_deploy.network_files import brighter_files, conditioned, network_file
     from beers_deploy.restoration.bands import parse_sensors
-    from beers_deploy.restoration.cog import write_item
     from beers_deploy.restoration.detectors.fault_list import FOUND, list_beside
     from beers_deploy.restoration.run import restore_file
+    from beers_deploy.restoration.stac import write_item
     from beers_deploy.results import Input, Table, print_rows
 
     # A budget of 0 bytes would count as none.

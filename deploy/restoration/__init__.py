@@ -1,11 +1,8 @@
 """Restoration of images of any size: exact seams, little memory, resumable.
 
-An image passes, in this order:
+`model.raster` reads an image by rows. It passes, in this order:
 
     options      what a user can choose
-    source       an image file, or an array, as rows
-    gdal_source  the same of what GDAL reads by windows: JPEG 2000, NITF, HFA, VRT, DIMAP
-    index_files  which files an untrusted VRT or DIMAP names, and that it names no others
     bands        a sensor, and so a network, for each band
     plan         how it is cut into tiles, and the memory that takes
     radiometry   which pixel value is full scale, and who says so
@@ -16,8 +13,9 @@ An image passes, in this order:
     sensor_check what the image shows of its sensor, and whether it is raw at all
     detectors    what it shows of faulty detectors; a list of them, whose pixels are replaced
     journal      which rows are finished, and their digests
-    output       finished rows in a checkpoint, the lock, the TIFF
-    cog          the finished TIFF cloud-optimised, by GDAL; its STAC item for a catalogue
+    checkpoint   the finished rows on the disk, which a later run can go on with
+    output       from the finished rows to the TIFF, plain or cloud-optimised
+    stac         the STAC item of a cloud-optimised output
     run          all of this for one file: `restore_file`
     traditional  a file by the traditional pipeline: `restore_file_traditionally`
 

@@ -11,17 +11,11 @@ from typing import TypeVar
 
 import onnx
 
+from beers_deploy.model.raster.facts import Raster
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.quant.tiling.walk import tiling_of
-from beers_deploy.restoration.index_files import parse_xml
-from beers_deploy.restoration.source import Raster
 
 Each = TypeVar("Each")
-
-METADATA_TAG = 42112
-"""GDAL's own of a TIFF, where bands' names stand
-(https://gdal.org/en/stable/drivers/raster/gtiff.html).
-"""
 
 
 def parse_sensors(text: str) -> dict[str, str]:
@@ -39,30 +33,13 @@ def parse_sensors(text: str) -> dict[str, str]:
     return profiles
 
 
-def band_names(raster: Raster) -> tuple[str, ...]:
-    """The names of an image's bands, as GDAL keeps them in a TIFF; empty where any has none."""
-    text = next((str(tag[3]) for tag in raster.tags if tag[0] == METADATA_TAG), "")
-    try:
-        root = parse_xml(text)
-    # Names are no part of the pixels, so that damaged metadata must not end a run.
-    except (ValueError, LookupError, RecursionError):
-        return ()
-    descriptions = {
-        item.get("sample"): item.text or ""
-        for item in root.iter("Item")
-        if item.get("role") == "description"
-    }
-    names = tuple(descriptions.get(str(band), "") for band in range(raster.bands))
-    return names if all(names) else ()
-
-
 def in_order(given: Mapping[str, Each], raster: Raster) -> list[Each]:
     """What was given for each band, in the order of the image's bands; what is for all of them
     alone.
     """
     if "" in given:
         return [given[""]]
-    stored_names = band_names(raster)
+    stored_names = raster.band_names
     names = stored_names or _by_number(given)
     if len(given) != raster.bands or set(names) != set(given):
         expected = f"a sensor for each of {raster.bands} bands" + (

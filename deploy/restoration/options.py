@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 
+from beers_deploy.model.raster.compression import Compression
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import TILE_PX
@@ -18,15 +19,6 @@ class Runtime(StrEnum):
 
     onnxruntime = "onnxruntime"
     openvino = "openvino"
-
-
-class Compression(StrEnum):
-    """The compressions of the output, all lossless, by tifffile's names."""
-
-    none = "none"
-    zlib = "zlib"
-    zstd = "zstd"
-    lzw = "lzw"
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,10 @@ import numpy as np
 import onnx
 import psutil
 
+from beers_deploy.model.raster.source import Source
 from beers_deploy.profiles.errors import MachineError, ModelError, OptionError, sizes
 from beers_deploy.quant.tiling.walk import Tiling, tiling_of
 from beers_deploy.restoration.options import Options, parse_halo
-from beers_deploy.restoration.source import Source
 
 
 @dataclass(frozen=True)

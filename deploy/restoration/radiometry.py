@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beers_deploy.model.io.images import Extent, settled_scale
+from beers_deploy.model.raster.facts import Extent, Raster
+from beers_deploy.model.raster.full_scale import settled_scale
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import MAX_DN
-from beers_deploy.restoration.source import Raster
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def require_room(raster: Raster, full_scale: float) -> None:
     """That restored pixels up to full scale fit into the output's type."""
     kind = raster.out_dtype
     # A float output holds any full scale.
-    if kind.kind == "u" and full_scale > np.iinfo(kind).max:
+    if kind.kind != "f" and full_scale > np.iinfo(kind).max:
         expected = f"at most {np.iinfo(kind).max} for {kind} pixels"
         remedy = "convert the image to uint16"
         raise OptionError("full_scale", expected=expected, got=f"{full_scale:g}", remedy=remedy)

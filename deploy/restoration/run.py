@@ -23,34 +23,31 @@ import onnx
 from beers_deploy.cluster import Cluster, open_cluster
 from beers_deploy.host_state import peak_memory
 from beers_deploy.model.io.files import require_writable
-from beers_deploy.model.io.images import require_image_file
 from beers_deploy.model.io.lock import only_run
 from beers_deploy.model.processor import require_cores
 from beers_deploy.model.progress import Log, held_back, no_log, steps
-from beers_deploy.profiles.errors import BeersError, ImageError, MachineError, optional
+from beers_deploy.model.raster.compression import Compression
+from beers_deploy.model.raster.facts import require_raw
+from beers_deploy.model.raster.reader import open_raster, require_image_file
+from beers_deploy.model.raster.source import Source, fingerprint, stamps
+from beers_deploy.model.raster.writer import cog_bytes, require_codec, write_cog
+from beers_deploy.profiles.errors import BeersError, ImageError, MachineError
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
 from beers_deploy.profiles.sensor import numbers_of
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.reading.external import network_sha256, unchanged
 from beers_deploy.restoration.bands import in_order, require_alike
-from beers_deploy.restoration.cog import disk_bytes, what_was_done, write_cog
+from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.detectors.fault_list import list_beside, write_list
 from beers_deploy.restoration.detectors.fix import faults_of, fixed
 from beers_deploy.restoration.detectors.words import warn_of_detectors
-from beers_deploy.restoration.georeference import unread_places
-from beers_deploy.restoration.options import Compression, Options
-from beers_deploy.restoration.output import (
-    Checkpoint,
-    require_codec,
-    require_tiff_name,
-    write_output,
-)
+from beers_deploy.restoration.options import Options
+from beers_deploy.restoration.output import require_tiff_name, what_was_done, write_output
 from beers_deploy.restoration.plan import Plan, Span, check_memory, is_bulky, plan_for, rows_bytes
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
 from beers_deploy.restoration.runtime import Infer, Packed, infer_on, open_runtime, tiles_at_once
 from beers_deploy.restoration.sensor_check import SensorCheck, restored_already, told_sensor
-from beers_deploy.restoration.source import Source, fingerprint, open_source, require_raw, stamps
 from beers_deploy.restoration.steps import consistency_steps, exposed_networks, factor_words
 from beers_deploy.restoration.tiles.engine import Restorer
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
@@ -62,6 +59,11 @@ CHECKED = (
     "the comparison of the image's own noise and edges with its sensor, and the look for faults "
     "of detectors: "
     "no part of time and throughput"
+)
+ALPHA = (
+    "band {band} is alpha, by the file's header: it is copied, and pixels where it is 0 are "
+    "missing. If it holds light, such as near infrared, write the file without alpha "
+    "(gdal_translate -colorinterp_{band} undefined)"
 )
 MANY = 0.05
 """Share of an image above its full scale that no scene has, but a wrong full scale."""
@@ -93,8 +95,8 @@ def restore_file(
         require_alike(networks, paths)
         plan = plan_for(networks[0], raster.shape, options)
         log(plan.sentence)
-        for sentence in unread_places(image, raster):
-            log(sentence)
+        if raster.mask_kind == "alpha":
+            log(ALPHA.format(band=raster.bands + 1))
         faults = faults_of(stored, options.fix_detectors, str(image), log)
         source = fixed(stored, faults)
         check_memory(rows_bytes(source, plan), options.memory_bytes, is_bulky(source, plan))
@@ -112,10 +114,10 @@ def restore_file(
         figures = seam_figures(source, plan, restorer)
         job = job_of(source, digests, plan, runtime, scale.value, options, bool(steps_taken))
         job["detectors"] = faults.sha256
-        cog_bytes = disk_bytes(plan.out_shape, raster.out_dtype.itemsize) if options.cog else 0
+        needed = cog_bytes(plan.out_shape, raster.out_dtype.itemsize) if options.cog else 0
         ends = [row.keep_stop * plan.scale for row in plan.rows]
         checkpoint = Checkpoint(
-            out, plan.out_shape, raster.out_dtype, job, options.resume, cog_bytes, ends
+            out, plan.out_shape, raster.out_dtype, job, options.resume, needed, ends
         )
         if checkpoint.damaged_rows:
             log(
@@ -207,11 +209,8 @@ def begun(
     require_image_file(image)
     require_writable(out, inputs=[path for path in (image, options.model) if path.is_file()])
     require_tiff_name(out)
-    if options.cog:
-        optional("rasterio", "cog")
-    else:
-        require_codec(options.compression)
-    with only_run(out), open_source(image, options.trust_index) as source:
+    require_codec(options.compression)
+    with only_run(out), open_raster(image, options.trust_index) as source:
         # Only an open index tells which tiles are read: no output may be one of them.
         require_writable(out, *beside, inputs=source.files)
         require_raw(str(image), source.raster.restored, options.again)

@@ -34,6 +34,7 @@ from beers_deploy.model.metrics.noise_line import (
 )
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.progress import Log
+from beers_deploy.model.raster.source import Source
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.figures import Figure, measured, unavailable
@@ -41,7 +42,6 @@ from beers_deploy.profiles.response import NYQUIST
 from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.restoration.bands import in_order
-from beers_deploy.restoration.source import Source
 
 WINDOW_PX = 512
 ACROSS = 4

@@ -12,6 +12,7 @@ from pathlib import Path
 import onnx
 
 from beers_deploy.model.consistency import Consistency
+from beers_deploy.model.raster.facts import Raster
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.quant.onnx_file import load_onnx
@@ -19,7 +20,6 @@ from beers_deploy.quant.tiling.walk import Tiling
 from beers_deploy.restoration.bands import in_order
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.runtime import Infer
-from beers_deploy.restoration.source import Raster
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 
 OFF = "off"

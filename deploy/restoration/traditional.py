@@ -16,18 +16,19 @@ from torch import Tensor
 
 from beers_deploy.host_state import peak_memory
 from beers_deploy.model.progress import Log, Steps, no_log, steps
+from beers_deploy.model.raster.source import Source, fingerprint, stamps, strips
 from beers_deploy.model.traditional.pipeline import Chain, restore_strips
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.figures import Row, measured
+from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.detectors.fault_list import list_beside, write_list
 from beers_deploy.restoration.detectors.fix import faults_of, fixed
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.output import Checkpoint, write_output
+from beers_deploy.restoration.output import write_output
 from beers_deploy.restoration.plan import Span, check_memory
 from beers_deploy.restoration.radiometry import full_scale_of
 from beers_deploy.restoration.run import CHECKED, begun, check_sensor, require_unchanged, timed
-from beers_deploy.restoration.source import Source, fingerprint, stamps, strips
 from beers_deploy.restoration.tiles.engine import as_stored, checked_strip
 from beers_deploy.restoration.tiles.rows import RestoredRow
 

@@ -18,11 +18,11 @@ from beers_deploy.dpu.checker.placement import Placement
 from beers_deploy.dpu.checker.table import check
 from beers_deploy.library import restore
 from beers_deploy.model.io.files import whole_file
-from beers_deploy.model.io.images import read_acquisition, read_pixels
 from beers_deploy.model.io.pictures import busiest_windows, picture_url, stretch_of, strip
-from beers_deploy.model.io.tiff import write_tiff
 from beers_deploy.model.metrics.fidelity import fidelity_db, ssim
 from beers_deploy.model.progress import Log
+from beers_deploy.model.raster.images import read_acquisition, read_pixels
+from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.model.shipped import SENSOR, VARIANT
 from beers_deploy.model.simulator.acquire import MARGIN_PX, Pair, simulate_pair
 from beers_deploy.model.simulator.detector import Draw

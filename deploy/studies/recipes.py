@@ -16,8 +16,8 @@ import torch
 
 from beers_deploy.model.family import SensorFamily
 from beers_deploy.model.io.files import sha256, whole_file
-from beers_deploy.model.io.images import list_images, site_of
 from beers_deploy.model.processor import processor_name
+from beers_deploy.model.raster.images import list_images, site_of
 from beers_deploy.model.shipped import INT8, SENSOR, shipped_weights
 from beers_deploy.model.training.checkpoint import TrainingRecipe
 from beers_deploy.model.training.patches import PatchRecipe

@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 from scipy import fft
 
-from beers_deploy.model.io.images import list_images
+from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.simulator.sampling import Scene, read_scene
 from beers_deploy.profiles.sensor import Instrument
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy import fft
 
-from beers_deploy.model.io.images import read_pixels
+from beers_deploy.model.raster.images import read_pixels
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument
 

@@ -31,11 +31,11 @@ from beers_deploy.model.convbeers import (
 )
 from beers_deploy.model.family import SensorFamily
 from beers_deploy.model.io.files import sha256, whole_file
-from beers_deploy.model.io.images import list_images, site_of
 from beers_deploy.model.io.pictures import busiest_windows, grid, stretch_of, strip_row
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.model.metrics.perceptual import Lpips, find_backbone, not_found
 from beers_deploy.model.progress import steps
+from beers_deploy.model.raster.images import list_images, site_of
 from beers_deploy.model.simulator.acquire import LEAST_SIDE_PX, fitting_oversampling, simulate_pair
 from beers_deploy.model.simulator.chart import draw_charts
 from beers_deploy.model.simulator.detector import Draw

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beers_deploy.model.io.images import read_acquisition
+from beers_deploy.model.raster.images import read_acquisition
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.training.patches import Files, turn
 from beers_deploy.model.training.source import Batch

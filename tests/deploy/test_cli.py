@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from beers_deploy import __version__
 from beers_deploy.cli import COMMANDS, app
-from beers_deploy.model.io.images import read_acquisition
+from beers_deploy.model.raster.images import read_acquisition
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import CRASHED, ImageError
 from beers_deploy.studies.demo import load_sensors, read_input

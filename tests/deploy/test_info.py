@@ -10,12 +10,12 @@ import pytest
 import tifffile
 
 from beers_deploy.info import info_row
+from beers_deploy.model.raster.reader import GdalSource
 from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles import load_target
 from beers_deploy.profiles.figures import Row
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.run import restore_file
-from beers_deploy.restoration.source import TiffSource
 from tests.deploy.command_line import done
 
 TAGS = [
@@ -50,14 +50,14 @@ def test_of_a_large_image_few_pixels_are_read(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.ones((900, 700), np.uint16))
-    read_rows = TiffSource.read
+    read_rows = GdalSource.read
     rows = list[int]()
 
-    def counting(self: TiffSource, start: int, stop: int) -> np.ndarray:
+    def counting(self: GdalSource, start: int, stop: int) -> np.ndarray:
         rows.append(stop - start)
         return read_rows(self, start, stop)
 
-    monkeypatch.setattr(TiffSource, "read", counting)
+    monkeypatch.setattr(GdalSource, "read", counting)
     monkeypatch.setattr("beers_deploy.restoration.detectors.look.LOOKED_PX", 200 * 700)
     about(tmp_path / "in.tif", Options(model, tile_px=23))
     assert 100 < sum(rows) < 300

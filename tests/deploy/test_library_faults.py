@@ -9,47 +9,43 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 import pytest
+import rasterio
 import tifffile
-from PIL import Image, PngImagePlugin
+from rasterio.errors import RasterioIOError
+from rasterio.io import MemoryFile
 
 from beers_deploy.cli import ending
 from beers_deploy.commands.restore import restore
-from beers_deploy.model.io import tiff
 from beers_deploy.model.processor import int8_adds_exactly
+from beers_deploy.model.raster.compression import Compression
+from beers_deploy.model.raster.writer import require_codec
 from beers_deploy.profiles.errors import (
     CODE_FAULTS,
     CRASHED,
-    MissingExtraError,
     ModelError,
+    OptionError,
     printable,
 )
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.untrusted import contradictions
-from beers_deploy.restoration.options import Compression
-from beers_deploy.restoration.output import require_codec
 from tests.deploy.command_line import done
 
 PIXELS = np.full((20, 30), 900, np.uint16)
 
 
-def test_an_argument_that_tifffile_does_not_know(
+def test_an_argument_that_rasterio_does_not_take(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tifffile.imwrite(tmp_path / "raw.tif", PIXELS)
-    monkeypatch.setitem(tiff.PLAIN, "is_of_the_future", False)
+
+    def of_the_future(*_: object, **__: object) -> None:
+        raise TypeError("open() got an unexpected keyword argument")
+
+    monkeypatch.setattr(rasterio, "open", of_the_future)
     message = done("info", tmp_path / "raw.tif", code=CRASHED)
-    assert f"tifffile {version('tifffile')}" in message
-    assert "is_of_the_future" in message
+    assert "unexpected keyword argument" in message
     assert "whole image" not in message
-
-
-def test_a_name_that_pillow_lacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    Image.fromarray(PIXELS).save(tmp_path / "raw.png")
-    monkeypatch.setattr(PngImagePlugin.PngImageFile, "_open", lambda self: self.of_the_future)
-    message = done("info", tmp_path / "raw.png", code=CRASHED)
-    assert f"pillow {version('pillow')}" in message
-    assert "of_the_future" in message
 
 
 @pytest.mark.parametrize("kind", CODE_FAULTS)
@@ -97,16 +93,18 @@ def test_a_run_of_onnxruntime_that_fails_is_no_fault_of_the_file(
     assert f"onnxruntime {version('onnxruntime')}" in message or "fault of this program" in message
 
 
-def test_a_fault_of_the_writer_is_no_missing_codec(monkeypatch: pytest.MonkeyPatch) -> None:
-    def failing(reason: str) -> Callable[..., None]:
+def test_a_compression_that_gdal_lacks_is_refused_before_the_run(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def failing(reason: Exception) -> Callable[..., None]:
         def write(*_: object, **__: object) -> None:
-            raise ValueError(reason)
+            raise reason
 
         return write
 
-    monkeypatch.setattr(tifffile, "imwrite", failing("odd"))
-    with pytest.raises(ValueError, match=r"^odd$"):
+    monkeypatch.setattr(MemoryFile, "open", failing(TypeError("odd")))
+    with pytest.raises(TypeError, match=r"^odd$"):
         require_codec(Compression.zlib)
-    monkeypatch.setattr(tifffile, "imwrite", failing("<LZW> requires the 'imagecodecs' package"))
-    with pytest.raises(MissingExtraError, match="an installed codec"):
-        require_codec(Compression.zlib)
+    monkeypatch.setattr(MemoryFile, "open", failing(RasterioIOError("missing codec")))
+    with pytest.raises(OptionError, match="the installed GDAL"):
+        require_codec(Compression.zstd)

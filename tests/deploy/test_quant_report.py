@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from beers_deploy.export import to_onnx
-from beers_deploy.model.io.tiff import write_tiff
+from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles import load_sensor

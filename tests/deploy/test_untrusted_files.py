@@ -21,19 +21,19 @@ from beers_deploy.cli import app
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.model.convbeers import arrays, load_network
 from beers_deploy.model.dataset import _read_summary
-from beers_deploy.model.io.images import read_pixels
 from beers_deploy.model.io.lock import part_folder
 from beers_deploy.model.io.tensors import read_tensors as read_weights
 from beers_deploy.model.io.tensors import write_tensors
 from beers_deploy.model.metrics.perceptual import read_tensors
+from beers_deploy.model.raster.images import read_pixels
 from beers_deploy.model.training.run import Log
 from beers_deploy.profiles.errors import BeersError, ModelError, OptionError, ProfileError
 from beers_deploy.profiles.figures import Check, Row, measured
 from beers_deploy.profiles.toml import HERE, read_json, read_toml_text
 from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.journal import FinishedRow, journal_text
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.output import Checkpoint
 from beers_deploy.results import Table
 from beers_deploy.studies.tradeoff.measure import Measurements
 from tests.deploy.command_line import refused

@@ -29,7 +29,6 @@ Sitting = tuple[str, ...]
 
 LEFT_OUT = {
     "pip install 'beers-deploy[notebook]'": "fetches from a registry",
-    "pip install 'beers-deploy[gdal]'": "fetches from a registry",
     "apt-get install gdal-bin python3-qgis": "changes the system",
     "pytest tests/deploy/restoration/test_other_readers.py": "is a part of the suite",
     "xdputil query": "is a program of the board",

@@ -125,7 +125,7 @@ def labelled_pictures(folder: Path) -> None:
 
 def other_formats(folder: Path) -> None:
     """What GDAL reads."""
-    from tests.deploy.restoration import images
+    from tests.model.raster import formats as images
 
     pixels = images.digital_numbers(bands=1)
     images.write_jp2(folder / "raw.jp2", pixels, NBITS=12)

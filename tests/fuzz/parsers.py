@@ -22,18 +22,18 @@ from beers_deploy.dpu.graph import Network
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.model.convbeers import BankedConvBEERS, load_network
 from beers_deploy.model.dataset import _read_summary, read_pairs_recipe
-from beers_deploy.model.io.images import read_pixels
 from beers_deploy.model.io.lock import part_folder
 from beers_deploy.model.metrics.perceptual import read_tensors
+from beers_deploy.model.raster.images import read_pixels
 from beers_deploy.model.training.run import Log
 from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.figures import Check, Row, measured, predicted, unavailable
 from beers_deploy.profiles.response import read_response
 from beers_deploy.profiles.scene_call import load_scene_call
 from beers_deploy.quant.limits import limits_of
+from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.journal import FinishedRow, journal_text
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.output import Checkpoint
 from beers_deploy.results import Table, by_row, cell
 from beers_deploy.studies.tradeoff.measure import Measurements
 from tests.deploy.dpu.graphs import integer_convbeers

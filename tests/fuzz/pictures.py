@@ -11,7 +11,7 @@ import numpy as np
 import tifffile
 from PIL import Image
 
-from beers_deploy.restoration.source import open_source
+from beers_deploy.model.raster.reader import open_raster
 
 
 def written(make: Callable[[Path], object], path: Path) -> bytes:
@@ -63,7 +63,7 @@ def image_of(options: dict[str, str]) -> bytes:
 
 def read_rows(path: Path) -> None:
     """What `restore` reads: bands of rows, a large image only in part."""
-    with open_source(path) as source:
+    with open_raster(path) as source:
         raster = source.raster
         if raster.bands * raster.width_px * min(raster.height_px, 64) < 1 << 24:
             source.held_bytes(64)
@@ -80,7 +80,7 @@ def _with_tiles(name: str) -> dict[str, bytes]:
     """An image, or an index and what it names, by their names; a test is skipped where rasterio is
     not installed.
     """
-    from tests.deploy.restoration import images
+    from tests.model.raster import formats as images
 
     with TemporaryDirectory() as folder:
         images.FORMATS[name](Path(folder) / name, images.digital_numbers())

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from beers_deploy.model.io.files import write_text
+from beers_deploy.model.raster.facts import Raster
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.restoration.source import Raster
 
 OPTION = "--fix-detectors"
 FOUND = "found"

@@ -12,10 +12,11 @@ import numpy as np
 from beers_deploy.model.metrics.detector_lines import Stripes, constant_columns
 from beers_deploy.model.metrics.detector_pixels import PATCH_PX, wrong_pixels
 from beers_deploy.model.progress import Log
+from beers_deploy.model.raster.facts import Raster
+from beers_deploy.model.raster.source import Source, strips
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.restoration.detectors.fault_list import FOUND, Fault, FaultList, read_list
 from beers_deploy.restoration.detectors.look import as_floats, look_at_detectors, value_steps
-from beers_deploy.restoration.source import Plane, Raster, Source, strips
 
 REACH_PX = 16
 """How far away a sound neighbour may lie."""
@@ -143,7 +144,6 @@ class FixedSource:
         self.faults = faults
         self.raster = source.raster
         self.files = source.files
-        self.veil: Plane | None = source.veil
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), masked where the
@@ -167,6 +167,10 @@ class FixedSource:
         if isinstance(stored, np.ma.MaskedArray):
             return np.ma.MaskedArray(pixels[:, within], mask=np.ma.getmaskarray(stored)[:, within])
         return pixels[:, within]
+
+    def read_mask(self, start: int, stop: int) -> np.ndarray:
+        """Read the same rows of the image's mask or alpha."""
+        return self._source.read_mask(start, stop)
 
     def held_bytes(self, rows_px: int) -> int:
         """As the image's own, and the rows around with their flags."""

@@ -22,7 +22,8 @@ from beers_deploy.model.metrics.detector_lines import (
 )
 from beers_deploy.model.metrics.detector_phases import Pattern, judge_phases, measure_phases
 from beers_deploy.model.metrics.detector_pixels import wrong_pixels
-from beers_deploy.restoration.source import Raster, Source
+from beers_deploy.model.raster.facts import Raster
+from beers_deploy.model.raster.source import Source
 
 LOOKED_PX = 1 << 23
 """Pixels of all bands that are looked at: one to two seconds on one core (measured)."""

@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from beers_deploy.model.metrics.detector_lines import Stripes
 from beers_deploy.model.metrics.detector_phases import COLOUR, Pattern
 from beers_deploy.model.progress import Log
+from beers_deploy.model.raster.source import Source
 from beers_deploy.profiles.figures import Figure, measured, unavailable
 from beers_deploy.restoration.detectors.fault_list import FOUND, OPTION
 from beers_deploy.restoration.detectors.look import BandFaults, look_at_detectors
-from beers_deploy.restoration.source import Source
 
 SHARPENS = "restoration about doubles it"
 EQUALISE = "equalise the image first"

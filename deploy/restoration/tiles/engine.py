@@ -12,13 +12,14 @@ from typing import NamedTuple
 import numpy as np
 
 from beers_deploy.model.consistency import RAW_REACH_PX, REACH_PX, Consistency, Placed
-from beers_deploy.model.io.images import remedy_outside
+from beers_deploy.model.raster.facts import Raster
+from beers_deploy.model.raster.full_scale import remedy_outside
+from beers_deploy.model.raster.source import Source
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.quant.tiling.walk import Tiling
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Span
 from beers_deploy.restoration.radiometry import require_room
-from beers_deploy.restoration.source import Raster, Source
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 from beers_deploy.restoration.tiles.missing import fill_from_nearest
 
@@ -333,7 +334,7 @@ def as_stored(raster: Raster, restored: np.ndarray, full_scale: float) -> np.nda
     A restored pixel that falls on the nodata value, which would read as missing, takes the number
     beside it.
     """
-    result = np.rint(restored) if raster.out_dtype.kind == "u" else restored
+    result = np.rint(restored) if raster.out_dtype.kind != "f" else restored
     result = result.astype(raster.out_dtype)
     nodata = raster.nodata
     # A restored pixel lies between 0 and full scale, so another nodata value is never hit.
@@ -343,7 +344,7 @@ def as_stored(raster: Raster, restored: np.ndarray, full_scale: float) -> np.nda
 
 
 def _beside(raster: Raster, nodata: float, full_scale: float) -> float:
-    if raster.out_dtype.kind == "u":
+    if raster.out_dtype.kind != "f":
         return nodata + 1 if nodata + 1 <= full_scale else nodata - 1
     towards = full_scale if nodata < full_scale else 0
     return float(np.nextafter(np.float32(nodata), np.float32(towards)))

@@ -13,13 +13,13 @@ import numpy as np
 import onnx
 
 from beers_deploy.model.consistency import RAW_REACH_PX, REACH_PX
+from beers_deploy.model.raster.facts import Raster
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.tiling.walk import Tiling
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.plan import Plan, Span, plan_for
 from beers_deploy.restoration.radiometry import full_scale_of
 from beers_deploy.restoration.runtime import Packed
-from beers_deploy.restoration.source import Raster
 from beers_deploy.restoration.steps import consistency_steps, exposed_networks
 from beers_deploy.restoration.tiles.engine import NAME, Restorer, checked_strip
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork

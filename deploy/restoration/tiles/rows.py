@@ -18,13 +18,14 @@ from typing import NamedTuple
 import numpy as np
 
 from beers_deploy.model.consistency import Consistency
+from beers_deploy.model.raster.facts import Raster
+from beers_deploy.model.raster.source import ArraySource, Source
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.quant.untrusted import times
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Plan, Span
 from beers_deploy.restoration.runtime import Infer
-from beers_deploy.restoration.source import ArraySource, Raster, Source
 from beers_deploy.restoration.tiles.engine import Restorer, Strip, Tile
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 

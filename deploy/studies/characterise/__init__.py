@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from beers_deploy.model.io.tiff import write_tiff
 from beers_deploy.model.progress import Progress, reporting
+from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import load_sensor

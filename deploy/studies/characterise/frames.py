@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.model.io.images import list_images
 from beers_deploy.model.metrics.uneven_edge import HALF_PX
+from beers_deploy.model.raster.images import list_images
+from beers_deploy.model.raster.reader import open_raster
 from beers_deploy.profiles.errors import ImageError, OptionError
-from beers_deploy.restoration.source import open_source
 
 TILE_PX = 1024
 BOX_PX = 2 * int(HALF_PX) + 1
@@ -195,7 +195,7 @@ def _settled_bits(stated: int | None, largest: int, step: int, piled: bool) -> i
 
 def read_raw(path: Path) -> np.ndarray:
     """Stored values (H, W) of one band, integers of any width; 0 where they are missing."""
-    with open_source(path) as source:
+    with open_raster(path) as source:
         raster = source.raster
         rows = source.read(0, raster.height_px)
     if raster.bands != 1:

@@ -21,10 +21,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beers_deploy.model.io.files import IMAGE_SUFFIXES
-from beers_deploy.model.io.images import image_size_px, list_images
+from beers_deploy.model.raster.images import image_size_px, list_images
+from beers_deploy.model.raster.index import parse_xml
 from beers_deploy.profiles.errors import MissingExtraError, OptionError
 from beers_deploy.profiles.toml import read_json, read_whole
-from beers_deploy.restoration.index_files import parse_xml
 from beers_deploy.studies.detection.boxes import Boxes, areas
 from beers_deploy.studies.detection.detector import class_names, letters
 

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.model.io.images import site_of
 from beers_deploy.model.io.pictures import stretch_of
 from beers_deploy.model.progress import Log, no_log, once, steps
+from beers_deploy.model.raster.images import site_of
 from beers_deploy.model.simulator.acquire import acquire_padded
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import read_scene

@@ -16,7 +16,6 @@ from PIL import Image
 
 from beers_deploy.model.dataset import profiles_for, read_pairs_recipe
 from beers_deploy.model.io.files import whole_file
-from beers_deploy.model.io.images import list_images
 from beers_deploy.model.io.pictures import (
     busiest_windows,
     error_row,
@@ -27,6 +26,7 @@ from beers_deploy.model.io.pictures import (
 )
 from beers_deploy.model.metrics.bootstrap import too_few
 from beers_deploy.model.progress import Log, Progress, no_log, once, reporting
+from beers_deploy.model.raster.images import list_images
 from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.pairs import Pair
 from beers_deploy.profiles.errors import OptionError

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.model.io.images import site_of
 from beers_deploy.model.metrics.bootstrap import site_interval
 from beers_deploy.model.metrics.fidelity import fidelity_db
 from beers_deploy.model.progress import steps
+from beers_deploy.model.raster.images import site_of
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.profiles.figures import Figure, Row, measured
 from beers_deploy.profiles.sensor import Instrument, Sensor, noise_from_snr

@@ -24,9 +24,9 @@ from beers_deploy.bench.traditional import drawn_acquisition
 from beers_deploy.export import float_model
 from beers_deploy.model.consistency import Consistency
 from beers_deploy.model.io.files import sha256, write_text
-from beers_deploy.model.io.images import list_images
 from beers_deploy.model.metrics.perceptual import find_backbone
 from beers_deploy.model.processor import processor_name
+from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.shipped import DETECTOR
 from beers_deploy.profiles import load_sensor, sensor_names
 from beers_deploy.profiles.errors import OptionError

@@ -14,10 +14,10 @@ from beers_deploy.bench.swath import PAPER_SIZE, Swath, parse_size
 from beers_deploy.bench.tables import PAPER_TARGET, published_rows
 from beers_deploy.dpu.board import BoardLike, boards_of, dpu_of
 from beers_deploy.dpu.cost.model import Constants
-from beers_deploy.model.io.images import list_images
 from beers_deploy.model.metrics.bootstrap import too_few
 from beers_deploy.model.metrics.perceptual import find_backbone
 from beers_deploy.model.progress import Log, Progress, no_log, reporting, steps
+from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.shipped import INT8 as SUFFIX
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike, SensorLike

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from beers_deploy.profiles.errors import MachineError, ModelError, OptionError
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.session import open_session, tensors_of
 from beers_deploy.quant.tiling.walk import Tiling, tiling_of
-from beers_deploy.restoration.georeference import enlarged_tags
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.run import restore_file
@@ -211,40 +209,6 @@ def test_a_result_of_another_shape_than_the_file_says_is_refused(tmp_path: Path)
         ModelError, match="expected a result of 2 x 60 x 60, as its file says, got 1 x 60 x 60"
     ):
         by_file(np.ones((30, 30), np.uint16), tmp_path, Options(path, 40))
-
-
-AREA = (1, 1, 0, 1, 1025, 0, 1, 1)
-POINT = (1, 1, 0, 1, 1025, 0, 1, 2)
-
-
-@pytest.mark.parametrize("keys", [AREA, POINT])
-def test_places_on_earth_stay_where_they_are(keys: tuple[int, ...]) -> None:
-    """By tie point and by matrix: the middle of four pixels is that of the one they came from."""
-    tie = (3.0, 5.0, 0.0, 700.0, 900.0, 0.0)
-    scale = (2.0, 4.0, 0.0)
-    matrix = (2.0, 0.5, 0, 10, 0.25, -4, 0, 20, 0, 0, 1, 0, 0, 0, 0, 1)
-    values = {33550: scale, 33922: tie, 34264: matrix}
-    tags = tuple((code, 12, len(value), value, True) for code, value in values.items())
-    larger = {tag[0]: tag[3] for tag in enlarged_tags((*tags, (34735, 3, 8, keys, True)), 2)}
-    middle = 0.5 if keys is AREA else 0.0
-
-    def by_tie(tag_values: dict[int, Any], column: float, row: float) -> list[float]:
-        point = tag_values[33922]
-        size = tag_values[33550]
-        return [
-            point[3] + (column + middle - point[0]) * size[0],
-            point[4] - (row + middle - point[1]) * size[1],
-        ]
-
-    def by_matrix(tag_values: dict[int, Any], column: float, row: float) -> list[float]:
-        m = tag_values[34264]
-        return [m[k] * (column + middle) + m[k + 1] * (row + middle) + m[k + 3] for k in (0, 4)]
-
-    for place in (by_tie, by_matrix):
-        corners = product((0, 1), repeat=2)
-        four = [place(larger, 2 * 7 + i, 2 * 9 + j) for i, j in corners]
-        np.testing.assert_allclose(np.mean(four, axis=0), place(values, 7, 9))
-    assert enlarged_tags(tags, 1) is tags
 
 
 def test_a_larger_file_has_its_tags(tmp_path: Path) -> None:

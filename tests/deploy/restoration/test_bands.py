@@ -4,13 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 import tifffile
 
+from beers_deploy.model.raster.reader import open_raster
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.restoration.bands import band_names, parse_sensors
-from beers_deploy.restoration.source import Raster, open_source
+from beers_deploy.restoration.bands import parse_sensors
 from tests.deploy.command_line import done, refused
-from tests.deploy.restoration import images
+from tests.model.raster import formats as images
 
 FIRST = "pleiades-degraded"
 SECOND = "blind"
@@ -42,9 +43,9 @@ def test_bands_without_names_are_taken_in_order(tmp_path: Path) -> None:
         planarconfig="separate",
         photometric="minisblack",
     )
-    with open_source(tmp_path / "in.tif") as source:
+    with open_raster(tmp_path / "in.tif") as source:
         assert source.raster.bands == 2
-        assert band_names(source.raster) == ()
+        assert source.raster.band_names == ()
     result, _ = restored(tmp_path / "in.tif", f"red={SECOND},blue={FIRST}")
     for band, sensor in ((0, SECOND), (1, FIRST)):
         np.testing.assert_array_equal(result[band], restored(tmp_path / "in.tif", sensor)[0][band])
@@ -56,7 +57,7 @@ def test_bands_without_names_are_taken_in_order(tmp_path: Path) -> None:
 def test_a_cog_names_the_sensors_in_the_order_of_the_bands(tmp_path: Path) -> None:
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
     restored(image, f"B1={FIRST},B0={SECOND}", "--cog")
-    with images.rasterio.open(tmp_path / "out.tif") as file:
+    with rasterio.open(tmp_path / "out.tif") as file:
         assert file.tags()["RESTORED_SENSOR"] == f"{SECOND}, {FIRST}"
         assert len(file.tags()["RESTORED_NETWORK_SHA256"].split(", ")) == 2
 
@@ -77,11 +78,7 @@ def test_what_does_not_fit_is_refused(sensor: str, words: str, tmp_path: Path) -
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]
 
 
-def test_names_are_read_from_no_bomb() -> None:
-    bomb = '<!DOCTYPE a [<!ENTITY b "x">]><a><Item sample="0" role="description">&b;</Item></a>'
-    assert (
-        band_names(Raster(1, 9, 9, np.dtype(np.uint16), None, ((42112, 2, 0, bomb, True),))) == ()
-    )
+def test_the_path_of_a_profile_is_for_all_bands() -> None:
     assert parse_sensors("my.toml") == {"": "my.toml"}
     with pytest.raises(OptionError):
         parse_sensors("=a,B1=b")

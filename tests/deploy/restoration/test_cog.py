@@ -2,27 +2,26 @@
 done.
 """
 
-import sys
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import rasterio
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from beers_deploy.model.io.files import sha256
+from beers_deploy.model.raster.compression import Compression
+from beers_deploy.model.raster.writer import cog_bytes
 from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.errors import MachineError
-from beers_deploy.restoration.cog import disk_bytes
-from beers_deploy.restoration.options import Compression, Options
+from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.run import restore_file
-from tests.deploy.restoration import images
+from tests.model.raster import formats as images
 
-rasterio: Any = images.rasterio
 cogeo: Any = pytest.importorskip("rio_cogeo")
 
 
@@ -98,9 +97,8 @@ def test_a_run_stopped_while_it_is_written_goes_on(
         (tmp_path / ".out.tif.part" / "cog.tif.ovr.tmp").touch()
         raise RuntimeError("no space left")
 
-    shutil: Any = import_module("rasterio.shutil")
     with monkeypatch.context() as patch:
-        patch.setattr(shutil, "copy", full)
+        patch.setattr("beers_deploy.model.raster.writer.copy", full)
         with pytest.raises(MachineError, match=r"no space left.*`resume` from row 150 of 150"):
             restore_file(image, tmp_path / "out.tif", options)
     assert (tmp_path / "out.tif").read_bytes() == b"the old one"
@@ -123,16 +121,6 @@ def test_it_is_valid_at_any_size(height: int, width: int, model: Path, tmp_path:
     assert cogeo.cog_validate(tmp_path / "out.tif")[0]
 
 
-def test_without_rasterio_it_is_one_sentence(
-    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    monkeypatch.setitem(sys.modules, "rasterio", None)
-    with pytest.raises(MachineError, match=r"cog.*pip install 'beers-deploy\[gdal\]'"):
-        restore_file(image, tmp_path / "out.tif", Options(model, cog=True))
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]
-
-
 @pytest.mark.parametrize("shape", [(1, 150, 118), (2, 520, 90), (2, 90, 1700), (3, 1100, 700)])
 def test_the_disk_is_asked_for_all_that_stands_on_it_at_a_time(
     shape: tuple[int, int, int], model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -145,7 +133,7 @@ def test_the_disk_is_asked_for_all_that_stands_on_it_at_a_time(
     options = Options(model, tile_px=256, cog=True, compression=Compression.none)
     free = 0
     tiles = shape[0] * -(-shape[1] // 256) * -(-shape[2] // 256) * 256**2
-    needed = 2 * shape[0] * shape[1] * shape[2] + 2 * tiles + disk_bytes(shape, 2)
+    needed = 2 * shape[0] * shape[1] * shape[2] + 2 * tiles + cog_bytes(shape, 2)
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=free))
     free = needed - 1
     with pytest.raises(MachineError, match="of disk"):

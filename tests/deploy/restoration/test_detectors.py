@@ -10,6 +10,8 @@ import tifffile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from beers_deploy.model.raster.facts import Raster
+from beers_deploy.model.raster.source import ArraySource
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.restoration.detectors.fault_list import Fault, FaultList, read_list
 from beers_deploy.restoration.detectors.fix import REACH_PX, FixedSource, find_faults
@@ -17,7 +19,6 @@ from beers_deploy.restoration.detectors.look import LOOKED_PX, look_at_detectors
 from beers_deploy.restoration.detectors.words import sentences
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.run import restore_file
-from beers_deploy.restoration.source import ArraySource, Raster, VeiledSource
 from tests.deploy.command_line import done, refused
 from tests.deploy.restoration.runs import stopped_after
 
@@ -116,9 +117,9 @@ def test_missing_pixels_stay_missing_and_are_no_neighbours() -> None:
     fixed = FixedSource(source_of(pixels, nodata=7.0), faults).read(0, HEIGHT)[0]
     np.testing.assert_array_equal(fixed[:, 61:], pixels[:, 61:])
     np.testing.assert_array_equal(fixed[:, 60], pixels[:, 59])
-    planes = np.stack([pixels, (pixels != 7).astype(np.uint16)])
-    veiled = FixedSource(VeiledSource(source_of(planes), "unassalpha"), faults)
-    rows = veiled.read(3, 9)
+    masked = np.ma.MaskedArray(pixels[None], pixels[None] == 7)
+    raster = Raster(1, HEIGHT, WIDTH, pixels.dtype, mask_kind="mask")
+    rows = FixedSource(ArraySource(masked, raster), faults).read(3, 9)
     np.testing.assert_array_equal(np.ma.getmaskarray(rows)[0], pixels[3:9] == 7)
     np.testing.assert_array_equal(np.ma.getdata(rows)[0], fixed[3:9])
 

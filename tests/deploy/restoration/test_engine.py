@@ -9,11 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from beers_deploy.model.raster.facts import Raster
+from beers_deploy.model.raster.source import ArraySource
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.quant.tiling.walk import Tiling
 from beers_deploy.restoration.plan import Plan, make_plan
 from beers_deploy.restoration.runtime import AT_ONCE, Infer, session_threads, tiles_at_once
-from beers_deploy.restoration.source import ArraySource, Raster
 from beers_deploy.restoration.tiles.engine import Restorer
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 from beers_deploy.restoration.tiles.rows import restore_rows

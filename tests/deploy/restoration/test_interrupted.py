@@ -16,14 +16,15 @@ from hypothesis import strategies as st
 
 from beers_deploy.model.io.lock import part_folder
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
+from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.output import Checkpoint
 from beers_deploy.restoration.plan import Span
 from beers_deploy.restoration.run import read_network, restore_file
 from beers_deploy.restoration.tiles.engine import Restorer
 from beers_deploy.restoration.tiles.rows import RestoredRow
 from tests.deploy.restoration.runs import noise, stopped_after
+from tests.model.raster import formats
 
 TILE_PX = 64
 JOB: dict[str, object] = {"image": "a"}
@@ -135,9 +136,9 @@ def same_size_and_time(path: Path) -> Iterator[None]:
 
 
 def write_mask(image: Path, hidden_rows: int) -> None:
-    mask = np.full((700, 260), 255, np.uint8)
-    mask[:hidden_rows] = 0
-    tifffile.imwrite(image.with_name("in.tif.msk"), mask)
+    known = np.ones((700, 260), bool)
+    known[:hidden_rows] = False
+    formats.write_mask(image, known)
 
 
 def write_nodata(image: Path, value: int) -> None:

@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rasterio
 
 from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.sensor_file import BLIND
-from beers_deploy.restoration.cog import write_item
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.run import restore_file
-from tests.deploy.restoration import images
+from beers_deploy.restoration.stac import write_item
+from tests.model.raster import formats as images
 
 ROOT = Path(__file__).parents[3]
 PYTHON = Path("/usr/bin/python3")
@@ -149,7 +150,7 @@ def restore_with_a_hole(folder: Path, model: Path) -> np.ndarray:
     pixels[:, 30:60, 20:90] = 0
     image = images.write_tiff(folder / "in.tif", pixels, nodata=0)
     restore_file(image, folder / "out.tif", Options(model, cog=True))
-    with images.rasterio.open(folder / "out.tif") as file:
+    with rasterio.open(folder / "out.tif") as file:
         restored: np.ndarray = file.read()
     return restored
 
@@ -195,8 +196,8 @@ def test_qgis_s_toolbox_restores(qgis: Path, tmp_path: Path) -> None:
     assert "expected a TIFF's name" in log
     restore_file(image, tmp_path / "expected.tif", Options(shipped_pair(sensor=BLIND)[1]))
     with (
-        images.rasterio.open(outs[0]) as ours,
-        images.rasterio.open(tmp_path / "expected.tif") as theirs,
+        rasterio.open(outs[0]) as ours,
+        rasterio.open(tmp_path / "expected.tif") as theirs,
     ):
         np.testing.assert_array_equal(ours.read(), theirs.read())
         assert ours.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import tifffile
 
-from beers_deploy.model.io.images import Extent
+from beers_deploy.model.raster.facts import Extent, Raster
+from beers_deploy.model.raster.reader import open_raster
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Row
@@ -18,7 +19,6 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
 from beers_deploy.restoration.run import restore_file
-from beers_deploy.restoration.source import Raster, open_source
 from tests.deploy.restoration.runs import restored
 
 SHAPE = 61, 47
@@ -127,7 +127,7 @@ def test_a_container_states_nothing_and_a_product_s_range_does(tmp_path: Path) -
             "<Dynamic_Range><PRODUCT_RANGE>12</PRODUCT_RANGE></Dynamic_Range>",
         ),
     ):
-        with open_source(image) as source:
+        with open_raster(image) as source:
             bits.append(source.raster.bits)
     assert bits == [None, None, None, 12, 12]
 

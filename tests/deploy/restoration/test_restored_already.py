@@ -16,6 +16,8 @@ from scipy.ndimage import gaussian_filter
 
 import beers_deploy as bd
 from beers_deploy.model.family import SNR_BRIGHT, SensorFamily
+from beers_deploy.model.raster.facts import Raster
+from beers_deploy.model.raster.source import ArraySource
 from beers_deploy.model.shipped import INT8
 from beers_deploy.model.simulator.acquire import acquire_three, prepare_scene
 from beers_deploy.model.simulator.detector import Draw, to_uint16
@@ -25,7 +27,6 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import BLIND, load_sensor
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.restoration.sensor_check import restored_already
-from beers_deploy.restoration.source import ArraySource, Raster
 from tests.deploy.command_line import done
 
 NETWORK = f"convbeers-xs{INT8}"

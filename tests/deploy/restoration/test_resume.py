@@ -17,8 +17,9 @@ import numpy as np
 import pytest
 import tifffile
 
+from beers_deploy.model.raster.compression import Compression
 from beers_deploy.profiles.errors import MachineError, OptionError
-from beers_deploy.restoration.options import Compression, Options
+from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.run import restore_file
 from tests.deploy.restoration.runs import begin, noise, stop_after, stopped_after, until
 

@@ -10,8 +10,8 @@ import pytest
 from beers_deploy.model.io.lock import part_folder
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.run import restore_file
-from tests.deploy.restoration import images
 from tests.deploy.restoration.runs import begin
+from tests.model.raster import formats as images
 
 pytestmark = pytest.mark.slow
 

@@ -11,9 +11,10 @@ import pytest
 import tifffile
 
 import beers_deploy as bd
+from beers_deploy.model.raster.facts import Raster
+from beers_deploy.model.raster.source import ArraySource
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.sensor_check import SensorCheck, check_source
-from beers_deploy.restoration.source import ArraySource, Raster
 from tests.deploy.command_line import done, refused
 
 NAME = "pleiades-degraded"

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import rasterio
 
 from tests.deploy.command_line import done, refused
-from tests.deploy.restoration import images
+from tests.model.raster import formats as images
 
 pystac: Any = pytest.importorskip("pystac")
-rasterio: Any = images.rasterio
 
 
 def restored_item(image: Path, item: Path, model: Path) -> dict[str, Any]:
@@ -53,6 +53,6 @@ def test_it_goes_with_a_cog_and_needs_its_package(
     outputs = (tmp_path / "out.tif", "--stac", tmp_path / "i.json")
     words = ("restore", image, *outputs, "--network", model)
     monkeypatch.setitem(sys.modules, "pystac", None)
-    for more, sentence in (([], "--stac: expected --cog"), (["--cog"], "beers-deploy[gdal]")):
+    for more, sentence in (([], "--stac: expected --cog"), (["--cog"], "beers-deploy[stac]")):
         assert sentence in refused(*words, *more)
         assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]

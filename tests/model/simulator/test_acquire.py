@@ -4,8 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beers_deploy.model.io.images import list_images
 from beers_deploy.model.metrics.fidelity import psnr_db
+from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.simulator.acquire import MARGIN_PX, acquire, acquire_padded, simulate_pair
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene

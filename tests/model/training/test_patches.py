@@ -13,7 +13,7 @@ import torch
 
 from beers_deploy.model.exposure import HEADROOM, factors_for
 from beers_deploy.model.family import RANGES, SensorFamily, noise_over_full_scale
-from beers_deploy.model.io.tiff import write_tiff
+from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.training.looks import VARIED

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beers_deploy.model.io.tiff import write_tiff
 from beers_deploy.model.metrics.fidelity import fidelity_db
+from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.model.shipped import shipped_names
 from beers_deploy.model.simulator.acquire import simulate_pair
 from beers_deploy.model.simulator.detector import Draw

@@ -7,9 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
-
-rasterio: Any = pytest.importorskip("rasterio")
+import rasterio
 
 BANDS = 2
 HEIGHT = 150
@@ -49,6 +47,19 @@ def write(path: Path, pixels: np.ndarray, driver: str, **options: Any) -> Path:
             file.descriptions = [f"B{k}" for k in range(bands)]
             file.scales = [0.1 * (k + 1) for k in range(bands)]
     return path
+
+
+def write_mask(image: Path, known: np.ndarray) -> None:
+    """Write the mask of an image beside it, as GDAL does where the format has none."""
+    height, width = known.shape
+    about = {"driver": "GTiff", "width": width, "height": height, "count": 1, "dtype": "uint8"}
+    with (
+        warnings.catch_warnings(action="ignore"),
+        rasterio.open(image.with_name(f"{image.name}.msk"), "w", **about) as file,
+    ):
+        # 2 says that the mask is for all bands (GDAL's RFC 15).
+        file.update_tags(INTERNAL_MASK_FLAGS_1="2")
+        file.write(np.where(known, 255, 0).astype(np.uint8), 1)
 
 
 def write_tiff(path: Path, pixels: np.ndarray, **options: Any) -> Path:

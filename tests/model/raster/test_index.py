@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from beers_deploy.model.raster.index import index_files
+from beers_deploy.model.raster.reader import open_raster
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.restoration import index_files as indexes
-from beers_deploy.restoration.index_files import index_files
-from beers_deploy.restoration.source import open_source
-from tests.deploy.restoration import images
+from tests.model.raster import formats as images
 
 ONE = images.source("tile.tif", 1, 0, 0, 9, 9)
 
@@ -85,7 +84,7 @@ def test_an_index_that_leads_elsewhere_is_refused(
     text, words = REFUSED[case]
     (folder / "a.vrt").write_text(text)
     (folder / "b.vrt").write_text(vrt(naming("a.vrt")))
-    with pytest.raises(ImageError) as caught, open_source(folder / "a.vrt"):
+    with pytest.raises(ImageError) as caught, open_raster(folder / "a.vrt"):
         pass
     assert words in str(caught.value)
 
@@ -115,7 +114,7 @@ def test_a_circle_ends_and_a_large_index_is_refused(
     (folder / "a.vrt").write_text(vrt(naming("b.vrt")))
     (folder / "b.vrt").write_text(vrt(naming("a.vrt") + ONE))
     assert set(index_files(folder / "a.vrt")) == {folder / "b.vrt", folder / "tile.tif"}
-    monkeypatch.setattr(indexes, "INDEX_BYTES", 30)
+    monkeypatch.setattr("beers_deploy.model.raster.index.INDEX_BYTES", 30)
     with pytest.raises(ImageError, match="more than 30 bytes"):
         index_files(folder / "a.vrt")
 
@@ -135,7 +134,7 @@ def test_code_in_an_index_is_never_run(trusted: bool, tmp_path: Path) -> None:
     index = folder_of(tmp_path) / "a.vrt"
     marker = tmp_path / "made"
     index.write_text(CODE.format(marker=str(marker), source=ONE))
-    with pytest.raises(ImageError), open_source(index, trusted=trusted) as source:
+    with pytest.raises(ImageError), open_raster(index, trusted=trusted) as source:
         source.read(0, 9)
     assert not marker.exists()
 
@@ -162,7 +161,7 @@ def test_a_dimap_that_leads_elsewhere_is_refused(
     text = index.read_text()
     assert before in text
     index.write_text(text.replace(before, after, 1))
-    with pytest.raises(ImageError) as caught, open_source(index):
+    with pytest.raises(ImageError) as caught, open_raster(index):
         pass
     assert words in str(caught.value)
 
@@ -184,7 +183,7 @@ class Silent(http.server.SimpleHTTPRequestHandler):
 def test_a_trusted_index_reaches_outside_and_to_urls(tmp_path: Path) -> None:
     index = folder_of(tmp_path) / "a.vrt"
     index.write_text(vrt(naming("../outside.tif")))
-    with open_source(index, trusted=True) as source:
+    with open_raster(index, trusted=True) as source:
         assert source.read(0, 9).sum() == 81
     with http.server.ThreadingHTTPServer(
         ("127.0.0.1", 0), partial(Silent, directory=tmp_path)
@@ -192,11 +191,11 @@ def test_a_trusted_index_reaches_outside_and_to_urls(tmp_path: Path) -> None:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         url = f"/vsicurl/http://127.0.0.1:{server.server_port}/outside.tif"
         index.write_text(vrt(naming(url)))
-        with open_source(index, trusted=True) as source:
+        with open_raster(index, trusted=True) as source:
             assert source.read(0, 9).sum() == 81
-        with pytest.raises(ImageError, match="trust_index"), open_source(index):
+        with pytest.raises(ImageError, match="trust_index"), open_raster(index):
             pass
         server.shutdown()
     index.write_text(vrt(naming("no.tif")))
-    with pytest.raises(ImageError), open_source(index, trusted=True):
+    with pytest.raises(ImageError), open_raster(index, trusted=True):
         pass

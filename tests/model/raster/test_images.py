@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from beers_deploy.model.io.files import whole_file
-from beers_deploy.model.io.images import image_size_px, list_images, read_pixels, site_of
+from beers_deploy.model.raster.images import image_size_px, list_images, read_pixels, site_of
 from beers_deploy.model.simulator.sampling import read_scene
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
@@ -46,9 +46,9 @@ def test_every_kind_of_file_reads_as_stored(tmp_path: Path) -> None:
 
 
 def test_the_size_of_what_is_no_image_is_refused(tmp_path: Path) -> None:
-    for name in ("a.png", "a.tif", "a.jpg"):
+    for name, kind in (("a.png", "PNG"), ("a.tif", "TIFF"), ("a.jpg", "JPEG")):
         (tmp_path / name).write_bytes(b"neither")
-        with pytest.raises(ImageError, match="a readable TIFF, PNG or JPEG"):
+        with pytest.raises(ImageError, match=f"a readable {kind}"):
             image_size_px(tmp_path / name)
     with pytest.raises(ImageError, match="no such file"):
         image_size_px(tmp_path / "none.png")

@@ -5,7 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from beers_deploy.model.io.images import UNIT_MAX, Extent, extent_of, settled_scale
+from beers_deploy.model.raster.facts import Extent, extent_of
+from beers_deploy.model.raster.full_scale import UNIT_MAX, settled_scale
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.sensor import MAX_DN
 

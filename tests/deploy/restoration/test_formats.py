@@ -2,37 +2,24 @@
 whatever the format.
 """
 
-import sys
 import warnings
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+import rasterio
 import tifffile
 
-from beers_deploy.profiles.errors import BeersError, ImageError, MachineError
-from beers_deploy.restoration.gdal_source import LEAST_CACHE_BYTES, GdalSource
+from beers_deploy.model.raster.reader import open_raster
+from beers_deploy.model.raster.source import fingerprint
+from beers_deploy.profiles.errors import BeersError, ImageError
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.run import restore_file
-from beers_deploy.restoration.source import TiffSource, fingerprint, open_source
 from tests.deploy.command_line import refused
-from tests.deploy.restoration import images
-
-rasterio: Any = images.rasterio
+from tests.model.raster import formats as images
 
 PLACED = ["a.tif", "cog.tif", "a.jp2", "a.vrt", "a.img", "DIM.XML"]
 """A NITF holds an image's corners, to a tenth of a pixel."""
-
-
-@pytest.mark.parametrize("name", images.FORMATS)
-def test_rows_are_those_of_the_image(name: str, tmp_path: Path) -> None:
-    pixels = images.digital_numbers()
-    with open_source(images.FORMATS[name](tmp_path / name, pixels)) as source:
-        assert source.raster.shape == pixels.shape
-        assert isinstance(source, TiffSource if name.endswith("tif") else GdalSource)
-        for start, stop in ((0, 7), (5, 70), (60, images.HEIGHT), (0, images.HEIGHT)):
-            np.testing.assert_array_equal(source.read(start, stop), pixels[:, start:stop])
 
 
 def test_the_restored_pixels_are_the_same_from_every_format(model: Path, tmp_path: Path) -> None:
@@ -64,7 +51,7 @@ def test_polynomials_bits_and_gains_of_a_dimap_are_kept(
     cog: bool, model: Path, tmp_path: Path
 ) -> None:
     image = images.write_dimap(tmp_path / "DIM.XML", images.digital_numbers(10), bits=10)
-    with open_source(image) as source:
+    with open_raster(image) as source:
         assert source.raster.bits == 10
     restore_file(image, tmp_path / "out.tif", Options(model, cog=cog))
     with rasterio.open(image) as before, rasterio.open(tmp_path / "out.tif") as after:
@@ -122,26 +109,6 @@ def test_missing_pixels_stay_missing(model: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(other, first)
 
 
-def test_the_cache_is_counted_with_the_blocks_of_a_mosaic_s_tiles(tmp_path: Path) -> None:
-    pixels = images.digital_numbers()
-    rows = 1 << 20
-    jp2 = images.write_jp2(tmp_path / "a.jp2", pixels)
-    images.write(tmp_path / "strip.tif", pixels, "GTiff", blockysize=140)
-    size = f'rasterXSize="{images.WIDTH}" rasterYSize="{images.HEIGHT}"'
-    bands = "".join(
-        f'<VRTRasterBand dataType="UInt16" band="{band}">'
-        f"{images.source('strip.tif', band, 0, 0, images.HEIGHT, images.WIDTH)}</VRTRasterBand>"
-        for band in (1, 2)
-    )
-    (tmp_path / "a.vrt").write_text(f"<VRTDataset {size}>{bands}</VRTDataset>")
-    for image, block_px in ((jp2, images.TILE_PX), (tmp_path / "a.vrt", 140)):
-        with open_source(image) as source:
-            assert (
-                source.held_bytes(rows) == (rows + 2 * block_px) * images.BANDS * images.WIDTH * 2
-            )
-            assert source.held_bytes(1) == LEAST_CACHE_BYTES
-
-
 def not_restored(image: Path, out: Path, model: Path, error: type[BeersError], *words: str) -> None:
     """One sentence, and nothing written."""
     before = sorted(out.parent.iterdir())
@@ -164,17 +131,12 @@ def test_a_truncated_jpeg_2000_is_one_sentence(
     assert capfd.readouterr().err == ""
 
 
-def test_what_gdal_needs_and_cannot_take_is_said(
-    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_gdal_cannot_read_is_said(model: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.tif"
     (tmp_path / "a.xml").write_text("<WMS_Service/>")
     not_restored(tmp_path / "a.xml", out, model, ImageError, "DIMAP")
     images.write(tmp_path / "c.img", np.ones((1, 9, 9), np.complex64), "HFA")
     not_restored(tmp_path / "c.img", out, model, ImageError, "complex64")
-    image = images.write_jp2(tmp_path / "a.jp2", images.digital_numbers())
-    monkeypatch.setitem(sys.modules, "rasterio", None)
-    not_restored(image, out, model, MachineError, "pip install 'beers-deploy[gdal]'")
 
 
 def test_a_tile_is_no_output(model: Path, tmp_path: Path) -> None:
@@ -194,7 +156,7 @@ def test_a_tile_is_no_output(model: Path, tmp_path: Path) -> None:
 
 def test_a_changed_tile_makes_another_image(tmp_path: Path) -> None:
     image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers())
-    with open_source(image) as source:
+    with open_raster(image) as source:
         before = fingerprint(source.files)
     images.write_jp2(
         tmp_path / "R64C80.jp2", np.zeros((2, images.HEIGHT - 64, images.WIDTH - 80), np.uint16)
@@ -211,11 +173,11 @@ def test_alpha_and_masks_of_gdal_s_formats_are_missing_pixels(tmp_path: Path) ->
         tmp_path / "alpha.jp2", pixels, NBITS=12, PHOTOMETRIC="MINISBLACK", ALPHA="YES"
     )
     images.write_jp2(tmp_path / "beside.jp2", pixels[:1], NBITS=12)
-    tifffile.imwrite(tmp_path / "beside.jp2.msk", np.where(hidden, 0, 255).astype(np.uint8))
-    for name, veil in (("alpha.jp2", "unassalpha"), ("beside.jp2", "mask")):
-        with open_source(tmp_path / name) as source:
+    images.write_mask(tmp_path / "beside.jp2", ~hidden)
+    for name, mask_kind in (("alpha.jp2", "alpha"), ("beside.jp2", "mask")):
+        with open_raster(tmp_path / name) as source:
             rows = source.read(20, 60)
-            assert (source.raster.bands, source.raster.veil) == (1, veil)
+            assert (source.raster.bands, source.raster.mask_kind) == (1, mask_kind)
             np.testing.assert_array_equal(np.ma.getdata(rows)[0], pixels[0, 20:60])
             np.testing.assert_array_equal(source.raster.missing(rows)[0], hidden[20:60])
 
@@ -233,7 +195,7 @@ def test_a_cog_keeps_mask_and_alpha(model: Path, tmp_path: Path) -> None:
         planarconfig="separate",
         extrasamples=[2],
     )
-    tifffile.imwrite(tmp_path / "mask.tif.msk", np.where(hidden, 0, 255).astype(np.uint8))
+    images.write_mask(tmp_path / "mask.tif", ~hidden)
     for name in ("mask", "alpha"):
         restore_file(tmp_path / f"{name}.tif", tmp_path / "out.tif", Options(model, cog=True))
         with warnings.catch_warnings(action="ignore"), rasterio.open(tmp_path / "out.tif") as file:

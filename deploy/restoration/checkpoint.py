@@ -1,0 +1,231 @@
+"""The finished rows of a run on the disk, so that a run that is killed at any moment can go on."""
+
+import hashlib
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beers_deploy.model.io.files import require_regular
+from beers_deploy.model.io.lock import part_folder
+from beers_deploy.model.raster.writer import padded_px
+from beers_deploy.profiles.errors import ImageError, MachineError, OptionError, sizes
+from beers_deploy.restoration.journal import FinishedRow, journal_text, read_journal
+from beers_deploy.restoration.outcome import Tally
+from beers_deploy.restoration.tiles.rows import RestoredRow
+
+PLAIN = "out.tif"
+COG = "cog.tif"
+"""Files of a checkpoint in which the output is written before it is renamed into place."""
+ROWS_FILES = ("journal.json", "journal.new", "rows.raw")
+"""Files of a checkpoint; the journal first, because it counts on the rows."""
+
+
+class Checkpoint:
+    """The finished rows of a restored image (bands, height, width), from the top, and a journal of
+    their digests.
+
+    Attributes:
+        rows: how many are finished.
+        tally: what was seen of them.
+        damaged_rows: how many an earlier run finished that no longer match its journal, and those
+            below them.
+    """
+
+    def __init__(
+        self,
+        out: Path,
+        shape: tuple[int, int, int],
+        dtype: np.dtype[Any],
+        job: Mapping[str, object],
+        resume: bool,
+        cog_bytes: int = 0,
+        row_ends: Sequence[int] = (),
+    ) -> None:
+        """Begin, or go on with what an earlier run left.
+
+        Args:
+            out: the image to write in the end.
+            shape: (bands, height, width).
+            dtype: of the pixels.
+            job: all that decides the pixels; a run is resumed only by one of the same job.
+            resume: go on; where nothing was left, begin.
+            cog_bytes: of disk that the output takes beside the rows and the plain TIFF.
+            row_ends: at which row of pixels each row of tiles ends; a journal of other rows is
+                refused.
+        """
+        self.out = out
+        self.shape = shape
+        self.dtype = dtype
+        self.folder = part_folder(out)
+        for name in ROWS_FILES:
+            require_regular(self.folder / name)
+        self._job = dict(job)
+        self._row_ends = list(row_ends)
+        journal_rows = self._left() if resume else []
+        self._finished = self._matching(journal_rows)
+        self.rows = sum(row.rows_px for row in self._finished)
+        self.tally = sum((row.tally for row in self._finished), Tally())
+        self.damaged_rows = sum(row.rows_px for row in journal_rows) - self.rows
+        with self.disk():
+            if not self.rows:
+                self.remove()
+            # Outputs that a stop left half-written take room that this run needs.
+            self._remove_outputs()
+            out.parent.mkdir(parents=True, exist_ok=True)
+            self._require_room(cog_bytes)
+            self.folder.mkdir(exist_ok=True)
+            (self.folder / "rows.raw").touch()
+
+    def append(self, row: RestoredRow) -> None:
+        """Keep a row of tiles, which must follow those that are kept."""
+        with self.disk():
+            with (self.folder / "rows.raw").open("r+b") as stream:
+                digest = hashlib.sha256()
+                for band in range(self.shape[0]):
+                    pixels = np.ascontiguousarray(row.pixels[band]).data
+                    stream.seek(self._offset(band, self.rows))
+                    stream.write(pixels)
+                    digest.update(pixels)
+                stream.flush()
+                # After a power cut, the rows that the journal counts must be on the disk.
+                os.fsync(stream.fileno())
+            rows_px = row.pixels.shape[1]
+            self._finished.append(
+                FinishedRow(rows_px, row.pixels.nbytes, digest.hexdigest(), row.tally)
+            )
+            self.rows = self.rows + rows_px
+            self.tally = self.tally + row.tally
+            self._write_journal()
+
+    def read(self, band: int, start: int, stop: int) -> np.ndarray:
+        """Finished rows `start` to `stop` (excluded) of one band, (rows, width) as they will be
+        written.
+        """
+        count = (stop - start) * self.shape[2]
+        pixels = np.fromfile(
+            self.folder / "rows.raw", self.dtype, count, offset=self._offset(band, start)
+        )
+        return pixels.reshape(-1, self.shape[2])
+
+    def require_known(self, name: str) -> None:
+        """Refuse an image, `name` in messages, that has no pixels with values."""
+        if not self.tally.known:
+            got = "NaN or nodata everywhere"
+            remedy = "check that it is the right file"
+            raise ImageError(name, expected="some pixels with values", got=got, remedy=remedy)
+
+    def remove(self) -> None:
+        """Throw the rows away; the journal first, so that nothing is left that counts on them."""
+        # The journal is the first of these, because it counts on the rows.
+        for name in ROWS_FILES:
+            (self.folder / name).unlink(missing_ok=True)
+        self._remove_outputs()
+
+    @contextmanager
+    def disk(self) -> Iterator[None]:
+        """One sentence for what a disk may do."""
+        try:
+            yield
+        except OSError as error:
+            advice = (
+                f"go on with `resume` from row {self.rows} of {self.shape[1]}"
+                if self.rows
+                else "run it again: no row is left to `resume` from"
+            )
+            remedy = f"correct that, and {advice}"
+            got = error.strerror or str(error)
+            raise MachineError(
+                str(self.out), expected="a disk to write to", got=got, remedy=remedy
+            ) from error
+
+    def _left(self) -> list[FinishedRow]:
+        """Return the rows of tiles that an earlier run of this job finished, by its journal."""
+        path = self.folder / "journal.json"
+        if not path.is_file():
+            return []
+        with suppress(ValueError, LookupError, TypeError, AttributeError, OSError):
+            finished = read_journal(path, self._job)
+            ends = list(accumulate(row.rows_px for row in finished))
+            planned = not self._row_ends or ends == self._row_ends[: len(ends)]
+            if planned and max(ends, default=0) <= self.shape[1]:
+                return finished
+        expected = "the image, the model and the options of the run that was stopped"
+        got = f"others, or a damaged {path}"
+        remedy = "run it as before, or start afresh without `resume`"
+        raise OptionError("resume", expected=expected, got=got, remedy=remedy)
+
+    def _matching(self, finished: list[FinishedRow]) -> list[FinishedRow]:
+        """Return the rows of tiles down to the first one whose pixels are not those that the
+        journal states.
+        """
+        matching = list[FinishedRow]()
+        top = 0
+        for row in finished:
+            if self._stored(top, row.rows_px) != (row.size_bytes, row.sha256):
+                break
+            matching.append(row)
+            top += row.rows_px
+        return matching
+
+    def _stored(self, top: int, rows_px: int) -> tuple[int, str]:
+        """Return the size in bytes and the digest of rows of pixels that are stored; fewer bytes
+        where it ends.
+        """
+        size_bytes = 0
+        digest = hashlib.sha256()
+        with suppress(OSError), (self.folder / "rows.raw").open("rb") as stream:
+            for band in range(self.shape[0]):
+                stream.seek(self._offset(band, top))
+                pixels = stream.read(rows_px * self.shape[2] * self.dtype.itemsize)
+                size_bytes += len(pixels)
+                digest.update(pixels)
+        return size_bytes, digest.hexdigest()
+
+    def _write_journal(self) -> None:
+        path = self.folder / "journal.json"
+        fresh = self.folder / "journal.new"
+        with fresh.open("w", encoding="utf-8") as stream:
+            stream.write(journal_text(self._job, self._finished))
+            stream.flush()
+            os.fsync(stream.fileno())
+        # A run that is killed here leaves the old journal or the new one, never half of one.
+        fresh.replace(path)
+        sync_folder(self.folder)
+
+    def _offset(self, band: int, row: int) -> int:
+        return (band * self.shape[1] + row) * self.shape[2] * self.dtype.itemsize
+
+    def _remove_outputs(self) -> None:
+        (self.folder / PLAIN).unlink(missing_ok=True)
+        # GDAL writes overviews into a file beside the COG first.
+        for path in self.folder.glob(f"{COG}*"):
+            path.unlink()
+
+    def _require_room(self, cog_bytes: int) -> None:
+        bands, height, width = self.shape
+        rows_bytes = bands * (height - self.rows) * width * self.dtype.itemsize
+        # How well the pixels pack is not known yet, so nothing is assumed to be packed.
+        needed = rows_bytes + padded_px(self.shape) * self.dtype.itemsize + cog_bytes
+        free = shutil.disk_usage(self.out.parent).free
+        if needed > free:
+            needed_size, free_size = sizes(needed, free)
+            expected = f"{needed_size} of disk (nothing packed)"
+            got = f"{free_size} free"
+            remedy = "free some space or write elsewhere"
+            raise MachineError(str(self.out), expected=expected, got=got, remedy=remedy)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make a renaming in `folder` last; not every system can."""
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

@@ -1,0 +1,259 @@
+"""What is known of an image before its pixels are read: size, type, missing pixels, and place."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from beers_deploy.profiles.errors import ImageError
+
+SIDE_PX = 1 << 22
+BANDS = 1 << 12
+"""An image has a plan of its tiles before any pixel is read, so a header alone must not make that
+plan large.
+"""
+
+RESTORED = "beers-deploy restore"
+"""The software that a restored image names."""
+RESTORED_BY = "RESTORED_BY"
+"""The metadata item that a Cloud-Optimised restored image has."""
+
+OFFSET_DN = 40
+"""Largest pixel value that may stand for no light: 1 % of 12 bits."""
+
+RGB_BANDS = ("red", "green", "blue")
+
+MaskKind = Literal["", "mask", "alpha"]
+"""What marks missing pixels besides NaN and the nodata value."""
+
+ControlPoint = tuple[float, float, float, float, float]
+"""A ground control point: row and column in pixels, then x, y and z in the reference system."""
+
+
+class Extent(NamedTuple):
+    """The largest absolute value among some pixels, and whether all of them are integers."""
+
+    largest: float
+    whole: bool
+
+
+def extent_of(pixels: np.ndarray, known: np.ndarray | bool = True) -> Extent:
+    """Return the extent of pixels of any shape.
+
+    Args:
+        pixels: values as stored.
+        known: which of them count, bool of the same shape.
+    """
+    low, high = (float(extreme(pixels, where=known, initial=0)) for extreme in (np.min, np.max))
+    integers = pixels.dtype.kind != "f" or bool((np.rint(pixels) == pixels).all(where=known))
+    return Extent(max(-low, high), integers)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an image lies on Earth, in GDAL's terms.
+
+    Attributes:
+        crs: the coordinate reference system of `transform` or of the ground control points.
+        transform: the affine transform from pixel corners (column, row) to coordinates.
+        gcps: ground control points; GDAL reads these or a transform.
+        rpcs: rational polynomial coefficients, by GDAL's names.
+        area_or_point: what a pixel's value stands for, GDAL's AREA_OR_POINT.
+    """
+
+    crs: Any = None
+    transform: Any = None
+    gcps: tuple[ControlPoint, ...] = ()
+    rpcs: tuple[tuple[str, str], ...] = ()
+    area_or_point: str = ""
+
+    def enlarged(self, scale: int) -> "Place":
+        """Return the place of the same image with `scale` times the pixels along either side.
+
+        A pixel's corner at (column, row) moves to `scale` times both. Rational polynomials count
+        from the middle of the first pixel, so their offsets also move by half a pixel (NITF
+        STDI-0002, RPC00B).
+        """
+        if scale == 1:
+            return self
+        coefficients = dict(self.rpcs)
+        points = tuple((row * scale, column * scale, x, y, z) for row, column, x, y, z in self.gcps)
+        for key in coefficients.keys() & {"LINE_OFF", "SAMP_OFF"}:
+            coefficients[key] = repr((_number(coefficients[key]) + 0.5) * scale - 0.5)
+        for key in coefficients.keys() & {"LINE_SCALE", "SAMP_SCALE"}:
+            coefficients[key] = repr(_number(coefficients[key]) * scale)
+        return replace(
+            self,
+            transform=self.transform and _of_smaller_pixels(self.transform, scale),
+            gcps=points,
+            rpcs=tuple(coefficients.items()),
+        )
+
+
+def _of_smaller_pixels(transform: Any, scale: int) -> Any:
+    """Return the affine transform of pixels that are `scale` times smaller along either side."""
+    a, b, c, d, e, f = transform[:6]
+    return type(transform)(a / scale, b / scale, c, d / scale, e / scale, f)
+
+
+def _number(text: str) -> float:
+    """Return the number that a text begins with; some products add a unit."""
+    return float(text.split()[0])
+
+
+@dataclass(frozen=True)
+class BandInfo:
+    """What a file states of one band: its name, its unit, and how pixels become physical values."""
+
+    name: str = ""
+    unit: str = ""
+    scale: float = 1.0
+    offset: float = 0.0
+    tags: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Raster:
+    """An image as stored: `bands` planes of (height_px, width_px).
+
+    Attributes:
+        bands: planes of light; alpha is none of them.
+        height_px: rows.
+        width_px: columns.
+        dtype: of the pixels.
+        nodata: the value of missing pixels; None without one.
+        bits: bits of a pixel that the sensor fills, where the file states them.
+        mask_kind: what marks missing pixels besides NaN and `nodata`.
+        colour: whether the bands are red, green and blue.
+        restored: whether `restore` has written the image.
+        place: where it lies.
+        band_info: names, units and scales; empty, or one for each band.
+        tags: the file's metadata items that a restored image keeps.
+    """
+
+    bands: int
+    height_px: int
+    width_px: int
+    dtype: np.dtype[Any]
+    nodata: float | None = None
+    bits: int | None = None
+    mask_kind: MaskKind = ""
+    colour: bool = False
+    restored: bool = False
+    place: Place = Place()
+    band_info: tuple[BandInfo, ...] = ()
+    tags: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Bands, height and width, (bands, H, W) in pixels."""
+        return self.bands, self.height_px, self.width_px
+
+    @property
+    def out_dtype(self) -> np.dtype[Any]:
+        """The type of the restored image: float32 for floats, else the type of the pixels."""
+        return np.dtype(np.float32) if self.dtype.kind == "f" else self.dtype
+
+    @property
+    def band_names(self) -> tuple[str, ...]:
+        """The names of the bands; empty if any band has none."""
+        names = tuple(band.name for band in self.band_info)
+        return names if all(names) else ()
+
+    def missing(self, pixels: np.ndarray) -> np.ndarray:
+        """Return which stored pixels hold no measurement, bool of the same shape.
+
+        They are NaN, have the nodata value, or are masked.
+        """
+        flags = np.ma.getmaskarray(pixels).copy()
+        values = np.ma.getdata(pixels)
+        if self.dtype.kind == "f":
+            flags |= np.isnan(values)
+        if self.nodata is not None:
+            flags |= values == values.dtype.type(self.nodata)
+        return flags
+
+    def extent(self, pixels: np.ndarray) -> Extent:
+        """Return the extent of the stored pixels that are not missing."""
+        return extent_of(np.ma.getdata(pixels), ~self.missing(pixels))
+
+    @property
+    def may_miss(self) -> bool:
+        """Whether any pixel could be missing at all."""
+        return self.dtype.kind == "f" or self.nodata is not None or bool(self.mask_kind)
+
+    def fill_margin_px(self, radius_px: int) -> int:
+        """Return how far around a window pixels are read that missing ones are filled from."""
+        return radius_px if self.may_miss else 0
+
+    def enlarged(self, shape: Sequence[int]) -> "Raster":
+        """Return the facts of this image restored to another shape.
+
+        Args:
+            shape: (bands, H, W); H and W are multiples of this image's.
+        """
+        bands, height_px, width_px = shape
+        alike = bands == self.bands
+        return replace(
+            self,
+            bands=bands,
+            height_px=height_px,
+            width_px=width_px,
+            dtype=self.out_dtype,
+            colour=self.colour and alike,
+            place=self.place.enlarged(width_px // self.width_px),
+            band_info=self.band_info if alike else (),
+        )
+
+
+def require_size(name: str, bands: int, height_px: int, width_px: int) -> None:
+    """Refuse an image that is too large to be planned."""
+    if max(height_px, width_px) > SIDE_PX or bands > BANDS:
+        got = f"{bands} bands of {width_px} x {height_px} pixels"
+        expected = f"at most {BANDS} bands of {SIDE_PX} pixels a side"
+        raise ImageError(name, expected=expected, got=got, remedy="cut it into pieces")
+
+
+def require_numbers(name: str, dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the type of the pixels; refuse complex numbers."""
+    if dtype.kind not in "uif":
+        remedy = "convert it to uint16"
+        raise ImageError(name, expected="integer or float pixels", got=str(dtype), remedy=remedy)
+    return dtype
+
+
+def require_small_offset(name: str, offset: float, scale: float) -> None:
+    """Refuse pixels whose 0 is far from no light: value = scale x pixel + offset."""
+    if abs(offset) > OFFSET_DN * abs(scale):
+        dark = -offset / (scale or 1)
+        got = f"{dark:g} DN for it, by its offset of {offset:g} and scale of {scale:g}"
+        remedy = (
+            "take it off the pixels, or remove the offset with 'gdal_edit.py -offset 0' if "
+            "it is none of them"
+        )
+        raise ImageError(name, expected="pixels whose 0 is no light", got=got, remedy=remedy)
+
+
+def usable_nodata(value: float | None, dtype: np.dtype[Any]) -> float | None:
+    """Return a nodata value, or None for one that no pixel of this type can have."""
+    if value is None or dtype.kind == "f":
+        return value
+    limits = np.iinfo(dtype)
+    # A value that no pixel can have marks none, so the image is as good without it.
+    fits = float(value).is_integer() and limits.min <= value <= limits.max
+    return value if fits else None
+
+
+def is_restored(software: str, metadata: object) -> bool:
+    """Return True if an image was written by `restore`, by its software or its metadata."""
+    return software.startswith(RESTORED) or RESTORED_BY in str(metadata)
+
+
+def require_raw(name: str, restored: bool, again: bool) -> None:
+    """Refuse a restored image unless `again`: a second restoration over-sharpens it."""
+    if restored and not again:
+        remedy = "give the raw one, or restore it once more with `again`"
+        raise ImageError(
+            name, expected="a raw image", got="one that 'restore' has written", remedy=remedy
+        )

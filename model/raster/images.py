@@ -1,0 +1,138 @@
+"""Read whole images, list those of a folder, and tell frames of one site apart."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from beers_deploy.model.io.files import IMAGE_SUFFIXES
+from beers_deploy.model.raster.facts import extent_of
+from beers_deploy.model.raster.full_scale import remedy_outside, settled_scale
+from beers_deploy.model.raster.reader import open_raster
+from beers_deploy.profiles.errors import ImageError, MachineError, sizes
+from beers_deploy.profiles.sensor import MAX_DN
+
+CAMERA = r"[_-](?:dji|img|image|dsc[nf]?|fhd|mos|gopr|frame|p)[_-]?"
+"""How cameras and programs begin the names of their files, after the name of a place."""
+
+FRAME_NUMBERS = re.compile(
+    rf"(?:(?:_|{CAMERA})[0-9a-f]*\d[0-9a-f]*(?:-[0-9]+)*(?:_(?:pre|post)(?=_|$))?)+$", re.IGNORECASE
+)
+"""The end of a name that tells frames of one site apart: _0034, _5dded5bc_23, _DJI_0005, _P1010012,
+_386690-220241, _2016_pre_1. Nothing else can be known by a name: the site is what it begins with.
+"""
+
+WORKING_COPIES = 12
+"""Float copies of an image that a command may hold at once: reading refuses what would not fit in
+memory.
+"""
+
+RESCALE = "rescale it to the sensor's digital numbers"
+
+
+def read_pixels(path: Path) -> np.ndarray:
+    """Read the pixels of an image file as stored: (H, W) or (H, W, bands), any dtype.
+
+    Raises:
+        ImageError: no image, a damaged one, or one with missing pixels.
+        MachineError: an image that does not fit in memory.
+    """
+    with open_raster(path) as source:
+        raster = source.raster
+        _check_memory(path, raster.bands * raster.height_px * raster.width_px)
+        stored = source.read(0, raster.height_px)
+    pixels = np.ma.getdata(stored)
+    if raster.dtype.kind == "f" and not np.isfinite(pixels).all():
+        count = f"{int((~np.isfinite(pixels)).sum())} NaN or infinite"
+    else:
+        count = f"{int(raster.missing(stored).sum())} by its mask, alpha or nodata value"
+    if not count.startswith("0 "):
+        remedy = "crop them off; 'restore' alone takes missing pixels, as NaN, nodata or a mask"
+        raise ImageError(str(path), expected="no missing pixels", got=count, remedy=remedy)
+    return pixels[0] if raster.bands == 1 else np.moveaxis(pixels, 0, 2)
+
+
+def image_size_px(path: Path) -> tuple[int, int]:
+    """Return height and width of an image file as its header states them."""
+    with open_raster(path) as source:
+        return source.raster.height_px, source.raster.width_px
+
+
+def _check_memory(path: Path, samples: int) -> None:
+    needed = samples * 4 * WORKING_COPIES
+    free = psutil.virtual_memory().available
+    if needed > free:
+        room, size = sizes(free, needed)
+        expected = f"an image that fits in {room} of free memory"
+        got = f"{samples:,} samples, which need about {size}"
+        raise MachineError(str(path), expected=expected, got=got, remedy="cut it into pieces")
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The image files of a folder, sorted by name."""
+    images = (
+        sorted(p for p in folder.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES)
+        if folder.is_dir()
+        else []
+    )
+    if not images:
+        got = "no image in it" if folder.is_dir() else "no such folder"
+        raise ImageError(
+            str(folder),
+            expected="a folder of images",
+            got=got,
+            remedy="give TIFF, PNG or JPEG files",
+        )
+    return images
+
+
+def site_of(name: str) -> str:
+    """Return the site of an image: its name without the end that tells frames of one site apart.
+
+    Examples:
+        >>> site_of("zebra_DJI_0005.jpg"), site_of("lake_2016_pre_1.tif")
+        ('zebra', 'lake')
+    """
+    return FRAME_NUMBERS.sub("", Path(name).stem) or name
+
+
+def read_acquisition(
+    path: Path, full_scale: float | None = None, remedy: str | None = RESCALE, max_dn: int = MAX_DN
+) -> np.ndarray:
+    """Digital numbers (H, W) float32 in 0..max_dn of a mono image: of at most 12 bits unless a
+    sensor says otherwise.
+
+    Args:
+        path: a TIFF, PNG or JPEG file.
+        full_scale: the pixel value that is full scale; None lets the pixels' type and values
+            decide.
+        remedy: what to do about pixels that leave it open; None names --full-scale.
+        max_dn: the sensor's largest digital number.
+    """
+    pixels = read_pixels(path)
+    if pixels.ndim != 2:
+        raise ImageError(
+            str(path),
+            expected="one band",
+            got=f"{pixels.shape[2]} bands",
+            remedy="extract the panchromatic band",
+        )
+    low = float(pixels.min())
+    high = float(pixels.max())
+    scale = settled_scale(str(path), pixels.dtype, [extent_of(pixels)], full_scale, max_dn, remedy)
+    if low < 0 or high > scale:
+        expected = (
+            f"{max_dn.bit_length()}-bit digital numbers, 0 to {max_dn}"
+            if scale == max_dn
+            else f"values of 0 to {scale:g}"
+        )
+        got = f"values from {low:g} to {high:g}"
+        raise ImageError(
+            str(path), expected=expected, got=got, remedy=remedy_outside(low, high, RESCALE)
+        )
+    dn = np.asarray(pixels, dtype=np.float32)
+    if scale == max_dn:
+        return dn
+    # Rounding may carry full scale above the largest digital number.
+    return np.asarray(np.minimum(dn * np.float32(max_dn / scale), np.float32(max_dn)))

@@ -1,0 +1,439 @@
+"""Open images by windows with GDAL: TIFF, PNG, JPEG, JPEG 2000, NITF, HFA, ENVI, and the indexes
+VRT and DIMAP that make one image of many tiles.
+
+GDAL chooses among all of its drivers by content, follows what a file names, and knows the network.
+Here the suffix chooses the driver, an index and its tiles are checked before GDAL opens them
+(`model.raster.index`), and all files that GDAL reports afterwards must lie in the image's folder,
+unless the user trusts the index.
+"""
+
+import logging
+import os
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import rasterio
+from rasterio.windows import Window
+
+from beers_deploy.model.raster.facts import (
+    RGB_BANDS,
+    BandInfo,
+    MaskKind,
+    Place,
+    Raster,
+    is_restored,
+    require_numbers,
+    require_size,
+    require_small_offset,
+    usable_nodata,
+)
+from beers_deploy.model.raster.index import MAGIC, dimap_bits, index_files, is_index, read_xml
+from beers_deploy.model.raster.source import Source
+from beers_deploy.profiles.errors import CODE_FAULTS, BeersError, ImageError, MachineError, sizes
+from beers_deploy.profiles.toml import unreadable
+
+DRIVERS = {
+    **dict.fromkeys((".tif", ".tiff", ".btf", ".tf8"), "GTiff"),
+    ".png": "PNG",
+    **dict.fromkeys((".jpg", ".jpeg"), "JPEG"),
+    **dict.fromkeys((".jp2", ".j2k"), "JP2OpenJPEG"),
+    **dict.fromkeys((".ntf", ".nitf"), "NITF"),
+    ".img": "HFA",
+    **dict.fromkeys((".dat", ".bsq", ".bil", ".bip"), "ENVI"),
+    ".vrt": "VRT",
+    ".xml": "DIMAP",
+}
+"""GDAL's drivers by suffix: others of its drivers open further files, or the network."""
+FORMATS = {"GTiff": "TIFF", "JP2OpenJPEG": "JPEG 2000"}
+"""What messages call a driver's format where its name does not say it."""
+
+LEAST_CACHE_BYTES = 1 << 26
+AUX_BYTES = 1 << 20
+"""The largest .aux.xml that is read."""
+ENVIRONMENT = {
+    # GDAL looks for each sidecar by its name, so that a large folder costs nothing.
+    "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE",
+    "GDAL_VRT_ENABLE_PYTHON": "NO",
+    # A VRT could show any file of the machine as raw pixels.
+    "GDAL_VRT_RAWRASTERBAND_ALLOWED_SOURCE": "NONE",
+    # Otherwise the end of a truncated JPEG is grey, and nothing is said.
+    "GDAL_ERROR_ON_LIBJPEG_WARNING": "TRUE",
+    # This way of reading a whole PNG leaves memory as it was where the file ends early.
+    "GDAL_PNG_WHOLE_IMAGE_OPTIM": "NO",
+    # Threads that decode print their errors, which are raised as one exception as well.
+    "CPL_LOG": os.devnull,
+}
+OFFLINE = {"CPL_VSIL_CURL_ALLOWED_EXTENSIONS": "{none}"}
+
+DARK = {"palette", "hue", "saturation", "lightness", "cyan", "magenta", "yellow", "black"}
+"""GDAL's interpretations of bands whose pixels are not brighter where they are larger."""
+UNKEPT = ("STATISTICS_", "TIFFTAG_", "NITF_", "AREA_OR_POINT", "METADATATYPE")
+"""Beginnings of metadata items that a restored image does not keep: they describe the raw pixels or
+the raw file, or are written from other facts.
+"""
+
+# GDAL's messages are not printed; a program that adds a handler of its own still gets them.
+logging.getLogger("rasterio").addHandler(logging.NullHandler())
+
+
+def require_image_file(path: Path) -> None:
+    """Refuse a path that is no file, and an empty file."""
+    got = unreadable(path)
+    if got is not None:
+        raise ImageError(str(path), expected="an image file", got=got, remedy="check the path")
+    if path.stat().st_size == 0:
+        raise ImageError(
+            str(path), expected="an image", got="an empty file", remedy="write or copy it again"
+        )
+
+
+@contextmanager
+def gdal(**options: Any) -> Iterator[None]:
+    """Configure GDAL for files that nobody has checked, and silence its warnings."""
+    # An image need not lie anywhere on Earth, which rasterio warns about.
+    with warnings.catch_warnings(action="ignore"), rasterio.Env(**ENVIRONMENT, **options):
+        yield
+
+
+@contextmanager
+def open_raster(path: Path, trusted: bool = False) -> Iterator[Source]:
+    """Open an image of any size for reading by rows.
+
+    Args:
+        path: an image file, or the index of its tiles (VRT, DIMAP).
+        trusted: whether an index may name files outside its folder, and URLs.
+
+    Yields:
+        The image; its files include the sidecars and tiles that GDAL reads.
+
+    Raises:
+        ImageError: no image, a damaged one, or one whose pixels cannot be restored.
+        MachineError: an image in strips or tiles that the memory does not hold.
+    """
+    require_image_file(path)
+    driver = _driver(path)
+    tiles = index_files(path, trusted)
+    for file in (path, *tiles):
+        _require_sidecars(file)
+    options = {} if trusted else OFFLINE
+    with damage_in_a_sentence(path), gdal(**options):
+        dataset = rasterio.open(path.absolute(), driver=driver)
+    with dataset:
+        with damage_in_a_sentence(path), gdal(**options):
+            files = _files(path, tiles, dataset, trusted)
+            block_px = _block_px(dataset, [tile for tile in tiles if not is_index(tile)])
+            raster = _raster(path, dataset)
+            _require_whole(path, dataset)
+        source = GdalSource(files, dataset, raster, block_px, options)
+        _require_memory(path, source)
+        yield source
+
+
+def _driver(path: Path) -> str:
+    """Return the GDAL driver that opens a file; ENVI's own files may end in .img as well."""
+    suffix = path.suffix.lower()
+    if suffix not in DRIVERS:
+        expected = f"an image with a suffix of {', '.join(DRIVERS)}"
+        remedy = "rename it, or convert it with 'gdal_translate'"
+        raise ImageError(str(path), expected=expected, got=suffix or "none", remedy=remedy)
+    has_header = path.with_suffix(".hdr").is_file()
+    return "ENVI" if suffix == ".img" and has_header else DRIVERS[suffix]
+
+
+def format_name(path: Path) -> str:
+    """Return what messages call the format of a file, by its suffix."""
+    driver = DRIVERS.get(path.suffix.lower(), "raster")
+    return FORMATS.get(driver, driver)
+
+
+def mask_file(path: Path) -> Path:
+    """Return where GDAL stores the mask of an image whose format has none."""
+    return path.with_name(f"{path.name}.msk")
+
+
+def _require_sidecars(path: Path) -> None:
+    """Refuse a mask or metadata file beside an image that GDAL would misread or pass over."""
+    remedy = "write it again, or remove it"
+    mask = mask_file(path)
+    if mask.is_file():
+        # GDAL opens a mask with any of its drivers, also with those that follow names.
+        with mask.open("rb") as stream:
+            is_tiff = stream.read(4) in MAGIC[:4]
+        if not is_tiff:
+            raise ImageError(
+                str(mask), expected="a mask as TIFF", got="another file", remedy=remedy
+            )
+    metadata = path.with_name(f"{path.name}.aux.xml")
+    if metadata.is_file():
+        read_xml(metadata, AUX_BYTES, "metadata as GDAL writes it", remedy)
+
+
+def _files(path: Path, tiles: tuple[Path, ...], dataset: Any, trusted: bool) -> tuple[Path, ...]:
+    """Return all files that an image is read from; refuse one outside its folder."""
+    homes = {path.absolute().parent, path.resolve().parent}
+    files = {path: None} | dict.fromkeys(tiles)
+    resolved = {file.resolve() for file in files}
+    for name in dataset.files:
+        file = Path(name)
+        real = file.resolve()
+        if real in resolved:
+            continue
+        inside = any(real.is_relative_to(home) for home in homes)
+        if not inside and not trusted:
+            remedy = "put it into the folder of the image, or trust it with `trust_index`"
+            raise ImageError(
+                str(path), expected="files in its own folder", got=f"one at {name}", remedy=remedy
+            )
+        if real.is_file():
+            files[file] = None
+            resolved.add(real)
+    # A mask beside the image is among GDAL's files only once it has been looked up.
+    mask = mask_file(path)
+    return tuple(files | ({mask: None} if mask.is_file() else {}))
+
+
+def _block_px(dataset: Any, tiles: list[Path]) -> int:
+    """Return the rows of the blocks in which an image is decoded."""
+    rows = [int(rows) for rows, _ in dataset.block_shapes]
+    # A mosaic states blocks of its own, but decodes those of its tiles, which are mostly alike.
+    if tiles:
+        with rasterio.open(tiles[0]) as tile:
+            rows += [int(tile_rows) for tile_rows, _ in tile.block_shapes]
+    return max(rows, default=1)
+
+
+@contextmanager
+def damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
+    """Raise ImageError for whatever GDAL raises over a file; `where` names the place in it."""
+    try:
+        yield
+    except (BeersError, MemoryError, *CODE_FAULTS):
+        raise
+    except Exception as error:
+        cause: BaseException = error
+        # rasterio's own message is "see previous exception", so the first cause is reported.
+        while cause.__cause__ is not None:
+            cause = cause.__cause__
+        name = f"{path}, {where}" if where else str(path)
+        got = " ".join(str(cause).split())[:160] or type(cause).__name__
+        remedy = "check that it is a whole image"
+        if "missing codec" in got:
+            remedy = "write it with deflate, LZW or ZSTD"
+        expected = f"a readable {format_name(path)}"
+        raise ImageError(name, expected=expected, got=got, remedy=remedy) from error
+
+
+class GdalSource:
+    """An image that GDAL has opened; one thread reads at a time."""
+
+    def __init__(
+        self,
+        files: tuple[Path, ...],
+        dataset: Any,
+        raster: Raster,
+        block_px: int,
+        options: dict[str, str],
+    ) -> None:
+        self.files = files
+        self.raster = raster
+        self._dataset = dataset
+        self._block_px = block_px
+        self._options = options
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        """Read rows `start` to `stop` (excluded) of every band as stored, (bands, rows, width)."""
+        bands = list(range(1, self.raster.bands + 1))
+        pixels = self._read(self._dataset.read, start, stop, indexes=bands)
+        if not self.raster.mask_kind:
+            return pixels
+        hidden = self.read_mask(start, stop) == 0
+        return np.ma.MaskedArray(pixels, mask=np.broadcast_to(hidden, pixels.shape))
+
+    def read_mask(self, start: int, stop: int) -> np.ndarray:
+        """Read the same rows of the mask or of alpha, (rows, width); 0 marks a missing pixel."""
+        if self.raster.mask_kind == "alpha":
+            return self._read(self._dataset.read, start, stop, indexes=self.raster.bands + 1)
+        return self._read(self._dataset.dataset_mask, start, stop)
+
+    def _read(
+        self, read_window: Callable[..., Any], start: int, stop: int, **options: Any
+    ) -> np.ndarray:
+        window = Window(0, start, self.raster.width_px, stop - start)
+        cache = {"GDAL_CACHEMAX": self.held_bytes(stop - start)}
+        where = f"rows {start} to {stop - 1}"
+        with damage_in_a_sentence(self.files[0], where), gdal(**self._options, **cache):
+            return np.asarray(read_window(window=window, **options))
+
+    def held_bytes(self, rows_px: int) -> int:
+        """Return the size of GDAL's cache: the blocks around the rows, so that none is decoded for
+        two strips.
+        """
+        raster = self.raster
+        planes = raster.bands + (raster.mask_kind == "alpha")
+        row_bytes = planes * raster.width_px * raster.dtype.itemsize
+        return int(max(LEAST_CACHE_BYTES, (rows_px + 2 * self._block_px) * row_bytes))
+
+
+def _require_whole(path: Path, dataset: Any) -> None:
+    """Refuse a TIFF that ends before its last strip or tile: a long run would find out late."""
+    if dataset.driver != "GTiff":
+        return
+    size = path.stat().st_size
+    for band, (rows_px, columns_px) in enumerate(dataset.block_shapes, 1):
+        last = f"{(dataset.width - 1) // columns_px}_{(dataset.height - 1) // rows_px}"
+        offset, count = (
+            int(dataset.get_tag_item(f"BLOCK_{kind}_{last}", "TIFF", bidx=band) or 0)
+            for kind in ("OFFSET", "SIZE")
+        )
+        if offset + count > size:
+            got = f"a file cut short at {size} of {offset + count} bytes"
+            raise ImageError(str(path), expected="a readable TIFF", got=got, remedy="copy it again")
+
+
+def _require_memory(path: Path, source: GdalSource) -> None:
+    """Refuse an image whose strips or tiles do not fit in memory, before one is decoded."""
+    needed = source.held_bytes(1)
+    free = psutil.virtual_memory().available
+    if needed > max(free, 2 * LEAST_CACHE_BYTES):
+        room, size = sizes(free, needed)
+        expected = f"strips or tiles that fit in {room} of free memory"
+        remedy = "rewrite it in smaller tiles (gdal_translate -co TILED=YES)"
+        raise MachineError(str(path), expected=expected, got=f"{size} for two", remedy=remedy)
+
+
+def _raster(path: Path, dataset: Any) -> Raster:
+    """Return what GDAL states of an image; refuse one whose pixels cannot be restored."""
+    name = str(path)
+    _require_one_image(name, dataset)
+    mask_kind = _mask_kind(name, dataset)
+    bands = dataset.count - (mask_kind == "alpha")
+    _require_alike(name, dataset, bands)
+    dtype = require_numbers(name, np.dtype(dataset.dtypes[0]))
+    require_size(name, bands, dataset.height, dataset.width)
+    _require_light(name, dataset)
+    for offset, scale in zip(dataset.offsets[:bands], dataset.scales[:bands], strict=True):
+        require_small_offset(name, offset, scale)
+    colours = [values.name for values in dataset.colorinterp]
+    tags = dataset.tags()
+    return Raster(
+        bands,
+        dataset.height,
+        dataset.width,
+        dtype,
+        nodata=usable_nodata(dataset.nodatavals[0], dtype),
+        bits=_bits(path, dataset),
+        mask_kind=mask_kind,
+        colour=colours[:bands] == list(RGB_BANDS),
+        restored=is_restored(tags.get("TIFFTAG_SOFTWARE", ""), tags),
+        place=_place(dataset),
+        band_info=tuple(_band_info(dataset, band) for band in range(bands)),
+        tags=_kept(tags),
+    )
+
+
+def _require_one_image(name: str, dataset: Any) -> None:
+    """Refuse a file of several images, such as the pages of a TIFF."""
+    count = len(dataset.subdatasets)
+    if dataset.count == 0 or count > 1:
+        remedy = "save the one that you mean by itself"
+        if count:
+            remedy += f": gdal_translate {dataset.subdatasets[0]} one.tif"
+        raise ImageError(name, expected="one image", got=f"{count}", remedy=remedy)
+
+
+def _mask_kind(name: str, dataset: Any) -> MaskKind:
+    """Return what marks missing pixels besides the nodata value."""
+    is_alpha = [values.name == "alpha" for values in dataset.colorinterp]
+    flags = {flag.name for flag in dataset.mask_flag_enums[0]}
+    if any(is_alpha[:-1]) or is_alpha == [True]:
+        raise ImageError(
+            name, expected="alpha as the last band", got="one before others", remedy="move it there"
+        )
+    # Where each band of a picture has its own nodata value, GDAL makes one mask of them.
+    has_mask = "per_dataset" in flags and "alpha" not in flags
+    mask = mask_file(Path(name))
+    if mask.is_file() and (is_alpha[-1] or not has_mask):
+        remedy = "write it with GDAL, or remove it"
+        got = "one without GDAL's INTERNAL_MASK_FLAGS, or alpha as well"
+        raise ImageError(str(mask), expected="one mask that GDAL reads", got=got, remedy=remedy)
+    if is_alpha[-1]:
+        return "alpha"
+    return "mask" if has_mask else ""
+
+
+def _require_alike(name: str, dataset: Any, bands: int) -> None:
+    """Refuse bands of different types or nodata values."""
+    for kind, values in (
+        ("types", dataset.dtypes),
+        ("nodata values", dataset.nodatavals[:bands]),
+    ):
+        if len({str(value) for value in values}) > 1:
+            got = ", ".join(str(value) for value in values)
+            raise ImageError(
+                name, expected=f"bands of equal {kind}", got=got, remedy="split the bands"
+            )
+
+
+def _require_light(name: str, dataset: Any) -> None:
+    """Refuse pixels that are not brighter where they are larger."""
+    structure = dataset.tags(ns="IMAGE_STRUCTURE")
+    dark = sorted({values.name for values in dataset.colorinterp} & DARK)
+    if structure.get("MINISWHITE") == "YES":
+        dark = ["white as zero (MINISWHITE)"]
+    elif structure.get("SOURCE_COLOR_SPACE") in ("CMYK", "CIELab"):
+        dark = [structure["SOURCE_COLOR_SPACE"]]
+    if dark:
+        remedy = "convert it to grey or RGB: 'gdal_translate -expand' does it for palettes"
+        raise ImageError(
+            name, expected="pixels where more is brighter", got=", ".join(dark), remedy=remedy
+        )
+
+
+def _bits(path: Path, dataset: Any) -> int | None:
+    """Return the bits per pixel that the file states, the largest of its bands'; None where any
+    band states none.
+
+    A DIMAP states those of the product.
+    """
+    if (product_bits := dimap_bits(path)) is not None:
+        return product_bits
+    band_bits = [
+        str(dataset.tags(band, ns="IMAGE_STRUCTURE").get("NBITS", "")) for band in dataset.indexes
+    ]
+    texts = band_bits if all(band_bits) else [str(dataset.tags().get("NITF_ABPP", "")).strip()]
+    most = max((int(text) for text in texts if text.isdecimal()), default=0)
+    # Bits that fill the type describe the container, not the sensor.
+    return most if 0 < most < 8 * np.dtype(dataset.dtypes[0]).itemsize else None
+
+
+def _place(dataset: Any) -> Place:
+    """Return where an image lies: by a transform, or by ground control points."""
+    points, points_crs = dataset.gcps
+    identity = dataset.transform.is_identity
+    return Place(
+        crs=points_crs if points else dataset.crs,
+        transform=None if points or identity else dataset.transform,
+        gcps=tuple((point.row, point.col, point.x, point.y, point.z or 0.0) for point in points),
+        rpcs=tuple(sorted(dataset.tags(ns="RPC").items())),
+        area_or_point=dataset.tags().get("AREA_OR_POINT", ""),
+    )
+
+
+def _band_info(dataset: Any, band: int) -> BandInfo:
+    return BandInfo(
+        dataset.descriptions[band] or "",
+        dataset.units[band] or "",
+        dataset.scales[band],
+        dataset.offsets[band],
+        _kept(dataset.tags(band + 1)),
+    )
+
+
+def _kept(tags: dict[str, str]) -> tuple[tuple[str, str], ...]:
+    """Return the metadata items that a restored image keeps."""
+    return tuple((key, text) for key, text in sorted(tags.items()) if not key.startswith(UNKEPT))

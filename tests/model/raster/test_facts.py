@@ -1,0 +1,73 @@
+"""An enlarged image lies on Earth where it came from; nodata values are those of pixels."""
+
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+from affine import Affine
+from hypothesis import given
+from hypothesis import strategies as st
+
+from beers_deploy.model.raster.facts import Place, Raster, usable_nodata
+
+NUMBER = st.floats(-1e3, 1e3).map(lambda number: round(number, 3))
+SIZE = st.floats(0.1, 1e3)
+
+
+@given(st.tuples(SIZE, NUMBER, NUMBER, NUMBER, SIZE, NUMBER), NUMBER, NUMBER, st.integers(1, 4))
+def test_the_pixels_of_one_share_its_middle(
+    matrix: tuple[float, ...], column: float, row: float, scale: int
+) -> None:
+    """By a transform, by ground control points, and by rational polynomials."""
+    polynomials = {"LINE_OFF": "20.5", "LINE_SCALE": "7", "SAMP_OFF": "3", "SAMP_SCALE": "2"}
+    place = Place(
+        transform=Affine(*matrix),
+        gcps=((row, column, 1.0, 2.0, 3.0),),
+        rpcs=tuple(polynomials.items()),
+    )
+    larger = place.enlarged(scale)
+    parts = [(k + 0.5) for k in range(scale)]
+    middles = [
+        larger.transform @ (column * scale + across, row * scale + down)
+        for down, across in product(parts, parts)
+    ]
+    np.testing.assert_allclose(
+        np.mean(middles, axis=0), place.transform @ (column + 0.5, row + 0.5), rtol=1e-6, atol=1e-5
+    )
+    assert larger.gcps[0] == (row * scale, column * scale, 1.0, 2.0, 3.0)
+    # Polynomials count pixels from the middle of the first one, in units of their scale.
+    after = {key: float(text) for key, text in larger.rpcs}
+    for axis, at in (("LINE", row), ("SAMP", column)):
+        offset = float(polynomials[f"{axis}_OFF"])
+        normalised = (at - offset) / float(polynomials[f"{axis}_SCALE"])
+        own = np.mean([at * scale + part - 0.5 for part in parts])
+        assert (own - after[f"{axis}_OFF"]) / after[f"{axis}_SCALE"] == pytest.approx(
+            normalised, abs=1e-6
+        )
+
+
+def test_one_is_the_same_place() -> None:
+    place = Place(rpcs=(("LINE_OFF", "1"),))
+    assert place.enlarged(1) is place
+
+
+@given(st.floats(-1e6, 1e6), st.sampled_from(["uint8", "int16", "uint16", "int32", "float32"]))
+def test_a_nodata_value_is_one_that_a_pixel_can_have(value: float, kind: str) -> None:
+    dtype = np.dtype(kind)
+    used = usable_nodata(value, dtype)
+    if dtype.kind == "f" or (value.is_integer() and dtype.type(0) + value in _values(dtype)):
+        assert used == value
+    else:
+        assert used is None
+
+
+def _values(dtype: np.dtype[Any]) -> range:
+    limits = np.iinfo(dtype)
+    return range(limits.min, limits.max + 1)
+
+
+def test_a_restored_image_has_the_type_of_its_pixels() -> None:
+    kinds = ("uint8", "int16", "uint16", "uint32", "float64")
+    out = [Raster(1, 9, 9, np.dtype(kind)).out_dtype.name for kind in kinds]
+    assert out == ["uint8", "int16", "uint16", "uint32", "float32"]
