@@ -38,6 +38,7 @@ from beers_deploy.bench.swath import parse_size
 from beers_deploy.export import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import VARIANTS, Variant
+from beers_deploy.network import Network
 from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.restoration.options import Options, Runtime
 from beers_deploy.restoration.plan import make_plan
@@ -96,13 +97,18 @@ def main() -> None:
             )
 
 
+def name_of(options: Options) -> str:
+    """The network's name."""
+    return Network.load(options.network).name
+
+
 def speed(folder: Path, options: Options, size: tuple[int, int], repeats: int) -> None:
     """Engine from file to file over the bare runtime on the same windows, already float32 in
     memory, one by one.
     """
     image = folder / "image.tif"
     dn = write_noise(image, size)
-    network = onnx.load(options.model)
+    network = Network.load(options.network).model
     tiling = tiling_of(network)
     plan = make_plan((1, *dn.shape), TILE_PX, tiling.halo_px, tiling)
     tiles = [dn[r.start : r.stop, c.start : c.stop] for r, c in product(plan.rows, plan.columns)]
@@ -120,7 +126,7 @@ def speed(folder: Path, options: Options, size: tuple[int, int], repeats: int) -
 
     (bare_s, bare_cpu_s), (engine_s, engine_cpu_s) = fastest([bare, engine], repeats)
     print(
-        f"{options.model.stem:18} {version:20} {plan.tiles} tiles: bare {bare_s:.2f} s, engine "
+        f"{name_of(options):18} {version:20} {plan.tiles} tiles: bare {bare_s:.2f} s, engine "
         f"{engine_s:.2f} s "
         f"({dn.size / engine_s / 1e6:.3f} Mpx/s); engine over bare {bare_s / engine_s:.3f} by "
         "the clock, "
@@ -143,7 +149,7 @@ def beside_peers(
     for name, (clock_s, cpu_s) in zip(runs, times_s, strict=True):
         largest, mean = difference_dn(task.out("engine"), task.out(name))
         print(
-            f"{options.model.stem:18} {options.runtime:12} {name:24} {clock_s:.2f} s "
+            f"{name_of(options):18} {options.runtime:12} {name:24} {clock_s:.2f} s "
             f"({dn.size / clock_s / 1e6:.3f} Mpx/s); over the engine "
             f"{clock_s / times_s[0, 0]:.2f} by the clock, "
             f"{cpu_s / times_s[0, 1]:.2f} by the processor; off by {largest:.0f} DN at most, "
@@ -167,7 +173,7 @@ class Task:
     @property
     def halo_px(self) -> int:
         """Of the engine, and of the peers."""
-        return tiling_of(onnx.load(self.options.model)).halo_px
+        return Network.load(self.options.network).tiling.halo_px
 
     def out(self, way: str) -> Path:
         """Where a way writes."""
@@ -205,7 +211,9 @@ def overlapped(task: Task, way: str, chunks_at_once: int) -> Run:
     def run() -> None:
         import dask.array as da
 
-        infer, _ = open_runtime(task.options.runtime, onnx.load(task.options.model), threads)
+        infer, _ = open_runtime(
+            task.options.runtime, Network.load(task.options.network).model, threads
+        )
 
         def restored(block: np.ndarray) -> np.ndarray:
             return np.asarray(np.rint(restore_window(block, infer)), np.uint16)
@@ -233,7 +241,7 @@ def child(task: Task, python: str) -> Iterator[Run]:
     the processor.
     """
     words = (
-        task.options.model,
+        task.options.network,
         task.image,
         task.out("MONAI"),
         TILE_PX,

@@ -18,7 +18,7 @@ from beers_deploy.model.exposure import HEADROOM
 from beers_deploy.model.io.files import write_text
 from beers_deploy.model.shipped import INT8, shipped_names
 from beers_deploy.network import Network, NetworkLike, SensorLike
-from beers_deploy.network_files import brighter_files, other_sensor
+from beers_deploy.network_files import other_sensor
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.figures import Figure, Mode, Row
 from beers_deploy.profiles.sensor import Sensor
@@ -91,7 +91,7 @@ class Board(TargetProfile):
         if record:
             require_library()
         core = network.core(self, tile)
-        brighter = _brighter(int8, profile)
+        brighter = {} if profile is None else network.exposures
         facts = host_facts(network, tile, profile, brighter)
         core.save(folder / "core.onnx")
         for factor, other in brighter.items():
@@ -122,17 +122,6 @@ class Board(TargetProfile):
         }
         write_text(folder / "README.md", README.read_text(encoding="utf-8").format(**words))
         return folder
-
-
-def _brighter(int8: NetworkLike, sensor: Sensor | None) -> dict[int, Network]:
-    """Return a shipped network for the sensor at higher exposures, by factor; none of any other
-    network.
-    """
-    if sensor is None or not isinstance(int8, str | os.PathLike):
-        return {}
-    return {
-        factor: Network.load(path) for factor, path in brighter_files(Path(int8), sensor).items()
-    }
 
 
 def _write_example(core: Network, folder: Path) -> None:

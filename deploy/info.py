@@ -13,22 +13,21 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-import onnx
 
 from beers_deploy.bench.swath import predict_file, swath_latency
 from beers_deploy.dpu.board import dpu_of
 from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.reader import open_raster
+from beers_deploy.network import Network
 from beers_deploy.profiles.errors import BeersError, ImageError
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.restoration.detectors.words import warn_of_detectors
+from beers_deploy.restoration.figures import plan_figures
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.plan import Plan, plan_for
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
-from beers_deploy.restoration.run import plan_figures
 from beers_deploy.restoration.runtime import open_runtime, tiles_at_once
 from beers_deploy.restoration.sensor_check import SensorCheck, told_sensor
 from beers_deploy.restoration.steps import keeps_pixels
@@ -50,7 +49,7 @@ def info_row(
         measure: whether tiles are timed here.
         log: is told of faults of detectors, and where the image contradicts its sensor.
     """
-    network = load_onnx(options.model)
+    network = Network.load(options.network)
     with open_raster(image, options.trust_index) as source:
         raster = source.raster
         scale = known_scale(image.name, raster, options)
@@ -69,7 +68,7 @@ def info_row(
         "bands": measured(raster.bands, "1", HEADER),
         **plan_figures(plan),
         "time here": time_here(network, plan, options) if measure else unavailable("s", UNTIMED),
-        f"time on {target.name}": time_on_board(options.model, plan, target),
+        f"time on {target.name}": time_on_board(network, plan, target),
         **check.figures,
         **detectors,
     }
@@ -130,13 +129,13 @@ def _crs_name(crs: Any) -> str:
     return f"EPSG:{code}" if code else "a coordinate system without a code"
 
 
-def time_here(network: onnx.ModelProto, plan: Plan, options: Options) -> Figure:
+def time_here(network: Network, plan: Plan, options: Options) -> Figure:
     """The time of all tiles, from those timed here; reading and writing are done beside it.
 
     The interval is of the quickest and the slowest of the runs.
     """
     at_once = tiles_at_once(options.threads, plan.tiles)
-    infer, runtime = open_runtime(options.runtime, network, options.threads)
+    infer, runtime = open_runtime(options.runtime, network.model, options.threads)
     shape = (1, plan.tiling.channels_in, *plan.tile_shape)
     tile = np.random.default_rng(0).random(shape, np.float32)
     # The first run also prepares the network, so it is not timed.
@@ -151,7 +150,7 @@ def time_here(network: onnx.ModelProto, plan: Plan, options: Options) -> Figure:
     return predicted(median(times), "s", (min(times), max(times)), how)
 
 
-def time_on_board(model: Path, plan: Plan, target: TargetProfile) -> Figure:
+def time_on_board(network: Network, plan: Plan, target: TargetProfile) -> Figure:
     """The time of all tiles on a board's DPU, by the cost model, in whole batches and with one
     exposure each.
 
@@ -163,7 +162,8 @@ def time_on_board(model: Path, plan: Plan, target: TargetProfile) -> Figure:
         else 0.0
     )
     try:
-        prediction = predict_file(model, dpu_of(target), max(plan.tile_shape), step_px=step_px)
+        tile_px = max(plan.tile_shape)
+        prediction = predict_file(network.file, dpu_of(target), tile_px, step_px=step_px)
     except BeersError as error:
         return unavailable("s", f"the cost model takes {error.expected}, got {error.got}")
     return swath_latency(prediction, math.ceil(plan.tiles / prediction.batch))

@@ -6,13 +6,12 @@ The pixels are those that the command `restore` writes of the same image.
 import os
 import warnings
 from dataclasses import dataclass, replace
-from functools import partial
+from enum import StrEnum
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
-import onnx
 
 from beers_deploy.model.progress import Progress, no_log, reporting
 from beers_deploy.model.raster.facts import (
@@ -24,29 +23,22 @@ from beers_deploy.model.raster.facts import (
     usable_nodata,
 )
 from beers_deploy.model.raster.source import ArraySource
-from beers_deploy.model.shipped import INT8, VARIANT
 from beers_deploy.network import Network, NetworkLike, SensorLike
-from beers_deploy.network_files import brighter_files, conditioned, other_sensor
-from beers_deploy.profiles.errors import ImageError, OptionError, optional
+from beers_deploy.network_files import other_sensor
+from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import TILE_PX
-from beers_deploy.quant.onnx_file import load_onnx
-from beers_deploy.restoration.options import Options, Runtime
+from beers_deploy.restoration.options import Method, Options, Runtime
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.plan import plan_for
-from beers_deploy.restoration.radiometry import full_scale_of
-from beers_deploy.restoration.run import check_sensor, restore_file, scale_of
-from beers_deploy.restoration.runtime import Packed, open_runtime, tiles_at_once
-from beers_deploy.restoration.sensor_check import told_sensor
-from beers_deploy.restoration.steps import consistency_steps, exposed_networks
-from beers_deploy.restoration.tiles.engine import NAME, Restorer, as_stored, checked_strip
+from beers_deploy.restoration.prepare import prepare
+from beers_deploy.restoration.run import restore_file
+from beers_deploy.restoration.tiles.engine import NAME
 from beers_deploy.restoration.tiles.lazy import restore_lazily
-from beers_deploy.restoration.tiles.rows import restore_array
 from beers_deploy.results import Table
 
-NETWORK = "network"
-TRADITIONAL = "traditional"
+PLAN = "plan: "
+"""How the sentence begins that says how an image is cut."""
 
 
 def restore(
@@ -133,40 +125,36 @@ def restore(
         >>> bool(pair.psnr(restored) > pair.psnr(pair.degraded))
         True
     """
-    if method not in (NETWORK, TRADITIONAL):
-        raise OptionError(
-            "method", expected=f"{NETWORK} or {TRADITIONAL}", got=repr(method), remedy="choose one"
-        )
-    if method == TRADITIONAL:
+    chosen = _choice(Method, "method", method)
+    if chosen is Method.traditional:
         changed = {"network": network is not None, "tile": tile != TILE_PX, "halo": halo != "exact"}
         changed |= {"runtime": runtime != Runtime.onnxruntime, "threads": threads != 0}
-        changed |= {"resume": resume, "cog": cog}
+        changed |= {"resume": resume}
         name = next((option for option, is_changed in changed.items() if is_changed), None)
         if name is not None:
             raise OptionError(
                 name, expected="none with method traditional", got="one", remedy="leave it out"
             )
     profile = Sensor.load(sensor)
-    chosen_network = Network.load(
-        f"{VARIANT}{INT8}" if network is None else network, sensor=profile
-    )
-    sensors = {} if profile.name == BLIND else {"": profile}
-    brighter = _brighter(network, chosen_network, profile) if exposure and method == NETWORK else {}
+    named = {} if profile.name == BLIND else {"": profile}
     options = Options(
-        chosen_network.file,
+        None if chosen is Method.traditional else _network(network, profile),
         tile,
         str(halo),
         full_scale,
-        _runtime(runtime),
+        _choice(Runtime, "runtime", runtime),
         threads,
-        sensors=sensors,
+        # The pipeline needs a sensor, and takes the middle of all where none is named.
+        sensors={"": profile} if chosen is Method.traditional else named,
         again=again,
         any_result=any_result,
         strict=strict,
         consistency=consistency,
-        brighter={"": brighter} if brighter else {},
+        exposure=exposure,
+        method=chosen,
+        quality=quality,
     )
-    job = Job(method, quality, profile, nodata, options)
+    job = Job(nodata, options)
     with reporting(progress):
         # A dataset of rasterio has a coordinate system and the name of its file.
         if isinstance(image, str | os.PathLike) or hasattr(image, "crs"):
@@ -180,29 +168,32 @@ def restore(
         return _restore_any(image, job)
 
 
-def _brighter(
-    network: NetworkLike | None, chosen_network: Network, sensor: Sensor
-) -> dict[int, Path]:
-    """A conditioned network at higher exposures; of any other one none, and a warning if it is
-    another sensor's.
-    """
-    if network is None or isinstance(network, str | os.PathLike):
-        path = None if network is None else Path(network)
-        if conditioned(path) is not None:
-            return brighter_files(path, sensor)
-    if sensor.name != BLIND and (doubt := other_sensor(chosen_network.model, sensor)):
+def _network(network: NetworkLike | None, sensor: Sensor) -> Network:
+    """Return the network that is meant, and warn if it was made for another sensor."""
+    chosen = Network.load(network, sensor=sensor)
+    named = sensor.name != BLIND and chosen.weights is None
+    if named and (doubt := other_sensor(chosen.model, sensor)):
         # The warning points at the line that calls `restore`.
         warnings.warn(doubt, stacklevel=3)
-    return {}
+    return chosen
+
+
+Choice = TypeVar("Choice", bound=StrEnum)
+
+
+def _choice(choices: type[Choice], option: str, name: str) -> Choice:
+    """Return the choice of that name; refuse any other."""
+    try:
+        return choices(name)
+    except ValueError as error:
+        expected = " or ".join(choices)
+        raise OptionError(option, expected=expected, got=repr(name), remedy="choose one") from error
 
 
 @dataclass(frozen=True)
 class Job:
     """How an array is restored, and the value of its missing pixels."""
 
-    method: str
-    quality: str
-    sensor: Sensor
     nodata: float | None
     options: Options
 
@@ -232,21 +223,15 @@ def _restore_path(
             "nodata", expected="none beside an image file", got=f"{job.nodata:g}", remedy=remedy
         )
     path = Path(out)
-    if job.method == TRADITIONAL:
-        # It loads torch, which is optional.
-        from beers_deploy.restoration.traditional import restore_file_traditionally
-
-        options_of_sensor = replace(options, sensors={"": job.sensor})
-        row = restore_file_traditionally(image, path, options_of_sensor, no_log)
-    else:
-        row = restore_file(image, path, options, no_log)
+    row = restore_file(image, path, options, no_log)
     arguments = {
-        "method": job.method,
-        "sensor": job.sensor.name,
+        "method": options.method.value,
+        "sensor": next((sensor.name for sensor in options.sensors.values()), BLIND),
         "tile": options.tile_px,
         "halo": options.halo,
     }
-    inputs = (image,) if job.method == TRADITIONAL else (options.model, image)
+    network = options.network
+    inputs = (network.input, image) if isinstance(network, Network) else (image,)
     time_s = row.figures["time"].value or 0.0
     return Run("restore", arguments, inputs, (row,), path=path, time_s=time_s)
 
@@ -315,46 +300,14 @@ def _restore(image: Any, job: Job) -> Any:
         raise ImageError(
             NAME, expected="a Dask array without a mask", got="a masked one", remedy=remedy
         )
-    if job.method == NETWORK:
-        restored = (restore_lazily if lazy else _restore_now)(bands, raster, job.options)
-    elif lazy:
+    method = job.options.method
+    if lazy and method is not Method.network:
         remedy = "compute it first, or take a network"
         raise OptionError(
-            "method", expected="network for a Dask array", got=job.method, remedy=remedy
+            "method", expected="network for a Dask array", got=method.value, remedy=remedy
         )
-    else:
-        restored = _restore_traditionally(bands, raster, job)
+    restored = (restore_lazily if lazy else _restore_now)(bands, raster, job.options)
     return restored[0] if image.ndim == 2 and len(restored) == 1 else restored
-
-
-def _restore_traditionally(bands: np.ndarray, raster: Raster, job: Job) -> np.ndarray:
-    """Each band by the traditional pipeline; missing pixels stay as they are."""
-    torch = optional("torch", "method")
-    from beers_deploy.model.traditional.pipeline import Chain, restore_traditional
-
-    chain = Chain(job.sensor.nominal(), job.sensor.reference.nominal(), job.quality)
-    bits = int(chain.degraded.max_dn).bit_length()
-    extents = (raster.extent(band) for band in bands)
-    full_scale = full_scale_of(NAME, raster, extents, job.options.full_scale, bits).value
-    to_dn = np.float32(chain.degraded.max_dn / full_scale)
-    restored = []
-    told_sensor(
-        ArraySource(bands, raster),
-        job.options.sensors,
-        full_scale,
-        NAME,
-        job.options.strict,
-        warnings.warn,
-    )
-    for band in bands:
-        strip = checked_strip(raster, 0, band[None], full_scale, NAME)
-        dn = np.ma.getdata(band).astype(np.float32) * to_dn
-        missing = np.zeros(band.shape, bool) if strip.missing is None else strip.missing[0]
-        dn[missing] = np.nan
-        result = np.nan_to_num(restore_traditional(torch.from_numpy(dn), chain).numpy()) / to_dn
-        stored = np.ma.getdata(band).astype(raster.out_dtype)
-        restored.append(np.where(missing, stored, as_stored(raster, result, full_scale)))
-    return np.stack(restored)
 
 
 def _labelled(image: Any, pixels: Any) -> Any:
@@ -393,22 +346,24 @@ def _between(places: np.ndarray, count: int) -> np.ndarray | None:
 
 
 def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndarray:
-    network = load_onnx(options.model)
-    source = ArraySource(bands, raster)
-    plan = plan_for(network, raster.shape, options)
-    at_once = tiles_at_once(options.threads, plan.tiles)
-    infer, _ = open_runtime(options.runtime, network, options.threads, at_once)
-    full_scale = scale_of(source, plan, options, NAME).value
-    check_sensor(source, [network], options, full_scale, NAME, warnings.warn)
+    work = prepare(ArraySource(bands, raster), options, NAME, _warn)
+    tally = Tally()
+    pixels = np.empty(work.out_shape, raster.out_dtype)
+    top = 0
+    for row in work.rows(0, lambda _: None):
+        rows_px = row.pixels.shape[1]
+        pixels[:, top : top + rows_px] = row.pixels
+        tally += row.tally
+        top += rows_px
+    if not options.any_result:
+        tally.require(name=NAME)
+    return pixels
 
-    def at_first_call(brighter: onnx.ModelProto) -> Packed:
-        return Packed(brighter.SerializeToString(), options.runtime, options.threads, at_once)
 
-    exposed = exposed_networks([infer], options, raster, plan.tiling, full_scale, at_first_call)
-    steps, _ = consistency_steps(options, raster, plan.tiling, full_scale)
-    restorer = Restorer(raster, exposed, full_scale, plan.tiling, NAME, consistency=steps)
-    look = None if options.any_result else partial(Tally.require, name=NAME)
-    return restore_array(source, plan, restorer, at_once, look)
+def _warn(sentence: str) -> None:
+    """Warn of what a run logs, except how the image is cut."""
+    if not sentence.startswith(PLAN):
+        warnings.warn(sentence, stacklevel=2)
 
 
 BAND_DIMS = ("band", "bands", "channel", "wavelength")
@@ -441,13 +396,3 @@ def _raster(bands: Any, nodata: float | None) -> Raster:
     mask_kind: MaskKind = "mask" if np.ma.isMaskedArray(bands) else ""
     nodata = usable_nodata(value, dtype)
     return Raster(count, height_px, width_px, dtype, nodata, mask_kind=mask_kind)
-
-
-def _runtime(name: str) -> Runtime:
-    try:
-        return Runtime(name)
-    except ValueError as error:
-        expected = " or ".join(Runtime)
-        raise OptionError(
-            "runtime", expected=expected, got=repr(name), remedy="choose one"
-        ) from error

@@ -4,7 +4,7 @@ import hashlib
 import io
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +15,16 @@ import onnx
 import onnxruntime as ort
 
 from beers_deploy.export import float_model, require_tile
-from beers_deploy.network_files import network_file, process_file
+from beers_deploy.model.exposure import brightened, factors_for
+from beers_deploy.model.progress import Log, no_log
+from beers_deploy.model.shipped import INT8, VARIANT
+from beers_deploy.network_files import (
+    Conditioned,
+    conditioned,
+    process_file,
+    require_known,
+    warn_outside,
+)
 from beers_deploy.profiles.errors import ModelError, OutsideRangeWarning, optional
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
@@ -61,6 +70,8 @@ class Network:
         quantised: its integers and the graph that they were rounded from, where it was quantised
             here by itself.
         file_sha256: of the file as it was read; empty of one that is in memory alone.
+        weights: of a network that is conditioned on its sensor: what it was made from.
+        profile: the sensor that such a network is conditioned on.
 
     Examples:
         >>> bd.Network.load("convbeers-s-int8").precision
@@ -74,11 +85,13 @@ class Network:
     layers: tuple[Row, ...] = ()
     quantised: "Quantised | None" = None
     file_sha256: str = ""
+    weights: Conditioned | None = None
+    profile: Sensor | None = None
 
     @classmethod
     def load(
         cls,
-        network: NetworkLike,
+        network: NetworkLike | None,
         *,
         sensor: SensorLike = BLIND,
         example: Sequence[int] = (1, 1, 64, 64),
@@ -88,7 +101,8 @@ class Network:
         torch.
 
         Args:
-            network: a shipped name has -int8 behind it for INT8; a `Network` is returned as it is.
+            network: a shipped name has -int8 behind it for INT8; a `Network` is returned as it is;
+                None is convbeers-s-int8.
             sensor: that a shipped network is told: a `Sensor`, a name or a .toml file.
             example: shape (N, C, H, W) of an image that a module of torch takes; number and size
                 stay free.
@@ -101,19 +115,58 @@ class Network:
         """
         if isinstance(network, Network):
             return network
+        if network is None:
+            network = f"{VARIANT}{INT8}"
         if isinstance(network, onnx.ModelProto):
             name = network.graph.name or "network"
             return cls(read_onnx(network.SerializeToString(), name), name)
         if isinstance(network, str | os.PathLike):
-            source = Path(network)
-            path = network_file(source, Sensor.load(sensor), _warn)
+            path = require_known(Path(network))
+            weights = conditioned(path)
+            if weights is not None:
+                int8 = path.name.endswith(INT8)
+                return cls.for_sensor(weights, Sensor.load(sensor), int8=int8, log=_warn)
             to_run = to_run or path.suffix == ".safetensors"
             with unchanged(path) as digest:
                 model = float_model(path) if to_run else load_onnx(path, to_run=False)
-            return cls(
-                model, source.stem if path == source else source.name, path, file_sha256=digest
-            )
+            return cls(model, path.stem, path, file_sha256=digest)
         return cls(exported(network, example), type(network).__name__)
+
+    @classmethod
+    def for_sensor(
+        cls, weights: Conditioned, sensor: Sensor, *, int8: bool, log: Log = no_log
+    ) -> "Network":
+        """Return a network conditioned on a sensor.
+
+        Args:
+            weights: of the network.
+            sensor: of which the middle of each range counts.
+            int8: whether in INT8 or in float32.
+            log: is told what of the sensor lies outside the range that was trained.
+
+        Raises:
+            ModelError: INT8 of weights that have no INT8 file.
+        """
+        warn_outside(sensor, weights.kernels, log)
+        name = f"{weights.name}{INT8}" if int8 else weights.name
+        return cls(weights.model(sensor, int8), name, weights=weights, profile=sensor)
+
+    @cached_property
+    def exposures(self) -> Mapping[int, "Network"]:
+        """The network for sensors of so many times the gain, by factor above 1.
+
+        Empty if the network is not conditioned on its sensor, and if the sensor's noise allows no
+        factor.
+        """
+        if self.weights is None or self.profile is None:
+            return {}
+        int8 = self.precision == "int8"
+        # Nobody chose the sensors of the other exposures, so their warnings are not logged.
+        return {
+            factor: Network.for_sensor(self.weights, brightened(self.profile, factor), int8=int8)
+            for factor in factors_for(self.profile.nominal())
+            if factor > 1
+        }
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the network as an ONNX file, whole or not at all."""
@@ -162,7 +215,7 @@ class Network:
         Raises:
             ModelError: a network that cannot be tiled.
         """
-        return tiling_of(self.model)
+        return tiling_of(self.model, self.label)
 
     @property
     def sensor(self) -> str:

@@ -124,6 +124,16 @@ def pair_of(floating: Path | None, int8: Path | None) -> tuple[Path, Path]:
     return name, in_int8(int8 or name)
 
 
+def require_known(given: Path) -> Path:
+    """Return a path that may be a file or a shipped name; refuse any other."""
+    if given.suffix or given.exists() or _is_shipped(given):
+        return given
+    expected = f"a file, or a shipped network ({', '.join(shipped_names())}, each also with {INT8})"
+    raise ModelError(
+        str(given), expected=expected, got="neither", remedy="correct the name, or the path"
+    )
+
+
 def network_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
     """The file of a network: the one given, or a conditioned network's for the sensor, INT8 where
     its name says so.
@@ -134,13 +144,8 @@ def network_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
         sensor: what a conditioned network is told: the middle of each of its ranges.
         log: is told what of the sensor lies outside the range that was trained.
     """
-    if given is not None and not (given.suffix or given.exists() or _is_shipped(given)):
-        expected = (
-            f"a file, or a shipped network ({', '.join(shipped_names())}, each also with {INT8})"
-        )
-        raise ModelError(
-            str(given), expected=expected, got="neither", remedy="correct the name, or the path"
-        )
+    if given is not None:
+        require_known(given)
     int8 = given is None or given.name.endswith(INT8)
     return int8_file(given, sensor, log) if int8 else float_file(given, sensor, log)
 

@@ -1,6 +1,5 @@
 """`beers-deploy info`: what the tool makes of an image, before it is restored."""
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -54,7 +53,7 @@ def info(
     from beers_deploy.info import info_row
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.raster.index import index_files
-    from beers_deploy.network_files import network_file
+    from beers_deploy.network import Network
     from beers_deploy.results import Table, print_rows
 
     tiles = index_files(image, trust_index)
@@ -62,12 +61,13 @@ def info(
         json, inputs=(image, *tiles, network, Path(sensor) if sensor else None, Path(target))
     )
     profile = load_sensor(sensor or BLIND)
-    path = network_file(network, profile, partial(say, err=True))
+    chosen = Network.load(network, sensor=profile)
     sensors = {"": profile} if sensor else {}
     options = Options(
-        path, tile, full_scale=full_scale, trust_index=trust_index, sensors=sensors, strict=strict
+        chosen, tile, full_scale=full_scale, trust_index=trust_index, sensors=sensors, strict=strict
     )
     row = info_row(image, options, load_target(target), measure, say)
     print_rows(str(image), [row])
     # FILE has no digest here, because the whole file would be read for it.
-    save(Table("info", arguments(sensor=sensor or BLIND, image=image.name), (path,), (row,)), json)
+    given = arguments(sensor=sensor or BLIND, image=image.name)
+    save(Table("info", given, (chosen.input,), (row,)), json)

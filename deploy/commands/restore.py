@@ -1,11 +1,9 @@
 """`beers-deploy restore`: a raw image in, the restored one out, of any size."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from enum import StrEnum
-from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,11 +20,13 @@ from beers_deploy.commands.shared import (
 from beers_deploy.model.raster.compression import Compression
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import OptionError, optional
-from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import TILE_PX
-from beers_deploy.restoration.options import Options, Runtime
+from beers_deploy.restoration.options import Method, Options, Runtime
+
+if TYPE_CHECKING:
+    from beers_deploy.network import Network
 
 NETWORK_ONLY = (
     "network",
@@ -36,20 +36,10 @@ NETWORK_ONLY = (
     "runtime",
     "threads",
     "scheduler",
-    "cog",
-    "stac",
-    "any_result",
     "consistency",
     "exposure",
 )
 """Options of which the traditional pipeline takes none."""
-
-
-class Method(StrEnum):
-    """A network, or the traditional pipeline."""
-
-    network = "network"
-    traditional = "traditional"
 
 
 def restore(
@@ -166,14 +156,12 @@ def restore(
     is conditioned on --sensor, and without it on the middle of its range. IN's own noise and edges
     are compared with --sensor, and stripes, dead and hot columns and pixels are warned of. The
     consistency step keeps the mean and the flux of points; exposure lets INT8 restore dark parts as
-    well as bright ones. --method traditional restores one band, about a minute a megapixel on two
-    cores, and is not resumable. Until OUT is finished its rows
-    lie in .OUT.part.
+    well as bright ones. --method traditional takes about a minute a megapixel and band on two
+    cores, and is not resumable. Until OUT is finished its rows lie in .OUT.part.
     """
-    from beers_deploy.model.io.files import require_writable, sha256
+    from beers_deploy.model.io.files import require_writable
     from beers_deploy.model.raster.reader import require_image_file
-    from beers_deploy.model.shipped import INT8
-    from beers_deploy.network_files import brighter_files, conditioned, network_file
+    from beers_deploy.network import Network
     from beers_deploy.restoration.bands import parse_sensors
     from beers_deploy.restoration.detectors.fault_list import FOUND, list_beside
     from beers_deploy.restoration.run import restore_file
@@ -189,6 +177,7 @@ def restore(
     # The list of faults is an output of its own where they are searched for.
     found_list = list_beside(out, fix_detectors or "")
     require_writable(out, json, stac, found_list, inputs=(image, network, listed, *profiles))
+    sensor_profiles = {band: load_sensor(text) for band, text in sensors.items()}
     how = Options(
         tile_px=tile,
         halo=halo,
@@ -206,65 +195,37 @@ def restore(
         any_result=any_result,
         consistency=consistency,
         fix_detectors=fix_detectors or "",
+        sensors=sensor_profiles if sensor else {},
+        exposure=exposure,
+        method=method,
     )
+    _require_item(stac, cog)
+    inputs = list[Input]()
     if method is Method.traditional:
         refuse(context, NETWORK_ONLY, expected="none with --method traditional", got="one")
-        row = _by_the_chain(image, out, sensor, how, (json, found_list))
-        print_rows(f"wrote {out}", [row])
-        save(Table("restore", arguments(), (image, *lists), (row,)), json)
-        return
-    _require_item(stac, cog)
-    sensor_profiles = {band: load_sensor(text) for band, text in sensors.items()}
-    require_image_file(image)
-    if weights := conditioned(network):
-        words = (
-            f"told {sensor}"
-            if sensor
-            else "told no sensor (blind): --sensor tells it yours, and restores better"
+        _require_sensor(sensor)
+    else:
+        require_image_file(image)
+        networks = {
+            band: Network.load(network, sensor=profile) for band, profile in sensor_profiles.items()
+        }
+        _say_network(next(iter(networks.values())), sensor, sensor_profiles)
+        _require_equal_bits(sensor_profiles, full_scale)
+        how = replace(
+            how,
+            network=next(iter(networks.values())),
+            bands={} if "" in networks else networks,
         )
-        name = network.name if network else f"{weights.name}{INT8}"
-        say(f"network: {name}, {words}")
-    paths = {
-        band: network_file(network, profile, partial(say, err=True))
-        for band, profile in sensor_profiles.items()
-    }
-    brighter = (
-        {band: brighter_files(network, profile) for band, profile in sensor_profiles.items()}
-        if exposure
-        else {}
-    )
-    # Only a conditioned network can be given the sensor; any other one was made for its own.
-    if sensor and not weights:
-        _look_at_network(network, paths, sensor_profiles)
-    path = next(iter(paths.values()))
-    # The bits of the sensor decide full scale, which is one number for all bands.
-    bits = {int(profile.bits.low) for profile in sensor_profiles.values()}
-    if len(bits) > 1 and full_scale is None:
-        remedy = "give --full-scale, or restore such bands apart"
-        raise OptionError(
-            "--sensor", expected="sensors of equal bits", got=f"{sorted(bits)}", remedy=remedy
-        )
-    how = replace(
-        how,
-        model=path,
-        sensors=sensor_profiles if sensor else {},
-        bands={} if "" in paths else paths,
-        brighter={band: files for band, files in brighter.items() if files},
-    )
-    # The digests are taken before the run, which may take hours and refuses a file that is
-    # replaced while it is read.
-    networks = [
-        Input(f"{path.name}, {band}" if band else path.name, sha256(path))
-        for band, path in paths.items()
-    ]
+        inputs = [
+            each.input._replace(name=f"{each.input.name}, {band}") if band else each.input
+            for band, each in networks.items()
+        ]
     row = restore_file(image, out, how, say, (json, stac, found_list))
     if stac is not None:
         write_item(out, stac)
     print_rows(f"wrote {out}", [row])
-    save(
-        Table("restore", arguments(sensor=sensor or BLIND), (*networks, image, *lists), (row,)),
-        json,
-    )
+    read = (*inputs, image, *lists)
+    save(Table("restore", arguments(sensor=sensor or BLIND), read, (row,)), json)
 
 
 def _require_item(stac: Path | None, cog: bool) -> None:
@@ -278,14 +239,37 @@ def _require_item(stac: Path | None, cog: bool) -> None:
     optional("pystac", "--stac")
 
 
-def _look_at_network(
-    network: Path | None, paths: Mapping[str, Path], sensor_profiles: Mapping[str, Sensor]
+def _say_network(
+    network: "Network", sensor: str | None, sensor_profiles: Mapping[str, Sensor]
 ) -> None:
+    """Say which network restores, and for which sensor it was made."""
+    if network.weights is not None:
+        words = (
+            f"told {sensor}"
+            if sensor
+            else "told no sensor (blind): --sensor tells it yours, and restores better"
+        )
+        say(f"network: {network.name}, {words}")
+    # Only a conditioned network can be given the sensor; any other one was made for its own.
+    elif sensor:
+        _look_at_network(network, sensor_profiles)
+
+
+def _require_equal_bits(sensor_profiles: Mapping[str, Sensor], full_scale: float | None) -> None:
+    """Refuse sensors of different bits: they decide full scale, one number for all bands."""
+    bits = {int(profile.bits.low) for profile in sensor_profiles.values()}
+    if len(bits) > 1 and full_scale is None:
+        remedy = "give --full-scale, or restore such bands apart"
+        raise OptionError(
+            "--sensor", expected="sensors of equal bits", got=f"{sorted(bits)}", remedy=remedy
+        )
+
+
+def _look_at_network(network: "Network", sensor_profiles: Mapping[str, Sensor]) -> None:
     """Refuse sensors by band for a network that is for one; say where it was made for another
     sensor.
     """
     from beers_deploy.network_files import other_sensor
-    from beers_deploy.quant.onnx_file import load_onnx
 
     if len(sensor_profiles) > 1:
         expected = "a shipped network, or weights of 'train --conditioned'"
@@ -293,23 +277,16 @@ def _look_at_network(
         raise OptionError(
             "--sensor",
             expected=expected,
-            got=f"{network} with a sensor for each band",
+            got=f"{network.label} with a sensor for each band",
             remedy=remedy,
         )
-    if doubt := other_sensor(load_onnx(paths[""]), sensor_profiles[""]):
+    if doubt := other_sensor(network.model, sensor_profiles[""]):
         say(doubt, err=True)
 
 
-def _by_the_chain(
-    image: Path, out: Path, sensor: str | None, how: Options, beside: Sequence[Path | None]
-) -> Row:
-    from beers_deploy.restoration.traditional import restore_file_traditionally
-
+def _require_sensor(sensor: str | None) -> None:
     if sensor is None:
         remedy = "name a profile ('beers-deploy profiles' lists them) or give your .toml file"
         raise OptionError(
             "--sensor", expected="the sensor that acquired IN", got="none", remedy=remedy
         )
-    return restore_file_traditionally(
-        image, out, replace(how, sensors={"": load_sensor(sensor)}), say, beside
-    )

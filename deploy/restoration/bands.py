@@ -9,11 +9,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-import onnx
-
 from beers_deploy.model.raster.facts import Raster
+from beers_deploy.network import Network
 from beers_deploy.profiles.errors import ModelError, OptionError
-from beers_deploy.quant.tiling.walk import tiling_of
 
 Each = TypeVar("Each")
 
@@ -61,11 +59,9 @@ def _by_number(names: Iterable[str]) -> tuple[str, ...]:
     )
 
 
-def require_alike(networks: Sequence[onnx.ModelProto], paths: Sequence[Path]) -> None:
-    """That networks of several bands are met alike by an image: one plan of
-    tiles serves them all.
-    """
-    tilings = [tiling_of(network, str(path)) for network, path in zip(networks, paths, strict=True)]
+def require_alike(networks: Sequence[Network]) -> None:
+    """Refuse networks of several bands that one plan of tiles cannot serve."""
+    tilings = [network.tiling for network in networks]
     if len(networks) > 1 and (len(set(map(repr, tilings))) > 1 or tilings[0].channels_in != 1):
         remedy = "give one network for all bands"
         got = "networks of several bands, or of different halos"

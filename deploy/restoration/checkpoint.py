@@ -33,6 +33,7 @@ class Checkpoint:
     Attributes:
         rows: how many are finished.
         tally: what was seen of them.
+        job: all that decides the pixels.
         damaged_rows: how many an earlier run finished that no longer match its journal, and those
             below them.
     """
@@ -65,7 +66,7 @@ class Checkpoint:
         self.folder = part_folder(out)
         for name in ROWS_FILES:
             require_regular(self.folder / name)
-        self._job = dict(job)
+        self.job = dict(job)
         self._row_ends = list(row_ends)
         journal_rows = self._left() if resume else []
         self._finished = self._matching(journal_rows)
@@ -150,7 +151,7 @@ class Checkpoint:
         if not path.is_file():
             return []
         with suppress(ValueError, LookupError, TypeError, AttributeError, OSError):
-            finished = read_journal(path, self._job)
+            finished = read_journal(path, self.job)
             ends = list(accumulate(row.rows_px for row in finished))
             planned = not self._row_ends or ends == self._row_ends[: len(ends)]
             if planned and max(ends, default=0) <= self.shape[1]:
@@ -191,7 +192,7 @@ class Checkpoint:
         path = self.folder / "journal.json"
         fresh = self.folder / "journal.new"
         with fresh.open("w", encoding="utf-8") as stream:
-            stream.write(journal_text(self._job, self._finished))
+            stream.write(journal_text(self.job, self._finished))
             stream.flush()
             os.fsync(stream.fileno())
         # A run that is killed here leaves the old journal or the new one, never half of one.

@@ -34,7 +34,7 @@ class Around:
     exposure: bool = True
 
 
-BOTH = Around()
+BOTH: Around = Around()
 
 
 def network_method(

@@ -3,15 +3,27 @@
 It loads nothing, so that '--help' stays quick.
 """
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from beers_deploy.model.raster.compression import Compression
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import TILE_PX
+
+if TYPE_CHECKING:
+    from beers_deploy.network import NetworkLike
+
+
+class Method(StrEnum):
+    """A network, or the traditional pipeline."""
+
+    network = "network"
+    traditional = "traditional"
 
 
 class Runtime(StrEnum):
@@ -26,7 +38,7 @@ class Options:
     """What a user can choose of a restoration.
 
     Attributes:
-        model: the network's file; none of the traditional pipeline.
+        network: what `Network.load` takes; the default network if None.
         tile_px: longest side of a tile.
         halo: 'exact', or pixels of context around a tile.
         full_scale: the pixel value that is 1.0 to the network; None leaves it to
@@ -40,20 +52,21 @@ class Options:
         scheduler: address of a Dask scheduler whose workers run the network; None runs it here.
         again: whether an image may be one that was restored already.
         any_result: whether a result is written that no restoration has.
-        bands: networks of single bands by their names, each for its own sensor; empty where `model`
+        bands: networks of single bands by their names, each for its own sensor; empty if `network`
             is for all.
-        brighter: the network for sensors of so many times the gain, by band and factor; empty where
-            none is.
+        exposure: whether dark parts are restored at a higher exposure, by a conditioned network.
         consistency: whether the consistency step is taken where the sensor is known.
         fix_detectors: the list of faulty detectors to replace, or 'found'; empty to replace none.
         cog: whether the output is a Cloud-Optimised GeoTIFF.
         sensors: that the user named, by band; under no name where one is for all, empty where none
             was named.
+        method: a network, or the traditional pipeline.
+        quality: of the traditional pipeline: fast, standard or best.
         strict: whether an image is refused that contradicts its sensor.
         trust_index: whether a VRT or DIMAP may name tiles outside its folder, at URLs too.
     """
 
-    model: Path = Path()
+    network: "NetworkLike | None" = None
     tile_px: int = TILE_PX
     halo: str = "exact"
     full_scale: float | None = None
@@ -69,10 +82,21 @@ class Options:
     cog: bool = False
     again: bool = False
     any_result: bool = False
-    bands: Mapping[str, Path] = field(default_factory=dict)
-    brighter: Mapping[str, Mapping[int, Path]] = field(default_factory=dict)
+    bands: "Mapping[str, NetworkLike]" = field(default_factory=dict)
+    exposure: bool = True
     consistency: bool = True
     fix_detectors: str = ""
+    method: Method = Method.network
+    quality: str = "standard"
+
+    @property
+    def network_paths(self) -> list[Path]:
+        """The files of the networks, which no output may be."""
+        given = [
+            each if isinstance(each, str | os.PathLike) else getattr(each, "path", None)
+            for each in (self.network, *self.bands.values())
+        ]
+        return [Path(each) for each in given if each is not None]
 
     @property
     def sensor_bits(self) -> int | None:

@@ -6,13 +6,13 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-import onnx
 
 from beers_deploy.model.io.files import TIFF_SUFFIXES
 from beers_deploy.model.raster.compression import Compression
 from beers_deploy.model.raster.facts import RESTORED_BY
 from beers_deploy.model.raster.source import Source
 from beers_deploy.model.raster.writer import require_equal, write_raster
+from beers_deploy.network import Network
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.restoration.checkpoint import COG, PLAIN, Checkpoint, sync_folder
@@ -40,16 +40,21 @@ def require_tiff_name(path: Path) -> None:
             )
 
 
-def what_was_done(
-    networks: Sequence[onnx.ModelProto], digests: str, scale: FullScale
-) -> dict[str, str]:
+def what_was_done(networks: Sequence[Network], scale: FullScale) -> dict[str, str]:
     """Return the run as an image's metadata: tool, networks in the order of the bands, their
     sensors and full scale.
     """
-    entries = [metadata(network) for network in networks]
+    tool = {RESTORED_BY: f"beers-deploy {version('beers-deploy')}"}
+    if not networks:
+        return {
+            **tool,
+            "RESTORED_NETWORK": "none: the traditional pipeline",
+            "RESTORED_FULL_SCALE": scale.words,
+        }
+    entries = [metadata(network.model) for network in networks]
     return {
-        RESTORED_BY: f"beers-deploy {version('beers-deploy')}",
-        "RESTORED_NETWORK_SHA256": digests,
+        **tool,
+        "RESTORED_NETWORK_SHA256": ", ".join(network.sha256 for network in networks),
         "RESTORED_NETWORK": ", ".join(entry.get("variant", "not stated") for entry in entries),
         "RESTORED_SENSOR": ", ".join(entry.get("sensor", "not stated") for entry in entries),
         "RESTORED_FULL_SCALE": scale.words,

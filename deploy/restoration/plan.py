@@ -11,12 +11,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import onnx
 import psutil
 
 from beers_deploy.model.raster.source import Source
+from beers_deploy.network import Network
 from beers_deploy.profiles.errors import MachineError, ModelError, OptionError, sizes
-from beers_deploy.quant.tiling.walk import Tiling, tiling_of
+from beers_deploy.quant.tiling.walk import Tiling
 from beers_deploy.restoration.options import Options, parse_halo
 
 
@@ -183,9 +183,9 @@ class Plan:
         )
 
 
-def plan_for(network: onnx.ModelProto, shape: tuple[int, int, int], options: Options) -> Plan:
+def plan_for(network: Network, shape: tuple[int, int, int], options: Options) -> Plan:
     """How an image of `shape` (bands, H, W) is cut for a network, as a user's options ask."""
-    tiling = tiling_of(network, str(options.model))
+    tiling = network.tiling
     _, height_px, width_px = shape
     if tiling.fixed_px is not None and (
         tiling.fixed_px != options.tile_px or min(shape[1:]) < tiling.fixed_px

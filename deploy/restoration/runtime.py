@@ -161,6 +161,23 @@ def session_threads(threads: int, at_once: int) -> int:
     return (threads or os.cpu_count() or 1) - at_once + 1 if at_once > 1 else threads
 
 
+class AtFirstCall:
+    """A network that is opened once, when it is first run."""
+
+    def __init__(self, open_network: Callable[[], tuple[Infer, str]]) -> None:
+        self._open = open_network
+        self._infer: Infer | None = None
+        self._lock = Lock()
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        """Run the network, as an `Infer`."""
+        # Without the lock each thread would open a network of its own.
+        with self._lock:
+            if self._infer is None:
+                self._infer, _ = self._open()
+        return self._infer(image)
+
+
 @dataclass(frozen=True)
 class Packed:
     """A network that is opened once, at its first call, be it in another process.

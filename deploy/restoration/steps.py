@@ -5,17 +5,16 @@ sensor; the consistency step needs a known sensor, and a network that gives one 
 band for each pixel.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import chain
-from pathlib import Path
 
 import onnx
 
 from beers_deploy.model.consistency import Consistency
 from beers_deploy.model.raster.facts import Raster
+from beers_deploy.network import Network
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import BLIND
-from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.tiling.walk import Tiling
 from beers_deploy.restoration.bands import in_order
 from beers_deploy.restoration.options import Options
@@ -27,36 +26,37 @@ NO_SENSOR = f"{OFF}: no sensor is named"
 OTHER_PIXELS = f"{OFF}: the network makes other pixels or bands"
 
 
+def exposures_of(network: Network, options: Options) -> Mapping[int, Network]:
+    """Return a network at higher exposures by factor; empty if none is to be used."""
+    return network.exposures if options.exposure else {}
+
+
 def exposed_networks(
-    infers: Sequence[Infer],
+    networks: Sequence[Network],
     options: Options,
-    raster: Raster,
     tiling: Tiling,
     full_scale: float,
-    opened: Callable[[onnx.ModelProto], Infer],
+    opened: Callable[[onnx.ModelProto, bool], Infer],
 ) -> tuple[ExposedNetwork, ...]:
     """Build the network of each band at its exposures.
 
     Args:
-        infers: the networks at factor 1, one for all bands or one for each.
+        networks: one for all bands or one for each.
         options: what the user chose.
-        raster: of the image.
-        tiling: how the network meets it.
-        full_scale: the pixel value that is 1.0 to the network.
-        opened: makes a network ready to run.
+        tiling: how the networks meet an image.
+        full_scale: the pixel value that is 1.0 to a network.
+        opened: makes a network ready to run, at its first call if so asked.
     """
-    if not options.brighter:
-        return tuple(ExposedNetwork({1: infer}) for infer in infers)
-    # A band whose sensor allows no factor above 1 has no files, but still needs its network.
-    bands = options.sensors or options.brighter
-    brighter = in_order({band: options.brighter.get(band, {}) for band in bands}, raster)
-    sensors = in_order(options.sensors, raster) if options.sensors else [None] * len(brighter)
-    networks = []
-    for infer, files, sensor in zip(infers, brighter, sensors, strict=True):
-        others = {factor: opened(load_onnx(path)) for factor, path in files.items()}
-        offset = offset_of(sensor, full_scale) if sensor else 0.0
-        networks.append(ExposedNetwork({1: infer, **others}, tiling.halo_px, offset))
-    return tuple(networks)
+    built = []
+    for network in networks:
+        others = exposures_of(network, options)
+        infers = {factor: opened(other.model, True) for factor, other in others.items()}
+        offset = 0.0
+        if network.profile is not None and others:
+            offset = offset_of(network.profile, full_scale)
+        first = opened(network.model, False)
+        built.append(ExposedNetwork({1: first, **infers}, tiling.halo_px, offset))
+    return tuple(built)
 
 
 def offset_of(sensor: Sensor, full_scale: float) -> float:
@@ -99,7 +99,7 @@ def step_for(sensor: Sensor, full_scale: float) -> Consistency:
     return Consistency.of(sensor.nominal(), sensor.reference.nominal(), full_scale)
 
 
-def factor_words(brighter: Mapping[str, Mapping[int, Path]]) -> str:
-    """Return the factors that may be used, in words."""
-    factors = sorted({1, *chain.from_iterable(brighter.values())})
-    return ", ".join(f"x{factor}" for factor in factors)
+def factor_words(networks: Iterable[Network], options: Options) -> str:
+    """Return the factors that may be used, in words; empty if there is only one."""
+    factors = sorted(set(chain.from_iterable(exposures_of(each, options) for each in networks)))
+    return ", ".join(f"x{factor}" for factor in (1, *factors)) if factors else ""

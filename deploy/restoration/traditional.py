@@ -1,34 +1,29 @@
-"""The traditional pipeline on an image file of any size: what `restore --method traditional` does.
+"""The traditional pipeline on an image of any size: what `restore --method traditional` does.
 
 Rows come and go in strips, so that memory grows with the width alone. The pipeline depends on the
 sensor alone: its MTF, noise and gain. The reference it imitates is seen with the sensor's own gain
-and bits, so that the output has the scale of the input.
+and bits, so that the output has the scale of the input. Bands are restored one by one, each for its
+own sensor.
 """
 
-import time
-from collections.abc import Iterator, Sequence
-from functools import partial
-from pathlib import Path
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from beers_deploy.host_state import peak_memory
-from beers_deploy.model.progress import Log, Steps, no_log, steps
-from beers_deploy.model.raster.source import Source, fingerprint, stamps, strips
+from beers_deploy.model.progress import Log, Steps, steps
+from beers_deploy.model.raster.source import Source, strips
 from beers_deploy.model.traditional.pipeline import Chain, restore_strips
-from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.figures import Row, measured
-from beers_deploy.restoration.checkpoint import Checkpoint
-from beers_deploy.restoration.detectors.fault_list import list_beside, write_list
-from beers_deploy.restoration.detectors.fix import faults_of, fixed
+from beers_deploy.profiles.figures import Figure
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.restoration.bands import in_order
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.output import write_output
 from beers_deploy.restoration.plan import Span, check_memory
+from beers_deploy.restoration.prepare import Restoration, check_sensor
 from beers_deploy.restoration.radiometry import full_scale_of
-from beers_deploy.restoration.run import CHECKED, begun, check_sensor, require_unchanged, timed
 from beers_deploy.restoration.tiles.engine import as_stored, checked_strip
 from beers_deploy.restoration.tiles.rows import RestoredRow
 
@@ -37,80 +32,127 @@ STRIP_PX = 128
 
 FIXED_BYTES = 100_000_000
 BYTES_PER_COLUMN = 40_000
-"""Of memory that the pipeline takes, and more for each pixel of a row: some 700 rows, in several
-float32 copies. Measured at 400 and 1200 columns: 75 MB and 30 kB.
+"""Of memory that the pipeline takes for a band, and more for each pixel of a row: some 700 rows, in
+several float32 copies. Measured at 400 and 1200 columns: 75 MB and 30 kB.
 """
 
 
-def restore_file_traditionally(
-    image: Path, out: Path, options: Options, log: Log = no_log, beside: Sequence[Path | None] = ()
-) -> Row:
-    """As `deploy.restoration.run.restore_file`, of a mono image, by the traditional pipeline of its
-    one sensor.
+@dataclass(frozen=True, kw_only=True)
+class TraditionalRestoration(Restoration):
+    """The traditional pipeline that restores one image.
+
+    No run can go on from a strip, because the pipeline looks hundreds of rows back.
+
+    Attributes:
+        chains: the pipeline of each band.
+        sensors: the sensor of each band.
     """
-    started = time.perf_counter()
-    sensor = options.sensors[""]
-    chain = Chain(sensor.nominal(), sensor.reference.nominal())
-    with begun(image, out, options, beside) as stored:
-        raster = stored.raster
-        if raster.bands > 1:
-            remedy = "extract the band that the profile describes"
-            raise ImageError(
-                str(image), expected="one band", got=f"{raster.bands} bands", remedy=remedy
-            )
-        faults = faults_of(stored, options.fix_detectors, str(image), log)
-        source = fixed(stored, faults)
-        needed = FIXED_BYTES + BYTES_PER_COLUMN * raster.width_px + source.held_bytes(STRIP_PX)
-        check_memory(needed, options.memory_bytes, bulky=False)
-        extents = (raster.extent(source.read(*rows)) for rows in strips(raster.height_px, STRIP_PX))
-        scale = full_scale_of(str(image), raster, extents, options.full_scale, options.sensor_bits)
-        check, check_s = timed(
-            partial(check_sensor, source, (), options, scale.value, name=str(image), log=log)
+
+    chains: tuple[Chain, ...]
+    sensors: tuple[Sensor, ...]
+
+    @property
+    def out_shape(self) -> tuple[int, int, int]:
+        """That of the image."""
+        return self.source.raster.shape
+
+    @property
+    def row_ends(self) -> Sequence[int]:
+        """None."""
+        return ()
+
+    @property
+    def identity(self) -> Mapping[str, object]:
+        """The quality of the pipeline."""
+        return {"quality": self.options.quality}
+
+    @property
+    def how(self) -> str:
+        """The threads of torch."""
+        return f"{torch.get_num_threads()} threads"
+
+    def ticks(self, done_px: int) -> int:
+        """Return the number of rows."""
+        return self.source.raster.height_px - done_px
+
+    def rows(
+        self,
+        done_px: int,  # noqa: ARG002
+        tick: Callable[[int], None],
+    ) -> Generator[RestoredRow, None, None]:
+        """Restore the image from its first row, strip by strip, all bands of one at a time."""
+        height_px = self.source.raster.height_px
+        by_band = [
+            restore_strips(self.read(band), height_px, chain)
+            for band, chain in enumerate(self.chains)
+        ]
+        top = 0
+        for bands in zip(*by_band, strict=True):
+            rows_px = bands[0].shape[0]
+            tick(rows_px)
+            yield self._stored(torch.stack(bands).numpy(), top)
+            top += rows_px
+
+    def figures(self, tally: Tally) -> dict[str, Figure]:
+        """Return the figures of a run."""
+        return dict(tally.figures)
+
+    def text(self) -> dict[str, str]:
+        """Return the run in words."""
+        names = ", ".join(sensor.name for sensor in self.sensors)
+        return {"method": self.options.method.value, "sensor": names}
+
+    def _to_dn(self, band: int) -> np.float32:
+        """Return the digital number of the sensor for a pixel value of 1."""
+        return np.float32(self.chains[band].degraded.max_dn / self.scale.value)
+
+    def read(self, band: int) -> Iterator[Tensor]:
+        """Read strips (rows, width) float32 of digital numbers, NaN where they are missing."""
+        source = self.source
+        for start, stop in strips(source.raster.height_px, STRIP_PX):
+            stored = source.read(start, stop)
+            # Values above an assumed full scale show that the assumption is wrong.
+            clips = not self.scale.assumed
+            strip = checked_strip(source.raster, start, stored, self.scale.value, self.name, clips)
+            pixels = np.minimum(strip.pixels[band].astype(np.float32), self.scale.value)
+            dn = pixels * self._to_dn(band)
+            if strip.missing is not None:
+                dn[strip.missing[band]] = np.nan
+            yield torch.from_numpy(dn)
+
+    def fitted(self) -> "TraditionalRestoration":
+        """Return it with the regularisation of each band, from a first pass over the image.
+
+        That is the Wiener optimum of the whole image, so it needs all strips, but little of the
+        time.
+        """
+        with steps("measuring noise and contrast", len(self.chains) * self.ticks(0)) as bar:
+            chains = [
+                chain.fitted_to(_counted(self.read(band), bar))
+                for band, chain in enumerate(self.chains)
+            ]
+        return replace(self, chains=tuple(chains))
+
+    def _stored(self, dn: np.ndarray, top: int) -> RestoredRow:
+        """Return restored rows (bands, rows, width) of digital numbers as they are stored."""
+        raster = self.source.raster
+        full_scale = self.scale.value
+        stop = top + dn.shape[1]
+        missing = np.isnan(dn)
+        factors = np.array([self._to_dn(band) for band in range(raster.bands)], np.float32)
+        restored = np.nan_to_num(dn) / factors[:, None, None]
+        pixels = as_stored(raster, restored, full_scale)
+        raw = np.ma.getdata(self.source.read(top, stop))
+        known = ~missing if missing.any() else None
+        if known is not None:
+            pixels = np.where(missing, raw.astype(raster.out_dtype), pixels)
+        tally = Tally.of(
+            np.nan_to_num(raw.astype(np.float64)) / full_scale,
+            restored.astype(np.float64) / full_scale,
+            known,
+            known,
         )
-        begun_with = stamps(source.files)
-        digest = fingerprint(source.files)
-        job = {"image": digest, "method": "traditional"}
-        checkpoint = Checkpoint(out, raster.shape, raster.out_dtype, job, resume=False)
-        try:
-            fitted = _fitted(source, chain, scale.value, str(image))
-            _fill(checkpoint, source, fitted, scale.value, str(image))
-            require_unchanged(source, str(image), begun_with, digest)
-            write_output(checkpoint, source, options.compression)
-            write_list(faults, list_beside(out, options.fix_detectors))
-        # No run can go on from a strip, because the pipeline looks hundreds of rows back.
-        except BaseException:
-            checkpoint.remove()
-            raise
-    time_s = time.perf_counter() - started - check_s
-    how = (
-        "from opening the image to the finished file without the sensor check, "
-        f"{torch.get_num_threads()} threads"
-    )
-    figures = {
-        "time": measured(time_s, "s", how),
-        "throughput": measured(raster.height_px * raster.width_px / time_s / 1e6, "Mpx/s", how),
-        "peak memory": peak_memory(),
-        "sensor check": measured(check_s, "s", CHECKED),
-        **check.figures,
-    }
-    text = {
-        "method": "traditional",
-        "sensor": sensor.name,
-        **scale.text,
-        **check.text,
-        **faults.text_of_row,
-    }
-    return Row("restore", image.name, figures, text)
-
-
-def _fitted(source: Source, chain: Chain, full_scale: float, name: str) -> Chain:
-    """Derive the regularisation of the pipeline from a first pass over the image, which takes
-    little of the time.
-    """
-    to_dn = chain.degraded.max_dn / full_scale
-    # The regularisation is the Wiener optimum of the whole image: it needs all strips.
-    with steps("measuring noise and contrast", source.raster.height_px) as bar:
-        return chain.fitted_to(_counted(_read(source, to_dn, full_scale, name), bar))
+        return RestoredRow(Span(top, stop, top, stop), pixels, tally)
 
 
 def _counted(strips_read: Iterator[Tensor], bar: Steps) -> Iterator[Tensor]:
@@ -120,35 +162,35 @@ def _counted(strips_read: Iterator[Tensor], bar: Steps) -> Iterator[Tensor]:
         bar.advance(strip.shape[0])
 
 
-def _fill(
-    checkpoint: Checkpoint, source: Source, chain: Chain, full_scale: float, name: str
-) -> None:
+def prepare_traditional(
+    source: Source, options: Options, name: str, log: Log
+) -> TraditionalRestoration:
+    """Make the traditional pipeline ready to restore an image; the arguments are those of
+    `prepare`.
+    """
     raster = source.raster
-    to_dn = chain.degraded.max_dn / full_scale
-    top = 0
-    with steps("restoring rows", raster.height_px) as bar:
-        raw_strips = _read(source, to_dn, full_scale, name)
-        for strip in restore_strips(raw_strips, raster.height_px, chain):
-            stop = top + strip.shape[0]
-            missing = torch.isnan(strip).numpy()[None]
-            pixels = as_stored(
-                raster, np.nan_to_num(strip.numpy()[None] / np.float32(to_dn)), full_scale
-            )
-            if missing.any():
-                stored = np.ma.getdata(source.read(top, stop))
-                pixels = np.where(missing, stored.astype(raster.out_dtype), pixels)
-            tally = Tally(int((~missing).sum()))
-            checkpoint.append(RestoredRow(Span(top, stop, top, stop), pixels, tally))
-            bar.advance(stop - top)
-            top = stop
-    checkpoint.require_known(name)
-
-
-def _read(source: Source, to_dn: float, full_scale: float, name: str) -> Iterator[Tensor]:
-    """Strips (rows, width) float32 of digital numbers, NaN where they are missing."""
-    for start, stop in strips(source.raster.height_px, STRIP_PX):
-        strip = checked_strip(source.raster, start, source.read(start, stop), full_scale, name)
-        dn = strip.pixels[0].astype(np.float32) * np.float32(to_dn)
-        if strip.missing is not None:
-            dn[strip.missing[0]] = np.nan
-        yield torch.from_numpy(dn)
+    sensors = in_order(options.sensors, raster)
+    sensors *= raster.bands // len(sensors)
+    needed = (
+        FIXED_BYTES
+        + BYTES_PER_COLUMN * raster.width_px * raster.bands
+        + source.held_bytes(STRIP_PX)
+    )
+    check_memory(needed, options.memory_bytes, bulky=False)
+    extents = (raster.extent(source.read(*rows)) for rows in strips(raster.height_px, STRIP_PX))
+    scale = full_scale_of(name, raster, extents, options.full_scale, options.sensor_bits)
+    check, check_s = check_sensor(source, (), options, scale.value, name, log)
+    chains = tuple(
+        Chain(sensor.nominal(), sensor.reference.nominal(), options.quality) for sensor in sensors
+    )
+    restoration = TraditionalRestoration(
+        source=source,
+        name=name,
+        options=options,
+        scale=scale,
+        check=check,
+        check_s=check_s,
+        chains=chains,
+        sensors=tuple(sensors),
+    )
+    return restoration.fitted()

@@ -221,7 +221,7 @@ REFUSED = {
     ],
     "restore": [
         Refused(
-            ("network", "tile", "halo", "runtime", "threads", "scheduler", "cog", "stac", "resume"),
+            ("network", "tile", "halo", "runtime", "threads", "scheduler", "resume"),
             "--method traditional",
         ),
         Refused(("method",), without="--sensor"),

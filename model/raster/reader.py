@@ -269,14 +269,15 @@ class GdalSource:
         with damage_in_a_sentence(self.files[0], where), gdal(**self._options, **cache):
             return np.asarray(read_window(window=window, **options))
 
-    def held_bytes(self, rows_px: int) -> int:
-        """Return the size of GDAL's cache: the blocks around the rows, so that none is decoded for
-        two strips.
+    def held_bytes(self, rows_px: int) -> int:  # noqa: ARG002
+        """Return the size of GDAL's cache: two rows of blocks.
+
+        Strips overlap by less than that, so no block is decoded for two of them.
         """
         raster = self.raster
         planes = raster.bands + (raster.mask_kind == "alpha")
         row_bytes = planes * raster.width_px * raster.dtype.itemsize
-        return int(max(LEAST_CACHE_BYTES, (rows_px + 2 * self._block_px) * row_bytes))
+        return int(max(LEAST_CACHE_BYTES, 2 * self._block_px * row_bytes))
 
 
 def _require_whole(path: Path, dataset: Any) -> None:

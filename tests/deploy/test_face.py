@@ -273,8 +273,8 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
         "cog: expected none beside an array",
     ),
     "a COG of no use": (
-        lambda _: bd.restore("raw.tif", out="a.tif", method="traditional", cog=True),
-        "cog: exp",
+        lambda _: bd.restore("raw.tif", out="a.tif", method="traditional", resume=True),
+        "resume: exp",
     ),
     "no method": (lambda _: bd.restore("raw.tif", out="a.tif", method="x"), "method: exp"),  # type: ignore[arg-type]
     "8 bits": (lambda raw: bd.restore(raw.astype(np.uint8)), "full_scale"),

@@ -5,14 +5,19 @@ INT8.
 import re
 import subprocess
 import sys
+import warnings
+from collections import Counter
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
 import pytest
 import tifffile
 
+import beers_deploy as bd
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.progress import once
 from beers_deploy.model.shipped import (
@@ -282,3 +287,32 @@ def test_a_tile_that_a_network_cannot_rearrange_is_refused(tmp_path: Path) -> No
     words = ("--network", "convbeers-half-xs-int8", "--tile", "65", "--out", out)
     assert "--tile: expected a multiple of 2 px, got 65 px" in refused("export", *words)
     assert not out.exists()
+
+
+@pytest.mark.parametrize("as_array", [False, True])
+def test_a_run_parses_walks_and_opens_a_network_once(
+    as_array: bool, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counts: Counter[str] = Counter()
+
+    def counted(module: str, name: str) -> None:
+        original = getattr(import_module(module), name)
+
+        def counting(*arguments: Any, **options: Any) -> Any:
+            counts[name] += 1
+            return original(*arguments, **options)
+
+        monkeypatch.setattr(f"{module}.{name}", counting)
+
+    counted("beers_deploy.quant.onnx_file", "parse_onnx")
+    counted("beers_deploy.network", "tiling_of")
+    counted("onnxruntime", "InferenceSession")
+    pixels = np.random.default_rng(0).integers(0, 4096, (61, 83)).astype(np.uint16)
+    tifffile.imwrite(tmp_path / "in.tif", pixels)
+    # The processor is asked once how it adds, with a network of its own.
+    with warnings.catch_warnings(action="ignore"):
+        if as_array:
+            bd.restore(pixels, model, tile=23)
+        else:
+            bd.restore(tmp_path / "in.tif", model, tile=23, out=tmp_path / "out.tif")
+    assert counts == {"parse_onnx": 1, "tiling_of": 1, "InferenceSession": 1}

@@ -14,7 +14,7 @@ import onnx
 
 from beers_deploy.model.consistency import RAW_REACH_PX, REACH_PX
 from beers_deploy.model.raster.facts import Raster
-from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.network import Network
 from beers_deploy.quant.tiling.walk import Tiling
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.plan import Plan, Span, plan_for
@@ -66,17 +66,17 @@ def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
     """
     da: Any = import_module("dask.array")
     delayed: Any = import_module("dask").delayed
-    network = load_onnx(options.model)
+    network = Network.load(options.network)
     plan = plan_for(network, raster.shape, options)
     # The type alone decides the scale at once. Pixels may lead to a refusal later, but not to
     # another scale.
     full_scale = full_scale_of(NAME, raster, (), options.full_scale, options.sensor_bits).value
     about = options, raster, plan.tiling, full_scale
 
-    def packed(network: onnx.ModelProto) -> Packed:
-        return Packed(network.SerializeToString(), options.runtime, options.threads or 1)
+    def packed(model: onnx.ModelProto, at_first_call: bool) -> Packed:  # noqa: ARG001
+        return Packed(model.SerializeToString(), options.runtime, options.threads or 1)
 
-    exposed = exposed_networks([packed(network)], *about, packed)
+    exposed = exposed_networks([network], options, plan.tiling, full_scale, packed)
     steps, _ = consistency_steps(*about)
     task = delayed(
         Task(raster, exposed, options.full_scale, options.sensor_bits, plan.tiling, steps)

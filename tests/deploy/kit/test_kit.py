@@ -26,7 +26,6 @@ from beers_deploy.model.convbeers import arrays
 from beers_deploy.model.exposure import HEADROOM, choose_factors, factors_for
 from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.variants import Variant
-from beers_deploy.network_files import brighter_files
 from beers_deploy.profiles.errors import OptionError, ProfileError
 from beers_deploy.quant.banked.calibrate import bank_results, quantise_family
 from beers_deploy.quant.encodings import host_model
@@ -169,8 +168,8 @@ def test_each_exposure_has_a_core_and_a_unit(kit: Path, sensor: bd.Sensor) -> No
     content = facts(kit)
     assert {1, *map(int, content["exposures"])} == FACTORS == {*factors_for(sensor.nominal())}
     assert len({content["unit"], *content["exposures"].values()}) == len(FACTORS)
-    for factor, path in brighter_files(Path(NAME), sensor).items():
-        expected = bd.Network.load(path).core("vck190", TILE_PX).model
+    for factor, other in bd.Network.load(NAME, sensor=sensor).exposures.items():
+        expected = other.core("vck190", TILE_PX).model
         assert onnx.load(kit / f"core-x{factor}.onnx") == expected
     golden = onnx.load(kit / "golden" / "int8.onnx")
     assert golden == bd.Network.load(NAME, sensor=sensor).model
@@ -199,21 +198,19 @@ def test_the_host_part_chooses_factors_and_takes_the_consistency_step_as_the_lib
         np.testing.assert_array_equal(host["consistent"](raw, restored), expected)
 
 
-def test_a_network_in_memory_gets_the_consistency_step_alone(
+def test_a_network_in_memory_takes_the_same_steps(
     tmp_path: Path, sensor: bd.Sensor, image: np.ndarray
 ) -> None:
-    """A `Network` is not known at other exposures. Without a sensor, neither step is taken."""
     in_memory = bd.Network.load("convbeers-half-xs-int8", sensor=sensor)
     folder = bd.Board.load("vck190").kit(in_memory, tmp_path / "kit", tile=TILE_PX, sensor=sensor)
-    assert not facts(folder)["exposures"]
-    assert not [*folder.glob("core-*")]
+    assert sorted(map(int, facts(folder)["exposures"])) == sorted(in_memory.exposures)
     expected = bd.restore(image, in_memory, sensor=sensor, full_scale=1.0, any_result=True)
     np.testing.assert_allclose(by_host(folder, image), expected, rtol=0, atol=1e-6)
 
 
 def test_a_sensor_that_does_not_exist_or_changes_nothing_is_one_sentence(tmp_path: Path) -> None:
     board = bd.Board.load("vck190")
-    in_memory = bd.Network.load(NAME)
+    in_memory = bd.Network.load(bd.Network.load(NAME).model)
     with pytest.raises(ProfileError, match=r"profile 'hubble': expected one of .*got 'hubble'"):
         board.kit(NAME, tmp_path / "kit", tile=TILE_PX, sensor="hubble")
     with pytest.raises(OptionError, match=r"sensor: expected none where .* got blind"):

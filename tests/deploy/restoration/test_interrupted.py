@@ -15,12 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.model.io.lock import part_folder
+from beers_deploy.network import Network
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Span
-from beers_deploy.restoration.run import read_network, restore_file
+from beers_deploy.restoration.run import restore_file
 from beers_deploy.restoration.tiles.engine import Restorer
 from beers_deploy.restoration.tiles.rows import RestoredRow
 from tests.deploy.restoration.runs import noise, stopped_after
@@ -235,6 +236,6 @@ def test_a_network_that_is_replaced_while_it_is_read_is_refused(
         path.write_bytes(b"another")
         return object()
 
-    monkeypatch.setattr("beers_deploy.restoration.run.load_onnx", replacing)
+    monkeypatch.setattr("beers_deploy.network.float_model", replacing)
     with pytest.raises(ModelError, match="a change while it was read"):
-        read_network(path)
+        Network.load(path)

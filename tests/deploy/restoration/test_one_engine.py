@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import beers_deploy as bd
 from beers_deploy import library
 from beers_deploy.library import restore
 from beers_deploy.network_files import shipped_pair
@@ -58,8 +59,8 @@ def image() -> np.ndarray:
 
 def by_engine(dn: np.ndarray, options: Options) -> np.ndarray:
     """As an array in memory."""
-    network = load_onnx(options.model)
-    infer, _ = open_runtime(Runtime.onnxruntime, network, threads=0)
+    network = bd.Network.load(options.network)
+    infer, _ = open_runtime(Runtime.onnxruntime, network.model, threads=0)
     steps = tuple(step_for(sensor, 4095) for sensor in options.sensors.values())
     return restore_dn(dn, infer, plan_for(network, (1, *ODD), options), consistency=steps)
 
@@ -131,11 +132,11 @@ def test_a_sensor_of_other_bits_has_its_own_full_scale(
 ) -> None:
     max_dn = (1 << bits) - 1
     dn = np.random.default_rng(3).integers(0, max_dn + 1, ODD).astype(np.uint16)
-    network = load_onnx(model)
+    network = bd.Network.load(model)
     expected = restored(tmp_path, dn, Options(model, 23, full_scale=max_dn))[0]
-    evaluated = network_method(network, max_dn)(dn.astype(np.float32))
+    evaluated = network_method(network.model, max_dn)(dn.astype(np.float32))
     np.testing.assert_array_equal(evaluated, expected)
-    infer, _ = open_runtime(Runtime.onnxruntime, network, threads=0)
+    infer, _ = open_runtime(Runtime.onnxruntime, network.model, threads=0)
     plan = plan_for(network, (1, *ODD), Options(model, 23))
     # `evaluate` rounds to integers as `restore` does, restore_floats does not.
     assert np.abs(restore_floats(dn, infer, plan, max_dn) - evaluated).max() <= 0.5

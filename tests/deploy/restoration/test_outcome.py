@@ -14,7 +14,7 @@ from onnx import numpy_helper
 
 import beers_deploy as bd
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.network_files import network_file
+from beers_deploy.network import Network
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.outcome import Tally
@@ -84,7 +84,7 @@ def test_shipped_networks_are_not_told(seed: int, light: float, has_sensor: bool
 def test_a_network_that_brightens_or_darkens_by_three_percent_is_told(
     factor: float, is_told: bool, tmp_path: Path
 ) -> None:
-    network = onnx.load(network_file(Path("convbeers-xs"), SENSOR))
+    network = Network.load("convbeers-xs", sensor=SENSOR).model
     last = network.graph.output[0].name
     for node in network.graph.node:
         node.output[:] = ["plain" if name == last else name for name in node.output]

@@ -22,10 +22,8 @@ from beers_deploy.model.shipped import INT8
 from beers_deploy.model.simulator.acquire import acquire_three, prepare_scene
 from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.network_files import network_file
+from beers_deploy.network import Network
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import BLIND, load_sensor
-from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.restoration.sensor_check import restored_already
 from tests.deploy.command_line import done
 
@@ -55,9 +53,7 @@ def look(
     planes = image if image.ndim == 3 else image[None]
     bands, height, width = planes.shape
     source = ArraySource(planes, Raster(bands, height, width, planes.dtype, nodata))
-    return restored_already(
-        source, [load_onnx(network_file(Path(network), load_sensor(BLIND)))], full_scale
-    )
+    return restored_already(source, [Network.load(network).model], full_scale)
 
 
 @settings(deadline=None, max_examples=20)

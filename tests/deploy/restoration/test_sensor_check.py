@@ -156,7 +156,7 @@ def test_its_time_is_no_part_of_the_restoration_s(
         time.sleep(2)
         return SensorCheck()
 
-    monkeypatch.setattr("beers_deploy.restoration.run.told_sensor", slow)
+    monkeypatch.setattr("beers_deploy.restoration.prepare.told_sensor", slow)
     start_s = time.perf_counter()
     result = bd.restore(
         image, "convbeers-xs-int8", sensor=SENSOR, out=tmp_path / "out.tif", progress=False

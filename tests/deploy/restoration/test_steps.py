@@ -17,7 +17,7 @@ import tifffile
 
 import beers_deploy as bd
 from beers_deploy.model.consistency import REACH_PX
-from beers_deploy.network_files import brighter_files, network_file
+from beers_deploy.network import Network
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import MachineError, OptionError
 from beers_deploy.profiles.sensor import Sensor
@@ -75,18 +75,13 @@ def options(
 ) -> Options:
     """Build what the command makes of --network, --sensor and --no-exposure."""
     by_band = sensors or {"": SENSOR}
-    network = Path(name)
-    files = {band: network_file(network, sensor) for band, sensor in by_band.items()}
-    brighter = (
-        {band: brighter_files(network, sensor) for band, sensor in by_band.items()}
-        if exposure
-        else {}
-    )
+    with warnings.catch_warnings(action="ignore"):
+        networks = {band: Network.load(name, sensor=sensor) for band, sensor in by_band.items()}
     return Options(
-        next(iter(files.values())),
+        next(iter(networks.values())),
         sensors=by_band,
-        bands={} if "" in files else files,
-        brighter={band: paths for band, paths in brighter.items() if paths},
+        bands={} if "" in networks else networks,
+        exposure=exposure,
         **more,
     )
 
@@ -130,9 +125,9 @@ def test_a_dask_array_gives_the_same_and_its_workers_read_no_files(
     da = pytest.importorskip("dask.array", reason="the extra 'dask' is not installed")
     untiled = by_array(lacking(), INT8, nodata=NODATA)
     lazy = by_array(da.from_array(lacking(), chunks=50), INT8, nodata=NODATA, tile=TILES_PX[0])
-    for module in ("tiles.lazy", "steps"):
+    for module in ("network", "network_files"):
         monkeypatch.setattr(
-            f"beers_deploy.restoration.{module}.load_onnx",
+            f"beers_deploy.{module}.load_onnx",
             lambda path: pytest.fail(f"reads {path}"),
         )
     np.testing.assert_array_equal(lazy.compute(scheduler="synchronous"), untiled)
@@ -184,7 +179,7 @@ def test_a_run_that_was_stopped_twice_is_resumed_to_the_same_bytes(tmp_path: Pat
     assert (tmp_path / "out.tif").read_bytes() == expected
 
 
-@pytest.mark.parametrize("switch", [{"consistency": False}, {"brighter": {}}])
+@pytest.mark.parametrize("switch", [{"consistency": False}, {"exposure": False}])
 def test_a_run_is_not_resumed_with_other_steps(switch: dict[str, Any], tmp_path: Path) -> None:
     how = options(INT8, tile_px=57, threads=1, full_scale=4095)
     tifffile.imwrite(tmp_path / "in.tif", np.concatenate([image(), image()]))

@@ -2,11 +2,13 @@
 sensor.
 """
 
+import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import rasterio
 import tifffile
 import torch
 
@@ -14,8 +16,8 @@ from beers_deploy.model.progress import no_log
 from beers_deploy.model.traditional.pipeline import Chain, restore_traditional
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError, MachineError
-from beers_deploy.restoration.options import Options
-from beers_deploy.restoration.traditional import restore_file_traditionally
+from beers_deploy.restoration.options import Method, Options
+from beers_deploy.restoration.run import restore_file
 from tests.deploy.command_line import done, refused
 from tests.profiles.own_sensor import own_sensor
 
@@ -23,7 +25,8 @@ SHAPE = (151, 67)
 
 
 def request(**more: Any) -> Options:
-    return Options(**{"sensors": {"": load_sensor("pleiades-degraded")}, **more})
+    sensors = {"": load_sensor("pleiades-degraded")}
+    return Options(**{"method": Method.traditional, "sensors": sensors, **more})
 
 
 def noise(seed: int = 0) -> np.ndarray:
@@ -38,10 +41,12 @@ def of_array(pixels: np.ndarray, options: Options) -> np.ndarray:
 
 def of_file(folder: Path, pixels: np.ndarray, options: Options, **tags: object) -> np.ndarray:
     tifffile.imwrite(folder / "in.tif", pixels, **tags)  # type: ignore[arg-type]
-    row = restore_file_traditionally(folder / "in.tif", folder / "out.tif", options, no_log)
+    row = restore_file(folder / "in.tif", folder / "out.tif", options, no_log)
     assert row.text["method"] == "traditional"
     assert sorted(path.name for path in folder.iterdir()) == ["in.tif", "out.tif"]
-    return tifffile.imread(folder / "out.tif")
+    with warnings.catch_warnings(action="ignore"), rasterio.open(folder / "out.tif") as file:
+        restored: np.ndarray = file.read()
+    return restored if len(restored) > 1 else restored[0]
 
 
 def other_sensor(folder: Path) -> Path:
@@ -77,6 +82,41 @@ def test_missing_pixels_stay(tmp_path: Path) -> None:
     )
 
 
+def test_bands_are_restored_one_by_one_each_for_its_sensor(tmp_path: Path) -> None:
+    bands = np.stack([noise(0), noise(1)])
+    mine = load_sensor("pleiades-degraded")
+    other = load_sensor("dior-medium")
+    for sensors in ({"": mine}, {"B1": mine, "B2": other}):
+        (tmp_path / "files").mkdir(exist_ok=True)
+        restored = of_file(
+            tmp_path / "files",
+            bands,
+            request(sensors=sensors),
+            planarconfig="separate",
+            photometric="minisblack",
+        )
+        for band, pixels in enumerate(bands):
+            sensor = list(sensors.values())[band % len(sensors)]
+            expected = of_array(pixels, request(sensors={"": sensor}))
+            np.testing.assert_array_equal(restored[band], np.rint(expected).astype(np.uint16))
+
+
+def test_alpha_and_a_cog_come_with_it(tmp_path: Path) -> None:
+    alpha = np.full(SHAPE, 4095, np.uint16)
+    alpha[:9] = 0
+    restored = of_file(
+        tmp_path,
+        np.stack([noise(), alpha]),
+        request(cog=True),
+        planarconfig="separate",
+        photometric="minisblack",
+        extrasamples=["unassalpha"],
+    )
+    np.testing.assert_array_equal(restored[1], alpha)
+    np.testing.assert_array_equal(restored[0][:9], noise()[:9])
+    assert (restored[0][9:] != noise()[9:]).any()
+
+
 def test_the_output_has_the_scale_of_the_input_whatever_the_gain(tmp_path: Path) -> None:
     mine = request(sensors={"": load_sensor(str(other_sensor(tmp_path)))})
     (tmp_path / "files").mkdir()
@@ -92,22 +132,19 @@ def test_the_output_has_the_scale_of_the_input_whatever_the_gain(tmp_path: Path)
 @pytest.mark.parametrize(
     ("pixels", "words"),
     [
-        (np.full(SHAPE, 5000, np.uint16), "5000"),
+        (np.full(SHAPE, 5000, np.uint16), "above full scale"),
         (np.full(SHAPE, 200, np.uint8), "full_scale"),
         (np.full(SHAPE, 0.5, np.float32), "full_scale"),
         (np.full(SHAPE, np.nan, np.float32), "NaN or nodata everywhere"),
-        (np.full((*SHAPE, 3), 500, np.uint16), "one band"),
     ],
 )
 def test_what_it_cannot_restore_leaves_the_old_output(
     pixels: np.ndarray, words: str, tmp_path: Path
 ) -> None:
-    tifffile.imwrite(
-        tmp_path / "in.tif", pixels, photometric="rgb" if pixels.ndim == 3 else "minisblack"
-    )
+    tifffile.imwrite(tmp_path / "in.tif", pixels)
     (tmp_path / "out.tif").write_bytes(b"the old one")
     with pytest.raises(ImageError, match=words):
-        restore_file_traditionally(tmp_path / "in.tif", tmp_path / "out.tif", request(), no_log)
+        restore_file(tmp_path / "in.tif", tmp_path / "out.tif", request(), no_log)
     assert (tmp_path / "out.tif").read_bytes() == b"the old one"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif", "out.tif"]
 

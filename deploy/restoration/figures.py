@@ -1,0 +1,62 @@
+"""Figures of a restoration: how the image is cut, and the error of seams where there are any."""
+
+import numpy as np
+
+from beers_deploy.model.raster.source import Source
+from beers_deploy.profiles.figures import Figure, measured, predicted, unavailable
+from beers_deploy.restoration.plan import Plan, Span
+from beers_deploy.restoration.tiles.engine import Restorer
+
+
+def plan_figures(plan: Plan) -> dict[str, Figure]:
+    """How an image is cut: known, but not measured."""
+    numbers = {"tiles": plan.tiles, "work factor": plan.work_factor}
+    source = "arithmetic on the plan of tiles"
+    return {
+        key: predicted(number, "1", (number, number), source) for key, number in numbers.items()
+    }
+
+
+def seam_figures(source: Source, plan: Plan, restorer: Restorer) -> dict[str, Figure]:
+    """The error of seams, where the halo leaves any: of a tile in the middle, in digital numbers.
+
+    The same kept pixels are restored twice: from the tile's own window, and from one with the whole
+    radius around.
+    """
+    keys = "seam error max", "seam error mean"
+    if plan.halo_px >= plan.radius_px or len(plan.rows) == len(plan.columns) == 1:
+        return {}
+    if plan.tiling.fixed_px is not None:
+        reason = "the network is fixed to one tile size: no wider window to compare with"
+        return dict.fromkeys(keys, unavailable("DN", reason))
+    rows = plan.rows[len(plan.rows) // 2]
+    columns = plan.columns[len(plan.columns) // 2]
+    ends_px = plan.rows[-1].stop, plan.columns[-1].stop
+    wide = [
+        _widened(span, plan.radius_px, end_px)
+        for span, end_px in zip((rows, columns), ends_px, strict=True)
+    ]
+    strip = restorer.read(source, min(rows.start, wide[0].start), max(rows.stop, wide[0].stop))
+    cheap, exact = (
+        restorer.tile(strip, 0, *spans).pixels.astype(np.float64)
+        for spans in ((rows, columns), wide)
+    )
+    error = np.abs(np.nan_to_num(cheap) - np.nan_to_num(exact))
+    how = f"the tile in the middle with a halo of {plan.halo_px} px against {plan.radius_px} px"
+    return {
+        key: measured(float(value), "DN", how)
+        for key, value in zip(keys, (error.max(), error.mean()), strict=True)
+    }
+
+
+def _widened(span: Span, radius_px: int, size_px: int) -> Span:
+    """The same kept pixels with the whole radius around them, as far as the image goes, with its
+    extension.
+
+    What is kept ends on the network's lattice, or with the image: then what is read ends with the
+    extension too.
+    """
+    start = max(span.keep_start - radius_px, 0)
+    stop = min(span.keep_stop + radius_px, size_px)
+    stop = size_px if span.stop == size_px else stop
+    return Span(start, stop, span.keep_start, span.keep_stop)

@@ -1,0 +1,339 @@
+"""What restores one image, made ready before its first row: by a network, or by the traditional
+pipeline.
+
+Both give finished rows in order, so that whoever writes them, to a file or into an array, need not
+know which it is.
+"""
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import onnx
+
+from beers_deploy.cluster import Cluster
+from beers_deploy.model.progress import Log
+from beers_deploy.model.raster.source import Source
+from beers_deploy.network import Network
+from beers_deploy.profiles.figures import Figure
+from beers_deploy.profiles.sensor_file import BLIND
+from beers_deploy.restoration.bands import in_order, require_alike
+from beers_deploy.restoration.detectors.words import warn_of_detectors
+from beers_deploy.restoration.figures import plan_figures, seam_figures
+from beers_deploy.restoration.options import Method, Options
+from beers_deploy.restoration.outcome import Tally
+from beers_deploy.restoration.plan import (
+    Plan,
+    Span,
+    check_memory,
+    is_bulky,
+    plan_for,
+    rows_bytes,
+)
+from beers_deploy.restoration.radiometry import FullScale, full_scale_of
+from beers_deploy.restoration.runtime import (
+    AtFirstCall,
+    Infer,
+    Packed,
+    infer_on,
+    open_runtime,
+    tiles_at_once,
+)
+from beers_deploy.restoration.sensor_check import SensorCheck, restored_already, told_sensor
+from beers_deploy.restoration.steps import (
+    consistency_steps,
+    exposed_networks,
+    exposures_of,
+    factor_words,
+)
+from beers_deploy.restoration.tiles.engine import Restorer
+from beers_deploy.restoration.tiles.rows import RestoredRow, restore_rows, rows_to_run
+
+Tick = Callable[[int], None]
+"""Is told how many ticks were done."""
+
+RUNS_UNTIL_STEADY = 2
+"""Of each tile in work at a time: then a runtime takes no more memory."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Restoration(ABC):
+    """What restores one image.
+
+    Attributes:
+        source: the image.
+        name: of the image, for messages.
+        options: what the user chose.
+        networks: that restore its bands; none of the traditional pipeline.
+        scale: the pixel value that is full scale.
+        check: what was seen of the image's sensor.
+        check_s: the time that took.
+    """
+
+    source: Source
+    name: str
+    options: Options
+    networks: Sequence[Network] = ()
+    scale: FullScale
+    check: SensorCheck
+    check_s: float
+
+    @property
+    @abstractmethod
+    def out_shape(self) -> tuple[int, int, int]:
+        """Of the restored image, (bands, H, W)."""
+
+    @property
+    @abstractmethod
+    def row_ends(self) -> Sequence[int]:
+        """The row of the restored image at which each row of tiles ends, where a later run can go
+        on; empty if none can.
+        """
+
+    @property
+    @abstractmethod
+    def identity(self) -> Mapping[str, object]:
+        """All that decides the pixels, besides the image and the full scale.
+
+        Who computes, on how many machines, is no part of it.
+        """
+
+    @property
+    @abstractmethod
+    def how(self) -> str:
+        """What computes, for the figures of time."""
+
+    @abstractmethod
+    def ticks(self, done_px: int) -> int:
+        """Return the sum of all ticks from row `done_px` of the restored image on."""
+
+    @abstractmethod
+    def rows(self, done_px: int, tick: Tick) -> Generator[RestoredRow, None, None]:
+        """Restore the rows from `done_px` of the restored image on, in order."""
+
+    def memory_bytes(self, ticks: int) -> int | None:  # noqa: ARG002
+        """Return the peak memory of the process if it can be told after so many ticks."""
+        return None
+
+    @abstractmethod
+    def figures(self, tally: Tally) -> dict[str, Figure]:
+        """Return the figures of a run."""
+
+    @abstractmethod
+    def text(self) -> dict[str, str]:
+        """Return the run in words."""
+
+
+def prepare(
+    source: Source, options: Options, name: str, log: Log, cluster: Cluster | None = None
+) -> Restoration:
+    """Make ready what restores an image.
+
+    Args:
+        source: the image.
+        options: what the user chose.
+        name: of the image, for messages.
+        log: is told the plan, and what is seen of the image.
+        cluster: whose workers run the network; None runs it here.
+    """
+    if options.method is Method.traditional:
+        # It loads torch, which is optional.
+        from beers_deploy.restoration.traditional import prepare_traditional
+
+        return prepare_traditional(source, options, name, log)
+    return prepare_network(source, options, name, log, cluster)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkRestoration(Restoration):
+    """A network that restores one image.
+
+    Attributes:
+        plan: how the image is cut into tiles.
+        restorer: what restores a tile.
+        at_once: tiles in work at a time.
+        runtime: name and version of what runs the network.
+        consistency: whether the consistency step is taken, in words.
+        seams: figures of the error at seams.
+    """
+
+    plan: Plan
+    restorer: Restorer
+    at_once: int
+    runtime: str
+    consistency: str
+    seams: Mapping[str, Figure]
+
+    @property
+    def out_shape(self) -> tuple[int, int, int]:
+        """Of the restored image, (bands, H, W)."""
+        return self.plan.out_shape
+
+    @property
+    def row_ends(self) -> Sequence[int]:
+        """The row of the restored image at which each row of tiles ends."""
+        return [row.keep_stop * self.plan.scale for row in self.plan.rows]
+
+    @property
+    def identity(self) -> Mapping[str, object]:
+        """All that decides the pixels, besides the image and the full scale."""
+        factors = [exposures_of(network, self.options) for network in self.networks]
+        return {
+            "model": [network.sha256 for network in self.networks],
+            "exposures": [[other.sha256 for other in others.values()] for others in factors],
+            "factors": [sorted(others) for others in factors],
+            "consistency": bool(self.restorer.consistency),
+            "tile_px": self.plan.tile_px,
+            "halo_px": self.plan.halo_px,
+            "runtime": self.runtime,
+        }
+
+    @property
+    def how(self) -> str:
+        """What computes, for the figures of time."""
+        return self.runtime
+
+    def _rows_left(self, done_px: int) -> list[Span]:
+        return [row for row in self.plan.rows if row.keep_start * self.plan.scale >= done_px]
+
+    def ticks(self, done_px: int) -> int:
+        """Return the number of tiles to run."""
+        rows = rows_to_run(self.plan, self.restorer, self._rows_left(done_px))
+        return len(rows) * self.plan.row_tiles
+
+    def rows(self, done_px: int, tick: Tick) -> Generator[RestoredRow, None, None]:
+        """Restore rows of tiles from row `done_px` of the restored image on."""
+        rows = self._rows_left(done_px)
+        return restore_rows(
+            self.source, self.plan, self.restorer, rows, lambda: tick(1), self.at_once
+        )
+
+    def memory_bytes(self, ticks: int) -> int | None:
+        """Return the peak memory once the runtime takes no more; None at any other tick."""
+        if ticks != min(RUNS_UNTIL_STEADY * self.at_once, self.plan.tiles):
+            return None
+        needed = rows_bytes(self.source, self.plan, begun=True)
+        bulky = is_bulky(self.source, self.plan)
+        return check_memory(needed, self.options.memory_bytes, bulky)
+
+    def figures(self, tally: Tally) -> dict[str, Figure]:
+        """Return the figures of a run."""
+        figures = {**plan_figures(self.plan), **self.seams, **tally.figures}
+        if any(exposures_of(network, self.options) for network in self.networks):
+            figures |= tally.exposure_figures
+        if self.restorer.consistency:
+            figures |= tally.consistency_figures
+        return figures
+
+    def text(self) -> dict[str, str]:
+        """Return the run in words."""
+        text = {"halo": self.plan.halo_words, "consistency": self.consistency}
+        if words := factor_words(self.networks, self.options):
+            text["exposures"] = words
+        workers = self.options.scheduler
+        return text | {"runtime": self.runtime} | ({"workers": workers} if workers else {})
+
+
+def networks_of(options: Options, source: Source) -> list[Network]:
+    """Return the networks of an image, one for all bands or one for each in their order."""
+    given = in_order(options.bands, source.raster) if options.bands else [options.network]
+    networks = [Network.load(network) for network in given]
+    require_alike(networks)
+    return networks
+
+
+def prepare_network(
+    source: Source, options: Options, name: str, log: Log, cluster: Cluster | None
+) -> NetworkRestoration:
+    """Make a network ready to restore an image; the arguments are those of `prepare`."""
+    networks = networks_of(options, source)
+    raster = source.raster
+    plan = plan_for(networks[0], raster.shape, options)
+    log(plan.sentence)
+    check_memory(rows_bytes(source, plan), options.memory_bytes, is_bulky(source, plan))
+    extents = (raster.extent(source.read(row.keep_start, row.keep_stop)) for row in plan.rows)
+    scale = full_scale_of(name, raster, extents, options.full_scale, options.sensor_bits)
+    check, check_s = check_sensor(source, networks, options, scale.value, name, log)
+    opened, at_once, runtime = _opener(plan, options, networks, cluster)
+    exposed = exposed_networks(networks, options, plan.tiling, scale.value, opened)
+    steps, words = consistency_steps(options, raster, plan.tiling, scale.value)
+    # Values above an assumed full scale show that the assumption is wrong, so they are refused.
+    clips = not scale.assumed
+    restorer = Restorer(raster, exposed, scale.value, plan.tiling, name, clips, steps)
+    return NetworkRestoration(
+        source=source,
+        name=name,
+        options=options,
+        networks=networks,
+        scale=scale,
+        check=check,
+        check_s=check_s,
+        plan=plan,
+        restorer=restorer,
+        at_once=at_once,
+        runtime=runtime,
+        consistency=words,
+        seams=seam_figures(source, plan, restorer),
+    )
+
+
+def _opener(
+    plan: Plan, options: Options, networks: Sequence[Network], cluster: Cluster | None
+) -> tuple[Callable[[onnx.ModelProto, bool], Infer], int, str]:
+    """Return what makes a network ready to run, how many tiles are in work, and the runtime.
+
+    The first network is opened at once, because it tells whether the runtime takes it. Others are
+    opened at their first call: bright images ask for no other exposure.
+    """
+    threads = 1 if cluster else options.threads
+    at_once = tiles_at_once(threads, plan.tiles)
+    first, runtime = open_runtime(options.runtime, networks[0].model, threads, at_once)
+    if cluster is None:
+
+        def open_here(model: onnx.ModelProto, at_first_call: bool) -> Infer:
+            if model is networks[0].model:
+                return first
+            if at_first_call:
+                return AtFirstCall(partial(open_runtime, options.runtime, model, threads, at_once))
+            return open_runtime(options.runtime, model, threads, at_once)[0]
+
+        return open_here, at_once, runtime
+    workers = cluster
+
+    def open_there(model: onnx.ModelProto, at_first_call: bool) -> Infer:  # noqa: ARG001
+        packed = Packed(model.SerializeToString(), options.runtime, options.threads or 1)
+        return infer_on(workers, packed)
+
+    # Two rows of tiles are in work: two tiles for each of the cluster's calls keep it busy.
+    at_once = max(min(2 * cluster.slots, 2 * plan.row_tiles), 1)
+    return open_there, at_once, runtime
+
+
+def check_sensor(
+    source: Source,
+    networks: Iterable[Network],
+    options: Options,
+    full_scale: float,
+    name: str,
+    log: Log,
+) -> tuple[SensorCheck, float]:
+    """Look for faults of detectors, and compare an image with the sensor that the user named.
+
+    Without a named sensor, log a sentence if the image looks restored already.
+
+    Returns:
+        What was seen, and the seconds that it took.
+    """
+    started = time.perf_counter()
+    check = SensorCheck()
+    if not options.again:
+        warn_of_detectors(source, full_scale, log)
+    if any(sensor.name != BLIND for sensor in options.sensors.values()):
+        check = told_sensor(source, options.sensors, full_scale, name, options.strict, log)
+    elif not options.again:
+        models = [network.model for network in networks]
+        if sentence := restored_already(source, models, full_scale):
+            log(sentence)
+    return check, time.perf_counter() - started
