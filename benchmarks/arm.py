@@ -15,12 +15,13 @@ import subprocess
 import sys
 import tempfile
 from importlib.metadata import version
-from itertools import chain
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.network_files import shipped_pair
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.network import Network
 
 PROJECT = Path(__file__).resolve().parents[1]
 PROCESSORS = ("cortex-a72", "neoverse-n1", "max")
@@ -132,7 +133,11 @@ def compare(root: Path, processors: tuple[str, ...]) -> dict[str, dict[str, floa
     processor and network.
     """
     with tempfile.TemporaryDirectory() as folder:
-        files = list(chain.from_iterable(map(shipped_pair, NETWORKS)))
+        networks = [
+            Network.load(name, sensor=SENSOR, int8=int8)
+            for name, int8 in product(NETWORKS, (False, True))
+        ]
+        files = [network.save(Path(folder) / f"{network.name}.onnx") for network in networks]
         here = Path(folder) / "here.npz"
         restored(files, here)
         expected = dict(np.load(here))

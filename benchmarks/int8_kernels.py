@@ -21,9 +21,9 @@ import onnxruntime as ort
 
 from beers_deploy.bench.timing import interleaved
 from beers_deploy.model.processor import decided, int8_adds_exactly, processor_name
-from beers_deploy.network_files import shipped_pair
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.network import Network
 from beers_deploy.quant.kernels import filled, made_exact
-from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session, run
 
 VARIANTS = ("convbeers-xs", "convbeers-s", "convbeers")
@@ -48,7 +48,9 @@ def main() -> None:
         (1, 1, arguments.tile, arguments.tile), dtype=np.float32
     )
     for variant in arguments.variant:
-        floating, integer = (load_onnx(path) for path in shipped_pair(variant))
+        floating, integer = (
+            Network.load(variant, sensor=SENSOR, int8=int8).model for int8 in (False, True)
+        )
         print_ways(variant, integer)
         for threads in arguments.threads:
             print_times(variant, floating, integer, image, threads, arguments.turns)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from beers_deploy.bench.swath import predict_file, swath_latency
+from beers_deploy.bench.swath import predict_network, swath_latency
 from beers_deploy.dpu.board import dpu_of
 from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.raster.facts import Raster
@@ -163,7 +163,7 @@ def time_on_board(network: Network, plan: Plan, target: TargetProfile) -> Figure
     )
     try:
         tile_px = max(plan.tile_shape)
-        prediction = predict_file(network.file, dpu_of(target), tile_px, step_px=step_px)
+        prediction = predict_network(network, dpu_of(target), tile_px, step_px=step_px)
     except BeersError as error:
         return unavailable("s", f"the cost model takes {error.expected}, got {error.got}")
     return swath_latency(prediction, math.ceil(plan.tiles / prediction.batch))

@@ -17,11 +17,10 @@ import onnxruntime as ort
 from beers_deploy.export import float_model, require_tile
 from beers_deploy.model.exposure import brightened, factors_for
 from beers_deploy.model.progress import Log, no_log
-from beers_deploy.model.shipped import INT8, VARIANT
+from beers_deploy.model.shipped import INT8, SENSOR, VARIANT, shipped_names
 from beers_deploy.network_files import (
     Conditioned,
     conditioned,
-    process_file,
     require_known,
     warn_outside,
 )
@@ -94,6 +93,7 @@ class Network:
         network: NetworkLike | None,
         *,
         sensor: SensorLike = BLIND,
+        int8: bool | None = None,
         example: Sequence[int] = (1, 1, 64, 64),
         to_run: bool = True,
     ) -> "Network":
@@ -104,6 +104,7 @@ class Network:
             network: a shipped name has -int8 behind it for INT8; a `Network` is returned as it is;
                 None is convbeers-s-int8.
             sensor: that a shipped network is told: a `Sensor`, a name or a .toml file.
+            int8: which precision of a conditioned network is meant; None leaves it to the name.
             example: shape (N, C, H, W) of an image that a module of torch takes; number and size
                 stay free.
             to_run: whether a runtime may get it; False where a file's nodes are only looked at,
@@ -124,8 +125,8 @@ class Network:
             path = require_known(Path(network))
             weights = conditioned(path)
             if weights is not None:
-                int8 = path.name.endswith(INT8)
-                return cls.for_sensor(weights, Sensor.load(sensor), int8=int8, log=_warn)
+                in_int8 = path.name.endswith(INT8) if int8 is None else int8
+                return cls.for_sensor(weights, Sensor.load(sensor), int8=in_int8, log=_warn)
             to_run = to_run or path.suffix == ".safetensors"
             with unchanged(path) as digest:
                 model = float_model(path) if to_run else load_onnx(path, to_run=False)
@@ -237,14 +238,6 @@ class Network:
         """What messages call it."""
         return str(self.path or self.name)
 
-    @property
-    def file(self) -> Path:
-        """A file that holds it: its own, or one that goes with this process."""
-        if self.path is not None:
-            return self.path
-        path = process_file(self.name, self.sha256)
-        return path if path.is_file() else self.save(path)
-
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Network) and self.sha256 == other.sha256
 
@@ -260,6 +253,17 @@ class Network:
         return (
             f"Network({self.name!r}: {self.precision}, {len(self.model.graph.node)} nodes{suffix})"
         )
+
+
+def other_precision(network: Network) -> Network | None:
+    """Return a shipped network of the same variant in the other precision, or None.
+
+    Its weights may be others: time depends on the shapes alone, so those of any sensor will do.
+    """
+    variant = metadata(network.model).get("variant", "")
+    if variant not in shipped_names():
+        return None
+    return Network.load(variant, sensor=SENSOR, int8=network.precision != "int8")
 
 
 def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:

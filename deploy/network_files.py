@@ -6,29 +6,20 @@ milliseconds from the profile alone. Where a file is needed, it lies in a folder
 which goes with it.
 """
 
-import atexit
-import hashlib
-import json
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import onnx
 
 from beers_deploy.export import float_for
 from beers_deploy.model.bank import network_bank
 from beers_deploy.model.departure import departure
-from beers_deploy.model.exposure import brightened, factors_for
 from beers_deploy.model.family import sensor_vector
-from beers_deploy.model.io.files import sha256
 from beers_deploy.model.io.tensors import is_conditioned, read_conditioned
 from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.shipped import (
     INT8,
-    SENSOR,
     SHIPPED,
     VARIANT,
     shipped_names,
@@ -36,12 +27,12 @@ from beers_deploy.model.shipped import (
 )
 from beers_deploy.model.variants import Kernels
 from beers_deploy.profiles.errors import ModelError, OptionError
-from beers_deploy.profiles.sensor import Sensor, numbers_of
-from beers_deploy.profiles.sensor_file import BLIND, BLIND_PROFILE, load_sensor
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import BLIND, BLIND_PROFILE
 from beers_deploy.profiles.toml import unreadable
 from beers_deploy.quant.banked.family import required_family, with_delta
 from beers_deploy.quant.encodings import host_model
-from beers_deploy.quant.onnx_file import fixed_tile_px, is_quantised, load_onnx, metadata, save_onnx
+from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata
 
 
 @dataclass(frozen=True)
@@ -134,64 +125,6 @@ def require_known(given: Path) -> Path:
     )
 
 
-def network_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
-    """The file of a network: the one given, or a conditioned network's for the sensor, INT8 where
-    its name says so.
-
-    Args:
-        given: a file, or a shipped name where no such file lies; None is the default network in
-            INT8.
-        sensor: what a conditioned network is told: the middle of each of its ranges.
-        log: is told what of the sensor lies outside the range that was trained.
-    """
-    if given is not None:
-        require_known(given)
-    int8 = given is None or given.name.endswith(INT8)
-    return int8_file(given, sensor, log) if int8 else float_file(given, sensor, log)
-
-
-def brighter_files(given: Path | None, sensor: Sensor) -> dict[int, Path]:
-    """Write a conditioned network for the sensor at higher exposures; return the files by factor.
-
-    Args:
-        given: as of `network_file`.
-        sensor: likewise.
-
-    Returns:
-        Empty for any other network, and where the sensor's noise allows no factor above 1.
-    """
-    network = conditioned(given)
-    if network is None:
-        return {}
-    int8 = given is None or given.name.endswith(INT8)
-    factors = factors_for(sensor.nominal())
-    # Nobody chose the sensors of the other exposures, so their warnings are not logged.
-    return {
-        factor: _written(network, brightened(sensor, factor), int8, no_log)
-        for factor in factors
-        if factor > 1
-    }
-
-
-def float_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
-    """As `network_file`, a conditioned network always in float32."""
-    network = conditioned(given)
-    return _written(network, sensor, False, log) if network else given or Path()
-
-
-def int8_file(given: Path | None, sensor: Sensor, log: Log = no_log) -> Path:
-    """As `network_file`, a conditioned network always in INT8."""
-    network = conditioned(given)
-    return _written(network, sensor, True, log) if network else given or Path()
-
-
-def shipped_pair(name: str = VARIANT, sensor: str = SENSOR) -> tuple[Path, Path]:
-    """A shipped network in float32 and in INT8, told a sensor."""
-    profile = load_sensor(sensor)
-    path = Path(shipped_weights(name).stem)
-    return float_file(path, profile), int8_file(path, profile)
-
-
 def warn_outside(sensor: Sensor, kernels: Kernels, log: Log) -> None:
     """Tell what of a sensor lies outside of what a network was trained on, whose banks have these
     kernels.
@@ -210,52 +143,6 @@ def other_sensor(model: onnx.ModelProto, sensor: Sensor) -> str:
     if own in ("", BLIND, BLIND_PROFILE, sensor.name):
         return ""
     return f"look at the sensor: the network was made for {own}, not for {sensor.name}"
-
-
-def other_precision(model: onnx.ModelProto) -> onnx.ModelProto | None:
-    """A shipped network of the same variant in the other precision, or None; its weights may be
-    others.
-
-    Time depends on the shapes, not on the weights: for a comparison of time any weights will do.
-    """
-    variant = metadata(model).get("variant", "")
-    if variant not in shipped_names():
-        return None
-    # Time depends on the shapes alone, so the weights of any sensor will do.
-    find = float_file if is_quantised(model) else int8_file
-    return load_onnx(find(Path(variant), load_sensor(SENSOR)))
-
-
-@cache
-def _folder() -> Path:
-    """Where the files of this process lie, until it ends."""
-    folder = TemporaryDirectory(prefix="beers-deploy-", ignore_cleanup_errors=True)
-    atexit.register(folder.cleanup)
-    return Path(folder.name)
-
-
-def _written(network: Conditioned, sensor: Sensor, int8: bool, log: Log) -> Path:
-    warn_outside(sensor, network.kernels, log)
-    stem = network.name + (INT8 if int8 else "")
-    text = json.dumps(
-        {"weights": sha256(network.weights), "sensor": numbers_of(sensor)},
-        sort_keys=True,
-        default=str,
-    )
-    # The digest of weights and sensor names the file, so that a process writes it once.
-    path = process_file(stem, hashlib.sha256(text.encode()).hexdigest())
-    if not path.is_file():
-        save_onnx(network.model(sensor, int8), path)
-    return path
-
-
-def process_file(name: str, digest: str) -> Path:
-    """Of a file of this process, named for the tables that show it."""
-    folder = _folder() / digest[:12]
-    # The name may be that of an ONNX graph, which may hold any character.
-    stem = re.sub(r"[^\w.-]+", "-", name)[:40]
-    folder.mkdir(exist_ok=True)
-    return folder / f"{stem}.onnx"
 
 
 def told_int8(

@@ -12,9 +12,8 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-import onnx
 
-from beers_deploy.bench.swath import PAPER_SIZE, Swath, parse_size, predict_file
+from beers_deploy.bench.swath import PAPER_SIZE, Swath, parse_size, predict_network
 from beers_deploy.bench.tables import (
     PAPER_TARGET,
     frame_row,
@@ -40,8 +39,6 @@ from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import MAX_DN, Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, require_side
-from beers_deploy.quant.onnx_file import load_onnx
-from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.restoration.options import parse_halo
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.steps import keeps_pixels, offset_of
@@ -115,15 +112,13 @@ def predict(
     try:
         tiling = source.tiling
     except ModelError:
-        predictions, notes = _predictions(source.file, source.model, boards, tile, host_task)
+        predictions, notes = _predictions(source, boards, tile, host_task)
         rows = list(map(frame_row, predictions))
     else:
         halo_px = parse_halo(str(halo), tiling.halo_px)
         takes_step = consistency and keeps_pixels(tiling)
         swath = Swath(width_px, height_px, tile, halo_px, consistency=takes_step)
-        predictions, notes = _predictions(
-            source.file, source.model, boards, tile, host_task, swath.step_px
-        )
+        predictions, notes = _predictions(source, boards, tile, host_task, swath.step_px)
         rows = [swath_row(prediction, swath) for prediction in predictions]
     layers = layer_rows(predictions[0]) if len(boards) == 1 else []
     names = ", ".join(build.target.name for build in boards)
@@ -148,8 +143,7 @@ def predict(
 
 
 def _predictions(
-    file: Path,
-    model: onnx.ModelProto,
+    network: Network,
     boards: Sequence[Dpu],
     tile_px: int,
     task: Task | None,
@@ -159,8 +153,8 @@ def _predictions(
     host.
     """
     # A network that is fixed to one size runs at that size alone.
-    size_px = None if own_tile_px(model) else tile_px
-    predictions = [predict_file(file, dpu, size_px, task, step_px) for dpu in boards]
+    size_px = None if own_tile_px(network.model) else tile_px
+    predictions = [predict_network(network, dpu, size_px, task, step_px) for dpu in boards]
     # Boards of one kind say the same of their hosts: each sentence is kept once.
     sentences = dict.fromkeys(chain.from_iterable(map(host_words, predictions)))
     return predictions, list(sentences)
@@ -199,7 +193,7 @@ class BoardBench:
 
 
 def bench_board(
-    model: Path,
+    network: NetworkLike,
     target: str,
     *,
     image: Path | None = None,
@@ -219,7 +213,7 @@ def bench_board(
     A network that cannot be tiled is predicted by the frame, with nothing beside it.
 
     Args:
-        model: ONNX file.
+        network: what `Network.load` takes.
         target: the board, or "all".
         image: the swath; None for a drawn one of `size`.
         full_scale: the image's pixel value that is full scale; None lets its type and values
@@ -235,14 +229,14 @@ def bench_board(
             counts none.
         consistency: whether the host takes the consistency step.
     """
-    network = load_onnx(model)
+    source = Network.load(network)
     boards, corrected = _boards(target, config, measured)
     try:
-        tiling = tiling_of(network)
+        tiling = source.tiling
     except ModelError as error:
         if image or size or within_s is not None:
             raise
-        return _frames(model, network, boards, corrected, error, host_task)
+        return _frames(source, boards, corrected, error, host_task)
     dn = read_acquisition(image, full_scale, None) if image else None
     width_px, height_px = (
         (dn.shape[1], dn.shape[0]) if dn is not None else parse_size(size or PAPER_SIZE)
@@ -265,14 +259,14 @@ def bench_board(
     comparison = [*(processor_row(swath, profile) for profile in targets), *papers]
     title = f"{width_px} x {height_px} pixels"
     if len(boards) == len(tiles_px) == 1 and within_s is None:
-        prediction = predict_file(model, boards[0], swath.tile_px, host_task, swath.step_px)
-        rows = [*predicted_rows(model.stem, prediction, swath), *comparison]
+        prediction = predict_network(source, boards[0], swath.tile_px, host_task, swath.step_px)
+        rows = [*predicted_rows(source.name, prediction, swath), *comparison]
         tables = [*corrected, (f"{title} in tiles of {swath.tile_px}", rows)]
         notes = [*host_words(prediction), *exposure_words(counts)]
-        layers = [_layers(model, prediction)]
+        layers = [_layers(source, prediction)]
         return BoardBench(tables, notes, layers, swath, dn)
-    swept = sweep_rows(model, swath, boards, tiles_px, host_task)
-    sweep = (f"{model.name}, {title} in whole tiles, halo {swath.halo_px} px", swept)
+    swept = sweep_rows(source, swath, boards, tiles_px, host_task)
+    sweep = (f"{source.input.name}, {title} in whole tiles, halo {swath.halo_px} px", swept)
     tables = [*corrected, sweep, (f"{title}, for comparison", comparison)]
     notes = exposure_words(counts)
     if within_s is not None:
@@ -294,29 +288,28 @@ def exposure_words(counts: Mapping[int, int]) -> list[str]:
     ]
 
 
-def _layers(model: Path, prediction: Prediction) -> tuple[str, list[Row]]:
+def _layers(network: Network, prediction: Prediction) -> tuple[str, list[Row]]:
     dpu = prediction.dpu
-    title = f"{model.name}, one batch on {dpu.target.name} {dpu.name}; {TRAFFIC}"
+    title = f"{network.input.name}, one batch on {dpu.target.name} {dpu.name}; {TRAFFIC}"
     return title, layer_rows(prediction)
 
 
 def _frames(
-    model: Path,
-    network: onnx.ModelProto,
+    network: Network,
     boards: Sequence[Dpu],
     corrected: Tables,
     why: ModelError,
     task: Task | None,
 ) -> BoardBench:
     """The network on whole images; of one configuration each layer too."""
-    predictions, notes = _predictions(model, network, boards, TILE_PX, task)
+    predictions, notes = _predictions(network, boards, TILE_PX, task)
     rows = list(map(frame_row, predictions))
-    sides = network.graph.input[0].type.tensor_type.shape.dim[2:]
+    sides = network.model.graph.input[0].type.tensor_type.shape.dim[2:]
     size = " x ".join(str(side.dim_value or TILE_PX) for side in sides)
-    layers = [_layers(model, predictions[0])] if len(boards) == 1 else []
+    layers = [_layers(network, predictions[0])] if len(boards) == 1 else []
     reason = f"not tiled, but run on whole images: expected {why.expected}, got {why.got}"
     return BoardBench(
-        [*corrected, (f"{model.name}, frames of {size}", rows)], [reason, *notes], layers
+        [*corrected, (f"{network.input.name}, frames of {size}", rows)], [reason, *notes], layers
     )
 
 

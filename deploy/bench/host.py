@@ -8,7 +8,6 @@ import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import onnx
@@ -19,11 +18,11 @@ from beers_deploy.dpu.reading import inputs_of
 from beers_deploy.host_state import cpu_load, resident_bytes
 from beers_deploy.model.consistency import Consistency, Placed
 from beers_deploy.model.processor import require_cores
-from beers_deploy.network_files import other_precision
+from beers_deploy.network import Network, NetworkLike, other_precision
 from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.quant.onnx_file import is_quantised, load_onnx
+from beers_deploy.quant.onnx_file import is_quantised
 from beers_deploy.quant.session import open_session, require_finite
 
 
@@ -95,7 +94,11 @@ def _mean_power(run: Timed) -> Figure:
 
 
 def host_rows(
-    model: Path, target: TargetProfile, tile_px: int, threads: int = 0, sensor: Sensor | None = None
+    network: NetworkLike,
+    target: TargetProfile,
+    tile_px: int,
+    threads: int = 0,
+    sensor: Sensor | None = None,
 ) -> list[Row]:
     """A network's time for one tile through onnxruntime, float32 and INT8 interleaved, and how much
     faster INT8 is.
@@ -106,12 +109,12 @@ def host_rows(
     other precision is the shipped network of the same variant; without one it runs alone.
     """
     require_cores("threads", threads)
-    network = load_onnx(model)
-    other = other_precision(network)
-    runs = [Timed(model.stem, network)]
+    source = Network.load(network)
+    other = other_precision(source)
+    runs = [Timed(source.name, source.model)]
     if other is not None:
-        precision = "INT8" if is_quantised(other) else "float32"
-        runs.append(Timed(f"{precision} of the same shape", other))
+        precision = "INT8" if other.precision == "int8" else "float32"
+        runs.append(Timed(f"{precision} of the same shape", other.model))
     min_time_s = target.value("measurement", "min_time_s")
     min_runs = int(target.value("measurement", "min_runs"))
     # The load is measured from one call to the next: this one opens the window of the timed runs.

@@ -4,14 +4,14 @@ predicted of it.
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import Prediction, dpu_power, predict
 from beers_deploy.dpu.cost.model import Interval, Task, between
-from beers_deploy.dpu.reading import read_network
+from beers_deploy.dpu.reading import network_of
 from beers_deploy.model.raster.facts import SIDE_PX
+from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Figure, predicted, unavailable
 from beers_deploy.profiles.target import TILE_PX
@@ -78,19 +78,20 @@ class Swath:
         return self.pixels / (self.tiles * self.runs) if self.consistency else 0.0
 
 
-def predict_file(
-    model: Path,
+def predict_network(
+    network: NetworkLike,
     dpu: Dpu,
     tile_px: int | None = TILE_PX,
     task: Task | None = None,
     step_px: float = 0.0,
 ) -> Prediction:
-    """What the cost model says of an ONNX file, for tiles of that side or, with None, for the size
-    it is fixed to.
+    """Predict a network for tiles of one side or, with None, for the size it is fixed to.
 
-    The `task` of the host is what the file tells, if none is given; `step_px` as of `predict`.
+    The `task` of the host is what the network tells, if none is given; `step_px` as of `predict`.
     """
-    return predict(place(read_network(model, tile_px), dpu), dpu, task, step_px)
+    source = Network.load(network, to_run=False)
+    sized = network_of(source.model, tile_px, source.label)
+    return predict(place(sized, dpu), dpu, task, step_px)
 
 
 def swath_figures(

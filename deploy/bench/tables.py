@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 
 from beers_deploy.bench.swath import (
     COST_SOURCE,
@@ -22,7 +21,7 @@ from beers_deploy.bench.swath import (
     host_time,
     interval_ends,
     one_thread_latency,
-    predict_file,
+    predict_network,
     scaled,
     swath_figures,
     swath_latency,
@@ -37,6 +36,7 @@ from beers_deploy.dpu.cost.latency import (
     layer_energy_j,
 )
 from beers_deploy.dpu.cost.model import Task, between
+from beers_deploy.network import NetworkLike
 from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Figure, Row, number, predicted, published, unavailable
@@ -190,7 +190,7 @@ MOST_TILE_PX = 8192
 
 
 def sweep_rows(
-    model: Path,
+    network: NetworkLike,
     swath: Swath,
     boards: Sequence[Dpu],
     tiles_px: Sequence[int],
@@ -200,7 +200,7 @@ def sweep_rows(
     rows = []
     for dpu, tile_px in product(boards, tiles_px):
         tiled = replace(swath, tile_px=tile_px)
-        prediction = predict_file(model, dpu, tile_px, task, tiled.step_px)
+        prediction = predict_network(network, dpu, tile_px, task, tiled.step_px)
         rows.append(swath_row(prediction, tiled))
     return rows
 

@@ -3,7 +3,6 @@ side by side.
 """
 
 from enum import StrEnum
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -147,7 +146,7 @@ def bench(
     from beers_deploy.dpu.board import ALL
     from beers_deploy.dpu.cost.model import TASKS
     from beers_deploy.model.io.files import require_writable
-    from beers_deploy.network_files import conditioned, int8_file
+    from beers_deploy.network import Network
     from beers_deploy.results import Table, inputs_of, print_rows, require_same
 
     tiles = parse_tiles(tile)
@@ -156,15 +155,15 @@ def bench(
     _refuse_unused(context, here)
     require_writable(json, inputs=(model, image, measured, Path(target), Path(sensor)))
     sensor_profile = load_sensor(sensor)
-    path = int8_file(model, sensor_profile, partial(say, err=True))
+    network = Network.load(model, sensor=sensor_profile, int8=True)
     # The digests are those of the files that are read from here on.
-    inputs = inputs_of(path, image, measured) if json else ()
+    inputs = inputs_of(image, measured) if json else ()
     if here:
         from beers_deploy.bench.host import host_rows
 
-        rows = host_rows(path, load_target("host-cpu"), _single(tiles), threads, sensor_profile)
+        rows = host_rows(network, load_target("host-cpu"), _single(tiles), threads, sensor_profile)
         for table, part in by_table(rows).items():
-            print_rows(f"{path.name} on this machine: {table}", part)
+            print_rows(f"{network.input.name} on this machine: {table}", part)
         say(NO_PROXY)
     elif board != ALL and (profile := load_target(board)).npu:
         refuse(
@@ -173,15 +172,16 @@ def bench(
             expected=f"none with {profile.name}, for which nothing is predicted",
             got="one",
         )
-        rows = quoted_rows(path.stem, profile)
+        rows = quoted_rows(network.name, profile)
         print_rows(
-            f"{path.name} on {profile.name}: nothing is predicted; published are other networks",
+            f"{network.input.name} on {profile.name}: nothing is predicted; published are other "
+            "networks",
             rows,
         )
     else:
         task = next((name for name in TASKS if name == host_task), None)
         prediction = bench_board(
-            path,
+            network,
             board,
             image=image,
             full_scale=full_scale,
@@ -192,7 +192,7 @@ def bench(
             measured=measured,
             within_s=within,
             host_task=task,
-            sensor=sensor_profile if conditioned(model) is not None else None,
+            sensor=sensor_profile if network.weights is not None else None,
             consistency=consistency,
         )
         for title, part in (*(_required_layers(prediction) if layers else []), *prediction.shown):
@@ -214,8 +214,8 @@ def bench(
                     "The traditional pipeline is not measured here: "
                     f"{missing_extra(error, 'bench')}"
                 )
-    require_same(inputs, path, image, measured)
-    save(Table("bench", arguments(), inputs, tuple(rows)), json)
+    require_same(inputs, image, measured)
+    save(Table("bench", arguments(), (network.input, *inputs), tuple(rows)), json)
 
 
 def _required_layers(prediction: "BoardBench") -> "Tables":

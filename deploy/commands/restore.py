@@ -224,8 +224,8 @@ def restore(
     if stac is not None:
         write_item(out, stac)
     print_rows(f"wrote {out}", [row])
-    read = (*inputs, image, *lists)
-    save(Table("restore", arguments(sensor=sensor or BLIND), read, (row,)), json)
+    table = Table("restore", arguments(sensor=sensor or BLIND), (*inputs, image, *lists), (row,))
+    save(table, json)
 
 
 def _require_item(stac: Path | None, cog: bool) -> None:

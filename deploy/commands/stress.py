@@ -4,7 +4,6 @@ Exit code 1 when something fails.
 """
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -90,7 +89,7 @@ def stress(
     """
     from beers_deploy.model.io.files import require_writable, write_text
     from beers_deploy.quant.calibration import Calibration
-    from beers_deploy.results import Table, inputs_of, print_rows, require_same
+    from beers_deploy.results import Table, print_rows
     from beers_deploy.studies.stress.battery import (
         TITLES,
         chosen,
@@ -109,9 +108,8 @@ def stress(
     require_writable(out, json, picture, inputs=sources)
     names = chosen(cases, [case.name for case in CASES], "--cases")
     stage_names = chosen(stages, STAGES, "--stages")
-    subject = open_subject(float_model, int8_model, sensor, partial(say, err=True))
-    # A network that is replaced during the run is refused at its end.
-    inputs = inputs_of(*subject.paths) if json else ()
+    subject = open_subject(float_model, int8_model, sensor)
+    inputs = tuple(network.input for network in subject.opened)
     if bit_flips:
         results = []
         table_rows = flip_rows(
@@ -124,12 +122,11 @@ def stress(
         table_rows = shown_rows(subject, results)
     for table, rows in by_table(table_rows).items():
         print_rows(TITLES[table], rows)
-    require_same(inputs, *subject.paths)
     save(Table("stress", arguments(), inputs, (*table_rows, *finding_rows(results))), json)
     if out is not None:
         write_text(out, markdown(table_rows))
     if picture is not None:
-        write_text(picture, flip_curves_svg({subject.paths[-1].stem: table_rows}))
+        write_text(picture, flip_curves_svg({subject.opened[-1].name: table_rows}))
     if not bit_flips:
         _judge(table_rows, results)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from beers_deploy.bench import tables
-from beers_deploy.bench.swath import Swath, predict_file
+from beers_deploy.bench.swath import Swath, predict_network
 from beers_deploy.bench.traditional import measure_chain
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import Placement
@@ -184,7 +184,7 @@ def bench_tables(model: Path, dn: np.ndarray, sensors: tuple[Sensor, Sensor]) ->
     rows = []
     for width, height in ((dn.shape[1], dn.shape[0]), SWATH_PX):
         swath = Swath(width, height, TILE_PX, halo_px, consistency=True)
-        prediction = predict_file(model, dpu, step_px=swath.step_px)
+        prediction = predict_network(model, dpu, step_px=swath.step_px)
         network = tables.predicted_rows(VARIANT, prediction, swath)
         rows.append([chain.row(swath), tables.processor_row(swath, dpu.target), *network])
     dpus = [load_dpu(name) for name in board_names()]

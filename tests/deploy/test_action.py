@@ -15,12 +15,12 @@ import pytest
 from beers_deploy.export import to_onnx
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.model.variants import Variant
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.quant.onnx_file import save_onnx
 from tests.deploy.command_line import done
 from tests.deploy.workflow_steps import ACTION, BASH, KEPT, ROOT, Runner, read_yaml
 from tests.model.networks import plain
 from tests.quant.quick import changed
+from tests.shipped import shipped_pair
 
 WORKFLOW = ROOT / ".github" / "workflows" / "int8-gate.yml"
 OURS = "Train a small network"

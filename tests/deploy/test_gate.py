@@ -17,7 +17,6 @@ from onnxruntime.quantization import quantize_static
 import beers_deploy as bd
 from beers_deploy.export import float_model
 from beers_deploy.network import Network
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles import load_target
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.profiles.figures import Bound, Check
@@ -39,6 +38,7 @@ from beers_deploy.quant.structure import Relus, count_relus, rounded_tensors, sa
 from beers_deploy.verdict import file_checks, junit_text, sentence
 from tests.deploy.command_line import done, refused
 from tests.quant.quick import Calibration, change, changed, drawn
+from tests.shipped import shipped_pair
 
 Spoil = Callable[[onnx.ModelProto], None]
 

@@ -19,7 +19,6 @@ from beers_deploy import verdict as gates
 from beers_deploy.export import float_model
 from beers_deploy.kit.record import bill_of, record_of, write_record
 from beers_deploy.network import Network
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.banked.family import FAMILY, WEIGHTS
@@ -27,6 +26,7 @@ from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
 from beers_deploy.quant.samples import CALIBRATED_ON
 from tests.deploy.command_line import done, refused
 from tests.quant.quick import change
+from tests.shipped import shipped_pair
 
 SMALL = ("convbeers-xs", "--patches", 1)
 

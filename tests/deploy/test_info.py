@@ -11,12 +11,12 @@ import tifffile
 
 from beers_deploy.info import info_row
 from beers_deploy.model.raster.reader import GdalSource
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles import load_target
 from beers_deploy.profiles.figures import Row
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.run import restore_file
 from tests.deploy.command_line import done
+from tests.shipped import shipped_pair
 
 TAGS = [
     (33550, "d", 3, (0.5, 0.25, 0.0), True),

@@ -12,7 +12,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from beers_deploy.library import restore
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.quant.onnx_file import save_onnx
@@ -21,6 +20,7 @@ from beers_deploy.restoration.run import restore_file
 from tests.deploy.restoration.runs import noise
 from tests.deploy.two_workers import local_cluster
 from tests.quant.tiling.small_networks import espcn
+from tests.shipped import shipped_pair
 
 SHAPES = [(61, 83), (17, 130), (1, 40), (29, 29), (3, 5), (3, 41, 35), (1, 50, 20)]
 

@@ -7,13 +7,11 @@ import subprocess
 import sys
 import warnings
 from collections import Counter
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import pytest
 import tifffile
 
@@ -28,12 +26,9 @@ from beers_deploy.model.shipped import (
     shipped_names,
     shipped_weights,
 )
+from beers_deploy.network import Network
 from beers_deploy.network_files import (
-    float_file,
-    int8_file,
-    network_file,
     pair_of,
-    shipped_pair,
     told_int8,
     weights_file,
 )
@@ -45,16 +40,9 @@ from beers_deploy.quant.banked.family import WEIGHTS
 from beers_deploy.quant.onnx_file import load_onnx, metadata
 from tests.deploy.command_line import done, refused
 from tests.profiles.own_sensor import own_sensor
+from tests.shipped import shipped_pair
 
 KNOWN = load_sensor(SENSOR)
-
-
-def test_a_network_is_written_once_for_a_sensor(conditioned: Path) -> None:
-    path = float_file(conditioned, KNOWN)
-    time_ns = path.stat().st_mtime_ns
-    assert float_file(conditioned, KNOWN) == path
-    assert path.stat().st_mtime_ns == time_ns
-    assert metadata(onnx.load(path))["sensor"] == SENSOR
 
 
 def test_the_same_numbers_are_the_same_sensor_and_others_are_not(
@@ -63,7 +51,7 @@ def test_the_same_numbers_are_the_same_sensor_and_others_are_not(
     """Sources and descriptions make no other network; a number does, under the
     same name of a file.
     """
-    files = []
+    networks = []
     for folder, old, new in (
         ("a", "", ""),
         ("b", "Raw", "My raw"),
@@ -71,10 +59,12 @@ def test_the_same_numbers_are_the_same_sensor_and_others_are_not(
     ):
         (tmp_path / folder).mkdir()
         sensor = load_sensor(str(own_sensor(tmp_path / folder, (old, new))))
-        files.append(float_file(conditioned, sensor))
-    assert files[0] == files[1]
-    assert files[2] != files[0]
-    assert files[2].read_bytes() != files[0].read_bytes()
+        networks.append(Network.load(conditioned, sensor=sensor))
+    weights = [
+        [tensor.raw_data for tensor in network.model.graph.initializer] for network in networks
+    ]
+    assert weights[0] == weights[1]
+    assert weights[2] != weights[0]
 
 
 @pytest.mark.slow
@@ -105,7 +95,7 @@ def test_weights_of_ones_own_are_calibrated_by_quantize_alone(conditioned: Path)
     with pytest.raises(
         ModelError, match=r"expected an INT8 network, got float weights; .*beers-deploy quantize"
     ):
-        int8_file(conditioned, KNOWN)
+        Network.load(conditioned, sensor=KNOWN, int8=True)
 
 
 @pytest.mark.parametrize("name", shipped_names())
@@ -114,7 +104,7 @@ def test_the_shipped_int8_files_are_of_these_weights(name: str) -> None:
     header = metadata(load_onnx(SHIPPED / f"{name}{INT8}.onnx"))
     assert header[WEIGHTS] == sha256(shipped_weights(name))
     assert header["variant"] == name
-    assert metadata(load_onnx(int8_file(Path(name), KNOWN)))["sensor"] == SENSOR
+    assert Network.load(name, sensor=KNOWN, int8=True).sensor == SENSOR
 
 
 def test_a_name_that_is_none_is_told_the_names_that_there_are() -> None:
@@ -122,27 +112,25 @@ def test_a_name_that_is_none_is_told_the_names_that_there_are() -> None:
         with pytest.raises(
             ModelError, match=r"shipped network \(convbeers, convbeers-half, .*convbeers-xs"
         ):
-            network_file(Path(name), KNOWN)
+            Network.load(name)
     with pytest.raises(ModelError, match="no such file"):
-        network_file(Path("none.safetensors"), KNOWN)
+        Network.load("none.safetensors")
 
 
 def test_blind_is_the_middle_of_a_range_of_sensors() -> None:
     blind = load_sensor(BLIND)
     assert (blind.name, numbers_of(blind)) == (BLIND, numbers_of(load_sensor(BLIND_PROFILE)))
-    floating = [
-        load_onnx(float_file(Path("convbeers-xs"), load_sensor(name)))
-        for name in (BLIND, BLIND_PROFILE)
-    ]
+    floating = [Network.load("convbeers-xs", sensor=name).model for name in (BLIND, BLIND_PROFILE)]
     weights = [[tensor.raw_data for tensor in model.graph.initializer] for model in floating]
     assert weights[0] == weights[1]
 
 
 def test_what_lies_outside_is_said_each_time(conditioned: Path, tmp_path: Path) -> None:
-    messages = list[str]()
     sensor = load_sensor(str(own_sensor(tmp_path, ("value = 0.07", "value = 0.004"))))
-    for _ in range(2):
-        float_file(conditioned, sensor, messages.append)
+    with warnings.catch_warnings(record=True, action="always") as caught:
+        for _ in range(2):
+            Network.load(conditioned, sensor=sensor)
+    messages = [str(warning.message) for warning in caught]
     assert len(messages) == 4
     assert all(
         re.match("warning: mtf_(across|along) 0.004 is outside 0.015 to 0.15", sentence)
@@ -193,11 +181,6 @@ def test_a_network_that_is_made_for_one_sensor_takes_no_sensor_for_each_band(
     assert not (tmp_path / "out.tif").exists()
 
 
-def test_a_sensors_name_cannot_leave_the_folder(conditioned: Path) -> None:
-    odd = replace(KNOWN, name="../../x y/" + 99 * "z")
-    assert float_file(conditioned, odd).parent == float_file(conditioned, KNOWN).parent
-
-
 def test_what_several_networks_have_to_say_is_said_once() -> None:
     messages: list[str] = []
     tell = once(messages.append)
@@ -207,29 +190,27 @@ def test_what_several_networks_have_to_say_is_said_once() -> None:
 
 
 @pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-s"])
-def test_a_name_is_the_shipped_network(
+def test_a_name_is_the_shipped_network_unless_a_file_has_it(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    floating, int8 = shipped_pair(name)
-    assert int8_file(Path(name), KNOWN) == int8_file(Path(f"{name}-int8"), KNOWN) == int8
-    assert network_file(Path(name), KNOWN) == float_file(Path(f"{name}-int8"), KNOWN) == floating
-    assert network_file(Path(f"{name}-int8"), KNOWN) == int8
+    for given, int8, precision in (
+        (name, None, "float32"),
+        (name, True, "int8"),
+        (f"{name}-int8", None, "int8"),
+        (f"{name}-int8", False, "float32"),
+    ):
+        network = Network.load(given, sensor=KNOWN, int8=int8)
+        assert (network.precision, network.sensor) == (precision, SENSOR)
     assert weights_file(Path(name)) == shipped_weights(name)
     monkeypatch.chdir(tmp_path)
-    # If a file has the name of a shipped network, the file is meant.
     Path(name).write_bytes(b"mine")
-    assert (
-        int8_file(Path(name), KNOWN)
-        == float_file(Path(name), KNOWN)
-        == weights_file(Path(name))
-        == Path(name)
-    )
+    with pytest.raises(ModelError, match="an ONNX file"):
+        Network.load(name)
+    assert weights_file(Path(name)) == Path(name)
 
 
-def test_anything_else_stays_a_path_and_nothing_is_the_default() -> None:
-    for path in map(Path, ("none", "none.onnx", "folder/convbeers-s")):
-        assert int8_file(path, KNOWN) == float_file(path, KNOWN) == weights_file(path) == path
-    assert network_file(None, KNOWN) == int8_file(None, KNOWN) == int8_file(Path(VARIANT), KNOWN)
+def test_nothing_is_the_default() -> None:
+    assert Network.load(None) == Network.load(f"{VARIANT}{INT8}")
 
 
 def test_commands_take_the_name(tmp_path: Path) -> None:

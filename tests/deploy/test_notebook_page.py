@@ -10,10 +10,10 @@ import pytest
 import tifffile
 
 import beers_deploy as bd
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.toml import profile_path
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.run import restore_file
+from tests.shipped import shipped_pair
 
 NET = """
 import torch

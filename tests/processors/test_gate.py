@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from onnx import numpy_helper
 
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from tests.deploy.command_line import done
+from tests.shipped import shipped_pair
 
 
 def gate(scenes: Path, *pair: object, code: int = 0) -> str:

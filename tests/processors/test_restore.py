@@ -8,11 +8,11 @@ import tifffile
 
 from beers_deploy.library import restore
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.onnx_file import load_onnx
 from tests.deploy.command_line import done
+from tests.shipped import shipped_pair
 
 MAX_DN = np.float32(4095)
 

@@ -7,11 +7,11 @@ import onnx
 import pytest
 from onnxruntime.quantization import quantize_static
 
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.quant.float_parts import float_layers_check, float_note
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, load_onnx, make_model, save_onnx
 from beers_deploy.quant.structure import structure_checks
 from tests.quant.quick import Calibration
+from tests.shipped import shipped_pair
 
 
 def decoy(hidden: str) -> onnx.ModelProto:

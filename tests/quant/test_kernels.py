@@ -18,7 +18,6 @@ from onnx import TensorProto, helper, numpy_helper
 from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
 
 from beers_deploy.model.processor import int8_adds_exactly
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.integer.reference import merged_correction, run_core
@@ -34,6 +33,7 @@ from beers_deploy.quant.kernels import (
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session, run
 from tests.quant.quick import Calibration
+from tests.shipped import shipped_pair
 
 SHAPES = [(1, 1, 1), (3, 5, 3), (4, 6, 1), (16, 16, 3), (5, 33, 3), (32, 8, 2), (17, 32, 3)]
 """(outputs, inputs, kernel) of convolutions: odd ones straddle what a kernel takes at a time."""

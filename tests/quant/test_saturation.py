@@ -7,12 +7,12 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import CORRECTION
 from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.onnx_file import image_info, load_onnx, make_model
 from beers_deploy.quant.structure import rounded_tensors, saturated_shares
+from tests.shipped import shipped_pair
 
 IMAGE = np.random.default_rng(3).random((2, 1, 37, 43), dtype=np.float32)
 Lost = Callable[[np.ndarray], np.ndarray]

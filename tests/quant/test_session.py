@@ -5,8 +5,8 @@ import time
 import numpy as np
 import pytest
 
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.quant.session import open_session, run
+from tests.shipped import shipped_pair
 
 IMAGE = np.full((1, 1, 96, 96), 0.5, np.float32)
 

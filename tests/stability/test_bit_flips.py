@@ -8,9 +8,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from beers_deploy.bench.swath import predict_file
+from beers_deploy.bench.swath import predict_network
 from beers_deploy.dpu.board import load_dpu
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.target import TILE_PX
@@ -38,6 +37,7 @@ from beers_deploy.studies.stress.faults import (
 from beers_deploy.studies.stress.networks import Subject, open_subject
 from docs.make import bit_flips as maker
 from tests.deploy.command_line import done, refused
+from tests.shipped import shipped_pair
 
 pytestmark = pytest.mark.slow
 
@@ -121,7 +121,7 @@ def test_all_guards_cost_under_two_per_cent_on_the_board(variant: str) -> None:
     }
     dpu = load_dpu("vck190", None)
     target = FaultTarget(core, Guards(relus, 1024.0, checksums(core)), ())
-    prices = price_rows(target, predict_file(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
+    prices = price_rows(target, predict_network(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
     *parts, together = (db(row, "time") for row in prices)
     assert together == pytest.approx(sum(parts))
     assert 0 < db(prices[-1], "of a tile, if nothing hides") < 2
@@ -175,7 +175,7 @@ def test_the_page_is_fresh() -> None:
     dpu = load_dpu("vck190", None)
     for variant in maker.VARIANTS:
         target = make_target(open_subject(Path(variant), None), maker.SOURCE)
-        rows = price_rows(target, predict_file(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
+        rows = price_rows(target, predict_network(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
         assert all(line in page for line in maker.price_lines({variant: rows}))
     for name, memory in MEMORIES.items():
         assert page.count(f"\n| {name}, ") == len(memory.rates)

@@ -13,14 +13,13 @@ from typing import Final
 import onnx
 import torch
 
-from beers_deploy.export import float_model
-from beers_deploy.model.exposure import brightened, factors_for
 from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.shipped import INT8, shipped_names
 from beers_deploy.model.traditional.nl_bayes import QUALITIES
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.model.traditional.pipeline import Chain, Order, restore_traditional
-from beers_deploy.network_files import Conditioned, conditioned, network_file, warn_outside
+from beers_deploy.network import Network
+from beers_deploy.network_files import conditioned
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Instrument, Sensor
@@ -125,49 +124,53 @@ def method_named(
     if not shipped and Path(network).suffix not in (".onnx", ".safetensors"):
         raise OptionError("methods", expected=EXPECTED, got=repr(name), remedy="correct that name")
     sensor = load_sensor(other) if other else degraded
-    bank_network = conditioned(Path(network))
-    if bank_network is None:
-        model = float_model(network_file(Path(network), sensor, log))
-        restore = with_steps(model, {}, sensor, reference.nominal(), around)
-        return Method(name, restore, knowledge_of(model, degraded.name))
-    model = bank_network.model(sensor, network.endswith(INT8))
-    warn_outside(sensor, bank_network.kernels, log)
-    specialise = None
+    weights = conditioned(Path(network))
+    if weights is None:
+        return method_of(name, Network.load(network), sensor, reference, around, degraded.name)
+    int8 = network.endswith(INT8)
+    told = Network.for_sensor(weights, sensor, int8=int8, log=log)
+    method = method_of(name, told, sensor, reference, around, degraded.name)
     # A name with @SENSOR asks for that sensor: another one does not take its place.
-    if not other:
-        specialise = _network_specialise(
-            network, bank_network, degraded, reference.nominal(), around, log
-        )
-    restore = _conditioned_restore(network, bank_network, sensor, reference.nominal(), around)
-    return Method(name, restore, knowledge_of(model, degraded.name), specialise)
+    if other:
+        return method
+
+    def specialise(instrument: Instrument) -> Restore:
+        profile = profile_of(instrument, degraded)
+        drawn = Network.for_sensor(weights, profile, int8=int8, log=log)
+        return network_restore(drawn, profile, reference.nominal(), around)
+
+    return replace(method, specialise=specialise)
 
 
-def _network_specialise(
-    name: str, network: Conditioned, like: Sensor, reference: Instrument, around: Around, log: Log
-) -> Specialise:
-    """A conditioned network given any sensor in the grid of a profile."""
+def method_of(
+    name: str,
+    network: Network,
+    sensor: Sensor,
+    reference: Sensor,
+    around: Around = BOTH,
+    acquired_by: str = "",
+) -> Method:
+    """Return a network as a method.
 
-    def specialise(sensor: Instrument) -> Restore:
-        profile = profile_of(sensor, like)
-        warn_outside(profile, network.kernels, log)
-        return _conditioned_restore(name, network, profile, reference, around)
+    Args:
+        name: in tables.
+        network: float or INT8.
+        sensor: that the steps around the network are taken for.
+        reference: the sensor that is aimed at.
+        around: which steps are taken.
+        acquired_by: the name of the images' sensor; that of `sensor` if empty.
+    """
+    restore = network_restore(network, sensor, reference.nominal(), around)
+    return Method(name, restore, knowledge_of(network.model, acquired_by or sensor.name))
 
-    return specialise
 
-
-def _conditioned_restore(
-    name: str, network: Conditioned, sensor: Sensor, reference: Instrument, around: Around
+def network_restore(
+    network: Network, sensor: Sensor, reference: Instrument, around: Around
 ) -> Restore:
-    """A conditioned network for one sensor, with its exposures."""
-    int8 = name.endswith(INT8)
-    # Dark parts are restored at a higher exposure, each by the network of a brighter sensor.
-    factors = factors_for(sensor.nominal()) if around.exposure else (1,)
-    models = {
-        factor: network.model(brightened(sensor, factor) if factor > 1 else sensor, int8)
-        for factor in factors
-    }
-    brighter = {factor: model for factor, model in models.items() if factor > 1}
-    return with_steps(models[1], brighter, sensor, reference, around)
+    """Return a network with the steps around it; dark parts are restored at a higher exposure."""
+    exposures = network.exposures if around.exposure else {}
+    brighter = {factor: other.model for factor, other in exposures.items()}
+    return with_steps(network.model, brighter, sensor, reference, around)
 
 
 def with_steps(

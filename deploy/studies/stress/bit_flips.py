@@ -11,7 +11,7 @@ from math import exp
 
 import numpy as np
 
-from beers_deploy.bench.swath import predict_file
+from beers_deploy.bench.swath import predict_network
 from beers_deploy.dpu.board import Dpu, load_dpu
 from beers_deploy.dpu.cost.latency import Prediction
 from beers_deploy.dpu.cost.model import Constants
@@ -42,7 +42,7 @@ def flip_rows(subject: Subject, source: Calibration, board: str) -> list[Row]:
     # A file without an integer core is refused before anything is drawn.
     _ = subject.core
     dpu = load_dpu(board, None)
-    prediction = predict_file(subject.paths[-1], dpu, TILE_PX)
+    prediction = predict_network(subject.opened[-1], dpu, TILE_PX)
     # So is a board that cannot price the guards.
     dpu.limit("cpu", "clock_ghz")
     target = make_target(subject, source)

@@ -15,10 +15,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, pixel_shuffle, pixel_unshuffle
 
-from beers_deploy.export import float_model
-from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.network_files import float_file, int8_file, pair_of
+from beers_deploy.network import Network as Opened
+from beers_deploy.network_files import pair_of
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import BeersError, ModelError
 from beers_deploy.quant.bounds import layer_bounds
@@ -35,7 +34,7 @@ from beers_deploy.quant.graph import (
     image_channels,
 )
 from beers_deploy.quant.integer.reference import merged_correction, run_core
-from beers_deploy.quant.onnx_file import any_size, load_onnx, require_quantised
+from beers_deploy.quant.onnx_file import any_size, require_quantised
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.walk import Tiling, tiling_of
 from beers_deploy.restoration.plan import make_plan
@@ -88,12 +87,12 @@ class Subject:
     Attributes:
         float32: the float one.
         int8: the INT8 one, or None.
-        paths: the files they came from.
+        opened: where they come from.
     """
 
     float32: Network
     int8: Network | None
-    paths: tuple[Path, ...]
+    opened: tuple[Opened, ...]
 
     @cached_property
     def graph(self) -> Graph | None:
@@ -117,25 +116,20 @@ class Subject:
         return self.int8
 
 
-def open_subject(
-    float_path: Path | None, int8_path: Path | None, sensor: str = SENSOR, say: Log = no_log
-) -> Subject:
+def open_subject(float_path: Path | None, int8_path: Path | None, sensor: str = SENSOR) -> Subject:
     """The files given, or a shipped network in both precisions by its name, told the sensor."""
     if int8_path is None and (float_path is None or not (float_path.suffix or float_path.exists())):
         float_path, int8_path = pair_of(float_path, None)
     profile = load_sensor(sensor)
-    paths = [
-        float_file(float_path, profile, say),
-        *([int8_file(int8_path, profile, say)] if int8_path else []),
-    ]
-    networks = [
-        Network(load(path)) for load, path in zip((float_model, load_onnx), paths, strict=False)
-    ]
-    for path, network, is_int8 in zip(paths, networks, (False, True), strict=False):
-        require_quantised(network.model, str(path), is_int8)
+    opened = [Opened.load(float_path, sensor=profile, int8=False)]
+    if int8_path is not None:
+        opened.append(Opened.load(int8_path, sensor=profile, int8=True))
+    networks = [Network(source.model) for source in opened]
+    for source, network, is_int8 in zip(opened, networks, (False, True), strict=False):
+        require_quantised(network.model, source.label, is_int8)
         # What cannot be tiled is refused before anything runs.
         _ = network.tiling
-    return Subject(networks[0], networks[1] if int8_path else None, tuple(paths))
+    return Subject(networks[0], networks[1] if int8_path else None, tuple(opened))
 
 
 def in_torch(graph: Graph, image: Tensor) -> Tensor:

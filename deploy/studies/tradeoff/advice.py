@@ -79,10 +79,10 @@ class Measured:
     @property
     def network(self) -> Network:
         """The network that restores here."""
-        if self.point is None or self.point.variant.file is None:
+        if self.point is None or self.point.variant.network is None:
             remedy = "take a point of a network"
             raise OptionError("point", expected="one with a network", got=self.name, remedy=remedy)
-        return Network.load(self.point.variant.file)
+        return self.point.variant.network
 
 
 def placed(points: Iterable[Measured], cost: str) -> list[Measured]:

@@ -21,25 +21,24 @@ from beers_deploy import __version__
 from beers_deploy.bench.swath import Swath
 from beers_deploy.bench.timing import interleaved
 from beers_deploy.bench.traditional import drawn_acquisition
-from beers_deploy.export import float_model
 from beers_deploy.model.consistency import Consistency
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.metrics.perceptual import find_backbone
 from beers_deploy.model.processor import processor_name
 from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.shipped import DETECTOR
+from beers_deploy.network import Network
 from beers_deploy.profiles import load_sensor, sensor_names
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Figure, measured, unavailable
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.calibration import Calibration
-from beers_deploy.quant.onnx_file import metadata, save_onnx
+from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.quant.quantise import quantise_model
-from beers_deploy.quant.reading.external import network_sha256
 from beers_deploy.restoration.method import Restore
 from beers_deploy.restoration.options import Runtime
 from beers_deploy.restoration.plan import Plan, make_plan
-from beers_deploy.restoration.runtime import Packed, open_runtime
+from beers_deploy.restoration.runtime import AtFirstCall, open_runtime
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork, tiles_by_factor
 from beers_deploy.restoration.tiles.rows import restore_dn
 from beers_deploy.studies.detection.average_precision import (
@@ -62,8 +61,7 @@ from beers_deploy.studies.tradeoff.points import (
     HALO_STEP_PX,
     Point,
     Variant,
-    model_of,
-    tiling_of_file,
+    network_of_variant,
 )
 
 Scores = Mapping[str, float | None]
@@ -164,13 +162,10 @@ class Benchmark:
 
     def depends(self, variant: Variant) -> str:
         """Digest of what a variant's pictures depend on."""
-        if variant.file is not None:
+        if variant.network is not None:
             sensors = self.degraded, self.reference
-            files = [
-                network_sha256(path)
-                for path in (variant.file, *(path for _, path in variant.brighter))
-            ]
-            return key_of(files=files, sensors=sensors)
+            networks = (variant.network, *variant.network.exposures.values())
+            return key_of(files=[network.sha256 for network in networks], sensors=sensors)
         return key_of(method=variant.method, sensors=[self.degraded, self.reference])
 
     def scores(
@@ -195,10 +190,11 @@ class Benchmark:
         """How often the network of a point runs on a tile of the images, once for each exposure; a
         mean.
         """
-        if not point.variant.brighter:
+        network = point.variant.network
+        if network is None or not network.exposures:
             return 1.0
         sensor = self.degraded.nominal()
-        factors = (1, *(factor for factor, _ in point.variant.brighter))
+        factors = (1, *network.exposures)
         tiles = 0
         runs = 0
         for pair in self.pairs:
@@ -239,14 +235,14 @@ class Benchmark:
 
 def restore_in_tiles(point: Point, degraded: Sensor, reference: Sensor) -> Restore:
     """A network in a point's tiles, with the steps around it that `restore` takes."""
-    file = point.variant.file or Path()
+    source = network_of_variant(point.variant)
     sensor = degraded.nominal()
-    infer, _ = open_runtime(Runtime.onnxruntime, model_of(file), threads=0)
+    infer, _ = open_runtime(Runtime.onnxruntime, source.model, threads=0)
     others = {
-        factor: Packed(path.read_bytes(), Runtime.onnxruntime, 0)
-        for factor, path in point.variant.brighter
+        factor: AtFirstCall(partial(open_runtime, Runtime.onnxruntime, other.model, 0))
+        for factor, other in source.exposures.items()
     }
-    network = ExposedNetwork({1: infer, **others}, tiling_of_file(file).halo_px, sensor.offset_dn)
+    network = ExposedNetwork({1: infer, **others}, source.tiling.halo_px, sensor.offset_dn)
     steps = (Consistency.of(sensor, reference.nominal().in_units_of(sensor), sensor.max_dn),)
 
     def restore(dn: np.ndarray) -> np.ndarray:
@@ -259,7 +255,7 @@ def tiles_of_point(point: Point, shape: tuple[int, ...]) -> Plan:
     """The tiles of a point on an image (H, W); one that is no larger than a tile is cut in two
     along each side.
     """
-    tiling = tiling_of_file(point.variant.file or Path())
+    tiling = network_of_variant(point.variant).tiling
     halo_px = tiling.halo_px if point.halo_px is None else point.halo_px
     # Half of the shorter side, rounded up to the halo's step: an image in one tile has no seam.
     half_px = HALO_STEP_PX * -(-(min(shape) // 2) // HALO_STEP_PX) + 2 * halo_px
@@ -402,29 +398,30 @@ takes.
 """
 
 
-def make_int8(file: Path, folder: Path, scenes: Path | None, sensor: Sensor, seed: int) -> Path:
+def make_int8(
+    network: Network, folder: Path, scenes: Path | None, sensor: Sensor, seed: int
+) -> Network:
     """Quantise a float network on simulated patches as `quantize` does, and keep the file.
 
     Args:
-        file: ONNX or safetensors.
+        network: in float32.
         folder: where the INT8 file is kept.
         scenes: folder of images to calibrate on; drawn ones if None.
         sensor: of the patches, where the network names none that is known.
         seed: of every random draw.
     """
-    model = float_model(file)
-    sensor_name = metadata(model).get("sensor", "")
-    calibration_sensor = load_sensor(sensor_name) if sensor_name in sensor_names() else sensor
+    named = network.sensor
+    calibration_sensor = load_sensor(named) if named in sensor_names() else sensor
     scene_digests = [sha256(path) for path in list_images(scenes)] if scenes else []
     key = key_of(
-        network=network_sha256(file),
+        network=network.sha256,
         scenes=scene_digests,
         sensor=calibration_sensor,
         seed=seed,
         size=[PATCHES, PATCH_PX],
     )
-    path = folder / f"{file.stem}-int8-{key[:16]}.onnx"
+    path = folder / f"{network.name}-int8-{key[:16]}.onnx"
     if not path.is_file():
         patches = Calibration(calibration_sensor, scenes, PATCHES, PATCH_PX, seed)
-        save_onnx(quantise_model(model, patches.drawn, patches.about).host, path)
-    return path
+        save_onnx(quantise_model(network.model, patches.drawn, patches.about).host, path)
+    return Network.load(path)

@@ -167,7 +167,7 @@ def series(drawn: Drawn) -> Iterator[Series]:
 
 
 def _kind(point: Measured) -> str:
-    if point.point is not None and point.point.variant.file is not None:
+    if point.point is not None and point.point.variant.network is not None:
         return point.text["method"]
     return LIBRARIES if point.text["method"] in PEERS else CHAINS
 

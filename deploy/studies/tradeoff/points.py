@@ -13,28 +13,23 @@ from functools import cache
 from itertools import product
 from pathlib import Path
 
-import onnx
-
 from beers_deploy.bench import tables
 from beers_deploy.bench.swath import Swath, chain_rate, efficiency, energy, swath_latency
 from beers_deploy.dpu.board import Dpu, dpu_of
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import dpu_power, predict
-from beers_deploy.dpu.graph import Network
+from beers_deploy.dpu.graph import Network as Graph
 from beers_deploy.dpu.reading import network_of
-from beers_deploy.export import float_model
-from beers_deploy.model.shipped import INT8 as SUFFIX
 from beers_deploy.model.shipped import shipped_names
 from beers_deploy.model.traditional.nl_bayes import QUALITIES
 from beers_deploy.model.traditional.peers import PEERS
-from beers_deploy.network_files import brighter_files, float_file, int8_file
+from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles import TargetProfile
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Figure, predicted, unavailable
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, board_names
-from beers_deploy.quant.onnx_file import is_quantised, load_onnx
-from beers_deploy.quant.tiling.walk import Tiling, tiling_of
+from beers_deploy.quant.tiling.walk import Tiling
 
 FLOAT = "float32"
 INT8 = "INT8"
@@ -54,19 +49,17 @@ class Variant:
     Attributes:
         method: its name without the precision.
         precision: float32 or INT8.
-        file: the network's file; None of a method without a network.
-        brighter: of a shipped network, its files for sensors of so many times the gain, by factor.
+        network: in that precision; None of a method without a network.
     """
 
     method: str
     precision: str = FLOAT
-    file: Path | None = None
-    brighter: tuple[tuple[int, Path], ...] = ()
+    network: Network | None = None
 
     @property
     def name(self) -> str:
         """The name in tables."""
-        return f"{self.method} {self.precision}" if self.file else self.method
+        return f"{self.method} {self.precision}" if self.network else self.method
 
 
 @dataclass(frozen=True)
@@ -119,23 +112,23 @@ def parse_targets(text: str) -> tuple[str, ...]:
 
 
 def network_variants(
-    names: Iterable[str],
+    given: Iterable[NetworkLike],
     sensor: Sensor,
-    make_int8: Callable[[Path], Path],
+    make_int8: Callable[[Network], Network],
     log: Callable[[str], None],
 ) -> list[Variant]:
     """Networks in float32 and INT8; shipped ones with the sensor's profile, INT8 files as they are.
 
     Args:
-        names: shipped names, ONNX and safetensors files.
+        given: shipped names, ONNX and safetensors files, or networks in memory.
         sensor: that acquires the images.
-        make_int8: quantises a float network's file, and says where it wrote the result.
+        make_int8: quantises a float network.
         log: is told which network has no INT8, and what of the sensor lies outside the range that
             was trained.
     """
     variants: list[Variant] = []
-    for name in dict.fromkeys(name.strip() for name in names):
-        variants += _variants(name, sensor, make_int8, log)
+    for network in dict.fromkeys(each.strip() if isinstance(each, str) else each for each in given):
+        variants += _variants(network, sensor, make_int8, log)
     variant_names = [variant.name for variant in variants]
     if len(set(variant_names)) < len(variant_names):
         twice = max(variant_names, key=variant_names.count)
@@ -146,34 +139,36 @@ def network_variants(
 
 
 def _variants(
-    name: str, sensor: Sensor, make_int8: Callable[[Path], Path], log: Callable[[str], None]
+    given: NetworkLike,
+    sensor: Sensor,
+    make_int8: Callable[[Network], Network],
+    log: Callable[[str], None],
 ) -> Iterator[Variant]:
-    path = Path(name)
-    if name not in shipped_names() and path.suffix not in (".onnx", ".safetensors"):
+    is_shipped = given in shipped_names()
+    if (
+        isinstance(given, str)
+        and not is_shipped
+        and Path(given).suffix not in (".onnx", ".safetensors")
+    ):
         expected = (
             f"a shipped network ({', '.join(shipped_names())}), or an ONNX or safetensors file"
         )
-        raise OptionError("network", expected=expected, got=repr(name), remedy="correct that name")
-    float_path = float_file(path, sensor, log)
-    model = float_model(float_path)
-    method = name if name in shipped_names() else path.stem
-    _require_tiles(name, tiling_of(model))
-    if is_quantised(model):
-        yield Variant(method, INT8, float_path)
+        raise OptionError("network", expected=expected, got=repr(given), remedy="correct that name")
+    network = Network.load(given, sensor=sensor)
+    _require_tiles(network.label, network.tiling)
+    if network.precision == "int8":
+        yield Variant(network.name, INT8, network)
         return
-    if name in shipped_names():
-        yield Variant(method, FLOAT, float_path, tuple(brighter_files(path, sensor).items()))
-        int8_path = int8_file(path, sensor)
-        brighter = brighter_files(Path(f"{name}{SUFFIX}"), sensor)
-        yield Variant(method, INT8, int8_path, tuple(brighter.items()))
+    yield Variant(network.name, FLOAT, network)
+    if is_shipped:
+        yield Variant(network.name, INT8, Network.load(given, sensor=sensor, int8=True))
         return
-    yield Variant(method, FLOAT, float_path)
     try:
-        int8_path = make_int8(float_path)
+        int8 = make_int8(network)
     except ModelError as error:
-        log(f"{name} is compared in float32 alone: {error}")
+        log(f"{network.label} is compared in float32 alone: {error}")
         return
-    yield Variant(method, INT8, int8_path)
+    yield Variant(network.name, INT8, int8)
 
 
 def _require_tiles(name: str, tiling: Tiling) -> None:
@@ -262,31 +257,24 @@ def dpu_latency(variant: Variant, dpu: Dpu, swath: Swath) -> Figure:
         dpu: that it runs on.
         swath: with its tiles and their halo.
     """
-    placement = place(_graph(variant.file or Path(), swath.tile_px), dpu)
+    placement = place(_graph(network_of_variant(variant), swath.tile_px), dpu)
     prediction = predict(placement, dpu, step_px=swath.step_px)
     return swath_latency(prediction, math.ceil(swath.tiles * swath.runs / prediction.batch))
 
 
 def radius_px(variant: Variant) -> int:
     """The halo that makes the seams of a network exact."""
-    return tiling_of_file(variant.file or Path()).halo_px
+    return network_of_variant(variant).tiling.halo_px
+
+
+def network_of_variant(variant: Variant) -> Network:
+    """Return the network of a variant that has one."""
+    return Network.load(variant.network)
 
 
 @cache
-def tiling_of_file(file: Path) -> Tiling:
-    """How an image may be cut into tiles for the network of an ONNX file."""
-    return tiling_of(model_of(file))
-
-
-@cache
-def model_of(file: Path) -> onnx.ModelProto:
-    """The network of an ONNX file."""
-    return load_onnx(file)
-
-
-@cache
-def _graph(file: Path, tile_px: int) -> Network:
-    return network_of(model_of(file), tile_px)
+def _graph(network: Network, tile_px: int) -> Graph:
+    return network_of(network.model, tile_px, network.label)
 
 
 UNITS: dict[str, str] = {

@@ -18,7 +18,6 @@ from beers_deploy.model.metrics.bootstrap import too_few
 from beers_deploy.model.metrics.perceptual import find_backbone
 from beers_deploy.model.progress import Log, Progress, no_log, reporting, steps
 from beers_deploy.model.raster.images import list_images
-from beers_deploy.model.shipped import INT8 as SUFFIX
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.profiles import TargetProfile
@@ -29,7 +28,7 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import REFERENCE
 from beers_deploy.profiles.target import DEFAULT_TARGET
 from beers_deploy.results import input_of
-from beers_deploy.studies.evaluation.methods import Method, method_named
+from beers_deploy.studies.evaluation.methods import Method, method_named, method_of
 from beers_deploy.studies.evaluation.pairs import pairs_of_scenes
 from beers_deploy.studies.tradeoff import advice
 from beers_deploy.studies.tradeoff.boards import Question, board_rows
@@ -43,7 +42,6 @@ from beers_deploy.studies.tradeoff.measure import (
 from beers_deploy.studies.tradeoff.page import Tradeoff
 from beers_deploy.studies.tradeoff.points import (
     CHAIN,
-    INT8,
     Point,
     Variant,
     board_figures,
@@ -118,10 +116,8 @@ def tradeoff(
     )
     degraded = Sensor.load(sensor)
     aim = Sensor.load(reference or REFERENCE).in_units_of(degraded)
-    names = [
-        network if isinstance(network, str) else str(Network.load(network).file)
-        for network in networks
-    ]
+    given = list(networks)
+    names = [each if isinstance(each, str) else Network.load(each).label for each in given]
     board_names = [profile.name for profile in boards]
     keep = nullcontext(cache) if cache is not None else TemporaryDirectory(prefix="beers-deploy-")
     with keep as folder, reporting(progress):
@@ -134,7 +130,7 @@ def tradeoff(
             sensor=degraded,
             seed=seed,
         )
-        points = points_of(network_variants(names, degraded, quantise, log), boards, swath)
+        points = points_of(network_variants(given, degraded, quantise, log), boards, swath)
         pairs, remarks = pairs_of_scenes(scenes, degraded, aim, seed)
         benchmark = Benchmark(pairs, degraded, aim, weights, seed)
         pictures = Labelled.open(Path(labelled), detector, classes, benchmark) if labelled else None
@@ -268,21 +264,19 @@ def _methods(variants: Sequence[Variant], benchmark: Benchmark, log: Log) -> dic
     methods: dict[Variant, Method] = {}
     for variant in dict.fromkeys(variants):
         try:
-            name = _method_name(variant)
-            methods[variant] = method_named(name, benchmark.degraded, benchmark.reference)
+            methods[variant] = _method(variant, benchmark)
         except MachineError as error:
             # The library of this method is not installed: the study goes on without it.
             log(f"{variant.name} is left out: {error}")
     return methods
 
 
-def _method_name(variant: Variant) -> str:
-    """What `method_named` calls a variant: a shipped network by its name, which brings its
-    exposures.
-    """
-    if variant.brighter:
-        return variant.method + (SUFFIX if variant.precision == INT8 else "")
-    return str(variant.file or variant.method)
+def _method(variant: Variant, benchmark: Benchmark) -> Method:
+    """Return the method of a variant: a network with its exposures, or a traditional one."""
+    degraded = benchmark.degraded
+    if variant.network is None:
+        return method_named(variant.method, degraded, benchmark.reference)
+    return method_of(variant.name, variant.network, degraded, benchmark.reference)
 
 
 def _text(point: Point, method: Method) -> dict[str, str]:

@@ -12,7 +12,7 @@ import tifffile
 import torch
 
 from beers_deploy.bench.board import BoardBench, bench_board
-from beers_deploy.bench.swath import Swath, predict_file
+from beers_deploy.bench.swath import Swath, predict_network
 from beers_deploy.bench.tables import frame_row, sweep_rows, within_words
 from beers_deploy.commands.bench import HostTask
 from beers_deploy.dpu.board import load_dpu
@@ -107,7 +107,7 @@ def test_a_frame_need_not_be_square(tmp_path: Path, classifier: Path) -> None:
     onnx.save(model, tmp_path / "wide.onnx")
     dpu = load_dpu("vck190", None)
     square, wide = (
-        frame_row(predict_file(path, dpu, None)) for path in (classifier, tmp_path / "wide.onnx")
+        frame_row(predict_network(path, dpu, None)) for path in (classifier, tmp_path / "wide.onnx")
     )
     assert (wide.figures["work"].value or 0) > 2.5 * (square.figures["work"].value or 0)
 

@@ -9,14 +9,13 @@ import onnx
 import pytest
 
 from beers_deploy.bench.host import Timed, host_rows, time_networks
-from beers_deploy.export import float_model
 from beers_deploy.host_state import cpu_load, resident_bytes
-from beers_deploy.network_files import other_precision, shipped_pair
+from beers_deploy.network import Network, other_precision
 from beers_deploy.profiles import load_target
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.figures import Row
-from beers_deploy.quant.onnx_file import is_quantised, load_onnx
 from tests.deploy.dpu.graphs import float_convbeers, integer_convbeers
+from tests.shipped import shipped_pair
 
 SHORT = {"min_time_s": Constant(0.05, "stated", "test"), "min_runs": Constant(3, "stated", "test")}
 QUICK = replace(load_target("host-cpu"), tables={"measurement": SHORT})
@@ -51,24 +50,26 @@ def test_turns_last_for_the_minimum_time_and_count(tmp_path: Path) -> None:
 
 
 def test_the_other_precision_is_a_shipped_network_of_the_same_variant() -> None:
-    int8 = load_onnx(shipped_pair()[1])
-    float32 = other_precision(int8)
-    assert is_quantised(int8)
+    floating, integer = map(Network.load, shipped_pair())
+    float32 = other_precision(integer)
     assert float32 is not None
-    assert not is_quantised(float32)
     back = other_precision(float32)
     assert back is not None
-    assert is_quantised(back)
+    assert (float32.precision, back.precision) == ("float32", "int8")
     shapes = [
-        [tensor.dims for tensor in model.graph.initializer if len(tensor.dims) == 4]
-        for model in (float_model(shipped_pair()[0]), float32)
+        sorted(
+            tuple(tensor.dims)
+            for tensor in network.model.graph.initializer
+            if len(tensor.dims) == 4
+        )
+        for network in (floating, float32)
     ]
-    assert str(shapes[0]) == str(shapes[1])
+    assert shapes[0] == shapes[1]
 
 
 def test_a_network_of_another_make_runs_alone(tmp_path: Path) -> None:
     path = float_convbeers(tmp_path / "f.onnx", 1, 8)
-    assert other_precision(load_onnx(path)) is None
+    assert other_precision(Network.load(path)) is None
     assert [row.name for row in host_rows(path, QUICK, 32, 1) if row.table == "host"] == [
         "f, 32 x 32"
     ]

@@ -20,7 +20,6 @@ from beers_deploy.dpu.cost.latency import dpu_power
 from beers_deploy.dpu.graph import Operation, Window
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.model.shipped import shipped_names
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles import load_target
 from beers_deploy.profiles.figures import predicted
 from beers_deploy.profiles.target import board_names, npu_names
@@ -36,6 +35,7 @@ from tests.deploy.dpu.draws import (
     node,
 )
 from tests.deploy.dpu.graphs import Sketch
+from tests.shipped import shipped_pair
 
 DPUS = {name: load_dpu(name) for name in board_names()}
 ZYNQ = ("kv260", "zcu102", "zcu104")

@@ -21,13 +21,13 @@ from beers_deploy.dpu.reading import network_of, read_network
 from beers_deploy.export import to_onnx
 from beers_deploy.model.shipped import shipped_names
 from beers_deploy.model.variants import Variant
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.quant.encodings import board_model
 from beers_deploy.quant.quantise import Quantised, quantise_model
 from tests.deploy.dpu.draws import rules_of
 from tests.deploy.dpu.graphs import IntegerSketch
 from tests.model.networks import plain
 from tests.quant.quick import changed, copied, drawn
+from tests.shipped import shipped_pair
 
 DPU = load_dpu("vck190")
 HALF = Scale((0.5,), (0,), "int8")

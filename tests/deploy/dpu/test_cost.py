@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from beers_deploy.bench.swath import predict_file
+from beers_deploy.bench.swath import predict_network
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import Prediction, counted_power, layer_energy_j
@@ -26,7 +26,7 @@ def papers(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def papers_prediction(papers: Path) -> Prediction:
-    return predict_file(papers, DPU, TILE_PX)
+    return predict_network(papers, DPU, TILE_PX)
 
 
 def test_the_papers_network(papers_prediction: Prediction) -> None:
@@ -58,7 +58,7 @@ def test_no_constant_is_the_published_figure(fps: float) -> None:
 @pytest.mark.parametrize("configuration", list(DPU.target.configurations))
 def test_layers_sum_to_the_batch(tmp_path: Path, configuration: str) -> None:
     dpu = load_dpu("vck190", configuration)
-    prediction = predict_file(integer_convbeers(tmp_path / "i.onnx", 3, 20), dpu, 177)
+    prediction = predict_network(integer_convbeers(tmp_path / "i.onnx", 3, 20), dpu, 177)
     assert math.fsum(layer.time_s for layer in prediction.layers) == prediction.batch_time_s
     assert prediction.fps == prediction.rate(prediction.batch_time_s, prediction.host_s)
     assert prediction.fps * prediction.batch_time_s < dpu.batch
@@ -67,7 +67,8 @@ def test_layers_sum_to_the_batch(tmp_path: Path, configuration: str) -> None:
 def test_the_three_encodings_cost_the_same(tmp_path: Path) -> None:
     makers = (float_convbeers, integer_convbeers, board_convbeers)
     costs = [
-        predict_file(make(tmp_path / f"{k}.onnx", 2, 32), DPU, 192) for k, make in enumerate(makers)
+        predict_network(make(tmp_path / f"{k}.onnx", 2, 32), DPU, 192)
+        for k, make in enumerate(makers)
     ]
     assert len({(c.batch_time_s, c.operations, c.streamed_bytes) for c in costs}) == 1
 
@@ -79,14 +80,14 @@ def test_maps_that_fit_the_banks_do_not_stream(tmp_path: Path) -> None:
     and two adds.
     """
     path = float_convbeers(tmp_path / "f.onnx", 1, 64)
-    assert predict_file(path, DPU, 128).streamed_bytes == 2 * 128 * 128 + 4 * 64 * 128 * 128
-    assert predict_file(path, DPU, 129).streamed_bytes == 2 * 129 * 129 + 14 * 64 * 129 * 129
+    assert predict_network(path, DPU, 128).streamed_bytes == 2 * 128 * 128 + 4 * 64 * 128 * 128
+    assert predict_network(path, DPU, 129).streamed_bytes == 2 * 129 * 129 + 14 * 64 * 129 * 129
 
 
 def test_unused_channels_take_time_all_the_same(tmp_path: Path) -> None:
     """20 channels into 20 take the array as long as 32 into 32."""
     narrow, full = (
-        predict_file(float_convbeers(tmp_path / f"{n}.onnx", 1, n), DPU, 96) for n in (20, 32)
+        predict_network(float_convbeers(tmp_path / f"{n}.onnx", 1, n), DPU, 96) for n in (20, 32)
     )
     assert narrow.layers[1].work.array_use == pytest.approx(20 * 20 / (32 * 32))
     assert full.layers[1].work.array_use == 1
@@ -100,7 +101,7 @@ def test_rows_and_columns_that_do_not_fill_the_array_take_time_all_the_same(
     tmp_path: Path, board: str, rows: int, columns: int
 ) -> None:
     path = float_convbeers(tmp_path / "f.onnx", 1, 32)
-    odd, even = (predict_file(path, load_dpu(board), side).layers[1] for side in (97, 104))
+    odd, even = (predict_network(path, load_dpu(board), side).layers[1] for side in (97, 104))
     filled = (math.ceil(97 / rows) * rows) * (math.ceil(97 / columns) * columns)
     assert odd.compute_s / even.compute_s == pytest.approx(filled / 104**2)
 
@@ -113,7 +114,7 @@ def test_first_layers_gather_their_window(
 ) -> None:
     """One channel by three columns fill what is taken in at a time, not three of them."""
     dpu = load_dpu(board)
-    prediction = predict_file(float_convbeers(tmp_path / "f.onnx", 1, 32), dpu, 96)
+    prediction = predict_network(float_convbeers(tmp_path / "f.onnx", 1, 32), dpu, 96)
     head = prediction.layers[0].work
     assert given_out == dpu.output_parallel
     assert head.array_operations == 2 * 3 * taken_in * 32 * 96 * 96
@@ -216,7 +217,7 @@ def test_the_interval_is_that_of_the_regime(tmp_path: Path) -> None:
     all fitted.
     """
     path = float_convbeers(tmp_path / "f.onnx", 3, 32)
-    small, large, outside = (predict_file(path, DPU, side) for side in (128, 640, 1024))
+    small, large, outside = (predict_network(path, DPU, side) for side in (128, 640, 1024))
     for prediction, name in (
         (small, "width_small_maps"),
         (large, "width_large_maps"),
@@ -234,7 +235,7 @@ def test_the_interval_is_that_of_the_regime(tmp_path: Path) -> None:
 def test_a_host_that_is_slower_sets_the_rate(tmp_path: Path) -> None:
     """A network of one small layer: the host cannot bring its images fast enough."""
     sketch = Sketch(8)
-    prediction = predict_file(
+    prediction = predict_network(
         sketch.save(tmp_path / "s.onnx", sketch.conv("image", (1, 8, 1, 1))), DPU, 640
     )
     dpu_s = prediction.batch_time_s / prediction.batch
@@ -245,7 +246,9 @@ def test_a_host_that_is_slower_sets_the_rate(tmp_path: Path) -> None:
 
 def test_more_batch_handlers_gain_less_on_large_maps(papers: Path) -> None:
     """All handlers share the memory."""
-    three, six = (predict_file(papers, load_dpu("vck190", name)).fps for name in ("C32B3", "C32B6"))
+    three, six = (
+        predict_network(papers, load_dpu("vck190", name)).fps for name in ("C32B3", "C32B6")
+    )
     assert 1.0 < six / three < 1.3
 
 
@@ -253,15 +256,15 @@ def test_a_network_without_convolutions_has_no_prediction(tmp_path: Path) -> Non
     sketch = Sketch(8)
     path = sketch.save(tmp_path / "p.onnx", sketch.node("MaxPool", "image", kernel_shape=[2, 2]))
     with pytest.raises(ModelError, match="no convolution"):
-        predict_file(path, DPU)
+        predict_network(path, DPU)
 
 
 def test_a_task_that_is_stated_takes_the_place_of_what_the_file_tells(tmp_path: Path) -> None:
     """Heads that are read and no more, or ranked: the file is the same."""
     sketch = Sketch(8)
     path = sketch.save(tmp_path / "h.onnx", sketch.conv("image", (80, 8, 3, 3)))
-    copied = predict_file(path, DPU, 96)
-    ranked = predict_file(path, DPU, 96, "sort")
+    copied = predict_network(path, DPU, 96)
+    ranked = predict_network(path, DPU, 96, "sort")
     assert (copied.task, ranked.task) == ("copy", "sort")
     assert ranked.host_s > copied.host_s
     assert ranked.batch_time_s == copied.batch_time_s
@@ -280,8 +283,8 @@ def test_latency_is_that_of_one_core_and_one_thread(tmp_path: Path) -> None:
     path = float_convbeers(tmp_path / "n.onnx", 2, 16)
     zcu102 = load_dpu("zcu102")
     kv260 = load_dpu("kv260")
-    prediction = predict_file(path, zcu102)
-    single = predict_file(path, kv260)
+    prediction = predict_network(path, zcu102)
+    single = predict_network(path, kv260)
     assert (zcu102.handlers, kv260.handlers) == (1, 1)
     assert prediction.alone_s <= prediction.batch_time_s
     assert single.alone_s == pytest.approx(single.batch_time_s)
@@ -293,7 +296,7 @@ def test_latency_is_that_of_one_core_and_one_thread(tmp_path: Path) -> None:
 
 def test_energy_counts_products_and_bytes(tmp_path: Path) -> None:
     """One 3 x 3 layer of 32 features that stays on chip: products and a third of its weights."""
-    prediction = predict_file(float_convbeers(tmp_path / "f.onnx", 1, 32), DPU, 96)
+    prediction = predict_network(float_convbeers(tmp_path / "f.onnx", 1, 32), DPU, 96)
     low, high = layer_energy_j(prediction.layers[2], DPU)
     products = 9 * 32 * 32 * 96 * 96
     weights = 9 * 32 * 32

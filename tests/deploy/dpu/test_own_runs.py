@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from beers_deploy.bench.swath import predict_file
+from beers_deploy.bench.swath import predict_network
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.cost.own_runs import SCATTER, OwnRuns, read_own_runs
 from beers_deploy.profiles.errors import OptionError
@@ -33,7 +33,7 @@ def runs_of(folder: Path, **times_as_fast: float) -> OwnRuns:
         {
             "model": f"{name}.onnx",
             "tile_px": 320,
-            "fps": factor * predict_file(folder / f"{name}.onnx", DPU, 320).fps,
+            "fps": factor * predict_network(folder / f"{name}.onnx", DPU, 320).fps,
         }
         for name, factor in times_as_fast.items()
     ]
@@ -68,7 +68,7 @@ def test_a_part_without_runs_keeps_its_constants(folder: Path) -> None:
     runs = runs_of(folder, deep=0.5)
     assert runs.host_factor == 1.0
     before, after = (
-        predict_file(folder / "deep.onnx", dpu, 320) for dpu in (DPU, runs.applied(DPU))
+        predict_network(folder / "deep.onnx", dpu, 320) for dpu in (DPU, runs.applied(DPU))
     )
     assert after.batch_time_s == pytest.approx(2**0.25 * before.batch_time_s)
     assert after.host_s == pytest.approx(before.host_s)

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beers_deploy.bench.swath import predict_file
+from beers_deploy.bench.swath import predict_network
 from beers_deploy.bench.tables import host_words
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
@@ -31,7 +31,7 @@ def segmenter(path: Path, where: str, scale: float = 8.0, behind: str = "") -> P
 
 
 def predicted(path: Path) -> Prediction:
-    return predict_file(path, DPU, 128)
+    return predict_network(path, DPU, 128)
 
 
 def test_what_the_dpu_enlarges_costs_the_processor_nothing(tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ def test_what_follows_the_processor_stays_with_it(tmp_path: Path) -> None:
 def test_a_refused_node_in_front_is_the_processors_too(tmp_path: Path) -> None:
     sketch = Sketch(8)
     path = sketch.save(tmp_path / "n.onnx", sketch.conv(sketch.node("Softmax", "image", axis=1)))
-    assert predict_file(path, DPU, 20).refused == (sketch.nodes[0].name,)
+    assert predict_network(path, DPU, 20).refused == (sketch.nodes[0].name,)
 
 
 def test_between_two_convolutions_of_the_dpu_there_is_no_prediction(tmp_path: Path) -> None:
@@ -65,7 +65,7 @@ def test_between_two_convolutions_of_the_dpu_there_is_no_prediction(tmp_path: Pa
     summed = sketch.node("Add", skip, sketch.node("Softmax", skip, axis=1))
     path = sketch.save(tmp_path / "n.onnx", sketch.conv(summed))
     with pytest.raises(ModelError, match="softmax"):
-        predict_file(path, DPU, 20)
+        predict_network(path, DPU, 20)
 
 
 def test_numbers_that_the_dpu_refuses_are_no_work_for_the_processor(tmp_path: Path) -> None:
@@ -74,7 +74,7 @@ def test_numbers_that_the_dpu_refuses_are_no_work_for_the_processor(tmp_path: Pa
     last = sketch.qconv(first, (4, 4, 3, 3), weight_scale=0.3)
     path = sketch.save(tmp_path / "n.onnx", sketch.node("DequantizeLinear", last, *sketch.numbers))
     with pytest.raises(ModelError, match="check"):
-        predict_file(path, DPU, 20)
+        predict_network(path, DPU, 20)
 
 
 @pytest.mark.parametrize("board", ["vck190", "zcu102", "kv260"])
@@ -128,7 +128,7 @@ def test_several_heads_are_copied_and_are_no_image(tmp_path: Path, ends: tuple[s
     assert sum(cut.size_bytes or 0 for cut in placement.cuts if not cut.onto_dpu) == 255 * (
         32**2 + 16**2
     )
-    prediction = predict_file(path, DPU, 64)
+    prediction = predict_network(path, DPU, 64)
     assert (prediction.task, prediction.refused) == ("copy", ())
 
 
@@ -139,4 +139,4 @@ def test_results_of_few_bands_become_an_image_and_scores_do_not(tmp_path: Path) 
             "DepthToSpace", sketch.conv("image", (channels, 3, 3, 3)), blocksize=block
         )
         path = sketch.save(tmp_path / f"{channels}.onnx", last)
-        assert predict_file(path, DPU, 64).task == task
+        assert predict_network(path, DPU, 64).task == task

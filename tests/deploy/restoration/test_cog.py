@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.raster.compression import Compression
 from beers_deploy.model.raster.writer import cog_bytes
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.errors import MachineError
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.run import restore_file
 from tests.model.raster import formats as images
+from tests.shipped import shipped_pair
 
 cogeo: Any = pytest.importorskip("rio_cogeo")
 

@@ -12,12 +12,12 @@ import tifffile
 
 from beers_deploy.model.io import lock
 from beers_deploy.model.io.lock import only_run
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.errors import MachineError
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.run import restore_file
 from tests.deploy.restoration.runs import begin, noise, until
+from tests.shipped import shipped_pair
 
 TILE_PX = 64
 

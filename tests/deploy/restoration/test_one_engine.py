@@ -13,7 +13,6 @@ import pytest
 import beers_deploy as bd
 from beers_deploy import library
 from beers_deploy.library import restore
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles import load_sensor
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.restoration import method
@@ -28,6 +27,7 @@ from beers_deploy.studies.stress.networks import Network
 from beers_deploy.studies.tradeoff.measure import restore_in_tiles
 from beers_deploy.studies.tradeoff.points import FLOAT, INT8, Point, Variant
 from tests.deploy.restoration.runs import restored
+from tests.shipped import shipped_pair
 
 Restored = Callable[[np.ndarray], np.ndarray]
 
@@ -110,7 +110,7 @@ def test_with_a_halo_below_the_radius_they_have_the_same_seams(
         result = restore(pixels, path, tile=tile_px, halo=halo_px, sensor=SENSOR)
     np.testing.assert_array_equal(result, expected)
     # A trade-off study scores an operating point whose halo is below the network's radius this way.
-    variant = Variant(path.stem, FLOAT if precision == "float" else INT8, path)
+    variant = Variant(path.stem, FLOAT if precision == "float" else INT8, bd.Network.load(path))
     point = Point(variant, tile_px=tile_px, halo_px=halo_px)
     by_tradeoff = restore_in_tiles(point, SENSOR, REFERENCE)
     np.testing.assert_array_equal(by_tradeoff(dn), expected)

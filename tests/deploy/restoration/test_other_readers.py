@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 import rasterio
 
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.run import restore_file
 from beers_deploy.restoration.stac import write_item
 from tests.model.raster import formats as images
+from tests.shipped import shipped_pair
 
 ROOT = Path(__file__).parents[3]
 PYTHON = Path("/usr/bin/python3")

@@ -13,7 +13,6 @@ import rasterio
 import tifffile
 
 from beers_deploy.model.raster.compression import Compression
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.errors import BeersError, ImageError, MachineError, OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.quant.onnx_file import load_onnx
@@ -26,6 +25,7 @@ from beers_deploy.restoration.tiles.exposures import restore_window
 from beers_deploy.restoration.tiles.missing import fill_from_nearest
 from tests.deploy.restoration.runs import noise
 from tests.deploy.restoration.runs import restored as restored_by_file
+from tests.shipped import shipped_pair
 
 RADIUS_PX = 5
 SHAPES = [(61, 83), (17, 130), (1, 40), (40, 1), (29, 29), (3, 5)]

@@ -19,7 +19,6 @@ import tifffile
 
 from beers_deploy import cluster
 from beers_deploy.cluster import open_cluster
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.errors import MachineError
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.tiling.walk import tiling_of
@@ -28,6 +27,7 @@ from beers_deploy.restoration.run import restore_file
 from tests.deploy.restoration.runs import noise, stopped_after
 from tests.deploy.two_workers import local_cluster
 from tests.quant.tiling.small_networks import espcn, float_unet, four_bands
+from tests.shipped import shipped_pair
 
 pytestmark = pytest.mark.slow
 

@@ -14,12 +14,12 @@ from onnx import TensorProto, helper
 from beers_deploy.export import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS
 from beers_deploy.model.variants import Variant
-from beers_deploy.network_files import shipped_pair
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.reading.folding import HALVES, OPSET, simplest
 from beers_deploy.quant.session import open_session, tensors_of
 from tests.quant.reading.networks import CASES, CHANNELS, conv, made, node, normal
+from tests.shipped import shipped_pair
 
 
 def results(model: onnx.ModelProto, names: Sequence[str] | None = None) -> list[np.ndarray]:

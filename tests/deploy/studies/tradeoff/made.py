@@ -1,11 +1,12 @@
 """Points with figures that were made up, on a real board."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
+import onnx
 
 from beers_deploy.dpu.board import load_dpu
+from beers_deploy.network import Network
 from beers_deploy.profiles.figures import measured, predicted
 from beers_deploy.studies.tradeoff.advice import Comparison, Measured
 from beers_deploy.studies.tradeoff.points import INT8, Point, Variant
@@ -33,7 +34,8 @@ def made(
     """
     noise = np.random.default_rng(sum(map(ord, name))).normal(size=len(SITES))
     values = psnr_db + DIFFICULTY_DB - DIFFICULTY_DB.mean() + scatter_db * (noise - noise.mean())
-    variant = Variant(method or name, INT8, Path(f"{method or name}.onnx"))
+    network = Network(onnx.ModelProto(), method or name)
+    variant = Variant(method or name, INT8, network)
     return Measured(
         name,
         {

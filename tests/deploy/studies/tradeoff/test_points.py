@@ -14,6 +14,7 @@ import pytest
 from beers_deploy.bench.swath import Swath
 from beers_deploy.export import to_onnx
 from beers_deploy.model.variants import Variant as Shape
+from beers_deploy.network import Network
 from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import ModelError, OptionError
@@ -54,10 +55,10 @@ SENSOR = load_sensor("pleiades-degraded")
 def variant(tmp_path_factory: pytest.TempPathFactory) -> Variant:
     """An INT8 network of four blocks of 16."""
     path = integer_convbeers(tmp_path_factory.mktemp("net") / "net.onnx", 4, 16)
-    return Variant("net", INT8, path)
+    return Variant("net", INT8, Network.load(path))
 
 
-def refused(_: Path) -> Path:
+def refused(_: Network) -> Network:
     raise ModelError("net", expected="convolutions", got="a sigmoid", remedy="leave it out")
 
 
@@ -78,7 +79,8 @@ def test_all_boards_are_the_shipped_ones_the_default_first() -> None:
 def test_shipped_networks_come_in_both_precisions_with_the_sensors_profile() -> None:
     variants = network_variants(["convbeers-xs", "convbeers-xs"], SENSOR, refused, lambda _: None)
     assert [variant.name for variant in variants] == ["convbeers-xs float32", "convbeers-xs INT8"]
-    assert all(variant.file and variant.file.is_file() for variant in variants)
+    precisions = [variant.network and variant.network.precision for variant in variants]
+    assert precisions == ["float32", "int8"]
 
 
 def test_an_own_network_is_quantised_and_one_that_cannot_be_stays_float(tmp_path: Path) -> None:
@@ -92,7 +94,7 @@ def test_an_own_network_is_quantised_and_one_that_cannot_be_stays_float(tmp_path
 
 
 def test_an_int8_file_is_taken_as_it_is(variant: Variant) -> None:
-    variants = network_variants([str(variant.file)], SENSOR, refused, lambda _: None)
+    variants = network_variants([variant.network or ""], SENSOR, refused, lambda _: None)
     assert [item.precision for item in variants] == [INT8]
 
 

@@ -15,6 +15,7 @@ from PIL import Image
 from beers_deploy.model.convbeers import save_network
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.variants import Variant as Shape
+from beers_deploy.network import Network
 from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor_file import reference_for
@@ -180,9 +181,10 @@ def test_a_measurement_depends_on_its_inputs(tmp_path: Path) -> None:
 
 def test_an_int8_file_is_made_once(folder: Path, tmp_path: Path) -> None:
     def made() -> Path:
-        return make_int8(
-            folder / "narrow.safetensors", tmp_path, folder / "calibration", load_sensor(SENSOR), 0
-        )
+        network = Network.load(folder / "narrow.safetensors")
+        int8 = make_int8(network, tmp_path, folder / "calibration", load_sensor(SENSOR), 0)
+        assert int8.path is not None
+        return int8.path
 
     path = made()
     time_ns = path.stat().st_mtime_ns
