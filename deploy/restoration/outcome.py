@@ -25,6 +25,11 @@ left; of fewer pixels nothing is.
 """
 SOME_AT_ENDS = 0.05
 """Told: more of the results at an end."""
+BLANK_PX = 8
+MANY_BLANK = 0.01
+"""Told: more of the image in squares of so many pixels a side that are exactly 0, while no pixel is
+stated to be missing. Noise leaves no such square, even around 0.
+"""
 MEAN_KEPT = 0.015
 LEAST_MOVE = 0.0003
 SCATTER = 2.0
@@ -70,6 +75,7 @@ class Tally:
         network_after: as `after`, of what the network gave.
         network_after_squared: as `after_squared`, of what the network gave.
         dark: pixels of the image that noise may take to 0.
+        blank: pixels of the image in squares of 8 x 8 that are exactly 0.
     """
 
     known: int = 0
@@ -88,6 +94,7 @@ class Tally:
     network_after: float = 0.0
     network_after_squared: float = 0.0
     dark: int = 0
+    blank: int = 0
 
     @classmethod
     def of(
@@ -118,7 +125,8 @@ class Tally:
             before = stored[seen]
             after = restored[known]
         ends = int(at_ends.sum())
-        counts = cls(after.size, int((before > 1).sum()), ends, network_at_ends=ends)
+        blank = 0 if seen is not None else _blank_px(stored)
+        counts = cls(after.size, int((before > 1).sum()), ends, network_at_ends=ends, blank=blank)
         if not alike:
             return counts
         before = np.minimum(before, 1)
@@ -256,6 +264,11 @@ class Tally:
             clauses.append(
                 before + "the mean went from {:.3g} to {:.3g} of full scale".format(*network.means)
             )
+        if self.blank > MANY_BLANK * max(self.compared, 1):
+            clauses.append(
+                f"{self.blank} pixels of the image lie in areas that are exactly 0 and bleed into "
+                "their surroundings; if they are missing, state it (gdal_edit.py -a_nodata 0)"
+            )
         if network.flat:
             clauses.append(f"{before}the results are constant and the image is not")
         return clauses
@@ -277,3 +290,13 @@ class Tally:
                 "the same: `any_result`"
             )
             raise ImageError(name, expected=expected, got=got, remedy=remedy)
+
+
+def _blank_px(stored: np.ndarray) -> int:
+    """Return how many pixels (bands, h, w) lie in whole squares of `BLANK_PX` that are 0."""
+    bands, height, width = stored.shape
+    rows = height // BLANK_PX
+    columns = width // BLANK_PX
+    whole = stored[:, : rows * BLANK_PX, : columns * BLANK_PX]
+    squares = whole.reshape(bands, rows, BLANK_PX, columns, BLANK_PX)
+    return int((squares == 0).all(axis=(2, 4)).sum()) * BLANK_PX**2

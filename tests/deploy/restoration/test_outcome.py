@@ -57,6 +57,18 @@ def test_noise_that_was_clipped_at_0_may_be_added_or_taken_off(seed: int, sigma:
     assert doubts_the_mean(tally(raw, raw + 0.02))
 
 
+@given(st.integers(0, 2**20), st.floats(0.0003, 0.0072), st.booleans())
+def test_areas_of_zero_are_told_and_clipped_noise_is_not(
+    seed: int, sigma: float, has_border: bool
+) -> None:
+    raw = np.maximum(np.random.default_rng(seed).normal(0, sigma, (200, 200)), 0)
+    if has_border:
+        raw[:, :40] = 0
+    counts = tally(raw, raw)
+    assert any("exactly 0" in doubt for doubt in counts.doubts) == has_border
+    assert counts.blank == has_border * 200 * 40
+
+
 def test_parts_add_up_to_the_whole() -> None:
     image = np.random.default_rng(1).uniform(0, 0.1, (60, 50))
     parts = tally(image[:20], image[:20]) + tally(image[20:], image[20:])
