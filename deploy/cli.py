@@ -33,7 +33,6 @@ from beers_deploy.commands import (
     export,
     gate,
     golden,
-    info,
     profiles,
     quantize,
     restore,
@@ -300,7 +299,6 @@ TRAIN = "Sensors and training"
 
 COMMANDS: dict[str, tuple[Callable[..., None], str, str]] = {
     "restore": (restore.restore, "raw.tif restored.tif", RESTORE),
-    "info": (info.info, "raw.jp2", RESTORE),
     "demo": (demo.demo, "--out demo", RESTORE),
     "export": (export.export, "--network convbeers-s --out float.onnx", INT8),
     "quantize": (

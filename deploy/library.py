@@ -57,8 +57,7 @@ def restore(
     out: str | os.PathLike[str] | None = None,
     resume: bool = False,
     cog: bool = False,
-    again: bool = False,
-    any_result: bool = False,
+    force: bool = False,
     strict: bool = False,
     consistency: bool = True,
     exposure: bool = True,
@@ -94,8 +93,9 @@ def restore(
         out: the TIFF that a file is restored into; files alone.
         resume: go on with a run into `out` that was stopped.
         cog: write `out` as a Cloud-Optimised GeoTIFF.
-        again: take an image that says it was restored already.
-        any_result: give a result even if it is clipped, constant or far from the image's mean.
+        force: take an image that was restored already, follow an index to tiles outside its folder
+            and at URLs, and give a result even if it is clipped, constant or far from the image's
+            mean.
         strict: refuse an image, none of Dask, that contradicts its sensor; else warn, or say
             "sensor told" of a file.
         consistency: make the result agree with the raw image at low spatial frequencies, where the
@@ -146,8 +146,7 @@ def restore(
         threads,
         # The pipeline needs a sensor, and takes the middle of all where none is named.
         sensors={"": profile} if chosen is Method.traditional else named,
-        again=again,
-        any_result=any_result,
+        force=force,
         strict=strict,
         consistency=consistency,
         exposure=exposure,
@@ -261,7 +260,7 @@ def _restore_labelled(image: Any, job: Job) -> Any:
         )
     own = image.attrs
     options = job.options
-    require_raw(NAME, is_restored(str(own.get("TIFFTAG_SOFTWARE", "")), own), options.again)
+    require_raw(NAME, is_restored(str(own.get("TIFFTAG_SOFTWARE", "")), own), options.force)
     full_scale = own.get("full_scale") if options.full_scale is None else options.full_scale
     nodata = own.get("_FillValue") if job.nodata is None else job.nodata
     dims = image.dims
@@ -355,7 +354,7 @@ def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndar
         pixels[:, top : top + rows_px] = row.pixels
         tally += row.tally
         top += rows_px
-    if not options.any_result:
+    if not options.force:
         tally.require(name=NAME)
     return pixels
 

@@ -71,6 +71,8 @@ class RestoreImage(QgsProcessingAlgorithm):
         command = [
             program,
             "restore",
+            # QGIS itself asks before it writes over a file.
+            "--overwrite",
             image,
             out,
             "--cog",

@@ -11,18 +11,17 @@ from beers_deploy.commands.shared import (
     Json,
     Restoring,
     Tile,
-    TrustIndex,
     arguments,
     refuse,
     save,
     say,
 )
 from beers_deploy.model.raster.compression import Compression
-from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import BLIND
-from beers_deploy.profiles.target import TILE_PX
+from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX
 from beers_deploy.restoration.options import Method, Options, Runtime
 
 if TYPE_CHECKING:
@@ -38,6 +37,7 @@ NETWORK_ONLY = (
     "scheduler",
     "consistency",
     "exposure",
+    "dry_run",
 )
 """Options of which the traditional pipeline takes none."""
 
@@ -48,7 +48,9 @@ def restore(
         Path,
         typer.Argument(metavar="IN", help="Image: TIFF or what GDAL reads, of any size, or PNG."),
     ],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="TIFF to write, of the type of IN.")],
+    out: Annotated[
+        Path | None, typer.Argument(metavar="OUT", help="TIFF to write, of the type of IN.")
+    ] = None,
     network: Restoring = None,
     method: Annotated[
         Method, typer.Option(help="A network, or the traditional pipeline of --sensor.")
@@ -104,15 +106,18 @@ def restore(
     stac: Annotated[
         Path | None, typer.Option(help="Write a STAC item of OUT here; with --cog.")
     ] = None,
-    trust_index: TrustIndex = False,
-    again: Annotated[
-        bool, typer.Option("--again", help="Restore an image that 'restore' has written.")
-    ] = False,
-    any_result: Annotated[
+    force: Annotated[
         bool,
         typer.Option(
-            "--any-result", help="Write OUT even if it is clipped, constant or far from IN's mean."
+            "--force",
+            help="Restore a restored IN, follow an index out of its folder, write any result.",
         ),
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace OUT if it exists.")
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show IN, the plan and the time instead; no OUT.")
     ] = False,
     strict: Annotated[
         bool,
@@ -175,7 +180,7 @@ def restore(
     listed = Path(fix_detectors) if fix_detectors and fix_detectors != FOUND else None
     lists = [] if listed is None else [listed]
     # The list of faults is an output of its own where they are searched for.
-    found_list = list_beside(out, fix_detectors or "")
+    found_list = list_beside(out, fix_detectors or "") if out else None
     require_writable(out, json, stac, found_list, inputs=(image, network, listed, *profiles))
     sensor_profiles = {band: load_sensor(text) for band, text in sensors.items()}
     how = Options(
@@ -188,11 +193,9 @@ def restore(
         memory_bytes=budget_bytes,
         resume=resume,
         scheduler=scheduler,
-        trust_index=trust_index,
         strict=strict,
         cog=cog,
-        again=again,
-        any_result=any_result,
+        force=force,
         consistency=consistency,
         fix_detectors=fix_detectors or "",
         sensors=sensor_profiles if sensor else {},
@@ -204,7 +207,8 @@ def restore(
     if method is Method.traditional:
         refuse(context, NETWORK_ONLY, expected="none with --method traditional", got="one")
         _require_sensor(sensor)
-    else:
+    target = None if dry_run else _required_out(out, overwrite or resume)
+    if method is Method.network:
         require_image_file(image)
         networks = {
             band: Network.load(network, sensor=profile) for band, profile in sensor_profiles.items()
@@ -220,12 +224,41 @@ def restore(
             each.input._replace(name=f"{each.input.name}, {band}") if band else each.input
             for band, each in networks.items()
         ]
-    row = restore_file(image, out, how, say, (json, stac, found_list))
+    if target is None:
+        _preview(image, how, json, arguments(sensor=sensor or BLIND, image=image.name))
+        return
+    row = restore_file(image, target, how, say, (json, stac, found_list))
     if stac is not None:
-        write_item(out, stac)
-    print_rows(f"wrote {out}", [row])
+        write_item(target, stac)
+    print_rows(f"wrote {target}", [row])
     table = Table("restore", arguments(sensor=sensor or BLIND), (*inputs, image, *lists), (row,))
     save(table, json)
+
+
+def _required_out(out: Path | None, may_exist: bool) -> Path:
+    """Return the output; refuse none, and one that exists."""
+    if out is None:
+        remedy = "name the file to write, or add --dry-run"
+        raise OptionError("OUT", expected="a TIFF's name", got="none", remedy=remedy)
+    if out.exists() and not may_exist:
+        remedy = "add --overwrite to replace it, or choose another name"
+        raise OptionError("OUT", expected="a new file", got=f"{out}, which exists", remedy=remedy)
+    return out
+
+
+def _preview(image: Path, how: Options, json: Path | None, given: dict[str, object]) -> None:
+    """Show what an image is, how it would be cut and how long that would take."""
+    from beers_deploy.dry_run import preview_row
+    from beers_deploy.model.io.files import require_writable
+    from beers_deploy.model.raster.index import index_files
+    from beers_deploy.network import Network
+    from beers_deploy.results import Table, print_rows
+
+    require_writable(json, inputs=index_files(image, how.force))
+    row = preview_row(image, how, load_target(DEFAULT_TARGET), log=say)
+    print_rows(str(image), [row])
+    # The image has no digest here, because the whole file would be read for it.
+    save(Table("restore", given, (Network.load(how.network).input,), (row,)), json)
 
 
 def _require_item(stac: Path | None, cog: bool) -> None:

@@ -38,12 +38,6 @@ Restoring = Annotated[
     Path | None,
     typer.Option(help="ONNX network, or a shipped one's name; convbeers-s-int8 if none."),
 ]
-TrustIndex = Annotated[
-    bool,
-    typer.Option(
-        "--trust-index", help="Let a VRT or DIMAP name tiles outside its folder and at URLs."
-    ),
-]
 FloatModel = Annotated[
     Path | None,
     typer.Argument(

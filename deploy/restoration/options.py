@@ -50,8 +50,8 @@ class Options:
         memory_bytes: budget of this process; None is what is free.
         resume: go on with a stopped run.
         scheduler: address of a Dask scheduler whose workers run the network; None runs it here.
-        again: whether an image may be one that was restored already.
-        any_result: whether a result is written that no restoration has.
+        force: whether to restore an image that was restored already, to follow a VRT or DIMAP to
+            tiles outside its folder and at URLs, and to write a result that no restoration has.
         bands: networks of single bands by their names, each for its own sensor; empty if `network`
             is for all.
         exposure: whether dark parts are restored at a higher exposure, by a conditioned network.
@@ -63,7 +63,6 @@ class Options:
         method: a network, or the traditional pipeline.
         quality: of the traditional pipeline: fast, standard or best.
         strict: whether an image is refused that contradicts its sensor.
-        trust_index: whether a VRT or DIMAP may name tiles outside its folder, at URLs too.
     """
 
     network: "NetworkLike | None" = None
@@ -76,12 +75,10 @@ class Options:
     memory_bytes: int | None = None
     resume: bool = False
     scheduler: str | None = None
-    trust_index: bool = False
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
     strict: bool = False
     cog: bool = False
-    again: bool = False
-    any_result: bool = False
+    force: bool = False
     bands: "Mapping[str, NetworkLike]" = field(default_factory=dict)
     exposure: bool = True
     consistency: bool = True

@@ -287,7 +287,7 @@ class Tally:
             got = "; ".join(self.doubts)
             remedy = (
                 "check its scale with 'gate' and the image's `full_scale`, or write it all "
-                "the same: `any_result`"
+                "the same: `force`"
             )
             raise ImageError(name, expected=expected, got=got, remedy=remedy)
 

@@ -328,11 +328,11 @@ def check_sensor(
     """
     started = time.perf_counter()
     check = SensorCheck()
-    if not options.again:
+    if not options.force:
         warn_of_detectors(source, full_scale, log)
     if any(sensor.name != BLIND for sensor in options.sensors.values()):
         check = told_sensor(source, options.sensors, full_scale, name, options.strict, log)
-    elif not options.again:
+    elif not options.force:
         models = [network.model for network in networks]
         if sentence := restored_already(source, models, full_scale):
             log(sentence)

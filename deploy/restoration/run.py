@@ -106,10 +106,10 @@ def begun(
     require_writable(out, inputs=[image, *options.network_paths])
     require_tiff_name(out)
     require_codec(options.compression)
-    with only_run(out), open_raster(image, options.trust_index) as source:
+    with only_run(out), open_raster(image, options.force) as source:
         # Only an open index tells which tiles are read: no output may be one of them.
         require_writable(out, *beside, inputs=source.files)
-        require_raw(str(image), source.raster.restored, options.again)
+        require_raw(str(image), source.raster.restored, options.force)
         yield source
 
 
@@ -193,7 +193,7 @@ def _finish_rows(checkpoint: Checkpoint, work: Restoration, log: Log) -> None:
         with closing(work.rows(checkpoint.rows, tick)) as finished:
             _write_behind(finished, checkpoint)
         checkpoint.require_known(work.name)
-        if not work.options.any_result:
+        if not work.options.force:
             checkpoint.tally.require(work.name)
     for doubt in checkpoint.tally.doubts:
         log(f"look at the result: {doubt}")

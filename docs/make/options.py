@@ -59,7 +59,6 @@ PATHS = {
     "check": Paths({"picture": FILE, "json": FILE}, ("model",), ("target",)),
     "golden": Paths({"out": FOLDER, "json": FILE}, ("given", "compare"), ("target",)),
     "bench": Paths({"json": FILE}, ("model", "image", "measured"), ("sensor", "target")),
-    "info": Paths({"json": FILE}, ("image", "network"), ("sensor", "target")),
     "restore": Paths(
         {"out": FILE, "json": FILE, "stac": FILE}, ("image", "network"), ("sensor", "fix_detectors")
     ),
@@ -221,7 +220,7 @@ REFUSED = {
     ],
     "restore": [
         Refused(
-            ("network", "tile", "halo", "runtime", "threads", "scheduler", "resume"),
+            ("network", "tile", "halo", "runtime", "threads", "scheduler", "resume", "dry_run"),
             "--method traditional",
         ),
         Refused(("method",), without="--sensor"),

@@ -250,10 +250,10 @@ def is_restored(software: str, metadata: object) -> bool:
     return software.startswith(RESTORED) or RESTORED_BY in str(metadata)
 
 
-def require_raw(name: str, restored: bool, again: bool) -> None:
-    """Refuse a restored image unless `again`: a second restoration over-sharpens it."""
-    if restored and not again:
-        remedy = "give the raw one, or restore it once more with `again`"
+def require_raw(name: str, restored: bool, force: bool) -> None:
+    """Refuse a restored image unless `force`: a second restoration over-sharpens it."""
+    if restored and not force:
+        remedy = "give the raw one, or restore it once more with `force`"
         raise ImageError(
             name, expected="a raw image", got="one that 'restore' has written", remedy=remedy
         )

@@ -187,7 +187,7 @@ def _located(index: Path, text: str, folder: Path, home: Path | None) -> Path:
         ) from error
     elsewhere = _is_elsewhere(text)
     if elsewhere or (home is not None and not file.is_relative_to(home)):
-        remedy = "put its tiles beside it, or trust it with `trust_index`"
+        remedy = "put its tiles beside it, or read it all the same with `force`"
         raise _refused(
             index, "tiles in its own folder", f"one at {text if elsewhere else file}", remedy
         )

@@ -185,7 +185,7 @@ def _files(path: Path, tiles: tuple[Path, ...], dataset: Any, trusted: bool) -> 
             continue
         inside = any(real.is_relative_to(home) for home in homes)
         if not inside and not trusted:
-            remedy = "put it into the folder of the image, or trust it with `trust_index`"
+            remedy = "put it into the folder of the image, or read it all the same with `force`"
             raise ImageError(
                 str(path), expected="files in its own folder", got=f"one at {name}", remedy=remedy
             )
@@ -224,6 +224,9 @@ def damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
         remedy = "check that it is a whole image"
         if "missing codec" in got:
             remedy = "write it with deflate, LZW or ZSTD"
+        # GDAL's own sentence repeats the path.
+        if "not recognized as being in a supported file format" in got:
+            got = "another format"
         expected = f"a readable {format_name(path)}"
         raise ImageError(name, expected=expected, got=got, remedy=remedy) from error
 

@@ -5,7 +5,7 @@ the file is closed, where rasterio reports none. So a file that was written is r
 compared with what it was written from.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,17 +13,19 @@ from typing import Any, Protocol
 import numpy as np
 import rasterio
 from rasterio.control import GroundControlPoint
+from rasterio.enums import ColorInterp
 from rasterio.io import MemoryFile
 from rasterio.shutil import copy
 from rasterio.windows import Window
 
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.raster.compression import Compression
-from beers_deploy.model.raster.facts import RESTORED, Raster
+from beers_deploy.model.raster.facts import RESTORED, BandInfo, Raster
 from beers_deploy.model.raster.reader import LEAST_CACHE_BYTES, OFFLINE, gdal
 from beers_deploy.model.raster.source import strips
 from beers_deploy.profiles.errors import CODE_FAULTS, OptionError
 
+RGB = [ColorInterp.red, ColorInterp.green, ColorInterp.blue]
 TILE_PX = 256
 COG_TILE_PX = 512
 
@@ -148,7 +150,6 @@ def _profile(raster: Raster, compression: Compression) -> dict[str, Any]:
         "interleave": "band",
         "compress": CODECS[compression],
         "photometric": "RGB" if raster.colour else "MINISBLACK",
-        "ALPHA": "YES" if has_alpha else "NO",
         "BIGTIFF": "IF_SAFER",
         "NUM_THREADS": "ALL_CPUS",
         **LEVELS.get(compression, {}),
@@ -164,22 +165,31 @@ def _profile(raster: Raster, compression: Compression) -> dict[str, Any]:
 
 
 def _describe(file: Any, raster: Raster) -> None:
-    """Write the place, and names, units and scales of the bands, into an open TIFF."""
+    """Write the place, and what is known of the bands, into an open TIFF."""
     if raster.place.area_or_point:
         file.update_tags(AREA_OR_POINT=raster.place.area_or_point)
     if raster.place.rpcs:
         file.update_tags(ns="RPC", **dict(raster.place.rpcs))
-    others = [None] * (file.count - raster.bands)
-    info = raster.band_info
-    if not info:
-        return
-    file.descriptions = [band.name or None for band in info] + others
-    if any(band.unit for band in info):
-        file.units = [band.unit for band in info] + [""] * len(others)
-    if any((band.scale, band.offset) != (1.0, 0.0) for band in info):
-        file.scales = [band.scale for band in info] + [1.0] * len(others)
-        file.offsets = [band.offset for band in info] + [0.0] * len(others)
-    for number, band in enumerate(info, 1):
+    if raster.mask_kind == "alpha":
+        # The creation option ALPHA would mark the first band after grey or blue.
+        grey = [ColorInterp.gray, *[ColorInterp.undefined] * raster.bands]
+        light = RGB if raster.colour else grey
+        file.colorinterp = [*light[: raster.bands], ColorInterp.alpha]
+    if raster.band_info:
+        _describe_bands(file, raster.band_info)
+
+
+def _describe_bands(file: Any, bands: Sequence[BandInfo]) -> None:
+    """Write names, units, scales and metadata of the bands; alpha has none."""
+    alpha = [BandInfo()] * (file.count - len(bands))
+    both = [*bands, *alpha]
+    file.descriptions = [band.name or None for band in both]
+    if any(band.unit for band in bands):
+        file.units = [band.unit for band in both]
+    if any((band.scale, band.offset) != (1.0, 0.0) for band in bands):
+        file.scales = [band.scale for band in both]
+        file.offsets = [band.offset for band in both]
+    for number, band in enumerate(bands, 1):
         if band.tags:
             file.update_tags(number, **dict(band.tags))
 

@@ -43,7 +43,7 @@ def test_an_argument_that_rasterio_does_not_take(
         raise TypeError("open() got an unexpected keyword argument")
 
     monkeypatch.setattr(rasterio, "open", of_the_future)
-    message = done("info", tmp_path / "raw.tif", code=CRASHED)
+    message = done("restore", tmp_path / "raw.tif", "--dry-run", code=CRASHED)
     assert "unexpected keyword argument" in message
     assert "whole image" not in message
 

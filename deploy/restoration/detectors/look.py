@@ -2,8 +2,9 @@
 single pixels.
 
 Restoration sharpens what stands alone: a column whose gain is off by 1 % comes out off by near 2 %.
-So `restore` warns of it, and `info` shows what was found. Strips over the whole width, spread
-evenly from top to bottom, are read: of a large image `LOOKED_PX` pixels of all bands together.
+So `restore` warns of it, and `restore --dry-run` shows what was found. Strips over the whole width,
+spread evenly from top to bottom, are read: of a large image `LOOKED_PX` pixels of all bands
+together.
 """
 
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""What `restore` and `info` say of the faults of detectors: sentences and figures."""
+"""What `restore` says of the faults of detectors: sentences and figures."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence

@@ -157,7 +157,7 @@ def test_the_host_part_restores_as_restore_does(
     kit: Path, sensor: bd.Sensor, image: np.ndarray
 ) -> None:
     """With both steps around the network; each of them changes the image."""
-    restored = partial(bd.restore, image, NAME, sensor=sensor, full_scale=1.0, any_result=True)
+    restored = partial(bd.restore, image, NAME, sensor=sensor, full_scale=1.0, force=True)
     by_kit = by_host(kit, image)
     np.testing.assert_allclose(by_kit, restored(), rtol=0, atol=1e-6)
     for without in (restored(exposure=False), restored(consistency=False)):
@@ -204,7 +204,7 @@ def test_a_network_in_memory_takes_the_same_steps(
     in_memory = bd.Network.load("convbeers-half-xs-int8", sensor=sensor)
     folder = bd.Board.load("vck190").kit(in_memory, tmp_path / "kit", tile=TILE_PX, sensor=sensor)
     assert sorted(map(int, facts(folder)["exposures"])) == sorted(in_memory.exposures)
-    expected = bd.restore(image, in_memory, sensor=sensor, full_scale=1.0, any_result=True)
+    expected = bd.restore(image, in_memory, sensor=sensor, full_scale=1.0, force=True)
     np.testing.assert_allclose(by_host(folder, image), expected, rtol=0, atol=1e-6)
 
 

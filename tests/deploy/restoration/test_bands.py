@@ -20,7 +20,7 @@ SECOND = "blind"
 def restored(image: Path, sensor: str, *more: str) -> tuple[np.ndarray, str]:
     out = image.with_name("out.tif")
     network = ("--network", "convbeers-xs", "--sensor", sensor)
-    output = done("restore", image, out, *network, *more)
+    output = done("restore", image, out, "--overwrite", *network, *more)
     return tifffile.imread(out), output
 
 

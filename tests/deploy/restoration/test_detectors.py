@@ -280,17 +280,17 @@ def test_a_stopped_run_goes_on_with_the_same_faults_and_no_others(
 
 def test_commands_say_it(image: Path, model: Path, tmp_path: Path) -> None:
     network = ("--network", model)
-    output = done("info", image, *network)
+    output = done("restore", image, "--dry-run", *network)
     assert "look at the detectors: 1 dead column" in output
     assert "dead lines" in output
     out = tmp_path / "out.tif"
     assert "look at the detectors: 1 dead column" in done("restore", image, out, *network)
-    output = done("restore", image, out, *network, "--fix-detectors", "found")
+    assert "add --overwrite" in refused("restore", image, out, *network)
+    again = ("restore", image, out, "--overwrite", *network)
+    output = done(*again, "--fix-detectors", "found")
     assert "2 pixels, 1 column, 1 row found" in output
     assert "look at the detectors" not in output
     before = out.read_bytes()
-    assert "--fix-detectors" in refused(
-        "restore", image, out, *network, "--fix-detectors", tmp_path / "none.csv"
-    )
-    assert "input" in refused("restore", image, out, *network, "--fix-detectors", out)
+    assert "--fix-detectors" in refused(*again, "--fix-detectors", tmp_path / "none.csv")
+    assert "input" in refused(*again, "--fix-detectors", out)
     assert out.read_bytes() == before

@@ -124,11 +124,12 @@ def test_the_command_says_it_and_goes_on(tmp_path: Path) -> None:
         "restore", image, out, "--network", NETWORK
     )
     assert out.exists()
-    output = done("restore", image, out, "--network", NETWORK, "--sensor", SENSOR.name)
+    again = ("restore", image, out, "--overwrite", "--network", NETWORK)
+    output = done(*again, "--sensor", SENSOR.name)
     assert "look at the image" not in output
     assert "look at the sensor" in output
     tifffile.imwrite(image, raw(1))
-    assert "look at the image" not in done("restore", image, out, "--network", NETWORK)
+    assert "look at the image" not in done(*again)
 
 
 def test_the_library_warns() -> None:

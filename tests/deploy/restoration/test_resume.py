@@ -12,6 +12,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ import tifffile
 from beers_deploy.model.raster.compression import Compression
 from beers_deploy.profiles.errors import MachineError, OptionError
 from beers_deploy.restoration.options import Options
+from beers_deploy.restoration.output import RestoredPixels
 from beers_deploy.restoration.run import restore_file
 from tests.deploy.restoration.runs import begin, noise, stop_after, stopped_after, until
 
@@ -127,13 +129,13 @@ def test_a_full_disk_is_one_sentence_and_loses_no_finished_row(
     count = iter(range(10**6))
     sync = os.fsync
 
-    def full(handle: int) -> None:
+    def full(handle: Any, *_: Any) -> None:
         if next(count) == calls or calls == 1000:
             raise OSError(errno.ENOSPC, "No space left on device")
         sync(handle)
 
     if calls == 1000:
-        monkeypatch.setattr("beers_deploy.restoration.output._squares", full)
+        monkeypatch.setattr(RestoredPixels, "read", full)
     else:
         monkeypatch.setattr(os, "fsync", full)
     out.write_bytes(b"old")

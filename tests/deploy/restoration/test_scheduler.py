@@ -101,7 +101,9 @@ def test_and_with_int8_and_users_own(
     (tmp_path / "in").mkdir()
     save_onnx(make(), tmp_path / "network.onnx")
     bands = tiling_of(load_onnx(tmp_path / "network.onnx")).channels_in
-    tifffile.imwrite(tmp_path / "in" / "in.tif", noise(bands, 171, 97), photometric="minisblack")
+    layout: dict[str, Any] = {"planarconfig": "separate"} if bands > 1 else {}
+    pixels = noise(bands, 171, 97)
+    tifffile.imwrite(tmp_path / "in" / "in.tif", pixels, photometric="minisblack", **layout)
     one, two = both(tmp_path / "in", Options(tmp_path / "network.onnx", tile_px=48), scheduler)
     assert two == one
 

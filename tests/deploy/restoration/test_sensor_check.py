@@ -117,9 +117,10 @@ def test_commands_say_it_and_strict_refuses(raw: np.ndarray, tmp_path: Path) -> 
     assert "look at the sensor: noise at" in done(
         "restore", image, out, *network, "--sensor", profile
     )
-    assert "look at the sensor" not in done("info", image, *network, "--sensor", NAME, "--strict")
+    preview = ("restore", image, "--dry-run", *network)
+    assert "look at the sensor" not in done(*preview, "--sensor", NAME, "--strict")
     out.unlink()
-    for words in (("restore", image, out, *network), ("info", image, *network)):
+    for words in (("restore", image, out, *network), preview):
         assert "expected an image of wrong" in refused(*words, "--sensor", profile, "--strict")
     refused("restore", image, out, "--method", "traditional", "--sensor", profile, "--strict")
     assert not out.exists()

@@ -296,9 +296,7 @@ def test_a_network_of_other_pixels_or_bands_gets_none(
     save_onnx(make(), tmp_path / "network.onnx")
     pixels = np.stack([image()] * bands) if bands > 1 else image()
     layout: dict[str, Any] = {"planarconfig": "separate"} if bands > 1 else {}
-    how = Options(
-        tmp_path / "network.onnx", 56, sensors={"": SENSOR}, full_scale=4095, any_result=True
-    )
+    how = Options(tmp_path / "network.onnx", 56, sensors={"": SENSOR}, full_scale=4095, force=True)
     result, row = restored(tmp_path, pixels, how, photometric="minisblack", **layout)
     assert row.text["consistency"] == "off: the network makes other pixels or bands"
     without, _ = restored(

@@ -230,9 +230,9 @@ def test_an_image_is_restored_once_unless_asked_again(model: Path, tmp_path: Pat
     tifffile.imwrite(tmp_path / "in.tif", noise(61, 83))
     first, _ = restored(tmp_path / "in.tif", model)
     (tmp_path / "out.tif").rename(tmp_path / "once.tif")
-    with pytest.raises(ImageError, match="again"):
+    with pytest.raises(ImageError, match="force"):
         restored(tmp_path / "once.tif", model)
-    second, _ = restored(tmp_path / "once.tif", model, again=True)
+    second, _ = restored(tmp_path / "once.tif", model, force=True)
     assert (second != first).any()
 
 
@@ -267,10 +267,10 @@ def test_a_result_that_no_restoration_has_is_refused(
     folder = tmp_path_factory.mktemp("refused")
     rows, columns = np.mgrid[:61, :83]
     tifffile.imwrite(folder / "in.tif", (900 + 10 * rows + 5 * columns).astype(np.uint16))
-    with pytest.raises(ImageError, match="any_result"):
+    with pytest.raises(ImageError, match="force"):
         restored(folder / "in.tif", scaled(*how))
     assert [path.name for path in folder.iterdir()] == ["in.tif"]
-    restored(folder / "in.tif", scaled(*how), any_result=True)
+    restored(folder / "in.tif", scaled(*how), force=True)
 
 
 @pytest.mark.parametrize("how", [(255.0, 0.0), (0.0, 0.3), (-1.0, 0.0)])
@@ -280,13 +280,13 @@ def test_the_consistency_step_does_not_hide_a_network_that_does_not_fit(
     rows, columns = np.mgrid[:61, :83]
     tifffile.imwrite(tmp_path / "in.tif", (900 + 10 * rows + 5 * columns).astype(np.uint16))
     sensors = {"": load_sensor("pleiades-degraded")}
-    with pytest.raises(ImageError, match=r"before the consistency step.*any_result"):
+    with pytest.raises(ImageError, match=r"before the consistency step.*force"):
         restored(tmp_path / "in.tif", scaled(*how), sensors=sensors)
     messages: list[str] = []
     row = restore_file(
         tmp_path / "in.tif",
         tmp_path / "out.tif",
-        Options(scaled(*how), any_result=True, sensors=sensors),
+        Options(scaled(*how), force=True, sensors=sensors),
         messages.append,
     )
     assert any("before the consistency step" in message for message in messages)

@@ -193,7 +193,7 @@ def test_a_trusted_index_reaches_outside_and_to_urls(tmp_path: Path) -> None:
         index.write_text(vrt(naming(url)))
         with open_raster(index, trusted=True) as source:
             assert source.read(0, 9).sum() == 81
-        with pytest.raises(ImageError, match="trust_index"), open_raster(index):
+        with pytest.raises(ImageError, match="force"), open_raster(index):
             pass
         server.shutdown()
     index.write_text(vrt(naming("no.tif")))

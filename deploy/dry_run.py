@@ -1,4 +1,4 @@
-"""What the tool makes of an image file, before anyone waits for it.
+"""`restore --dry-run`: what the tool makes of an image file, before anyone waits for it.
 
 Of a TIFF only strips are read, which are searched for faults of detectors, and windows where a
 sensor is told, which are held against it. Time here is predicted only from tiles that were timed;
@@ -34,11 +34,11 @@ from beers_deploy.restoration.steps import keeps_pixels
 
 HEADER = "the file's own header"
 RUNS = 3
-UNTIMED = "no tile was timed here: --measure times some"
+UNTIMED = "no tile was timed here"
 
 
-def info_row(
-    image: Path, options: Options, target: TargetProfile, measure: bool = False, log: Log = no_log
+def preview_row(
+    image: Path, options: Options, target: TargetProfile, measure: bool = True, log: Log = no_log
 ) -> Row:
     """The facts of an image and of its restoration.
 
@@ -50,7 +50,7 @@ def info_row(
         log: is told of faults of detectors, and where the image contradicts its sensor.
     """
     network = Network.load(options.network)
-    with open_raster(image, options.trust_index) as source:
+    with open_raster(image, options.force) as source:
         raster = source.raster
         scale = known_scale(image.name, raster, options)
         check = SensorCheck()
@@ -83,7 +83,7 @@ def info_row(
         "halo": plan.halo_words,
         **check.text,
     }
-    return Row("info", image.name, figures, text)
+    return Row("restore", image.name, figures, text)
 
 
 def missing_words(raster: Raster) -> str:

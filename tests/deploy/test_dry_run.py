@@ -1,4 +1,4 @@
-"""`info`: what restore would make of a file, told before any pixel is read."""
+"""`restore --dry-run`: what restore would make of a file, shown before any pixel is restored."""
 
 import json
 import math
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from beers_deploy.info import info_row
+from beers_deploy.dry_run import preview_row
 from beers_deploy.model.raster.reader import GdalSource
 from beers_deploy.profiles import load_target
 from beers_deploy.profiles.figures import Row
@@ -28,7 +28,7 @@ TAGS = [
 
 
 def about(image: Path, options: Options, measure: bool = False) -> Row:
-    return info_row(image, options, load_target("vck190"), measure)
+    return preview_row(image, options, load_target("vck190"), measure)
 
 
 def test_it_says_what_the_header_says(model: Path, tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_it_reads_none_of_a_file_of_ten_gigabytes(model: Path, tmp_path: Path) -
     )
     del image
     out = tmp_path / "a.json"
-    done("info", tmp_path / "big.tif", "--network", model, "--json", out)
+    done("restore", tmp_path / "big.tif", "--dry-run", "--network", model, "--json", out)
     (row,) = json.loads(out.read_text())["rows"]
     assert row["figures"]["width"]["value"] == 73_000
     assert [entry["name"] for entry in json.loads(out.read_text())["inputs"]] == [model.name]
@@ -127,4 +127,6 @@ def test_it_reads_none_of_a_file_of_ten_gigabytes(model: Path, tmp_path: Path) -
 def test_no_image_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "a.tif").write_text("no image")
     for name in ("a.tif", "missing.tif"):
-        assert done("info", tmp_path / name, code=2).count("\n") == 1
+        network = ("--network", "convbeers-xs", "--sensor", "blind")
+        message = done("restore", tmp_path / name, "--dry-run", *network, code=2)
+        assert name in message.splitlines()[-1]

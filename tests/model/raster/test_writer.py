@@ -1,0 +1,83 @@
+"""What was written is read again, and a file that differs from it is an error."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rasterio.enums import ColorInterp
+
+from beers_deploy.model.raster.compression import Compression
+from beers_deploy.model.raster.facts import MaskKind, Raster
+from beers_deploy.model.raster.writer import ArrayPixels, require_equal, write_raster, write_tiff
+
+
+class Masked(ArrayPixels):
+    """Pixels that are missing in the first columns."""
+
+    def read_mask(self, start: int, stop: int) -> np.ndarray:
+        mask = super().read_mask(start, stop)
+        mask[:, :3] = 0
+        return mask
+
+
+@settings(max_examples=25)
+@given(
+    st.sampled_from(Compression),
+    st.sampled_from(["uint8", "int16", "uint16", "float32"]),
+    st.integers(1, 3),
+    st.integers(1, 300),
+    st.integers(4, 300),
+    st.sampled_from(["", "mask", "alpha"]),
+)
+def test_every_type_and_compression_is_what_was_written(
+    tmp_path_factory: pytest.TempPathFactory,
+    compression: Compression,
+    kind: str,
+    bands: int,
+    height_px: int,
+    width_px: int,
+    mask_kind: MaskKind,
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "written.tif"
+    rng = np.random.default_rng(height_px)
+    pixels = rng.integers(0, 100, (bands, height_px, width_px)).astype(kind)
+    raster = Raster(bands, height_px, width_px, pixels.dtype, mask_kind=mask_kind)
+    write_raster(path, raster, Masked(pixels), compression)
+    with warnings.catch_warnings(action="ignore"), rasterio.open(path) as file:
+        np.testing.assert_array_equal(file.read()[:bands], pixels)
+        # GDAL itself takes alpha for a mask of one or three bands alone.
+        is_alpha = file.colorinterp[-1] is ColorInterp.alpha
+        missing = (file.read(bands + 1) if is_alpha else file.dataset_mask()) == 0
+    assert is_alpha == (mask_kind == "alpha")
+    assert missing[:, :3].all() == bool(mask_kind)
+    assert not missing[:, 3:].any()
+
+
+@pytest.mark.parametrize("compression", [Compression.none, Compression.zlib])
+def test_a_file_that_differs_from_what_was_written_is_an_error(
+    compression: Compression, tmp_path: Path
+) -> None:
+    pixels = np.random.default_rng(0).integers(0, 4096, (1, 300, 280)).astype(np.uint16)
+    raster = Raster(1, 300, 280, pixels.dtype)
+    path = tmp_path / "a.tif"
+    write_raster(path, raster, ArrayPixels(pixels), compression)
+    content = bytearray(path.read_bytes())
+    content[20_000] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(OSError, match=r"\w"):
+        require_equal(path, raster, ArrayPixels(pixels))
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(OSError, match=r"\w"):
+        require_equal(path, raster, ArrayPixels(pixels))
+
+
+def test_a_small_image_is_read_back(tmp_path: Path) -> None:
+    dn = np.arange(35, dtype=np.uint16).reshape(5, 7)
+    write_tiff(tmp_path / "a.tif", dn)
+    with warnings.catch_warnings(action="ignore"), rasterio.open(tmp_path / "a.tif") as file:
+        np.testing.assert_array_equal(file.read(1), dn)
+        assert file.tags()["TIFFTAG_SOFTWARE"] == "beers-deploy"
