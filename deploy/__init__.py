@@ -9,8 +9,8 @@ is shipped. What is offered is loaded when it is asked for. Inside:
   each;
 - `restoration`: images of any size through a network or the traditional pipeline;
 - `dpu` and `bench`: the checker of operators, the cost model, and what they say of a swath;
-- `results`, `frames`, `report`: figures as tables, JSON, DataFrames and pages; `differences` of two
-  of them;
+- `results`, `frames`, `report`: figures as tables, JSON, DataFrames and pages; `documents` reads
+  JSON again;
 - `studies`: what takes hours and writes pages: `evaluation`, `characterise`, `stress`, `detection`,
   `tradeoff`, `demo`, and `recipes`, which make the shipped networks;
 - `cli` and `commands`: a file a command, which parses options, calls one function and prints.

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from beers_deploy.differences import read_document
+from beers_deploy.documents import read_document
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.raster.images import list_images
 from beers_deploy.profiles.errors import OptionError, encodable

@@ -80,7 +80,6 @@ PATHS = {
         ("images", "lpips", "calibration", "labelled", "detector"),
         ("sensor", "reference", "network", "target"),
     ),
-    "diff": Paths({"json": FILE}, ("before", "after")),
 }
 
 UNITS = {
@@ -124,7 +123,6 @@ WORDS = {
     "device": "cpu, cuda",
     "dpu": "configuration",
     "edge": "box",
-    "fail_on": "change",
     "finetune": "auto, or steps",
     "fix_detectors": "found",
     "forbid": "effect",

@@ -73,7 +73,7 @@ def test_the_chain_opens_no_socket(tmp_path: Path, no_sockets: list[tuple[object
     done("check", int8, "--tile", 64)
     done("bench", int8, "--size", "300x200", "--tile", 64, "--no-traditional")
     done("restore", tmp_path / "raw.tif", tmp_path / "out.tif", "--network", int8)
-    done("diff", figures, figures)
+    done("gate", flt, int8, "--images", scenes, "--patches", 2, "--baseline", figures)
     done("evaluate", "--images", scenes, "--methods", f"degraded,{int8}")
     done("simulate", "--scene", "haze-over-sea", "--explain")
     done("simulate", "--patch", 32, "--workers", 1, "--out", tmp_path / "pairs")

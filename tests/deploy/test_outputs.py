@@ -32,7 +32,7 @@ INSIDE = {
     "tradeoff": "tradeoff.html",
 }
 """A file that a command writes into its output folders."""
-SUFFIXES = {"check": ".svg", "diff": ".json"}
+SUFFIXES = {"check": ".svg"}
 """Of every name, where a command asks for one."""
 MORE = {"stress": ("--bit-flips",), "tradeoff": ("--network", "convbeers-xs")}
 """Without which a command does not write, or computes for seconds before it looks at its images."""
