@@ -9,7 +9,7 @@ is shipped. What is offered is loaded when it is asked for. Inside:
   each;
 - `restoration`: images of any size through a network or the traditional pipeline;
 - `dpu` and `bench`: the checker of operators, the cost model, and what they say of a swath;
-- `results`, `frames`, `report`: figures as tables, JSON, DataFrames and pages; `documents` reads
+- `results`, `frames`, `report`: figures as tables, JSON, DataFrames and pages; `baseline` reads
   JSON again;
 - `studies`: what takes hours and writes pages: `evaluation`, `characterise`, `stress`, `detection`,
   `tradeoff`, `demo`, and `recipes`, which make the shipped networks;

@@ -10,14 +10,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from beers_deploy.documents import read_document
+from jsonschema import Draft202012Validator
+
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.raster.images import list_images
 from beers_deploy.profiles.errors import OptionError, encodable
 from beers_deploy.profiles.figures import Check
 from beers_deploy.profiles.sensor import Sensor, numbers_of
+from beers_deploy.profiles.toml import read_json
 from beers_deploy.quant.samples import sample_files
-from beers_deploy.results import Input
+from beers_deploy.results import SCHEMA_PATH, Input
 
 PATCHES = ("sensor", "images", "patches", "seed", "samples")
 """The arguments that say what INT8 and float are compared on."""
@@ -29,6 +31,23 @@ than a thousandth.
 
 SCALE = "of full scale"
 REMEDY = "make it again with 'gate --json' and these arguments"
+
+
+def read_document(path: Path) -> dict[str, object]:
+    """Read a results document; refuse what does not follow the schema."""
+    try:
+        document = read_json(path)
+        schema = Draft202012Validator(json.loads(SCHEMA_PATH.read_text(encoding="utf-8")))
+        error = next(schema.iter_errors(document), None)
+        got = "" if error is None else f"another document: {error.message[:100]}"
+    except FileNotFoundError:
+        got = "no such file"
+    except (OSError, ValueError) as error:
+        got = " ".join(str(error).split())[:100]
+    if got:
+        remedy = "give what a command wrote with --json"
+        raise OptionError(str(path), expected="a results document", got=got, remedy=remedy)
+    return document  # type: ignore[return-value]
 
 
 @dataclass(frozen=True)

@@ -30,11 +30,11 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import TILE_PX
 from beers_deploy.restoration.options import Method, Options, Runtime
-from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.prepare import prepare
 from beers_deploy.restoration.run import restore_file
 from beers_deploy.restoration.tiles.engine import NAME
 from beers_deploy.restoration.tiles.lazy import restore_lazily
+from beers_deploy.restoration.tiles.rows import gathered
 from beers_deploy.results import Table
 
 PLAN = "plan: "
@@ -346,14 +346,7 @@ def _between(places: np.ndarray, count: int) -> np.ndarray | None:
 
 def _restore_now(bands: np.ndarray, raster: Raster, options: Options) -> np.ndarray:
     work = prepare(ArraySource(bands, raster), options, NAME, _warn)
-    tally = Tally()
-    pixels = np.empty(work.out_shape, raster.out_dtype)
-    top = 0
-    for row in work.rows(0, lambda _: None):
-        rows_px = row.pixels.shape[1]
-        pixels[:, top : top + rows_px] = row.pixels
-        tally += row.tally
-        top += rows_px
+    pixels, tally = gathered(work.rows(0, lambda _: None), work.out_shape, raster.out_dtype)
     if not options.force:
         tally.require(name=NAME)
     return pixels

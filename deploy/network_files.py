@@ -1,9 +1,8 @@
-"""Which file a command means by a network, and the files that are written for a sensor.
+"""What a command means by the name of a network, and a network for a sensor.
 
 A shipped network is one set of weights, and one INT8 file, for every sensor in range. NAME is that
 network in float32 and NAME-int8 in INT8, each conditioned on one sensor: its filters, written in
-milliseconds from the profile alone. Where a file is needed, it lies in a folder of this process,
-which goes with it.
+milliseconds from the profile alone.
 """
 
 from collections.abc import Mapping

@@ -6,6 +6,7 @@ The pixels are those that `restore` writes.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import onnx
@@ -16,7 +17,7 @@ from beers_deploy.profiles.target import TILE_PX
 from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.restoration.options import Runtime
 from beers_deploy.restoration.plan import make_plan
-from beers_deploy.restoration.runtime import Packed, open_runtime
+from beers_deploy.restoration.runtime import AtFirstCall, open_runtime
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 from beers_deploy.restoration.tiles.rows import restore_dn
 
@@ -59,13 +60,13 @@ def network_method(
     infer, _ = open_runtime(Runtime.onnxruntime, model, threads=0)
     tiling = tiling_of(model)
     others = {} if brighter is None else brighter
-    # These are opened at their first call: bright images ask for no factor above 1.
-    packed = {
-        factor: Packed(other.SerializeToString(), Runtime.onnxruntime, 0)
+    # Bright images ask for no factor above 1.
+    at_first_call = {
+        factor: AtFirstCall(partial(open_runtime, Runtime.onnxruntime, other, 0))
         for factor, other in others.items()
     }
     offset = sensor.offset_dn if sensor else 0.0
-    network = ExposedNetwork({1: infer, **packed}, tiling.halo_px, offset)
+    network = ExposedNetwork({1: infer, **at_first_call}, tiling.halo_px, offset)
     consistency = (Consistency.of(sensor, reference, max_dn),) if sensor and reference else ()
 
     def restore(dn: np.ndarray) -> np.ndarray:

@@ -113,9 +113,14 @@ class Restoration(ABC):
     def rows(self, done_px: int, tick: Tick) -> Generator[RestoredRow, None, None]:
         """Restore the rows from `done_px` of the restored image on, in order."""
 
-    def memory_bytes(self, ticks: int) -> int | None:  # noqa: ARG002
-        """Return the peak memory of the process if it can be told after so many ticks."""
-        return None
+    @property
+    def steady_ticks(self) -> int:
+        """The number of ticks after which memory is checked again; 0 if it is not."""
+        return 0
+
+    def memory_bytes(self) -> int:
+        """Return the peak memory of the process, once it grows no more by itself."""
+        raise NotImplementedError
 
     @abstractmethod
     def figures(self, tally: Tally) -> dict[str, Figure]:
@@ -210,10 +215,13 @@ class NetworkRestoration(Restoration):
             self.source, self.plan, self.restorer, rows, lambda: tick(1), self.at_once
         )
 
-    def memory_bytes(self, ticks: int) -> int | None:
-        """Return the peak memory once the runtime takes no more; None at any other tick."""
-        if ticks != min(RUNS_UNTIL_STEADY * self.at_once, self.plan.tiles):
-            return None
+    @property
+    def steady_ticks(self) -> int:
+        """The number of tiles after which the runtime takes no more memory."""
+        return RUNS_UNTIL_STEADY * self.at_once
+
+    def memory_bytes(self) -> int:
+        """Return the peak memory: what the process holds, and the rows to come."""
         needed = rows_bytes(self.source, self.plan, begun=True)
         bulky = is_bulky(self.source, self.plan)
         return check_memory(needed, self.options.memory_bytes, bulky)
@@ -328,8 +336,7 @@ def check_sensor(
     """
     started = time.perf_counter()
     check = SensorCheck()
-    if not options.force:
-        warn_of_detectors(source, full_scale, log)
+    warn_of_detectors(source, full_scale, log)
     if any(sensor.name != BLIND for sensor in options.sensors.values()):
         check = told_sensor(source, options.sensors, full_scale, name, options.strict, log)
     elif not options.force:

@@ -177,11 +177,13 @@ def require_unchanged(
 def _finish_rows(checkpoint: Checkpoint, work: Restoration, log: Log) -> None:
     """Restore the rows that a checkpoint lacks, and keep each in it while the next is made."""
     total = work.ticks(checkpoint.rows)
+    steady = min(work.steady_ticks, total)
     with steps("restoring", total) as bar, held_back() as interrupt:
 
         def tick(count: int) -> None:
             bar.advance(count)
-            if most := work.memory_bytes(bar.done):
+            if bar.done == steady:
+                most = work.memory_bytes()
                 log(
                     f"memory: about {most / 1e9:.2f} GB (measured after the first tiles, and "
                     "the rows to come)"

@@ -103,14 +103,25 @@ def write_raster(
 
 
 def require_equal(path: Path, raster: Raster, pixels: Pixels) -> None:
-    """Raise OSError if the bands of a TIFF differ from the pixels that it was written from."""
+    """Raise OSError if bands, mask or alpha of a TIFF differ from what it was written from."""
     with disk_errors(), gdal(), rasterio.open(path, driver="GTiff") as file:
         for band in range(raster.bands):
             for start, stop in strips(raster.height_px, TILE_PX):
                 stored = file.read(band + 1, window=_window(file, start, stop))
-                # Floats are compared bit for bit, because NaN differs from itself.
-                if stored.tobytes() != pixels.read(band, start, stop).tobytes():
-                    raise OSError("the file holds other pixels than were written")
+                _require_same(stored, pixels.read(band, start, stop))
+        for start, stop in strips(raster.height_px, TILE_PX) if raster.mask_kind else ():
+            window = _window(file, start, stop)
+            if raster.mask_kind == "alpha":
+                stored = file.read(file.count, window=window)
+            else:
+                stored = file.dataset_mask(window=window)
+            _require_same(stored, _mask_rows(raster, pixels.read_mask(start, stop)))
+
+
+def _require_same(stored: np.ndarray, written: np.ndarray) -> None:
+    # Floats are compared bit for bit, because NaN differs from itself.
+    if stored.tobytes() != written.tobytes():
+        raise OSError("the file holds other pixels than were written")
 
 
 @contextmanager
@@ -197,9 +208,16 @@ def _describe_bands(file: Any, bands: Sequence[BandInfo]) -> None:
 def _write_mask(file: Any, raster: Raster, rows: np.ndarray, start: int, stop: int) -> None:
     window = _window(file, start, stop)
     if raster.mask_kind == "alpha":
-        file.write(rows.astype(raster.dtype), file.count, window=window)
+        file.write(_mask_rows(raster, rows), file.count, window=window)
     else:
-        file.write_mask(np.where(rows == 0, 0, 255).astype(np.uint8), window=window)
+        file.write_mask(_mask_rows(raster, rows), window=window)
+
+
+def _mask_rows(raster: Raster, rows: np.ndarray) -> np.ndarray:
+    """Return rows of alpha in the type of the bands, or of a mask as GDAL has it: 0 and 255."""
+    if raster.mask_kind == "alpha":
+        return rows.astype(raster.dtype)
+    return np.where(rows == 0, 0, 255).astype(np.uint8)
 
 
 def write_cog(plain: Path, cog: Path, compression: Compression, about: Mapping[str, str]) -> None:

@@ -16,8 +16,7 @@ import tifffile
 import torch
 from typer.testing import CliRunner
 
-from beers_deploy.baseline import PATCHES, read_baseline
-from beers_deploy.documents import read_document
+from beers_deploy.baseline import PATCHES, read_baseline, read_document
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.model.convbeers import arrays, load_network
 from beers_deploy.model.dataset import _read_summary

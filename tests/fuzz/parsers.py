@@ -11,8 +11,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from beers_deploy.baseline import PATCHES, read_baseline
-from beers_deploy.documents import read_document
+from beers_deploy.baseline import PATCHES, read_baseline, read_document
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.model import Layers

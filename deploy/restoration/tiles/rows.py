@@ -4,7 +4,7 @@ stands here.
 A `Source` gives a strip of rows, `Restorer.tile` runs the network on one tile of it, and
 `Restorer.finish` takes the consistency step once the tiles around are there. `restore_rows` yields
 finished rows of tiles in order: the next strip is read ahead, and several tiles are in work at a
-time. `restore_array`, `restore_floats` and `restore_dn` gather the rows of an image in memory;
+time. `gathered`, `restore_floats` and `restore_dn` gather the rows of an image in memory;
 `deploy.restoration.run` writes those of a file.
 """
 
@@ -13,7 +13,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -240,30 +240,28 @@ def places(plan: Plan) -> list[tuple[int, Span]]:
     return list(product(range(plan.groups), plan.columns))
 
 
-def restore_array(
-    source: Source,
-    plan: Plan,
-    restorer: Restorer,
-    at_once: int = 1,
-    look: Callable[[Tally], object] | None = None,
-) -> np.ndarray:
-    """Restore all rows of an image: the plan's `out_shape` of the raster's `out_dtype`.
+def gathered(
+    rows: Iterable[RestoredRow], shape: tuple[int, int, int], dtype: np.dtype[Any]
+) -> tuple[np.ndarray, Tally]:
+    """Gather all restored rows of an image, from the top.
 
     Args:
-        source: the image.
-        plan: its tiles.
-        restorer: its network.
-        at_once: tiles in work at a time.
-        look: is shown what was seen of all of it, and may refuse it.
+        rows: of tiles or strips, in order.
+        shape: of the restored image, (bands, H, W).
+        dtype: of its pixels.
+
+    Returns:
+        The pixels, and what was seen of all of them.
     """
-    result = np.empty(plan.out_shape, restorer.raster.out_dtype)
+    pixels = np.empty(shape, dtype)
     tally = Tally()
-    for row in restore_rows(source, plan, restorer, plan.rows, lambda: None, at_once):
-        result[:, row.span.keep_start * plan.scale : row.span.keep_stop * plan.scale] = row.pixels
+    top = 0
+    for row in rows:
+        stop = top + row.pixels.shape[1]
+        pixels[:, top:stop] = row.pixels
         tally += row.tally
-    if look is not None:
-        look(tally)
-    return result
+        top = stop
+    return pixels, tally
 
 
 def restore_floats(
@@ -289,7 +287,9 @@ def restore_floats(
     raster = Raster(1, height_px, width_px, pixels.dtype)
     exposed = network if isinstance(network, ExposedNetwork) else ExposedNetwork({1: network})
     restorer = Restorer(raster, (exposed,), float(max_dn), plan.tiling, consistency=consistency)
-    return np.asarray(restore_array(ArraySource(pixels, raster), plan, restorer)[0])
+    rows = restore_rows(ArraySource(pixels, raster), plan, restorer, plan.rows, lambda: None)
+    restored, _ = gathered(rows, plan.out_shape, raster.out_dtype)
+    return np.asarray(restored[0])
 
 
 def restore_dn(

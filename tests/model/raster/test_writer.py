@@ -75,6 +75,18 @@ def test_a_file_that_differs_from_what_was_written_is_an_error(
         require_equal(path, raster, ArrayPixels(pixels))
 
 
+@pytest.mark.parametrize("mask_kind", ["mask", "alpha"])
+def test_a_mask_that_differs_from_what_was_written_is_an_error(
+    mask_kind: MaskKind, tmp_path: Path
+) -> None:
+    pixels = np.random.default_rng(0).integers(0, 4096, (1, 300, 280)).astype(np.uint16)
+    raster = Raster(1, 300, 280, pixels.dtype, mask_kind=mask_kind)
+    path = tmp_path / "a.tif"
+    write_raster(path, raster, Masked(pixels), Compression.zlib)
+    with pytest.raises(OSError, match="other pixels"):
+        require_equal(path, raster, ArrayPixels(pixels))
+
+
 def test_a_small_image_is_read_back(tmp_path: Path) -> None:
     dn = np.arange(35, dtype=np.uint16).reshape(5, 7)
     write_tiff(tmp_path / "a.tif", dn)

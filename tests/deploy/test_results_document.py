@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from beers_deploy.documents import read_document
+from beers_deploy.baseline import read_document
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Check, Row, measured, predicted
 from beers_deploy.results import Table

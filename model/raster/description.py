@@ -1,0 +1,166 @@
+"""What GDAL states of an open image, and refusals of pixels that cannot be restored."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beers_deploy.model.raster.facts import (
+    RGB_BANDS,
+    BandInfo,
+    MaskKind,
+    Place,
+    Raster,
+    is_restored,
+    require_numbers,
+    require_size,
+    require_small_offset,
+    usable_nodata,
+)
+from beers_deploy.model.raster.index import dimap_bits
+from beers_deploy.profiles.errors import ImageError
+
+DARK = {"palette", "hue", "saturation", "lightness", "cyan", "magenta", "yellow", "black"}
+"""GDAL's interpretations of bands whose pixels are not brighter where they are larger."""
+UNKEPT = ("STATISTICS_", "TIFFTAG_", "NITF_", "AREA_OR_POINT", "METADATATYPE")
+"""Beginnings of metadata items that a restored image does not keep: they describe the raw pixels or
+the raw file, or are written from other facts.
+"""
+
+
+def mask_file(path: Path) -> Path:
+    """Return where GDAL stores the mask of an image whose format has none."""
+    return path.with_name(f"{path.name}.msk")
+
+
+def raster_of(path: Path, dataset: Any) -> Raster:
+    """Return what GDAL states of an image; refuse one whose pixels cannot be restored."""
+    name = str(path)
+    _require_one_image(name, dataset)
+    mask_kind = _mask_kind(name, dataset)
+    bands = dataset.count - (mask_kind == "alpha")
+    _require_alike(name, dataset, bands)
+    dtype = require_numbers(name, np.dtype(dataset.dtypes[0]))
+    require_size(name, bands, dataset.height, dataset.width)
+    _require_light(name, dataset)
+    for offset, scale in zip(dataset.offsets[:bands], dataset.scales[:bands], strict=True):
+        require_small_offset(name, offset, scale)
+    colours = [values.name for values in dataset.colorinterp]
+    tags = dataset.tags()
+    return Raster(
+        bands,
+        dataset.height,
+        dataset.width,
+        dtype,
+        nodata=usable_nodata(dataset.nodatavals[0], dtype),
+        bits=_bits(path, dataset),
+        mask_kind=mask_kind,
+        colour=colours[:bands] == list(RGB_BANDS),
+        restored=is_restored(tags.get("TIFFTAG_SOFTWARE", ""), tags),
+        place=_place(dataset),
+        band_info=tuple(_band_info(dataset, band) for band in range(bands)),
+        tags=_kept(tags),
+    )
+
+
+def _require_one_image(name: str, dataset: Any) -> None:
+    """Refuse a file of several images, such as the pages of a TIFF."""
+    count = len(dataset.subdatasets)
+    if dataset.count == 0 or count > 1:
+        remedy = "save the one that you mean by itself"
+        if count:
+            remedy += f": gdal_translate {dataset.subdatasets[0]} one.tif"
+        raise ImageError(name, expected="one image", got=f"{count}", remedy=remedy)
+
+
+def _mask_kind(name: str, dataset: Any) -> MaskKind:
+    """Return what marks missing pixels besides the nodata value."""
+    is_alpha = [values.name == "alpha" for values in dataset.colorinterp]
+    flags = {flag.name for flag in dataset.mask_flag_enums[0]}
+    if any(is_alpha[:-1]) or is_alpha == [True]:
+        raise ImageError(
+            name, expected="alpha as the last band", got="one before others", remedy="move it there"
+        )
+    # Where each band of a picture has its own nodata value, GDAL makes one mask of them.
+    has_mask = "per_dataset" in flags and "alpha" not in flags
+    mask = mask_file(Path(name))
+    if mask.is_file() and (is_alpha[-1] or not has_mask):
+        remedy = "write it with GDAL, or remove it"
+        got = "one without GDAL's INTERNAL_MASK_FLAGS, or alpha as well"
+        raise ImageError(str(mask), expected="one mask that GDAL reads", got=got, remedy=remedy)
+    if is_alpha[-1]:
+        return "alpha"
+    return "mask" if has_mask else ""
+
+
+def _require_alike(name: str, dataset: Any, bands: int) -> None:
+    """Refuse bands of different types or nodata values."""
+    for kind, values in (
+        ("types", dataset.dtypes),
+        ("nodata values", dataset.nodatavals[:bands]),
+    ):
+        if len({str(value) for value in values}) > 1:
+            got = ", ".join(str(value) for value in values)
+            raise ImageError(
+                name, expected=f"bands of equal {kind}", got=got, remedy="split the bands"
+            )
+
+
+def _require_light(name: str, dataset: Any) -> None:
+    """Refuse pixels that are not brighter where they are larger."""
+    structure = dataset.tags(ns="IMAGE_STRUCTURE")
+    dark = sorted({values.name for values in dataset.colorinterp} & DARK)
+    if structure.get("MINISWHITE") == "YES":
+        dark = ["white as zero (MINISWHITE)"]
+    elif structure.get("SOURCE_COLOR_SPACE") in ("CMYK", "CIELab"):
+        dark = [structure["SOURCE_COLOR_SPACE"]]
+    if dark:
+        remedy = "convert it to grey or RGB: 'gdal_translate -expand' does it for palettes"
+        raise ImageError(
+            name, expected="pixels where more is brighter", got=", ".join(dark), remedy=remedy
+        )
+
+
+def _bits(path: Path, dataset: Any) -> int | None:
+    """Return the bits per pixel that the file states, the largest of its bands'; None where any
+    band states none.
+
+    A DIMAP states those of the product.
+    """
+    if (product_bits := dimap_bits(path)) is not None:
+        return product_bits
+    band_bits = [
+        str(dataset.tags(band, ns="IMAGE_STRUCTURE").get("NBITS", "")) for band in dataset.indexes
+    ]
+    texts = band_bits if all(band_bits) else [str(dataset.tags().get("NITF_ABPP", "")).strip()]
+    most = max((int(text) for text in texts if text.isdecimal()), default=0)
+    # Bits that fill the type describe the container, not the sensor.
+    return most if 0 < most < 8 * np.dtype(dataset.dtypes[0]).itemsize else None
+
+
+def _place(dataset: Any) -> Place:
+    """Return where an image lies: by a transform, or by ground control points."""
+    points, points_crs = dataset.gcps
+    identity = dataset.transform.is_identity
+    return Place(
+        crs=points_crs if points else dataset.crs,
+        transform=None if points or identity else dataset.transform,
+        gcps=tuple((point.row, point.col, point.x, point.y, point.z or 0.0) for point in points),
+        rpcs=tuple(sorted(dataset.tags(ns="RPC").items())),
+        area_or_point=dataset.tags().get("AREA_OR_POINT", ""),
+    )
+
+
+def _band_info(dataset: Any, band: int) -> BandInfo:
+    return BandInfo(
+        dataset.descriptions[band] or "",
+        dataset.units[band] or "",
+        dataset.scales[band],
+        dataset.offsets[band],
+        _kept(dataset.tags(band + 1)),
+    )
+
+
+def _kept(tags: dict[str, str]) -> tuple[tuple[str, str], ...]:
+    """Return the metadata items that a restored image keeps."""
+    return tuple((key, text) for key, text in sorted(tags.items()) if not key.startswith(UNKEPT))
