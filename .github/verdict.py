@@ -24,7 +24,7 @@ VERDICTS = {0: "passed", 1: "failed"}
 MARKDOWN = re.compile(r"[\\`*_{}\[\]<>()#!|~&@:]")
 """Characters that Markdown or GitHub may read as markup, a link or a mention."""
 LAST_LINES = 20
-"""Of the messages of a program that failed without a sentence of its own, such as a traceback."""
+"""Number of lines that are shown of a program that failed without a message, as by a traceback."""
 
 
 def main(code: int, results: Path, stderr: Path) -> None:
@@ -72,11 +72,15 @@ def verdict_of(code: int, results: Path) -> dict[str, Any] | None:
 
 
 def reason_in(stderr: Path) -> str:
-    """Return the program's own sentences; the last lines of its messages if there is none."""
+    """Return the message of the error that ended the program; the last lines if there is none.
+
+    It is the last line that begins with the name of the program: lines of progress and warnings may
+    come before it.
+    """
     text = stderr.read_text(encoding="utf-8", errors="replace") if stderr.is_file() else ""
     lines = [plain(line) for line in text.splitlines() if line.strip()]
-    said = [line for line in lines if line.startswith("beers-deploy: ")]
-    return "\n".join(said or lines[-LAST_LINES:]) or "the program said nothing"
+    messages = [line for line in lines if line.startswith("beers-deploy: ")]
+    return "\n".join(messages[-1:] or lines[-LAST_LINES:]) or "the program printed nothing"
 
 
 def report_refusal(reason: str) -> None:

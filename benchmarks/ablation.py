@@ -20,7 +20,7 @@ import onnx
 
 from beers_deploy.model.shipped import SENSOR, shipped_names, shipped_weights
 from beers_deploy.network_files import Conditioned, told_int8
-from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.quant.banked.calibrate import PASSES as BANKED
 from beers_deploy.quant.calibration import unseen_patches
 from beers_deploy.quant.gate import compare
@@ -29,7 +29,7 @@ from beers_deploy.quant.passes.selection import ALL, Passes
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.samples import samples_of
 from beers_deploy.quant.session import open_any_size, open_session, result_of
-from beers_deploy.quantise import family_model
+from beers_deploy.quantization import family_model
 from benchmarks.small_networks import NETWORKS, SIDE_PX, Drawn, losses, save, slug, trained
 
 Loss = Callable[[Passes], float]

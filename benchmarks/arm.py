@@ -30,7 +30,16 @@ products of int8 too.
 """
 NETWORKS = ("convbeers-xs", "convbeers-s")
 PINNED = ("numpy", "onnx", "onnxruntime", "pillow", "psutil", "tifffile")
-OTHERS = ("filelock", "hypothesis", "jinja2", "jsonschema", "pytest", "rich", "typer")
+OTHERS = (
+    "docstring-parser",
+    "filelock",
+    "hypothesis",
+    "jinja2",
+    "jsonschema",
+    "pytest",
+    "rich",
+    "typer",
+)
 PLATFORMS = [
     f"{name}_aarch64"
     for name in ("manylinux_2_28", "manylinux_2_27", "manylinux_2_26", "manylinux2014")
@@ -119,13 +128,14 @@ def restored(networks: list[Path], out: Path) -> None:
     """Write what `restore` makes of one image with each network, float32 of full scale 4095, by its
     file's name.
     """
-    from beers_deploy.library import restore
+    from beers_deploy.verbs.restore import restore
 
     generator = np.random.default_rng(4)
     y, x = np.mgrid[:83, :131]
     dn = 2048 + 1500 * np.sin(y / 9) * np.cos(x / 7) + generator.normal(0, 600, y.shape) * (x > 65)
     image = np.rint(np.clip(dn, 0, 4095)).astype(np.float32)
-    np.savez(out, **{path.stem: restore(image, path, tile=64, threads=1) for path in networks})
+    pixels = {path.stem: restore(image, network=path, tile=64, threads=1) for path in networks}
+    np.savez(out, **pixels)
 
 
 def compare(root: Path, processors: tuple[str, ...]) -> dict[str, dict[str, float]]:

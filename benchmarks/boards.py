@@ -17,11 +17,10 @@ from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.model.shipped import INT8, SHIPPED, shipped_names, shipped_weights
 from beers_deploy.network_files import Conditioned
-from beers_deploy.profiles import load_target
-from beers_deploy.profiles.target import board_names
+from beers_deploy.profiles.target import board_names, load_target
 from beers_deploy.quant.core import target_shifts
 from beers_deploy.quant.onnx_file import load_onnx
-from beers_deploy.quantise import family_model
+from beers_deploy.quantization import family_model
 
 
 def files(images: Path | None, variants: list[str]) -> None:

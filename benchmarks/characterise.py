@@ -32,12 +32,12 @@ from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.mtf import mtf
 from beers_deploy.model.simulator.sampling import Scene, crop_divisible, read_scene, scene_spectrum
 from beers_deploy.parity import torch_network
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.studies.characterise import Characterised, Stated, characterise, profile_toml
-from beers_deploy.studies.characterise.instrument import AXES
-from beers_deploy.studies.characterise.profile import SHOWN_CPX
+from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.studies.characterize import Characterised, Stated, characterise, profile_toml
+from beers_deploy.studies.characterize.instrument import AXES
+from beers_deploy.studies.characterize.profile import SHOWN_CPX
 from beers_deploy.studies.evaluation.pairs import simulate_pairs
 
 LIKE, REFERENCE = (

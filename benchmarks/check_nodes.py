@@ -14,8 +14,8 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from beers_deploy.dpu.checker.table import check
 from beers_deploy.model.processor import processor_name
+from beers_deploy.verbs.check import check
 
 NODES = (1000, 2000, 4000, 8000)
 CHANNELS = 8

@@ -176,33 +176,28 @@ def lone_helpers(nodes: list[ast.AST]) -> int:
 
 
 def descriptions_an_option() -> float:
-    """Return how often an option of the command line is described, in the mean.
+    """Return how often a parameter of a verb is described, in the mean.
 
-    Counted are help texts of commands, lines of `Args:` and `Attributes:` of library functions of
-    the commands' names and of classes of options, and the tables of `docs/make/options.py`.
+    Counted are the lines of `Args:` in the docstrings of verbs, and of other functions that have
+    their names.
     """
-    commands = functions_of(nodes_below(ROOT / "deploy" / "commands"))
-    options = list(chain.from_iterable(map(options_of, commands)))
-    descriptions = Counter(options)
-    verbs = {function.name for function in commands}
-    library = nodes_below(ROOT / "deploy")
-    classes = [node for node in library if isinstance(node, ast.ClassDef)]
-    described: list[ast.FunctionDef | ast.ClassDef] = [*functions_of(library), *classes]
-    for node in described:
-        if node.name in verbs or node.name.endswith("Options"):
-            text = ast.get_docstring(node) or ""
-            descriptions.update(re.findall(r"^ +(\w+): ", text, re.MULTILINE))
-    tables = ast.walk(ast.parse((ROOT / "docs/make/options.py").read_text(encoding="utf-8")))
-    constants = (node.value for node in tables if isinstance(node, ast.Constant))
-    descriptions.update(value for value in constants if isinstance(value, str))
-    names = set(options)
-    return sum(descriptions[name] for name in names) / len(names)
+    functions = functions_of(nodes_below(ROOT / "deploy"))
+    options = {function.name: options_of(function) for function in functions if is_verb(function)}
+    descriptions = 0
+    for function in functions:
+        named = re.findall(r"^ +(\w+): ", ast.get_docstring(function) or "", re.MULTILINE)
+        descriptions += len(set(named) & options.get(function.name, set()))
+    return descriptions / sum(map(len, options.values()))
 
 
-def options_of(command: ast.FunctionDef) -> list[str]:
-    """Return the parameters of a command that Typer makes options or arguments of."""
-    types = {each.arg: each.annotation for each in command.args.args}
-    return [name for name, type_ in types.items() if type_ and "typer." in ast.unparse(type_)]
+def is_verb(function: ast.FunctionDef) -> bool:
+    """Return True if a function is decorated as a verb."""
+    return "verb" in map(ast.unparse, function.decorator_list)
+
+
+def options_of(verb: ast.FunctionDef) -> set[str]:
+    """Return the names of the parameters of a verb."""
+    return {each.arg for each in (*verb.args.args, *verb.args.kwonlyargs)}
 
 
 def nodes_below(folder: Path) -> list[ast.AST]:

@@ -31,9 +31,9 @@ from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.simulator.acquire import acquire
 from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.sampling import read_scene, scene_spectrum
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.response import NYQUIST, MtfTable
 from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.sensor_file import load_sensor
 
 LIKE = load_sensor("pleiades-degraded").nominal()
 OVERSAMPLING = 4

@@ -46,7 +46,7 @@ from beers_deploy.model.training.losses import LossWeights, RestorationLoss
 from beers_deploy.model.training.patches import PatchRecipe
 from beers_deploy.model.training.source import PatchSource
 from beers_deploy.network import Network
-from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.quant.calibration import Calibration, draw_patches
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.samples import Patches

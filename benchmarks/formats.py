@@ -28,15 +28,15 @@ from rasterio.shutil import copy
 from rasterio.transform import from_origin
 from rasterio.windows import Window
 
-from beers_deploy.bench.swath import parse_size
 from beers_deploy.model.raster.reader import open_raster
+from beers_deploy.performance.swath import parse_size
 
 BLOCK_PX = 1024
 STRIP_PX = 640
 TIFF = "TIFF"
 COUNTED = """
 import resource, sys
-from beers_deploy.cli import app
+from beers_deploy.cli.commands import app
 try:
     app()
 finally:

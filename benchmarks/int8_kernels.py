@@ -19,10 +19,10 @@ import numpy as np
 import onnx
 import onnxruntime as ort
 
-from beers_deploy.bench.timing import interleaved
 from beers_deploy.model.processor import decided, int8_adds_exactly, processor_name
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network
+from beers_deploy.performance.timing import interleaved
 from beers_deploy.quant.kernels import filled, made_exact
 from beers_deploy.quant.session import open_session, run
 

@@ -37,13 +37,12 @@ from pathlib import Path
 import numpy as np
 import onnx
 
-from beers_deploy.export import float_model as read_float
+from beers_deploy.float_onnx import float_model as read_float
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.model.shipped import shipped_weights
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.network import Network
-from beers_deploy.profiles import load_sensor
-from beers_deploy.profiles.sensor_file import reference_for
+from beers_deploy.profiles.sensor_file import load_sensor, reference_for
 from beers_deploy.quant.calibration import HELD_OUT_SEED, draw_patches
 from beers_deploy.quant.ends import Ends, ends_of
 from beers_deploy.quant.graph import CORRECTION, PLANES, graph_to_onnx, read_network, read_planes

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from beers_deploy.model.raster.images import site_of
 from beers_deploy.model.simulator.mtf import mtf
 from beers_deploy.model.simulator.procedural import load_scenes
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.response import NYQUIST, MtfTable
 from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.restoration.method import Restore
 from beers_deploy.studies.evaluation.methods import (
     TRADITIONAL,

@@ -9,15 +9,15 @@ machine does falls on both.
 import argparse
 import time
 from itertools import product
+from typing import get_args
 
 import numpy as np
 
 from beers_deploy.model.processor import processor_name
 from beers_deploy.model.shipped import SENSOR, shipped_names, shipped_weights
 from beers_deploy.network_files import Conditioned
-from beers_deploy.profiles import load_sensor
-from beers_deploy.restoration.options import Runtime
-from beers_deploy.restoration.runtime import Infer, open_runtime
+from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.restoration.runtime import Infer, Runtime, open_runtime
 
 TILE_PX = 640
 TURNS = 5
@@ -40,7 +40,7 @@ def main() -> None:
         arguments.networks.split(","), (False, True), map(int, arguments.threads.split(","))
     ):
         model = Conditioned(name, shipped_weights(name)).model(sensor, int8)
-        runs = [open_runtime(runtime, model, threads)[0] for runtime in Runtime]
+        runs = [open_runtime(runtime, model, threads)[0] for runtime in get_args(Runtime)]
         results = [run(image) for run in runs]
         difference = float(np.abs(results[0] - results[1]).max())
         first_s, second_s = fastest_s(runs, image)

@@ -19,14 +19,14 @@ import numpy as np
 import onnx
 import torch
 
-from beers_deploy.bench.swath import PAPER_SIZE, Swath, parse_size, swath_latency
 from beers_deploy.dpu.board import Dpu, load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import Prediction, predict
 from beers_deploy.dpu.reading import network_of
-from beers_deploy.export import to_onnx
+from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import Variant
+from beers_deploy.performance.swath import PAPER_SIZE, Swath, parse_size, swath_latency
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.samples import Patches, Remade
 from beers_deploy.quant.tiling.walk import tiling_of

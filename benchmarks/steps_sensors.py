@@ -21,8 +21,8 @@ from beers_deploy.model.metrics.fidelity import fidelity_db
 from beers_deploy.model.raster.images import site_of
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.model.simulator.sampling import Scene
-from beers_deploy.profiles import load_sensor
-from beers_deploy.restoration.method import Around
+from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.restoration.steps import Around
 from beers_deploy.studies.evaluation.methods import method_named
 from beers_deploy.studies.evaluation.pairs import NamedPair, simulate_pairs
 from beers_deploy.studies.evaluation.sweep import NOMINAL, conditions

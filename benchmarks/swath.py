@@ -34,20 +34,19 @@ import onnx
 import tifffile
 import torch
 
-from beers_deploy.bench.swath import parse_size
-from beers_deploy.export import to_onnx
+from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import VARIANTS, Variant
 from beers_deploy.network import Network
+from beers_deploy.performance.swath import parse_size
 from beers_deploy.quant.tiling.walk import tiling_of
-from beers_deploy.restoration.options import Options, Runtime
 from beers_deploy.restoration.plan import make_plan
-from beers_deploy.restoration.run import restore_file
-from beers_deploy.restoration.runtime import open_runtime
+from beers_deploy.restoration.runtime import Runtime, open_runtime
 from beers_deploy.restoration.tiles.exposures import restore_window
+from beers_deploy.verbs.restore import restore
 
 TILE_PX = 640
-ENTRY = "from beers_deploy.cli import app; app()"
+ENTRY = "from beers_deploy.cli.commands import app; app()"
 
 
 def main() -> None:
@@ -79,15 +78,13 @@ def main() -> None:
         ]
         for path in networks + ([arguments.int8] if arguments.int8 else []):
             for runtime in arguments.runtimes.split(","):
-                options = Options(
-                    path, TILE_PX, runtime=Runtime(runtime), threads=arguments.threads
-                )
+                way = Way(path, runtime, arguments.threads)
                 size = parse_size(arguments.size)
                 repeats = arguments.repeats
                 if arguments.peers or arguments.monai_python:
-                    beside_peers(folder, options, size, repeats, arguments.monai_python)
+                    beside_peers(folder, way, size, repeats, arguments.monai_python)
                 else:
-                    speed(folder, options, size, repeats)
+                    speed(folder, way, size, repeats)
         for size in filter(None, arguments.swaths.split(",")):
             memory(
                 folder,
@@ -97,36 +94,64 @@ def main() -> None:
             )
 
 
-def name_of(options: Options) -> str:
-    """The network's name."""
-    return Network.load(options.network).name
+@dataclass(frozen=True)
+class Way:
+    """A network, and what runs it.
+
+    Attributes:
+        path: of the network.
+        runtime: the library.
+        threads: of the library; 0 uses all cores.
+    """
+
+    path: Path
+    runtime: Runtime
+    threads: int
+
+    @property
+    def network(self) -> Network:
+        """The network, read from its file."""
+        return Network.load(self.path)
+
+    def restore(self, image: Path, out: Path) -> None:
+        """Restore a file in tiles, over an older result."""
+        restore(
+            image,
+            out,
+            network=self.path,
+            tile=TILE_PX,
+            runtime=self.runtime,
+            threads=self.threads,
+            overwrite=True,
+            progress=False,
+        )
 
 
-def speed(folder: Path, options: Options, size: tuple[int, int], repeats: int) -> None:
+def speed(folder: Path, way: Way, size: tuple[int, int], repeats: int) -> None:
     """Engine from file to file over the bare runtime on the same windows, already float32 in
     memory, one by one.
     """
     image = folder / "image.tif"
     dn = write_noise(image, size)
-    network = Network.load(options.network).model
+    network = way.network.model
     tiling = tiling_of(network)
     plan = make_plan((1, *dn.shape), TILE_PX, tiling.halo_px, tiling)
     tiles = [dn[r.start : r.stop, c.start : c.stop] for r, c in product(plan.rows, plan.columns)]
     windows = [
         np.ascontiguousarray(pixels, np.float32)[None, None] / np.float32(4095) for pixels in tiles
     ]
-    infer, version = open_runtime(options.runtime, network, options.threads)
+    infer, version = open_runtime(way.runtime, network, way.threads)
 
     def bare() -> None:
         for window in windows:
             infer(window)
 
     def engine() -> None:
-        restore_file(image, folder / "out.tif", options)
+        way.restore(image, folder / "out.tif")
 
     (bare_s, bare_cpu_s), (engine_s, engine_cpu_s) = fastest([bare, engine], repeats)
     print(
-        f"{name_of(options):18} {version:20} {plan.tiles} tiles: bare {bare_s:.2f} s, engine "
+        f"{way.network.name:18} {version:20} {plan.tiles} tiles: bare {bare_s:.2f} s, engine "
         f"{engine_s:.2f} s "
         f"({dn.size / engine_s / 1e6:.3f} Mpx/s); engine over bare {bare_s / engine_s:.3f} by "
         "the clock, "
@@ -136,20 +161,20 @@ def speed(folder: Path, options: Options, size: tuple[int, int], repeats: int) -
 
 
 def beside_peers(
-    folder: Path, options: Options, size: tuple[int, int], repeats: int, monai_python: str | None
+    folder: Path, way: Way, size: tuple[int, int], repeats: int, monai_python: str | None
 ) -> None:
     """Engine and peers from file to file; peers run on onnxruntime or OpenVINO here, MONAI on
     onnxruntime.
     """
     image = folder / "image.tif"
     dn = write_noise(image, size)
-    task = Task(image, options, options.threads or os.cpu_count() or 1)
+    task = Task(image, way, way.threads or os.cpu_count() or 1)
     with ways(task, monai_python) as runs:
         times_s = fastest(list(runs.values()), repeats)
     for name, (clock_s, cpu_s) in zip(runs, times_s, strict=True):
         largest, mean = difference_dn(task.out("engine"), task.out(name))
         print(
-            f"{name_of(options):18} {options.runtime:12} {name:24} {clock_s:.2f} s "
+            f"{way.network.name:18} {way.runtime:12} {name:24} {clock_s:.2f} s "
             f"({dn.size / clock_s / 1e6:.3f} Mpx/s); over the engine "
             f"{clock_s / times_s[0, 0]:.2f} by the clock, "
             f"{cpu_s / times_s[0, 1]:.2f} by the processor; off by {largest:.0f} DN at most, "
@@ -164,20 +189,20 @@ Run = Callable[[], float | None]
 
 @dataclass(frozen=True)
 class Task:
-    """One image through one network, into a file of each way's own."""
+    """One image through one network, into a file for each program."""
 
     image: Path
-    options: Options
+    way: Way
     cores: int
 
     @property
     def halo_px(self) -> int:
         """Of the engine, and of the peers."""
-        return Network.load(self.options.network).tiling.halo_px
+        return self.way.network.tiling.halo_px
 
-    def out(self, way: str) -> Path:
-        """Where a way writes."""
-        return self.image.with_name(f"{way.replace(',', '').replace(' ', '-')}.tif")
+    def out(self, program: str) -> Path:
+        """Return the file that a program writes."""
+        return self.image.with_name(f"{program.replace(',', '').replace(' ', '-')}.tif")
 
 
 @contextmanager
@@ -185,7 +210,7 @@ def ways(task: Task, monai_python: str | None) -> Iterator[dict[str, Run]]:
     """The engine first, then its peers, ready to run."""
 
     def engine() -> None:
-        restore_file(task.image, task.out("engine"), task.options)
+        task.way.restore(task.image, task.out("engine"))
 
     runs: dict[str, Run] = {
         "engine": engine,
@@ -199,21 +224,19 @@ def ways(task: Task, monai_python: str | None) -> Iterator[dict[str, Run]]:
         yield {**runs, "MONAI": turn}
 
 
-def overlapped(task: Task, way: str, chunks_at_once: int) -> Run:
+def overlapped(task: Task, program: str, chunks_at_once: int) -> Run:
     """dask.array.map_overlap over chunks that are a tile with their overlap, the cores shared among
     those at work.
     """
     core_px = TILE_PX - 2 * task.halo_px
     halo_px = task.halo_px
-    out = task.out(way)
+    out = task.out(program)
     threads = max(task.cores // chunks_at_once, 1)
 
     def run() -> None:
         import dask.array as da
 
-        infer, _ = open_runtime(
-            task.options.runtime, Network.load(task.options.network).model, threads
-        )
+        infer, _ = open_runtime(task.way.runtime, task.way.network.model, threads)
 
         def restored(block: np.ndarray) -> np.ndarray:
             return np.asarray(np.rint(restore_window(block, infer)), np.uint16)
@@ -241,7 +264,7 @@ def child(task: Task, python: str) -> Iterator[Run]:
     the processor.
     """
     words = (
-        task.options.network,
+        task.way.path,
         task.image,
         task.out("MONAI"),
         TILE_PX,

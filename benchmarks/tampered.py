@@ -20,7 +20,7 @@ from beers_deploy.network import Network
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings import host_model, read_core
 from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata
-from beers_deploy.verdict import gate
+from beers_deploy.verbs.gate import gate
 
 Change = Callable[[IntConv], IntConv]
 
@@ -105,15 +105,15 @@ def main() -> None:
     model = load_onnx(arguments.int8)
     core = read_core(model)
     floating = Network.load(arguments.floating)
-    untampered = gate(arguments.int8, floating, progress=False)
-    print(f"untampered: {untampered}\n")
+    untampered = gate(floating, arguments.int8, progress=False)
+    print(f"untampered: {untampered.verdict}\n")
     print("| tampering | further loss, dB | default limits | with a baseline |\n|---|---|---|---|")
     stopped = {"default": 0, "baseline": 0}
     with TemporaryDirectory() as folder:
         baseline = untampered.save(Path(folder) / "baseline.json")
         for name, place, change in TAMPERINGS:
             other = host_model(tampered(core, place, change), metadata(model), fixed_tile_px(model))
-            verdict = gate(Network(other, "tampered"), floating, baseline=baseline, progress=False)
+            verdict = gate(floating, Network(other, "tampered"), baseline=baseline, progress=False)
             lost_db = (
                 untampered.comparison.result.psnr_int8_db - verdict.comparison.result.psnr_int8_db
             )

@@ -33,8 +33,8 @@ from beers_deploy.model.traditional.nl_bayes import QUALITIES
 from beers_deploy.model.traditional.noise import Noise, with_rounding_noise
 from beers_deploy.model.traditional.pipeline import WORKING_SIGMA, denoise_radiance
 from beers_deploy.model.traditional.regularisation import FIT, Fit, measure
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.sensor import Instrument, noise_from_snr
+from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.studies.evaluation.pairs import NamedPair, simulate_pairs
 
 BORDER_PX = 24

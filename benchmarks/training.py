@@ -33,7 +33,7 @@ from beers_deploy.model.training.patches import PatchRecipe
 from beers_deploy.model.training.source import Batch, PatchSource
 from beers_deploy.model.training.trainer import Precision, Trainer
 from beers_deploy.model.variants import VARIANTS
-from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.sensor_file import load_sensor
 
 BATCH = 8
 PATCH_PX = 96

@@ -1,19 +1,18 @@
 """`import beers_deploy as bd`: satellite image restoration from training to board, as a library.
 
-Nouns are values: `Sensor`, `Network`, `Board`, `Pair`, `Table`. Verbs return values and write files
-only where they are told to: `simulate`, `restore`, `quantize`, `compare`, `gate`, `check`,
-`predict`, `evaluate`, `tradeoff` and `characterize`. `sensors`, `boards` and `networks` list what
-is shipped. What is offered is loaded when it is asked for. Inside:
+Nouns are values: `Sensor`, `Network`, `Board`, `Pair`, `Table`. Verbs are functions that return
+values, and write files only where they are given an output; each is a command too. `sensors`,
+`boards` and `networks` list what is shipped. A name is loaded when it is first used. Inside:
 
-- `network`: a network as a value; `library`, `quantise`, `verdict`, `pairs`, `board`: a verb or two
-  each;
+- `verbs`: one verb a file: signature and docstring are those of the library, the command and its
+  help; `cli` makes the commands;
+- `network`: a network as a value; `quantization`, `comparison`, `verdict`, `pairs`, `board`: the
+  steps of the verbs;
 - `restoration`: images of any size through a network or the traditional pipeline;
-- `dpu` and `bench`: the checker of operators, the cost model, and what they say of a swath;
-- `results`, `frames`, `report`: figures as tables, JSON, DataFrames and pages; `baseline` reads
-  JSON again;
-- `studies`: what takes hours and writes pages: `evaluation`, `characterise`, `stress`, `detection`,
-  `tradeoff`, `demo`, and `recipes`, which make the shipped networks;
-- `cli` and `commands`: a file a command, which parses options, calls one function and prints.
+- `dpu`: the checker of operators and the cost model; `performance`: times, predicted and measured;
+- `results`: figures as one table, JSON document and page; `tables` and `report` show them;
+- `studies`: what takes long: evaluation, trade-off, stress, detection, a sensor from its images,
+  and the recipes that make the shipped networks.
 """
 
 from typing import Any

@@ -1,22 +1,27 @@
-from .bench.board import predict as predict
 from .board import Board as Board
 from .board import boards as boards
 from .board import networks as networks
 from .board import sensors as sensors
-from .dpu.checker.table import check as check
-from .library import restore as restore
+from .comparison import compare as compare
 from .network import Network as Network
 from .pairs import Pair as Pair
-from .pairs import simulate as simulate
 from .profiles.errors import BeersError as BeersError
 from .profiles.sensor import Sensor as Sensor
 from .quant.limits import Limits as Limits
-from .quantise import quantize as quantize
 from .results import Table as Table
-from .studies.characterise import characterize as characterize
-from .studies.evaluation.run import evaluate as evaluate
-from .studies.tradeoff.run import tradeoff as tradeoff
-from .verdict import compare as compare
-from .verdict import gate as gate
+from .verbs.bench import bench as bench
+from .verbs.characterize import characterize as characterize
+from .verbs.check import check as check
+from .verbs.demo import demo as demo
+from .verbs.evaluate import evaluate as evaluate
+from .verbs.export import export as export
+from .verbs.gate import gate as gate
+from .verbs.golden import golden as golden
+from .verbs.quantize import quantize as quantize
+from .verbs.restore import restore as restore
+from .verbs.simulate import simulate as simulate
+from .verbs.stress import stress as stress
+from .verbs.tradeoff import tradeoff as tradeoff
+from .verbs.train import train as train
 
 __version__: str

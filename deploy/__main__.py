@@ -14,7 +14,7 @@ def main() -> None:
     failed.
     """
     try:
-        from beers_deploy.cli import app
+        from beers_deploy.cli.commands import app
 
         app(prog_name="beers-deploy")
     except Exception as error:  # noqa: BLE001 - Python itself would end with 1

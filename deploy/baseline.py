@@ -14,7 +14,7 @@ from jsonschema import Draft202012Validator
 
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.raster.images import list_images
-from beers_deploy.profiles.errors import OptionError, encodable
+from beers_deploy.profiles.errors import OptionError, encodable, printable
 from beers_deploy.profiles.figures import Check
 from beers_deploy.profiles.sensor import Sensor, numbers_of
 from beers_deploy.profiles.toml import read_json
@@ -30,7 +30,7 @@ than a thousandth.
 """
 
 SCALE = "of full scale"
-REMEDY = "make it again with 'gate --json' and these arguments"
+REMEDY = "Make it again with 'gate --json' and these arguments."
 
 
 def read_document(path: Path) -> dict[str, object]:
@@ -39,14 +39,16 @@ def read_document(path: Path) -> dict[str, object]:
         document = read_json(path)
         schema = Draft202012Validator(json.loads(SCHEMA_PATH.read_text(encoding="utf-8")))
         error = next(schema.iter_errors(document), None)
-        got = "" if error is None else f"another document: {error.message[:100]}"
+        fault = "" if error is None else error.message
     except FileNotFoundError:
-        got = "no such file"
+        fault = "there is no such file"
     except (OSError, ValueError) as error:
-        got = " ".join(str(error).split())[:100]
-    if got:
-        remedy = "give what a command wrote with --json"
-        raise OptionError(str(path), expected="a results document", got=got, remedy=remedy)
+        fault = " ".join(str(error).split())
+    if fault:
+        raise OptionError(
+            f"{path} is not a results document: {fault[:100].removesuffix('.')}. Give what a "
+            "command wrote with '--json'."
+        )
     return document  # type: ignore[return-value]
 
 
@@ -83,18 +85,18 @@ class Baseline:
         # A network that was saved again has another digest, but the same PSNR.
         same_psnr = abs(psnr_float_db - self.psnr_float_db) < SAME_DB
         if not same_psnr and not any(float_sha256 in digests for digests in self.digests.values()):
-            raise self._refused("a baseline of this float network", "another's")
+            raise OptionError(f"{self.path} is the baseline of another float network. {REMEDY}")
         for item in inputs:
             before = self.digests.get(encodable(item.name))
             if before is None:
-                raise self._refused(f"a baseline that rests on {item.name}", "one that does not")
-            if before != {item.sha256}:
-                raise self._refused(
-                    f"a baseline of the same {item.name}", f"one of another {item.name}"
+                raise OptionError(
+                    f"{self.path} is the baseline of a gate without {item.name}. {REMEDY}"
                 )
-
-    def _refused(self, expected: str, got: str) -> OptionError:
-        return OptionError(str(self.path), expected=expected, got=got, remedy=REMEDY)
+            if before != {item.sha256}:
+                raise OptionError(
+                    f"{self.path} is the baseline of a gate in which {item.name} had other "
+                    f"content. {REMEDY}"
+                )
 
 
 def read_baseline(path: Path, arguments: Mapping[str, Any]) -> Baseline:
@@ -111,34 +113,34 @@ def read_baseline(path: Path, arguments: Mapping[str, Any]) -> Baseline:
     """
     document: Any = read_document(path)
     if document["command"] != "gate":
-        got = f"one of {document['command']}"
-        raise OptionError(str(path), expected="what 'gate --json' wrote", got=got, remedy=REMEDY)
+        command = printable(repr(document["command"]))
+        raise OptionError(f"{path} is a document of {command}, not of 'gate'. {REMEDY}")
     if document["verdict"] != "passed":
-        remedy = "give that of a version that passed"
         raise OptionError(
-            str(path), expected="the document of a gate that passed", got="failed", remedy=remedy
+            f"{path} is the document of a gate that failed. Give the document of a version that "
+            "passed."
         )
     before = document["arguments"]
     for name in PATCHES:
         then = _plain(name, before.get(name))
         now = _plain(name, arguments.get(name))
         if then != now:
-            expected = f"a baseline of the same patches ({name} {now})"
-            raise OptionError(str(path), expected=expected, got=f"{name} {then}", remedy=REMEDY)
+            raise OptionError(
+                f"{path} is the baseline of other patches: its `{name}` is {printable(then)}, but "
+                f"here it is {printable(now)}. {REMEDY}"
+            )
     rows = [row for row in document["rows"] if row["table"] == "gate"]
     figures: dict[str, Any] = rows[0]["figures"] if rows else {}
     mae = figures.get("MAE", {})
     if mae.get("mode") != "measured" or mae.get("unit") != SCALE or not 0 <= mae["value"] <= 1:
-        got = f"{mae.get('value')} {mae.get('unit')}, {mae.get('mode')}" if mae else "no MAE"
-        raise OptionError(str(path), expected=f"a measured MAE {SCALE}", got=got, remedy=REMEDY)
+        found = f"{mae.get('value')} {mae.get('unit')}, {mae.get('mode')}" if mae else "no MAE"
+        raise OptionError(
+            f"{path} must have a measured MAE from 0 to 1 {SCALE}, but it has {printable(found)}. "
+            f"{REMEDY}"
+        )
     contradiction = _contradiction(document["checks"], len(rows), mae["value"])
     if contradiction:
-        raise OptionError(
-            str(path),
-            expected="a baseline that agrees with itself",
-            got=contradiction,
-            remedy=REMEDY,
-        )
+        raise OptionError(f"{path} contradicts itself: it has {printable(contradiction)}. {REMEDY}")
     psnr_db = figures.get("PSNR float", {}).get("value")
     digests: dict[str, frozenset[str]] = {}
     for entry in document["inputs"]:

@@ -1,15 +1,15 @@
 """Boards for notebooks, what a board's engineer is handed, and tables of what is shipped."""
 
 import json
+import logging
 import os
 import shutil
-import warnings
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.dpu.checker.table import check
+from beers_deploy.dpu.checker.table import check_network
 from beers_deploy.kit.golden import PICTURE, save_array, write_golden
 from beers_deploy.kit.host_facts import host_facts
 from beers_deploy.kit.record import require_library, write_record
@@ -26,7 +26,10 @@ from beers_deploy.profiles.sensor_file import BLIND, sensor_names
 from beers_deploy.profiles.target import TILE_PX, TargetProfile, board_names
 from beers_deploy.quant.encodings import save_config
 from beers_deploy.quant.session import open_session, tensors_of
-from beers_deploy.results import Table, markdown_text
+from beers_deploy.results import Table
+from beers_deploy.tables.markdown import markdown_text
+
+logger = logging.getLogger(__name__)
 
 MEASURE, HOST, README = (
     Path(__file__).parent / "kit" / name for name in ("measure.py", "host.py", "readme.md")
@@ -53,7 +56,7 @@ class Board(TargetProfile):
         """Write what a board's engineer needs of an INT8 network to a folder, and return it.
 
         `core.onnx` is the part that the DPU computes, fixed to a tile. `measure.py` times it there
-        and writes `board.json`, which `predict` takes as `measured`. `input.npy` and `expected.npy`
+        and writes `board.json`, which `bench` accepts as `measured`. `input.npy` and `expected.npy`
         are one input of the core and what onnxruntime makes of it on this processor. `host.py` is
         the host's part around it in plain NumPy, `golden` has what every layer must write, and
         README.md says what to do there.
@@ -86,7 +89,7 @@ class Board(TargetProfile):
             and profile.name != BLIND
             and (doubt := other_sensor(network.model, profile))
         ):
-            warnings.warn(doubt, stacklevel=2)
+            logger.warning(doubt)
         # A missing library is refused before anything is written.
         if record:
             require_library()
@@ -104,14 +107,14 @@ class Board(TargetProfile):
         if facts is not None:
             write_text(folder / "host.json", json.dumps(facts, indent=1) + "\n")
             shutil.copyfile(HOST, folder / "host.py")
-        vectors = write_golden(network, folder / "golden", board=self)
+        vectors = write_golden(network, folder / "golden", target=self)
         # The golden vectors have tiles of their own side, and so need a core of that side.
         vectors_px = np.load(vectors / "noise" / PICTURE).shape[-1]
         network.core(self, vectors_px).save(vectors / "core.onnx")
         if record:
             conditioned_on = Sensor.load(BLIND) if profile is None else profile
             write_record(
-                check(network, self, tile=tile), network, conditioned_on, folder / "record"
+                check_network(network, self, None, tile), network, conditioned_on, folder / "record"
             )
         words = {
             "network": markdown_text(network.name),

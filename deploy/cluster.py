@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from importlib.metadata import version
 from typing import Any, TypeVar
 
-from beers_deploy.profiles.errors import MachineError, optional
+from beers_deploy.profiles.errors import MachineError, optional, printable
 
 ANSWER_S = 10
 JOIN_S = 30
@@ -44,7 +44,7 @@ class Cluster:
         try:
             return sum(self._client.nthreads().values())
         except OSError as error:
-            raise _lost("no connection to their scheduler", "start it again") from error
+            raise _lost(UNCONNECTED, "Start it again") from error
 
     def share(self, value: T) -> T:
         """What stands for a value in calls: it is sent once, and again where all workers that held
@@ -64,7 +64,9 @@ class Cluster:
             except TimeoutError:
                 seen_s = time.monotonic() if self.slots else seen_s
                 if time.monotonic() - seen_s > WORKERLESS_S:
-                    raise _lost(f"none for {WORKERLESS_S} s", "start some") from None
+                    raise _lost(
+                        f"The scheduler has had no workers for {WORKERLESS_S} s.", "Start some"
+                    ) from None
 
 
 def _itself(value: T) -> T:
@@ -84,32 +86,36 @@ def open_cluster(scheduler: str | None) -> Iterator[Cluster | None]:
             yield Cluster(client)
         except distributed.KilledWorker as error:
             raise _lost(
-                "some that died over one call", "give them more memory, or smaller tiles"
+                "Several workers died during the same call.",
+                "Give them more memory, or use smaller tiles",
             ) from error
         except CancelledError as error:
-            raise _lost("no connection to their scheduler", "start it again") from error
+            raise _lost(UNCONNECTED, "Start it again") from error
 
 
-def _lost(got: str, remedy: str) -> MachineError:
-    remedy = f"{remedy}, and go on with `resume`"
-    return MachineError("workers", expected="some that live to the end", got=got, remedy=remedy)
+UNCONNECTED = "The connection to the scheduler of the workers was lost."
+
+
+def _lost(fault: str, remedy: str) -> MachineError:
+    return MachineError(f"{fault} {remedy}, and go on with `resume`.")
 
 
 def _connect(distributed: Any, address: str) -> Any:
     try:
         client = distributed.Client(address, timeout=ANSWER_S, set_as_default=False)
     except (OSError, ValueError) as error:
-        got = " ".join(str(error).split())[:120]
-        remedy = "give its address, such as tcp://host:8786"
+        reason = " ".join(str(error).split())[:120]
         raise MachineError(
-            f"scheduler {address}", expected="an answer", got=got, remedy=remedy
+            f"The scheduler {printable(address)} does not answer: {reason}. Give its address, such "
+            "as tcp://host:8786."
         ) from error
     try:
         client.wait_for_workers(1, timeout=JOIN_S)
     except OSError as error:
         client.close()
         raise _lost(
-            f"none within {JOIN_S} s", f"start some with 'dask worker {address}'"
+            f"No worker joined the scheduler within {JOIN_S} s.",
+            f"Start some with 'dask worker {address}'",
         ) from error
     return client
 
@@ -120,12 +126,11 @@ def _require_same_versions(client: Any) -> None:
     """
     for package in PACKAGES:
         here = version(package)
-        for worker, got in client.run(version, package, on_error="return").items():
-            if got != here:
-                expected = f"{package} {here}"
-                remedy = "install the same versions on every machine"
+        for worker, there in client.run(version, package, on_error="return").items():
+            if there != here:
                 raise MachineError(
-                    f"worker {worker}", expected=expected, got=str(got), remedy=remedy
+                    f"The worker {worker} must have {package} {here} as on this machine, got "
+                    f"{printable(str(there))}. Install the same versions on every machine."
                 )
 
 

@@ -1,8 +1,8 @@
-"""`restore --dry-run`: what the tool makes of an image file, before anyone waits for it.
+"""`restore --dry-run`: the facts of an image file, the plan of its tiles and the time it takes.
 
-Of a TIFF only strips are read, which are searched for faults of detectors, and windows where a
-sensor is told, which are held against it. Time here is predicted only from tiles that were timed;
-time on the board is the cost model's.
+Only strips of the image are read, to search them for faults of detectors, and windows if a sensor
+is named, to compare them with it. The time on this machine is predicted from tiles that are timed
+here; the time on the board is predicted by the cost model.
 """
 
 import math
@@ -14,22 +14,22 @@ from typing import Any
 
 import numpy as np
 
-from beers_deploy.bench.swath import predict_network, swath_latency
 from beers_deploy.dpu.board import dpu_of
-from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.reader import open_raster
 from beers_deploy.network import Network
+from beers_deploy.performance.swath import predict_network, swath_latency
 from beers_deploy.profiles.errors import BeersError, ImageError
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.restoration.detectors.words import warn_of_detectors
 from beers_deploy.restoration.figures import plan_figures
-from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.plan import Plan, plan_for
+from beers_deploy.restoration.prepare import NetworkPipeline
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
-from beers_deploy.restoration.runtime import open_runtime, tiles_at_once
-from beers_deploy.restoration.sensor_check import SensorCheck, told_sensor
+from beers_deploy.restoration.reading import Reading
+from beers_deploy.restoration.runtime import Engine, open_runtime, tiles_at_once
+from beers_deploy.restoration.sensor_check import SensorCheck, checked_sensor
 from beers_deploy.restoration.steps import keeps_pixels
 
 HEADER = "the file's own header"
@@ -38,36 +38,41 @@ UNTIMED = "no tile was timed here"
 
 
 def preview_row(
-    image: Path, options: Options, target: TargetProfile, measure: bool = True, log: Log = no_log
+    image: Path,
+    pipeline: NetworkPipeline,
+    reading: Reading,
+    target: TargetProfile,
+    measure: bool = True,
 ) -> Row:
-    """The facts of an image and of its restoration.
+    """Return the facts of an image and of its restoration.
 
     Args:
         image: its file.
-        options: as a restoration would be given them.
+        pipeline: that would restore it.
+        reading: how its pixels would be understood.
         target: the board whose time is predicted.
         measure: whether tiles are timed here.
-        log: is told of faults of detectors, and where the image contradicts its sensor.
     """
-    network = Network.load(options.network)
-    with open_raster(image, options.force) as source:
+    network = next(iter(pipeline.networks.values()))
+    with open_raster(image, reading.force) as source:
         raster = source.raster
-        scale = known_scale(image.name, raster, options)
+        scale = known_scale(image.name, raster, reading)
         check = SensorCheck()
         # Where full scale is open, no pixel counts as saturated.
         saturation = scale.value if isinstance(scale, FullScale) else math.inf
-        detectors = warn_of_detectors(source, saturation, log)
+        detectors = warn_of_detectors(source, saturation)
         if isinstance(scale, FullScale):
-            check = told_sensor(
-                source, options.sensors, scale.value, str(image), options.strict, log
-            )
-    plan = plan_for(network, raster.shape, options)
+            check = checked_sensor(source, reading.sensors, scale.value, str(image), reading.strict)
+    plan = plan_for(network, raster.shape, pipeline.tiles)
+    here = unavailable("s", UNTIMED)
+    if measure:
+        here = time_here(network, plan, pipeline.engine)
     figures = {
         "width": measured(raster.width_px, "px", HEADER),
         "height": measured(raster.height_px, "px", HEADER),
         "bands": measured(raster.bands, "1", HEADER),
         **plan_figures(plan),
-        "time here": time_here(network, plan, options) if measure else unavailable("s", UNTIMED),
+        "time here": here,
         f"time on {target.name}": time_on_board(network, plan, target),
         **check.figures,
         **detectors,
@@ -93,17 +98,18 @@ def missing_words(raster: Raster) -> str:
     return ", ".join([*valued, *hidden]) or "none"
 
 
-def known_scale(name: str, raster: Raster, options: Options) -> FullScale | str:
+def known_scale(name: str, raster: Raster, reading: Reading) -> FullScale | str:
     """Full scale as far as no pixel is read; else why it is open."""
-    if raster.dtype.kind == "f" and options.full_scale is None:
+    if raster.dtype.kind == "f" and reading.full_scale is None:
         return (
             "the pixels decide when they are read: digital numbers if one is above 2, else "
             "state the full scale"
         )
     try:
-        return full_scale_of(name, raster, (), options.full_scale, options.sensor_bits)
-    except ImageError as error:
-        return f"{error.got}; state the pixel value that is full scale"
+        return full_scale_of(name, raster, (), reading.full_scale, reading.sensor_bits)
+    except ImageError:
+        # Of integers only those of 8 bits leave it open.
+        return "8-bit pixels do not tell it; state the pixel value that is full scale"
 
 
 def place_words(raster: Raster) -> Mapping[str, str]:
@@ -129,13 +135,13 @@ def _crs_name(crs: Any) -> str:
     return f"EPSG:{code}" if code else "a coordinate system without a code"
 
 
-def time_here(network: Network, plan: Plan, options: Options) -> Figure:
+def time_here(network: Network, plan: Plan, engine: Engine) -> Figure:
     """The time of all tiles, from those timed here; reading and writing are done beside it.
 
     The interval is of the quickest and the slowest of the runs.
     """
-    at_once = tiles_at_once(options.threads, plan.tiles)
-    infer, runtime = open_runtime(options.runtime, network.model, options.threads)
+    at_once = tiles_at_once(engine.threads, plan.tiles)
+    infer, runtime = open_runtime(engine.runtime, network.model, engine.threads)
     shape = (1, plan.tiling.channels_in, *plan.tile_shape)
     tile = np.random.default_rng(0).random(shape, np.float32)
     # The first run also prepares the network, so it is not timed.
@@ -165,5 +171,5 @@ def time_on_board(network: Network, plan: Plan, target: TargetProfile) -> Figure
         tile_px = max(plan.tile_shape)
         prediction = predict_network(network, dpu_of(target), tile_px, step_px=step_px)
     except BeersError as error:
-        return unavailable("s", f"the cost model takes {error.expected}, got {error.got}")
+        return unavailable("s", f"no prediction by the cost model: {error}")
     return swath_latency(prediction, math.ceil(plan.tiles / prediction.batch))

@@ -14,9 +14,8 @@ import numpy as np
 import onnx
 import onnxruntime as ort
 
-from beers_deploy.export import float_model, require_tile
+from beers_deploy.float_onnx import float_model, require_tile
 from beers_deploy.model.exposure import brightened, factors_for
-from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.shipped import INT8, SENSOR, VARIANT, shipped_names
 from beers_deploy.network_files import (
     Conditioned,
@@ -24,7 +23,7 @@ from beers_deploy.network_files import (
     require_known,
     warn_outside,
 )
-from beers_deploy.profiles.errors import ModelError, OutsideRangeWarning, optional
+from beers_deploy.profiles.errors import ModelError, optional
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import BLIND
@@ -43,7 +42,7 @@ from beers_deploy.quant.reading.folding import OPSET
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.tiling.walk import Tiling, tiling_of
 from beers_deploy.quant.untrusted import times
-from beers_deploy.results import Input
+from beers_deploy.results import Input, Table
 
 if TYPE_CHECKING:
     import torch
@@ -71,6 +70,7 @@ class Network:
         file_sha256: of the file as it was read; empty of one that is in memory alone.
         weights: of a network that is conditioned on its sensor: what it was made from.
         profile: the sensor that such a network is conditioned on.
+        table: what `quantize` reports of it.
 
     Examples:
         >>> bd.Network.load("convbeers-s-int8").precision
@@ -86,6 +86,7 @@ class Network:
     file_sha256: str = ""
     weights: Conditioned | None = None
     profile: Sensor | None = None
+    table: "Table | None" = None
 
     @classmethod
     def load(
@@ -126,7 +127,9 @@ class Network:
             weights = conditioned(path)
             if weights is not None:
                 in_int8 = path.name.endswith(INT8) if int8 is None else int8
-                return cls.for_sensor(weights, Sensor.load(sensor), int8=in_int8, log=_warn)
+                profile = Sensor.load(sensor)
+                warn_outside(profile, weights.kernels)
+                return cls.for_sensor(weights, profile, int8=in_int8)
             to_run = to_run or path.suffix == ".safetensors"
             with unchanged(path) as digest:
                 model = float_model(path) if to_run else load_onnx(path, to_run=False)
@@ -134,21 +137,17 @@ class Network:
         return cls(exported(network, example), type(network).__name__)
 
     @classmethod
-    def for_sensor(
-        cls, weights: Conditioned, sensor: Sensor, *, int8: bool, log: Log = no_log
-    ) -> "Network":
+    def for_sensor(cls, weights: Conditioned, sensor: Sensor, *, int8: bool) -> "Network":
         """Return a network conditioned on a sensor.
 
         Args:
             weights: of the network.
             sensor: of which the middle of each range counts.
             int8: whether in INT8 or in float32.
-            log: is told what of the sensor lies outside the range that was trained.
 
         Raises:
             ModelError: INT8 of weights that have no INT8 file.
         """
-        warn_outside(sensor, weights.kernels, log)
         name = f"{weights.name}{INT8}" if int8 else weights.name
         return cls(weights.model(sensor, int8), name, weights=weights, profile=sensor)
 
@@ -162,7 +161,6 @@ class Network:
         if self.weights is None or self.profile is None:
             return {}
         int8 = self.precision == "int8"
-        # Nobody chose the sensors of the other exposures, so their warnings are not logged.
         return {
             factor: Network.for_sensor(self.weights, brightened(self.profile, factor), int8=int8)
             for factor in factors_for(self.profile.nominal())
@@ -269,9 +267,10 @@ def other_precision(network: Network) -> Network | None:
 def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
     """A module of torch as ONNX, for any number and size of images."""
     if not hasattr(module, "state_dict"):
-        expected = "a Network, a ModelProto, a torch.nn.Module, a file or a shipped name"
-        remedy = "give one of these"
-        raise ModelError("network", expected=expected, got=type(module).__name__, remedy=remedy)
+        raise ModelError(
+            "`network` must be a Network, a ModelProto, a torch.nn.Module, a file or a shipped "
+            f"name, got {type(module).__name__}."
+        )
     torch = optional("torch", "network")
     free = {name: {0: "N", 2: "H", 3: "W"} for name in ("image", "restored")}
     stream = io.BytesIO()
@@ -287,17 +286,12 @@ def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
             )
         # The code of a module may raise anything.
         except Exception as error:
-            got = " ".join(str(error).split())[:160]
-            remedy = f"check that it takes an image {times(example)}, or give example=(N, C, H, W)"
-            expected = "a module that torch exports"
+            reason = " ".join(str(error).split())[:160]
             raise ModelError(
-                type(module).__name__, expected=expected, got=got, remedy=remedy
+                f"torch cannot export the module {type(module).__name__}: {reason}. Check that it "
+                f"accepts an image of {times(example)}, or give example=(N, C, H, W)."
             ) from error
         finally:
             # `eval` changed the caller's own module.
             module.train(training)
     return read_onnx(stream.getvalue(), type(module).__name__)
-
-
-def _warn(sentence: str) -> None:
-    warnings.warn(sentence, OutsideRangeWarning, stacklevel=4)

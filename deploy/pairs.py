@@ -4,10 +4,10 @@ would have seen.
 
 import json
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,19 +15,11 @@ from beers_deploy.model.io.files import write_text
 from beers_deploy.model.io.pictures import picture_url, stretch_of
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.model.raster.writer import write_tiff
-from beers_deploy.model.shipped import SENSOR
-from beers_deploy.network import SensorLike
-from beers_deploy.profiles.errors import ImageError, OptionError
-from beers_deploy.profiles.scene_call import calling_for, load_scene_call
+from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument, Sensor, require_same_units
 
 if TYPE_CHECKING:
     from beers_deploy.model.simulator.sampling import Scene
-
-LARGEST_PX = 4096
-"""The largest side that is simulated at once; `beers-deploy simulate` writes
-data sets of any size.
-"""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -76,10 +68,9 @@ class Pair:
     def _alike(self, image: np.ndarray) -> np.ndarray:
         pixels = np.asarray(image)
         if pixels.shape != self.reference.shape:
-            remedy = "compare images of one size"
-            got = f"an image of shape {pixels.shape}"
             raise ImageError(
-                "image", expected=f"one of shape {self.reference.shape}", got=got, remedy=remedy
+                f"`image` has the shape {pixels.shape}, but the reference has the shape "
+                f"{self.reference.shape}. Compare images of one size."
             )
         return pixels
 
@@ -111,56 +102,37 @@ class Pair:
         return "".join(pictures)
 
 
-def simulate(
-    scene: "str | os.PathLike[str] | np.ndarray | None" = None,
-    sensor: SensorLike = SENSOR,
-    *,
-    reference: SensorLike | None = None,
-    size: int = 512,
-    calls_for: str | os.PathLike[str] | None = None,
-    effects: Collection[str] = (),
-    seed: int = 0,
+def simulated_pair(
+    scene: Any,
+    degraded: Sensor,
+    reference: Sensor,
+    size_px: int,
+    radiance_scale: float,
+    ratio: int,
+    seed: int,
 ) -> Pair:
-    """Simulate what a sensor sees of a scene, and what a better one would have seen.
+    """Simulate what two sensors see of one scene.
 
     Args:
         scene: an image file or its pixels: 8 bits, 16-bit digital numbers, or float radiance in
             W/m2/sr/um; one is drawn if None.
-        sensor: of the degraded image; each of its ranges is drawn from.
-        reference: the sensor that is aimed at, in the digital numbers of `sensor`; None for the
-            shipped one.
-        size: side in pixels of the images of a drawn scene.
-        calls_for: what the scene calls for: the name of a shipped scene such as night-port, or a
-            .toml file.
-        effects: further effects by name, at typical values.
+        degraded: the sensor; each of its ranges is drawn from.
+        reference: the better sensor, which is converted to the digital numbers of `degraded`.
+        size_px: side of the images of a drawn scene.
+        radiance_scale: factor of the scene's radiance.
+        ratio: scene pixels for each pixel.
         seed: of every random draw.
 
     Raises:
         ImageError: a scene that cannot be read, or too small for the margin that the blur needs.
-        ProfileError: no such sensor or scene.
-        OptionError: no such effect, or a size that is not simulated at once.
-
-    Examples:
-        >>> degraded, reference = bd.simulate(sensor="pleiades-degraded", size=96, seed=1)
-        >>> degraded.shape, degraded.dtype
-        ((96, 96), dtype('uint16'))
     """
-    if not 1 <= size <= LARGEST_PX:
-        remedy = "give another, or simulate a data set with beers-deploy simulate"
-        raise OptionError(
-            "size", expected=f"1 to {LARGEST_PX} pixels", got=str(size), remedy=remedy
-        )
     from beers_deploy.model.simulator.acquire import acquire_three, prepare_scene
     from beers_deploy.model.simulator.detector import Draw, to_uint16
 
-    call = None if calls_for is None else load_scene_call(os.fspath(calls_for))
-    degraded = calling_for(Sensor.load(sensor), call, effects)
-    aim = degraded.reference if reference is None else Sensor.load(reference).in_units_of(degraded)
+    aim = reference.in_units_of(degraded)
     require_same_units(degraded, aim)
     draw = Draw(seed)
-    ratio = int(degraded.oversampling.low)
-    radiance_scale = call.radiance_scale.low if call else 1.0
-    radiance = _scene(scene, aim.nominal(), size, ratio, seed).radiance * radiance_scale
+    radiance = _scene(scene, aim.nominal(), size_px, ratio, seed).radiance * radiance_scale
     # Each sensor has a generator of its own: leaving one draw out does not change the others.
     instrument, aim_instrument = (
         profile.draw(draw.generator(f"sensor-{role}"))
@@ -173,7 +145,7 @@ def simulate(
 
 
 def _scene(
-    scene: "str | os.PathLike[str] | np.ndarray | None",
+    scene: Any,
     sensor: Instrument,
     size_px: int,
     ratio: int,

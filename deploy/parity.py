@@ -57,13 +57,13 @@ def require_parity(
     with np.errstate(invalid="ignore", over="ignore"):
         difference = float(np.abs(run(open_session(model), image) - expected).max())
     if not np.isfinite(difference):
-        expected_text = "finite pixels on a random image"
-        remedy = "train it again with a lower learning rate"
-        raise ModelError("network", expected=expected_text, got="NaN or infinity", remedy=remedy)
-    if difference > MAX_DIFFERENCE:
-        expected = f"at most {MAX_DIFFERENCE:g} of full scale from torch"
-        remedy = "report it: the export is wrong"
         raise ModelError(
-            "exported network", expected=expected, got=f"{difference:g}", remedy=remedy
+            "The network returns NaN or infinity for a random image. Train it again with a lower "
+            "learning rate."
+        )
+    if difference > MAX_DIFFERENCE:
+        raise ModelError(
+            f"The exported network differs from torch by {difference:g} of full scale, but at "
+            f"most {MAX_DIFFERENCE:g} is allowed. The export is wrong: report it."
         )
     return difference

@@ -1,29 +1,29 @@
-"""The one kind of document that commands write with --json: rows of figures that say where they
-come from.
+"""`Table`: what a verb found, with where each figure comes from.
+
+It is shown on a terminal, as HTML and as Markdown, and saved as one kind of JSON document.
 """
 
 import io
 import json
 import os
 import platform
-import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from html import escape
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from rich import table as rich_table
 from rich.console import Console
-from rich.measure import Measurement
-from rich.text import Text
 
 from beers_deploy import __version__
-from beers_deploy.frames import bars, figures_of, html_table, tidy_frame, wide_frame, words_of
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.processor import decided, processor_name
-from beers_deploy.profiles.errors import OptionError, encodable, one_line, printable, visible
-from beers_deploy.profiles.figures import Check, Figure, Row, by_table
+from beers_deploy.profiles.errors import OptionError, encodable, one_line, printable
+from beers_deploy.profiles.figures import Check, Row, by_table
+from beers_deploy.tables.columns import LEGEND
+from beers_deploy.tables.frames import bars, tidy_frame, wide_frame
+from beers_deploy.tables.html import html_table, html_text
+from beers_deploy.tables.markdown import markdown_table, markdown_text
+from beers_deploy.tables.terminal import PIPE_WIDTH, default_console, plain, print_rows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -35,14 +35,14 @@ SCHEMA_PATH = Path(__file__).parent / "schema" / "results-2.json"
 
 
 class Input(NamedTuple):
-    """What a figure rests on, by its name and SHA-256: of a network in memory, which is no file."""
+    """A file or a network that figures rest on, by its name and SHA-256."""
 
     name: str
     sha256: str
 
 
 def input_of(path: Path) -> Input:
-    """A file's name and digest."""
+    """Return the name and the digest of a file."""
     return Input(path.name, sha256(path))
 
 
@@ -58,43 +58,105 @@ def require_same(before: Iterable[Input], *paths: Path | None) -> None:
     # A file that is gone meanwhile has no digest, so the lists may differ in length.
     for then, now in zip(before, inputs_of(*paths), strict=False):
         if then != now:
-            expected = "a file that stays as it is"
-            remedy = "wait until it is written, then run this again"
             raise OptionError(
-                then.name, expected=expected, got="a change during this run", remedy=remedy
+                f"{then.name} changed during this run. Wait until it is written, then run this "
+                "again."
             )
 
 
 @dataclass(frozen=True, repr=False)
 class Table:
-    """The figures that one verb found, and where they come from: what `--json` writes and a
-    notebook shows.
+    """The figures of a verb, its checks, and where they come from.
+
+    A table is true if all its checks passed. Iterating over it yields its rows.
 
     Attributes:
         command: the verb.
-        arguments: what it was given.
+        arguments: of the verb.
         inputs: files and networks that the figures rest on.
         rows: the figures, each with its value, unit, mode, interval and source.
-        checks: of a verb that judges, its verdict.
-        notes: what a reader must know, a sentence each.
+        checks: what a verb judges; the command exits with 1 if one of them failed.
+        notes: sentences that a reader must know.
+        title: heading of the whole.
+        headings: the heading of each table of rows, if its name is not clear enough by itself.
+        details: tables, figures and words that are shown only in detail, by their names.
 
     Examples:
-        >>> table = bd.check("convbeers-xs-int8", "vck190")
+        >>> table = bd.check("convbeers-xs-int8", target="vck190")
         >>> table.save("check.json").name
         'check.json'
         >>> bool(table)
         True
     """
 
-    command: str
-    arguments: Mapping[str, object]
-    inputs: tuple[Path | Input, ...]
-    rows: tuple[Row, ...]
+    command: str = ""
+    arguments: Mapping[str, object] = field(default_factory=dict)
+    inputs: tuple[Path | Input, ...] = ()
+    rows: tuple[Row, ...] = ()
     checks: tuple[Check, ...] = ()
     notes: tuple[str, ...] = ()
+    title: str = ""
+    headings: Mapping[str, str] = field(default_factory=dict)
+    details: frozenset[str] = frozenset()
+
+    @property
+    def failed(self) -> tuple[Check, ...]:
+        """The checks that did not pass."""
+        return tuple(check for check in self.checks if not check.passed)
+
+    @property
+    def verdict(self) -> str:
+        """A sentence that says whether the checks passed; empty without checks."""
+        if not self.checks:
+            return ""
+        if self.failed:
+            reasons = "; ".join(map(str, self.failed))
+            return f"{self.command} FAILED, {len(self.failed)} of {len(self.checks)}: {reasons}"
+        return f"{self.command} passed, {len(self.checks)} of {len(self.checks)}"
+
+    def shown(self, details: bool = False) -> dict[str, list[Row]]:
+        """Return the rows of each table that is shown, by its heading.
+
+        Args:
+            details: whether to include what is for a closer look.
+        """
+        tables: dict[str, list[Row]] = {}
+        for name, rows in by_table(self.rows).items():
+            if details:
+                tables[self.headings.get(name, name)] = rows
+            elif name not in self.details:
+                tables[self.headings.get(name, name)] = [self._short(row) for row in rows]
+        return tables
+
+    def _short(self, row: Row) -> Row:
+        """Return a row without its details."""
+        figures = {key: figure for key, figure in row.figures.items() if key not in self.details}
+        text = {word: words for word, words in row.text.items() if word not in self.details}
+        return Row(row.table, row.name, figures, text)
+
+    def print(self, console: Console | None = None, details: bool = False) -> None:
+        """Print the tables, checks and notes.
+
+        Args:
+            console: of rich; standard output if None.
+            details: whether to include what is for a closer look.
+        """
+        console = console or default_console()
+        if self.title:
+            console.print(plain(self.title), style="bold", highlight=False)
+        tables = self.shown(details)
+        for heading, rows in tables.items():
+            print_rows(heading if heading != self.title else "", rows, console)
+        if any(row.figures for rows in tables.values() for row in rows):
+            console.print(LEGEND, style="dim", highlight=False, markup=False)
+        for check in self.checks:
+            word = "ok    " if check.passed else "FAILED"
+            console.print(plain(f"{word} {check}"), highlight=False)
+        for sentence in filter(None, (*self.notes, self.verdict)):
+            console.print(plain(sentence), highlight=False)
 
     def to_dict(self) -> dict[str, object]:
-        """The whole as the schema of results documents wants it."""
+        """Return the table as the schema of results documents wants it."""
         inputs = [item if isinstance(item, Input) else input_of(item) for item in self.inputs]
         checks = [check.to_json() for check in self.checks]
         verdict = "passed" if self else "failed"
@@ -121,13 +183,26 @@ class Table:
         # The name of a file may hold bytes of another encoding, which UTF-8 cannot hold.
         return {key: _encodable(value) for key, value in document.items()}
 
+    def to_json(self) -> str:
+        """Return `to_dict` as JSON."""
+        return json.dumps(self.to_dict(), indent=1) + "\n"
+
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write `to_dict` as a JSON file, whole or not at all."""
-        write_text(Path(path), json.dumps(self.to_dict(), indent=1) + "\n")
+        """Write the table as a JSON file, whole or not at all, and return its path."""
+        write_text(Path(path), self.to_json())
         return Path(path)
 
+    def to_markdown(self) -> str:
+        """Return the tables, checks and notes as Markdown."""
+        lines: list[str] = []
+        for heading, rows in self.shown().items():
+            lines += [f"## {markdown_text(heading)}", "", *markdown_table(rows), ""]
+        sentences = [*map(str, self.checks), *self.notes]
+        lines += [f"- {markdown_text(sentence)}" for sentence in sentences]
+        return "\n".join(lines).rstrip() + "\n"
+
     def to_pandas(self, tidy: bool = False) -> "pd.DataFrame":
-        """The figures as a pandas DataFrame.
+        """Return the figures as a pandas DataFrame.
 
         Args:
             tidy: one line a figure with value, unit, mode, low, high and source. Otherwise one line
@@ -140,7 +215,7 @@ class Table:
         return tidy_frame(self.rows) if tidy else wide_frame(self.rows)
 
     def plot(self, figure: str | None = None, ax: "Axes | None" = None) -> "Axes":
-        """Bars of one figure of every row that has it, with its interval, coloured by mode.
+        """Draw bars of one figure of every row that has it, with its interval, coloured by mode.
 
         Args:
             figure: its name; the first that any row has if None.
@@ -159,7 +234,7 @@ class Table:
         return len(self.rows)
 
     def __bool__(self) -> bool:
-        return all(check.passed for check in self.checks)
+        return not self.failed
 
     def __repr__(self) -> str:
         names = ", ".join(row.name for row in self.rows[:3]) + (
@@ -168,24 +243,22 @@ class Table:
         return f"{type(self).__name__}({self.command}: {len(self.rows)} rows: {printable(names)})"
 
     def __str__(self) -> str:
-        """Return all tables as the commands print them, and the notes."""
+        """Return what `print` prints, without colours."""
         stream = io.StringIO()
-        for name, rows in by_table(self.rows).items():
-            print_rows(name, rows, Console(file=stream, width=PIPE_WIDTH, force_jupyter=False))
-        lines = [line.rstrip() for line in stream.getvalue().splitlines()]
-        return "\n".join([*lines, *map(one_line, self.notes)])
+        self.print(Console(file=stream, width=PIPE_WIDTH, force_jupyter=False))
+        return "\n".join(line.rstrip() for line in stream.getvalue().splitlines())
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: each table, the source of a figure as its tooltip."""
-        return "".join(
-            html_table(name, rows) for name, rows in by_table(self.rows).items()
-        ) + "".join(f"<p>{escape(visible(note))}</p>" for note in self.notes)
+        """Return what a notebook shows: each table, checks and notes."""
+        tables = [html_table(heading, rows) for heading, rows in self.shown().items()]
+        sentences = [*map(str, self.checks), *self.notes, self.verdict]
+        return "".join(tables) + "".join(
+            f"<p>{html_text(one_line(sentence))}</p>" for sentence in sentences if sentence
+        )
 
 
 def host() -> dict[str, object]:
-    """What the measured figures were measured on, and what was asked of its kernels; None for what
-    is not told.
-    """
+    """Return the machine that measured figures were measured on; None for what is unknown."""
     import psutil
 
     return {
@@ -206,7 +279,6 @@ def _encodable(value: object) -> object:
     """Return a value of a document with text that any reader of JSON takes."""
     if isinstance(value, dict):
         return {encodable(key): _encodable(item) for key, item in value.items()}
-
     if isinstance(value, list):
         return [_encodable(item) for item in value]
     return encodable(value) if isinstance(value, str) else value
@@ -214,153 +286,3 @@ def _encodable(value: object) -> object:
 
 def _plain(value: object) -> object:
     return value if isinstance(value, str | int | float | bool | type(None)) else str(value)
-
-
-COLOURS = {"measured": "green", "predicted": "yellow", "published": "blue"}
-LEGEND = "measured: here; predicted: by a model, with its [interval]; published: in a document"
-PIPE_WIDTH = 200
-"""Columns when the output is no terminal: nothing is cut."""
-
-
-def print_rows(title: str, rows: Iterable[Row], console: Console | None = None) -> None:
-    """Print the rows of one table, reasons for missing figures below it.
-
-    One line a row; or, where there are more figures than rows, one line a figure. Where a terminal
-    is too narrow for either, one line a figure of each row: no number is ever cut or broken.
-    """
-    rows = list(rows)
-    console = console or default_console()
-    keys = figures_of(rows)
-    table = by_figure(rows, keys) if len(keys) > len(rows) else by_row(rows, keys)
-    # On its own console, the least width of a table never exceeds the console's.
-    wide_options = console.options.update(width=PIPE_WIDTH)
-    if Measurement.get(console, wide_options, table).minimum > console.width:
-        table = one_by_one(rows)
-    table.title = plain(title)
-    table.title_justify = "left"
-    console.print(table)
-    if keys:
-        console.print(LEGEND, style="dim", highlight=False, markup=False)
-    for reason in missing(rows):
-        console.print(plain(reason), style="dim")
-
-
-def default_console() -> Console:
-    """Standard output, wide enough for whole tables when it is a file or a pipe."""
-    console = Console()
-    return console if console.is_terminal else Console(width=PIPE_WIDTH)
-
-
-def plain(text: str) -> Text:
-    """Return words as they are, on one line: no markup, and nothing that a terminal would obey."""
-    return Text(one_line(text))
-
-
-MARKUP = re.compile(r"[\\`*_\[\]<>&|]")
-"""Characters that Markdown reads as markup within a line or a cell, or as the end of a cell."""
-
-
-def markdown_text(text: str) -> str:
-    """Return text on one line that Markdown shows as it is: a layer's name comes from the network's
-    file.
-    """
-    return MARKUP.sub(lambda match: f"\\{match[0]}", one_line(text))
-
-
-def by_row(rows: list[Row], keys: list[str]) -> rich_table.Table:
-    """One line a row; the units in the header, and the mode where it is that of
-    the whole column.
-    """
-    table = rich_table.Table("")
-    words = words_of(rows)
-    for key in keys:
-        mode = common_mode(key, rows)
-        about = ", ".join(filter(None, (unit_of(key, rows), mode)))
-        table.add_column(
-            Text("\n").join(map(plain, (key, f"({about})") if about else (key,))), justify="right"
-        )
-    for word in words:
-        table.add_column(plain(word), overflow="fold")
-    for row in rows:
-        figures = [cell(row.figures.get(key), common_mode(key, rows)) for key in keys]
-        table.add_row(plain(row.name), *figures, *(plain(row.text.get(word, "")) for word in words))
-    return table
-
-
-def by_figure(rows: list[Row], keys: list[str]) -> rich_table.Table:
-    """One line a figure, the rows side by side; its mode in a column where it
-    is that of them all.
-    """
-    table = rich_table.Table("", "unit", "mode")
-    for row in rows:
-        table.add_column(plain(row.name), justify="right", overflow="fold")
-    for key in keys:
-        mode = common_mode(key, rows)
-        figures = [cell(row.figures.get(key), mode) for row in rows]
-        table.add_row(plain(key), plain(unit_of(key, rows)), mode, *figures)
-    for word in words_of(rows):
-        table.add_row(plain(word), "", "", *(plain(row.text.get(word, "")) for row in rows))
-    return table
-
-
-def one_by_one(rows: list[Row]) -> rich_table.Table:
-    """One line a figure, row after row: the narrowest table."""
-    table = rich_table.Table("", "", "", "unit")
-    # Long text is folded, because no number may be cut.
-    table.columns[1].overflow = table.columns[2].overflow = "fold"
-    for row in rows:
-        figures = [
-            (plain(key), cell(figure, ""), plain(figure.unit))
-            for key, figure in row.figures.items()
-        ]
-        words = [(plain(word), plain(text), plain("")) for word, text in row.text.items()]
-        table.add_section()
-        for number, line in enumerate([*figures, *words] or [()]):
-            table.add_row(plain("" if number else row.name), *line)
-    return table
-
-
-def unit_of(key: str, rows: list[Row]) -> str:
-    """The unit of a column: that of all its figures; empty where they differ, as those of a
-    comparison.
-    """
-    # The rows of a comparison have figures of different units in one column.
-    units = {row.figures[key].unit for row in rows if key in row.figures}
-    return units.pop() if len(units) == 1 else ""
-
-
-def common_mode(key: str, rows: list[Row]) -> str:
-    """The mode of all figures of a column that there are; empty where they
-    differ or none is there.
-    """
-    modes = {
-        row.figures[key].mode
-        for row in rows
-        if key in row.figures and row.figures[key].value is not None
-    }
-    return modes.pop() if len(modes) == 1 else ""
-
-
-def cell(figure: Figure | None, said: str) -> Text:
-    """A figure, its mode behind it unless the table says it elsewhere; or nothing."""
-    if figure is None or figure.value is None:
-        return Text("" if figure is None else "-")
-    text = Text(str(figure), COLOURS[figure.mode])
-    return text if said else text.append(f" {figure.mode}")
-
-
-def missing(rows: list[Row]) -> list[str]:
-    """Why figures are unavailable: a line a reason."""
-    names: dict[tuple[str, str], list[str]] = {}
-    for row in rows:
-        for key, figure in row.figures.items():
-            if figure.value is None:
-                names.setdefault((key, figure.reason), []).append(row.name)
-    few = {
-        place: ", ".join(row_names) if len(row_names) < len(rows) / 2 else ""
-        for place, row_names in names.items()
-    }
-    return [
-        f"- {key}{f' of {few[key, reason]}' if few[key, reason] else ''}: {reason}"
-        for key, reason in names
-    ]

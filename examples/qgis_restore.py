@@ -1,8 +1,7 @@
-"""`beers-deploy restore` in QGIS's processing toolbox: Scripts, Add Script to Toolbox, then this
-file.
+"""`beers-deploy restore` in the processing toolbox of QGIS.
 
-QGIS has a Python of its own, and this tool another one: the program is started, nothing of it is
-imported. Names of methods are QGIS's
+Choose Scripts, Add Script to Toolbox, then this file. QGIS has a Python of its own, and this tool
+another one, so the script starts the program and imports nothing of it. Names of methods are QGIS's
 (https://docs.qgis.org/latest/en/docs/user_manual/processing/scripts.html).
 """
 
@@ -58,10 +57,10 @@ class RestoreImage(QgsProcessingAlgorithm):
         context: QgsProcessingContext,
         feedback: QgsProcessingFeedback,
     ) -> dict[str, Any]:
-        """Restore; the program's one sentence is the error of QGIS.
+        """Restore; the last line of the program's messages is the error of QGIS.
 
         Raises:
-            QgsProcessingException: the program refused, or is not there.
+            QgsProcessingException: the program ended with an error, or cannot be started.
         """
         image = self.parameterAsRasterLayer(parameters, IMAGE, context).source()
         out = self.parameterAsOutputLayer(parameters, OUT, context)
@@ -79,7 +78,7 @@ class RestoreImage(QgsProcessingAlgorithm):
             *(["--sensor", sensor] if sensor else []),
         ]
         feedback.pushCommandInfo(" ".join(command))
-        # QGIS tells its own Python where its modules lie; another Python must not look there.
+        # These variables hold the paths of QGIS's own Python. Another Python must not use them.
         environment = {
             key: value for key, value in os.environ.items() if not key.startswith("PYTHON")
         }
@@ -94,9 +93,12 @@ class RestoreImage(QgsProcessingAlgorithm):
             )
         except OSError as error:
             raise QgsProcessingException(
-                f"{program}: {error.strerror}; give its whole path"
+                f"{program} cannot be started: {error.strerror}. Give its whole path."
             ) from error
+        # Notes and warnings come on standard error, the figures on standard output.
+        lines = process.stderr.splitlines()
         if process.returncode:
-            raise QgsProcessingException(process.stderr)
-        feedback.pushInfo(process.stdout)
+            reason = lines[-1] if lines else f"{program} ended with {process.returncode}."
+            raise QgsProcessingException(reason)
+        feedback.pushInfo("\n".join([*lines, process.stdout]))
         return {OUT: out}

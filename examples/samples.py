@@ -28,8 +28,8 @@ from beers_deploy.model.training.looks import Look
 from beers_deploy.model.training.passes import Pass, Visited, detected, folded_signals, prepare
 from beers_deploy.model.training.patches import PatchRecipe, draw_turn
 from beers_deploy.model.training.source import PatchSource, cut, turned
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import BeersError, ImageError, OptionError
+from beers_deploy.profiles.sensor_file import load_sensor
 from examples.networks import NETWORKS
 
 BATCH = 8
@@ -122,12 +122,9 @@ def banded(scenes: Sequence[Scene], generator: np.random.Generator) -> Iterator[
     ready = [prepare(scene, math.lcm(*RECIPE.oversamplings)) for scene in scenes]
     passes = [pair for pair in product(ready, RECIPE.oversamplings) if _fits(*pair)]
     if not passes:
-        expected = f"images that hold a patch of {PATCH_PX} target pixels"
         raise ImageError(
-            "training images",
-            expected=expected,
-            got="none large enough",
-            remedy="give larger images",
+            f"None of the training images is large enough for a patch of {PATCH_PX} target pixels. "
+            "Give larger images."
         )
     while True:
         mixed = [passes[generator.integers(len(passes))] for _ in range(MIXED)]
@@ -214,9 +211,7 @@ def write_samples(name: str, count: int, out: Path, folder: Path | None, seed: i
     where it restores.
     """
     if out.suffix != ".npz":
-        raise OptionError(
-            "--out", expected="a name that ends in .npz", got=out.name, remedy="choose such a name"
-        )
+        raise OptionError(f"--out must be a name that ends in .npz, got {out.name}.")
     require_writable(out)
     batches = list(islice(batches_of(name, folder, seed), -(-count // BATCH)))
     image, reference = (

@@ -121,9 +121,7 @@ def run(
     print one line.
     """
     if out.suffix != ".onnx":
-        raise OptionError(
-            "--out", expected="a name that ends in .onnx", got=out.name, remedy="choose such a name"
-        )
+        raise OptionError(f"--out must be a name that ends in .onnx, got {out.name}.")
     weights = out.with_suffix(".safetensors")
     require_writable(out, weights)
     learnt, judged = (batches_of(name, folder, seed + k) for k, folder in enumerate(folders))

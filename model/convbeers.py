@@ -334,16 +334,10 @@ def _sources(small: Variant, large: Variant) -> dict[str, str | None]:
     factor = large.scale // small.scale
     fits = small.scale in (1, large.scale) and large.features % (small.features * factor**2) == 0
     if large.blocks < small.blocks or not fits:
-        expected = (
-            f"at most {large.blocks} blocks, of features that divide {large.features} at "
-            f"scale {large.scale}"
-        )
-        got = f"{small.blocks} blocks of {small.features} features at scale {small.scale}"
         raise ModelError(
-            "weights to start from",
-            expected=expected,
-            got=got,
-            remedy="start from a smaller network",
+            f"The weights to start from must have at most {large.blocks} blocks, and features that "
+            f"divide {large.features} at scale {large.scale}, but they have {small.blocks} blocks "
+            f"of {small.features} features at scale {small.scale}. Start from a smaller network."
         )
     places = [block * large.blocks // small.blocks for block in range(small.blocks)]
     origins = {f"body.{place}.": f"body.{block}." for block, place in enumerate(places)}

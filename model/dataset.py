@@ -7,6 +7,7 @@ which scenes.
 """
 
 import json
+import logging
 import multiprocessing
 import os
 import shutil
@@ -24,7 +25,6 @@ import numpy as np
 
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.manifest import DIGESTS, ROLES, Line, image_of, line_text, matching_lines
-from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.raster.images import site_of
 from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.model.shipped import SENSOR
@@ -37,6 +37,8 @@ from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.sensor import Instrument, Sensor, require_same_units, same_instrument
 from beers_deploy.profiles.sensor_file import reference_beside, sensor_from_json
 from beers_deploy.profiles.toml import parse_json, read_json
+
+logger = logging.getLogger(__name__)
 
 DRAWN_SIDE_PX = 3000
 SensorLike = Sensor | str | os.PathLike[str]
@@ -90,8 +92,7 @@ def plan_windows(recipe: DatasetRecipe) -> list[Window]:
         scene_windows = list(_scene_windows(recipe, index, len(windows)))
         if not scene_windows:
             side = ((recipe.patch_px or 1) + 2 * MARGIN_PX) * recipe.oversampling
-            expected = f"at least {side} scene pixels a side"
-            raise ImageError(str(path), expected=expected, got="less", remedy="leave it out")
+            raise ImageError(f"{path} has less than {side} scene pixels a side. Leave it out.")
         windows += scene_windows
     return windows
 
@@ -201,7 +202,6 @@ def write_dataset(
     resume: bool,
     tick: Callable[[int], None],
     pool: Executor | None = None,
-    log: Log = no_log,
 ) -> dict[str, float]:
     """Write a dataset of 12-bit TIFF patches and its manifest.
 
@@ -215,7 +215,6 @@ def write_dataset(
         resume: whether to go on with a dataset that the folder holds in part.
         tick: is told how many further patches are done.
         pool: makes them instead of processes here; only this process writes.
-        log: is told how many pairs of an earlier run do not match.
 
     Returns:
         patches, and the share of drawn SNR pairs that were impossible and drawn again.
@@ -225,7 +224,7 @@ def write_dataset(
     windows = plan_windows(recipe)
     manifest = out / "manifest.jsonl"
     parts = {out / "parts" / f"{chunk[0].number:08d}.jsonl": chunk for chunk in _chunks(windows)}
-    lines = _lines_left(recipe, out, windows, parts, log) if resume else {}
+    lines = _lines_left(recipe, out, windows, parts) if resume else {}
     waiting = {path: [w for w in chunk if w.number not in lines] for path, chunk in parts.items()}
     waiting = {path: chunk for path, chunk in waiting.items() if chunk}
     tick(len(lines))
@@ -273,10 +272,9 @@ def _lines_left(
     out: Path,
     windows: list[Window],
     parts: Mapping[Path, list[Window]],
-    log: Log,
 ) -> dict[int, str]:
-    """Return the lines of the pairs that an earlier run wrote and that match, by number; tell `log`
-    of the others.
+    """Return the lines of the pairs that an earlier run wrote and that match, by number; warn of
+    the others.
     """
     manifest = out / "manifest.jsonl"
     texts = matching_lines(out, (manifest, *parts))
@@ -291,9 +289,10 @@ def _lines_left(
         candidates = list(chain.from_iterable(begun))
     damaged = sum(window.number not in lines for window in candidates)
     if damaged:
-        log(
-            f"{damaged} of {len(candidates)} pairs do not match the digests in the manifest: they "
-            "are made again"
+        logger.warning(
+            "%d of %d pairs do not match the digests in the manifest: they are simulated again",
+            damaged,
+            len(candidates),
         )
     return lines
 
@@ -326,16 +325,18 @@ def _check_folder(recipe: DatasetRecipe, out: Path, resume: bool) -> None:
     if not path.exists():
         write_text(path, content)
         return
-    expected = "a folder without a dataset"
     present = path.read_bytes() if path.is_file() else b""
     # An editor or Git may have changed how its lines end.
     if present.replace(b"\r\n", b"\n") != content.encode():
         raise OptionError(
-            "out", expected=expected, got="another dataset", remedy="choose another folder"
+            f"`out` must be a folder without a dataset, but {out} holds another dataset. Choose "
+            "another folder."
         )
     if not resume:
-        remedy = "add `resume` or choose another folder"
-        raise OptionError("out", expected=expected, got="this dataset", remedy=remedy)
+        raise OptionError(
+            f"`out` must be a folder without a dataset, but {out} holds this dataset. Add `resume` "
+            "or choose another folder."
+        )
     if present != content.encode():
         write_text(path, content)
 
@@ -346,16 +347,17 @@ def _read_summary(path: Path) -> dict[str, float]:
         lines: list[Any] = [
             parse_json(line) for line in path.read_text(encoding="utf-8").split("\n") if line
         ]
+        if not lines:
+            raise ValueError("it is empty")
         rejected = sum(
             int(line[role]["rejected_snr_pairs"])
             for line, role in product(lines, ("degraded", "reference"))
         )
         return {"patches": len(lines), "rejected_share": rejected / (rejected + 2 * len(lines))}
     except (ArithmeticError, LookupError, OSError, TypeError, ValueError) as error:
-        got = " ".join(str(error).split())[:120]
-        remedy = "choose another folder"
+        reason = " ".join(str(error).split())[:120]
         raise OptionError(
-            str(path), expected="a dataset's manifest", got=got, remedy=remedy
+            f"{path} is not the manifest of a dataset: {reason}. Choose another folder."
         ) from error
 
 
@@ -390,9 +392,9 @@ def read_pairs_recipe(folder: Path) -> PairsRecipe | None:
         scenes = tuple(str(s["name"]) if "sha256" in s else None for s in raw["scenes"])
         sensors = {role: dict(raw[role]) for role in ("degraded", "reference")}
     except (LookupError, OSError, TypeError, ValueError) as error:
-        remedy = "make the pairs anew, or remove it and give `sensor`"
         raise OptionError(
-            str(path), expected="a dataset's recipe", got="another file", remedy=remedy
+            f"{path} is not the recipe of a dataset. Simulate the pairs again, or remove the file "
+            "and give `sensor`."
         ) from error
     profiles = {role: sensor_from_json(f"{path} {role}", raw) for role, raw in sensors.items()}
     return PairsRecipe(profiles["degraded"], profiles["reference"], scenes)
@@ -402,14 +404,13 @@ def profiles_for(
     sensor: SensorLike | None,
     reference: SensorLike | None,
     recipe: PairsRecipe | None,
-    say: Callable[[str], None],
 ) -> tuple[Sensor, Sensor]:
     """The profiles of degraded and reference images: the recipe's where there is one, else those
     named.
     """
     if recipe is None:
         degraded = Sensor.load(sensor or SENSOR)
-        return degraded, reference_beside(degraded, reference, say)
+        return degraded, reference_beside(degraded, reference)
     sensor_profile = Sensor.load(sensor) if sensor else None
     # A dataset's images are in the degraded sensor's units: so is its reference.
     reference_profile = None
@@ -422,8 +423,7 @@ def profiles_for(
 
 def _require_made_by(option: str, profile: Sensor | None, of_recipe: Sensor) -> None:
     if profile is not None and not same_instrument(profile, of_recipe):
-        expected = (
-            f"the sensor that made the pairs, {of_recipe.name} with the numbers in recipe.json"
+        raise OptionError(
+            f"`{option}` must be the sensor that made the pairs, {of_recipe.name} with the numbers "
+            f"in recipe.json, but it is {profile.name} with other numbers. Leave it out."
         )
-        got = f"{profile.name} with other numbers"
-        raise OptionError(option, expected=expected, got=got, remedy="leave it out")

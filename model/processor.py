@@ -175,7 +175,7 @@ def require_cores(option: str, asked: int) -> None:
     """
     cores = os.cpu_count() or 1
     if not 0 <= asked <= cores:
-        expected = f"0 to {cores}, the cores of this machine"
         raise OptionError(
-            option, expected=expected, got=str(asked), remedy="leave it out for the default"
+            f"`{option}` must be 0 to {cores}, the cores of this machine, got {asked}. Leave it "
+            "out for the default."
         )

@@ -1,10 +1,12 @@
 """Long work: its progress is shown, and Ctrl-C waits for a good moment.
 
-`steps` is a bar for work whose length is known, `progress` names one step after the other where it
-is not. On a terminal both are rich's, elsewhere plain lines, always on standard error. An interrupt
-arrives between two steps, never within one: a half-made update cannot be resumed.
+`steps` counts work whose length is known, `progress` names one step after the other where it is
+not, and `step` names a step from within. On a terminal and in Jupyter they are one bar of rich,
+elsewhere plain lines on standard error. An interrupt arrives between two steps, never within one: a
+half-made update cannot be resumed.
 """
 
+import logging
 import signal
 import sys
 import threading
@@ -20,16 +22,19 @@ from rich.console import Console
 
 from beers_deploy.profiles.errors import one_line
 
-Log = Callable[[str], None]
-"""Is told a sentence, or the name of a step, as the work goes on."""
+logger = logging.getLogger(__name__)
 
 LINE_EVERY_S = 5.0
 
 
 @dataclass(frozen=True)
 class Step:
-    """How far a piece of work is: what is done, how many steps of it, and of how many (None where
-    none can say).
+    """How far a piece of work is.
+
+    Attributes:
+        what: is being done.
+        done: number of steps that are done.
+        total: number of all steps, or None if that is unknown.
     """
 
     what: str
@@ -38,8 +43,8 @@ class Step:
 
 
 Progress = bool | Callable[[Step], None] | None
-"""How a caller wants to be told: a function, False for not at all, None or True for a bar or plain
-lines.
+"""How a caller wants to see progress: a function, False for not at all, None or True for a bar or
+plain lines.
 """
 
 _sink: ContextVar[Progress] = ContextVar("progress", default=None)
@@ -55,39 +60,69 @@ def reporting(wanted: Progress) -> Iterator[None]:
         _sink.reset(token)
 
 
+class Display:
+    """The one bar that is drawn, on which all work that runs has a line."""
+
+    bar: rich_progress.Progress | None = None
+
+
+def live_console() -> Console | None:
+    """Return the console of the bar that is drawn now, or None: other lines go through it."""
+    return Display.bar.console if Display.bar is not None else None
+
+
+@contextmanager
+def _task(label: str, total: int | None) -> Iterator[rich_progress.TaskID | None]:
+    """Add a line to the bar while a block runs; None where no bar is drawn."""
+    if _sink.get() not in (None, True) or not _shows_bars():
+        yield None
+        return
+    # Two bars at once would overwrite each other.
+    outer = Display.bar
+    bar = _new_bar() if outer is None else outer
+    if outer is None:
+        bar.start()
+        Display.bar = bar
+    task = bar.add_task(one_line(label), total=total)
+    try:
+        yield task
+    finally:
+        if outer is None:
+            Display.bar = None
+            bar.stop()
+        else:
+            bar.remove_task(task)
+
+
 def _shows_bars() -> bool:
-    """Whether there is a terminal or a notebook to draw on."""
+    """Return True if there is a terminal or a notebook to draw on."""
     console = Console(stderr=True)
     return console.is_terminal or console.is_jupyter
 
 
-def no_log(_: str) -> None:
-    """Tell nobody."""
-
-
-def once(log: Log) -> Log:
-    """Tells each sentence the first time alone: several networks of one sensor have the same to
-    say.
-    """
-    sentences = set[str]()
-
-    def tell(sentence: str) -> None:
-        if sentence not in sentences:
-            sentences.add(sentence)
-            log(sentence)
-
-    return tell
+def _new_bar() -> rich_progress.Progress:
+    # Without markup a name in brackets is shown as it is.
+    columns = (
+        rich_progress.TextColumn("{task.description}", markup=False),
+        rich_progress.BarColumn(),
+        rich_progress.MofNCompleteColumn(),
+        rich_progress.TimeElapsedColumn(),
+        rich_progress.TimeRemainingColumn(),
+    )
+    return rich_progress.Progress(*columns, console=Console(stderr=True), transient=True)
 
 
 class Steps:
     """Counts steps of one piece of work."""
 
-    def __init__(self, label: str, total: int, bar: rich_progress.Progress | None) -> None:
+    def __init__(
+        self, label: str, total: int, task: rich_progress.TaskID | None, nested: bool
+    ) -> None:
         self.label = label
         self.total = total
         self.done = 0
-        self._bar = bar
-        self._task = bar.add_task(label, total=total) if bar else None
+        self._task = task
+        self._nested = nested
         self._printed = time.monotonic()
 
     def advance(self, steps: int = 1, note: str = "") -> None:
@@ -97,61 +132,80 @@ class Steps:
         text = f"{self.label} {note}".strip()
         if callable(sink):
             sink(Step(text, self.done, self.total))
-        elif self._bar is not None and self._task is not None:
-            self._bar.update(self._task, completed=self.done, description=one_line(text))
-        elif sink is not False and (
-            time.monotonic() - self._printed > LINE_EVERY_S or self.done >= self.total
-        ):
+        elif self._task is not None and Display.bar is not None:
+            Display.bar.update(self._task, completed=self.done, description=one_line(text))
+        elif sink is not False and self._is_due():
             self._printed = time.monotonic()
             _line(f"{self.label}: {self.done}/{self.total} {note}".rstrip())
+
+    def _is_due(self) -> bool:
+        """Return True if a plain line is due: now and then, and at the end of outer work."""
+        if time.monotonic() - self._printed > LINE_EVERY_S:
+            return True
+        return self.done >= self.total and not self._nested
 
 
 @contextmanager
 def steps(label: str, total: int) -> Iterator[Steps]:
     """Show the progress of `total` steps while the block runs."""
-    if _sink.get() not in (None, True) or not _shows_bars():
-        yield Steps(label, total, None)
-        return
-    columns = (
-        rich_progress.BarColumn(),
-        rich_progress.MofNCompleteColumn(),
-        rich_progress.TimeRemainingColumn(),
-    )
-    with _bar(*columns) as bar:
-        yield Steps(label, total, bar)
+    with _task(label, total) as task:
+        nested = _nested.get()
+        token = _nested.set(True)
+        try:
+            yield Steps(label, total, task, nested)
+        finally:
+            _nested.reset(token)
+
+
+@dataclass
+class Work:
+    """Work whose steps are named one after the other."""
+
+    label: str
+    task: rich_progress.TaskID | None
+    done: int = 0
+
+
+_work: ContextVar[Work | None] = ContextVar("work", default=None)
+_nested: ContextVar[bool] = ContextVar("nested", default=False)
 
 
 @contextmanager
-def progress(label: str) -> Iterator[Log]:
-    """Show the name of each step that is begun while the block runs, and on a terminal the time
-    since it began.
-    """
+def progress(label: str) -> Iterator[None]:
+    """Show the steps that `step` names while the block runs."""
+    with _task(label, None) as task:
+        token = _work.set(Work(label, task))
+        within = _nested.set(True)
+        try:
+            yield
+        finally:
+            _nested.reset(within)
+            _work.reset(token)
+
+
+def step(name: str) -> None:
+    """Name the step that begins now, for whoever shows the progress of this work."""
+    logger.debug(name)
+    work = _work.get()
     sink = _sink.get()
+    if work is None or sink is False:
+        return
+    text = f"{work.label}: {name}"
     if callable(sink):
-        begun = iter(range(sys.maxsize))
-        yield lambda step: sink(Step(f"{label}: {step}", next(begun), None))
-    elif sink is False:
-        yield no_log
-    elif not _shows_bars():
-        yield lambda step: _line(f"{label}: {step}")
+        sink(Step(text, work.done, None))
+    elif work.task is not None and Display.bar is not None:
+        Display.bar.update(work.task, completed=work.done, description=one_line(text))
     else:
-        with _bar(rich_progress.TimeElapsedColumn()) as bar:
-            task = bar.add_task(label, total=None)
-            yield lambda step: bar.update(task, description=one_line(f"{label}: {step}"))
+        _line(text)
+    work.done += 1
 
 
 def _line(text: str) -> None:
     sys.stderr.write(f"{one_line(text)}\n")
 
 
-def _bar(*columns: rich_progress.ProgressColumn) -> rich_progress.Progress:
-    # Without markup a name in brackets is shown as it is.
-    words = rich_progress.TextColumn("{task.description}", markup=False)
-    return rich_progress.Progress(words, *columns, console=Console(stderr=True), transient=True)
-
-
 class Interrupt:
-    """Whether somebody asked to stop."""
+    """True in `asked` if somebody asked to stop."""
 
     asked = False
 

@@ -34,7 +34,8 @@ def shipped_names() -> list[str]:
 def shipped_weights(name: str) -> Path:
     """The shipped weights of that name."""
     if name not in shipped_names():
-        remedy = "give the file that 'beers-deploy train' wrote"
-        expected = f"shipped weights ({', '.join(shipped_names())})"
-        raise ModelError(f"weights {name}", expected=expected, got="none", remedy=remedy)
+        raise ModelError(
+            f"There are no shipped weights {name!r}, only {', '.join(shipped_names())}. Give one "
+            "of these, or the file that 'beers-deploy train' wrote."
+        )
     return SHIPPED / f"{name}.safetensors"

@@ -89,6 +89,5 @@ VARIANTS = {
 def variant_named(name: str) -> Variant:
     """The variant of that name."""
     if name not in VARIANTS:
-        expected = f"one of {', '.join(VARIANTS)}"
-        raise OptionError("variant", expected=expected, got=repr(name), remedy="choose one of them")
+        raise OptionError(f"`variant` must be one of {', '.join(VARIANTS)}, got {name!r}.")
     return VARIANTS[name]

@@ -1,6 +1,6 @@
 """The facts: what an instrument, a scene or a board is, and what a reported figure is.
 
-It imports nothing of ours.
+It imports nothing of ours, and offers no names of its own, so that `--help` loads no NumPy.
 
 - `sensor`, `effects`, `scene_call`: instruments and scenes, short TOML files that `sensor_file`
   reads;
@@ -9,9 +9,3 @@ It imports nothing of ours.
 - `constant`, `toml`: how such a file is read and checked, each number with its status and source;
 - `figures`: numbers with unit, mode and source; `errors`: what bad input becomes.
 """
-
-from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import load_sensor, sensor_names
-from beers_deploy.profiles.target import TargetProfile, load_target, target_names
-
-__all__ = ["Sensor", "TargetProfile", "load_sensor", "load_target", "sensor_names", "target_names"]

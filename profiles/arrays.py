@@ -38,9 +38,9 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
         # NumPy was called in a way that it does not know, whatever the file holds.
         raise
     except MemoryError:
-        raise ValueError("an array that does not fit into memory") from None
+        raise ValueError("an array does not fit into memory") from None
     # Each decompressor and the parser of NumPy's header raise classes of their own.
     except Exception as error:
         raise ValueError(
-            f"another file ({type(error).__name__}: {' '.join(str(error).split())[:80]})"
+            f"it has another format ({type(error).__name__}: {' '.join(str(error).split())[:80]})"
         ) from error

@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.errors import ProfileError, printable
 
 Status = Literal["published", "inferred", "measured", "assumed", "stated"]
 """published: in a document; measured: on the instrument; inferred: computed from such; assumed: our
@@ -64,9 +64,11 @@ def read_words(where: str, raw: object, known: Collection[str] = ()) -> Words:
     if not isinstance(value, list) or not all(
         isinstance(name, str) and name in (known or value) for name in value
     ):
-        expected = f"a list out of {', '.join(known)}" if known else "a list of names"
-        remedy = "correct the names; an empty list stands for none"
-        raise ProfileError(where, expected=expected, got=repr(value), remedy=remedy)
+        choices = f" out of {', '.join(known)}" if known else ""
+        raise ProfileError(
+            f"{where} must be a list of names{choices}, got {printable(repr(value))}. Correct the "
+            "names; an empty list stands for none."
+        )
     return Words(tuple(value), status, source)
 
 
@@ -88,13 +90,15 @@ def read_stated(where: str, raw: object) -> tuple[object, Status, str]:
     check_keys(where, raw, required={"value", "status", "source"})
     status = raw["status"]
     source = raw["source"]
-    remedy = "say where the number comes from"
     if status not in get_args(Status):
-        expected = "one of " + ", ".join(get_args(Status))
-        raise ProfileError(f"{where}.status", expected=expected, got=repr(status), remedy=remedy)
+        raise ProfileError(
+            f"{where}.status must be one of {', '.join(get_args(Status))}, got "
+            f"{printable(repr(status))}. State where the number comes from."
+        )
     if not isinstance(source, str) or not source.strip():
         raise ProfileError(
-            f"{where}.source", expected="a text naming a document", got=repr(source), remedy=remedy
+            f"{where}.source must be a text that names a document, got {printable(repr(source))}. "
+            "State where the number comes from."
         )
     return raw["value"], status, source
 
@@ -111,27 +115,20 @@ def check_keys(
     for key in raw:
         if key not in allowed:
             raise ProfileError(
-                where,
-                expected=f"the keys {', '.join(sorted(allowed))}",
-                got=f"{key!r}",
-                remedy=_rename(key, allowed),
+                f"{where} has the unknown key {printable(repr(key))}; it can have the keys "
+                f"{', '.join(sorted(allowed))}. {_rename(key, allowed)}."
             )
     for key in sorted(required - set(raw)):
-        raise ProfileError(
-            where,
-            expected=f"the key {key!r}",
-            got="none",
-            remedy="add it; a shipped profile shows how",
-        )
+        raise ProfileError(f"{where} has no key {key!r}. Add it; a shipped profile shows how.")
 
 
 def _rename(key: str, allowed: set[str]) -> str:
     """Point at the key that was meant: most often the same one with its unit."""
     similar = sorted(name for name in allowed if name.startswith(key) or key.startswith(name))
     return (
-        f"write {similar[0]!r} (the unit belongs to the name)"
+        f"Write {similar[0]!r} (the unit belongs to the name)"
         if similar
-        else "remove it or correct its spelling"
+        else "Remove it or correct its spelling"
     )
 
 
@@ -141,10 +138,7 @@ def _number(where: str, raw: object) -> Number:
     if isinstance(raw, list) and len(raw) == 2 and all(map(is_number, raw)) and raw[0] <= raw[1]:
         return (float(raw[0]), float(raw[1]))
     raise ProfileError(
-        where,
-        expected="a finite number or a range [low, high]",
-        got=repr(raw),
-        remedy="give one of the two",
+        f"{where} must be a finite number or a range [low, high], got {printable(repr(raw))}."
     )
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, get_type_hints
 import numpy as np
 
 from beers_deploy.profiles.constant import Constant, check_keys, read_constant
-from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.errors import ProfileError, printable
 
 if TYPE_CHECKING:
     from beers_deploy.profiles.sensor import Instrument
@@ -288,7 +288,7 @@ def read_effect(where: str, name: str, raw: object) -> Table:
     limits = TABLES[name].limits()
     if not isinstance(raw, Mapping):
         raise ProfileError(
-            where, expected=f"a table [{name}]", got=repr(raw), remedy="write it as one"
+            f"{where} must be a table, got {printable(repr(raw))}. Write it as [{name}]."
         )
     check_keys(where, raw, required=set(limits))
     table = {key: read_constant(f"{where} {key}", raw[key]) for key in limits}
@@ -296,10 +296,8 @@ def read_effect(where: str, name: str, raw: object) -> Table:
         low, high = limits[key]
         if not low <= constant.low <= constant.high <= high:
             raise ProfileError(
-                f"{where} {key}",
-                expected=f"{low:g} to {high:g}",
-                got=str(constant),
-                remedy="correct the value",
+                f"{where} {key} must be in the range {low:g} to {high:g}, but it is {constant}. "
+                "Correct the value."
             )
     return table
 

@@ -13,7 +13,6 @@ Each is also the built-in exception that a caller expects: ValueError, RuntimeEr
 A gate that fails is no error: its command exits with 1.
 """
 
-from functools import partial
 from importlib import import_module
 from traceback import walk_tb
 from typing import Any
@@ -24,15 +23,17 @@ CRASHED = 70
 LONGEST = 400
 """Characters of a file that a message shows at most."""
 
+LONGEST_MESSAGE = 2400
+"""Characters of a whole message at most."""
+
 
 class BeersError(Exception):
-    """Bad input: what was expected, what was got, and what to do about it.
+    """Bad input: a message for the person who gave it.
 
     Args:
-        where: the file, option or tensor at fault.
-        expected: what a sound input looks like.
-        got: what stood there instead.
-        remedy: what the user can do.
+        message: a sentence that says what is wrong, with the value and the file or the parameter,
+            and one that says what to do. Names of parameters stand in backquotes: the command line
+            replaces them by its options.
 
     Examples:
         >>> try:
@@ -42,21 +43,8 @@ class BeersError(Exception):
         ProfileError
     """
 
-    def __init__(self, where: str, *, expected: str, got: str, remedy: str) -> None:
-        super().__init__(
-            f"{printable(where)}: expected {printable(expected, 4 * LONGEST)}, got "
-            f"{printable(got)}; {remedy}."
-        )
-        self.where = where
-        self.expected = expected
-        self.got = got
-        self.remedy = remedy
-
-    def __reduce__(self) -> tuple[object, ...]:
-        """How it comes back from a worker process: an exception's own way knows no keywords."""
-        return partial(type(self), expected=self.expected, got=self.got, remedy=self.remedy), (
-            self.where,
-        )
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message, LONGEST_MESSAGE))
 
 
 def printable(text: str, longest: int = LONGEST) -> str:
@@ -130,12 +118,6 @@ class MissingExtraError(MachineError, ImportError):
     """An optional package that is not installed, and the extra that brings it."""
 
 
-class OutsideRangeWarning(UserWarning):
-    """A sensor that lies outside the range that a network was trained for; the command line prints
-    it as a line.
-    """
-
-
 CODE_FAULTS = (AttributeError, ImportError, NameError, TypeError)
 """What code raises that does not fit the version of a library.
 
@@ -158,12 +140,17 @@ EXTRAS = {
 
 
 def optional(package: str, where: str) -> Any:
-    """The module of an optional package, imported for `where`, the parameter or
-    verb that needs it.
+    """Import an optional package and return its module.
+
+    Args:
+        package: the name of the module to import.
+        where: the parameter or function that needs it.
+
+    Raises:
+        MissingExtraError: the package is not installed, or does not load.
     """
     try:
         return import_module(package)
-    # It is not there, or is there and cannot load what it needs.
     except ImportError as error:
         raise _without(package.split(".")[0], where, error) from error
 
@@ -189,6 +176,8 @@ def _imported(error: ImportError) -> str | None:
 
 
 def _without(package: str, where: str, error: ImportError) -> MissingExtraError:
-    got = "none" if error.name == package else f"one that does not load ({error})"
-    remedy = f"pip install 'beers-deploy[{EXTRAS[package]}]'"
-    return MissingExtraError(where, expected=f"the package {package}", got=got, remedy=remedy)
+    fault = "is not installed" if error.name == package else f"does not load ({error})"
+    return MissingExtraError(
+        f"`{where}` needs the package {package}, which {fault}. Run "
+        f"pip install 'beers-deploy[{EXTRAS[package]}]'."
+    )

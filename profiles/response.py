@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beers_deploy.profiles.constant import Constant, Status, check_keys, is_number, read_stated
-from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.errors import ProfileError, printable
 from beers_deploy.profiles.toml import unreadable
 
 NYQUIST = 0.5
@@ -231,10 +231,8 @@ def response_from_json(label: str, raw: object) -> Response:
     """
     if not isinstance(raw, Mapping):
         raise ProfileError(
-            label,
-            expected="a table or a point-spread function",
-            got=repr(raw),
-            remedy="make it anew",
+            f"{label} must be a table or a point-spread function, got {printable(repr(raw))}. "
+            "Generate the file again."
         )
     if "samples" not in raw:
         check_keys(label, raw, required={"frequency", "across", "along"})
@@ -255,14 +253,15 @@ def _stored_point_spread(label: str, raw: Mapping[str, Any]) -> PointSpread:
         if not all(
             type(side) is int and 1 <= side <= KEPT_SIDE for side in (point.height, point.width)
         ):
-            raise ValueError(f"{point.height!r} x {point.width!r} samples")
+            raise ValueError(f"it states {point.height!r} x {point.width!r} samples")
         samples = unpacked(point)
         if not (np.isfinite(samples).all() and samples.sum() > 0):
-            raise ValueError("samples that are not finite or have no sum above 0")
+            raise ValueError("they are not finite, or their sum is not above 0")
     except (TypeError, ValueError) as error:
-        expected = "the samples of a point-spread function, as they were stored"
-        remedy = "make the file again"
-        raise ProfileError(label, expected=expected, got=str(error), remedy=remedy) from error
+        raise ProfileError(
+            f"{label} does not hold the samples of a point-spread function as they were stored: "
+            f"{printable(str(error))}. Generate the file again."
+        ) from error
     return point
 
 
@@ -272,11 +271,9 @@ def _require_contrast(where: str, response: Response) -> None:
     for axis, contrast in zip(("across", "along"), response.at_nyquist, strict=True):
         if not 0 < contrast <= limit:
             raise ProfileError(
-                where,
-                expected=f"a contrast at Nyquist above 0 and up to {limit:.4f} (2/pi, the "
-                "square detector alone)",
-                got=f"{contrast:.4g} {axis} the track",
-                remedy="describe the whole system, its detector included, in target pixels",
+                f"{where} has a contrast of {contrast:.4g} at Nyquist {axis} the track, but it "
+                f"must be above 0 and at most {limit:.4f} (2/pi, the square detector alone). "
+                "Describe the whole system, its detector included, in target pixels."
             )
 
 
@@ -284,14 +281,12 @@ def _table(label: str, values: Mapping[str, Any]) -> MtfTable:
     frequency = _numbers(f"{label} frequency", values["frequency"])
     rising = all(after - before >= LEAST_STEP for before, after in pairwise(frequency))
     if not rising or frequency[0] != 0 or not NYQUIST <= frequency[-1] < 1:
+        order = "" if rising else " that are not ascending"
         raise ProfileError(
-            f"{label} frequency",
-            expected="cycles per pixel, ascending from 0 to 0.5 at least and below 1, the "
-            "detector's first zero",
-            got=f"{len(frequency)} from {frequency[0]:g} to {frequency[-1]:g}"
-            + ("" if rising else ", not ascending"),
-            remedy=f"give them in that order, in cycles per target pixel, {LEAST_STEP:g} apart "
-            "at least",
+            f"{label} frequency must be ascending from 0 to at least 0.5 and below 1 cycles per "
+            f"pixel (the detector's first zero), but it has {len(frequency)} values from "
+            f"{frequency[0]:g} to {frequency[-1]:g}{order}. Give them in that order, in cycles per "
+            f"target pixel, at least {LEAST_STEP:g} apart."
         )
     across = _contrasts(f"{label} across", values["across"], frequency)
     along = values.get("along")
@@ -305,22 +300,19 @@ def _table(label: str, values: Mapping[str, Any]) -> MtfTable:
 def _contrasts(where: str, raw: object, frequency: tuple[float, ...]) -> tuple[float, ...]:
     contrast = _numbers(where, raw)
     if len(contrast) != len(frequency) or contrast[0] != 1:
-        expected = f"{len(frequency)} contrasts, one for each frequency, the first of them 1"
-        got = f"{len(contrast)}, the first of them {contrast[0]:g}"
         raise ProfileError(
-            where, expected=expected, got=got, remedy="divide the table by its value at frequency 0"
+            f"{where} must have {len(frequency)} contrasts, one for each frequency and the first "
+            f"of them 1, but it has {len(contrast)}, the first of them {contrast[0]:g}. Divide the "
+            "table by its value at frequency 0."
         )
     for f, value in zip(frequency, contrast, strict=True):
         detector = float(np.sinc(f))
         if not 0 < value <= detector + READING:
             raise ProfileError(
-                where,
-                expected=f"a contrast above 0 and up to {detector:.4f} at {f:g} cycles per "
-                "pixel (sinc, the square "
-                "detector alone)",
-                got=f"{value:g}",
-                remedy="describe the whole system; zeros and reversed contrast need a "
-                "point-spread function, psf",
+                f"{where} has a contrast of {value:g} at {f:g} cycles per pixel, but it must be "
+                f"above 0 and at most {detector:.4f} there (sinc, the square detector alone). "
+                "Describe the whole system; zeros and reversed contrast need a point-spread "
+                "function, psf."
             )
     return contrast
 
@@ -328,9 +320,9 @@ def _contrasts(where: str, raw: object, frequency: tuple[float, ...]) -> tuple[f
 def _numbers(where: str, raw: object) -> tuple[float, ...]:
     numbers = raw if isinstance(raw, list | tuple) else []
     if not 2 <= len(numbers) <= MOST_FREQUENCIES or not all(map(is_number, numbers)):
-        expected = f"a list of 2 to {MOST_FREQUENCIES} finite numbers"
         raise ProfileError(
-            where, expected=expected, got=repr(raw), remedy="give one for each frequency"
+            f"{where} must be a list of 2 to {MOST_FREQUENCIES} finite numbers, one for each "
+            f"frequency, got {printable(repr(raw))}."
         )
     return tuple(map(float, numbers))
 
@@ -339,11 +331,11 @@ def _point_spread(label: str, values: Mapping[str, Any], folder: Path) -> PointS
     per_px = _samples_per_px(f"{label} psf_samples_per_px", values["psf_samples_per_px"])
     name = values["psf"]
     if not isinstance(name, str) or not _lies_within(folder, name):
-        expected = "the name of a file beside this one or in a folder beneath"
         raise ProfileError(
-            f"{label} psf", expected=expected, got=repr(name), remedy="copy it there"
+            f"{label} psf must be the name of a file in the profile's folder or below it, got "
+            f"{printable(repr(name))}. Copy the file there."
         )
-    where = f"{label} psf, {folder / name}"
+    where = f"{label} psf ({folder / name})"
     return _from_samples(where, _read_samples(where, folder / name), per_px)
 
 
@@ -358,9 +350,9 @@ def _lies_within(folder: Path, name: str) -> bool:
 def _samples_per_px(where: str, raw: Any) -> float:
     low, high = SAMPLES_PER_PX
     if not is_number(raw) or not low <= raw <= high:
-        expected = f"samples that make one target pixel, {low:g} to {high:g}"
         raise ProfileError(
-            where, expected=expected, got=repr(raw), remedy="resample the point-spread function"
+            f"{where} must be {low:g} to {high:g} samples per target pixel, got "
+            f"{printable(repr(raw))}. Resample the point-spread function."
         )
     return float(raw)
 
@@ -374,24 +366,24 @@ def _from_samples(where: str, samples: NDArray[np.float64], per_px: float) -> Po
     samples = samples / max(float(np.abs(samples).max()), 1e-300) if finite else samples
     total = float(samples.sum())
     if not finite or total <= 0:
-        got = f"a sum of {total:g}" if finite else "NaN or infinite ones"
-        remedy = "correct the file; a background must be taken off first"
+        fault = f"their sum is {total:g}" if finite else "some are NaN or infinite"
         raise ProfileError(
-            where, expected="finite samples whose sum is above 0", got=got, remedy=remedy
+            f"{where} must hold finite samples whose sum is above 0, but {fault}. Correct the "
+            "file; a background must be subtracted first."
         )
     shift_px = math.hypot(*centroid(samples)) / per_px
     if shift_px > OFF_CENTRE_PX:
-        expected = f"a centroid within {OFF_CENTRE_PX:g} target pixel of the middle"
-        remedy = "crop it around its centroid, and take its background off"
         raise ProfileError(
-            where, expected=expected, got=f"one {shift_px:.3g} pixels off", remedy=remedy
+            f"{where} must have its centroid within {OFF_CENTRE_PX:g} target pixel of the middle, "
+            f"but it lies {shift_px:.3g} pixels off. Crop the file around its centroid, and "
+            "subtract its background."
         )
     core = _trimmed(samples / total)
     if max(core.shape) > KEPT_SIDE:
-        expected = f"all but a millionth of the weight within {KEPT_SIDE} x {KEPT_SIDE} samples"
-        remedy = "crop it, or sample it more coarsely"
         raise ProfileError(
-            where, expected=expected, got=f"{core.shape[1]} x {core.shape[0]}", remedy=remedy
+            f"{where} must have all but a millionth of its weight within {KEPT_SIDE} x {KEPT_SIDE} "
+            f"samples, but it takes {core.shape[1]} x {core.shape[0]}. Crop it, or sample it more "
+            "coarsely."
         )
     return PointSpread(len(core), core.shape[1], per_px, packed(core))
 
@@ -412,12 +404,12 @@ def _trimmed(samples: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _read_samples(where: str, path: Path) -> NDArray[np.float64]:
     """The samples of a .npy file, (H, W)."""
-    reason = (
-        unreadable(path) if path.suffix.lower() == ".npy" else f"one that ends in {path.suffix!r}"
-    )
+    reason = unreadable(path) if path.suffix.lower() == ".npy" else f"it ends in {path.suffix!r}"
     if reason:
-        remedy = "check the path, which counts from the profile's folder"
-        raise ProfileError(where, expected="a .npy file", got=reason, remedy=remedy)
+        raise ProfileError(
+            f"{where} cannot be read as a .npy file: {reason}. Check the path, which is relative "
+            "to the profile's folder."
+        )
     try:
         # Mapped: nothing is read before its shape is known.
         samples = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -426,11 +418,12 @@ def _read_samples(where: str, path: Path) -> NDArray[np.float64]:
             or samples.dtype.kind not in "iuf"
             or not 1 <= min(samples.shape) <= max(samples.shape) <= FILE_SIDE
         ):
-            raise ValueError(f"{samples.dtype} of shape {samples.shape}")
+            raise ValueError(f"it is {samples.dtype} of shape {samples.shape}")
         return np.asarray(samples, np.float64)
     # The bytes of a damaged file may lead to anything.
     except Exception as error:
-        expected = f"one array of real numbers, (rows, columns), of at most {FILE_SIDE} a side"
-        got = str(error) or type(error).__name__
-        remedy = "crop it, leave one plane, and save it by numpy.save"
-        raise ProfileError(where, expected=expected, got=got, remedy=remedy) from error
+        reason = printable(str(error)) or type(error).__name__
+        raise ProfileError(
+            f"{where} is not one array of real numbers, (rows, columns), of at most {FILE_SIDE} a "
+            f"side: {reason}. Crop it, leave one plane, and save it with numpy.save."
+        ) from error

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from beers_deploy.profiles.constant import Constant, check_keys, read_constant
 from beers_deploy.profiles.effects import TABLES, Table, read_effect
-from beers_deploy.profiles.errors import OptionError, ProfileError
+from beers_deploy.profiles.errors import OptionError, ProfileError, printable
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.toml import HERE, read_toml, shipped_names
 
@@ -40,25 +40,20 @@ def load_scene_call(name: str) -> SceneCall:
     scale = read_constant(f"{label} radiance_scale", raw["radiance_scale"])
     if scale.low <= 0:
         raise ProfileError(
-            f"{label} radiance_scale", expected="above 0", got=str(scale), remedy="1 is a clear day"
+            f"{label} radiance_scale must be above 0, but it is {scale}. Give 1 for a clear day."
         )
     effects = {key: read_effect(f"{label} [{key}]", key, raw[key]) for key in TABLES if key in raw}
     without = raw.get("without", [])
     if not isinstance(without, list) or not all(
         isinstance(w, str) and w in TABLES for w in without
     ):
-        expected = f"a list out of {', '.join(TABLES)}"
         raise ProfileError(
-            f"{label} without", expected=expected, got=repr(without), remedy="correct the names"
+            f"{label} without must be a list of names out of {', '.join(TABLES)}, got "
+            f"{printable(repr(without))}. Correct the names."
         )
     if set(without) & set(effects):
         both = ", ".join(sorted(set(without) & set(effects)))
-        raise ProfileError(
-            label,
-            expected="an effect added or forbidden",
-            got=f"both for {both}",
-            remedy="drop one",
-        )
+        raise ProfileError(f"{label} both adds and forbids {both}. Remove one of the two.")
     return SceneCall(
         label.removesuffix(".toml"), str(raw["description"]), scale, effects, tuple(without)
     )
@@ -83,9 +78,9 @@ def calling_for(
     """
     for name in (*add, *forbid):
         if name not in TABLES:
-            names = ", ".join(TABLES)
             raise OptionError(
-                "effect", expected=f"one of {names}", got=repr(name), remedy="correct the name"
+                f"There is no effect {name!r}. Correct the name, which must be one of "
+                f"{', '.join(TABLES)}."
             )
     typical = typical_effects()
     effects = {**profile.effects, **(scene.effects if scene else {})}

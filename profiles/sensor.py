@@ -77,7 +77,8 @@ class Instrument:
     def __post_init__(self) -> None:
         if self.response is not None and not np.allclose(self.mtf_axes, self.response.at_nyquist):
             raise ValueError(
-                f"MTF {self.mtf_axes} at Nyquist beside a response of {self.response.at_nyquist}"
+                f"the MTF at Nyquist is {self.mtf_axes}, but the response has "
+                f"{self.response.at_nyquist} there"
             )
 
     @property
@@ -350,12 +351,10 @@ class Sensor:
         snr_0, snr_1 = self.snr_pair
         low, high = snr_0_bounds(self.radiance_0.low, self.radiance_1.low, snr_1.high)
         return ProfileError(
-            f"sensor profile {self.name}: noise.snr_0 and noise.snr_1",
-            expected=f"an SNR of {low:g} to {high:g} at {self.radiance_0} W/m2/sr/um for "
-            f"{snr_1.high:g} at "
-            f"{self.radiance_1} (variance alpha L + beta with alpha, beta >= 0)",
-            got=f"{snr_0}",
-            remedy="correct one of the two; both are linear ratios, not dB",
+            f"The sensor profile {self.name} has noise.snr_0 = {snr_0}, but with noise.snr_1 = "
+            f"{snr_1.high:g} at {self.radiance_1} W/m2/sr/um, the SNR at {self.radiance_0} must be "
+            f"{low:g} to {high:g} (variance alpha L + beta with alpha, beta >= 0). Correct one of "
+            "the two; both are linear ratios, not dB."
         )
 
 
@@ -372,10 +371,9 @@ def require_same_units(degraded: Sensor, reference: Sensor) -> None:
     """
     if degraded.units != reference.units:
         raise ProfileError(
-            f"sensor profile {reference.name}, the reference of {degraded.name}",
-            expected=describe_units(degraded),
-            got=describe_units(reference),
-            remedy="take the reference in the degraded sensor's units",
+            f"The sensor profile {reference.name}, the reference of {degraded.name}, must have "
+            f"{describe_units(degraded)}, but it has {describe_units(reference)}. Convert the "
+            "reference to the degraded sensor's units."
         )
 
 

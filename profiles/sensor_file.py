@@ -1,6 +1,7 @@
 """Sensor profiles as TOML files: found by name, read, and refused where no instrument can be so."""
 
 import json
+import logging
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -12,7 +13,7 @@ import numpy as np
 from beers_deploy.profiles.constant import Constant, Number, check_keys, read_constant
 from beers_deploy.profiles.effects import TABLES as EFFECT_TABLES
 from beers_deploy.profiles.effects import Table, read_effect
-from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.errors import ProfileError, printable
 from beers_deploy.profiles.response import (
     MtfTable,
     axes_of,
@@ -34,6 +35,8 @@ from beers_deploy.profiles.sensor import (
     table_keys,
 )
 from beers_deploy.profiles.toml import profile_path, read_toml, shipped_names
+
+logger = logging.getLogger(__name__)
 
 REFERENCE = "pleiades-reference"
 """The shipped profile of the image that restoration aims at, unless another is named."""
@@ -71,9 +74,10 @@ def with_numbers(sensor: Sensor, numbers: Mapping[str, Number]) -> Sensor:
     tables = tables_of(sensor)
     for key, value in numbers.items():
         if key not in TABLE_OF:
-            expected = f"one of {', '.join(TABLE_OF)}"
-            remedy = "correct the name"
-            raise ProfileError(where, expected=expected, got=repr(key), remedy=remedy)
+            raise ProfileError(
+                f"A sensor has no number {key!r}. Correct the name, which must be one of "
+                f"{', '.join(TABLE_OF)}."
+            )
         tables[TABLE_OF[key]][key] = list(value) if isinstance(value, tuple) else value
     # Noise is stated in one of two ways: numbers of the one replace those of the other.
     for stated, superseded in (
@@ -164,7 +168,8 @@ def sensor_from_json(label: str, raw: Mapping[str, Any]) -> Sensor:
     effects = raw.get("effects", {})
     if not isinstance(effects, Mapping):
         raise ProfileError(
-            label, expected="a table of effects", got=repr(effects), remedy="make it anew"
+            f"{label} effects must be a table, got {printable(repr(effects))}. Generate the file "
+            "again."
         )
     sensor = read_sensor(label, {"description": raw["description"], **tables, **effects})
     if raw.get("response") is not None:
@@ -216,7 +221,8 @@ def _read_table(label: str, table: str, content: object) -> Mapping[str, object]
     """The content of a table that is filled in one of its ways, and in no other."""
     if not isinstance(content, Mapping):
         raise ProfileError(
-            label, expected=f"a table [{table}]", got=repr(content), remedy="write it as one"
+            f"{label} {table} must be a table, got {printable(repr(content))}. Write it as "
+            f"[{table}]."
         )
     where = f"{label} [{table}]"
     ways = TABLES[table]
@@ -225,9 +231,11 @@ def _read_table(label: str, table: str, content: object) -> Mapping[str, object]
     telling = set(content) - {"radiance_0", "radiance_1"}
     begun = [way for way in ways if telling & {*way[0], *way[1]}]
     if len(begun) > 1:
-        expected = "one of " + ", or ".join(" and ".join(required) for required, _ in ways)
-        got = "keys of several: " + ", ".join(content)
-        raise ProfileError(where, expected=expected, got=got, remedy="keep one of them")
+        choices = ", or ".join(" and ".join(required) for required, _ in ways)
+        raise ProfileError(
+            f"{where} must have one of {choices}, but it has keys of several: "
+            f"{', '.join(content)}. Keep one of them."
+        )
     required, optional = begun[0] if begun else ways[0]
     check_keys(where, content, required=set(required), optional=set(optional))
     return content
@@ -244,46 +252,52 @@ def _check_single(
     single |= {f"[{OFFSET}] {key}": constant for key, constant in effects.get(OFFSET, {}).items()}
     for key, constant in single.items():
         if constant.low != constant.high:
-            remedy = "write a profile for each"
             raise ProfileError(
-                f"{label} {key}", expected="one number", got=f"a range, {constant}", remedy=remedy
+                f"{label} {key} must be one number, but it is the range {constant}. Write a "
+                "profile for each number."
             )
 
 
 Check = tuple[Callable[[float], bool], str, str]
 CONTRAST: Check = (
     lambda v: 0 < v <= MTF_NYQUIST_MAX,
-    f"a contrast above 0 and up to {MTF_NYQUIST_MAX:.4f} (2/pi, the square detector alone)",
-    "give a ratio, 0.07 for 7 %",
+    f"a contrast above 0 and at most {MTF_NYQUIST_MAX:.4f} (2/pi, the square detector alone)",
+    "Give a ratio, 0.07 for 7 %.",
 )
-SNR: Check = (lambda v: v > 0, "linear ratios above 0", "convert dB first")
+SNR: Check = (lambda v: v > 0, "a linear ratio above 0", "Convert dB first.")
 CHECKS: dict[str, Check] = {
-    "gsd_m": (lambda v: v > 0, "metres above 0", "give the ground sampling distance"),
+    "gsd_m": (lambda v: v > 0, "above 0 m", "Give the ground sampling distance."),
     "oversampling": (
         lambda v: v >= 1 and v == int(v),
-        "whole numbers from 1 on",
-        "give the number of scene pixels per sensor pixel",
+        "an integer of at least 1",
+        "Give the number of scene pixels per sensor pixel.",
     ),
     "mtf_nyquist": CONTRAST,
     "mtf_nyquist_along": CONTRAST,
     "snr_0": SNR,
     "snr_1": SNR,
-    "radiance_0": (lambda v: v > 0, "W/m2/sr/um above 0", "give the darker of two radiances"),
-    "radiance_1": (lambda v: v > 0, "W/m2/sr/um above 0", "give the brighter of two radiances"),
-    "alpha": (lambda v: v >= 0, "W/m2/sr/um, 0 or more", "the noise's variance is alpha L + beta"),
+    "radiance_0": (lambda v: v > 0, "above 0 W/m2/sr/um", "Give the darker of two radiances."),
+    "radiance_1": (lambda v: v > 0, "above 0 W/m2/sr/um", "Give the brighter of two radiances."),
+    "alpha": (
+        lambda v: v >= 0,
+        "0 or more, in W/m2/sr/um",
+        "The variance of the noise is alpha L + beta.",
+    ),
     "beta": (
         lambda v: v >= 0,
-        "(W/m2/sr/um)^2, 0 or more",
-        "the noise's variance is alpha L + beta",
+        "0 or more, in (W/m2/sr/um)^2",
+        "The variance of the noise is alpha L + beta.",
     ),
-    "bits": (lambda v: v in range(1, 17), "a whole number from 1 to 16", "give the bits per pixel"),
+    "bits": (lambda v: v in range(1, 17), "an integer from 1 to 16", "Give the bits per pixel."),
     "gain_dn_per_radiance": (
         lambda v: v > 0,
-        "DN per W/m2/sr/um above 0",
-        "give full-scale DN divided by full-scale radiance",
+        "above 0 DN per W/m2/sr/um",
+        "Give full-scale DN divided by full-scale radiance.",
     ),
 }
-"""What each constant may be, both ends of a range: in words, and what to do otherwise."""
+"""The test that both ends of each constant must pass, the same in words that follow "must be", and
+a sentence of advice.
+"""
 LEAST = 1e-12
 MOST = 1e12
 """Of any constant that is not 0: beyond lies no instrument, and powers of it no float."""
@@ -291,16 +305,17 @@ MOST = 1e12
 
 def _check_each(label: str, constants: Mapping[str, Constant]) -> None:
     for key, constant in constants.items():
-        valid, expected, remedy = CHECKS[key]
+        valid, allowed, advice = CHECKS[key]
         where = f"{label} [{TABLE_OF[key]}] {key}"
         if any(
             value and not LEAST <= abs(value) <= MOST for value in (constant.low, constant.high)
         ):
             raise ProfileError(
-                where, expected=f"{LEAST:g} to {MOST:g}", got=str(constant), remedy=remedy
+                f"{where} must have an absolute value of {LEAST:g} to {MOST:g}, but it is "
+                f"{constant}. {advice}"
             )
         if not (valid(constant.low) and valid(constant.high)):
-            raise ProfileError(where, expected=expected, got=str(constant), remedy=remedy)
+            raise ProfileError(f"{where} must be {allowed}, but it is {constant}. {advice}")
 
 
 def _check_noise(label: str, constants: Mapping[str, Constant]) -> None:
@@ -308,15 +323,13 @@ def _check_noise(label: str, constants: Mapping[str, Constant]) -> None:
     dark, bright = (constants[key].low for key in ("radiance_0", "radiance_1"))
     if not dark < bright:
         raise ProfileError(
-            f"{label} [noise] radiance_0",
-            expected=f"W/m2/sr/um below radiance_1, {bright:g}",
-            got=f"{dark:g}",
-            remedy="name the darker of the two points radiance_0",
+            f"{label} [noise] radiance_0 must be below radiance_1, {bright:g} W/m2/sr/um, but it "
+            f"is {dark:g}. Name the darker of the two points radiance_0."
         )
     if "alpha" in constants and constants["alpha"].high == constants["beta"].high == 0:
-        remedy = "give the variance of the dark as beta"
         raise ProfileError(
-            f"{label} [noise] alpha and beta", expected="not both 0", got="0 and 0", remedy=remedy
+            f"{label} [noise] alpha and beta must not both be 0. Give the variance in the dark as "
+            "beta."
         )
 
 
@@ -337,20 +350,18 @@ def _check_budget(label: str, profile: Sensor) -> None:
     if "antialias" not in profile.effects:
         return
     if profile.response is not None:
-        remedy = "remove it"
-        got = f"one beside the {profile.response}, which has it already"
-        raise ProfileError(f"{label} [antialias]", expected="no such table", got=got, remedy=remedy)
+        raise ProfileError(
+            f"{label} must have no table [antialias], because the {profile.response} already "
+            "includes the filter. Remove the table."
+        )
     sigma = profile.effects["antialias"]["sigma_px"]
     limit = mtf_limit(sigma.high)
     for key in ("mtf_nyquist", "mtf_nyquist_along"):
         mtf: Constant | None = getattr(profile, key)
         if mtf is not None and mtf.high > limit:
             raise ProfileError(
-                f"{label} [mtf] {key}",
-                expected=f"at most {limit:.4f}, what an anti-alias filter of {sigma.high:g} px "
-                "leaves",
-                got=str(mtf),
-                remedy="lower one of the two",
+                f"{label} [mtf] {key} must be at most {limit:.4f}, which an anti-alias filter of "
+                f"{sigma.high:g} px leaves, but it is {mtf}. Lower one of the two."
             )
 
 
@@ -366,17 +377,14 @@ def _check_snr(profile: Sensor) -> None:
         raise profile.impossible_snr()
 
 
-def reference_beside(
-    degraded: Sensor, named: "Sensor | str | os.PathLike[str] | None", say: Callable[[str], None]
-) -> Sensor:
-    """The reference profile that a user named, or the default one, in the digital numbers of
-    `degraded`.
-
-    One that was named, and states other ones, is converted in sight: `say` is told.
+def reference_beside(degraded: Sensor, named: "Sensor | str | os.PathLike[str] | None") -> Sensor:
+    """Return the reference profile that a user names, or the default one, in the digital numbers of
+    `degraded`; log if one that is named states other numbers.
     """
     profile = Sensor.load(named or REFERENCE)
     reference = profile.in_units_of(degraded)
     if named is not None and reference is not profile:
         units = f"{describe_units(degraded)}, as {degraded.name} has them"
-        say(f"note: the reference {profile.name} ({describe_units(profile)}) is taken at {units}")
+        own = describe_units(profile)
+        logger.info("the reference %s (%s) is converted to %s", profile.name, own, units)
     return reference

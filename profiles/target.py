@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Self
 
 from beers_deploy.profiles.constant import Constant, Words, check_keys, read_constant, read_words
-from beers_deploy.profiles.errors import OptionError, ProfileError
+from beers_deploy.profiles.errors import OptionError, ProfileError, printable
 from beers_deploy.profiles.target_limits import CONFIGURATIONS, check_limits
 from beers_deploy.profiles.toml import profile_path, read_toml, shipped_names
 
@@ -88,24 +88,23 @@ class TargetProfile:
         try:
             return self.tables[table][key]
         except KeyError:
-            got = "none"
-            remedy = "add it to the file"
             if table == "cost" and table not in self.tables:
-                got = "no cost constants yet"
-                remedy = "take those of a board with the same DPU: base = its name"
+                raise ProfileError(
+                    f"The target profile {self.name} has no [{table}] {key}, because it states no "
+                    "cost constants yet. Use those of a board with the same DPU: base = its name."
+                ) from None
             raise ProfileError(
-                f"target profile {self.name}", expected=f"[{table}] {key}", got=got, remedy=remedy
+                f"The target profile {self.name} has no [{table}] {key}. Add it to the file."
             ) from None
 
     def configuration(self, name: str | None = None) -> tuple[str, dict[str, Constant]]:
         """Name and constants of configuration `name`, or of the default one."""
         build = name or self.default_configuration
         if build is None or build not in self.configurations:
+            missing = "default configuration" if build is None else f"configuration {build!r}"
             raise ProfileError(
-                f"target profile {self.name}",
-                expected=f"a configuration out of {', '.join(self.configurations) or 'none'}",
-                got=repr(name),
-                remedy="choose one of them as `dpu`",
+                f"The target profile {self.name} has no {missing}. Choose one of its "
+                f"configurations as `dpu`: {', '.join(self.configurations) or 'none'}."
             )
         return build, self.configurations[build]
 
@@ -151,7 +150,7 @@ def load_target(name: str) -> TargetProfile:
     tables = {k: _table(f"{label} [{k}]", k, v) for k, v in raw.items() if k not in special}
     configurations = {
         k: _table(f"{label} [configurations.{k}]", CONFIGURATIONS, v)
-        for k, v in _mapping(label, raw.get("configurations", {})).items()
+        for k, v in _mapping(f"{label} configurations", raw.get("configurations", {})).items()
     }
     default = raw.get("default_configuration")
     activations = _whole_table(label, raw, "activations", PLACES)
@@ -185,12 +184,9 @@ def _with_base(label: str, raw: dict[str, object]) -> tuple[str, dict[str, objec
     if base is None:
         return label, raw
     if base not in target_names():
-        boards = ", ".join(board_names())
         raise ProfileError(
-            f"{label} base",
-            expected=f"one of {boards}",
-            got=repr(base),
-            remedy="name a shipped board",
+            f"{label} base must be a shipped board, one of {', '.join(board_names())}, got "
+            f"{printable(repr(base))}."
         )
     inherited = _with_base(*read_toml("targets", str(base)))[1]
     # Measured powers belong to one board, and no other board inherits them.
@@ -242,7 +238,8 @@ def _table(where: str, name: str, raw: object) -> dict[str, Constant]:
 def _mapping(where: str, raw: object) -> Mapping[str, object]:
     if not isinstance(raw, Mapping):
         raise ProfileError(
-            where, expected="a table of constants", got=repr(raw), remedy="write it as [table]"
+            f"{where} must be a table of constants, got {printable(repr(raw))}. Write it as "
+            "[table]."
         )
     return raw
 
@@ -250,7 +247,5 @@ def _mapping(where: str, raw: object) -> Mapping[str, object]:
 def require_side(tile_px: int) -> int:
     """The side of a tile, refused where it is none."""
     if tile_px < 1:
-        raise OptionError(
-            "tile", expected="pixels, 1 or more", got=str(tile_px), remedy="choose another"
-        )
+        raise OptionError(f"`tile` must be at least 1 px, got {tile_px} px. Choose another.")
     return tile_px

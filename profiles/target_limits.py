@@ -24,13 +24,8 @@ class Limits:
         """Return True if the key can have the value."""
         return self.low <= value <= self.high and not (self.whole and value % 1)
 
-    @property
-    def expected(self) -> str:
-        """What a message expects."""
-        return f"{self} that a board can have"
-
     def __str__(self) -> str:
-        kind = "a whole number" if self.whole else "a number"
+        kind = "an integer" if self.whole else "a number"
         least = "above 0" if self.low == SMALLEST else f"of at least {self.low:g}"
         return f"{kind} {least} and at most {self.high:g}"
 
@@ -178,6 +173,8 @@ def check_limits(where: str, table: str, constants: Mapping[str, Constant]) -> N
         allowed = limits.get(key, ANY_KEY.get(table))
         values = (constant.low, constant.high)
         if allowed is not None and not all(map(allowed.holds, values)):
-            got = " to ".join(dict.fromkeys(f"{value:.12g}" for value in values))
-            remedy = "correct it; the unit is in the name"
-            raise ProfileError(f"{where} {key}", expected=allowed.expected, got=got, remedy=remedy)
+            stated = " to ".join(dict.fromkeys(f"{value:.12g}" for value in values))
+            raise ProfileError(
+                f"{where} {key} must be {allowed}, but it is {stated}, which no board can have. "
+                "Correct it; the unit is in the name."
+            )

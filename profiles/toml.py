@@ -9,7 +9,7 @@ from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 
-from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.errors import ProfileError, printable
 
 TOML_BYTES = 1 << 16
 """The largest shipped profile takes a fifth of it."""
@@ -32,7 +32,7 @@ def read_toml_text(path: Path) -> dict[str, object]:
         raise ValueError(TOO_DEEP) from None
     # Python converts no more than 4300 digits, and its message names a setting of its own.
     except ValueError:
-        raise ValueError("a number of too many digits") from None
+        raise ValueError("a number has too many digits") from None
 
 
 def _line_at_fault(text: str, reason: str) -> str:
@@ -55,7 +55,7 @@ def read_json(path: Path) -> object:
 def parse_json(text: str) -> object:
     """Read JSON text as plain values of Python; raise ValueError with the reason if it is none."""
     if not text.strip():
-        raise ValueError("an empty file")
+        raise ValueError("it is an empty file")
     try:
         document: object = json.loads(
             text,
@@ -78,14 +78,14 @@ def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
     members = dict(pairs)
     if len(members) < len(pairs):
         twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
-        raise ValueError(f"the key {twice[:QUOTED]!r} twice")
+        raise ValueError(f"it has the key {twice[:QUOTED]!r} twice")
     return members
 
 
 def _number(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
-        raise ValueError(f"the number {text[:20]}")
+        raise ValueError(f"the number {text[:20]} is not finite")
     return value
 
 
@@ -101,7 +101,7 @@ def read_whole(path: Path, limit_bytes: int) -> bytes:
     if reason := unreadable(path):
         raise ValueError(reason)
     if status.st_size > limit_bytes:
-        raise ValueError(f"more than {limit_bytes} bytes")
+        raise ValueError(f"it has more than {limit_bytes} bytes")
     return path.read_bytes()
 
 
@@ -119,10 +119,10 @@ def unreadable(path: Path) -> str | None:
     except OSError as error:
         return error.strerror or str(error)
     if not stat.S_ISREG(mode):
-        return "a folder" if stat.S_ISDIR(mode) else "no regular file"
+        return "it is a folder" if stat.S_ISDIR(mode) else "it is not a regular file"
     with suppress(OSError), path.open("rb") as stream:
         if stream.read(len(LFS_POINTER)) == LFS_POINTER:
-            return "a pointer of Git LFS in place of the file, which 'git lfs pull' fetches"
+            return "it is a Git LFS pointer to the file, which 'git lfs pull' fetches"
     return None
 
 
@@ -145,19 +145,17 @@ def read_toml(kind: str, name: str) -> tuple[str, dict[str, object]]:
     names = shipped_names(kind)
     if not name.endswith(".toml") and name not in names:
         raise ProfileError(
-            f"profile {name!r}",
-            expected=f"one of {', '.join(names)}, or the path of a .toml file",
-            got=repr(name),
-            remedy="run 'beers-deploy profiles' to see them all",
+            f"There is no profile {printable(repr(name))}. Give one of {', '.join(names)}, or the "
+            "path of a .toml file; 'beers-deploy profiles' shows them all."
         )
     try:
         return path.name, read_toml_text(path)
     except OSError as error:
         reason = error.strerror or str(error)
         raise ProfileError(
-            str(path), expected="a readable file", got=reason, remedy="check the path"
+            f"{printable(str(path))} cannot be read: {reason}. Check the path."
         ) from error
     except ValueError as error:
         raise ProfileError(
-            str(path), expected="TOML text", got=str(error), remedy="correct that line"
+            f"{path} cannot be read as TOML: {printable(str(error))}. Correct it."
         ) from error

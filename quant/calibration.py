@@ -158,12 +158,10 @@ def _places(scenes: Sequence[Scene], recipe: PatchRecipe) -> list[tuple[Scene, i
         if min(scene.radiance.shape) >= side_px * ratio
     ]
     if not fitting:
-        expected = (
-            f"scenes that hold a patch of {recipe.patch_px} target pixels and {MARGIN_PX} around it"
-        )
-        remedy = "give larger images or a smaller patch"
         raise ImageError(
-            "calibration images", expected=expected, got="none large enough", remedy=remedy
+            "None of the calibration images is large enough for a patch of "
+            f"{recipe.patch_px} target pixels and {MARGIN_PX} around it. Give larger images or a "
+            "smaller patch."
         )
     return fitting
 

@@ -194,9 +194,9 @@ def build_core(
         faults = shift_faults(core, shifts)
         if not faults:
             return _with_biases_left(core, graph)
-    remedy = "look for weights that are far too large or small"
     raise ModelError(
-        "float model", expected="values that the DPU's shifts reach", got=faults[0], remedy=remedy
+        f"The DPU's shifts do not reach all values of the float network: {faults[0]}. Look for "
+        "weights that are far too large or small."
     )
 
 

@@ -91,11 +91,10 @@ def parts_of(name: str, result: np.ndarray, reference: np.ndarray) -> Parts:
     shape = (len(result), *result.shape[2:]) if metric.of_classes else result.shape
     # Of one channel the largest is always the same, so it tells no classes.
     if reference.size != math.prod(shape) or (metric.of_classes and result.shape[1] < 2):
-        kind = "numbers of classes" if metric.of_classes else "references"
-        expected = f"{kind} of {times(shape)}"
-        got = f"{times(reference.shape)} for results of {times(result.shape)}"
+        kind = "numbers of classes as references" if metric.of_classes else "references"
         raise OptionError(
-            "metric", expected=expected, got=got, remedy="give these, or another metric"
+            f"The `metric` {name!r} needs {kind} of {times(shape)} for results of "
+            f"{times(result.shape)}, got {times(reference.shape)}. Give these, or another metric."
         )
     return metric.parts(result, reference)
 
@@ -222,13 +221,10 @@ def compare(
         counts.add(degraded)
         results = [result_of(s, degraded) for s in (float_session, int8_session)]
         if results[0].shape != results[1].shape:
-            expected, got = (times(result.shape) for result in results)
-            remedy = "give the INT8 file that was made of this float network"
+            float_size, int8_size = (times(result.shape) for result in results)
             raise ModelError(
-                "INT8 network",
-                expected=f"results of {expected}, as in float",
-                got=got,
-                remedy=remedy,
+                f"The results of the INT8 network are {int8_size}, but those of the float network "
+                f"are {float_size}. Give the INT8 file that was made from this float network."
             )
         classes = [result.argmax(1) for result in results]
         # More channels than the image has are taken for classes.
@@ -260,7 +256,7 @@ def compare(
     if unfit_shapes and some_fit:
         # A mean over some of them would be NaN, and its check left out.
         name, shape = next(iter(unfit_shapes.items()))
-        raise unfit_reference(name, shape, "the PSNRs, as other samples have one")
+        raise unfit_reference(name, shape, "the PSNRs, because other samples have one")
     difference = np.concatenate(differences).astype(np.float64)
     degraded_db, float_db, int8_db = np.mean(errors, axis=0)
     return GateResult(
@@ -289,22 +285,20 @@ def _require_full_scale(name: str, reference: np.ndarray) -> None:
     low = float(reference.min())
     high = float(reference.max())
     if not (low >= 0 and high <= LARGEST):
-        got = f"{low:.4g} to {high:.4g}"
-        remedy = "divide it by full scale"
-        raise ImageError(name, expected="a reference with values in [0, 1]", got=got, remedy=remedy)
+        raise ImageError(
+            f"The reference of {name} must have values in [0, 1], but they are {low:.4g} to "
+            f"{high:.4g}. Divide it by full scale."
+        )
 
 
 def unfit_reference(name: str, shape: Sequence[int], wanted: str) -> ImageError:
     """Return the error of a reference of another size than the network's results, which `wanted`
     needs.
     """
-    expected = f"a reference of the results' size for {wanted}"
-    got = times(shape[1:]) if math.prod(shape) else "none"
+    fault = f"its reference has {times(shape[1:])}" if math.prod(shape) else "it has none"
     return ImageError(
-        name,
-        expected=expected,
-        got=got,
-        remedy="give references of that size for all samples, or none",
+        f"{name} must have a reference of the size of the network's results for {wanted}, but "
+        f"{fault}. Give references of that size for all samples, or none."
     )
 
 

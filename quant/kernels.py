@@ -30,8 +30,9 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.onnx_file import constants
-from beers_deploy.quant.untrusted import opset_of, refused
+from beers_deploy.quant.untrusted import opset_of
 
 INT16_MAX = 32767
 INT16_MIN = -32768
@@ -198,10 +199,11 @@ class _Rewriting:
             return [node]
         weight = self.arrays.get(node.input[places.weight])
         if weight is None:
-            got = f"{node.op_type} {node.name or node.output[0]!r} with computed weights"
-            remedy = "store its weights as constants, or run it on a processor with VNNI"
-            raise refused(
-                "INT8 model", "weights that are constants, which this processor needs", got, remedy
+            name = printable(repr(node.name or node.output[0]))
+            raise ModelError(
+                f"{node.op_type} {name} in the INT8 network has computed weights, but this "
+                "processor needs constant ones. Store them as constants, or run the network on a "
+                "processor with VNNI."
             )
         if weight.dtype != np.int8:
             return [node]

@@ -18,7 +18,13 @@ from onnx import numpy_helper
 
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.formats import HEAD_BYTES, other_format
-from beers_deploy.profiles.errors import BeersError, ModelError, OptionError
+from beers_deploy.profiles.errors import (
+    BeersError,
+    ModelError,
+    OptionError,
+    one_line,
+    printable,
+)
 from beers_deploy.profiles.toml import read_whole, unreadable
 from beers_deploy.quant.domains import functions_of, operator_name
 from beers_deploy.quant.reading.external import take_in
@@ -26,7 +32,9 @@ from beers_deploy.quant.reading.folding import IR_VERSION, OPSET, simplest
 from beers_deploy.quant.reading.training_mode import require_inference
 from beers_deploy.quant.untrusted import FILE_BYTES, check_content, check_runnable, opset_of
 
-REMEDY = "give an ONNX file, as 'beers-deploy export', 'beers-deploy quantize' or PyTorch writes it"
+REMEDY = (
+    "Give an ONNX file, as 'beers-deploy export', 'beers-deploy quantize' or PyTorch writes it."
+)
 
 
 def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
@@ -48,8 +56,10 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
     try:
         content = read_whole(path, FILE_BYTES)
     except (OSError, ValueError) as error:
-        got = unreadable(path) or " ".join(str(error).split())[:120]
-        raise ModelError(str(path), expected="an ONNX file", got=got, remedy=REMEDY) from error
+        reason = unreadable(path) or printable(" ".join(str(error).split()))
+        raise ModelError(
+            f"The network {printable(str(path))} cannot be read: {reason}. {REMEDY}"
+        ) from error
     return _simplest(parse_onnx(content, str(path), to_run, path), str(path), to_run)
 
 
@@ -79,9 +89,9 @@ def parse_onnx(
     lie beside it.
     """
     if not content:
-        raise ModelError(where, expected="an ONNX file", got="an empty file", remedy=REMEDY)
+        raise ModelError(f"{where} is an empty file. {REMEDY}")
     if other := other_format(content[:HEAD_BYTES]):
-        raise ModelError(where, expected="an ONNX file", got=other.name, remedy=other.remedy)
+        raise ModelError(f"{where} is not an ONNX file, but {other.name}: {other.remedy}.")
     try:
         model = onnx.ModelProto()
         model.ParseFromString(content)
@@ -93,27 +103,25 @@ def parse_onnx(
     except BeersError:
         raise
     except (DecodeError, onnx.checker.ValidationError, ValueError) as error:
-        got = " ".join(str(error).split())[:120] or "other bytes"
-        raise ModelError(where, expected="an ONNX file", got=got, remedy=REMEDY) from error
+        reason = printable(" ".join(str(error).split()) or "other bytes")
+        raise ModelError(f"{where} is not an ONNX file: {reason}. {REMEDY}") from error
     opset = opset_of(model)
     newest = onnx.defs.onnx_opset_version()
     if opset > newest:
-        expected = f"an ONNX opset of at most {newest}"
-        remedy = "export it for an older one"
-        raise ModelError(where, expected=expected, got=f"{opset}", remedy=remedy)
+        raise ModelError(
+            f"{where} has the ONNX opset {opset}, but {newest} is the newest that is supported. "
+            "Export it for an older one."
+        )
     if to_run:
         check_runnable(model, where)
     return model
 
 
 def require_onnx_name(*paths: Path | None) -> None:
-    """Refuse an output under whose name no program would look for a network."""
+    """Raise OptionError if the name of an output does not end in .onnx."""
     for path in paths:
         if path is not None and path.suffix.lower() != ".onnx":
-            remedy = "name it so"
-            raise OptionError(
-                str(path), expected="a name that ends in .onnx", got=path.name, remedy=remedy
-            )
+            raise OptionError(f"The name of the output must end in .onnx, got {path}.")
 
 
 def save_onnx(model: onnx.ModelProto, path: Path) -> None:
@@ -228,10 +236,9 @@ def fixed_tile_px(model: onnx.ModelProto) -> int | None:
         sizes = [d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim]
     if len(model.graph.input) != 1 or len(sizes) != 4 or sizes[2] != sizes[3]:
         raise ModelError(
-            "ONNX model",
-            expected="one input (N, C, H, W), of one side where it is fixed",
-            got=f"{sizes}",
-            remedy="export it with 'beers-deploy export'",
+            "The network must have one input (N, C, H, W), with H equal to W if they are fixed, "
+            f"got {len(model.graph.input)} of the sizes {sizes}. Export it with "
+            "'beers-deploy export'."
         )
     return sizes[2] or None
 
@@ -262,27 +269,25 @@ def is_quantised(model: onnx.ModelProto) -> bool:
     return any(mark in kind for kind, mark in product(kinds, marks))
 
 
-NAMELESS = "ONNX model", "float model", "tiled model", "INT8 core"
-"""What readers call a model in memory."""
-
-
 @contextmanager
 def faults_named(label: str) -> Iterator[None]:
-    """Give a model in memory its name in whatever is found to be wrong with it."""
+    """Put the name of a network in front of a ModelError that does not state it.
+
+    Functions that work on a model in memory do not know the name of its file.
+    """
     try:
         yield
     except ModelError as error:
-        if error.where not in NAMELESS:
+        if one_line(label) in str(error):
             raise
-        raise ModelError(
-            label, expected=error.expected, got=error.got, remedy=error.remedy
-        ) from error
+        raise ModelError(f"{label}: {error}") from error
 
 
 def require_quantised(model: onnx.ModelProto, name: str, wanted: bool) -> None:
-    """Refuse the float network in the place of the INT8 one, and the other way round."""
+    """Raise ModelError if the float and the INT8 network are swapped."""
     if is_quantised(model) != wanted:
-        expected = "an INT8 network" if wanted else "a float network"
-        got = "a float one" if wanted else "an INT8 one"
-        remedy = "give the float model first, the INT8 model second"
-        raise ModelError(name, expected=expected, got=got, remedy=remedy)
+        kinds = ("a float network", "an INT8 network")
+        raise ModelError(
+            f"{name} must be {kinds[wanted]}, but it is {kinds[not wanted]}. Give the float model "
+            "first, the INT8 model second."
+        )

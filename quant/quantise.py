@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import onnx
 
-from beers_deploy.model.progress import Log, no_log
+from beers_deploy.model.progress import step
 from beers_deploy.quant.core import (
     CANDIDATES,
     SHIFTS,
@@ -217,7 +217,6 @@ def quantise_model(
     shifts: Shifts = SHIFTS,
     tuning: "Tuning | None" = None,
     passes: Passes = ALL,
-    log: Log = no_log,
 ) -> Quantised:
     """Quantise a float network under the DPU's rules: int8, symmetric, per tensor, power-of-two
     scales.
@@ -233,7 +232,6 @@ def quantise_model(
         tuning: on what, how long and how fast the whole numbers are trained at last; None leaves
             them.
         passes: that reduce the error.
-        log: is told each step.
 
     Raises:
         ModelError: an operation that the DPU does not compute, or weights of no sensible size.
@@ -244,7 +242,7 @@ def quantise_model(
     ends = ends_of(network, 2 if finer else 1)
     equalised = streams(graph)
     plan = Plan(graph, ends, equalised, _chain(graph, ends, equalised), shifts, passes)
-    core, final, last_sum = rounded(plan, patches.degraded, log)
+    core, final, last_sum = rounded(plan, patches.degraded)
     # Only now: values of boxes that no object has would outweigh all others in the search.
     core = replace(core, ends=replace(core.ends, tail=network.tail))
     if tuning:
@@ -252,7 +250,7 @@ def quantise_model(
         from beers_deploy.quant.passes.tune import tune
 
         # Patches that hold few roofs would train the last sum's room away.
-        core, steps = tune(core, graph, tuning, still=last_sum, log=log)
+        core, steps = tune(core, graph, tuning, still=last_sum)
     about = {
         **metadata(model),
         "precision": "int8 legal",
@@ -312,16 +310,14 @@ def _errors(tensor: np.ndarray, first: int) -> np.ndarray:
     return np.asarray(np.sum([squared_errors(part, first) for part in parts], axis=0))
 
 
-def rounded(
-    plan: Plan, images: Remade[np.ndarray], log: Log = no_log
-) -> tuple[IntCore, Graph, frozenset[str]]:
+def rounded(plan: Plan, images: Remade[np.ndarray]) -> tuple[IntCore, Graph, frozenset[str]]:
     """A plan's graph in whole numbers, the float graph that was rounded, and the tensors of its
     last sum.
     """
-    log("scale of each tensor")
+    step("scale of each tensor")
     frac_bits = choose_frac_bits(plan.graph, images, plan.ends, plan.passes.least_squares)
     plan = plan.without_large_sums(frac_bits).with_windows(frac_bits[CORRECTION], images)
-    graph = _balanced(plan, frac_bits, images, log)
+    graph = _balanced(plan, frac_bits, images)
     paired = plan.paired(graph)
     last_sum = frozenset[str]()
     if paired is not graph:
@@ -329,7 +325,7 @@ def rounded(
         paired = with_room(paired, STREAM_STEP, images, plan.ends)
         last_sum = frozenset(paired[-2].inputs)
     final = plan.ended(paired)
-    log("rounding of the weights")
+    step("rounding of the weights")
     return _fitted(plan, final, plan.core(final, frac_bits), images), final, last_sum
 
 
@@ -338,7 +334,7 @@ def _fitted(plan: Plan, graph: Graph, core: IntCore, images: Remade[np.ndarray])
     return fit_weights(graph, core, images, plan.shifts) if plan.passes.fitted_weights else core
 
 
-def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray], log: Log) -> Graph:
+def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray]) -> Graph:
     """The plan's graph, its streams equalised, its chain levelled, and what gains by it stored from
     -128 on.
 
@@ -362,8 +358,8 @@ def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray],
 
     def searched(graph: Graph, copies: Copies) -> Graph:
         graph = plan.chain.scaled(graph, plan.chain.unscaled(frac_bits))
-        graph = _equalised(graph, plan, trial, images, log) if plan.streams else graph
-        graph = _levelled(graph, plan, trial, images, log, copies) if plan.chain.tensors else graph
+        graph = _equalised(graph, plan, trial, images) if plan.streams else graph
+        graph = _levelled(graph, plan, trial, images, copies) if plan.chain.tensors else graph
         shared = frac_bits | dict.fromkeys(plan.chain.tensors, STREAM_FRAC_BITS)
         # There are few of these trials, so each is judged with its weights fitted as in the end.
         return lower(graph, shared, fitted) if plan.passes.full_range_relu else graph
@@ -380,12 +376,12 @@ def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray],
 
 
 def _levelled(
-    graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray], log: Log, copies: Copies
+    graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray], copies: Copies
 ) -> Graph:
     """The graph, its chain levelled; what the image itself passes through clips nothing that
     calibration sees.
     """
-    log(f"equalising the channels of {len(plan.chain.tensors)} tensors")
+    step(f"equalising the channels of {len(plan.chain.tensors)} tensors")
     ranges = chain_ranges(graph, plan.chain, images, plan.ends)
     ranges = ranges_apart(ranges, plan.chain.parts, copies)
     factors = level(graph, plan.chain, ranges, np.ones(len(ranges)), trial)
@@ -397,15 +393,13 @@ def _levelled(
     return plan.chain.scaled(graph, FULL / np.maximum(largest, FULL))
 
 
-def _equalised(
-    graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray], log: Log
-) -> Graph:
+def _equalised(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray]) -> Graph:
     """Stream after stream, the others levelled by a first guess until their turn comes."""
     ranges = [channel_ranges(plan.graph, stream, images, plan.ends) for stream in plan.streams]
     for stream, stream_ranges in list(zip(plan.streams, ranges, strict=True))[1:]:
         graph = equalise(graph, stream, first_guess(stream_ranges, LEVELLING[0], 1.0))
     for number, stream in enumerate(plan.streams):
-        log(f"equalising the channels of residual stream {number + 1} of {len(plan.streams)}")
+        step(f"equalising the channels of residual stream {number + 1} of {len(plan.streams)}")
         # The search starts from the stream as it is in the float network.
         if number:
             graph = equalise(graph, stream, 1 / first_guess(ranges[number], LEVELLING[0], 1.0))

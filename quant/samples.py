@@ -21,7 +21,7 @@ import onnx
 from beers_deploy.model.io.files import IMAGE_SUFFIXES
 from beers_deploy.model.raster.images import read_pixels
 from beers_deploy.profiles.arrays import load_arrays
-from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
+from beers_deploy.profiles.errors import ImageError, ModelError, OptionError, printable
 from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.quant.onnx_file import fixed_tile_px
 from beers_deploy.quant.tiling.walk import tiling_of
@@ -89,7 +89,7 @@ HELD_OUT_EVERY = 4
 LARGEST = 1 + 1e-6
 LEAST_CONTRAST = 1 / MAX_DN
 FULL_SCALE_8 = 255
-REMEDY = "see docs/reference/any-network.md for how samples are given"
+REMEDY = "See docs/reference/any-network.md for how to give samples."
 
 
 def read_samples(
@@ -118,8 +118,8 @@ def read_samples(
         pairs = _cut(pixels, target, name, fixed_px, multiple_px)
         samples += [(name, pair) for pair in pairs]
     if not samples:
-        where = str(given) if isinstance(given, Path) else IN_MEMORY
-        raise ImageError(where, expected="at least one sample", got="none", remedy=REMEDY)
+        source = str(given) if isinstance(given, Path) else f"`{IN_MEMORY}`"
+        raise ImageError(f"{source} contains no sample, but at least one is needed. {REMEDY}")
     return _patches(samples)
 
 
@@ -154,15 +154,15 @@ def samples_in(given: object) -> list[Pair]:
         references = _plain(given[1])
         references = references[None] if np.ndim(given[0]) == 3 else references
         if references.ndim == 0 or len(images) != len(references):
-            got = f"images of {times(images.shape)} and references of {_shape(references)}"
             raise ImageError(
-                IN_MEMORY, expected="a reference for each image", got=got, remedy=REMEDY
+                f"`{IN_MEMORY}` must have a reference for each image, got images of "
+                f"{times(images.shape)} and references of {_shape(references)}. {REMEDY}"
             )
         return list(zip(images, references, strict=True))
     if not isinstance(given, Iterable) or isinstance(given, str | bytes | Mapping):
-        got = type(given).__name__
         raise ImageError(
-            IN_MEMORY, expected="arrays (N, C, H, W), or a path", got=got, remedy=REMEDY
+            f"`{IN_MEMORY}` must be arrays (N, C, H, W) or a path, got {type(given).__name__}. "
+            f"{REMEDY}"
         )
     # A DataLoader gives a batch as a list: of images and references, or of images alone.
     items = (tuple(item) if isinstance(item, list) and len(item) == 2 else item for item in given)
@@ -177,7 +177,7 @@ def _batch(array: Any) -> np.ndarray:
     batch = _plain(array)
     if batch.ndim not in (3, 4):
         raise ImageError(
-            IN_MEMORY, expected="a batch of (N, C, H, W)", got=times(batch.shape), remedy=REMEDY
+            f"`{IN_MEMORY}` must be a batch of (N, C, H, W), got {times(batch.shape)}. {REMEDY}"
         )
     return batch if batch.ndim == 4 else batch[None]
 
@@ -248,9 +248,7 @@ def _samples(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
             continue
         image, _ = _stored(file)
         if image.ndim != 3:
-            raise ImageError(
-                str(file), expected="one image (C, H, W)", got=_shape(image), remedy=REMEDY
-            )
+            raise ImageError(f"{file} must be one image (C, H, W), got {_shape(image)}. {REMEDY}")
         yield file.name, image, NO_REFERENCE
 
 
@@ -258,13 +256,11 @@ def _batch_in(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yield the samples of one file, as `_samples` does."""
     images, references = _stored(path)
     if images.ndim != 4:
-        raise ImageError(
-            str(path), expected="a batch of (N, C, H, W)", got=_shape(images), remedy=REMEDY
-        )
+        raise ImageError(f"{path} must be a batch of (N, C, H, W), got {_shape(images)}. {REMEDY}")
     if references.ndim == 0 or (references is not NO_REFERENCE and len(references) != len(images)):
-        expected = f"as many references as images ({len(images)})"
         raise ImageError(
-            str(path), expected=expected, got=f"references of {_shape(references)}", remedy=REMEDY
+            f"{path} must have a reference for each of its {len(images)} images, got references "
+            f"of {_shape(references)}. {REMEDY}"
         )
     for number, image in enumerate(images):
         yield (
@@ -283,14 +279,16 @@ def _stored(path: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         arrays = load_arrays(path)
     except ValueError as error:
-        expected = "a .npy or .npz file of numbers, or a folder of images"
-        raise ImageError(str(path), expected=expected, got=str(error), remedy=REMEDY) from error
+        raise ImageError(
+            f"Samples are a .npy or .npz file of numbers, or a folder of images, but {path} cannot "
+            f"be read as such: {printable(str(error))}. {REMEDY}"
+        ) from error
     # One array alone may have any name: `np.savez(file, images)` calls it `arr_0`.
     image = next(iter(arrays)) if len(arrays) == 1 else "image"
     if image not in arrays:
-        got = ", ".join(arrays) or "no array"
+        names = printable(", ".join(arrays)) or "no array"
         raise ImageError(
-            str(path), expected="arrays named image and reference", got=got, remedy=REMEDY
+            f"{path} must have arrays named 'image' and 'reference', got {names}. {REMEDY}"
         )
     return arrays[image], arrays.get("reference", NO_REFERENCE)
 
@@ -303,9 +301,7 @@ def _bands_first(path: Path, pixels: np.ndarray) -> np.ndarray:
     if bands.dtype.kind == "f":
         return bands
     if bands.dtype.kind not in "ui":
-        raise ImageError(
-            str(path), expected="pixels that are numbers", got=f"{bands.dtype}", remedy=REMEDY
-        )
+        raise ImageError(f"The pixels of {path} must be numbers, got {bands.dtype}. {REMEDY}")
     # Files state no full scale: pixels of 8 bits use all of them, others are taken for 12 bits.
     return bands / np.float32(FULL_SCALE_8 if bands.dtype.itemsize == 1 else MAX_DN)
 
@@ -321,34 +317,39 @@ def _sound_reference(name: str, reference: np.ndarray) -> np.ndarray:
     `quant.gate.compare`.
     """
     if reference.dtype.kind not in "fuib":
-        got = f"{reference.dtype}"
-        raise ImageError(name, expected="a reference of real numbers", got=got, remedy=REMEDY)
+        raise ImageError(
+            f"The reference of {name} must be of real numbers, got {reference.dtype}. {REMEDY}"
+        )
     values = np.asarray(reference, np.float32)
     lost = np.count_nonzero(~np.isfinite(values))
     if lost:
-        remedy = "leave out samples whose references lack pixels"
-        got = f"{lost} values that are NaN or infinite"
-        raise ImageError(name, expected="a reference of finite numbers", got=got, remedy=remedy)
+        raise ImageError(
+            f"The reference of {name} has {lost} values that are NaN or infinite. Leave out "
+            "samples whose references lack pixels."
+        )
     return values
 
 
 def _sound(name: str, image: np.ndarray, channels: int) -> np.ndarray:
     if image.dtype.kind not in "fui" or len(image) != channels:
-        got = f"{len(image)} channels of {image.dtype}"
-        raise ImageError(name, expected=f"{channels} channels of numbers", got=got, remedy=REMEDY)
+        raise ImageError(
+            f"{name} must have {channels} channels of numbers, as the network reads, got "
+            f"{len(image)} channels of {image.dtype}. {REMEDY}"
+        )
     if not image.size:
-        raise ImageError(name, expected="an image with pixels", got=_shape(image), remedy=REMEDY)
+        raise ImageError(f"{name} has no pixels: its shape is {_shape(image)}. {REMEDY}")
     values = np.asarray(image, np.float32)
     low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
     # NaN fails every comparison, so it is refused as well.
     if not (low >= 0 and high <= LARGEST):
         remedy = (
-            "divide them by full scale"
+            "Divide them by full scale."
             if np.isfinite(high)
-            else "leave out samples with missing pixels"
+            else "Leave out samples with missing pixels."
         )
         raise ImageError(
-            name, expected="values in [0, 1]", got=f"{low:.4g} to {high:.4g}", remedy=remedy
+            f"The values of {name} must be in [0, 1], but they are {low:.4g} to {high:.4g}. "
+            f"{remedy}"
         )
     # What rounding has left above 1, within the tolerance of LARGEST.
     return np.minimum(values, 1)
@@ -360,14 +361,15 @@ def _cut(
     """Patches of an image (C, H, W), or the whole where a reference belongs to it."""
     height, width = image.shape[1:]
     if fixed_px is not None and (height, width) != (fixed_px, fixed_px) and reference.size:
-        got = times((height, width))
         raise ImageError(
-            name, expected=f"images of {fixed_px} x {fixed_px} pixels", got=got, remedy=REMEDY
+            f"{name} must have {fixed_px} x {fixed_px} pixels, to which the network is fixed, got "
+            f"{times((height, width))}. {REMEDY}"
         )
     if reference.size and (height % multiple_px or width % multiple_px):
-        expected = f"images of multiples of {multiple_px} pixels beside a reference"
-        got = times((height, width))
-        raise ImageError(name, expected=expected, got=got, remedy="cut both")
+        raise ImageError(
+            f"{name} has a reference, so its sides must be multiples of {multiple_px} pixels, got "
+            f"{times((height, width))}. Cut both."
+        )
     # A reference may be of another size, such as an enlarged image or a class: it cannot be cut.
     if reference.size:
         yield image[None], reference[None]
@@ -376,9 +378,9 @@ def _cut(
     # An image smaller than a patch is one patch, cut to the sides that the network takes.
     sizes = [side if n >= side else n // multiple_px * multiple_px for n in (height, width)]
     if 0 in sizes or (fixed_px is not None and sizes != [side, side]):
-        expected = f"images of at least {fixed_px or multiple_px} pixels a side"
         raise ImageError(
-            name, expected=expected, got=times((height, width)), remedy="give larger ones"
+            f"{name} must have at least {fixed_px or multiple_px} pixels a side, got "
+            f"{times((height, width))}. Give larger images."
         )
     for top in range(0, height - sizes[0] + 1, sizes[0]):
         for left in range(0, width - sizes[1] + 1, sizes[1]):
@@ -406,12 +408,10 @@ class OwnSamples:
             (name, pair) for name, pair in _named(samples) if np.ptp(pair[0]) >= LEAST_CONTRAST
         ]
         if not textured:
-            name = str(self.given) if isinstance(self.given, Path) else IN_MEMORY
+            source = str(self.given) if isinstance(self.given, Path) else f"`{IN_MEMORY}`"
             raise ImageError(
-                name,
-                expected="samples with contrast",
-                got="constant ones",
-                remedy="give real images",
+                f"All samples of {source} are constant, but samples need contrast. Give real "
+                "images."
             )
         return _patches(textured)
 
@@ -450,16 +450,18 @@ def samples_of(model: onnx.ModelProto, given: object) -> OwnSamples | None:
         return OwnSamples(source, channels, fixed_px, multiple_px or 1)
     # Simulated patches have one channel and PATCH_PX a side.
     if channels != 1 or multiple_px is None or PATCH_PX % multiple_px:
-        what = f"images of {fixed_px} x {fixed_px} pixels alone"
+        what = f"only images of {fixed_px} x {fixed_px} pixels"
         if multiple_px is not None:
             what = (
                 f"{channels} channels"
                 if channels != 1
                 else f"images of multiples of {multiple_px} pixels"
             )
-        expected = f"samples for a network of {what}: simulated patches are others"
-        remedy = "give a .npy or .npz file of (N, C, H, W) in [0, 1], or a folder of images"
-        raise OptionError("samples", expected=expected, got="none", remedy=remedy)
+        raise OptionError(
+            f"`samples` must be given, because the network reads {what}, and simulated patches "
+            f"are {PATCH_PX} x {PATCH_PX} pixels of one channel. Give a .npy or .npz file of "
+            "(N, C, H, W) in [0, 1], or a folder of images."
+        )
     return None
 
 

@@ -13,7 +13,7 @@ import onnx
 import onnxruntime as ort
 
 from beers_deploy.model.processor import int8_adds_exactly
-from beers_deploy.profiles.errors import CODE_FAULTS, ModelError
+from beers_deploy.profiles.errors import CODE_FAULTS, ModelError, printable
 from beers_deploy.quant.ends import ONE_CHANNEL, Ends
 from beers_deploy.quant.graph import (
     PLANES,
@@ -63,7 +63,7 @@ def open_session(
     if not optimise:
         options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
     network = model if isinstance(model, onnx.ModelProto) else load_onnx(model)
-    name = "ONNX model" if isinstance(model, onnx.ModelProto) else str(model)
+    name = "the network" if isinstance(model, onnx.ModelProto) else str(model)
     # Outside `contradictions`: the processor is asked with a network of its own, whose faults are
     # not this file's.
     if exact is None:
@@ -79,10 +79,10 @@ def open_session(
     except CODE_FAULTS:
         raise
     except Exception as error:  # onnxruntime raises a class of its own for each status code
-        got = " ".join(str(error).split())[:160]
-        remedy = "give a file written by 'beers-deploy export' or 'beers-deploy quantize'"
+        reason = printable(" ".join(str(error).split())).rstrip(".")
         raise ModelError(
-            name, expected="a model that onnxruntime runs", got=got, remedy=remedy
+            f"onnxruntime cannot run {name}: {reason}. Give a file written by "
+            "'beers-deploy export' or 'beers-deploy quantize'."
         ) from error
 
 
@@ -99,7 +99,7 @@ def run(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:
     """
     restored = tensors_of(session, None, image)[0]
     if restored.shape != image.shape:
-        raise _unfit(f"a result of {times(restored.shape)}")
+        raise _unfit(f"its result has {times(restored.shape)}")
     return restored
 
 
@@ -118,27 +118,28 @@ def tensors_of(
     except CODE_FAULTS:
         raise
     except Exception as error:  # as above
-        raise _unfit(" ".join(str(error).split())[:160]) from error
+        raise _unfit(" ".join(str(error).split()).rstrip(".")) from error
 
 
-def require_finite(values: Iterable[np.ndarray], where: str) -> None:
-    """Refuse what a network computed of an image in [0, 1], where its weights are finite and that
-    is not.
+def require_finite(values: Iterable[np.ndarray], name: str) -> None:
+    """Raise ModelError if what a network computed from an image in [0, 1] is not finite.
+
+    Args:
+        values: its results.
+        name: of the network, with which the message begins.
     """
     # NaN and infinity reach the minimum or the maximum, which need no array of their own.
     if not all(np.isfinite((value.min(), value.max())).all() for value in values):
-        remedy = (
-            "its sums overflow: train it again with a lower learning rate, or scale its weights"
-        )
         raise ModelError(
-            where, expected="finite values for an image", got="NaN or infinity", remedy=remedy
+            f"{name} returns NaN or infinity for an image, because its sums overflow. Train it "
+            "again with a lower learning rate, or scale its weights."
         )
 
 
-def _unfit(got: str) -> ModelError:
-    remedy = "export it for images of any size, or check its sizes"
+def _unfit(reason: str) -> ModelError:
     return ModelError(
-        "ONNX model", expected="one that restores an image to its own size", got=got, remedy=remedy
+        f"The network does not restore an image to its own size: {printable(reason)}. Export it "
+        "for images of any size, or check its sizes."
     )
 
 
@@ -179,7 +180,7 @@ def tensor_values(
         if halo_px is not None:
             inner = ..., slice(above, above + bottom - top), slice(before, before + right - left)
             values = [result[inner] for result in values]
-        require_finite(values, "float network")
+        require_finite(values, "The float network")
         yield values
 
 

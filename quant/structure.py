@@ -94,7 +94,7 @@ def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> di
 
 def rounded_tensors(model: onnx.ModelProto) -> list[Rounded]:
     """What the graph's nodes round to 8 bits, in the graph's order."""
-    with contradictions("INT8 model"):
+    with contradictions("the INT8 network"):
         return _rounded(OnnxGraph(model), _own_core(model))
 
 
@@ -176,7 +176,7 @@ class Relus:
 
 def count_relus(model: onnx.ModelProto) -> Relus:
     """The ReLUs of a file."""
-    with contradictions("model"):
+    with contradictions("the network"):
         graph = OnnxGraph(model)
         core = _own_core(model)
         tensors = {tensor.name: tensor for tensor in _rounded(graph, core)}

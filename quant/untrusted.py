@@ -10,7 +10,7 @@ import numpy as np
 import onnx
 from onnx import AttributeProto, NodeProto, TensorProto, helper, numpy_helper
 
-from beers_deploy.profiles.errors import BeersError, ModelError
+from beers_deploy.profiles.errors import BeersError, ModelError, printable
 from beers_deploy.quant.domains import INLINE, MICROSOFT, STANDARD, foreign_remedy
 
 DAMAGE = (
@@ -41,12 +41,18 @@ VALUE_BYTES: dict[int, int] = {
 
 
 def check_content(model: onnx.ModelProto, where: str) -> None:
-    """Refuse a model that does not hold what it states."""
+    """Raise ModelError if a model does not hold what it states.
+
+    Args:
+        model: to be checked.
+        where: name of the network for the message, such as "a.onnx" or "the float network".
+    """
     graph = model.graph
     initializers = {tensor.name for tensor in graph.initializer}
     if all(value.name in initializers for value in graph.input) or not graph.output:
-        raise refused(
-            where, "a network with an input and an output", "none", "export the network again"
+        raise ModelError(
+            f"The graph of {where} must have an input and an output, but it has none. Export the "
+            "network again."
         )
     for value in (*graph.input, *graph.output, *graph.value_info):
         check_size(value.name, [d.dim_value for d in value.type.tensor_type.shape.dim], where)
@@ -56,8 +62,11 @@ def check_content(model: onnx.ModelProto, where: str) -> None:
 
 @contextmanager
 def contradictions(where: str) -> Iterator[None]:
-    """One sentence for whatever a graph leads to whose nodes lack inputs, or have sizes that cannot
-    be.
+    """Raise ModelError for whatever a graph leads to whose nodes lack inputs or have impossible
+    sizes.
+
+    Args:
+        where: name of the network for the message, such as "a.onnx" or "the float network".
     """
     try:
         yield
@@ -67,29 +76,28 @@ def contradictions(where: str) -> Iterator[None]:
         if isinstance(getattr(error, "obj", None), ModuleType):
             # The installed library lacks what this program calls, whatever the file holds.
             raise
-        got = f"nodes that contradict it ({' '.join(str(error).split())[:80]})"
-        remedy = "check the file with onnx.checker, and export it again"
-        raise refused(where, "nodes as ONNX defines them", got, remedy) from error
+        reason = printable(" ".join(str(error).split()))
+        raise ModelError(
+            f"Nodes of {where} contradict their definition in ONNX ({reason}). Check the file with "
+            "onnx.checker, and export it again."
+        ) from error
 
 
 def check_size(name: str, sizes: Iterable[float], where: str) -> None:
-    """Refuse a tensor that a file sizes beyond reason; 0 and -1 stand for sizes left open."""
+    """Raise ModelError if a file states an absurd size of a tensor; 0 and -1 are open sizes."""
     sizes = list(sizes)
     allowed = len(sizes) <= RANK and min(sizes, default=0) >= -1
     # Written so that NaN is refused as well: it compares as False.
     if not allowed or not math.prod(max(size, 1) for size in sizes) <= VALUES:
-        got = f"{name!r} of {times(sizes)}"
-        raise refused(where, f"tensors of at most {VALUES} values", got, "export the network again")
+        raise ModelError(
+            f"{printable(repr(name))} in {where} has the size {printable(times(sizes))}, but a "
+            f"tensor may have at most {VALUES} values. Export the network again."
+        )
 
 
 def times(sizes: Iterable[float]) -> str:
     """Sizes as a person writes them: 64 x 3 x 3."""
     return " x ".join(f"{size:.12g}" for size in sizes)
-
-
-def refused(where: str, expected: str, got: str, remedy: str) -> ModelError:
-    """What is raised of a file."""
-    return ModelError(where, expected=expected, got=got, remedy=remedy)
 
 
 def held_tensors(graph: onnx.GraphProto) -> Iterator[TensorProto]:
@@ -109,8 +117,11 @@ def held_tensors(graph: onnx.GraphProto) -> Iterator[TensorProto]:
 def _check_tensor(tensor: TensorProto, where: str) -> None:
     _check_place_and_type(tensor, where)
     if len(tensor.dims) > RANK or min(tensor.dims, default=0) < 0:
-        got = f"{tensor.name!r} of {times(tensor.dims)}"
-        raise refused(where, f"at most {RANK} sizes from 0 on", got, "export it again")
+        raise ModelError(
+            f"{printable(repr(tensor.name))} in {where} has the size "
+            f"{printable(times(tensor.dims))}, but a tensor has at most {RANK} dimensions, each 0 "
+            "or more. Export it again."
+        )
     # A tensor that states more than it holds makes a runtime allocate first and read afterwards.
     stated_count = math.prod(tensor.dims)
     raw = tensor.HasField("raw_data")
@@ -118,8 +129,10 @@ def _check_tensor(tensor: TensorProto, where: str) -> None:
     field = tensor.raw_data if raw else getattr(tensor, helper.tensor_dtype_to_field(kind))
     stored_count = len(field) / (VALUE_BYTES[kind] if raw else 1)
     if stated_count != stored_count:
-        got = f"{tensor.name!r} of {times(tensor.dims)} values that holds {stored_count:g}"
-        raise refused(where, "weights as many as it states", got, "copy or export it again")
+        raise ModelError(
+            f"The weights {printable(repr(tensor.name))} in {where} state {times(tensor.dims)} "
+            f"values, but the file holds {stored_count:g}. Copy or export it again."
+        )
     _check_finite(tensor, where)
 
 
@@ -132,8 +145,11 @@ def _check_finite(tensor: TensorProto, where: str) -> None:
     values = numpy_helper.to_array(tensor)
     lost = np.isnan(values) if not tensor.dims else ~np.isfinite(values)
     if lost.any():
-        got = f"{np.count_nonzero(lost)} NaN or infinite in {tensor.name or 'a constant'}"
-        raise refused(where, "finite weights", got, "train or export it again")
+        name = printable(tensor.name) or "a constant"
+        raise ModelError(
+            f"The weights of {where} must be finite, but {name} has {np.count_nonzero(lost)} "
+            "NaN or infinite values. Train or export the network again."
+        )
 
 
 def _check_place_and_type(tensor: TensorProto, where: str) -> None:
@@ -141,8 +157,10 @@ def _check_place_and_type(tensor: TensorProto, where: str) -> None:
         place = next(
             (entry.value for entry in tensor.external_data if entry.key == "location"), "no place"
         )
-        got = f"{tensor.name!r} kept in another file, {place!r}"
-        raise refused(where, "one self-contained ONNX file", got, "save it as one file")
+        raise ModelError(
+            f"{where} stores {printable(repr(tensor.name))} in another file, "
+            f"{printable(repr(place))}. Save the network as one self-contained ONNX file."
+        )
     if tensor.data_type not in VALUE_BYTES:
         type_numbers = TensorProto.DataType.values()
         kind = (
@@ -150,8 +168,9 @@ def _check_place_and_type(tensor: TensorProto, where: str) -> None:
             if tensor.data_type in type_numbers
             else f"{tensor.data_type}"
         )
-        raise refused(
-            where, "weights of plain numbers", f"{tensor.name!r} of type {kind}", "convert them"
+        raise ModelError(
+            f"{printable(repr(tensor.name))} in {where} has the type {kind}, but weights must be "
+            "plain numbers. Convert them."
         )
 
 
@@ -183,12 +202,19 @@ KEEPING = {
 
 
 def check_runnable(model: onnx.ModelProto, where: str) -> None:
-    """Refuse a model that no runtime of ours should open."""
+    """Raise ModelError if no runtime should open a model.
+
+    Args:
+        model: to be checked.
+        where: name of the network for the message, such as "a.onnx" or "the float network".
+    """
     for function in model.functions:
-        got = f"{function.name} of {function.domain!r}, a function of the file"
-        raise refused(where, "operators of ONNX itself", got, INLINE)
+        name = printable(f"{function.name} of {function.domain!r}")
+        raise _not_of_onnx(f"{name}, a function that the file defines", where, INLINE)
     if model.graph.sparse_initializer:
-        raise refused(where, "plain weights", "sparse ones", "export it without them")
+        raise ModelError(
+            f"{where} has sparse weights, which are not supported. Export it without them."
+        )
     constants = _Constants(model, where)
     # What follows from the image is sized by it; what follows from constants alone may have any
     # size.
@@ -229,9 +255,9 @@ class _Constants:
         if result is not None:
             self.values[node.output[0]] = numpy_helper.from_array(result, node.output[0])
         elif node.op_type not in KEEPING | {"ConstantOfShape"}:
-            got = f"{named(node)} of constants alone"
-            raise refused(
-                self._where, "operators that work on the image", got, "fold its constants"
+            raise ModelError(
+                f"{printable(named(node))} in {self._where} reads constants only, but only "
+                "operators on the image are supported here. Fold its constants."
             )
 
     def _array(self, name: str) -> np.ndarray | None:
@@ -250,16 +276,11 @@ class _Constants:
         if node.op_type != "ConstantOfShape":
             return
         if len(arrays) != 1 or arrays[0] is None:
-            raise refused(
-                self._where,
-                "sizes that the file states",
-                f"a computed one in {named(node)}",
-                "fold it",
-            )
+            raise _computed_size(node, self._where)
         sizes = [int(size) for size in arrays[0].ravel()[: RANK + 1]]
         check_size(named(node), sizes, self._where)
         self._made += math.prod(max(size, 0) for size in sizes)
-        check_size("what constants fill", [self._made], self._where)
+        check_size("all filled constants", [self._made], self._where)
 
 
 LIST_VALUES = 4096
@@ -326,13 +347,26 @@ def named(node: NodeProto) -> str:
 
 def _check_operator(node: NodeProto, where: str) -> None:
     if node.domain not in STANDARD and (node.domain, node.op_type) not in ONNXRUNTIMES:
-        got = f"{named(node)} of {node.domain!r}"
-        remedy = foreign_remedy(node.domain, node.op_type)
-        raise refused(where, "operators of ONNX itself", got, remedy)
+        name = printable(f"{named(node)} of {node.domain!r}")
+        raise _not_of_onnx(name, where, foreign_remedy(node.domain, node.op_type))
     if any(a.HasField("g") or a.graphs or a.HasField("sparse_tensor") for a in node.attribute):
-        raise refused(
-            where, "nodes that run once", f"{named(node)} with a graph within", "unroll it"
+        raise ModelError(
+            f"{printable(named(node))} in {where} contains a graph, such as the body of a loop. "
+            "Unroll it, so that each node runs once."
         )
+
+
+def _not_of_onnx(name: str, where: str, remedy: str) -> ModelError:
+    return ModelError(
+        f"{where} uses {name}, but only operators of ONNX itself are supported: {remedy}."
+    )
+
+
+def _computed_size(node: NodeProto, where: str) -> ModelError:
+    return ModelError(
+        f"{printable(named(node))} in {where} has a size that other nodes compute, but the file "
+        "must state it. Fold it into a constant."
+    )
 
 
 def _check_windows(node: NodeProto, where: str) -> None:
@@ -343,9 +377,9 @@ def _check_windows(node: NodeProto, where: str) -> None:
         ):
             largest = max(map(abs, (attribute.i, *attribute.ints)))
             if largest > WINDOW_PX:
-                got = f"{attribute.name} of {largest} in {named(node)}"
-                raise refused(
-                    where, f"windows of at most {WINDOW_PX} pixels", got, "export the network again"
+                raise ModelError(
+                    f"{printable(named(node))} in {where} has {attribute.name} of {largest}, but a "
+                    f"window has at most {WINDOW_PX} pixels. Export the network again."
                 )
         elif attribute.name in ("shape", "output_shape"):
             check_size(named(node), attribute.ints, where)
@@ -362,12 +396,7 @@ def _check_growth(
             if not name or name in of_image:
                 continue
             if name not in constants:
-                raise refused(
-                    where,
-                    "sizes that the file states",
-                    f"a computed one in {named(node)}",
-                    "fold it",
-                )
+                raise _computed_size(node, where)
             # At most one more than any list of sizes has.
             values = [
                 float(value)
@@ -376,6 +405,7 @@ def _check_growth(
             if absolute:
                 check_size(named(node), values, where)
             elif not max(map(abs, values), default=0) <= WINDOW_PX:
-                got = f"{named(node)} by {times(values)}"
-                remedy = "export the network again"
-                raise refused(where, f"enlargements of at most {WINDOW_PX}", got, remedy)
+                raise ModelError(
+                    f"{printable(named(node))} in {where} enlarges by {times(values)}, but the "
+                    f"largest factor is {WINDOW_PX}. Export the network again."
+                )

@@ -6,9 +6,9 @@ import sys
 import beers_deploy as bd
 
 NAMES = (
-    "BeersError Board Limits Network Pair Sensor Table boards characterize check compare "
-    "evaluate gate networks "
-    "predict quantize restore sensors simulate tradeoff"
+    "BeersError Board Limits Network Pair Sensor Table bench boards characterize check compare "
+    "demo evaluate export gate golden networks quantize restore sensors simulate stress "
+    "tradeoff train"
 )
 LIGHT = (
     "beers_deploy",

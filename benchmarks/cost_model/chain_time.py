@@ -21,15 +21,14 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from beers_deploy.bench.swath import Swath
-from beers_deploy.bench.traditional import CROP_PX, CROPS, drawn_acquisition
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.model.traditional.nl_bayes import overlap_add, patch_matrix
 from beers_deploy.model.traditional.pipeline import Chain, quality_named, restore_traditional
 from beers_deploy.model.traditional.rows import one_thread_per_operation
-from beers_deploy.profiles import TargetProfile, load_sensor, load_target
-from beers_deploy.profiles.sensor_file import REFERENCE
-from beers_deploy.profiles.target import board_names
+from beers_deploy.performance.swath import Swath
+from beers_deploy.performance.traditional import CROP_PX, CROPS, drawn_acquisition
+from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
+from beers_deploy.profiles.target import TargetProfile, board_names, load_target
 from benchmarks.cost_model.chain_work import FLOAT_BYTES, Work, chain_work
 
 ROUNDS = 25

@@ -21,7 +21,7 @@ from scipy.stats import binom, spearmanr
 
 from beers_deploy.dpu.cost.model import Array, Constants, Regime, Structure, regime_of
 from beers_deploy.dpu.cost.own_runs import SCATTER
-from beers_deploy.profiles import load_target
+from beers_deploy.profiles.target import load_target
 from benchmarks.cost_model.fit import Cases, fit
 from benchmarks.cost_model.published import boards, host_cores, published_cases
 

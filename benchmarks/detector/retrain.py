@@ -20,7 +20,7 @@ from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.profiles.sensor_file import load_sensor, reference_for
 from beers_deploy.quant.onnx_file import save_onnx
-from beers_deploy.results import Table, print_rows
+from beers_deploy.results import Table
 from beers_deploy.studies.detection.average_precision import find_hits, score
 from beers_deploy.studies.detection.boxes import Letterbox
 from beers_deploy.studies.detection.detector import open_detector
@@ -98,11 +98,9 @@ def main() -> None:
         row.name: [row.scores(file, scenes, arguments.seed) for file in files[row.name]]
         for row in rows
     }
-    scored_rows = retrained_rows(scored)
-    print_rows(TABLE, scored_rows)
-    Table("retrain", vars(arguments), (), tuple(scored_rows)).save(
-        arguments.folder / "figures.json"
-    )
+    table = Table("retrain", vars(arguments), rows=tuple(retrained_rows(scored)))
+    table.print()
+    table.save(arguments.folder / "figures.json")
 
 
 def conditions(sensors: Sequence[str], method: str) -> list[Condition]:

@@ -244,8 +244,10 @@ def _step(
     loss = torch.stack(loss_of(output.float(), targets)).sum()
     value = float(loss.detach())
     if not math.isfinite(value):
-        remedy = "train with a lower learning rate, and look at the boxes"
-        raise ModelError("detector", expected="a finite loss", got=str(value), remedy=remedy)
+        raise ModelError(
+            f"The loss of the detector is {value}. Train with a lower learning rate, and check "
+            "the boxes."
+        )
     optimiser.zero_grad(set_to_none=True)
     loss.backward()  # type: ignore[no-untyped-call]
     torch.nn.utils.clip_grad_norm_(network.parameters(), 10.0)

@@ -5,10 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from beers_deploy.profiles import TargetProfile, load_target
 from beers_deploy.profiles.constant import Constant
-from beers_deploy.profiles.errors import OptionError, ProfileError
-from beers_deploy.profiles.target import board_names
+from beers_deploy.profiles.errors import OptionError, ProfileError, printable
+from beers_deploy.profiles.target import MODEL_SUFFIX, TargetProfile, board_names, load_target
 from beers_deploy.profiles.target_limits import CONFIGURATION
 
 BoardLike = TargetProfile | str | os.PathLike[str]
@@ -19,10 +18,17 @@ ALL = "all"
 
 
 def boards_of(board: BoardLike | Sequence[BoardLike]) -> list[TargetProfile]:
-    """One board or several; "all" stands for the shipped ones with a DPU."""
-    if board == ALL:
+    """Return one board or several.
+
+    Args:
+        board: a board, several, or names separated by commas, each with or without -model behind
+            it; "all" stands for the shipped boards with a DPU.
+    """
+    if isinstance(board, str) and board.removesuffix(MODEL_SUFFIX) == ALL:
         return [load_target(name) for name in board_names()]
-    if isinstance(board, str | os.PathLike | TargetProfile):
+    if isinstance(board, str):
+        return [load_target(name.strip()) for name in board.split(",")]
+    if isinstance(board, os.PathLike | TargetProfile):
         return [TargetProfile.load(board)]
     return [TargetProfile.load(source) for source in board]
 
@@ -135,21 +141,22 @@ def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
     found.
     """
     if not profile.configurations:
-        expected = f"a target with a DPU: {', '.join(board_names())}"
         raise OptionError(
-            "target", expected=expected, got=repr(profile.name), remedy="choose another"
+            f"The target {profile.name!r} has no DPU. Choose one of {', '.join(board_names())}."
         )
     name, constants = profile.configuration(configuration)
     for key in REQUIRED:
         if key not in constants:
-            where = f"{profile.name} [configurations.{name}] {key}"
-            expected = CONFIGURATION[key].expected
-            raise ProfileError(where, expected=expected, got="none", remedy="add it")
+            raise ProfileError(
+                f"The table [configurations.{name}] of the target {profile.name} has no {key}. Add "
+                f"it: {CONFIGURATION[key]} that a board can have."
+            )
     # The rules quote these documents: without them a rule's text would have no source.
     if not profile.documents:
-        got = "none"
-        remedy = "add it, or begin with base = the name of a board with the same DPU"
-        raise ProfileError(profile.name, expected="a table [documents]", got=got, remedy=remedy)
+        raise ProfileError(
+            f"The target {profile.name} has no table [documents]. Add it, or start with base = the "
+            "name of a board with the same DPU."
+        )
     return Dpu(profile, name, constants)
 
 
@@ -160,8 +167,9 @@ def ruled(profile: TargetProfile, configuration: str | None = None) -> Dpu:
     if not profile.npu:
         return dpu_of(profile, configuration)
     if configuration is not None:
-        expected = f"none beside {profile.name}, which has an NPU"
-        remedy = "leave it out"
-        raise OptionError("dpu", expected=expected, got=repr(configuration), remedy=remedy)
+        raise OptionError(
+            f"`dpu` cannot be {printable(repr(configuration))} for {profile.name}, because this "
+            "board has an NPU. Leave it out."
+        )
     # An NPU has rules, and no configuration that a prediction could rest on.
     return Dpu(profile, "NPU", {})

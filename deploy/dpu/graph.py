@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.graph.nodes import Kind, Shape, Window
 from beers_deploy.quant.graph.quantised import Scale
 
@@ -80,11 +80,8 @@ class Network:
 
 def _pixels(name: str, shape: Shape | None) -> int:
     if shape is None:
-        remedy = "replace the node before it that hides the shape"
         raise ModelError(
-            name,
-            expected="a shape that can be computed from the input's",
-            got="none",
-            remedy=remedy,
+            f"The shape of {printable(name)} cannot be computed from the shape of the input. "
+            "Replace the node before it that hides the shape."
         )
     return shape[1] * shape[2]

@@ -16,7 +16,7 @@ import onnx
 
 from beers_deploy.dpu.graph import Network, Operation, Shape, Window
 from beers_deploy.model.bank import GAINS, LARGEST, WIDE
-from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.encodings import BORDER_PX, PLACE_PX, as_on_board
 from beers_deploy.quant.graph.moves import with_shuffles
 from beers_deploy.quant.graph.nodes import Kind, Node, OnnxGraph, kind_of, out_shape
@@ -75,9 +75,9 @@ def network_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX m
     """As `read_network`, of a model in memory; a host's file is read as the board gets it."""
     model = as_on_board(model)
     if not model.graph.node:
-        remedy = "give a file written by 'beers-deploy export' or 'beers-deploy quantize'"
         raise ModelError(
-            where, expected="a network", got="an ONNX file without nodes", remedy=remedy
+            f"{where} has no nodes, so it is not a network. Give a file written by 'beers-deploy "
+            "export' or 'beers-deploy quantize'."
         )
     with contradictions(where):
         graph = with_shuffles(model)
@@ -212,33 +212,34 @@ def _input_shape(
         where: the file, in messages.
     """
     if len(sizes) != 4 or sizes[1] < 1:
-        got = f"{name} {sizes}"
-        remedy = "export the network as such"
-        raise ModelError(where, expected="inputs (N, C, H, W)", got=got, remedy=remedy)
-    if sizes[0] > 1:
-        remedy = "export it for any number of images, or for one"
         raise ModelError(
-            where, expected="an input of one image", got=f"{name} of {sizes[0]}", remedy=remedy
+            f"The inputs of {where} must be (N, C, H, W), got {printable(name)} {sizes}. Export "
+            "the network with such inputs."
+        )
+    if sizes[0] > 1:
+        raise ModelError(
+            f"The inputs of {where} must hold one image, but {printable(name)} holds {sizes[0]}. "
+            "Export the network for any number of images, or for one."
         )
     if tile_px is None:
         if not all(sizes[2:]):
-            raise ModelError(
-                where, expected="an input of a stated size", got="any size", remedy="give `tile`"
-            )
+            raise ModelError(f"{where} states no size of its input. Give `tile`.")
         return sizes[1], sizes[2], sizes[3]
     # The tile is stated in pixels of the image, and the input counts places of several pixels.
     place_px, border_px = places
     side, beyond = divmod(tile_px + 2 * border_px, place_px)
     if beyond:
-        expected = f"a tile of a multiple of {place_px} px"
-        remedy = "choose another `tile`"
-        raise ModelError(where, expected=expected, got=f"{tile_px} px", remedy=remedy)
+        raise ModelError(
+            f"`tile` must be a multiple of {place_px} px for {where}, got {tile_px} px. Choose "
+            "another `tile`."
+        )
     other_sides = {size for size in sizes[2:] if size} - {side}
     if other_sides:
-        expected = f"an input that takes {tile_px} x {tile_px} pixels"
-        got = f"one fixed to {_side_px(sizes[3], places)} x {_side_px(sizes[2], places)}"
-        remedy = f"give `tile` {_side_px(min(other_sides), places)}, or export it with free sizes"
-        raise ModelError(where, expected=expected, got=got, remedy=remedy)
+        fixed = f"{_side_px(sizes[3], places)} x {_side_px(sizes[2], places)}"
+        raise ModelError(
+            f"The input of {where} is fixed to {fixed} pixels, but `tile` is {tile_px} px. Give "
+            f"`tile` {_side_px(min(other_sides), places)}, or export the network with free sizes."
+        )
     return (sizes[1], side, side)
 
 

@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 
 from beers_deploy import __version__
+from beers_deploy.dpu.board import BoardLike
 from beers_deploy.model.io.files import whole_file, write_text
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.arrays import ALONE, load_arrays
-from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.errors import ImageError, OptionError, printable
 from beers_deploy.profiles.figures import Check, Row, measured
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 from beers_deploy.profiles.toml import read_json, unreadable
@@ -50,7 +51,7 @@ def write_golden(
     out: str | os.PathLike[str],
     *,
     tile: int | None = None,
-    board: "TargetProfile | str" = DEFAULT_TARGET,
+    target: BoardLike = DEFAULT_TARGET,
 ) -> Path:
     """Write golden vectors of an INT8 network to a folder, and return it.
 
@@ -58,14 +59,14 @@ def write_golden(
         int8: the network, quantised under a board's rules.
         out: the folder.
         tile: side of a tile in pixels; the network's own if it has one, else 64.
-        board: whose way to round ties is taken.
+        target: whose way to round ties is used.
     """
-    network = Network.load(int8)
+    network = Network.load(int8, int8=True)
     folder = Path(out)
     with faults_named(network.label):
         core = read_core(network.model)
     # AMD's kernel for its NPU rounds ties to even.
-    half_even = bool(TargetProfile.load(board).npu)
+    half_even = bool(TargetProfile.load(target).npu)
     names = files_of(core)
     generator = np.random.default_rng(0)
     images = _images(network, core.ends.image_channels, tile, generator)
@@ -94,6 +95,13 @@ def write_golden(
     }
     write_text(folder / INDEX, json.dumps(index, indent=1) + "\n")
     return folder
+
+
+def vectors_table(folder: Path) -> Table:
+    """Return a table of the cases in a folder of golden vectors."""
+    digests, _ = _index(folder / INDEX)
+    rows = [Row("cases", case, {}, {"tensors": str(len(files))}) for case, files in digests.items()]
+    return Table(title=f"golden vectors in {folder}", inputs=(folder / NETWORK,), rows=tuple(rows))
 
 
 def _remove_older(folder: Path) -> None:
@@ -147,12 +155,12 @@ def _images(
     lattice_px = fixed_px or network.tiling.lattice_px
     side = fixed_px or tile or -(-TILE_PX // lattice_px) * lattice_px
     if (tile or side) != side or side < 1 or side % lattice_px:
-        expected = (
+        rule = (
             f"{fixed_px} px, to which the network is fixed"
             if fixed_px
             else f"a multiple of {lattice_px} px"
         )
-        raise OptionError("tile", expected=expected, got=f"{tile} px", remedy="choose another")
+        raise OptionError(f"`tile` must be {rule}, got {tile} px. Choose another.")
     shape = 1, channels, side, side
     steps = np.indices((side, side)).sum(0) // 8 % 2
     steps[3::11, 5::13] = 1
@@ -231,21 +239,22 @@ def read_golden(folder: Path) -> Golden:
             cases[case], _ = run_core(core, planes, half_even)
         # The planes may have a size that the network cannot rearrange.
         except (LookupError, ValueError) as error:
-            got = f"{times(planes.shape)} in {case}"
-            expected = "planes of a size that the network takes"
-            raise OptionError(str(folder), expected=expected, got=got, remedy=REMEDY) from error
+            raise OptionError(
+                f"The planes in {folder / case} have the size {times(planes.shape)}, which the "
+                f"network does not accept. {AGAIN}"
+            ) from error
         wrong = [
             file for name, file in names.items() if files.get(file) != _digest(cases[case][name])
         ]
         if wrong:
-            got = f"other numbers in {case}/{wrong[0]}"
             raise OptionError(
-                str(folder), expected="the vectors that were written", got=got, remedy=REMEDY
+                f"The golden vectors in {folder} are not those that were written: "
+                f"{case}/{printable(wrong[0])} has other numbers. {AGAIN}"
             )
     return Golden(core, half_even, cases, network.input)
 
 
-REMEDY = "make it again with 'beers-deploy golden'"
+AGAIN = "Write the folder again with 'beers-deploy golden'."
 
 
 def _index(path: Path) -> tuple[dict[str, dict[str, str]], bool]:
@@ -261,12 +270,13 @@ def _index(path: Path) -> tuple[dict[str, dict[str, str]], bool]:
             raise ValueError(f"the case {foreign[0]!r}")
         return digests, bool(document["half_even"])
     except (AttributeError, LookupError, OSError, TypeError, ValueError) as error:
-        got = (
-            unreadable(path)
-            or f"a damaged one ({type(error).__name__}: {' '.join(str(error).split())[:80]})"
+        reason = unreadable(path)
+        fault = (
+            f"cannot be read: {reason}"
+            if reason
+            else f"is damaged ({type(error).__name__}: {' '.join(str(error).split())[:80]})"
         )
-        expected = f"the index of a folder of golden vectors ({INDEX})"
-        raise OptionError(str(path), expected=expected, got=got, remedy=REMEDY) from error
+        raise OptionError(f"The index of golden vectors {path} {fault}. {AGAIN}") from error
 
 
 def _planes(path: Path, core: IntCore) -> np.ndarray:
@@ -279,9 +289,9 @@ def _planes(path: Path, core: IntCore) -> np.ndarray:
         or planes.shape[1] != channels
         or not planes.size
     ):
-        got = f"{planes.dtype} of shape {planes.shape}"
         raise ImageError(
-            str(path), expected=f"int8 planes (N, {channels}, H, W)", got=got, remedy=REMEDY
+            f"{path} must hold int8 planes of shape (N, {channels}, H, W), got {planes.dtype} of "
+            f"shape {planes.shape}. {AGAIN}"
         )
     return planes
 
@@ -292,9 +302,8 @@ def _array(path: Path) -> np.ndarray:
         if list(arrays) != [ALONE]:
             raise ValueError("an archive of arrays")
     except ValueError as error:
-        remedy = "write it with numpy.save"
         raise ImageError(
-            str(path), expected="an array (.npy)", got=str(error), remedy=remedy
+            f"{path} is not an array (.npy): {printable(str(error))}. Write it with numpy.save."
         ) from error
     return arrays[ALONE]
 
@@ -318,11 +327,13 @@ def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[st
     )
     checks = (Check("layers that differ", len(wrong), 0, "layer", detail=verdict),)
     return Table(
-        "golden",
-        {"results": results_folder.name},
-        (golden.network, Path(folder) / INDEX),
-        rows,
-        checks,
+        title=f"{results_folder.name} against {Path(folder).name}",
+        command="golden",
+        inputs=(golden.network, Path(folder) / INDEX),
+        rows=rows,
+        checks=checks,
+        notes=() if wrong else (f"no layer differs: {len(rows)} compared",),
+        headings={"golden": "layers"},
     )
 
 
@@ -341,10 +352,11 @@ def _results(golden: Golden, folder: Path) -> Results:
         if path.parent.name not in golden.cases or path.name not in files.values()
     ]
     if unknown or not paths:
-        got = f"{unknown[0].parent.name}/{unknown[0].name}" if unknown else "none"
-        expected = "results as CASE/LAYER.npy"
-        remedy = f"name them as in {INDEX}"
-        raise OptionError(str(folder), expected=expected, got=got, remedy=remedy)
+        found = f"{unknown[0].parent.name}/{unknown[0].name}" if unknown else "none"
+        raise OptionError(
+            f"The results in {folder} must be named CASE/LAYER.npy as in {INDEX}, got {found}. "
+            "Rename them."
+        )
     outputs: dict[str, list[Seen]] = {}
     for name, file in files.items():
         for path in sorted(path for path in paths if path.name == file):
@@ -368,12 +380,15 @@ def _integers(path: Path, shape: tuple[int, ...], frac_bits: int) -> np.ndarray:
     ):
         values = np.moveaxis(values, -1, 1)
     if values.shape != shape:
-        got = f"{values.shape}"
-        remedy = "write the tensor whole, of the tile that the vectors have"
-        raise ImageError(str(path), expected=f"shape {shape}", got=got, remedy=remedy)
+        raise ImageError(
+            f"{path} must have the shape {shape}, got {values.shape}. Write the whole tensor, for "
+            "the tile of the golden vectors."
+        )
     if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
-        got = f"{values.dtype} values, or some that are not finite"
-        raise ImageError(str(path), expected="real numbers", got=got, remedy="write int8")
+        raise ImageError(
+            f"{path} must hold finite real numbers, but it holds {values.dtype} values or some "
+            "that are not finite. Write int8."
+        )
     numbers = values.astype(np.float64)
     if values.dtype == np.uint8:
         numbers -= 128
@@ -383,9 +398,9 @@ def _integers(path: Path, shape: tuple[int, ...], frac_bits: int) -> np.ndarray:
         not (np.abs(numbers - np.rint(numbers)) < 1e-3).all()
         or np.abs(numbers).max(initial=0) > 128
     ):
-        expected = f"int8, or its values as whole multiples of 2^{-frac_bits}"
         raise ImageError(
-            str(path), expected=expected, got=f"other {values.dtype} numbers", remedy="write these"
+            f"{path} holds {values.dtype} numbers that are not those of an int8 tensor. Write "
+            f"int8, or its values as integer multiples of 2^{-frac_bits}."
         )
     return np.rint(numbers).astype(np.int16)
 

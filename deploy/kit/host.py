@@ -245,8 +245,8 @@ def main(source: str, target: str, runs: dict[int, Any]) -> None:
     r = S["scale"]
     if image.ndim != 3 or min(image.shape[1:]) < t or not np.isfinite(image).all():
         sys.exit(
-            f"{source}: expected finite values (C, H, W) of at least {t} x {t} pixels, got "
-            f"shape {image.shape}"
+            f"{source} must hold finite values (C, H, W) of at least {t} x {t} pixels, got "
+            f"shape {image.shape}."
         )
     wide = np.pad(image, [(0, 0)] + [(0, -n % S["lattice_px"]) for n in image.shape[1:]], "edge")
     down, across = (spans(n, t, S["halo_px"]) for n in wide.shape[1:])

@@ -43,9 +43,11 @@ def host_facts(
     others = brighter or {}
     step = consistency_facts(network, sensor) if sensor is not None and facts is not None else None
     if sensor is not None and step is None and not others:
-        expected = "none where neither the consistency step nor exposures can be used"
-        remedy = "leave it out, or name a shipped network and a known sensor"
-        raise OptionError("sensor", expected=expected, got=sensor.name, remedy=remedy)
+        raise OptionError(
+            f"`sensor` {sensor.name} has no effect on {network.label}, because neither the "
+            "consistency step nor exposures can be used. Leave it out, or name a shipped network "
+            "and a known sensor."
+        )
     if facts is None:
         return None
     units = {str(factor): _unit(facts, other, tile_px) for factor, other in others.items()}

@@ -110,15 +110,16 @@ def open_session(model: Path, provider: str, options: dict[str, str]) -> ort.Inf
     """
     if provider not in ort.get_available_providers():
         raise ValueError(
-            f"expected the provider {provider}, got only {', '.join(ort.get_available_providers())}"
+            f"onnxruntime has no provider {provider} here, only "
+            f"{', '.join(ort.get_available_providers())}."
         )
     if not model.is_file():
-        raise ValueError(f"{model}: expected an ONNX file, got no such file")
+        raise ValueError(f"{model}: no such file. Give an ONNX file.")
     session = ort.InferenceSession(str(model), providers=[provider], provider_options=[options])
     if session.get_providers()[0] != provider:
         raise ValueError(
-            f"{provider} did not take the model: onnxruntime fell back to "
-            f"{session.get_providers()[0]}"
+            f"{provider} does not run the model: onnxruntime fell back to "
+            f"{session.get_providers()[0]}."
         )
     return session
 
@@ -134,8 +135,8 @@ def make_feed(session: ort.InferenceSession, batch: int, tile_px: int) -> dict[s
         sides = zip(tensor.shape, shape)  # noqa: B905 - a board's Python may be old
         if any(isinstance(size, int) and size != expected for size, expected in sides):
             raise ValueError(
-                f"{tensor.name} is fixed to {tensor.shape}, not {shape}: give its --tile and "
-                "--batch"
+                f"{tensor.name} is fixed to {tensor.shape}, not {shape}. Give its --tile and "
+                "--batch."
             )
         values = random.integers(-100, 100, shape)
         feed[tensor.name] = (
@@ -195,7 +196,9 @@ def throughput(stamps: list[float], batch: int) -> float:
         ValueError: fewer than two calls.
     """
     if len(stamps) < 2:
-        raise ValueError(f"expected at least two calls, got {len(stamps)}: give more --frames")
+        raise ValueError(
+            f"The throughput needs at least two calls, got {len(stamps)}. Give more --frames."
+        )
     return batch * (len(stamps) - 1) / (stamps[-1] - stamps[0])
 
 
@@ -204,7 +207,7 @@ def write_entry(entry: dict[str, object], path: Path) -> None:
     runs = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
     if not isinstance(runs, list):
         raise ValueError(
-            f"{path}: expected a JSON list of runs, got {type(runs).__name__}: give another --out"
+            f"{path} must be a JSON list of runs, got {type(runs).__name__}. Give another --out."
         )
     path.write_text(json.dumps([*runs, entry], indent=1) + "\n", encoding="utf-8")
 

@@ -10,7 +10,7 @@ from typing import Any
 from uuid import NAMESPACE_URL, uuid5
 
 from beers_deploy import __version__
-from beers_deploy.export import float_for
+from beers_deploy.float_onnx import float_for
 from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.io.tensors import read_conditioned

@@ -15,7 +15,7 @@ from beers_deploy import __version__
 from beers_deploy.model.io.files import write_text
 from beers_deploy.profiles.errors import visible
 from beers_deploy.profiles.figures import Figure, Row
-from beers_deploy.results import missing, unit_of
+from beers_deploy.tables.columns import missing, unit_of
 
 INTERVAL = re.compile(r"\[[^\[\]]*\]")
 

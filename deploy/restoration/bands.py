@@ -4,31 +4,95 @@ Where the image names its bands, each is found by its name; else by the number t
 in the order given.
 """
 
+import logging
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
 from beers_deploy.model.raster.facts import Raster
-from beers_deploy.network import Network
-from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.network import Network, NetworkLike, SensorLike
+from beers_deploy.network_files import other_sensor
+from beers_deploy.profiles.errors import ModelError, OptionError, printable
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import BLIND
+
+logger = logging.getLogger(__name__)
 
 Each = TypeVar("Each")
 
 
-def parse_sensors(text: str) -> dict[str, str]:
-    """A profile for each band by the band's name; under no name at all where
-    one is for all bands.
+def sensors_of(sensor: SensorLike | Mapping[str, Sensor]) -> dict[str, Sensor]:
+    """Return the sensor of each band by the band's name; under no name where one is for all.
+
+    Args:
+        sensor: one for all bands, a mapping, or BAND=PROFILE,BAND=PROFILE.
     """
+    if isinstance(sensor, Mapping):
+        return dict(sensor)
     # The path of one profile may have an equals sign in it.
-    if "=" not in text or Path(text).is_file():
-        return {"": text}
-    pairs = [part.partition("=") for part in text.split(",")]
+    if not isinstance(sensor, str) or "=" not in sensor or Path(sensor).is_file():
+        return {"": Sensor.load(sensor)}
+    pairs = [part.partition("=") for part in sensor.split(",")]
     profiles = {name.strip(): profile.strip() for name, _, profile in pairs}
     if not all((*profiles, *profiles.values())) or len(profiles) < len(pairs):
-        expected = "BAND=PROFILE,BAND=PROFILE"
-        raise OptionError("sensor", expected=expected, got=repr(text), remedy="name each band once")
-    return profiles
+        raise OptionError(
+            f"`sensor` must be BAND=PROFILE,BAND=PROFILE, got {printable(repr(sensor))}. Name each "
+            "band once."
+        )
+    return {band: Sensor.load(profile) for band, profile in profiles.items()}
+
+
+def is_unknown(sensors: Mapping[str, Sensor]) -> bool:
+    """Return True if one sensor is for all bands, and that is unknown."""
+    return list(sensors) == [""] and sensors[""].name == BLIND
+
+
+def networks_of(
+    network: NetworkLike | None, sensors: Mapping[str, Sensor], full_scale: float | None
+) -> dict[str, Network]:
+    """Return a network for each sensor, by the name of the band, and log which it is.
+
+    Args:
+        network: for all bands; the default one if None.
+        sensors: by band, or one under no name.
+        full_scale: that the user states, or None.
+
+    Raises:
+        OptionError: several sensors of a network that was made for one, or sensors of different
+            bits and no full scale.
+    """
+    networks = {band: Network.load(network, sensor=sensor) for band, sensor in sensors.items()}
+    first = next(iter(networks.values()))
+    if first.weights is None and len(sensors) > 1:
+        raise OptionError(
+            f"`sensor` names a sensor for each band, but {first.label} was made for one sensor. "
+            "Give one sensor for all bands, or use a shipped network, or weights of 'train "
+            "--conditioned'."
+        )
+    bits = {int(sensor.bits.low) for sensor in sensors.values()}
+    if len(bits) > 1 and full_scale is None:
+        raise OptionError(
+            f"The sensors have different bits ({', '.join(map(str, sorted(bits)))}). Give "
+            "`full_scale`, or restore such bands separately."
+        )
+    _log_network(first, sensors)
+    return networks
+
+
+def _log_network(network: Network, sensors: Mapping[str, Sensor]) -> None:
+    """Log which network restores, and warn if it was made for another sensor."""
+    names = ", ".join(sensor.name for sensor in sensors.values())
+    if network.weights is None:
+        if not is_unknown(sensors) and (doubt := other_sensor(network.model, sensors[""])):
+            logger.warning(doubt)
+    elif is_unknown(sensors):
+        logger.info(
+            "network: %s, for an unknown sensor; it restores better if it is given the sensor",
+            network.name,
+        )
+    else:
+        logger.info("network: %s, conditioned on %s", network.name, names)
 
 
 def in_order(given: Mapping[str, Each], raster: Raster) -> list[Each]:
@@ -40,11 +104,12 @@ def in_order(given: Mapping[str, Each], raster: Raster) -> list[Each]:
     stored_names = raster.band_names
     names = stored_names or _by_number(given)
     if len(given) != raster.bands or set(names) != set(given):
-        expected = f"a sensor for each of {raster.bands} bands" + (
-            f": {', '.join(stored_names)}" if stored_names else ""
+        wanted = f" ({printable(', '.join(stored_names))})" if stored_names else ""
+        raise OptionError(
+            f"`sensor` must name a sensor for each of {raster.bands} bands{wanted}, got "
+            f"{printable(', '.join(given))}. Name every band of the image; pansharpening is out of "
+            "scope."
         )
-        remedy = "name every band of the image; pansharpening is out of scope"
-        raise OptionError("sensor", expected=expected, got=", ".join(given), remedy=remedy)
     return [given[name] for name in names]
 
 
@@ -63,8 +128,7 @@ def require_alike(networks: Sequence[Network]) -> None:
     """Refuse networks of several bands that one plan of tiles cannot serve."""
     tilings = [network.tiling for network in networks]
     if len(networks) > 1 and (len(set(map(repr, tilings))) > 1 or tilings[0].channels_in != 1):
-        remedy = "give one network for all bands"
-        got = "networks of several bands, or of different halos"
         raise ModelError(
-            "sensor", expected="networks of one band, alike but for weights", got=got, remedy=remedy
+            "Networks for single bands must each have one band and differ only in their weights, "
+            "but these have several bands or different halos. Give one network for all bands."
         )

@@ -117,9 +117,10 @@ class Checkpoint:
     def require_known(self, name: str) -> None:
         """Refuse an image, `name` in messages, that has no pixels with values."""
         if not self.tally.known:
-            got = "NaN or nodata everywhere"
-            remedy = "check that it is the right file"
-            raise ImageError(name, expected="some pixels with values", got=got, remedy=remedy)
+            raise ImageError(
+                f"{name} has no pixels with values, only NaN or nodata. Check that it is the right "
+                "file."
+            )
 
     def remove(self) -> None:
         """Throw the rows away; the journal first, so that nothing is left that counts on them."""
@@ -139,10 +140,9 @@ class Checkpoint:
                 if self.rows
                 else "run it again: no row is left to `resume` from"
             )
-            remedy = f"correct that, and {advice}"
-            got = error.strerror or str(error)
             raise MachineError(
-                str(self.out), expected="a disk to write to", got=got, remedy=remedy
+                f"{self.out} cannot be written: {error.strerror or error}. Correct that, and "
+                f"{advice}."
             ) from error
 
     def _left(self) -> list[FinishedRow]:
@@ -156,10 +156,11 @@ class Checkpoint:
             planned = not self._row_ends or ends == self._row_ends[: len(ends)]
             if planned and max(ends, default=0) <= self.shape[1]:
                 return finished
-        expected = "the image, the model and the options of the run that was stopped"
-        got = f"others, or a damaged {path}"
-        remedy = "run it as before, or start afresh without `resume`"
-        raise OptionError("resume", expected=expected, got=got, remedy=remedy)
+        raise OptionError(
+            "`resume` needs the image, the model and the options of the run that was stopped, but "
+            f"they differ, or {path} is damaged. Run it as before, or start afresh without "
+            "`resume`."
+        )
 
     def _matching(self, finished: list[FinishedRow]) -> list[FinishedRow]:
         """Return the rows of tiles down to the first one whose pixels are not those that the
@@ -216,10 +217,10 @@ class Checkpoint:
         free = shutil.disk_usage(self.out.parent).free
         if needed > free:
             needed_size, free_size = sizes(needed, free)
-            expected = f"{needed_size} of disk (nothing packed)"
-            got = f"{free_size} free"
-            remedy = "free some space or write elsewhere"
-            raise MachineError(str(self.out), expected=expected, got=got, remedy=remedy)
+            raise MachineError(
+                f"{self.out} may need {needed_size} of disk space before compression, but "
+                f"{free_size} are free. Free some space, or write elsewhere."
+            )
 
 
 def sync_folder(folder: Path) -> None:

@@ -5,7 +5,6 @@ The pixels are those that `restore` writes.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -15,7 +14,6 @@ from beers_deploy.model.consistency import Consistency
 from beers_deploy.profiles.sensor import Instrument
 from beers_deploy.profiles.target import TILE_PX
 from beers_deploy.quant.tiling.walk import tiling_of
-from beers_deploy.restoration.options import Runtime
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.runtime import AtFirstCall, open_runtime
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
@@ -23,19 +21,6 @@ from beers_deploy.restoration.tiles.rows import restore_dn
 
 Restore = Callable[[np.ndarray], np.ndarray]
 """Degraded digital numbers (H, W) float32 to restored ones."""
-
-
-@dataclass(frozen=True)
-class Around:
-    """Which steps around a network are taken where they can be: the consistency
-    step, and exposure.
-    """
-
-    consistency: bool = True
-    exposure: bool = True
-
-
-BOTH: Around = Around()
 
 
 def network_method(
@@ -57,12 +42,12 @@ def network_method(
         sensor: that acquired the images; None leaves the consistency step out.
         reference: that the restoration aims at; needed with `sensor`.
     """
-    infer, _ = open_runtime(Runtime.onnxruntime, model, threads=0)
+    infer, _ = open_runtime("onnxruntime", model, threads=0)
     tiling = tiling_of(model)
     others = {} if brighter is None else brighter
     # Bright images ask for no factor above 1.
     at_first_call = {
-        factor: AtFirstCall(partial(open_runtime, Runtime.onnxruntime, other, 0))
+        factor: AtFirstCall(partial(open_runtime, "onnxruntime", other, 0))
         for factor, other in others.items()
     }
     offset = sensor.offset_dn if sensor else 0.0

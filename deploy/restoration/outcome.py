@@ -13,7 +13,7 @@ from operator import add
 import numpy as np
 
 from beers_deploy.model.family import RANGES
-from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.errors import ImageError, printable
 from beers_deploy.profiles.figures import Figure, measured
 
 MANY_AT_ENDS = 0.9
@@ -283,13 +283,11 @@ class Tally:
         if self.known >= FEW and (
             impossible or self.clipped > MANY_AT_ENDS * max(self.compared, 1)
         ):
-            expected = "a network that restores this image"
-            got = "; ".join(self.doubts)
-            remedy = (
-                "check its scale with 'gate' and the image's `full_scale`, or write it all "
-                "the same: `force`"
+            raise ImageError(
+                f"The network does not restore {name}: {printable('; '.join(self.doubts))}. Check "
+                "the scale of the network with 'gate' and the `full_scale` of the image, or write "
+                "the result all the same with `force`."
             )
-            raise ImageError(name, expected=expected, got=got, remedy=remedy)
 
 
 def _blank_px(stored: np.ndarray) -> int:

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
@@ -20,6 +21,26 @@ from beers_deploy.restoration.radiometry import FullScale
 
 OUT_SUFFIXES = TIFF_SUFFIXES | {".btf", ".tf8"}
 
+
+@dataclass(frozen=True)
+class Output:
+    """What is written.
+
+    Attributes:
+        path: of the TIFF.
+        compression: of the TIFF.
+        cog: whether it is a Cloud-Optimised GeoTIFF.
+        resume: whether a stopped run goes on.
+        others: further files that will be written, which must be no input either.
+    """
+
+    path: Path
+    compression: Compression = "zlib"
+    cog: bool = False
+    resume: bool = False
+    others: tuple[Path | None, ...] = ()
+
+
 ToCog = Callable[[Path, Path], None]
 """Writes a TIFF again, cloud-optimised."""
 
@@ -27,16 +48,16 @@ ToCog = Callable[[Path, Path], None]
 def require_tiff_name(path: Path) -> None:
     """Refuse a name under which no program would look for a TIFF."""
     if path.suffix.lower() not in OUT_SUFFIXES:
-        remedy = "name it so; other programs turn a TIFF into what you need"
         raise OptionError(
-            "OUT", expected="a TIFF's name, such as restored.tif", got=path.name, remedy=remedy
+            f"The output must have the name of a TIFF, such as restored.tif, got {path.name}. "
+            "Rename it; other programs convert a TIFF to the format that you need."
         )
     for ending in (".msk", ".aux.xml"):
         sidecar = path.with_name(f"{path.name}{ending}")
         if sidecar.exists():
-            remedy = "remove it, or choose another name: readers would take it for the new image's"
             raise OptionError(
-                "OUT", expected="no sidecar of that name", got=sidecar.name, remedy=remedy
+                f"The sidecar {sidecar.name} exists already, and readers would apply it to the new "
+                "image. Remove it, or choose another name for the output."
             )
 
 

@@ -15,9 +15,34 @@ import psutil
 
 from beers_deploy.model.raster.source import Source
 from beers_deploy.network import Network
-from beers_deploy.profiles.errors import MachineError, ModelError, OptionError, sizes
+from beers_deploy.profiles.errors import MachineError, ModelError, OptionError, printable, sizes
+from beers_deploy.profiles.target import TILE_PX
 from beers_deploy.quant.tiling.walk import Tiling
-from beers_deploy.restoration.options import Options, parse_halo
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """How an image is to be cut.
+
+    Attributes:
+        side_px: longest side of a tile.
+        halo: 'exact', or pixels of context around a tile.
+    """
+
+    side_px: int = TILE_PX
+    halo: str = "exact"
+
+
+def parse_halo(halo: str, radius_px: int) -> int:
+    """Return the halo in pixels that a user asks for: 'exact' is the network's receptive radius."""
+    if halo == "exact":
+        return radius_px
+    if halo.isdecimal():
+        return int(halo)
+    raise OptionError(
+        f"`halo` must be 'exact' or a number of pixels, got {printable(repr(halo))}. A halo "
+        f"of {radius_px} px is exact for this network."
+    )
 
 
 @dataclass(frozen=True)
@@ -48,10 +73,11 @@ def plan_side(
         least_px: that a span reads, beyond the image where that has fewer.
     """
     if tile_px < 2 * halo_px + lattice_px or halo_px < 0:
-        least = f", {2 * halo_px + lattice_px} px at least" if lattice_px > 1 else ""
-        expected = f"more than twice the halo of {halo_px} px{least}"
-        remedy = "take larger tiles or a smaller halo"
-        raise OptionError("tile", expected=expected, got=f"{tile_px} px", remedy=remedy)
+        least = f", at least {2 * halo_px + lattice_px} px" if lattice_px > 1 else ""
+        raise OptionError(
+            f"`tile` must be more than twice the halo of {halo_px} px{least}, got {tile_px} px. "
+            "Use larger tiles or a smaller halo."
+        )
     # The strides of a network sample other pixels in a tile that begins or ends off the lattice.
     extended_px = _up(max(size_px, least_px), lattice_px)
     side_px = min(tile_px // lattice_px * lattice_px, extended_px)
@@ -183,20 +209,19 @@ class Plan:
         )
 
 
-def plan_for(network: Network, shape: tuple[int, int, int], options: Options) -> Plan:
-    """How an image of `shape` (bands, H, W) is cut for a network, as a user's options ask."""
+def plan_for(network: Network, shape: tuple[int, int, int], tiles: Tiles) -> Plan:
+    """Return how an image of `shape` (bands, H, W) is cut for a network."""
     tiling = network.tiling
     _, height_px, width_px = shape
     if tiling.fixed_px is not None and (
-        tiling.fixed_px != options.tile_px or min(shape[1:]) < tiling.fixed_px
+        tiling.fixed_px != tiles.side_px or min(shape[1:]) < tiling.fixed_px
     ):
-        expected = (
-            f"{tiling.fixed_px}, the size the model is fixed to, and an image at least as large"
+        raise OptionError(
+            f"`tile` must be {tiling.fixed_px} px, the size to which the network is fixed, and the "
+            f"image at least as large, got {tiles.side_px} px and an image of {width_px} x "
+            f"{height_px} pixels. Use a network with free sizes."
         )
-        got = f"tile {options.tile_px}, image {width_px} x {height_px}"
-        remedy = "take a network of free sizes"
-        raise OptionError("tile", expected=expected, got=got, remedy=remedy)
-    return make_plan(shape, options.tile_px, parse_halo(options.halo, tiling.halo_px), tiling)
+    return make_plan(shape, tiles.side_px, parse_halo(tiles.halo, tiling.halo_px), tiling)
 
 
 def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, tiling: Tiling) -> Plan:
@@ -225,23 +250,21 @@ def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, tiling: Tiling
 def _require_fit(bands: int, halo_px: int, tiling: Tiling) -> None:
     """That a network can restore an image of so many bands, with such a halo."""
     if tiling.scale.denominator != 1:
-        got = f"one of {tiling.scale} of it"
-        remedy = "add what enlarges it to the network"
         raise ModelError(
-            "tiled model",
-            expected="a result of the image's size or a multiple",
-            got=got,
-            remedy=remedy,
+            "The network's result must have the size of the image or a multiple of it, but it has "
+            f"{tiling.scale} of it. Add the layers that enlarge the result to the network."
         )
     if tiling.channels_in not in (1, bands):
-        expected = f"an image of {tiling.channels_in} bands, as the network takes them"
         raise OptionError(
-            "network", expected=expected, got=f"{bands}", remedy="choose bands, or another network"
+            f"The network restores {tiling.channels_in} bands together, but the number of bands of "
+            f"the image is {bands}. Select bands, or use another network."
         )
     if halo_px % tiling.lattice_px:
-        expected = f"a multiple of {tiling.lattice_px} px, after which the network's strides repeat"
-        remedy = f"{tiling.halo_px} is exact for this network"
-        raise OptionError("halo", expected=expected, got=f"{halo_px} px", remedy=remedy)
+        raise OptionError(
+            f"`halo` must be a multiple of {tiling.lattice_px} px, after which the strides of the "
+            f"network repeat, got {halo_px} px. A halo of {tiling.halo_px} px is exact for this "
+            "network."
+        )
 
 
 FLOAT_BYTES = np.dtype(np.float32).itemsize
@@ -282,17 +305,19 @@ def check_memory(rows: int, budget_bytes: int | None, bulky: bool) -> int:
         return resident_bytes + rows
     limit, before, rows_size = sizes(allowed_bytes, resident_bytes, rows)
     smaller = (
-        "rewrite the image in tiles (gdal_translate -co TILED=YES)"
+        "Rewrite the image in tiles (gdal_translate -co TILED=YES)"
         if bulky
-        else "take a smaller `tile`"
+        else "Use a smaller `tile`"
     )
     remedy = (
-        f"{smaller} or give it more"
+        f"{smaller}, or allow more memory"
         if resident_bytes < allowed_bytes
-        else f"give it more than {before}"
+        else f"Allow more memory than {before}"
     )
-    got = f"{before} before and {rows_size} for rows of the image"
-    raise MachineError("memory", expected=f"a run within {limit}", got=got, remedy=remedy)
+    raise MachineError(
+        f"The run may use {limit} of memory, but the process already uses {before}, and rows of "
+        f"the image need {rows_size}. {remedy}."
+    )
 
 
 def is_bulky(source: Source, plan: Plan) -> bool:

@@ -1,20 +1,21 @@
-"""What restores one image, made ready before its first row: by a network, or by the traditional
-pipeline.
+"""What restores one image, made ready before its first row: a network, or the traditional pipeline.
 
-Both give finished rows in order, so that whoever writes them, to a file or into an array, need not
-know which it is.
+Both return finished rows in order. Whoever writes them, to a file or into an array, need not know
+which of the two it is.
 """
 
+import logging
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
+from typing import Protocol
 
 import onnx
 
 from beers_deploy.cluster import Cluster
-from beers_deploy.model.progress import Log
 from beers_deploy.model.raster.source import Source
 from beers_deploy.network import Network
 from beers_deploy.profiles.figures import Figure
@@ -22,27 +23,30 @@ from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.detectors.words import warn_of_detectors
 from beers_deploy.restoration.figures import plan_figures, seam_figures
-from beers_deploy.restoration.options import Method, Options
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import (
     Plan,
     Span,
+    Tiles,
     check_memory,
     is_bulky,
     plan_for,
     rows_bytes,
 )
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
+from beers_deploy.restoration.reading import Reading
 from beers_deploy.restoration.runtime import (
     AtFirstCall,
+    Engine,
     Infer,
     Packed,
     infer_on,
     open_runtime,
     tiles_at_once,
 )
-from beers_deploy.restoration.sensor_check import SensorCheck, restored_already, told_sensor
+from beers_deploy.restoration.sensor_check import SensorCheck, checked_sensor, restored_already
 from beers_deploy.restoration.steps import (
+    Around,
     consistency_steps,
     exposed_networks,
     exposures_of,
@@ -51,8 +55,10 @@ from beers_deploy.restoration.steps import (
 from beers_deploy.restoration.tiles.engine import Restorer
 from beers_deploy.restoration.tiles.rows import RestoredRow, restore_rows, rows_to_run
 
+logger = logging.getLogger(__name__)
+
 Tick = Callable[[int], None]
-"""Is told how many ticks were done."""
+"""Is called with the number of ticks that were done."""
 
 RUNS_UNTIL_STEADY = 2
 """Of each tile in work at a time: then a runtime takes no more memory."""
@@ -65,7 +71,8 @@ class Restoration(ABC):
     Attributes:
         source: the image.
         name: of the image, for messages.
-        options: what the user chose.
+        reading: how its pixels are understood.
+        method: 'network' or 'traditional'.
         networks: that restore its bands; none of the traditional pipeline.
         scale: the pixel value that is full scale.
         check: what was seen of the image's sensor.
@@ -74,7 +81,8 @@ class Restoration(ABC):
 
     source: Source
     name: str
-    options: Options
+    reading: Reading
+    method: str
     networks: Sequence[Network] = ()
     scale: FullScale
     check: SensorCheck
@@ -131,24 +139,28 @@ class Restoration(ABC):
         """Return the run in words."""
 
 
-def prepare(
-    source: Source, options: Options, name: str, log: Log, cluster: Cluster | None = None
-) -> Restoration:
-    """Make ready what restores an image.
+class Pipeline(Protocol):
+    """What can restore an image."""
 
-    Args:
-        source: the image.
-        options: what the user chose.
-        name: of the image, for messages.
-        log: is told the plan, and what is seen of the image.
-        cluster: whose workers run the network; None runs it here.
-    """
-    if options.method is Method.traditional:
-        # It loads torch, which is optional.
-        from beers_deploy.restoration.traditional import prepare_traditional
+    @property
+    def network_paths(self) -> list[Path]:
+        """The files of its networks, which no output may be."""
 
-        return prepare_traditional(source, options, name, log)
-    return prepare_network(source, options, name, log, cluster)
+    @property
+    def engine(self) -> Engine:
+        """What runs its networks."""
+
+    def prepare(
+        self, source: Source, reading: Reading, name: str, cluster: Cluster | None = None
+    ) -> Restoration:
+        """Make ready what restores an image.
+
+        Args:
+            source: the image.
+            reading: how its pixels are understood.
+            name: of the image, for messages.
+            cluster: whose workers run the network; None runs it here.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,6 +168,8 @@ class NetworkRestoration(Restoration):
     """A network that restores one image.
 
     Attributes:
+        around: which steps around the network are used.
+        engine: what runs it.
         plan: how the image is cut into tiles.
         restorer: what restores a tile.
         at_once: tiles in work at a time.
@@ -164,6 +178,8 @@ class NetworkRestoration(Restoration):
         seams: figures of the error at seams.
     """
 
+    around: Around
+    engine: Engine
     plan: Plan
     restorer: Restorer
     at_once: int
@@ -184,7 +200,7 @@ class NetworkRestoration(Restoration):
     @property
     def identity(self) -> Mapping[str, object]:
         """All that decides the pixels, besides the image and the full scale."""
-        factors = [exposures_of(network, self.options) for network in self.networks]
+        factors = [exposures_of(network, self.around) for network in self.networks]
         return {
             "model": [network.sha256 for network in self.networks],
             "exposures": [[other.sha256 for other in others.values()] for others in factors],
@@ -224,12 +240,12 @@ class NetworkRestoration(Restoration):
         """Return the peak memory: what the process holds, and the rows to come."""
         needed = rows_bytes(self.source, self.plan, begun=True)
         bulky = is_bulky(self.source, self.plan)
-        return check_memory(needed, self.options.memory_bytes, bulky)
+        return check_memory(needed, self.reading.memory_bytes, bulky)
 
     def figures(self, tally: Tally) -> dict[str, Figure]:
         """Return the figures of a run."""
         figures = {**plan_figures(self.plan), **self.seams, **tally.figures}
-        if any(exposures_of(network, self.options) for network in self.networks):
+        if any(exposures_of(network, self.around) for network in self.networks):
             figures |= tally.exposure_figures
         if self.restorer.consistency:
             figures |= tally.consistency_figures
@@ -238,80 +254,99 @@ class NetworkRestoration(Restoration):
     def text(self) -> dict[str, str]:
         """Return the run in words."""
         text = {"halo": self.plan.halo_words, "consistency": self.consistency}
-        if words := factor_words(self.networks, self.options):
+        if words := factor_words(self.networks, self.around):
             text["exposures"] = words
-        workers = self.options.scheduler
+        workers = self.engine.scheduler
         return text | {"runtime": self.runtime} | ({"workers": workers} if workers else {})
 
 
-def networks_of(options: Options, source: Source) -> list[Network]:
-    """Return the networks of an image, one for all bands or one for each in their order."""
-    given = in_order(options.bands, source.raster) if options.bands else [options.network]
-    networks = [Network.load(network) for network in given]
-    require_alike(networks)
-    return networks
+@dataclass(frozen=True)
+class NetworkPipeline:
+    """A network, or one for each band, and how it is run.
 
+    Attributes:
+        networks: by band; under no name where one is for all.
+        tiles: how an image is cut.
+        engine: what runs the networks.
+        around: which steps around them are used.
+    """
 
-def prepare_network(
-    source: Source, options: Options, name: str, log: Log, cluster: Cluster | None
-) -> NetworkRestoration:
-    """Make a network ready to restore an image; the arguments are those of `prepare`."""
-    networks = networks_of(options, source)
-    raster = source.raster
-    plan = plan_for(networks[0], raster.shape, options)
-    log(plan.sentence)
-    check_memory(rows_bytes(source, plan), options.memory_bytes, is_bulky(source, plan))
-    extents = (raster.extent(source.read(row.keep_start, row.keep_stop)) for row in plan.rows)
-    scale = full_scale_of(name, raster, extents, options.full_scale, options.sensor_bits)
-    check, check_s = check_sensor(source, networks, options, scale.value, name, log)
-    opened, at_once, runtime = _opener(plan, options, networks, cluster)
-    exposed = exposed_networks(networks, options, plan.tiling, scale.value, opened)
-    steps, words = consistency_steps(options, raster, plan.tiling, scale.value)
-    # Values above an assumed full scale show that the assumption is wrong, so they are refused.
-    clips = not scale.assumed
-    restorer = Restorer(raster, exposed, scale.value, plan.tiling, name, clips, steps)
-    return NetworkRestoration(
-        source=source,
-        name=name,
-        options=options,
-        networks=networks,
-        scale=scale,
-        check=check,
-        check_s=check_s,
-        plan=plan,
-        restorer=restorer,
-        at_once=at_once,
-        runtime=runtime,
-        consistency=words,
-        seams=seam_figures(source, plan, restorer),
-    )
+    networks: Mapping[str, Network]
+    tiles: Tiles = Tiles()  # noqa: RUF009 - frozen
+    engine: Engine = Engine()  # noqa: RUF009 - frozen
+    around: Around = Around()  # noqa: RUF009 - frozen
+
+    @property
+    def network_paths(self) -> list[Path]:
+        """The files of the networks, which no output may be."""
+        return [network.path for network in self.networks.values() if network.path]
+
+    def prepare(
+        self, source: Source, reading: Reading, name: str, cluster: Cluster | None = None
+    ) -> NetworkRestoration:
+        """Make the network ready to restore an image; see `Pipeline.prepare`."""
+        raster = source.raster
+        networks = in_order(self.networks, raster)
+        require_alike(networks)
+        plan = plan_for(networks[0], raster.shape, self.tiles)
+        logger.info(plan.sentence)
+        check_memory(rows_bytes(source, plan), reading.memory_bytes, is_bulky(source, plan))
+        extents = (raster.extent(source.read(row.keep_start, row.keep_stop)) for row in plan.rows)
+        scale = full_scale_of(name, raster, extents, reading.full_scale, reading.sensor_bits)
+        check, check_s = check_sensor(source, networks, reading, scale.value, name)
+        opened, at_once, runtime = _opener(plan, self.engine, networks, cluster)
+        exposed = exposed_networks(networks, self.around, plan.tiling, scale.value, opened)
+        steps, words = consistency_steps(
+            self.around, reading.sensors, raster, plan.tiling, scale.value
+        )
+        # Values above an assumed full scale show that the assumption is wrong, so they are refused.
+        clips = not scale.assumed
+        restorer = Restorer(raster, exposed, scale.value, plan.tiling, name, clips, steps)
+        return NetworkRestoration(
+            source=source,
+            name=name,
+            reading=reading,
+            method="network",
+            networks=networks,
+            scale=scale,
+            check=check,
+            check_s=check_s,
+            around=self.around,
+            engine=self.engine,
+            plan=plan,
+            restorer=restorer,
+            at_once=at_once,
+            runtime=runtime,
+            consistency=words,
+            seams=seam_figures(source, plan, restorer),
+        )
 
 
 def _opener(
-    plan: Plan, options: Options, networks: Sequence[Network], cluster: Cluster | None
+    plan: Plan, engine: Engine, networks: Sequence[Network], cluster: Cluster | None
 ) -> tuple[Callable[[onnx.ModelProto, bool], Infer], int, str]:
     """Return what makes a network ready to run, how many tiles are in work, and the runtime.
 
     The first network is opened at once, because it tells whether the runtime takes it. Others are
     opened at their first call: bright images ask for no other exposure.
     """
-    threads = 1 if cluster else options.threads
+    threads = 1 if cluster else engine.threads
     at_once = tiles_at_once(threads, plan.tiles)
-    first, runtime = open_runtime(options.runtime, networks[0].model, threads, at_once)
+    first, runtime = open_runtime(engine.runtime, networks[0].model, threads, at_once)
     if cluster is None:
 
         def open_here(model: onnx.ModelProto, at_first_call: bool) -> Infer:
             if model is networks[0].model:
                 return first
             if at_first_call:
-                return AtFirstCall(partial(open_runtime, options.runtime, model, threads, at_once))
-            return open_runtime(options.runtime, model, threads, at_once)[0]
+                return AtFirstCall(partial(open_runtime, engine.runtime, model, threads, at_once))
+            return open_runtime(engine.runtime, model, threads, at_once)[0]
 
         return open_here, at_once, runtime
     workers = cluster
 
     def open_there(model: onnx.ModelProto, at_first_call: bool) -> Infer:  # noqa: ARG001
-        packed = Packed(model.SerializeToString(), options.runtime, options.threads or 1)
+        packed = Packed(model.SerializeToString(), engine.runtime, engine.threads or 1)
         return infer_on(workers, packed)
 
     # Two rows of tiles are in work: two tiles for each of the cluster's calls keep it busy.
@@ -322,25 +357,25 @@ def _opener(
 def check_sensor(
     source: Source,
     networks: Iterable[Network],
-    options: Options,
+    reading: Reading,
     full_scale: float,
     name: str,
-    log: Log,
 ) -> tuple[SensorCheck, float]:
-    """Look for faults of detectors, and compare an image with the sensor that the user named.
+    """Look for faults of detectors, and compare an image with the sensor that the user names.
 
-    Without a named sensor, log a sentence if the image looks restored already.
+    A warning is logged for each fault and each contradiction; without a named sensor, if the image
+    looks restored already.
 
     Returns:
-        What was seen, and the seconds that it took.
+        The check, and the seconds that it took.
     """
     started = time.perf_counter()
     check = SensorCheck()
-    warn_of_detectors(source, full_scale, log)
-    if any(sensor.name != BLIND for sensor in options.sensors.values()):
-        check = told_sensor(source, options.sensors, full_scale, name, options.strict, log)
-    elif not options.force:
+    warn_of_detectors(source, full_scale)
+    if any(sensor.name != BLIND for sensor in reading.sensors.values()):
+        check = checked_sensor(source, reading.sensors, full_scale, name, reading.strict)
+    elif not reading.force:
         models = [network.model for network in networks]
         if sentence := restored_already(source, models, full_scale):
-            log(sentence)
+            logger.warning(sentence)
     return check, time.perf_counter() - started

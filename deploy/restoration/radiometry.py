@@ -78,6 +78,7 @@ def require_room(raster: Raster, full_scale: float) -> None:
     kind = raster.out_dtype
     # A float output holds any full scale.
     if kind.kind != "f" and full_scale > np.iinfo(kind).max:
-        expected = f"at most {np.iinfo(kind).max} for {kind} pixels"
-        remedy = "convert the image to uint16"
-        raise OptionError("full_scale", expected=expected, got=f"{full_scale:g}", remedy=remedy)
+        raise OptionError(
+            f"`full_scale` must be at most {np.iinfo(kind).max} for {kind} pixels, got "
+            f"{full_scale:g}. Convert the image to uint16."
+        )

@@ -6,10 +6,12 @@ One row is written while the next is made. Whatever stops a run, the output is t
 new one; finished rows stay in the checkpoint where a later run can go on.
 """
 
+import logging
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from math import prod
@@ -20,8 +22,7 @@ from beers_deploy.host_state import peak_memory
 from beers_deploy.model.io.files import require_writable
 from beers_deploy.model.io.lock import only_run
 from beers_deploy.model.processor import require_cores
-from beers_deploy.model.progress import Log, held_back, no_log, steps
-from beers_deploy.model.raster.compression import Compression
+from beers_deploy.model.progress import held_back, steps
 from beers_deploy.model.raster.facts import require_raw
 from beers_deploy.model.raster.reader import open_raster, require_image_file
 from beers_deploy.model.raster.source import Source, fingerprint, stamps
@@ -29,13 +30,23 @@ from beers_deploy.model.raster.writer import cog_bytes, require_codec, write_cog
 from beers_deploy.profiles.errors import BeersError, ImageError, MachineError
 from beers_deploy.profiles.figures import Row, measured
 from beers_deploy.profiles.sensor import numbers_of
+from beers_deploy.restoration.bands import in_order
 from beers_deploy.restoration.checkpoint import Checkpoint
-from beers_deploy.restoration.detectors.fault_list import FaultList, list_beside, write_list
+from beers_deploy.restoration.detectors.fault_list import FOUND, FaultList, list_beside, write_list
 from beers_deploy.restoration.detectors.fix import faults_of, fixed
-from beers_deploy.restoration.options import Options
-from beers_deploy.restoration.output import ToCog, require_tiff_name, what_was_done, write_output
-from beers_deploy.restoration.prepare import Restoration, prepare
+from beers_deploy.restoration.output import (
+    Output,
+    ToCog,
+    require_tiff_name,
+    what_was_done,
+    write_output,
+)
+from beers_deploy.restoration.prepare import Pipeline, Restoration
+from beers_deploy.restoration.reading import Reading
 from beers_deploy.restoration.tiles.rows import RestoredRow
+from beers_deploy.results import Input, Table
+
+logger = logging.getLogger(__name__)
 
 CHECKED = (
     "the comparison of the image's own noise and edges with its sensor, and the look for faults "
@@ -51,80 +62,116 @@ MANY = 0.05
 """Share of an image above its full scale that no scene has, but a wrong full scale."""
 
 
-def restore_file(
-    image: Path, out: Path, options: Options, log: Log = no_log, beside: Sequence[Path | None] = ()
-) -> Row:
-    """Restore `image` into the TIFF `out`, and return the run's figures.
+@dataclass(frozen=True, repr=False, kw_only=True)
+class Run(Table):
+    """One file restored into another.
+
+    Attributes:
+        path: of the restored image.
+        time_s: from opening the image to the finished file.
+    """
+
+    path: Path
+    time_s: float
+
+
+def restore_file(image: Path, output: Output, pipeline: Pipeline, reading: Reading) -> Run:
+    """Restore an image file into a TIFF, and return the run's figures.
 
     Args:
         image: a file that `model.raster.reader.open_raster` opens, of any size.
-        out: a TIFF of the type `Raster.out_dtype`, in the scale of the image; larger by the
+        output: the TIFF, of the type `Raster.out_dtype`, in the scale of the image; larger by the
             network's factor where it has one, and in its place on Earth.
-        options: what the user chose.
-        log: is told the plan, the memory, and how to go on after a stop.
-        beside: other files that the caller will write.
+        pipeline: what restores it.
+        reading: how its pixels are understood.
     """
     started = time.perf_counter()
-    if options.scheduler is None:
-        require_cores("threads", options.threads)
-    with begun(image, out, options, beside) as stored, open_cluster(options.scheduler) as cluster:
+    out = output.path
+    engine = pipeline.engine
+    if engine.scheduler is None:
+        require_cores("threads", engine.threads)
+    paths = [image, *pipeline.network_paths]
+    with begun(output, reading, paths) as stored, open_cluster(engine.scheduler) as cluster:
         before = stamps(stored.files)
         if stored.raster.mask_kind == "alpha":
-            log(ALPHA.format(band=stored.raster.bands + 1))
-        faults = faults_of(stored, options.fix_detectors, str(image), log)
-        work = prepare(fixed(stored, faults), options, str(image), log, cluster)
-        checkpoint = _checkpoint(out, work, faults, log)
+            logger.info(ALPHA.format(band=stored.raster.bands + 1))
+        faults = faults_of(stored, reading.fix_detectors, str(image))
+        work = pipeline.prepare(fixed(stored, faults), reading, str(image), cluster)
+        checkpoint = _checkpoint(output, work, faults)
         done_px = checkpoint.rows
-        with _kept_for_resuming(checkpoint, bool(work.row_ends), log):
-            _finish_rows(checkpoint, work, log)
+        with _kept_for_resuming(checkpoint, bool(work.row_ends)):
+            _finish_rows(checkpoint, work)
             require_unchanged(stored, str(image), before, checkpoint.job["image"])
         # All rows are finished: a stop now would save nothing.
         with held_back():
-            to_cog = _to_cog(work)
-            compression = Compression.none if to_cog else options.compression
+            to_cog = _to_cog(output, work)
+            compression = "none" if to_cog else output.compression
             write_output(checkpoint, work.source, compression, to_cog)
-            write_list(faults, list_beside(out, options.fix_detectors))
+            write_list(faults, list_beside(out, reading.fix_detectors))
     # The sensor check is no part of a restoration, and its time is a figure of its own.
     time_s = time.perf_counter() - started - work.check_s
-    _warn_of_clipping(work, checkpoint, log)
-    return _row(image.name, work, checkpoint, done_px, time_s, faults)
+    _warn_of_clipping(work, checkpoint)
+    row = _row(image.name, work, checkpoint, done_px, time_s, faults)
+    listed = reading.fix_detectors not in ("", FOUND)
+    return Run(
+        title=f"wrote {out}",
+        inputs=(*_inputs(work), image, *([Path(reading.fix_detectors)] if listed else [])),
+        rows=(row,),
+        headings={"restore": ""},
+        details=DETAILS,
+        path=out,
+        time_s=time_s,
+    )
+
+
+DETAILS = frozenset({"runtime", "sensor check", "work factor"})
+"""Figures and words for a closer look."""
+
+
+def _inputs(work: Restoration) -> list[Input]:
+    """Return the networks that a result rests on, with the band of each if there are several."""
+    if len(work.networks) < 2:
+        return [network.input for network in work.networks]
+    # The user may name the bands in another order than that of the image and of the networks.
+    bands = in_order({band: band for band in work.reading.sensors}, work.source.raster)
+    return [
+        network.input._replace(name=f"{network.input.name}, {band}")
+        for band, network in zip(bands, work.networks, strict=True)
+    ]
 
 
 @contextmanager
-def begun(
-    image: Path, out: Path, options: Options, beside: Sequence[Path | None]
-) -> Iterator[Source]:
+def begun(output: Output, reading: Reading, inputs: Sequence[Path]) -> Iterator[Source]:
     """Open the image of the only run on an output, once all that can be checked before is checked.
 
     Args:
-        image: as of `restore_file`.
-        out: as of `restore_file`.
-        options: what the user chose.
-        beside: other files that will be written: like `out` they must be none that is read.
+        output: as of `restore_file`.
+        reading: as of `restore_file`.
+        inputs: the image, then other files that are read.
     """
+    image = inputs[0]
     require_image_file(image)
-    require_writable(out, inputs=[image, *options.network_paths])
-    require_tiff_name(out)
-    require_codec(options.compression)
-    with only_run(out), open_raster(image, options.force) as source:
+    require_writable(output.path, inputs=inputs)
+    require_tiff_name(output.path)
+    require_codec(output.compression)
+    with only_run(output.path), open_raster(image, reading.force) as source:
         # Only an open index tells which tiles are read: no output may be one of them.
-        require_writable(out, *beside, inputs=source.files)
-        require_raw(str(image), source.raster.restored, options.force)
+        require_writable(output.path, *output.others, inputs=source.files)
+        require_raw(str(image), source.raster.restored, reading.force)
         yield source
 
 
-def _checkpoint(out: Path, work: Restoration, faults: FaultList, log: Log) -> Checkpoint:
+def _checkpoint(output: Output, work: Restoration, faults: FaultList) -> Checkpoint:
     """Open the checkpoint of a run, with the rows that an earlier run of the same job finished."""
-    options = work.options
     raster = work.source.raster
     sensors = {
         band: [numbers_of(sensor), numbers_of(sensor.reference)]
-        for band, sensor in options.sensors.items()
+        for band, sensor in work.reading.sensors.items()
     }
     job = {
         # Another version of the program or of the runtime may compute other bits.
         "program": version("beers-deploy"),
-        "method": options.method.value,
+        "method": work.method,
         "image": fingerprint(work.source.files),
         "raster": repr(raster),
         "sensors": repr(sensors),
@@ -132,24 +179,24 @@ def _checkpoint(out: Path, work: Restoration, faults: FaultList, log: Log) -> Ch
         "detectors": faults.sha256,
         **work.identity,
     }
-    needed = cog_bytes(work.out_shape, raster.out_dtype.itemsize) if options.cog else 0
+    needed = cog_bytes(work.out_shape, raster.out_dtype.itemsize) if output.cog else 0
     checkpoint = Checkpoint(
-        out, work.out_shape, raster.out_dtype, job, options.resume, needed, work.row_ends
+        output.path, work.out_shape, raster.out_dtype, job, output.resume, needed, work.row_ends
     )
     if checkpoint.damaged_rows:
-        log(
-            f"{checkpoint.damaged_rows} finished rows do not match their digests: they are made "
-            "again"
+        logger.warning(
+            "%d finished rows do not match their digests: they are restored again",
+            checkpoint.damaged_rows,
         )
     return checkpoint
 
 
-def _to_cog(work: Restoration) -> ToCog | None:
-    """Return what writes the output again as a COG, if the user asked for one."""
-    if not work.options.cog:
+def _to_cog(output: Output, work: Restoration) -> ToCog | None:
+    """Return what writes the output again as a COG, if the user asks for one."""
+    if not output.cog:
         return None
     about = what_was_done(work.networks, work.scale)
-    return partial(write_cog, compression=work.options.compression, about=about)
+    return partial(write_cog, compression=output.compression, about=about)
 
 
 def require_unchanged(
@@ -165,16 +212,12 @@ def require_unchanged(
     """
     # A file that was only touched or copied back is the same image: its content decides.
     if stamps(source.files) != before and fingerprint(source.files) != digest:
-        remedy = "wait until it is written, then restore it again"
         raise ImageError(
-            name,
-            expected="an image that stays as it is",
-            got="a change while it was read",
-            remedy=remedy,
+            f"{name} changed while it was read. Wait until it is written, then restore it again."
         )
 
 
-def _finish_rows(checkpoint: Checkpoint, work: Restoration, log: Log) -> None:
+def _finish_rows(checkpoint: Checkpoint, work: Restoration) -> None:
     """Restore the rows that a checkpoint lacks, and keep each in it while the next is made."""
     total = work.ticks(checkpoint.rows)
     steady = min(work.steady_ticks, total)
@@ -184,9 +227,9 @@ def _finish_rows(checkpoint: Checkpoint, work: Restoration, log: Log) -> None:
             bar.advance(count)
             if bar.done == steady:
                 most = work.memory_bytes()
-                log(
-                    f"memory: about {most / 1e9:.2f} GB (measured after the first tiles, and "
-                    "the rows to come)"
+                logger.info(
+                    "memory: about %.2f GB (measured after the first tiles, and the rows to come)",
+                    most / 1e9,
                 )
             if interrupt.asked:
                 raise KeyboardInterrupt
@@ -195,22 +238,23 @@ def _finish_rows(checkpoint: Checkpoint, work: Restoration, log: Log) -> None:
         with closing(work.rows(checkpoint.rows, tick)) as finished:
             _write_behind(finished, checkpoint)
         checkpoint.require_known(work.name)
-        if not work.options.force:
+        if not work.reading.force:
             checkpoint.tally.require(work.name)
     for doubt in checkpoint.tally.doubts:
-        log(f"look at the result: {doubt}")
+        logger.warning("look at the result: %s", doubt)
 
 
 @contextmanager
-def _kept_for_resuming(checkpoint: Checkpoint, resumable: bool, log: Log) -> Iterator[None]:
+def _kept_for_resuming(checkpoint: Checkpoint, resumable: bool) -> Iterator[None]:
     """Keep finished rows through a stop or a full disk, if a later run can go on from them."""
     try:
         yield
     except KeyboardInterrupt:
         if resumable:
-            log(
-                f"stopped at row {checkpoint.rows} of {checkpoint.shape[1]}; the same command with "
-                "--resume goes on"
+            logger.warning(
+                "stopped at row %d of %d; the same command with --resume goes on",
+                checkpoint.rows,
+                checkpoint.shape[1],
             )
         else:
             checkpoint.remove()
@@ -237,12 +281,14 @@ def _write_behind(restored: Iterable[RestoredRow], checkpoint: Checkpoint) -> No
             writing.result()
 
 
-def _warn_of_clipping(work: Restoration, checkpoint: Checkpoint, log: Log) -> None:
+def _warn_of_clipping(work: Restoration, checkpoint: Checkpoint) -> None:
     clipped = checkpoint.tally.clipped
     if clipped:
         share = clipped / prod(work.source.raster.shape)
         doubt = f": {share:.0%} of the image; is that its full scale?" if share > MANY else ""
-        log(f"{clipped} pixels above full scale, {work.scale.words}, were clipped to it{doubt}")
+        logger.warning(
+            "%d pixels above full scale, %s, were clipped to it%s", clipped, work.scale.words, doubt
+        )
 
 
 def _row(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import version
 from threading import Lock, get_ident
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import onnx
@@ -21,12 +21,31 @@ from beers_deploy.profiles.errors import ModelError, optional
 from beers_deploy.quant.kernels import made_exact
 from beers_deploy.quant.onnx_file import is_quantised, parse_onnx
 from beers_deploy.quant.session import open_session, tensors_of
-from beers_deploy.restoration.options import Runtime
+
+Runtime = Literal["onnxruntime", "openvino"]
+"""The library that runs a network."""
 
 Infer = Callable[[np.ndarray], np.ndarray]
 """A network ready to run: (1, C, h, w) float32 in [0, 1] to what it makes of it, of the shape that
 its file says.
 """
+
+
+@dataclass(frozen=True)
+class Engine:
+    """What runs the networks of a restoration.
+
+    Attributes:
+        runtime: the library.
+        threads: of the runtime; 0 uses every core, or one for each call that a scheduler's workers
+            run at once.
+        scheduler: address of a Dask scheduler whose workers run the network; None runs it here.
+    """
+
+    runtime: Runtime = "onnxruntime"
+    threads: int = 0
+    scheduler: str | None = None
+
 
 LOWEST = "openvino.lowest_uint8"
 
@@ -54,10 +73,9 @@ def open_openvino(model: onnx.ModelProto, threads: int, at_once: int = 1) -> tup
             network.reshape(list(shape))
             return core.compile_model(network, "CPU", options)
         except RuntimeError as error:
-            got = " ".join(str(error).split())[:160]
-            remedy = "take `runtime` onnxruntime"
+            reason = " ".join(str(error).split())[:160]
             raise ModelError(
-                "ONNX model", expected="one that OpenVINO runs", got=got, remedy=remedy
+                f"OpenVINO does not run the network: {reason}. Use `runtime` onnxruntime."
             ) from error
 
     compiling = Lock()
@@ -148,7 +166,7 @@ def open_runtime(
         at_once: how many callers share the threads.
     """
     require_cores("threads", threads)
-    if runtime is Runtime.openvino:
+    if runtime == "openvino":
         return open_openvino(model, threads, at_once)
     session = open_session(model, session_threads(threads, at_once))
     return lambda image: tensors_of(session, None, image)[0], f"onnxruntime {ort.__version__}"

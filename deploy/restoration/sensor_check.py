@@ -12,6 +12,7 @@ that is not given their sensor takes them for images of a middling one, and shar
 time.
 """
 
+import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -33,15 +34,16 @@ from beers_deploy.model.metrics.noise_line import (
     join,
 )
 from beers_deploy.model.metrics.refusal import Refusal
-from beers_deploy.model.progress import Log
 from beers_deploy.model.raster.source import Source
 from beers_deploy.model.simulator.mtf import sensor_mtf
-from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.errors import ImageError, printable
 from beers_deploy.profiles.figures import Figure, measured, unavailable
 from beers_deploy.profiles.response import NYQUIST
 from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.restoration.bands import in_order
+
+logger = logging.getLogger(__name__)
 
 WINDOW_PX = 512
 ACROSS = 4
@@ -138,48 +140,49 @@ class SensorCheck:
         words = "; ".join(self.doubts) or ("agrees" if is_measured else "cannot be seen")
         return {"sensor told": words} if self.figures else {}
 
-    def settled(self, name: str, sensor: str, strict: bool, log: Log) -> "SensorCheck":
-        """This check, once `log` is told of each contradiction.
+    def settled(self, name: str, sensor: str, strict: bool) -> "SensorCheck":
+        """Return this check, and log a warning for each contradiction.
 
         Args:
             name: of the image, for messages.
             sensor: its profile's name.
             strict: whether a contradiction is an error instead.
-            log: is told of each.
+
+        Raises:
+            ImageError: a contradiction, if `strict`.
         """
         if self.doubts and strict:
-            remedy = "name its own sensor, measure it with 'characterise', or leave `strict` out"
             raise ImageError(
-                name, expected=f"an image of {sensor}", got="; ".join(self.doubts), remedy=remedy
+                f"{name} contradicts the sensor {sensor}: {printable('; '.join(self.doubts))}. "
+                "Name the image's own sensor, measure it with 'characterise', or leave `strict` "
+                "out."
             )
         for doubt in self.doubts:
-            log(f"look at the sensor: {doubt}")
+            logger.warning("look at the sensor: %s", doubt)
         return self
 
 
-def told_sensor(
+def checked_sensor(
     source: Source,
     sensors: Mapping[str, Sensor],
     full_scale: float,
     name: str,
     strict: bool,
-    log: Log,
 ) -> SensorCheck:
-    """Hold an image against the sensor that a user named, and say where it contradicts it.
+    """Compare an image with the sensor that a user names, and warn where it contradicts it.
 
     Args:
         source: the image.
         sensors: by band, under no name where one is for all; empty where none was named.
         full_scale: the pixel value that is the sensors' largest digital number.
         name: of the image, for messages.
-        strict: whether a contradiction is an error.
-        log: is told of each otherwise.
+        strict: whether a contradiction is an error instead of a warning.
     """
     if not sensors:
         return SensorCheck()
     ordered = in_order(sensors, source.raster)
     names = " and ".join(dict.fromkeys(sensor.name for sensor in ordered))
-    return check_source(source, ordered, full_scale).settled(name, names, strict, log)
+    return check_source(source, ordered, full_scale).settled(name, names, strict)
 
 
 def check_source(source: Source, sensors: Sequence[Sensor], full_scale: float) -> SensorCheck:

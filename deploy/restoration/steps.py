@@ -6,6 +6,7 @@ band for each pixel.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import chain
 
 import onnx
@@ -17,7 +18,6 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.quant.tiling.walk import Tiling
 from beers_deploy.restoration.bands import in_order
-from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.runtime import Infer
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 
@@ -26,14 +26,30 @@ NO_SENSOR = f"{OFF}: no sensor is named"
 OTHER_PIXELS = f"{OFF}: the network makes other pixels or bands"
 
 
-def exposures_of(network: Network, options: Options) -> Mapping[int, Network]:
+@dataclass(frozen=True)
+class Around:
+    """Which steps around a network are used where they can be.
+
+    Attributes:
+        consistency: whether the result is made to agree with the image at low spatial frequencies.
+        exposure: whether dark parts are restored at a higher exposure.
+    """
+
+    consistency: bool = True
+    exposure: bool = True
+
+
+BOTH: Around = Around()
+
+
+def exposures_of(network: Network, around: Around) -> Mapping[int, Network]:
     """Return a network at higher exposures by factor; empty if none is to be used."""
-    return network.exposures if options.exposure else {}
+    return network.exposures if around.exposure else {}
 
 
 def exposed_networks(
     networks: Sequence[Network],
-    options: Options,
+    around: Around,
     tiling: Tiling,
     full_scale: float,
     opened: Callable[[onnx.ModelProto, bool], Infer],
@@ -42,14 +58,14 @@ def exposed_networks(
 
     Args:
         networks: one for all bands or one for each.
-        options: what the user chose.
+        around: whether higher exposures are used.
         tiling: how the networks meet an image.
         full_scale: the pixel value that is 1.0 to a network.
         opened: makes a network ready to run, at its first call if so asked.
     """
     built = []
     for network in networks:
-        others = exposures_of(network, options)
+        others = exposures_of(network, around)
         infers = {factor: opened(other.model, True) for factor, other in others.items()}
         offset = 0.0
         if network.profile is not None and others:
@@ -66,23 +82,27 @@ def offset_of(sensor: Sensor, full_scale: float) -> float:
 
 
 def consistency_steps(
-    options: Options, raster: Raster, tiling: Tiling, full_scale: float
+    around: Around,
+    sensors: Mapping[str, Sensor],
+    raster: Raster,
+    tiling: Tiling,
+    full_scale: float,
 ) -> tuple[tuple[Consistency | None, ...], str]:
     """Build the consistency step, one for all bands or one for each, and say in words whether it is
     taken.
 
     "blind" is the name of no sensor: a band of that name has None.
     """
-    if not options.consistency:
+    if not around.consistency:
         return (), OFF
-    blind = [band for band, sensor in options.sensors.items() if sensor.name == BLIND]
-    if len(blind) == len(options.sensors):
+    blind = [band for band, sensor in sensors.items() if sensor.name == BLIND]
+    if len(blind) == len(sensors):
         return (), NO_SENSOR
     if not keeps_pixels(tiling):
         return (), OTHER_PIXELS
-    sensors = in_order(options.sensors, raster)
     steps = tuple(
-        None if sensor.name == BLIND else step_for(sensor, full_scale) for sensor in sensors
+        None if sensor.name == BLIND else step_for(sensor, full_scale)
+        for sensor in in_order(sensors, raster)
     )
     return steps, f"on; {', '.join(blind)} {NO_SENSOR}" if blind else "on"
 
@@ -99,7 +119,7 @@ def step_for(sensor: Sensor, full_scale: float) -> Consistency:
     return Consistency.of(sensor.nominal(), sensor.reference.nominal(), full_scale)
 
 
-def factor_words(networks: Iterable[Network], options: Options) -> str:
+def factor_words(networks: Iterable[Network], around: Around) -> str:
     """Return the factors that may be used, in words; empty if there is only one."""
-    factors = sorted(set(chain.from_iterable(exposures_of(each, options) for each in networks)))
+    factors = sorted(set(chain.from_iterable(exposures_of(each, around) for each in networks)))
     return ", ".join(f"x{factor}" for factor in (1, *factors)) if factors else ""

@@ -8,22 +8,25 @@ own sensor.
 
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from beers_deploy.model.progress import Log, Steps, steps
+from beers_deploy.cluster import Cluster
+from beers_deploy.model.progress import Steps, steps
 from beers_deploy.model.raster.source import Source, strips
 from beers_deploy.model.traditional.pipeline import Chain, restore_strips
 from beers_deploy.profiles.figures import Figure
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.bands import in_order
-from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Span, check_memory
 from beers_deploy.restoration.prepare import Restoration, check_sensor
 from beers_deploy.restoration.radiometry import full_scale_of
+from beers_deploy.restoration.reading import Reading
+from beers_deploy.restoration.runtime import Engine
 from beers_deploy.restoration.tiles.engine import as_stored, checked_strip
 from beers_deploy.restoration.tiles.rows import RestoredRow
 
@@ -64,7 +67,7 @@ class TraditionalRestoration(Restoration):
     @property
     def identity(self) -> Mapping[str, object]:
         """The quality of the pipeline."""
-        return {"quality": self.options.quality}
+        return {"quality": self.chains[0].quality}
 
     @property
     def how(self) -> str:
@@ -100,7 +103,7 @@ class TraditionalRestoration(Restoration):
     def text(self) -> dict[str, str]:
         """Return the run in words."""
         names = ", ".join(sensor.name for sensor in self.sensors)
-        return {"method": self.options.method.value, "sensor": names}
+        return {"method": self.method, "sensor": names}
 
     def _to_dn(self, band: int) -> np.float32:
         """Return the digital number of the sensor for a pixel value of 1."""
@@ -162,35 +165,59 @@ def _counted(strips_read: Iterator[Tensor], bar: Steps) -> Iterator[Tensor]:
         bar.advance(strip.shape[0])
 
 
-def prepare_traditional(
-    source: Source, options: Options, name: str, log: Log
-) -> TraditionalRestoration:
-    """Make the traditional pipeline ready to restore an image; the arguments are those of
-    `prepare`.
+@dataclass(frozen=True)
+class TraditionalPipeline:
+    """The traditional pipeline, as what can restore an image.
+
+    Attributes:
+        quality: fast, standard or best.
     """
-    raster = source.raster
-    sensors = in_order(options.sensors, raster)
-    sensors *= raster.bands // len(sensors)
-    needed = (
-        FIXED_BYTES
-        + BYTES_PER_COLUMN * raster.width_px * raster.bands
-        + source.held_bytes(STRIP_PX)
-    )
-    check_memory(needed, options.memory_bytes, bulky=False)
-    extents = (raster.extent(source.read(*rows)) for rows in strips(raster.height_px, STRIP_PX))
-    scale = full_scale_of(name, raster, extents, options.full_scale, options.sensor_bits)
-    check, check_s = check_sensor(source, (), options, scale.value, name, log)
-    chains = tuple(
-        Chain(sensor.nominal(), sensor.reference.nominal(), options.quality) for sensor in sensors
-    )
-    restoration = TraditionalRestoration(
-        source=source,
-        name=name,
-        options=options,
-        scale=scale,
-        check=check,
-        check_s=check_s,
-        chains=chains,
-        sensors=tuple(sensors),
-    )
-    return restoration.fitted()
+
+    quality: str = "standard"
+
+    @property
+    def network_paths(self) -> list[Path]:
+        """None: it has no networks."""
+        return []
+
+    @property
+    def engine(self) -> Engine:
+        """This process."""
+        return Engine()
+
+    def prepare(
+        self,
+        source: Source,
+        reading: Reading,
+        name: str,
+        cluster: Cluster | None = None,  # noqa: ARG002
+    ) -> TraditionalRestoration:
+        """Make the pipeline ready to restore an image; see `prepare.Pipeline.prepare`."""
+        raster = source.raster
+        sensors = in_order(reading.sensors, raster)
+        sensors *= raster.bands // len(sensors)
+        needed = (
+            FIXED_BYTES
+            + BYTES_PER_COLUMN * raster.width_px * raster.bands
+            + source.held_bytes(STRIP_PX)
+        )
+        check_memory(needed, reading.memory_bytes, bulky=False)
+        rows = strips(raster.height_px, STRIP_PX)
+        extents = (raster.extent(source.read(*strip)) for strip in rows)
+        scale = full_scale_of(name, raster, extents, reading.full_scale, reading.sensor_bits)
+        check, check_s = check_sensor(source, (), reading, scale.value, name)
+        chains = tuple(
+            Chain(sensor.nominal(), sensor.reference.nominal(), self.quality) for sensor in sensors
+        )
+        restoration = TraditionalRestoration(
+            source=source,
+            name=name,
+            reading=reading,
+            method="traditional",
+            scale=scale,
+            check=check,
+            check_s=check_s,
+            chains=chains,
+            sensors=tuple(sensors),
+        )
+        return restoration.fitted()

@@ -1,48 +1,36 @@
-"""The whole chain on one image, ending with a report: simulate, export, gate, check, restore,
-bench.
+"""The parts of the demonstration: input, tables of time, quality, pictures, headline."""
 
-Each step is the verb's own function; here their rows are joined.
-"""
-
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.bench import tables
-from beers_deploy.bench.swath import Swath, predict_network
-from beers_deploy.bench.traditional import measure_chain
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import Placement
-from beers_deploy.dpu.checker.table import check
-from beers_deploy.library import restore
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.pictures import busiest_windows, picture_url, stretch_of, strip
 from beers_deploy.model.metrics.fidelity import fidelity_db, ssim
-from beers_deploy.model.progress import Log
 from beers_deploy.model.raster.images import read_acquisition, read_pixels
-from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.model.shipped import SENSOR, VARIANT
 from beers_deploy.model.simulator.acquire import MARGIN_PX, Pair, simulate_pair
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import read_scene
-from beers_deploy.network import Network
-from beers_deploy.profiles import Sensor, load_sensor
+from beers_deploy.network import Network, SensorLike
+from beers_deploy.performance import board as bench_board
+from beers_deploy.performance import tables
+from beers_deploy.performance.swath import Swath, predict_network
+from beers_deploy.performance.traditional import measure_chain
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Row, measured
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.sensor import MAX_DN, Sensor
 from beers_deploy.profiles.sensor_file import reference_for
 from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, board_names
-from beers_deploy.quant.onnx_file import load_onnx
-from beers_deploy.quant.tiling.walk import tiling_of
-from beers_deploy.report.page import Picture, Report, Section
-from beers_deploy.verdict import gate
+from beers_deploy.report.page import Picture, Section
 
 BITS = 12
 SIDE_PX = 640
-GATE_PATCHES = 12
 CROP_PX = 110
 ZOOM = 3
 LARGEST_PX = 1280
@@ -50,8 +38,6 @@ SWATH_PX = (13600, 9016)
 """Width and height of the paper's swath."""
 WITHIN_S = 60.0
 """What a swath may take, for the smallest board to be named."""
-FILES = ("report.html", "float.onnx", "int8.onnx", "core.onnx", "restored.tif", "before-after.png")
-"""What a run leaves in its folder; core.onnx is the network in the board's encoding."""
 INPUT = "degraded input"
 TRADITIONAL = "traditional"
 INT8 = f"{VARIANT}, INT8"
@@ -66,6 +52,9 @@ GATE_CAPTION = (
     "On simulated patches that calibration did not see; the INT8 network obeys the "
     "DPU's power-of-two rules."
 )
+DETAILS = bench_board.DETAILS | {"samples"}
+"""Figures and tables for a closer look."""
+
 NOTES = (
     (
         "Nothing here has run on a board: the DPU's figures come from a cost model fitted on "
@@ -79,71 +68,24 @@ NOTES = (
 )
 
 
-def run_demo(
-    image: Path | None,
-    out: Path,
-    seed: int,
-    say: Log,
-    full_scale: float | None = None,
-    sensor: str = SENSOR,
-) -> Report:
-    """Run the chain, write its files into a folder, and return the report.
-
-    Args:
-        image: a raw acquisition or a photograph; a synthetic scene if None.
-        out: the folder.
-        seed: of every random draw.
-        say: is told each step.
-        full_scale: pixel value of a raw image that is full scale.
-        sensor: of the raw image, or to simulate: a profile's name or file.
-    """
-    say("reading the image")
-    sensors = load_sensors(sensor)
-    degraded, pair = read_input(image, seed, sensors, full_scale)
-    say("telling the shipped network the sensor, and gating its INT8")
-    floating, int8 = (
-        Network.load(name, sensor=sensors[0]) for name in (VARIANT, f"{VARIANT}-int8")
-    )
-    for name, network in (("float", floating), ("int8", int8), ("core", int8.core())):
-        network.save(out / f"{name}.onnx")
-    float_file = out / "float.onnx"
-    int8_file = out / "int8.onnx"
-    verdict = gate(int8_file, float_file, sensor=sensors[0], patches=GATE_PATCHES, seed=seed)
-    say("checking every operator against the DPU")
-    placement = check(int8_file, tile=TILE_PX).placement
-    say("restoring: traditional pipeline and INT8 network")
-    traditional = restore(degraded, method="traditional", sensor=sensors[0], full_scale=MAX_DN)
-    int8_dn = restore(degraded, f"{VARIANT}-int8", sensor=sensors[0], full_scale=MAX_DN)
-    # The file holds integers: what is measured and shown is what it holds.
-    images = {INPUT: degraded, TRADITIONAL: traditional, INT8: np.rint(int8_dn)}
-    write_tiff(out / "restored.tif", images[INT8].astype(np.uint16))
-    quality = list[Row]()
-    if pair is not None:
-        reference = pair.reference
-        for name, dn in images.items():
-            psnr = measured(fidelity_db(dn, reference, degraded), "dB", "simulated pair")
-            similarity = measured(ssim(dn, reference, MAX_DN), "ratio", "simulated pair")
-            quality.append(Row("quality", name, {"PSNR": psnr, "SSIM": similarity}))
-        images[REFERENCE] = reference
-    say("measuring the traditional pipeline, predicting the board")
-    bench = bench_tables(int8_file, degraded, sensors)
-    sections = [*bench]
-    if quality:
-        sections.append(Section("Quality on this image, over 4095 DN", quality))
-    sections.append(Section("What quantisation changes", verdict.rows, GATE_CAPTION))
-    sentence = headline(bench[0].rows, quality, placement)
-    return Report(
-        "From training to board, on one image", sentence, sections, pictures_of(images, out), NOTES
-    )
+def quality_rows(images: Mapping[str, np.ndarray], pair: Pair, degraded: np.ndarray) -> list[Row]:
+    """Return PSNR and SSIM of each image (H, W) against the reference of a simulated pair."""
+    rows = []
+    for name, dn in images.items():
+        psnr = measured(fidelity_db(dn, pair.reference, degraded), "dB", "simulated pair")
+        similarity = measured(ssim(dn, pair.reference, MAX_DN), "ratio", "simulated pair")
+        rows.append(Row("quality", name, {"PSNR": psnr, "SSIM": similarity}))
+    return rows
 
 
-def load_sensors(name: str = SENSOR) -> tuple[Sensor, Sensor]:
-    """The sensor that the demo simulates, and the one it imitates."""
-    degraded = load_sensor(name)
+def load_sensors(sensor: SensorLike = SENSOR) -> tuple[Sensor, Sensor]:
+    """Return the sensor that the demo simulates, and the one that it imitates."""
+    degraded = Sensor.load(sensor)
     if degraded.nominal().bits != BITS:
-        got = f"{degraded.nominal().bits} bits"
-        remedy = "use 'restore', with a full scale or the traditional method"
-        raise OptionError("sensor", expected=f"a sensor of {BITS} bits", got=got, remedy=remedy)
+        raise OptionError(
+            f"`sensor` must have {BITS} bits, but {degraded.name} has {degraded.nominal().bits}. "
+            "Use 'restore', with a full scale or the traditional method."
+        )
     return degraded, reference_for(degraded)
 
 
@@ -174,12 +116,12 @@ def read_input(
     return pair.degraded, pair
 
 
-def bench_tables(model: Path, dn: np.ndarray, sensors: tuple[Sensor, Sensor]) -> list[Section]:
+def bench_tables(model: Network, dn: np.ndarray, sensors: tuple[Sensor, Sensor]) -> list[Section]:
     """Speed for this image, for the swath of the paper beside its rows, and for that swath on every
     board.
     """
     dpu = load_dpu(DEFAULT_TARGET)
-    halo_px = tiling_of(load_onnx(model)).halo_px
+    halo_px = model.tiling.halo_px
     chain = measure_chain(dn, *sensors)
     rows = []
     for width, height in ((dn.shape[1], dn.shape[0]), SWATH_PX):

@@ -6,9 +6,10 @@ OUT/NAME.safetensors  OUT/NAME-int8.onnx  OUT/NAME.md
 """
 
 import hashlib
+import logging
 import math
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -28,9 +29,9 @@ from beers_deploy.model.variants import VARIANTS, Variant
 from beers_deploy.network_files import Conditioned
 from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
 from beers_deploy.quant.onnx_file import save_onnx
-from beers_deploy.quantise import family_model, rounding_of
+from beers_deploy.quantization import family_model, rounding_of
 
-Say = Callable[[str], None]
+logger = logging.getLogger(__name__)
 
 
 def make_network(
@@ -40,7 +41,6 @@ def make_network(
     out: Path,
     resume: bool,
     device: str,
-    say: Say,
 ) -> None:
     """Run a recipe to its end.
 
@@ -51,15 +51,14 @@ def make_network(
         out: folder of what is made.
         resume: whether to go on with what lies there; else it holds no run.
         device: cpu or cuda.
-        say: is told what was written.
     """
     weights = shipped_weights(recipe.start) if recipe.start else None
     for number, stage in enumerate(recipe.stages, 1):
         run = stage_run(recipe, number, stage, images, out, weights, device)
         goes_on = resume and run.checkpoint.exists()
-        train(run, goes_on, Worker(), say)
+        train(run, goes_on, Worker())
         weights = run.weights
-        say(f"stage {number} of {len(recipe.stages)}, {stage.name}: wrote {weights}")
+        logger.info("stage %d of %d, %s: wrote %s", number, len(recipe.stages), stage.name, weights)
     assert weights is not None  # noqa: S101 - a recipe has a stage
     finished = out / f"{recipe.variant}.safetensors"
     shutil.copyfile(weights, finished)
@@ -69,7 +68,7 @@ def make_network(
     with whole_file(card) as temporary:
         temporary.write_text(model_card(recipe, toml, images), encoding="utf-8")
     for path in (finished, int8, card):
-        say(f"wrote {path}")
+        logger.info("wrote %s", path)
 
 
 def stage_run(

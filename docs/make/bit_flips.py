@@ -9,8 +9,9 @@ from itertools import product
 from pathlib import Path
 
 from beers_deploy.model.io.files import write_text
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.target import load_target
 from beers_deploy.quant.calibration import Calibration
 from beers_deploy.studies.stress.bit_flips import SETS, flip_curves_svg, flip_rows
 from beers_deploy.studies.stress.networks import open_subject
@@ -91,9 +92,8 @@ def table(networks: Mapping[str, Sequence[Row]]) -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    studies = {
-        variant: flip_rows(open_subject(Path(variant), None), SOURCE, BOARD) for variant in VARIANTS
-    }
+    board = load_target(BOARD)
+    studies = {variant: flip_rows(open_subject(variant), SOURCE, board) for variant in VARIANTS}
     write_text(PAGE, document(studies))
     write_text(PICTURE, flip_curves_svg(studies))
     print(f"wrote {PAGE} and {PICTURE}")

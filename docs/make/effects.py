@@ -17,7 +17,6 @@ from beers_deploy.model.simulator.acquire import MARGIN_PX, prepare_scene, simul
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.plan import ORDER, TOLERANCE_DN, Plan, make_plan, scene_stats
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.effects import TABLES, middle_effect
 from beers_deploy.profiles.scene_call import (
     calling_for,
@@ -26,6 +25,7 @@ from beers_deploy.profiles.scene_call import (
     typical_effects,
 )
 from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.sensor_file import load_sensor
 
 DOCS = Path(__file__).parents[1]
 PAGE = DOCS / "explanation" / "effects.md"

@@ -11,7 +11,7 @@ from pathlib import Path
 from beers_deploy.model.shipped import INT8, shipped_names, shipped_weights
 from beers_deploy.network_files import Conditioned
 from beers_deploy.quant.onnx_file import save_onnx
-from beers_deploy.quantise import family_model
+from beers_deploy.quantization import family_model
 
 WEIGHTS = Path(__file__).parents[2] / "model" / "weights"
 

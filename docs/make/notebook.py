@@ -1,4 +1,4 @@
-"""Shows the tutorials' notebooks as pages of the site: a hook of MkDocs, which mkdocs.yml names.
+"""Show the tutorials' notebooks as pages of the site: a hook of MkDocs, which mkdocs.yml names.
 
 `tutorials/NAME.ipynb` becomes the page `tutorials/NAME.md` as the site is built; no such file is
 written. Code becomes fenced code, printed text a block, a picture an image inside the page. The
@@ -27,13 +27,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def page(notebook: dict[str, Any], name: str) -> str:
-    """The notebook as Markdown, with a link to the file at its end."""
+    """Return a notebook as Markdown, with a link to the file at its end."""
     parts = chain.from_iterable(map(cell_parts, notebook["cells"]))
     return "\n\n".join([*parts, f"[The notebook itself]({name}), to run."]) + "\n"
 
 
 def cell_parts(cell: dict[str, Any]) -> list[str]:
-    """A cell as Markdown, then what it gave."""
+    """Return a cell as Markdown, and its outputs."""
     source = "".join(cell["source"])
     if cell["cell_type"] == "markdown":
         return [source]
@@ -41,7 +41,7 @@ def cell_parts(cell: dict[str, Any]) -> list[str]:
 
 
 def output_part(output: dict[str, Any]) -> str:
-    """What a cell gave: a picture where there is one, its text where there is none."""
+    """Return an output of a cell as Markdown: its picture if it has one, else its text."""
     data = output.get("data", {})
     if "image/png" in data:
         return (

@@ -108,6 +108,6 @@ def limitation_lines() -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    shipped = open_subject(Path(VARIANT), None)
+    shipped = open_subject(VARIANT)
     write_text(TARGET, document(shipped, run_battery(shipped)))
     print(f"wrote {TARGET}")

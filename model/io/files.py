@@ -13,7 +13,7 @@ from itertools import chain, combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from beers_deploy.profiles.errors import MachineError, OptionError
+from beers_deploy.profiles.errors import MachineError, OptionError, printable
 
 TIFF_SUFFIXES = {".tif", ".tiff"}
 IMAGE_SUFFIXES = TIFF_SUFFIXES | {".png", ".jpg", ".jpeg"}
@@ -63,7 +63,7 @@ def require_writable(
     _require_apart(outputs, image_folders, inputs)
     for folder in image_folders:
         if os.path.lexists(folder) and not folder.is_dir():
-            raise _unwritable(folder, "something else", expected="a folder")
+            raise MachineError(f"{folder} is not a folder. Choose another path.")
     for path in outputs:
         require_regular(path)
         _probe(path)
@@ -81,17 +81,17 @@ def _require_apart(
     # What does not exist has no identity, and is in nobody's way.
     identities = {_identity(file) for file in files} - {None}
     homes = {_identity(image.parent) for image in images} - {None}
-    for places, occupied, by in (
-        (outputs, identities, "an input of this run"),
-        (image_folders, homes, "the folder of an input"),
+    for places, occupied, use in (
+        (outputs, identities, "is an input of this run"),
+        (image_folders, homes, "is the folder of an input"),
     ):
         for path in places:
             if _identity(path) in occupied:
-                raise _taken(path, by)
+                raise _taken(path, use)
     for one, other in combinations(outputs, 2):
         # Some disks know no capitals.
         if os.path.realpath(one).casefold() == os.path.realpath(other).casefold():
-            raise _taken(other, f"a place that another output takes: {one}")
+            raise _taken(other, f"is the path of another output, {one}")
 
 
 def require_regular(path: Path) -> None:
@@ -99,12 +99,15 @@ def require_regular(path: Path) -> None:
     nothing may.
     """
     if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
-        got = "no regular file"
+        kind = "is not a regular file"
         if path.is_symlink():
-            got = "a symbolic link"
+            kind = "is a symbolic link"
         elif path.is_dir():
-            got = "a folder"
-        raise _unwritable(path, got, expected="a regular file or a new name")
+            kind = "is a folder"
+        raise MachineError(
+            f"{path} {kind}, but an output must be a regular file or a new name. Choose another "
+            "path."
+        )
 
 
 def _probe(path: Path) -> None:
@@ -143,13 +146,14 @@ def _files_of(path: Path) -> list[Path]:
     return [file for file in path.glob("*") if file.suffix.lower() in READ_SUFFIXES]
 
 
-def _taken(path: Path, got: str) -> OptionError:
-    expected = "a place of its own for each output"
-    return OptionError(str(path), expected=expected, got=got, remedy="choose another path")
+def _taken(path: Path, use: str) -> OptionError:
+    return OptionError(
+        f"{path} {use}, but each output needs a place of its own. Choose another path."
+    )
 
 
-def _unwritable(path: Path, got: str, expected: str = "a place to write to") -> MachineError:
-    return MachineError(str(path), expected=expected, got=got, remedy="choose another path")
+def _unwritable(path: Path, reason: str) -> MachineError:
+    return MachineError(f"{printable(str(path))} cannot be written: {reason}. Choose another path.")
 
 
 def write_text(path: Path, text: str) -> None:

@@ -59,9 +59,10 @@ def _take(out: Path, folder: Path) -> BaseFileLock:
     # A file that only stands for a lock would outlive a killed run: rather none where the system
     # has none.
     if folder.is_symlink():
-        got = "a symbolic link"
-        remedy = "remove it, or choose another output"
-        raise MachineError(str(folder), expected="a folder of this program", got=got, remedy=remedy)
+        raise MachineError(
+            f"{folder} must be a folder of this program, but it is a symbolic link. Remove it, or "
+            "choose another output."
+        )
     lock = FileLock(folder / NAME, timeout=GRACE_S, thread_local=False, fallback_to_soft=False)
     until_s = time.monotonic() + GRACE_S
     while True:
@@ -69,18 +70,16 @@ def _take(out: Path, folder: Path) -> BaseFileLock:
             folder.mkdir(parents=True, exist_ok=True)
             lock.acquire()
         except Timeout as error:
-            got = "another one at work"
-            remedy = "wait for its end or choose another output"
             raise MachineError(
-                str(out), expected="no other run on this output", got=got, remedy=remedy
+                f"Another run is at work on the output {out}. Wait until it ends, or choose "
+                "another output."
             ) from error
         except OSError as error:
             if isinstance(error, FileNotFoundError) and time.monotonic() < until_s:
                 continue  # The folder went with a run that ended just now.
             if error.errno not in NO_LOCKS:
-                got = error.strerror or str(error)
-                remedy = "choose another path"
+                reason = error.strerror or str(error)
                 raise MachineError(
-                    str(folder), expected="a folder to write to", got=got, remedy=remedy
+                    f"The folder {folder} cannot be written: {reason}. Choose another path."
                 ) from error
         return lock

@@ -19,7 +19,7 @@ from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.formats import HEAD_BYTES, SAFETENSORS, OtherFormat, other_format
 from beers_deploy.model.variants import Kernels, Variant
-from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.profiles.toml import parse_json, unreadable
 
 BANKED = "behind the bank of its sensor"
@@ -27,7 +27,7 @@ BANKED = "behind the bank of its sensor"
 state none.
 """
 
-TRAINED = "give a file written by 'beers-deploy train'"
+TRAINED = "Give a file written by 'beers-deploy train'"
 
 FAULTS = (AttributeError, LookupError, TypeError, ValueError, OverflowError, RuntimeError)
 """What reading a header or filling a network may raise on a file that is not ours."""
@@ -87,14 +87,14 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
             # others may change.
             return {key: np.array(file.get_tensor(key)) for key in file.keys()}, header  # noqa: SIM118 - no mapping
     except (SafetensorError, OSError, ValueError, LookupError, TypeError, RuntimeError) as error:
-        got = unreadable(path) or " ".join(str(error).split())[:120]
-        remedy = TRAINED
+        name = printable(str(path))
         if other := _other_format(path):
-            got = other.name
-            remedy = f"{TRAINED}, or an ONNX file of your own network: {other.remedy}"
-        raise ModelError(
-            str(path), expected="safetensors weights", got=got, remedy=remedy
-        ) from error
+            raise ModelError(
+                f"{name} must hold safetensors weights, but it is {other.name}. {TRAINED}, or an "
+                f"ONNX file of your own network: {other.remedy}."
+            ) from error
+        reason = unreadable(path) or " ".join(str(error).split())[:120]
+        raise ModelError(f"{name} holds no safetensors weights: {reason}. {TRAINED}.") from error
 
 
 def _other_format(path: Path) -> OtherFormat | None:
@@ -127,10 +127,15 @@ def read_weights(path: Path) -> Weights:
         variant = _variant(header)
         # Before a list of the network's is made: a header alone must not take memory.
         if len(tensors) != 4 * variant.blocks + (7 if conditioned else 6):
-            raise ValueError(f"{len(tensors)} tensors for {variant}")
+            raise ValueError(f"it has {len(tensors)} tensors for {variant}")
         _check_like(tensors, variant.banked_shapes if conditioned else variant.shapes)
     except FAULTS as error:
-        raise _not_weights(path, "the weights of a ConvBEERS", error) from error
+        reason = " ".join(str(error).split())[:120]
+        if isinstance(error, KeyError):
+            reason = f"it has no {reason}"
+        raise ModelError(
+            f"{path} does not hold the weights of a ConvBEERS: {reason}. {TRAINED}."
+        ) from error
     recipe = header.get("recipe")
     kernels: Kernels = "fitted" if header.get("kernels") == "fitted" else "cut"
     return Weights(
@@ -142,10 +147,9 @@ def read_plain(path: Path) -> Weights:
     """The weights of a plain network."""
     weights = read_weights(path)
     if weights.conditioned:
-        remedy = "name the sensor: beers-deploy export --network FILE --sensor NAME"
-        got = "one that is conditioned on its sensor"
         raise ModelError(
-            str(path), expected="the weights of a plain network", got=got, remedy=remedy
+            f"{path} must hold the weights of a plain network, but its network is conditioned on "
+            "a sensor. Name the sensor: beers-deploy export --network FILE --sensor NAME."
         )
     return weights
 
@@ -154,8 +158,9 @@ def read_conditioned(path: Path) -> Weights:
     """The weights of a network that is told its sensor."""
     weights = read_weights(path)
     if not weights.conditioned:
-        raise _not_weights(
-            path, "weights that 'train --conditioned' wrote", "a network that is told no sensor"
+        raise ModelError(
+            f"{path} must hold weights that 'train --conditioned' wrote, but its network is not "
+            f"conditioned on a sensor. {TRAINED}."
         )
     return weights
 
@@ -170,20 +175,13 @@ def all_finite(tensors: Arrays) -> bool:
     return all(bool(np.isfinite(tensor).all()) for tensor in tensors.values())
 
 
-def _not_weights(path: Path, expected: str, reason: object) -> ModelError:
-    got = " ".join(str(reason).split())[:120]
-    return ModelError(
-        str(path), expected=expected, got=got, remedy="give a file written by 'beers-deploy train'"
-    )
-
-
 def _told(header: Mapping[str, object]) -> bool:
     """Whether the network is told its sensor."""
     kind = header.get("kind")
     if kind not in (None, BANKED):
-        raise ValueError(f"weights {kind}: those of another version")
+        raise ValueError(f"its weights are {kind}, as another version wrote them")
     if kind and header.get("ranges") != {name: list(ends) for name, ends in RANGES.items()}:
-        raise ValueError("other ranges of sensors than this version's")
+        raise ValueError("its ranges of sensors differ from those of this version")
     return kind is not None
 
 
@@ -191,7 +189,7 @@ def _variant(header: Mapping[str, Any]) -> Variant:
     shape = header["variant"]
     variant = Variant(int(shape["blocks"]), int(shape["features"]), int(shape.get("scale", 1)))
     if variant.scale < 1:
-        raise ValueError(f"a scale of {variant.scale}")
+        raise ValueError(f"it states a scale of {variant.scale}")
     return variant
 
 
@@ -199,8 +197,8 @@ def _check_like(tensors: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> None:
     """Compare with what a network has."""
     for name, shape in shapes.items():
         if tensors[name].shape != shape:
-            raise ValueError(f"{name} of shape {tensors[name].shape}, for {shape}")
+            raise ValueError(f"{name} has the shape {tensors[name].shape} instead of {shape}")
     if not all(tensor.dtype == np.float32 for tensor in tensors.values()) or not all_finite(
         tensors
     ):
-        raise ValueError("weights that are not finite float32")
+        raise ValueError("its weights are not finite float32")

@@ -49,9 +49,10 @@ def ssim(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
     from skimage.metrics import structural_similarity
 
     if min(image.shape) < MIN_SIDE_PX:
-        expected = f"at least {MIN_SIDE_PX} pixels a side"
-        got = " x ".join(map(str, image.shape[::-1]))
-        raise ImageError("SSIM", expected=expected, got=got, remedy="give larger images")
+        raise ImageError(
+            f"SSIM needs images of at least {MIN_SIDE_PX} pixels a side, but these have "
+            f"{' x '.join(map(str, image.shape[::-1]))} pixels. Give larger images."
+        )
     # In float64: scikit-image would compute float32 images in float32, off by some 1e-8.
     pair = (np.asarray(each, np.float64) for each in (image, reference))
     window = {"gaussian_weights": True, "sigma": SSIM_SIGMA_PX, "use_sample_covariance": False}

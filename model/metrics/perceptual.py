@@ -22,7 +22,7 @@ from safetensors import safe_open
 from torch import Tensor, nn
 from torch.nn import functional
 
-from beers_deploy.profiles.errors import ImageError, ModelError
+from beers_deploy.profiles.errors import ImageError, ModelError, printable
 from beers_deploy.profiles.toml import unreadable
 
 
@@ -134,11 +134,10 @@ def _vgg16() -> list[nn.Module]:
 WEIGHTS_VARIABLE = "BEERS_LPIPS_WEIGHTS"
 SUFFIXES = (".safetensors", ".npz")
 CONVERT = (
-    "convert it where you trust it: safetensors.torch.save_file(torch.load(FILE, "
-    "weights_only=True), "
-    "'NAME.safetensors')"
+    "If you trust it, convert it: safetensors.torch.save_file(torch.load(FILE, "
+    "weights_only=True), 'NAME.safetensors')."
 )
-NAMED = "give the feature layers named as in torchvision (features.0.weight ...)"
+NAMED = "Give the feature layers named as in torchvision (features.0.weight ...)."
 
 
 def find_backbone(network: str, place: Path | None = None) -> Path | None:
@@ -176,14 +175,12 @@ def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbon
     tensors = read_tensors(path, parameters)
     for name, tensor in tensors.items():
         if tensor.shape != parameters[name].shape:
-            raise _error(
-                path,
-                f"{name} of shape {tuple(parameters[name].shape)}",
-                f"{tuple(tensor.shape)}",
-                NAMED,
+            raise ModelError(
+                f"{path} must have {name} of the shape {tuple(parameters[name].shape)}, got "
+                f"{tuple(tensor.shape)}. {NAMED}"
             )
         if not bool(torch.isfinite(tensor).all()):
-            raise _error(path, f"finite values in {name}", "NaN or infinity", NAMED)
+            raise ModelError(f"{path} has NaN or infinity in {name}. {NAMED}")
     backbone.load_state_dict(tensors)
     return backbone
 
@@ -191,12 +188,12 @@ def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbon
 def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
     """The named tensors, of any shape, of a .safetensors or .npz file, as float32."""
     if path.suffix not in SUFFIXES:
-        raise _error(
-            path, "a .safetensors or .npz file", f"'{path.suffix}', which is not read", CONVERT
+        raise ModelError(
+            f"{path} must be a .safetensors or .npz file; '{path.suffix}' is not read. {CONVERT}"
         )
-    got = unreadable(path)
-    if got is not None:
-        raise _error(path, "a weights file", got, "check the path")
+    reason = unreadable(path)
+    if reason is not None:
+        raise ModelError(f"The weights file {path} cannot be read: {reason}. Check the path.")
     try:
         tensors = _read(path, names)
         for tensor in tensors.values():
@@ -204,13 +201,14 @@ def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
                 raise TypeError(f"an array of {tensor.dtype}")
     # The bytes of a damaged archive may lead to anything.
     except Exception as error:
-        got = " ".join(str(error).split())[:120]
-        raise _error(
-            path, "arrays of floating-point numbers, none pickled", got, CONVERT
+        reason = printable(" ".join(str(error).split()))
+        raise ModelError(
+            f"{path} must contain arrays of floating-point numbers, none pickled, but reading it "
+            f"failed: {reason}. {CONVERT}"
         ) from error
     for name in names:
         if name not in tensors:
-            raise _error(path, f"a tensor named {name}", "none of that name", NAMED)
+            raise ModelError(f"{path} has no tensor named {name}. {NAMED}")
     return {name: tensor.float() for name, tensor in tensors.items()}
 
 
@@ -227,10 +225,6 @@ def _read(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
         keys = set(file.keys())
         # Copies, because the library's own lie in the file.
         return {name: file.get_tensor(name).clone() for name in names if name in keys}
-
-
-def _error(path: Path, expected: str, got: str, remedy: str) -> ModelError:
-    return ModelError(str(path), expected=expected, got=got, remedy=remedy)
 
 
 PUBLISHED = Path(__file__).parent / "weights"
@@ -347,8 +341,7 @@ def _check_pair(label: str, backbone: Backbone, image: Tensor, reference: Tensor
     smallest = backbone.spec.min_side_px
     grey = image.ndim == 4 and image.shape[1] == 1 and image.shape == reference.shape
     if not grey or min(image.shape[2:]) < smallest:
-        expected = f"two images (N, 1, H, W) of at least {smallest} pixels a side"
-        got = f"{tuple(image.shape)} and {tuple(reference.shape)}"
         raise ImageError(
-            label, expected=expected, got=got, remedy="give larger images, grey and of one shape"
+            f"{label} needs two grey images (N, 1, H, W) of one shape and at least {smallest} "
+            f"pixels a side, got {tuple(image.shape)} and {tuple(reference.shape)}."
         )

@@ -1,12 +1,6 @@
 """The compressions of an output. It imports nothing, so that '--help' stays quick."""
 
-from enum import StrEnum
+from typing import Literal
 
-
-class Compression(StrEnum):
-    """The lossless compressions of a TIFF."""
-
-    none = "none"
-    zlib = "zlib"
-    zstd = "zstd"
-    lzw = "lzw"
+Compression = Literal["none", "zlib", "zstd", "lzw"]
+"""The lossless compressions of a TIFF."""

@@ -18,7 +18,7 @@ from beers_deploy.model.raster.facts import (
     usable_nodata,
 )
 from beers_deploy.model.raster.index import dimap_bits
-from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.errors import ImageError, printable
 
 DARK = {"palette", "hue", "saturation", "lightness", "cyan", "magenta", "yellow", "black"}
 """GDAL's interpretations of bands whose pixels are not brighter where they are larger."""
@@ -67,10 +67,11 @@ def _require_one_image(name: str, dataset: Any) -> None:
     """Refuse a file of several images, such as the pages of a TIFF."""
     count = len(dataset.subdatasets)
     if dataset.count == 0 or count > 1:
-        remedy = "save the one that you mean by itself"
-        if count:
-            remedy += f": gdal_translate {dataset.subdatasets[0]} one.tif"
-        raise ImageError(name, expected="one image", got=f"{count}", remedy=remedy)
+        how = f" with 'gdal_translate {dataset.subdatasets[0]} one.tif'" if count else ""
+        raise ImageError(
+            f"{name} must hold one image, got {count}. Save the one that you mean as a file of its "
+            f"own{how}."
+        )
 
 
 def _mask_kind(name: str, dataset: Any) -> MaskKind:
@@ -79,15 +80,16 @@ def _mask_kind(name: str, dataset: Any) -> MaskKind:
     flags = {flag.name for flag in dataset.mask_flag_enums[0]}
     if any(is_alpha[:-1]) or is_alpha == [True]:
         raise ImageError(
-            name, expected="alpha as the last band", got="one before others", remedy="move it there"
+            f"{name} must have alpha as the last band, after at least one other. Move it there."
         )
     # Where each band of a picture has its own nodata value, GDAL makes one mask of them.
     has_mask = "per_dataset" in flags and "alpha" not in flags
     mask = mask_file(Path(name))
     if mask.is_file() and (is_alpha[-1] or not has_mask):
-        remedy = "write it with GDAL, or remove it"
-        got = "one without GDAL's INTERNAL_MASK_FLAGS, or alpha as well"
-        raise ImageError(str(mask), expected="one mask that GDAL reads", got=got, remedy=remedy)
+        raise ImageError(
+            f"The mask {mask} has no INTERNAL_MASK_FLAGS, so that GDAL does not read it, or its "
+            "image has alpha as well. Write the mask with GDAL, or remove it."
+        )
     if is_alpha[-1]:
         return "alpha"
     return "mask" if has_mask else ""
@@ -100,10 +102,8 @@ def _require_alike(name: str, dataset: Any, bands: int) -> None:
         ("nodata values", dataset.nodatavals[:bands]),
     ):
         if len({str(value) for value in values}) > 1:
-            got = ", ".join(str(value) for value in values)
-            raise ImageError(
-                name, expected=f"bands of equal {kind}", got=got, remedy="split the bands"
-            )
+            stated = printable(", ".join(str(value) for value in values))
+            raise ImageError(f"{name} has bands of different {kind}: {stated}. Split the bands.")
 
 
 def _require_light(name: str, dataset: Any) -> None:
@@ -115,9 +115,9 @@ def _require_light(name: str, dataset: Any) -> None:
     elif structure.get("SOURCE_COLOR_SPACE") in ("CMYK", "CIELab"):
         dark = [structure["SOURCE_COLOR_SPACE"]]
     if dark:
-        remedy = "convert it to grey or RGB: 'gdal_translate -expand' does it for palettes"
         raise ImageError(
-            name, expected="pixels where more is brighter", got=", ".join(dark), remedy=remedy
+            f"{name} has pixels whose larger values are not brighter: {', '.join(dark)}. Convert "
+            "it to grey or RGB; 'gdal_translate -expand' does it for palettes."
         )
 
 

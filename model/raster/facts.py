@@ -210,16 +210,18 @@ class Raster:
 def require_size(name: str, bands: int, height_px: int, width_px: int) -> None:
     """Refuse an image that is too large to be planned."""
     if max(height_px, width_px) > SIDE_PX or bands > BANDS:
-        got = f"{bands} bands of {width_px} x {height_px} pixels"
-        expected = f"at most {BANDS} bands of {SIDE_PX} pixels a side"
-        raise ImageError(name, expected=expected, got=got, remedy="cut it into pieces")
+        raise ImageError(
+            f"{name} has {bands} bands of {width_px} x {height_px} pixels, but at most {BANDS} "
+            f"bands of {SIDE_PX} pixels a side can be read. Cut it into pieces."
+        )
 
 
 def require_numbers(name: str, dtype: np.dtype[Any]) -> np.dtype[Any]:
     """Return the type of the pixels; refuse complex numbers."""
     if dtype.kind not in "uif":
-        remedy = "convert it to uint16"
-        raise ImageError(name, expected="integer or float pixels", got=str(dtype), remedy=remedy)
+        raise ImageError(
+            f"{name} must have integer or float pixels, got {dtype}. Convert it to uint16."
+        )
     return dtype
 
 
@@ -227,12 +229,11 @@ def require_small_offset(name: str, offset: float, scale: float) -> None:
     """Refuse pixels whose 0 is far from no light: value = scale x pixel + offset."""
     if abs(offset) > OFFSET_DN * abs(scale):
         dark = -offset / (scale or 1)
-        got = f"{dark:g} DN for it, by its offset of {offset:g} and scale of {scale:g}"
-        remedy = (
-            "take it off the pixels, or remove the offset with 'gdal_edit.py -offset 0' if "
-            "it is none of them"
+        raise ImageError(
+            f"{name} must have pixels whose 0 is no light, but its offset of {offset:g} and scale "
+            f"of {scale:g} put no light at {dark:g} DN. Subtract that from the pixels, or remove "
+            "the offset with 'gdal_edit.py -offset 0' if the pixels do not include it."
         )
-        raise ImageError(name, expected="pixels whose 0 is no light", got=got, remedy=remedy)
 
 
 def usable_nodata(value: float | None, dtype: np.dtype[Any]) -> float | None:
@@ -253,7 +254,7 @@ def is_restored(software: str, metadata: object) -> bool:
 def require_raw(name: str, restored: bool, force: bool) -> None:
     """Refuse a restored image unless `force`: a second restoration over-sharpens it."""
     if restored and not force:
-        remedy = "give the raw one, or restore it once more with `force`"
         raise ImageError(
-            name, expected="a raw image", got="one that 'restore' has written", remedy=remedy
+            f"{name} is not a raw image, because 'restore' has written it. Give the raw one, or "
+            "restore it once more with `force`."
         )

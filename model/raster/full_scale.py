@@ -18,7 +18,7 @@ RADIANCE_SHARE = 0.2
 those of a bright scene, in W/m2/sr/um, stay below some 700.
 """
 
-REMEDY = "give the pixel value that is full scale as `full_scale`"
+ADVICE = "Give the pixel value that is full scale as `full_scale`"
 
 
 def settled_scale(
@@ -38,14 +38,16 @@ def settled_scale(
             that decides.
         asked: as the user gave it; None lets type and values decide.
         usual: the full scale of digital numbers.
-        remedy: what to do about pixels that leave it open, where the caller has no --full-scale.
+        remedy: what to do about pixels that leave it open, a sentence, where the caller has no
+            `full_scale`.
     """
     if asked is not None:
         check_scale(asked, dtype.kind)
         return asked
     if dtype.itemsize == 1:
-        raise _open(
-            name, "8-bit pixels", remedy or f"{REMEDY} (255 for all of 8 bits), or the raw image"
+        advice = remedy or f"{ADVICE} (255 for all of 8 bits), or use the raw image."
+        raise ImageError(
+            f"{name} has 8-bit pixels, but digital numbers have more than 8 bits. {advice}"
         )
     if dtype.kind != "f":
         return usual
@@ -57,45 +59,39 @@ def settled_scale(
     if brightest == 0:  # All of it is black or missing.
         return usual
     if brightest > UNIT_MAX:
-        got = "no whole numbers, as radiances are"
-        choices = f"{usual:g} for digital numbers, else your own"
+        meaning = "are not integers and may be radiances"
+        choices = f"({usual:g} for digital numbers, else your own)"
     else:
-        got = "which may be shares of it"
-        choices = f"1 for 0..1, {usual:g} for digital numbers"
-    raise _open(
-        name, f"floats of at most {brightest:.3g}, {got}", remedy or f"{REMEDY} ({choices})"
+        meaning = "may be shares of full scale"
+        choices = f"(1 for 0..1, {usual:g} for digital numbers)"
+    advice = remedy or f"{ADVICE} {choices}."
+    raise ImageError(
+        f"{name} has floats of at most {brightest:.3g}, which {meaning} instead of digital numbers "
+        f"of more than 8 bits. {advice}"
     )
 
 
 def check_scale(full_scale: float, kind: str) -> None:
-    """A full scale that pixels of this kind (numpy's letter) can have."""
+    """Raise OptionError if pixels of this kind (NumPy's letter) cannot have this full scale."""
     fits_integers = full_scale <= 65535 and full_scale % 1 == 0
     if 0 < full_scale < np.inf and (kind == "f" or fits_integers):
         return
-    expected = (
-        "a number above 0" if kind == "f" else "a whole number of 1 to 65535 for integer pixels"
-    )
-    raise OptionError(
-        "full_scale", expected=expected, got=f"{full_scale:g}", remedy="4095 is 12 bits"
-    )
+    allowed = "a number above 0" if kind == "f" else "an integer of 1 to 65535 for integer pixels"
+    raise OptionError(f"`full_scale` must be {allowed}, got {full_scale:g}. 12 bits are 4095.")
 
 
 def remedy_outside(low: float, high: float, remedy: str) -> str:
-    """What to do about values from `low` to `high` that no sensor gives; `remedy` where they are
-    only too large.
+    """Return a sentence on what to do about values from `low` to `high` that no sensor gives:
+    `remedy` if they are only too large.
     """
     if not np.isfinite([low, high]).all():
         return (
-            "write NaN or the nodata value in place of infinite pixels: 'restore' takes both "
-            "for missing"
+            "Write NaN or the nodata value in place of infinite pixels: 'restore' treats both as "
+            "missing."
         )
     if low < 0:
         return (
-            "add the offset that was taken off the image, clip it at 0, or mark such pixels "
-            "as nodata"
+            "Add the offset that was subtracted from the image, clip it at 0, or mark such pixels "
+            "as nodata."
         )
     return remedy
-
-
-def _open(name: str, got: str, remedy: str) -> ImageError:
-    return ImageError(name, expected="digital numbers of more than 8 bits", got=got, remedy=remedy)

@@ -28,7 +28,7 @@ WORKING_COPIES = 12
 memory.
 """
 
-RESCALE = "rescale it to the sensor's digital numbers"
+RESCALE = "Rescale it to the sensor's digital numbers."
 
 
 def read_pixels(path: Path) -> np.ndarray:
@@ -44,12 +44,16 @@ def read_pixels(path: Path) -> np.ndarray:
         stored = source.read(0, raster.height_px)
     pixels = np.ma.getdata(stored)
     if raster.dtype.kind == "f" and not np.isfinite(pixels).all():
-        count = f"{int((~np.isfinite(pixels)).sum())} NaN or infinite"
+        count = int((~np.isfinite(pixels)).sum())
+        fault = f"{count} NaN or infinite pixels"
     else:
-        count = f"{int(raster.missing(stored).sum())} by its mask, alpha or nodata value"
-    if not count.startswith("0 "):
-        remedy = "crop them off; 'restore' alone takes missing pixels, as NaN, nodata or a mask"
-        raise ImageError(str(path), expected="no missing pixels", got=count, remedy=remedy)
+        count = int(raster.missing(stored).sum())
+        fault = f"{count} missing pixels by its mask, alpha or nodata value"
+    if count:
+        raise ImageError(
+            f"{path} has {fault}. Crop them off; only 'restore' accepts missing pixels, as NaN, "
+            "nodata or a mask."
+        )
     return pixels[0] if raster.bands == 1 else np.moveaxis(pixels, 0, 2)
 
 
@@ -64,9 +68,10 @@ def _check_memory(path: Path, samples: int) -> None:
     free = psutil.virtual_memory().available
     if needed > free:
         room, size = sizes(free, needed)
-        expected = f"an image that fits in {room} of free memory"
-        got = f"{samples:,} samples, which need about {size}"
-        raise MachineError(str(path), expected=expected, got=got, remedy="cut it into pieces")
+        raise MachineError(
+            f"{path} has {samples:,} samples, which need about {size}, but there is only {room} of "
+            "free memory. Cut it into pieces."
+        )
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -77,12 +82,9 @@ def list_images(folder: Path) -> list[Path]:
         else []
     )
     if not images:
-        got = "no image in it" if folder.is_dir() else "no such folder"
+        fault = "there is no image in it" if folder.is_dir() else "no such folder"
         raise ImageError(
-            str(folder),
-            expected="a folder of images",
-            got=got,
-            remedy="give TIFF, PNG or JPEG files",
+            f"{folder} is not a folder of images: {fault}. Give TIFF, PNG or JPEG files."
         )
     return images
 
@@ -107,29 +109,27 @@ def read_acquisition(
         path: a TIFF, PNG or JPEG file.
         full_scale: the pixel value that is full scale; None lets the pixels' type and values
             decide.
-        remedy: what to do about pixels that leave it open; None names --full-scale.
+        remedy: a sentence on what to do about pixels that leave it open; None names `full_scale`.
         max_dn: the sensor's largest digital number.
     """
     pixels = read_pixels(path)
     if pixels.ndim != 2:
         raise ImageError(
-            str(path),
-            expected="one band",
-            got=f"{pixels.shape[2]} bands",
-            remedy="extract the panchromatic band",
+            f"{path} must have one band, but it has {pixels.shape[2]}. Extract the panchromatic "
+            "band."
         )
     low = float(pixels.min())
     high = float(pixels.max())
     scale = settled_scale(str(path), pixels.dtype, [extent_of(pixels)], full_scale, max_dn, remedy)
     if low < 0 or high > scale:
-        expected = (
-            f"{max_dn.bit_length()}-bit digital numbers, 0 to {max_dn}"
+        allowed = (
+            f"{max_dn.bit_length()}-bit digital numbers are 0 to {max_dn}"
             if scale == max_dn
-            else f"values of 0 to {scale:g}"
+            else f"they must be 0 to {scale:g}"
         )
-        got = f"values from {low:g} to {high:g}"
         raise ImageError(
-            str(path), expected=expected, got=got, remedy=remedy_outside(low, high, RESCALE)
+            f"{path} has values from {low:g} to {high:g}, but {allowed}. "
+            f"{remedy_outside(low, high, RESCALE)}"
         )
     dn = np.asarray(pixels, dtype=np.float32)
     if scale == max_dn:

@@ -12,7 +12,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
 
-from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.errors import ImageError, printable
 from beers_deploy.profiles.toml import read_whole
 
 INDEX_SUFFIXES = {".vrt", ".xml"}
@@ -41,7 +41,7 @@ class _NoDoctype(ET.TreeBuilder):
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:  # noqa: ARG002
         """Refuse it."""
-        raise ValueError("a document type, which may declare entities")
+        raise ValueError("it has a document type, which may declare entities")
 
 
 def parse_xml(content: str | bytes) -> ET.Element:
@@ -55,21 +55,24 @@ def parse_xml(content: str | bytes) -> ET.Element:
         raise ValueError(str(error)) from error
 
 
-def read_xml(path: Path, limit_bytes: int, expected: str, remedy: str) -> ET.Element:
-    """The root of a file of untrusted XML, of at most `limit_bytes`.
+def read_xml(path: Path, limit_bytes: int, kind: str, advice: str) -> ET.Element:
+    """Return the root of a file of untrusted XML, of at most `limit_bytes`.
 
     Args:
         path: of the file.
         limit_bytes: more is refused.
-        expected: for the message where it is none.
-        remedy: for the message, too.
+        kind: what the file should be, for the message.
+        advice: what to do if it is not, a sentence.
+
+    Raises:
+        ImageError: the file cannot be read as XML.
     """
     try:
         return parse_xml(read_whole(path, limit_bytes))
     # An encoding that Python does not know raises a LookupError.
     except (ValueError, LookupError, OSError, RecursionError) as error:
-        got = getattr(error, "strerror", None) or str(error)
-        raise _refused(path, expected, got, remedy) from error
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ImageError(f"{path} is not {kind}: {printable(reason)}. {advice}") from error
 
 
 def is_index(path: Path) -> bool:
@@ -117,27 +120,30 @@ def _named(index: Path, home: Path, trusted: bool) -> Iterator[Path]:
 
 
 def _require_pixels(index: Path, text: str, file: Path) -> None:
-    """That a tile is there, and is an image or a VRT."""
-    if not (text and file.is_file()):
-        raise _refused(
-            index,
-            f"the tile {text or '(no name)'}",
-            "no such file",
-            "fetch it or make the index anew",
+    """Raise ImageError if a tile does not exist, or is neither an image nor a VRT."""
+    if not text:
+        raise ImageError(f"{index} has a tile without a name. Write the index again.")
+    if not file.is_file():
+        raise ImageError(
+            f"{index} names the tile {printable(text)}, but there is no such file. Fetch it, or "
+            "write the index again."
         )
     with file.open("rb") as stream:
         is_image = stream.read(16).startswith(MAGIC)
     if not is_image and file.suffix.lower() != ".vrt":
-        expected = "tiles that are TIFF, JPEG 2000, NITF, PNG or JPEG"
-        raise _refused(index, expected, f"another file, {text}", "convert it to TIFF")
+        raise ImageError(
+            f"{index} names the tile {printable(text)}, which is not a TIFF, JPEG 2000, NITF, PNG "
+            "or JPEG. Convert it to TIFF."
+        )
 
 
 def _parsed(path: Path) -> ET.Element:
-    expected = "a VRT or a DIMAP, plain XML"
-    remedy = "write it again"
-    root = read_xml(path, INDEX_BYTES, expected, remedy)
+    root = read_xml(path, INDEX_BYTES, "a VRT or a DIMAP in plain XML", "Write it again.")
     if path.suffix.lower() == ".vrt" and root.tag != VRT:
-        raise _refused(path, expected, f"a document that is no {VRT}", remedy)
+        raise ImageError(
+            f"{path} is not a VRT: its root is {printable(root.tag)} instead of {VRT}. Write it "
+            "again."
+        )
     return root
 
 
@@ -182,20 +188,18 @@ def _located(index: Path, text: str, folder: Path, home: Path | None) -> Path:
         # A name that the system does not accept raises here and not in the middle of a run.
         file.is_file()
     except (OSError, RuntimeError, ValueError) as error:
-        raise _refused(
-            index, "names of tiles", f"no path, {text}", "make the index anew"
+        raise ImageError(
+            f"{index} names a tile whose name is not a path: {printable(text)}. Write the index "
+            "again."
         ) from error
     elsewhere = _is_elsewhere(text)
     if elsewhere or (home is not None and not file.is_relative_to(home)):
-        remedy = "put its tiles beside it, or read it all the same with `force`"
-        raise _refused(
-            index, "tiles in its own folder", f"one at {text if elsewhere else file}", remedy
+        raise ImageError(
+            f"{index} names a file outside its own folder: "
+            f"{printable(text if elsewhere else str(file))}. Put the file into that folder, or "
+            "read it anyway with `force`."
         )
     return file
-
-
-def _refused(path: Path, expected: str, got: str, remedy: str) -> ImageError:
-    return ImageError(str(path), expected=expected, got=got, remedy=remedy)
 
 
 def dimap_bits(path: Path) -> int | None:

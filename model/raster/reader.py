@@ -24,7 +24,14 @@ from beers_deploy.model.raster.description import mask_file, raster_of
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.index import MAGIC, index_files, is_index, read_xml
 from beers_deploy.model.raster.source import Source
-from beers_deploy.profiles.errors import CODE_FAULTS, BeersError, ImageError, MachineError, sizes
+from beers_deploy.profiles.errors import (
+    CODE_FAULTS,
+    BeersError,
+    ImageError,
+    MachineError,
+    printable,
+    sizes,
+)
 from beers_deploy.profiles.toml import unreadable
 
 DRIVERS = {
@@ -66,13 +73,11 @@ logging.getLogger("rasterio").addHandler(logging.NullHandler())
 
 def require_image_file(path: Path) -> None:
     """Refuse a path that is no file, and an empty file."""
-    got = unreadable(path)
-    if got is not None:
-        raise ImageError(str(path), expected="an image file", got=got, remedy="check the path")
+    reason = unreadable(path)
+    if reason is not None:
+        raise ImageError(f"{printable(str(path))} cannot be read: {reason}. Check the path.")
     if path.stat().st_size == 0:
-        raise ImageError(
-            str(path), expected="an image", got="an empty file", remedy="write or copy it again"
-        )
+        raise ImageError(f"{path} is an empty file. Write or copy it again.")
 
 
 @contextmanager
@@ -121,9 +126,10 @@ def _driver(path: Path) -> str:
     """Return the GDAL driver that opens a file; ENVI's own files may end in .img as well."""
     suffix = path.suffix.lower()
     if suffix not in DRIVERS:
-        expected = f"an image with a suffix of {', '.join(DRIVERS)}"
-        remedy = "rename it, or convert it with 'gdal_translate'"
-        raise ImageError(str(path), expected=expected, got=suffix or "none", remedy=remedy)
+        raise ImageError(
+            f"{path} must be an image with a suffix of {', '.join(DRIVERS)}, got "
+            f"{suffix or 'none'}. Rename it, or convert it with 'gdal_translate'."
+        )
     has_header = path.with_suffix(".hdr").is_file()
     return "ENVI" if suffix == ".img" and has_header else DRIVERS[suffix]
 
@@ -136,19 +142,17 @@ def format_name(path: Path) -> str:
 
 def _require_sidecars(path: Path) -> None:
     """Refuse a mask or metadata file beside an image that GDAL would misread or pass over."""
-    remedy = "write it again, or remove it"
+    advice = "Write it again, or remove it."
     mask = mask_file(path)
     if mask.is_file():
         # GDAL opens a mask with any of its drivers, also with those that follow names.
         with mask.open("rb") as stream:
             is_tiff = stream.read(4) in MAGIC[:4]
         if not is_tiff:
-            raise ImageError(
-                str(mask), expected="a mask as TIFF", got="another file", remedy=remedy
-            )
+            raise ImageError(f"{mask} is not a mask stored as TIFF. {advice}")
     metadata = path.with_name(f"{path.name}.aux.xml")
     if metadata.is_file():
-        read_xml(metadata, AUX_BYTES, "metadata as GDAL writes it", remedy)
+        read_xml(metadata, AUX_BYTES, "metadata as GDAL writes it", advice)
 
 
 def _files(path: Path, tiles: tuple[Path, ...], dataset: Any, trusted: bool) -> tuple[Path, ...]:
@@ -163,9 +167,9 @@ def _files(path: Path, tiles: tuple[Path, ...], dataset: Any, trusted: bool) -> 
             continue
         inside = any(real.is_relative_to(home) for home in homes)
         if not inside and not trusted:
-            remedy = "put it into the folder of the image, or read it all the same with `force`"
             raise ImageError(
-                str(path), expected="files in its own folder", got=f"one at {name}", remedy=remedy
+                f"{path} needs a file outside its own folder: {printable(name)}. Put it into the "
+                "folder of the image, or read it anyway with `force`."
             )
         if real.is_file():
             files[file] = None
@@ -186,8 +190,8 @@ def _block_px(dataset: Any, tiles: list[Path]) -> int:
 
 
 @contextmanager
-def damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
-    """Raise ImageError for whatever GDAL raises over a file; `where` names the place in it."""
+def damage_in_a_sentence(path: Path, rows: str = "") -> Iterator[None]:
+    """Raise ImageError for whatever GDAL raises over a file, or over some rows of it."""
     try:
         yield
     except (BeersError, MemoryError, *CODE_FAULTS):
@@ -197,16 +201,17 @@ def damage_in_a_sentence(path: Path, where: str = "") -> Iterator[None]:
         # rasterio's own message is "see previous exception", so the first cause is reported.
         while cause.__cause__ is not None:
             cause = cause.__cause__
-        name = f"{path}, {where}" if where else str(path)
-        got = " ".join(str(cause).split())[:160] or type(cause).__name__
-        remedy = "check that it is a whole image"
-        if "missing codec" in got:
-            remedy = "write it with deflate, LZW or ZSTD"
+        reason = " ".join(str(cause).split())[:160] or type(cause).__name__
+        advice = "Check that it is a whole image"
+        if "missing codec" in reason:
+            advice = "Write it with deflate, LZW or ZSTD"
         # GDAL's own sentence repeats the path.
-        if "not recognized as being in a supported file format" in got:
-            got = "another format"
-        expected = f"a readable {format_name(path)}"
-        raise ImageError(name, expected=expected, got=got, remedy=remedy) from error
+        if "not recognized as being in a supported file format" in reason:
+            reason = "it has another format"
+        part = f" in {rows}" if rows else ""
+        raise ImageError(
+            f"{path} is not a readable {format_name(path)}{part}: {reason.rstrip('.')}. {advice}."
+        ) from error
 
 
 class GdalSource:
@@ -246,8 +251,8 @@ class GdalSource:
     ) -> np.ndarray:
         window = Window(0, start, self.raster.width_px, stop - start)
         cache = {"GDAL_CACHEMAX": self.held_bytes(stop - start)}
-        where = f"rows {start} to {stop - 1}"
-        with damage_in_a_sentence(self.files[0], where), gdal(**self._options, **cache):
+        rows = f"rows {start} to {stop - 1}"
+        with damage_in_a_sentence(self.files[0], rows), gdal(**self._options, **cache):
             return np.asarray(read_window(window=window, **options))
 
     def held_bytes(self, rows_px: int) -> int:  # noqa: ARG002
@@ -273,8 +278,10 @@ def _require_whole(path: Path, dataset: Any) -> None:
             for kind in ("OFFSET", "SIZE")
         )
         if offset + count > size:
-            got = f"a file cut short at {size} of {offset + count} bytes"
-            raise ImageError(str(path), expected="a readable TIFF", got=got, remedy="copy it again")
+            raise ImageError(
+                f"{path} is not a readable TIFF, because it is cut short at {size} of "
+                f"{offset + count} bytes. Copy it again."
+            )
 
 
 def _require_memory(path: Path, source: GdalSource) -> None:
@@ -283,6 +290,7 @@ def _require_memory(path: Path, source: GdalSource) -> None:
     free = psutil.virtual_memory().available
     if needed > max(free, 2 * LEAST_CACHE_BYTES):
         room, size = sizes(free, needed)
-        expected = f"strips or tiles that fit in {room} of free memory"
-        remedy = "rewrite it in smaller tiles (gdal_translate -co TILED=YES)"
-        raise MachineError(str(path), expected=expected, got=f"{size} for two", remedy=remedy)
+        raise MachineError(
+            f"{path} needs {size} for two of its strips or tiles, but there is only {room} of free "
+            "memory. Rewrite it in smaller tiles (gdal_translate -co TILED=YES)."
+        )

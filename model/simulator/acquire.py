@@ -203,8 +203,9 @@ def crop_margin(image: np.ndarray, margin_px: int) -> np.ndarray:
     """Cut `margin_px` from every side of (..., H, W)."""
     height, width = image.shape[-2:]
     if min(height, width) <= 2 * margin_px:
-        expected = f"more than {2 * margin_px} target pixels a side, the margin that the blur needs"
-        got = f"{width} x {height} target pixels"
-        remedy = "give a larger scene or a smaller oversampling"
-        raise ImageError("scene", expected=expected, got=got, remedy=remedy)
+        raise ImageError(
+            f"The scene must have more than {2 * margin_px} target pixels a side, which is the "
+            f"margin for the blur, but it has {width} x {height}. Give a larger scene or a smaller "
+            "oversampling."
+        )
     return image[..., margin_px : height - margin_px, margin_px : width - margin_px]

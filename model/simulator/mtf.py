@@ -25,15 +25,11 @@ def gamma_from_mtf(mtf_nyquist: float, antialias_sigma_px: float = 0.0) -> float
     if not 0 < mtf_nyquist <= limit:
         filter_gain = limit / MTF_NYQUIST_MAX
         with_filter = (
-            f" behind an anti-alias filter that keeps {filter_gain:.3f}"
-            if antialias_sigma_px
-            else ""
+            f" (with an anti-alias filter of gain {filter_gain:.3f})" if antialias_sigma_px else ""
         )
         raise OptionError(
-            "MTF at Nyquist",
-            expected=f"a ratio above 0 and up to {limit:.4f}{with_filter}",
-            got=repr(mtf_nyquist),
-            remedy="0.07 means 7 %",
+            f"The MTF at Nyquist must be a ratio above 0 and up to {limit:.4f}{with_filter}, got "
+            f"{mtf_nyquist!r}. A ratio of 0.07 means 7 %."
         )
     # At the limit itself the rounding of the ratio may fall on either side of 1.
     return max(-2 * math.log(mtf_nyquist / limit), 0.0)
@@ -71,10 +67,11 @@ def mtf(
     fy = np.asarray(fy, np.float64)
     if isinstance(blur, Response):
         if antialias_sigma_px:
-            expected = "none beside a whole response"
-            got = f"one of {antialias_sigma_px:g} px beside the {blur}"
-            remedy = "leave it out: it is part of that"
-            raise OptionError("anti-alias filter", expected=expected, got=got, remedy=remedy)
+            raise OptionError(
+                f"The anti-alias filter of {antialias_sigma_px:g} px cannot be combined with the "
+                f"{blur}, which is the whole response and includes the filter. Leave the filter "
+                "out."
+            )
         return np.asarray(blur.at(fx, fy))
     across, along = blur if isinstance(blur, tuple) else (blur, blur)
     gamma_x, gamma_y = (gamma_from_mtf(value, antialias_sigma_px) for value in (across, along))

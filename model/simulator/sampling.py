@@ -136,9 +136,10 @@ def scene_of(name: str, pixels: np.ndarray, sensor: Instrument) -> Scene:
     elif pixels.ndim == 2 and np.issubdtype(pixels.dtype, np.floating):
         radiance = pixels.astype(np.float32)
     else:
-        expected = "8-bit RGB or mono, 16-bit mono, or float mono pixels"
-        got = f"{pixels.dtype} of shape {pixels.shape}"
-        raise ImageError(name, expected=expected, got=got, remedy="convert it to one of these")
+        raise ImageError(
+            f"{name} must have 8-bit RGB or mono, 16-bit mono, or float mono pixels, but it has "
+            f"{pixels.dtype} pixels of shape {pixels.shape}. Convert it to one of these."
+        )
     return Scene(name, np.ascontiguousarray(radiance, dtype=np.float32))
 
 

@@ -103,7 +103,8 @@ def compensation_gain(
     """
     if not 0 <= epsilon < float("inf"):
         raise OptionError(
-            "epsilon", expected="0 or more", got=repr(epsilon), remedy="a few thousandths are usual"
+            f"epsilon must be a finite number of 0 or more, got {epsilon!r}. A few thousandths are "
+            "usual."
         )
     fy = np.fft.fftfreq(height)[:, None]
     fx = np.fft.rfftfreq(width)[None, :]

@@ -459,8 +459,8 @@ def finite_or_missing(strips: Iterable[Tensor]) -> Iterator[Tensor]:
     """Pass strips (any, W) on as they come; NaN marks missing pixels."""
     for strip in strips:
         if bool(torch.isinf(strip).any()):
-            remedy = "mark missing pixels as NaN"
             raise ImageError(
-                "image to denoise", expected="finite values or NaN", got="infinity", remedy=remedy
+                "The image to denoise contains infinity, but its values must be finite or NaN. "
+                "Mark missing pixels as NaN."
             )
         yield strip

@@ -75,8 +75,10 @@ class Chain:
         epsilon.
         """
         if self.epsilon is None:
-            remedy = "call Chain.fitted_to with the strips of the image first"
-            raise OptionError("epsilon", expected="a number", got="None", remedy=remedy)
+            raise OptionError(
+                "The pipeline has no epsilon yet. Call Chain.fitted_to with the strips of the "
+                "image first."
+            )
         return compensation_kernel(self.degraded.blur, self.reference.blur, self.epsilon)
 
 
@@ -132,9 +134,7 @@ def denoise_radiance(
 
 
 def quality_named(name: str) -> Quality:
-    """Look a quality up, refusing an unknown name."""
+    """Return the quality of a name, or raise OptionError."""
     if name not in QUALITIES:
-        raise OptionError(
-            "quality", expected=f"one of {', '.join(QUALITIES)}", got=repr(name), remedy="pick one"
-        )
+        raise OptionError(f"`quality` must be one of {', '.join(QUALITIES)}, got {name!r}.")
     return QUALITIES[name]

@@ -19,7 +19,7 @@ from beers_deploy.model.convbeers import Network, arrays, save_network, told
 from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.tensors import all_finite, read_tensors
 from beers_deploy.model.training.losses import PAPER, LossWeights
-from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.errors import ModelError, OptionError, printable
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,9 @@ class TrainingRecipe:
         }
         for name, value in numbers.items():
             if not (math.isfinite(value) and value >= 0):
-                expected = "a finite number, 0 or above"
-                remedy = "correct it"
-                raise OptionError(name, expected=expected, got=f"{value:g}", remedy=remedy)
+                raise OptionError(
+                    f"The {name} must be a finite number of 0 or more, got {value:g}."
+                )
 
     def rate_at(self, step: int) -> float:
         """Learning rate of a step: linear warm-up, then a cosine down to zero."""
@@ -71,6 +71,7 @@ class TrainingRecipe:
 MOMENTS = ("exp_avg", "exp_avg_sq")
 """What Adam keeps of each parameter, besides its step."""
 
+LOWER_RATE = "Lower the learning rate or check the images."
 MAX_BAD_STEPS = 10
 WINDOW_STEPS = 200
 TEST_PLACES = 65
@@ -101,7 +102,10 @@ class Guards:
         """Count a step whose loss or gradient was not finite."""
         self.bad_steps += 1
         if self.bad_steps > MAX_BAD_STEPS:
-            raise _error(step, "a finite loss", f"{self.bad_steps} non-finite steps")
+            raise ModelError(
+                f"The training stopped at step {step}: the loss or the gradient was NaN or "
+                f"infinite in {self.bad_steps} steps. {LOWER_RATE}"
+            )
 
     def passed(self, step: int, loss: float) -> None:
         """Take note of a step's loss."""
@@ -113,17 +117,24 @@ class Guards:
         self.sum = 0.0
         self.count = 0
         if self.best is not None and mean > DIVERGED * self.best:
-            raise _error(step, f"a loss near {self.best:.4g}", f"{mean:.4g}: it diverged")
+            raise ModelError(
+                f"The training diverged at step {step}: the mean loss is {mean:.4g}, and it was "
+                f"{self.best:.4g} before. {LOWER_RATE}"
+            )
         self.best = mean if self.best is None else min(self.best, mean)
 
 
 def require_finite_output(
-    network: Network, where: str, remedy: str = "lower the learning rate"
+    network: Network, name: str, remedy: str = "Lower the learning rate."
 ) -> None:
-    """Refuse a network that makes NaN or infinity of an image in [0, 1]: its weights may be finite
-    all the same.
+    """Raise ModelError if a network returns NaN or infinity for an image in [0, 1].
 
-    It lies on the CPU; a conditioned one is told the middle of every range.
+    Finite weights do not exclude that, because their sums may overflow.
+
+    Args:
+        network: on the CPU; a conditioned one is given the middle of every range.
+        name: of the network, in the message.
+        remedy: the last sentence of the message.
     """
     side_px = network.variant.scale * TEST_PLACES
     image = torch.rand((1, 1, side_px, side_px), generator=torch.Generator().manual_seed(0))
@@ -131,14 +142,7 @@ def require_finite_output(
     with torch.inference_mode():
         restored = told(network, torch.zeros(len(RANGES)))(images)
     if not bool(torch.isfinite(restored).all()):
-        raise ModelError(
-            where, expected="finite pixels of a test image", got="NaN or infinity", remedy=remedy
-        )
-
-
-def _error(step: int, expected: str, got: str) -> ModelError:
-    remedy = "lower the learning rate or check the images"
-    return ModelError(f"training step {step}", expected=expected, got=got, remedy=remedy)
+        raise ModelError(f"{name} returns NaN or infinity for a test image. {remedy}")
 
 
 def checkpoint_sha256(tensors: Mapping[str, Tensor], header: Mapping[str, object]) -> str:
@@ -170,29 +174,31 @@ def read_checkpoint(
     parts, header = read_tensors(path)
     tensors = {name: torch.from_numpy(array) for name, array in parts.items()}
     if header.get("recipe") != asdict(recipe):
-        remedy = "repeat its options, or choose another folder"
         raise ModelError(
-            str(path), expected=f"a checkpoint of {recipe}", got="another recipe", remedy=remedy
+            f"The checkpoint {path} belongs to another recipe than {recipe}. Repeat the options "
+            "it was begun with, or choose another folder."
         )
     if header.get("data") != data:
-        remedy = "give the same ones, or choose another folder"
-        expected = "a checkpoint of these images, sensors and first weights"
-        raise ModelError(str(path), expected=expected, got="one of others", remedy=remedy)
+        raise ModelError(
+            f"The checkpoint {path} belongs to a training with other images, sensors or first "
+            "weights. Give the same ones, or choose another folder."
+        )
     try:
         if header["sha256"] != checkpoint_sha256(tensors, header):
-            raise ValueError("a content that does not match its digest")
+            raise ValueError("its content does not match its digest")
         _check_parts(tensors, network, recipe.steps)
         counts: Any = header["guards"]
         best = None if counts["best"] is None else float(counts["best"])
         guards = Guards(int(counts["bad_steps"]), best, float(counts["sum"]), int(counts["count"]))
         step = int(str(header["step"]))
         if not 0 <= step <= recipe.steps:
-            raise ValueError(f"step {step} of {recipe.steps}")
+            raise ValueError(f"it is at step {step} of {recipe.steps}")
     except (AttributeError, LookupError, TypeError, ValueError, OverflowError) as error:
-        got = " ".join(str(error).split())[:120]
-        remedy = "choose the variant it was begun with, or begin anew where the file is damaged"
+        # The message of a KeyError is the bare key.
+        reason = f"it has no {error}" if isinstance(error, KeyError) else str(error)
         raise ModelError(
-            str(path), expected="a checkpoint of this network", got=got, remedy=remedy
+            f"{path} is not a checkpoint of this network: {printable(reason)}. Choose the variant "
+            "it was begun with, or start again if the file is damaged."
         ) from error
     return tensors, step, guards
 
@@ -200,9 +206,10 @@ def read_checkpoint(
 def finish(network: Network, path: Path, recipe: dict[str, object]) -> None:
     """Write a network with the recipe that made it."""
     if not all_finite(arrays(network.state_dict())):
-        remedy = "lower the learning rate"
-        raise ModelError(str(path), expected="finite weights", got="NaN or infinity", remedy=remedy)
-    require_finite_output(network, str(path))
+        raise ModelError(
+            f"The trained weights for {path} contain NaN or infinity. Lower the learning rate."
+        )
+    require_finite_output(network, f"The network for {path}")
     save_network(path, network, recipe)
 
 
@@ -220,14 +227,17 @@ def _check_parts(tensors: dict[str, Tensor], network: Network, steps: int) -> No
         value = tensors[name]
         moment = name.rsplit(".", 1)[1]
         if value.shape != template.shape or value.dtype != template.dtype:
-            shapes = f"{tuple(value.shape)} of {value.dtype} in place of {tuple(template.shape)}"
-            raise ValueError(f"a tensor {shapes}")
+            raise ValueError(
+                f"a tensor has the shape {tuple(value.shape)} of {value.dtype} instead of "
+                f"{tuple(template.shape)}"
+            )
         # Adam's second moment is a mean of squares.
         limits = {"step": (0, steps), "exp_avg_sq": (0, math.inf)}
         least, most = limits.get(moment, (-math.inf, math.inf))
         if not bool(((value >= least) & (value <= most)).all()):
-            raise ValueError(f"{name} that Adam cannot have")
+            raise ValueError(f"{name} has values that Adam cannot have")
     if len(tensors) != len(templates) or not all_finite(arrays(tensors)):
         raise ValueError(
-            f"{len(tensors)} tensors in place of {len(templates)}, or values that are not finite"
+            f"it has {len(tensors)} tensors instead of {len(templates)}, or values that are not "
+            "finite"
         )

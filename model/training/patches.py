@@ -87,8 +87,8 @@ def pair_files(folder: Path) -> list[Files]:
     )
     unpaired = sorted(degraded.keys() ^ reference.keys())
     if unpaired:
-        expected = "each name in degraded/ and in reference/"
-        got = f"{unpaired[0]!r} in one of them only"
-        remedy = "complete the pairs; 'beers-deploy simulate' writes such folders"
-        raise ImageError(str(folder), expected=expected, got=got, remedy=remedy)
+        raise ImageError(
+            f"{folder} has {unpaired[0]!r} in only one of the folders degraded and reference. "
+            "Complete the pairs; 'beers-deploy simulate' writes such folders."
+        )
     return [(path, reference[name]) for name, path in degraded.items()]

@@ -14,7 +14,7 @@ from beers_deploy.model.training.losses import LossWeights
 from beers_deploy.model.training.trainer import Precision
 from beers_deploy.model.variants import variant_named
 from beers_deploy.profiles.constant import check_keys, is_number
-from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.errors import ProfileError, printable
 from beers_deploy.profiles.toml import read_toml_text
 
 RECIPES = Path(__file__).parents[1] / "recipes"
@@ -37,23 +37,23 @@ def _list_of(value: Any, fits: Callable[[Any], bool]) -> bool:
 
 KINDS: Mapping[object, tuple[Callable[[Any], bool], str]] = {
     bool: (lambda value: isinstance(value, bool), "true or false"),
-    str: (lambda value: isinstance(value, str), "a text"),
-    int: (_whole, "a whole number from 0 on"),
-    float: (_number, "a number from 0 on"),
+    str: (lambda value: isinstance(value, str), "a string"),
+    int: (_whole, "an integer of 0 or more"),
+    float: (_number, "a number of 0 or more"),
     tuple[float, float]: (
         lambda value: _list_of(value, _number) and len(value) == 2,
-        "two numbers from 0 on",
+        "two numbers of 0 or more",
     ),
     tuple[str, ...]: (
         lambda value: _list_of(value, lambda item: isinstance(item, str)),
-        "a list of texts",
+        "a list of strings",
     ),
     Precision: (
         lambda value: value in get_args(Precision),
         f"one of {', '.join(get_args(Precision))}",
     ),
 }
-"""What a field of each kind takes, and how a message says it."""
+"""The values that a field of each type accepts: a check, and their description in messages."""
 
 
 @dataclass(frozen=True)
@@ -123,9 +123,9 @@ def recipe_file(name: str) -> Path:
     if name.endswith(".toml"):
         return Path(name)
     if name not in recipe_names():
-        expected = f"one of {', '.join(recipe_names())}, or the path of a .toml file"
         raise ProfileError(
-            f"recipe {name!r}", expected=expected, got=repr(name), remedy="choose one of them"
+            f"There is no recipe {name!r}. Choose one of {', '.join(recipe_names())}, or give the "
+            "path of a .toml file."
         )
     return RECIPES / f"{name}.toml"
 
@@ -146,20 +146,17 @@ def load_recipe(name: str) -> NetworkRecipe:
     except OSError as error:
         reason = error.strerror or str(error)
         raise ProfileError(
-            str(path), expected="a readable file", got=reason, remedy="check the path"
+            f"The recipe {path} cannot be read: {reason}. Check the path."
         ) from error
     except ValueError as error:
         raise ProfileError(
-            str(path), expected="TOML text", got=str(error), remedy="correct that line"
+            f"The recipe {path} is not valid TOML: {printable(str(error))}. Correct that line."
         ) from error
     where = f"recipe {path.name}"
     tables = raw.get("stages")
     if not isinstance(tables, list) or not tables:
         raise ProfileError(
-            where,
-            expected="one [[stages]] or more",
-            got="none",
-            remedy="add the stages of the training",
+            f"The {where} has no stages. Add each stage of the training as a table [[stages]]."
         )
     stages = tuple(
         _made(Stage, f"{where}: stage {number}", table) for number, table in enumerate(tables, 1)
@@ -171,9 +168,9 @@ def load_recipe(name: str) -> NetworkRecipe:
     recipe = _made(NetworkRecipe, where, {**raw, **parts})
     variant_named(recipe.variant)
     if stages[0].rounding and not recipe.start:
-        expected = "weights to make an INT8 file of before a stage with rounding"
         raise ProfileError(
-            where, expected=expected, got="none", remedy="put a stage without rounding in front"
+            f"The {where} begins with a stage with rounding, which needs the INT8 file of trained "
+            "weights, but there are none yet. Put a stage without rounding in front."
         )
     return recipe
 
@@ -181,7 +178,7 @@ def load_recipe(name: str) -> NetworkRecipe:
 def _made(kind: type[T], where: str, raw: object) -> T:
     """A dataclass of a table's values, each of the kind of the field's default."""
     if not isinstance(raw, Mapping):
-        raise ProfileError(where, expected="a table", got=repr(raw), remedy="write it as a table")
+        raise ProfileError(f"{where} must be a table, got {printable(repr(raw))}.")
     fields_by_name = {field_.name: field_ for field_ in fields(kind)}  # type: ignore[arg-type]
     required = {
         n
@@ -203,5 +200,5 @@ def _value(where: str, kind: object, value: object) -> object:
         return value
     fits, expected = KINDS[kind]
     if not fits(value):
-        raise ProfileError(where, expected=expected, got=repr(value), remedy="correct it")
+        raise ProfileError(f"{where} must be {expected}, got {printable(repr(value))}.")
     return tuple(value) if isinstance(value, list) else value

@@ -7,8 +7,9 @@ RUN/VARIANT.safetensors
 
 import csv
 import hashlib
+import logging
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
@@ -50,6 +51,8 @@ from beers_deploy.model.training.trainer import Batches, Precision, Schedule, Sp
 from beers_deploy.model.variants import Variant, variant_named
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.sensor import Instrument, Sensor, numbers_of
+
+logger = logging.getLogger(__name__)
 
 STEP = re.compile(r"[0-9]{1,18}(?=,)")
 """What a line of a log begins with."""
@@ -98,10 +101,6 @@ class Run:
         return self.out / f"{self.variant}.safetensors"
 
 
-FILES = ("checkpoint.safetensors", "log.csv", "validation.csv", "validation.png")
-"""What a run leaves in its folder besides the weights."""
-
-
 SHARE = 0.05
 """Of the images: sites are held out, the ones with the fewest images first, until so many are."""
 
@@ -126,8 +125,10 @@ def split_by_site(names: Sequence[str], wanted: Sequence[str] = ()) -> tuple[lis
     held_out: list[int] = []
     for site in wanted:
         if site not in sites:
-            remedy = "give the folders of all its images"
-            raise OptionError("held out", expected=f"images of {site}", got="none", remedy=remedy)
+            raise OptionError(
+                f"The site {site!r} is to be held out, but no image shows it. Give the folders of "
+                "all its images."
+            )
         held_out += sites[site]
     if len(sites) >= 3 and not wanted:
         # The name decides between sites of one size, so that the split is always the same.
@@ -205,13 +206,13 @@ class Validation:
         }
 
 
-def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) -> None:
-    """Run or resume a training to its end; says first whether LPIPS is part of the loss."""
+def train(run: Run, resume: bool, worker: Worker) -> None:
+    """Run or resume a training to its end, and log whether LPIPS is part of the loss."""
     variant = variant_named(run.variant)
     require_whole_places(run, variant)
     loss, message = loss_of(run)
     if message and worker.first:
-        say(message)
+        logger.info(message)
     generator = torch.Generator().manual_seed(run.recipe.seed)
     start = grow(_given(run, run.start), variant, generator) if run.start else None
     conditioned = run.patches.family is not None
@@ -223,9 +224,9 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
     if resume:
         trainer.resume(run.checkpoint)
     elif run.checkpoint.exists():
-        remedy = "add `resume` or choose another"
         raise OptionError(
-            "out", expected="a folder without a run", got=str(run.checkpoint), remedy=remedy
+            f"`out` already contains a training: {run.checkpoint}. Add `resume`, or choose another "
+            "folder."
         )
     batches, validation, names = data(run, trainer)
     _train(run, trainer, batches, validation)
@@ -235,13 +236,11 @@ def train(run: Run, resume: bool, worker: Worker, say: Callable[[str], None]) ->
 
 
 def require_whole_places(run: Run, variant: Variant) -> None:
-    """Refuse patches that a network at a lower resolution cannot rearrange."""
+    """Raise OptionError if a network at a lower resolution cannot rearrange the patches."""
     if run.patches.patch_px % variant.scale:
-        expected = (
-            f"a multiple of {variant.scale} px, for a network at 1/{variant.scale} resolution"
-        )
         raise OptionError(
-            "patch", expected=expected, got=f"{run.patches.patch_px} px", remedy="choose another"
+            f"`patch` must be a multiple of {variant.scale} px for a network at 1/{variant.scale} "
+            f"resolution, but it is {run.patches.patch_px} px."
         )
 
 
@@ -252,24 +251,23 @@ def _given(run: Run, path: Path) -> Network:
     network, _ = load_network(path)
     kind = ConvBEERS if run.patches.family is None else BankedConvBEERS
     if not isinstance(network, kind):
-        kinds = {
-            ConvBEERS: "a plain network's",
-            BankedConvBEERS: "those that 'train --conditioned' wrote",
-        }
-        remedy = "give others, or give `conditioned`" if kind is ConvBEERS else "give others"
+        if kind is ConvBEERS:
+            raise ModelError(
+                f"{path} holds the weights of a conditioned network, but this training is of a "
+                "plain one. Give other weights, or add `conditioned`."
+            )
         raise ModelError(
-            str(path), expected=f"weights: {kinds[kind]}", got=kinds[type(network)], remedy=remedy
+            f"{path} holds the weights of a plain network, but this training is of a conditioned "
+            "one. Give weights that were trained with `conditioned`."
         )
     if run.rounding is not None and network.variant != variant_named(run.variant):
-        remedy = "train a network of that size first, and make its INT8 file"
         raise OptionError(
-            "rounding",
-            expected=f"weights of {run.variant}",
-            got=f"{network.variant.blocks} blocks of {network.variant.features} features",
-            remedy=remedy,
+            f"`rounding` needs weights of {run.variant}, but {path} has {network.variant.blocks} "
+            f"blocks of {network.variant.features} features. Train a network of that size first, "
+            "and make its INT8 file."
         )
     # Finite weights may still give NaN, and then would in every step.
-    require_finite_output(network, str(path), "give another network")
+    require_finite_output(network, str(path), "Give another network.")
     return network
 
 
@@ -349,10 +347,7 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
     synthetic = draw_scenes(run.drawn, recipe.seed) + draw_charts(run.charts, recipe.seed)
     train_on = [scenes[number] for number in training] + synthetic
     if not train_on:
-        remedy = "give `images`, `pairs` or `drawn`"
-        raise OptionError(
-            "training data", expected="images, pairs or drawn scenes", got="none", remedy=remedy
-        )
+        raise OptionError("There is nothing to train on. Give `images`, `pairs` or `drawn`.")
     worker = trainer.worker
     ranks = worker.rank, worker.count
     patches = PatchSource(train_on, run.patches, recipe.batch, recipe.seed, *ranks, trainer.device)
@@ -387,7 +382,7 @@ def _train(run: Run, trainer: Trainer, batches: Batches, validation: Validation)
             bar.advance(step - bar.done, f"{means}, {rate}")
 
         def validate(step: int, network: Network) -> None:
-            require_finite_output(network, f"training step {step}")
+            require_finite_output(network, f"The network at training step {step}")
             judged = validation.judge(network)
             scores.write(step, judged)
             write_picture(validation, network, run.out / "validation.png")

@@ -128,10 +128,9 @@ class PatchSource:
                 # scene.
                 order = generator.permutation(count)[:shard_size]
                 return _mixed(visits, order)
-        expected = f"scenes that hold a patch of {self.recipe.patch_px} target pixels"
-        remedy = "give larger images or a smaller patch"
         raise ImageError(
-            "training images", expected=expected, got="none large enough", remedy=remedy
+            "None of the training images is large enough for a patch of "
+            f"{self.recipe.patch_px} target pixels. Give larger images or a smaller patch."
         )
 
 

@@ -13,7 +13,7 @@ from beers_deploy.model.training.patches import Files, turn
 from beers_deploy.model.training.source import Batch
 from beers_deploy.profiles.errors import ImageError
 
-RESCALE = "rescale it to the digital numbers of the sensor that made the pairs"
+RESCALE = "Rescale it to the digital numbers of the sensor that made the pairs."
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,12 @@ class StoredPairs:
         images = [read_acquisition(file, remedy=RESCALE, max_dn=self.max_dn) for file in files]
         height, width = images[0].shape
         if images[0].shape != images[1].shape or min(height, width) < self.patch_px:
-            expected = f"a mono pair of one size, {self.patch_px} pixels a side or more"
-            got = " and ".join(f"{image.shape[1]} x {image.shape[0]} pixels" for image in images)
-            remedy = "choose a smaller `patch`, or simulate larger patches"
-            raise ImageError(str(files[0]), expected=expected, got=got, remedy=remedy)
+            sizes = " and ".join(f"{image.shape[1]} x {image.shape[0]} pixels" for image in images)
+            raise ImageError(
+                f"{files[0]} and its reference must be mono images of one size, "
+                f"{self.patch_px} pixels a side or more, but they have {sizes}. Choose a smaller "
+                "`patch`, or simulate larger patches."
+            )
         top, left = (int(generator.integers(size - self.patch_px + 1)) for size in (height, width))
         window = slice(top, top + self.patch_px), slice(left, left + self.patch_px)
         both = np.stack([np.float32(image[window]) for image in images])

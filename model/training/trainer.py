@@ -59,9 +59,9 @@ class Worker:
         """The device of that name; of several GPUs, this worker's own."""
         device = torch.device(name)
         if device.type == "cuda" and not torch.cuda.is_available():
-            remedy = "choose the device cpu, or install a build of PyTorch for it"
             raise MachineError(
-                "device", expected="a CUDA device", got="none that PyTorch can see", remedy=remedy
+                f"`device` is {name!r}, but PyTorch finds no CUDA device. Choose cpu, or install "
+                "a build of PyTorch with CUDA."
             )
         if name == "cuda":
             return torch.device("cuda", self.local_rank)
@@ -345,12 +345,12 @@ class Trainer:
 
 
 def require_loss(loss: RestorationLoss) -> None:
-    """Refuse a loss that is 0 whatever the network gives: such a run learns nothing."""
+    """Raise OptionError if the loss is 0 for every network: such a run learns nothing."""
     weights = loss.weights
     if loss.perceptual is not None or weights.l1 + weights.fft + weights.psnr > 0:
         return
-    left_out = ", and none but LPIPS, which lacks its weights" if weights.lpips else ""
-    remedy = "raise one of `l1_weight`, `fft_weight`, `psnr_weight`"
+    left_out = ", except that of LPIPS, whose network was not found" if weights.lpips else ""
     raise OptionError(
-        "loss", expected="a term of weight above 0", got=f"weights of 0{left_out}", remedy=remedy
+        f"The loss is always 0, because the weights of all its terms are 0{left_out}. "
+        "Raise one of `l1_weight`, `fft_weight`, `psnr_weight`."
     )

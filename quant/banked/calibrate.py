@@ -14,7 +14,6 @@ import numpy as np
 from beers_deploy.model.bank import FILTERS, UNIT_STEPS, Bank, network_bank
 from beers_deploy.model.family import SensorFamily, sensor_vector
 from beers_deploy.model.io.tensors import Weights
-from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.variants import SENSOR_VALUES, Kernels
 from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
@@ -199,7 +198,6 @@ def quantise_family(
     images: Remade[np.ndarray],
     shifts: Shifts = SHIFTS,
     passes: Passes = PASSES,
-    log: Log = no_log,
 ) -> Family:
     """A network behind a bank in whole numbers, for the middle of the family.
 
@@ -209,9 +207,8 @@ def quantise_family(
         images: of `bank_results`, of sensors from all over the family.
         shifts: the windows of the target.
         passes: that reduce the error.
-        log: is told each step.
     """
-    body, *_ = rounded(_plan(weights, shifts, passes), images, log)
+    body, *_ = rounded(_plan(weights, shifts, passes), images)
     biases = {op.name: _biases(op) for op in body.convolutions}
     # A sensor's values are constant, so their planes become part of the biases.
     ops = tuple(

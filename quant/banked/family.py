@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from beers_deploy.model.bank import Bank
 from beers_deploy.model.variants import SENSOR_VALUES, Kernels
-from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.banked.filters import BITS, whole_bank
 from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, Shifts, quantise_bias
 from beers_deploy.quant.encodings import read_core
@@ -93,7 +93,7 @@ def family_of(model: onnx.ModelProto) -> Family | None:
     words = metadata(model).get(FAMILY)
     if words is None:
         return None
-    with contradictions("INT8 model"):
+    with contradictions("the INT8 network"):
         core = read_core(model)
         record = json.loads(words)
         biases = {str(name): np.array(values, np.float64) for name, values in record.items()}
@@ -104,7 +104,7 @@ def family_of(model: onnx.ModelProto) -> Family | None:
             for name, op in body.items()
         }
         if {name: values.shape for name, values in biases.items()} != shapes:
-            raise ValueError("biases that are not its convolutions'")
+            raise ValueError("the biases do not fit its convolutions")
         # Only behind fitted kernels does the analytic restoration have a coarse copy.
         return Family(core, biases, kernels="fitted" if core.ends.wide else "cut")
 
@@ -113,9 +113,9 @@ def required_family(model: onnx.ModelProto) -> Family:
     """As `family_of`, of a file that must be such a network's."""
     family = family_of(model)
     if family is None:
-        remedy = "make one with 'beers-deploy quantize' of weights that 'train --conditioned' wrote"
         raise ModelError(
-            "INT8 model", expected="one that can be told its sensor", got="another", remedy=remedy
+            "The INT8 network cannot be conditioned on a sensor. Make one that can with "
+            "'beers-deploy quantize', from weights that 'beers-deploy train --conditioned' wrote."
         )
     return family
 
@@ -157,13 +157,13 @@ def _numbers(op: IntConv) -> list[np.ndarray]:
     return [op.weight, op.bias] if op.input == PLANES else [op.bias]
 
 
-def with_delta(core: IntCore, delta: bytes, where: str = "delta") -> tuple[IntCore, str]:
+def with_delta(core: IntCore, delta: bytes, where: str = "The delta") -> tuple[IntCore, str]:
     """Return a core conditioned on the sensor of a delta, and that sensor's name.
 
     Args:
         core: of the network that the delta was made for.
         delta: its bytes.
-        where: what messages call it.
+        where: what messages call it, at their beginning.
 
     Raises:
         ModelError: damaged bytes, or a delta of another network.
@@ -196,11 +196,15 @@ def with_delta(core: IntCore, delta: bytes, where: str = "delta") -> tuple[IntCo
         TypeError,
         ValueError,
     ) as error:
-        remedy = "give a file that 'export --delta' wrote for the same network"
-        reason = " ".join(f"{type(error).__name__}: {error}".split())[:80]
-        got = "damaged bytes" if isinstance(error, zlib.error) else f"another one ({reason})"
+        reason = printable(" ".join(f"{type(error).__name__}: {error}".split()))
+        fault = (
+            "is damaged"
+            if isinstance(error, zlib.error)
+            else f"belongs to another network ({reason})"
+        )
         raise ModelError(
-            where, expected="a delta of this network", got=got, remedy=remedy
+            f"{where} {fault}. Give a file that 'beers-deploy export --delta' wrote for the same "
+            "network."
         ) from error
 
 

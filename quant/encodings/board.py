@@ -83,7 +83,7 @@ def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:
     """
     if KEY not in metadata(model):
         return model
-    with contradictions("INT8 model"):
+    with contradictions("the INT8 network"):
         core = described_core(metadata(model)[KEY], constants(model))
         return board_model(core, {}, fixed_tile_px(model))
 
@@ -159,11 +159,12 @@ def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> on
 
 
 def required_tile(tile_px: int | None) -> int:
-    """The tile's side, which an NPU's file must be fixed to."""
+    """Return the side of the tile, or raise OptionError: an NPU's file must be fixed to one."""
     if tile_px is None:
-        expected = "a side in pixels: the compiler of an NPU takes stated sizes alone"
-        remedy = "give it, such as 640"
-        raise OptionError("tile", expected=expected, got="none", remedy=remedy)
+        raise OptionError(
+            "`tile` must be given for an NPU, because its compiler accepts fixed sizes only. Give "
+            "a side in pixels, such as 640."
+        )
     return tile_px
 
 

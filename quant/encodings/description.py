@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import (
@@ -73,10 +73,10 @@ def described_core(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
     try:
         return _described(text, constants)
     except DAMAGE as error:
-        got = f"damaged ones ({type(error).__name__}: {' '.join(str(error).split())[:80]})"
-        expected = f"metadata {KEY!r} that describe its integers"
+        reason = printable(" ".join(f"{type(error).__name__}: {error}".split()))
         raise ModelError(
-            "INT8 core", expected=expected, got=got, remedy="quantise the network again"
+            f"The metadata {KEY!r} of the INT8 network, which describe its integers, are damaged "
+            f"({reason}). Quantise the network again."
         ) from error
 
 

@@ -292,10 +292,9 @@ def read_core(model: onnx.ModelProto) -> IntCore:
     text = metadata(model).get(KEY)
     if text is not None:
         return described_core(text, constants(model))
-    expected = "a file that describes its integers"
-    remedy = "make it with 'beers-deploy quantize'"
     raise ModelError(
-        "INT8 core", expected=expected, got="a file without a description", remedy=remedy
+        "The network's file does not describe its integers, as INT8 files of 'beers-deploy "
+        "quantize' do. Make it with that command."
     )
 
 
@@ -311,8 +310,8 @@ def encoding_faults(model: onnx.ModelProto) -> list[str] | None:
     try:
         core = read_core(model)
     except ModelError as error:
-        return [f"no integers to compare with: {error.got}"]
-    with contradictions("INT8 model"):
+        return [f"no integers to compare with: {error}"]
+    with contradictions("the INT8 network"):
         expected = host_model(core, {}, fixed_tile_px(model)).graph
         faults = list[str]()
     for kind, parts, expected_parts in (

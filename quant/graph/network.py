@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.errors import LONGEST, ModelError, printable
 from beers_deploy.quant.graph.nodes import Pair, Window
 from beers_deploy.quant.graph.operations import (
     CORRECTION,
@@ -28,8 +28,8 @@ from beers_deploy.quant.graph.operations import (
 from beers_deploy.quant.graph.tail import Tail
 
 REMEDY = (
-    "see docs/reference/any-network.md for what 'quantize' takes; 'check' names what a DPU "
-    "does not run"
+    "See docs/reference/any-network.md for the operators that 'quantize' accepts; 'check' names "
+    "what a DPU does not run."
 )
 
 
@@ -67,9 +67,14 @@ class Network:
         return self.channels * int(np.prod([shuffle.block**2 for shuffle in self.front], initial=1))
 
 
-def refused_graph(expected: str, got: str, remedy: str = "") -> ModelError:
-    """The sentence for a network that cannot be quantised."""
-    return ModelError("float model", expected=expected, got=got, remedy=remedy or REMEDY)
+def unsupported(fault: str, remedy: str = REMEDY) -> ModelError:
+    """Return the error of a float network that cannot be quantised.
+
+    Args:
+        fault: a sentence; names in it may come from a file, and a long one is cut.
+        remedy: another sentence.
+    """
+    return ModelError(f"{printable(fault, 4 * LONGEST)} {remedy}")
 
 
 def cut(graph: Graph, channels: int, flat: bool, softmax: bool) -> Network:
@@ -125,7 +130,7 @@ def _without_shuffles(graph: Graph) -> tuple[Graph, tuple[Shuffle, ...]]:
 
 def _ended(graph: Graph, name: str) -> Graph:
     if name == IMAGE or not any(op.output == name for op in graph):
-        raise refused_graph("a correction that the network computes", f"{name} of nobody")
+        raise unsupported(f"No operation of the network computes its correction, {name!r}.")
     return tuple(renamed(op, {name: CORRECTION}) for op in graph)
 
 
@@ -164,31 +169,31 @@ def _is_ours(name: str) -> bool:
 
 
 def check_network(network: Network) -> None:
-    """Refuse what cannot be quantised, before anything is computed."""
+    """Raise ModelError if a network cannot be quantised, before anything is computed."""
     graph = network.graph
     if not graph or graph[-1].output != CORRECTION:
-        raise refused_graph(
-            "a last operation that writes the result", graph[-1].name if graph else "no operation"
-        )
+        last = f"is {graph[-1].name}" if graph else "does not exist"
+        raise unsupported(f"The last operation must write the network's result, but it {last}.")
     if network.tail and (network.adds_image or network.flat or network.softmax):
-        expected = "nothing behind the global add, a Flatten or a Softmax at the end"
-        raise refused_graph(expected, str(network.tail.graph.node[0].name))
+        raise unsupported(
+            "The network may have nothing behind the global add, or behind a Flatten or a Softmax "
+            f"at its end, but {network.tail.graph.node[0].name} follows."
+        )
     widths = channels_of(graph, {IMAGE: network.core_channels})
     for op in graph:
         # ONNX's SpaceToDepth has the other order of channels, so several need a Gather, which the
         # DPU does not compute.
         if isinstance(op, Shuffle) and not op.up and op.columns_first and widths[op.input] > 1:
-            remedy = (
-                "put it at the network's start, where the host does it, or take a strided "
-                "convolution"
-            )
-            raise refused_graph(
-                "pixel unshuffle of several channels at the image alone", op.name, remedy
+            raise unsupported(
+                f"{op.name} is a pixel unshuffle of several channels within the network, which is "
+                "supported on the image only.",
+                "Put it at the network's start, where the host does it, or use a strided "
+                "convolution.",
             )
         if isinstance(op, Conv) and not (
             np.isfinite(op.weight).all() and np.isfinite(op.bias).all()
         ):
-            raise refused_graph("finite weights", f"NaN or infinity in {op.name}")
+            raise unsupported(f"The weights of {op.name} contain NaN or infinity.")
 
 
 def sized(graph: Graph, size: Pair) -> Graph:
@@ -199,8 +204,8 @@ def sized(graph: Graph, size: Pair) -> Graph:
         input_sizes = [sizes[name] for name in op.inputs]
         input_size = input_sizes[0]
         if any(other != input_size for other in input_sizes):
-            got = " and ".join(f"{rows} x {columns}" for rows, columns in input_sizes)
-            raise refused_graph(f"tensors of one size for {op.name}", got)
+            unequal = " and ".join(f"{rows} x {columns}" for rows, columns in input_sizes)
+            raise unsupported(f"{op.name} needs tensors of one size, but they have {unequal}.")
         # Global pooling is a window of the whole map, whose size is known from here on.
         if isinstance(op, AveragePool) and op.kernel is None:
             op = replace(op, kernel=input_size)
@@ -236,27 +241,27 @@ def add_channels(widths: dict[str, int], ops: Iterable[Op]) -> None:
     for op in ops:
         unwritten = [name for name in op.inputs if name not in widths]
         if unwritten:
-            raise refused_graph(f"{op.name} behind what it reads", unwritten[0])
+            raise unsupported(f"{op.name} reads {unwritten[0]!r} before it is computed.")
         widths[op.output] = _width(op, [widths[name] for name in op.inputs])
 
 
 def _width(op: Op, widths: list[int]) -> int:
     if isinstance(op, HasWeight):  # in float or in whole numbers
         if widths[0] != op.weight.shape[1] * op.groups:
-            raise refused_graph(
-                f"{op.weight.shape[1] * op.groups} channels for {op.name}", f"{widths[0]}"
+            raise unsupported(
+                f"{op.name} needs {op.weight.shape[1] * op.groups} channels, got {widths[0]}."
             )
         return len(op.weight)
     if isinstance(op, Concat):
         return sum(widths)
     if isinstance(op, Add | Mul) and len(set(widths)) > 1:
-        raise refused_graph(
-            f"two tensors of one width for {op.name}", f"{widths[0]} and {widths[1]} channels"
+        raise unsupported(
+            f"{op.name} needs tensors of one number of channels, got {widths[0]} and {widths[1]}."
         )
     if isinstance(op, Shuffle):
         if op.up and widths[0] % op.block**2:
-            raise refused_graph(
-                f"a multiple of {op.block**2} channels for {op.name}", f"{widths[0]}"
+            raise unsupported(
+                f"{op.name} needs a multiple of {op.block**2} channels, got {widths[0]}."
             )
         return widths[0] // op.block**2 if op.up else widths[0] * op.block**2
     return widths[0]

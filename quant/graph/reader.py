@@ -12,14 +12,15 @@ import onnx
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph.moves import MOVES, ORDERS, Resizing, with_shuffles
 from beers_deploy.quant.graph.network import (
+    REMEDY,
     Network,
     add_channels,
     check_network,
     cut,
     named_apart,
-    refused_graph,
     renamed,
     sized,
+    unsupported,
 )
 from beers_deploy.quant.graph.nodes import Node, Pair
 from beers_deploy.quant.graph.operations import (
@@ -48,7 +49,7 @@ from beers_deploy.quant.untrusted import check_runnable, contradictions, times
 
 def read_network(model: onnx.ModelProto) -> Network:
     """The operations of a float network that has been simplified (`quant.reading`)."""
-    with contradictions("float model"):
+    with contradictions("the float network"):
         body, tail = without_tail(model, {*READERS, *ACTIVATIONS})
         reader = _Reader(body)
         network = replace(
@@ -69,12 +70,16 @@ def plain_network(model: onnx.ModelProto) -> Network:
     blocks = [[shuffle.block for shuffle in end] for end in (network.front, network.back)]
     same_ends = network == Network(network.graph, front=network.front, back=network.back)
     if not (same_ends and blocks[0] == blocks[1] and len(blocks[0]) <= 1):
-        raise refused_graph(
-            "an image of one channel, and a global add of it at the end", "another network"
+        raise unsupported(
+            "The network must read an image of one channel, and add it to its result at the end "
+            "(a global add)."
         )
     for op in network.graph:
         if not _is_plain(op):
-            raise refused_graph("only same-size convolutions of stride 1, ReLU and adds", op.name)
+            raise unsupported(
+                "The network may have only same-size convolutions of stride 1, ReLU and adds, but "
+                f"it has {op.name}."
+            )
     return network
 
 
@@ -98,12 +103,13 @@ def image_channels(graph: Graph) -> int:
 
 
 def refusal(model: onnx.ModelProto) -> str:
-    """Why a float network cannot be quantised, as a sentence; empty where it can."""
+    """Return the sentence that says why a float network cannot be quantised; "" if it can."""
     try:
-        check_runnable(model, "float model")
+        check_runnable(model, "the float network")
         read_network(model)
     except ModelError as error:
-        return f"expected {error.expected}, got {error.got}"
+        # `check` calls this, so its user need not be sent to `check`.
+        return str(error).removesuffix(f" {REMEDY}")
     return ""
 
 
@@ -125,7 +131,9 @@ class _Reader:
         """Of the image."""
         sizes = self.source.inputs[self.image]
         if len(sizes) != 4:
-            raise refused_graph("an input of (N, C, H, W)", f"{len(sizes)} sizes")
+            raise unsupported(
+                f"The network's input must be (N, C, H, W), but it has {len(sizes)} dimensions."
+            )
         return sizes[1] or 1
 
     def graph(self) -> Graph:
@@ -133,22 +141,23 @@ class _Reader:
         size of image.
         """
         if len(self.source.outputs) != 1:
-            got = f"{len(self.source.outputs)}: {', '.join(self.source.outputs)}"
-            raise refused_graph("one output", got, "export it with one of them")
+            raise unsupported(
+                f"The network must have one output, but it has {len(self.source.outputs)}: "
+                f"{', '.join(self.source.outputs)}.",
+                "Export it with one of them.",
+            )
         for node in self.source.nodes:
             self._read(node)
         if not self.ops or self.ops[-1].output != self.result:
-            raise refused_graph("an operation that writes the output", "none")
+            raise unsupported("No operation writes the network's output.")
         graph = named_apart(self.ops, {self.image: IMAGE, self.result: CORRECTION})
         pools = [op for op in graph if isinstance(op, AveragePool) and op.kernel is None]
         rows, columns = self.source.inputs[self.image][2:]
         if pools and not (rows and columns):
-            remedy = (
-                "export it with fixed height and width: what pools over the whole image "
-                "has one size"
-            )
-            raise refused_graph(
-                "images of one size", f"any size, and global pooling at {pools[0].name}", remedy
+            raise unsupported(
+                f"The network accepts images of any size, but {pools[0].name} pools over the whole "
+                "image, whose size must be known.",
+                "Export it with fixed height and width.",
             )
         return sized(graph, (rows, columns)) if pools else graph
 
@@ -157,13 +166,13 @@ class _Reader:
             self._activation(node)
             return
         if node.op_type not in READERS:
-            remedy = "replace it by one that the DPU computes, or cut the network in front of it"
+            remedy = "Replace it by one that the DPU computes, or cut the network in front of it."
             if node.op_type == "Pad":
                 remedy = (
-                    "pad in the convolution; a network behind a bank is quantised from its "
-                    "weights (.safetensors)"
+                    "Pad in the convolution; a network behind a bank is quantised from its "
+                    "weights (.safetensors)."
                 )
-            raise refused_graph("operations that a DPU computes", str(node), remedy)
+            raise unsupported(f"The DPU does not compute the operation {node}.", remedy)
         op = READERS[node.op_type](self, node)
         if op is not None:
             self._append(op)
@@ -189,21 +198,22 @@ class _Reader:
         self._measured = len(self.ops)
         return self._widths[tensor]
 
-    def _require(self, condition: bool, node: Node, expected: str, got: str = "another") -> None:
+    def _require(self, condition: bool, node: Node, rule: str) -> None:
+        """Raise ModelError with a rule, "must ..." or "has ...", that the node breaks."""
         if not condition:
-            raise refused_graph(expected, f"{got} at {node}")
+            raise unsupported(f"{node} {rule}.")
 
     def _weights(self, node: Node) -> tuple[np.ndarray, np.ndarray]:
         """Of a convolution, (O, I / groups, kh, kw), and its bias (O,)."""
         weight = self.source.value(node, 1)
         bias = self.source.value(node, 2)
         if weight is None:
-            raise refused_graph("weights that are constants", f"computed ones at {node}")
+            raise unsupported(f"{node} must have constant weights, but they are computed.")
         self._require(
             weight.ndim == 4,
             node,
-            "convolutions over rows and columns",
-            f"weights of {weight.ndim} sizes",
+            f"must be a convolution over rows and columns, but its weights have {weight.ndim} "
+            "dimensions",
         )
         if node.op_type == "ConvTranspose":
             weight = np.ascontiguousarray(weight.swapaxes(0, 1))
@@ -218,8 +228,7 @@ class _Reader:
         self._require(
             groups == 1 or depthwise,
             node,
-            "one group, or one a channel (depthwise)",
-            f"{groups} groups",
+            f"must have one group, or one for each channel (depthwise), got {groups} groups",
         )
         _, window = self._window(node, weight.shape[2:])
         return Conv(
@@ -234,7 +243,7 @@ class _Reader:
         plain = int(attributes.get("group", 1)) == 1 and not any(
             attributes.get("output_padding", [0])
         )
-        self._require(plain, node, "transposed convolutions of one group, without output padding")
+        self._require(plain, node, "must have one group and no output padding")
         even = (
             set(attributes.get("dilations", [1])) == {1}
             and len(set(strides)) == 1
@@ -243,11 +252,13 @@ class _Reader:
         self._require(
             even,
             node,
-            "transposed convolutions of one stride, undilated, sized by it",
-            f"{list(strides)}",
+            "must have one stride for rows and columns, no dilation and no output_shape, got "
+            f"strides {list(strides)}",
         )
         self._require(
-            attributes.get("auto_pad", "NOTSET") == "NOTSET", node, "stated pads", "auto_pad"
+            attributes.get("auto_pad", "NOTSET") == "NOTSET",
+            node,
+            "must state its pads instead of auto_pad",
         )
         _, window = self._window(node, weight.shape[2:])
         return Conv(
@@ -258,9 +269,11 @@ class _Reader:
         window = node.window(kernel)
         auto = str(node.attributes.get("auto_pad", ""))
         if window is None:
-            raise refused_graph("windows over rows and columns", f"another at {node}")
+            raise unsupported(f"{node} must have a window over rows and columns.")
         has_pads = window.stride == (1, 1) or not auto.startswith("SAME")
-        self._require(has_pads, node, "stated pads", f"auto_pad {auto} with strides")
+        self._require(
+            has_pads, node, f"must state its pads instead of auto_pad {auto} with strides"
+        )
         return window.kernel, Window(window.stride, window.pads, window.dilation)
 
     def _flatten(self, node: Node) -> None:
@@ -271,7 +284,9 @@ class _Reader:
             and node.attributes.get("axis", 1) == 1
         )
         self._require(
-            at_end and self.ops[-1].output == node.inputs[0], node, "Flatten at the end alone"
+            at_end and self.ops[-1].output == node.inputs[0],
+            node,
+            "is supported at the end of the network only",
         )
         self._replace(len(self.ops) - 1, renamed(self.ops[-1], {node.inputs[0]: node.outputs[0]}))
         self.flat = True
@@ -287,7 +302,11 @@ class _Reader:
             and self.ops[-1].output == node.inputs[0]
             and self.source.reads(node.inputs[0]) == 1
         )
-        self._require(at_end and of_channels and last, node, "Softmax of channels at the end alone")
+        self._require(
+            at_end and of_channels and last,
+            node,
+            "is supported along the channels at the end of the network only",
+        )
         self._replace(len(self.ops) - 1, renamed(self.ops[-1], {node.inputs[0]: node.outputs[0]}))
         self.softmax = True
 
@@ -305,7 +324,7 @@ class _Reader:
         self._require(
             op is not None,
             node,
-            "a difference whose second tensor a convolution writes, for it alone",
+            "is supported only if a convolution writes its second tensor, which nothing else reads",
         )
         return op
 
@@ -319,12 +338,20 @@ class _Reader:
         (place, value), *others = constants.items()
         flat = None if others else per_channel(value)
         if flat is None:
-            got = f"one of {times(value.shape)} at {node}"
-            raise refused_graph("a constant of one number a channel", got)
-        self._require(node.op_type != "Sub" or place == 1, node, "a constant that is taken off")
+            raise unsupported(
+                f"{node} must have a constant of one number for each channel, got "
+                f"{times(value.shape)}."
+            )
+        self._require(
+            node.op_type != "Sub" or place == 1, node, "must subtract the constant, not the tensor"
+        )
         source = node.inputs[1 - place]
         channels = self._channels_of(source)
-        self._require(value.size in (1, channels), node, f"{channels} numbers", f"{value.size}")
+        self._require(
+            value.size in (1, channels),
+            node,
+            f"must have a constant of {channels} numbers, got {value.size}",
+        )
         values = np.broadcast_to(flat.astype(np.float32), (channels,))
         one = np.ones(channels, np.float32)
         none = np.zeros(channels, np.float32)
@@ -336,48 +363,63 @@ class _Reader:
 
     def _concat(self, node: Node) -> Op:
         axis = node.attributes.get("axis")
-        self._require(axis in (1, -3), node, "concat along the channels", f"axis {axis}")
+        self._require(
+            axis in (1, -3), node, f"must concatenate along the channels, got axis {axis}"
+        )
         computed = self.source.constants.keys().isdisjoint(node.inputs)
-        self._require(computed, node, "computed tensors", "a constant")
+        self._require(computed, node, "must concatenate computed tensors, got a constant")
         return Concat(node.name, node.inputs, node.outputs[0])
 
     def _maxpool(self, node: Node) -> Op:
         plain = len(node.outputs) == 1 and not node.attributes.get("ceil_mode", 0)
-        self._require(plain, node, "max pooling without indices or ceil_mode")
+        self._require(plain, node, "must pool without indices and ceil_mode")
         return MaxPool(node.name, node.inputs[0], node.outputs[0], *self._window(node))
 
     def _averagepool(self, node: Node) -> Op:
         kernel, window = self._window(node)
         zeros = bool(node.attributes.get("count_include_pad", 0)) or not any(window.pads)
         plain = zeros and not node.attributes.get("ceil_mode", 0)
-        self._require(plain, node, "average pooling that counts padding")
+        self._require(plain, node, "must count its padding and have no ceil_mode")
         return AveragePool(node.name, node.inputs[0], node.outputs[0], kernel, window)
 
     def _resize(self, node: Node) -> Op:
         resizing = Resizing.of(node, self.source)
         is_uniform = resizing.factors[:2] == (1, 1) and resizing.factors[2] == resizing.factors[3]
-        self._require(is_uniform, node, "a resize by a constant factor of rows and columns")
+        self._require(is_uniform, node, "must enlarge rows and columns by one constant factor")
         factor = int(resizing.factors[2])
         where = resizing.where
         self._require(
-            resizing.factors[2] == factor >= 1, node, "a whole factor", f"{resizing.factors[2]:g}"
+            resizing.factors[2] == factor >= 1,
+            node,
+            f"must enlarge by an integer factor, got {resizing.factors[2]:g}",
         )
         # A DPU enlarges bilinearly by 2 and 4 alone where centres are half-pixel ones.
         if resizing.mode == "linear":
             half = where in ("half_pixel", "pytorch_half_pixel") and factor in (2, 4)
             self._require(
-                half, node, "bilinear by 2 or 4 with half-pixel centres", f"{where} by {factor}"
+                half,
+                node,
+                "must enlarge bilinearly by 2 or 4 with half-pixel centres, got "
+                f"{where} by {factor}",
             )
         else:
             blocks = resizing.mode == "nearest" and resizing.makes_blocks(factor)
-            got = f"{resizing.mode}, {where}, {resizing.rounding} by {factor}"
-            self._require(blocks, node, "a nearest resize that makes a block of each pixel", got)
+            self._require(
+                blocks,
+                node,
+                "must be a nearest resize that makes a block of each pixel, got "
+                f"{resizing.mode}, {where}, {resizing.rounding} by {factor}",
+            )
         return Resize(node.name, node.inputs[0], node.outputs[0], factor, resizing.mode == "linear")
 
     def _shuffle(self, node: Node) -> Op:
         """A pixel shuffle, or Reshape and Transpose as exporters spell one."""
         mode = node.attributes.get("mode", "DCR") if node.op_type not in MOVES else ""
-        self._require(mode in ORDERS, node, "Reshape and Transpose that spell a pixel shuffle")
+        self._require(
+            mode in ORDERS,
+            node,
+            "must be a pixel shuffle, or part of a Reshape and Transpose that make one",
+        )
         up = node.op_type == "DepthToSpace"
         block = int(node.attributes["blocksize"])
         # Of several nodes that spell one shuffle it is the last one's name.
@@ -418,18 +460,19 @@ class _Reader:
             self._require(
                 slope == np.float32(LEAKY_SLOPE),
                 node,
-                "a slope of 26/256 (0.1015625)",
-                f"{slope:g}",
+                f"must have a slope of 26/256 (0.1015625), got {slope:g}",
             )
         if node.op_type == "Clip":
             low, high = (self.source.value(node, k) for k in (1, 2))
             six = low is not None and high is not None and float(low) == 0 and float(high) == 6
-            self._require(six, node, "a clip from 0 to 6 (ReLU6)")
+            self._require(six, node, "must clip from 0 to 6 (ReLU6)")
         if node.op_type == "HardSigmoid":
             alpha = node.attributes.get("alpha", 0.2)
             beta = node.attributes.get("beta", 0.5)
             plain = bool(np.isclose(alpha, 1 / 6, 1e-4)) and beta == 0.5
-            self._require(plain, node, "HardSigmoid with alpha 1/6", f"{alpha:g}")
+            self._require(
+                plain, node, f"must have alpha 1/6 and beta 0.5, got {alpha:g} and {beta:g}"
+            )
         return activation
 
 

@@ -14,6 +14,7 @@ from itertools import product
 
 import numpy as np
 
+from beers_deploy.model.progress import steps
 from beers_deploy.quant.core import INT8_MAX
 from beers_deploy.quant.ends import ONE_CHANNEL, Ends
 from beers_deploy.quant.graph import Activation, Conv, Graph
@@ -194,8 +195,10 @@ def search(graph: Graph, stream: Stream, ranges: np.ndarray, trial: Trial) -> np
     first, *others = (first_guess(ranges, *shape) for shape in product(LEVELLING, HEADROOM))
     # Without factors to compare with, the first guess has to be run on all crops.
     best = Best(first, costs_of(first)(None))
-    for guess in others:
-        best = race(costs_of(guess), guess, best)
+    with steps("first guesses", len(others)) as bar:
+        for guess in others:
+            best = race(costs_of(guess), guess, best)
+            bar.advance()
     # One channel after the other takes hours in a wide network.
     channels = range(len(ranges)) if len(ranges) <= MOST_CHANNELS else ()
     return stepped(costs_of, channels, best).factors
@@ -205,9 +208,10 @@ def stepped(
     costs_of: Callable[[np.ndarray], Costs], channels: Iterable[int], best: "Best"
 ) -> "Best":
     """The best factors once each of these channels has been tried larger and smaller."""
-    for step in STEPS:
-        for channel in channels:
-            for factor in (step, 1 / step):
+    trials = list(product(STEPS, channels))
+    with steps("channels", len(trials)) as bar:
+        for size, channel in trials:
+            for factor in (size, 1 / size):
                 candidate = best.factors.copy()
                 candidate[channel] *= factor
                 winner = race(costs_of(candidate), candidate, best)
@@ -215,6 +219,7 @@ def stepped(
                     best = winner
                     # The inverse factor would lead back to where the channel came from.
                     break
+            bar.advance()
     return best
 
 

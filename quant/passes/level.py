@@ -19,6 +19,7 @@ from itertools import product
 
 import numpy as np
 
+from beers_deploy.model.progress import steps
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import Conv, Graph
 from beers_deploy.quant.passes.equalise import (
@@ -142,11 +143,15 @@ def level(
     # All jointly first: the error of the worst tensor would hide what the others gain.
     best = guessed(Best(start, costs_of(start)(None)), tensors)
     separately = chain.by_channel or len(tensors) <= FEW_TENSORS
-    # From the last one on, because what is rounded late reaches the result.
-    for tensor in reversed(tensors) if separately else ():
-        best = guessed(best, [tensor])
-        if chain.by_channel and len(ranges) <= MOST_CHANNELS:
-            best = stepped(costs_of, range(tensor[0].start, tensor[0].stop), best)
+    if not separately:
+        return best.factors
+    with steps("tensors", len(tensors)) as bar:
+        # From the last one on, because what is rounded late reaches the result.
+        for tensor in reversed(tensors):
+            best = guessed(best, [tensor])
+            if chain.by_channel and len(ranges) <= MOST_CHANNELS:
+                best = stepped(costs_of, range(tensor[0].start, tensor[0].stop), best)
+            bar.advance()
     return best.factors
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from beers_deploy.model.progress import Log, no_log
+from beers_deploy.model.progress import step
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import host_model
@@ -146,9 +146,9 @@ class Descent:
 
     def round(self, steps: int) -> Iterator[int]:
         """So many steps; yields how many of them are left."""
-        for step in range(steps):
+        for taken in range(steps):
             self._optimiser.param_groups[0]["lr"] = (
-                self._rate * 0.5 * (1 + math.cos(math.pi * step / steps))
+                self._rate * 0.5 * (1 + math.cos(math.pi * taken / steps))
             )
             self._optimiser.zero_grad()
             numbers = torch.randint(len(self._samples), (self._batch,), generator=self._generator)
@@ -159,11 +159,11 @@ class Descent:
                 (error / self._batch).backward()
             self._optimiser.step()
             self.done += 1
-            yield steps - step - 1
+            yield steps - taken - 1
 
 
 def tune(
-    core: IntCore, full: Graph, tuning: Tuning, still: Collection[str] = (), log: Log = no_log
+    core: IntCore, full: Graph, tuning: Tuning, still: Collection[str] = ()
 ) -> tuple[IntCore, int]:
     """The core with the numbers that erred least on pairs that they were not trained on, and the
     steps taken.
@@ -173,7 +173,6 @@ def tune(
         full: the float network that reads all planes.
         tuning: on what, how long, how fast.
         still: the tensors whose convolutions are not trained.
-        log: is told now and then how many steps are done, and what they gained.
     """
     samples = list(_samples(core.ends, full, tuning.pairs))
     # Too few samples to hold one out are trained on and judged by.
@@ -190,7 +189,7 @@ def tune(
             # Counted from the end, so that the last step is judged, where the rate is near 0.
             if remainder % JUDGED_EVERY == 0:
                 judge.see(trainable.core())
-                log(
+                step(
                     f"fine-tuning, step {descent.done} of {most}: held-out pairs lose "
                     f"{judge.share:.2f} of the first"
                 )
@@ -213,8 +212,10 @@ def _samples(ends: Ends, full: Graph, pairs: Remade[Pair]) -> Iterator[Sample]:
         size = times(reference.shape)
         expected = times(ends.finished(image, floats).shape)
         if size != expected:
-            remedy = "give references of the size that the network makes"
-            raise ImageError("reference", expected=f"one of {expected}", got=size, remedy=remedy)
+            raise ImageError(
+                f"A reference has the size {size}, but the network's result has {expected}. Give "
+                "references of the size of the results."
+            )
         target = torch.from_numpy(ends.correction_of(image, reference))
         # Over the float network's own error, dark and busy patches count alike.
         weight = 1 / max(float(_inner_error(result, target)), LEAST_ERROR)

@@ -17,9 +17,9 @@ from google.protobuf.message import DecodeError
 from onnx import TensorProto
 
 from beers_deploy.model.io.files import sha256
-from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.profiles.toml import read_whole, unreadable
-from beers_deploy.quant.untrusted import FILE_BYTES, VALUE_BYTES, check_size, refused
+from beers_deploy.quant.untrusted import FILE_BYTES, VALUE_BYTES, check_size
 
 
 def take_in(model: onnx.ModelProto, path: Path) -> None:
@@ -66,10 +66,8 @@ def unchanged(path: Path) -> Iterator[str]:
     before = network_sha256(path) if path.is_file() else ""
     yield before
     if before and network_sha256(path) != before:
-        expected = "a network that stays as it is"
-        remedy = "wait until it is written, then run this again"
         raise ModelError(
-            str(path), expected=expected, got="a change while it was read", remedy=remedy
+            f"{path} changed while it was read. Wait until it is written, then run this again."
         )
 
 
@@ -80,20 +78,21 @@ def _entries(tensor: TensorProto) -> dict[str, str]:
 def _content(tensor: TensorProto, path: Path, limit_bytes: int) -> bytes:
     """The bytes of one tensor, as many as its sizes ask for."""
     entries = _entries(tensor)
-    where = str(path)
-    check_size(tensor.name, tensor.dims, where)
+    check_size(tensor.name, tensor.dims, str(path))
     if tensor.data_type not in VALUE_BYTES or min(tensor.dims, default=0) < 0:
-        raise _refused(tensor, where, "a tensor of plain numbers")
+        raise _refused(tensor, path, "their type is not one of plain numbers")
     size = math.prod(tensor.dims) * VALUE_BYTES[tensor.data_type]
     if size > limit_bytes:
-        raise _refused(tensor, where, f"more than {FILE_BYTES} bytes in all")
+        raise _refused(tensor, path, f"the model would be more than {FILE_BYTES} bytes in all")
     start, length = (
         _byte_count(entries.get(key, default))
         for key, default in (("offset", "0"), ("length", str(size)))
     )
     beside = _beside(tensor, entries.get("location", ""), path)
     if start is None or length != size or start + size > beside.stat().st_size:
-        raise _refused(tensor, where, f"not the {size} bytes of its weights in {beside.name!r}")
+        raise _refused(
+            tensor, path, f"{beside.name!r} does not hold the {size} bytes of these weights"
+        )
     with beside.open("rb") as stream:
         stream.seek(start)
         return stream.read(size)
@@ -110,7 +109,6 @@ def _beside(tensor: TensorProto, location: str, path: Path) -> Path:
     """
     # Files that were written on Windows have backslashes between folders.
     parts = PurePosixPath(location.replace("\\", "/")).parts
-    where = str(path)
     if (
         not parts
         or location.startswith(("/", "\\"))
@@ -118,16 +116,19 @@ def _beside(tensor: TensorProto, location: str, path: Path) -> Path:
         or ":" in location
         or "\0" in location
     ):
-        raise _refused(tensor, where, f"one in {location!r}, outside the model's folder")
+        raise _refused(tensor, path, f"{location!r} is outside the model's folder")
     # A link in any folder on the way could lead out of the model's own folder.
     places = [path.parent.joinpath(*parts[: number + 1]) for number in range(len(parts))]
     if any(place.is_symlink() for place in places):
-        raise _refused(tensor, where, f"a link, {location!r}")
+        raise _refused(tensor, path, f"{location!r} is a link")
     if reason := unreadable(places[-1]):
-        raise _refused(tensor, where, f"{location!r}: {reason}")
+        raise _refused(tensor, path, f"{location!r} cannot be read ({reason})")
     return places[-1]
 
 
-def _refused(tensor: TensorProto, where: str, got: str) -> ModelError:
-    remedy = "copy its data file beside the model, or save both as one file"
-    return refused(where, f"the weights of {tensor.name!r} in a file beside the model", got, remedy)
+def _refused(tensor: TensorProto, path: Path, reason: str) -> ModelError:
+    return ModelError(
+        f"{path} stores the weights {printable(repr(tensor.name))} in another file, which is "
+        f"refused, because {printable(reason)}. Copy its data file into the model's folder, or "
+        "save both as one file."
+    )

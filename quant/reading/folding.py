@@ -37,9 +37,10 @@ import onnxruntime as ort
 from onnx import TensorProto, numpy_helper, version_converter
 from onnx.shape_inference import InferenceError
 
+from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.reading.equivalents import rewrite
 from beers_deploy.quant.reading.nodes import fresh
-from beers_deploy.quant.untrusted import contradictions, held_tensors, opset_of, refused
+from beers_deploy.quant.untrusted import contradictions, held_tensors, opset_of
 
 OPSET = 17
 IR_VERSION = 8
@@ -149,9 +150,11 @@ def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
             )
         # onnxruntime raises a class of its own for each status code.
         except Exception as error:
-            got = " ".join(str(error).split())[:160]
-            remedy = "check the file with onnx.checker, and export it again"
-            raise refused(where, "a model that onnxruntime runs", got, remedy) from error
+            reason = printable(" ".join(str(error).split())).rstrip(".")
+            raise ModelError(
+                f"onnxruntime cannot run {where}: {reason}. Check the file with onnx.checker, and "
+                "export it again."
+            ) from error
         network.ParseFromString(path.read_bytes())
     return network
 

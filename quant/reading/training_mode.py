@@ -9,9 +9,10 @@ import numpy as np
 import onnx
 from onnx import NodeProto, TensorProto, numpy_helper
 
+from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.domains import STANDARD
 from beers_deploy.quant.reading.nodes import attributes_of
-from beers_deploy.quant.untrusted import opset_of, refused
+from beers_deploy.quant.untrusted import opset_of
 
 IS_TEST_UNTIL = 6
 """The last opset whose operators state by `is_test` whether they are in use; without it they are in
@@ -21,11 +22,11 @@ DROPOUT_MODE_INPUT = 2
 
 
 def require_inference(model: onnx.ModelProto, where: str) -> None:
-    """Refuse a network with a node in training mode.
+    """Raise ModelError if a network has a node in training mode.
 
     Args:
         model: what `check_content` let through.
-        where: names the network in the message.
+        where: name of the network for the message, such as "a.onnx" or "the float network".
 
     Raises:
         ModelError: a Dropout or a BatchNormalization in training mode, or in a mode that the file
@@ -39,12 +40,12 @@ def require_inference(model: onnx.ModelProto, where: str) -> None:
             and node.op_type in TRAINED
             and TRAINED[node.op_type](node, opset, constants)
         ):
-            got = f"{node.op_type} {node.name or node.output[0]!r} in training mode"
-            remedy = (
-                "call model.eval() before you export it, or give the exporter its mode for "
-                "inference"
+            name = printable(repr(node.name or node.output[0]))
+            raise ModelError(
+                f"{node.op_type} {name} in {where} is in training mode, so that the result is not "
+                "a function of the image alone. Call model.eval() before you export the network, "
+                "or give the exporter its mode for inference."
             )
-            raise refused(where, "a network that gives one result for one image", got, remedy)
 
 
 def _constants(graph: onnx.GraphProto) -> dict[str, TensorProto]:

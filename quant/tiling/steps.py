@@ -13,7 +13,7 @@ from fractions import Fraction
 from itertools import product
 from typing import Any
 
-from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.errors import LONGEST, ModelError, printable
 from beers_deploy.quant.graph.moves import PLACES, ROUNDINGS, Resizing
 from beers_deploy.quant.graph.nodes import WEIGHTS, Node, OnnxGraph, Window
 from beers_deploy.quant.untrusted import WINDOW_PX, times
@@ -72,12 +72,14 @@ class Along:
     graph: OnnxGraph
     shapes: Mapping[str, tuple[int, ...]]
 
-    def require(self, sound: bool, why: str) -> None:
-        """Refuse a node that cannot be tiled."""
-        if not sound:
-            raise refused(
-                "operators that do the same at every pixel, from near pixels alone",
-                f"{self.node}, {why}",
+    def require(self, valid: bool, why: str) -> None:
+        """Raise ModelError unless the node can be tiled; `why` is what it does instead, a verb
+        phrase.
+        """
+        if not valid:
+            raise not_tileable(
+                "every operator must do the same at every pixel and read near pixels only, but "
+                f"{self.node} {why}"
             )
 
     def given(self, key: str, otherwise: Any) -> Any:
@@ -87,7 +89,7 @@ class Along:
     def numbers(self, place: int, key: str, otherwise: Sequence[float] = ()) -> list[Any]:
         """What the node states in an input or, of older opsets, in an attribute."""
         values = self.graph.numbers(self.node, place, key, otherwise)
-        self.require(values is not None, "whose sizes are computed: fold them")
+        self.require(values is not None, "has sizes that are computed (fold them)")
         return values or []
 
     def own(self, numbers: Sequence[Any], axes: Sequence[int], otherwise: Any) -> Any:
@@ -121,7 +123,7 @@ def _window(at: Along) -> Window:
     window = at.node.window(kernel, (at.extra, at.extra))
     at.require(
         window is not None and not at.given("channels_last", 0),
-        "which has no constant window of rows and columns",
+        "has no constant window of rows and columns",
     )
     return window or Window()
 
@@ -132,7 +134,7 @@ def _slide(at: Along) -> Step:
 
 def _transpose(at: Along) -> Step:
     has_pads = at.given("auto_pad", "NOTSET") == "NOTSET" and at.given("output_shape", None) is None
-    at.require(has_pads, "of a fixed or automatic size")
+    at.require(has_pads, "has a fixed or automatic size")
     return at.put_down(_window(at))
 
 
@@ -142,17 +144,17 @@ def _shuffle(at: Along) -> Step:
     window = Window((block, block), (block, block))
     if at.node.op_type == "DepthToSpace":
         return at.put_down(window)
-    at.require(at.extra % block == 0, "of squares that do not fit")
+    at.require(at.extra % block == 0, "makes channels of blocks that do not fit the image")
     return at.slid(window)
 
 
 def _pad(at: Along) -> Step:
     """Padding by itself; less than none cuts off."""
     mode = at.given("mode", "constant")
-    at.require(mode != "wrap", "which joins opposite borders")
+    at.require(mode != "wrap", "joins opposite borders")
     pads = at.numbers(1, "pads")
     axes = at.numbers(3, "axes", range(4))
-    at.require(len(pads) == 2 * len(axes), "of an unknown padding")
+    at.require(len(pads) == 2 * len(axes), "has an unknown padding")
     ends = [at.own(part, axes, 0) for part in (pads[: len(axes)], pads[len(axes) :])]
     # A pad is a window of one pixel that slides over the padded source.
     step = at.slid(Window(pads=(ends[0], ends[0], ends[1], ends[1])))
@@ -173,9 +175,7 @@ def _slice(at: Along) -> Step:
     end = at.own(ends, axes, FAR)
     step = at.own(steps, axes, 1)
     # A start from the end or an end from the start lies elsewhere for each size of the image.
-    at.require(
-        start >= 0 and step > 0 and (end < 0 or end >= FAR), "which cuts at a place that is fixed"
-    )
+    at.require(start >= 0 and step > 0 and (end < 0 or end >= FAR), "cuts at a fixed position")
     behind = min(end, 0)
     return at.slid(Window(stride=(step, step), pads=(-start, -start, behind, behind)))
 
@@ -185,31 +185,32 @@ def _resize(at: Along) -> Step:
     exact floats.
     """
     resizing = Resizing.of(at.node, at.graph)
-    at.require(bool(resizing.factors), "to a size that is fixed")
+    at.require(bool(resizing.factors), "resizes to a fixed size")
     growth = Fraction(resizing.factors[2 + at.axis])
     by_whole_factor = (
         0 < growth <= WINDOW_PX
         and 1 in (growth.numerator, growth.denominator)
         and resizing.factors[:2] == (1, 1)
     )
-    at.require(by_whole_factor, f"by {times(resizing.factors)}")
+    at.require(by_whole_factor, f"resizes by {times(resizing.factors)}")
     at.require(
-        resizing.where in PLACES, f"of coordinates {resizing.where}, which depend on the size"
+        resizing.where in PLACES, f"uses the coordinates {resizing.where}, which depend on the size"
     )
     # Its formula differs where the result has a single pixel.
     at.require(
         growth > 1 or resizing.where != "pytorch_half_pixel",
-        "of coordinates that depend on the size",
+        "uses coordinates that depend on the size",
     )
     linear = resizing.mode == "linear"
+    antialias = " with antialiasing" if at.given("antialias", 0) else ""
     at.require(
-        not at.given("antialias", 0) and (linear or resizing.mode == "nearest"),
-        f"of mode {resizing.mode}",
+        not antialias and (linear or resizing.mode == "nearest"),
+        f"resizes in mode {resizing.mode}{antialias}",
     )
     # Weights that are multiples of a power of two are exact floats, so that the same sum is rounded
     # alike at every place.
     exact = not linear or growth.numerator & (growth.numerator - 1) == 0
-    at.require(exact, f"by {growth}, of weights that depend on the place by rounding")
+    at.require(exact, f"resizes by {growth} with weights whose rounding depends on the position")
     ways = (math.floor, math.ceil) if linear else (ROUNDINGS[resizing.rounding],)
     # The offsets repeat after as many pixels as one pixel of the source becomes.
     pixels = range(growth.numerator)
@@ -230,11 +231,9 @@ STEPS: dict[str, Callable[[Along], Step]] = {
 """What reads other pixels than the one in its own place; the image is its first input."""
 
 
-def refused(expected: str, got: str) -> ModelError:
-    """What is raised of a network that cannot be tiled."""
+def not_tileable(reason: str) -> ModelError:
+    """Return the error of a network that cannot be tiled; `reason` may have names from a file."""
     return ModelError(
-        "tiled model",
-        expected=expected,
-        got=got,
-        remedy="give a network of near pixels alone, one image in and one out",
+        f"The network cannot be tiled: {printable(reason, 4 * LONGEST)}. Give a network that "
+        "computes one image from one image, each pixel from near pixels only."
     )

@@ -29,7 +29,7 @@ import onnx
 from beers_deploy.quant.graph.moves import MOVES, with_shuffles
 from beers_deploy.quant.graph.nodes import Node, OnnxGraph
 from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px
-from beers_deploy.quant.tiling.steps import STEPS, Along, Step, refused
+from beers_deploy.quant.tiling.steps import STEPS, Along, Step, not_tileable
 from beers_deploy.quant.untrusted import contradictions
 
 
@@ -70,13 +70,17 @@ class Tiling:
         )
 
 
-def tiling_of(model: onnx.ModelProto, where: str = "tiled model") -> Tiling:
-    """How an image may be tiled for a network, float or INT8, `where` in messages.
+def tiling_of(model: onnx.ModelProto, where: str = "") -> Tiling:
+    """Return how an image may be tiled for a network, float or INT8.
+
+    Args:
+        model: the network.
+        where: its file, which messages then name.
 
     Raises:
         ModelError: a network that cannot be tiled; the sentence names the node.
     """
-    with faults_named(where), contradictions(where):
+    with faults_named(where), contradictions(where or "the network"):
         graph = with_shuffles(model)
         rows, columns = (_Walk(graph, axis) for axis in (0, 1))
         channels_in, channels_out = _channels(graph, model)
@@ -84,13 +88,14 @@ def tiling_of(model: onnx.ModelProto, where: str = "tiled model") -> Tiling:
         lattice_px = math.lcm(rows.lattice_px, columns.lattice_px)
         radius_px = max(rows.radius_px, columns.radius_px)
         if rows.scale != columns.scale:
-            raise refused(
-                "as many pixels of output along both sides", f"{rows.scale} and {columns.scale}"
+            raise not_tileable(
+                "it must scale rows and columns by one factor, but the factors are "
+                f"{rows.scale} and {columns.scale}"
             )
         if fixed_px is not None and fixed_px % lattice_px:
-            raise refused(
-                f"tiles of a multiple of {lattice_px} pixels a side",
-                f"a network fixed to {fixed_px}",
+            raise not_tileable(
+                f"the side of a tile must be a multiple of {lattice_px} pixels, but the network is "
+                f"fixed to {fixed_px} pixels"
             )
         # A tile begins and ends on the lattice, so its context does too.
         halo_px = -(-radius_px // lattice_px) * lattice_px
@@ -102,14 +107,20 @@ def tiling_of(model: onnx.ModelProto, where: str = "tiled model") -> Tiling:
 
 def _channels(graph: OnnxGraph, model: onnx.ModelProto) -> tuple[int, int]:
     if len(graph.inputs) != 1 or len(graph.outputs) != 1:
-        raise refused(
-            "one image in and one out", f"{len(graph.inputs)} in and {len(graph.outputs)} out"
+        raise not_tileable(
+            f"it must have one input and one output, but it has {len(graph.inputs)} and "
+            f"{len(graph.outputs)}"
         )
     (sizes,) = graph.inputs.values()
     if sizes and sizes[0] > 1:
-        raise refused("any number of images, or one at a time", f"batches of {sizes[0]}")
+        raise not_tileable(
+            f"it must accept one image at a time, but it is fixed to batches of {sizes[0]}"
+        )
     if len(sizes) != 4 or not sizes[1]:
-        raise refused("an image (N, C, H, W) of a stated number of channels", "none stated")
+        raise not_tileable(
+            "its input must be an image (N, C, H, W) of a stated number of channels, but the file "
+            "states none"
+        )
     channels_out = _channel_count(model.graph.output[0])
     if not channels_out:
         info = onnx.shape_inference.infer_shapes(model).graph
@@ -166,19 +177,22 @@ class _Walk:
             self._visit(node)
         output = graph.outputs[0]
         if output not in self._grids:
-            raise refused("an output that depends on the image", "one of constants alone")
+            raise not_tileable("its output must depend on the image, but it is constant")
         self.scale = self._grids[output].per_px
         extra = self._grids[output].extra
         if extra:
-            raise refused(
-                "an output of the image's size or a multiple", f"{extra:+d} pixels a side"
+            raise not_tileable(
+                "its output must have the image's size or a multiple of it, but it has "
+                f"{extra:+d} pixels a side"
             )
         self.lattice_px = math.lcm(*(grid.per_px.denominator for grid in self._grids.values()))
         period = max(
             self.lattice_px, *(grid.in_cell(self.lattice_px) for grid in self._grids.values())
         )
         if period > PERIOD:
-            raise refused(f"a network that repeats within {PERIOD} pixels", f"a period of {period}")
+            raise not_tileable(
+                f"it must repeat within {PERIOD} pixels, but its period is {period} pixels"
+            )
         self.radius_px = self._radius_px(output)
 
     def _visit(self, node: Node) -> None:
@@ -186,7 +200,7 @@ class _Walk:
         at = Along(node, self._axis, grids[0].extra if grids else 0, self._graph, self._shapes)
         if grids:
             step = self._step(at, grids)
-            at.require(step.growth > 0, "of no stride")
+            at.require(step.growth > 0, "has no positive stride")
             self._steps.append((node, step))
             self._grids.update(
                 dict.fromkeys(node.outputs, _Grid(grids[0].per_px * step.growth, step.extra))
@@ -195,16 +209,21 @@ class _Walk:
                 self.least_px = max(self.least_px, math.ceil((1 + step.mirrored) / grids[0].per_px))
         else:
             # A board's file dequantises its weights by such nodes.
-            at.require(node.op_type in KEEPING, "of constants alone: fold them")
+            at.require(node.op_type in KEEPING, "reads constants only (fold them)")
             self._shapes[node.outputs[0]] = self._shapes[node.inputs[0]]
 
     def _step(self, at: Along, grids: list[_Grid]) -> Step:
         if at.node.op_type in STEPS:
-            at.require(at.node.inputs[0] in self._grids and len(grids) == 1, "steered by the image")
-            at.require(len([name for name in at.node.outputs if name]) == 1, "which tells places")
+            at.require(
+                at.node.inputs[0] in self._grids and len(grids) == 1,
+                "has parameters that the image determines",
+            )
+            at.require(
+                len([name for name in at.node.outputs if name]) == 1, "returns positions as well"
+            )
             return STEPS[at.node.op_type](at)
         _require_pointwise(at)
-        at.require(len(set(grids)) == 1, "of tensors of unequal sizes")
+        at.require(len(set(grids)) == 1, "combines tensors of different sizes")
         return Step(Fraction(1), at.extra)
 
     def _radius_px(self, output: str) -> int:
@@ -237,19 +256,19 @@ def _hull(ranges: list[tuple[int, int]]) -> tuple[int, int]:
 def _require_pointwise(at: Along) -> None:
     kind = at.node.op_type
     if kind in AXES:
-        at.require(at.given("axis", AXES[kind]) in (1, -3), "along other sides than the channels")
+        at.require(at.given("axis", AXES[kind]) in (1, -3), "does not work along the channels")
     elif kind == "Gather":
         # Our host files have an activation by itself as a table.
         table = at.shapes.get(at.node.inputs[0], ())
-        at.require(len(table) == 1 and at.given("axis", 0) == 0, "which moves pixels")
+        at.require(len(table) == 1 and at.given("axis", 0) == 0, "moves pixels")
     else:
         why = next(
             (why for why, marks in WHY.items() if any(mark in kind for mark in marks)),
-            "of which it is not known",
+            "is not known to do so",
         )
         at.require(kind in POINTWISE, why)
         flat = all(set(at.shapes.get(name, ())[-2:]) <= {1} for name in at.node.inputs)
-        at.require(flat, "with a constant that differs from pixel to pixel")
+        at.require(flat, "has a constant that differs from pixel to pixel")
 
 
 POINTWISE = {
@@ -317,8 +336,8 @@ none is stated.
 KEEPING = {"BatchNormalization", "Cast", "DequantizeLinear", "Identity", "QuantizeLinear"}
 """What leaves the shape of constants as it is."""
 WHY = {
-    "which looks at the whole image": ("Dynamic", "Global", "Normalization", "Reduce", "Shape"),
-    "fully connected": ("Flatten", "Gemm", "MatMul"),
-    "which moves pixels": tuple(MOVES),
+    "reads the whole image": ("Dynamic", "Global", "Normalization", "Reduce", "Shape"),
+    "is fully connected": ("Flatten", "Gemm", "MatMul"),
+    "moves pixels": tuple(MOVES),
 }
-"""What is refused, by parts of its name."""
+"""Why an operator is refused, by parts of its name."""

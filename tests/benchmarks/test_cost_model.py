@@ -9,8 +9,7 @@ from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import predict
 from beers_deploy.dpu.cost.model import Constants, Structure
 from beers_deploy.model.traditional.nl_bayes import QUALITIES
-from beers_deploy.profiles import load_target
-from beers_deploy.profiles.target import board_names
+from beers_deploy.profiles.target import board_names, load_target
 from benchmarks.cost_model.builder import Builder
 from benchmarks.cost_model.chain_time import BOUND_BY, HEIGHT_PX, WIDTH_PX, Rates, s_per_mpx
 from benchmarks.cost_model.chain_work import UNITS, chain_work

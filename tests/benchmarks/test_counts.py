@@ -32,6 +32,10 @@ def test_what_is_counted() -> None:
     assert counts.lone_helpers(nodes) == 1
 
 
+def test_each_parameter_of_a_verb_is_described_once() -> None:
+    assert counts.descriptions_an_option() == pytest.approx(1, abs=0.01)
+
+
 @pytest.mark.parametrize("limit", [0.0, 1.0])
 def test_a_limit_that_is_passed_is_told(monkeypatch: pytest.MonkeyPatch, limit: float) -> None:
     totals = dict.fromkeys(counts.PARTS, counts.counted(("benchmarks/detector",)))

@@ -2,7 +2,7 @@
 
 from typer.testing import CliRunner
 
-from beers_deploy.cli import app
+from beers_deploy.cli.commands import app
 
 
 def done(*words: object, code: int = 0) -> str:

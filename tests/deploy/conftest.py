@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from beers_deploy.export import to_onnx
+from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.convbeers import save_network
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.onnx_file import save_onnx

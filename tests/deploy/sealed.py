@@ -63,6 +63,6 @@ def seal() -> None:
 
 if __name__ == "__main__":
     seal()
-    from beers_deploy.cli import app
+    from beers_deploy.cli.commands import app
 
     app(sys.argv[1:])

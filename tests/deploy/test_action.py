@@ -1,4 +1,4 @@
-"""The action and the workflow to copy, run as shell: green on a sound pair, red on a broken or a
+"""The action and the workflow to copy, run as shell: green on a valid pair, red on a broken or a
 missing one.
 """
 
@@ -12,7 +12,7 @@ from xml.etree import ElementTree as ET
 import onnx
 import pytest
 
-from beers_deploy.export import to_onnx
+from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.onnx_file import save_onnx
@@ -114,7 +114,7 @@ def test_a_missing_float_network_is_red_in_one_sentence(
     outputs = runner.run_action({"float": "models/float.onnx", **more})
     assert runner.red
     assert runner.stderr.count("\n") == 1
-    assert "models/float.onnx: expected an ONNX file, got no such file" in runner.stderr
+    assert "models/float.onnx cannot be read: no such file" in runner.stderr
     assert outputs["verdict"] == "error"
     assert (outputs["mae"], outputs["drop"]) == ("", "")
     assert runner.stderr in runner.summary.read_text()
@@ -139,7 +139,7 @@ def test_without_an_int8_network_it_quantises_for_the_same_sensor(
     assert [call.split()[0] for call in calls] == ["quantize", "gate"]
     assert all("--target vck190 --sensor mine.toml" in call for call in calls)
     arguments = json.loads((runner.folder / "gate.json").read_text())["arguments"]
-    assert (arguments["sensor"], arguments["max_mae"]) == ("mine.toml", 0.001)
+    assert (arguments["sensor"], arguments["max_mae"]) == ("mine", 0.001)
 
 
 def test_a_network_that_quantize_refuses_is_an_error_whose_reason_is_in_the_summary(
@@ -163,8 +163,9 @@ def test_a_network_that_quantize_refuses_is_an_error_whose_reason_is_in_the_summ
     assert outputs["verdict"] == "error"
     summary = runner.summary.read_text()
     assert "## INT8 gate: not judged" in summary
-    assert runner.stderr.startswith("beers-deploy: ")
-    assert runner.stderr.splitlines()[-1] in summary
+    message = runner.stderr.splitlines()[-1]
+    assert message.startswith("beers-deploy: ")
+    assert message in summary
     assert [call.split()[0] for call in runner.calls.read_text().splitlines()] == ["quantize"]
     assert obeyed(runner.stdout) == ["error title=INT8 gate%3A not judged"]
 

@@ -1,4 +1,4 @@
-"""What the action writes for a job, whatever text the network under test holds: it stays text."""
+"""The outputs of the action: text of the network under test stays text, whatever it is."""
 
 import json
 import os
@@ -81,19 +81,23 @@ def test_a_check_is_one_row_of_plain_text_and_one_annotation(
 @given(st.text(alphabet=st.characters(exclude_categories=["Cs"])))
 @example(HOSTILE)
 @example("````")
-def test_a_refusal_is_a_block_of_code(folder: Path, reason: str) -> None:
+def test_the_last_message_is_a_block_of_code(folder: Path, reason: str) -> None:
+    """Progress, log records and warnings come before the message on standard error."""
     capture: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.stdout.write", capture.append)
         summary, outputs = reported(
-            folder, 2, {"verdict": "passed"}, f"progress\nbeers-deploy: {reason}\n"
+            folder,
+            2,
+            {"verdict": "passed"},
+            f"beers-deploy: earlier\nwarning: doubt\nprogress\nbeers-deploy: {reason}\n",
         )
     assert outputs == "verdict=error\n"
     html = rendered(summary)
     assert html.startswith("<h2>INT8 gate: not judged</h2>\n<pre><code")
     assert html.rstrip().endswith("</code></pre>")
     assert html.count("<pre>") == 1
-    assert "progress" not in html
+    assert not any(word in html for word in ("earlier", "doubt", "progress"))
     assert all(letter.isprintable() or letter == "\n" for letter in summary)
     assert capture[0].count("\n") == 1
 

@@ -1,4 +1,4 @@
-"""A baseline is the document of a gate that passed, on the same patches: everything else is
+"""A baseline is the document of a gate that passed on the same patches: every other file is
 refused.
 """
 
@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 import beers_deploy as bd
 from beers_deploy.baseline import Baseline, data_inputs, read_baseline, sensor_input
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Check, Row, measured
+from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.results import Input, Table
 from tests.deploy.command_line import done, refused
 
@@ -29,7 +29,7 @@ KEPT = Check("MAE", 5e-4, 1.0, "of full scale")
 
 
 def document(mae: float = 5e-4, **arguments: object) -> dict[str, Any]:
-    """What a gate writes that passed."""
+    """Return the document of a gate that passed."""
     figures = {
         "MAE": measured(mae, "of full scale", "here"),
         "PSNR float": measured(50.0, "dB", "here"),
@@ -83,17 +83,17 @@ def two_rows(content: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (failed, "a gate that passed, got failed"),
-        (another_command, "got one of check"),
+        (failed, "a gate that failed"),
+        (another_command, "a document of 'check', not of 'gate'"),
         (without_mae, "no MAE"),
-        (figure("unit", "dB"), "a measured MAE of full scale"),
-        (figure("value", 1.5), "a measured MAE of full scale"),
-        (figure("value", -1e-9), "a measured MAE of full scale"),
+        (figure("unit", "dB"), "a measured MAE from 0 to 1 of full scale"),
+        (figure("value", 1.5), "a measured MAE from 0 to 1 of full scale"),
+        (figure("value", -1e-9), "a measured MAE from 0 to 1 of full scale"),
         (figure("value", "inf"), "a results document"),
-        (figure("mode", "published"), "a measured MAE of full scale"),
-        (figure("value", 6e-4), "agrees with itself, got an MAE of 0.0006"),
-        (check(limit=1e-4), "agrees with itself, got MAE 0.0005 with the limit 0.0001"),
-        (check(bound="at least"), "agrees with itself"),
+        (figure("mode", "published"), "a measured MAE from 0 to 1 of full scale"),
+        (figure("value", 6e-4), "contradicts itself: it has an MAE of 0.0006"),
+        (check(limit=1e-4), "contradicts itself: it has MAE 0.0005 with the limit 0.0001"),
+        (check(bound="at least"), "contradicts itself"),
         (two_rows, "2 rows of the table gate"),
     ],
 )
@@ -149,7 +149,7 @@ def test_files_that_are_no_document_are_refused(tmp_path: Path) -> None:
         read_baseline(tmp_path / "none.json", ASKED)
     contents: list[object] = [{}, [], "gate", 3]
     for content in contents:
-        with pytest.raises(OptionError, match="another document"):
+        with pytest.raises(OptionError, match=r"b\.json is not a results document: "):
             read_baseline(written(tmp_path / "b.json", content), ASKED)
 
 
@@ -164,7 +164,7 @@ def test_a_baseline_of_other_patches_is_refused_and_a_folder_may_lie_elsewhere(
     asked = {**ASKED, "images": Path("there/ground")}
     assert read_baseline(path, asked).mae == 5e-4
     (name,) = other
-    with pytest.raises(OptionError, match=f"same patches \\({name}"):
+    with pytest.raises(OptionError, match=f"other patches: its `{name}` is"):
         read_baseline(path, {**asked, **other})
 
 
@@ -175,21 +175,21 @@ BEFORE = Baseline(Path("b.json"), 5e-4, 50.0, DIGESTS)
 def test_the_float_network_is_known_by_its_digest_or_its_psnr() -> None:
     BEFORE.require_same("a" * 64, 47.0, [])
     BEFORE.require_same("c" * 64, 50.004, [])
-    with pytest.raises(OptionError, match="another's"):
+    with pytest.raises(OptionError, match="another float network"):
         BEFORE.require_same("c" * 64, 50.02, [])
-    with pytest.raises(OptionError, match="another's"):
+    with pytest.raises(OptionError, match="another float network"):
         replace(BEFORE, psnr_float_db=float("nan")).require_same("c" * 64, float("nan"), [])
 
 
 @pytest.mark.parametrize("digest", ["c" * 64, "a" * 64])
 def test_what_else_it_rests_on_must_be_the_same(digest: str) -> None:
     BEFORE.require_same("a" * 64, 50.0, [Input("sensor s", "b" * 64)])
-    with pytest.raises(OptionError, match="the same sensor s"):
+    with pytest.raises(OptionError, match="sensor s had other content"):
         BEFORE.require_same("a" * 64, 50.0, [Input("sensor s", digest)])
-    with pytest.raises(OptionError, match="rests on samples"):
+    with pytest.raises(OptionError, match="a gate without samples"):
         BEFORE.require_same("a" * 64, 50.0, [Input("samples", digest)])
     twice = replace(BEFORE, digests={**DIGESTS, "sensor s": DIGESTS["sensor s"] | {"e" * 64}})
-    with pytest.raises(OptionError, match="the same sensor s"):
+    with pytest.raises(OptionError, match="sensor s had other content"):
         twice.require_same("a" * 64, 50.0, [Input("sensor s", "b" * 64)])
 
 
@@ -225,19 +225,20 @@ def test_a_baseline_holds_the_mae(scenes: Path, tmp_path: Path) -> None:
     done(*command, "--json", first)
     before = read_baseline(first, {**ASKED, "images": scenes}).mae
     first.write_text(first.read_text().replace(str(before), str(before / 2)))
-    last_line = done(*command, "--baseline", first, "--json", second, code=1).splitlines()[-1]
-    assert f"MAE against the baseline {before:.4g} of full scale" in last_line
+    output = " ".join(done(*command, "--baseline", first, "--json", second, code=1).split())
+    verdict = output.rpartition("gate FAILED, ")[2]
+    assert f"MAE against the baseline {before:.4g} of full scale" in verdict
     content = json.loads(second.read_text())
     assert content["verdict"] == "failed"
     limits = {check["name"]: (check["value"], check["limit"]) for check in content["checks"]}
     assert limits["MAE against the baseline"] == (before, pytest.approx(1.05 * before / 2))
-    assert "got failed" in refused(*command, "--baseline", second)
+    assert "a gate that failed" in refused(*command, "--baseline", second)
 
 
 def test_the_baseline_of_another_float_network_is_refused(scenes: Path, tmp_path: Path) -> None:
     command = ["--images", scenes, "--patches", 2]
     done("gate", "convbeers-s", *command, "--json", tmp_path / "s.json")
-    assert "another's" in refused(
+    assert "another float network" in refused(
         "gate", "convbeers-xs", *command, "--baseline", tmp_path / "s.json"
     )
 
@@ -249,17 +250,19 @@ def test_the_baseline_of_other_samples_is_refused(model: Path, tmp_path: Path) -
     int8 = folder / model.name
     values = np.random.default_rng(0).random((12, 1, 32, 40), np.float32)
     np.save(samples, values)
-    bd.quantize(model, samples).save(int8)
+    bd.quantize(model, samples=samples).save(int8)
     command = ["gate", model, int8, "--max-mae", 0.1]
     done(*command, "--samples", samples, "--json", before)
     done(*command, "--samples", samples, "--baseline", before)
     np.save(samples, np.random.default_rng(1).random((12, 1, 32, 40), np.float32))
-    assert "same samples" in refused(*command, "--samples", samples, "--baseline", before)
+    assert "samples s.npy had other content" in refused(
+        *command, "--samples", samples, "--baseline", before
+    )
     limits = {"mae": 0.1}
-    bd.gate(int8, model, values, limits=limits).save(before)
-    assert bd.gate(int8, model, values, limits=limits, baseline=before)
-    assert "same patches (samples None), got samples in memory" in refused(
+    bd.gate(model, int8, samples=values, limits=limits).save(before)
+    assert bd.gate(model, int8, samples=values, limits=limits, baseline=str(before))
+    assert "its --samples is in memory, but here it is None" in refused(
         *command, "--baseline", before
     )
-    with pytest.raises(OptionError, match="same samples in memory"):
-        bd.gate(int8, model, values[::-1], limits=limits, baseline=before)
+    with pytest.raises(OptionError, match="samples in memory had other content"):
+        bd.gate(model, int8, samples=values[::-1], limits=limits, baseline=before)

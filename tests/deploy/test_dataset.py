@@ -1,4 +1,5 @@
 import json
+import logging
 import shutil
 import subprocess
 import sys
@@ -6,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +23,6 @@ from beers_deploy.model.dataset import (
     write_dataset,
 )
 from beers_deploy.model.manifest import DIGESTS, Line, line_text
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.effects import TABLES
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.scene_call import (
@@ -31,6 +32,8 @@ from beers_deploy.profiles.scene_call import (
     scene_names,
     typical_effects,
 )
+from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.verbs.simulate import simulate
 from tests.deploy.command_line import done, refused
 from tests.deploy.two_workers import local_cluster
 
@@ -60,7 +63,7 @@ def small(scene: Path, patch_px: int | None = 24) -> DatasetRecipe:
 
 
 def silent(_: int) -> None:
-    """Says nothing."""
+    """Report nothing."""
 
 
 def bytes_of(folder: Path) -> dict[str, bytes]:
@@ -102,12 +105,12 @@ def test_the_manifest_tells_where_each_patch_comes_from(scene: Path, tmp_path: P
 
 @pytest.mark.slow
 def test_a_killed_dataset_is_resumed_to_the_same_bytes(scene: Path, tmp_path: Path) -> None:
-    options = [str(scene), "--oversampling", "2", "--patch", "8", "--workers", "1"]
+    options = ["--images", str(scene), "--oversampling", "2", "--patch", "8", "--workers", "1"]
     unbroken, killed = (tmp_path / name for name in ("whole", "killed"))
     command = [
         sys.executable,
         "-c",
-        "from beers_deploy.cli import app; app()",
+        "from beers_deploy.cli.commands import app; app()",
         "simulate",
         *options,
         "--out",
@@ -125,7 +128,7 @@ def test_a_killed_dataset_is_resumed_to_the_same_bytes(scene: Path, tmp_path: Pa
 
 def test_another_dataset_in_the_folder_is_not_overwritten(scene: Path, dataset: Path) -> None:
     before = bytes_of(dataset)
-    with pytest.raises(OptionError, match="add `resume`"):
+    with pytest.raises(OptionError, match="Add `resume`"):
         write_dataset(small(scene), dataset, 1, resume=False, tick=silent)
     with pytest.raises(OptionError, match="another dataset"):
         write_dataset(small(scene, patch_px=32), dataset, 1, resume=True, tick=silent)
@@ -170,20 +173,22 @@ DAMAGES: dict[str, tuple[str, Callable[[Path], None], int]] = {
 
 @pytest.mark.parametrize("kind", DAMAGES)
 def test_damaged_pairs_of_a_finished_dataset_are_made_again(
-    kind: str, scene: Path, dataset: Path, tmp_path: Path
+    kind: str,
+    scene: Path,
+    dataset: Path,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     name, damage, count = DAMAGES[kind]
     folder = Path(shutil.copytree(dataset, tmp_path / "damaged"))
     damage(folder / name)
-    messages: list[str] = []
-    write_dataset(small(scene), folder, 1, resume=True, tick=silent, log=messages.append)
+    with caplog.at_level(logging.WARNING, "beers_deploy"):
+        write_dataset(small(scene), folder, 1, resume=True, tick=silent)
     assert bytes_of(folder) == bytes_of(dataset)
-    assert (
-        [sentence.split(" ")[0] for sentence in messages] == [str(count)]
-        if count
-        else len(messages) <= 1
-    )
-    assert all("they are made again" in sentence for sentence in messages)
+    if count:
+        assert [message.split(" ")[0] for message in caplog.messages] == [str(count)]
+    assert len(caplog.messages) <= 1
+    assert all("they are simulated again" in message for message in caplog.messages)
 
 
 def rejected(value: object) -> Callable[[Line], None]:
@@ -201,7 +206,11 @@ FORGED: dict[str, Callable[[Line], object]] = {
 
 @pytest.mark.parametrize("kind", FORGED)
 def test_a_forged_line_with_its_digest_is_made_again(
-    kind: str, scene: Path, dataset: Path, tmp_path: Path
+    kind: str,
+    scene: Path,
+    dataset: Path,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     folder = Path(shutil.copytree(dataset, tmp_path / "forged"))
     lines = (folder / "manifest.jsonl").read_text().splitlines(keepends=True)
@@ -209,10 +218,10 @@ def test_a_forged_line_with_its_digest_is_made_again(
     del line[DIGESTS]
     FORGED[kind](line)
     (folder / "manifest.jsonl").write_text("".join([line_text(folder, line), *lines[1:]]))
-    messages: list[str] = []
-    write_dataset(small(scene), folder, 1, resume=True, tick=silent, log=messages.append)
+    with caplog.at_level(logging.WARNING, "beers_deploy"):
+        write_dataset(small(scene), folder, 1, resume=True, tick=silent)
     assert bytes_of(folder) == bytes_of(dataset)
-    assert messages[0].startswith("1 of ")
+    assert caplog.messages[0].startswith("1 of ")
 
 
 def test_a_recipe_whose_lines_end_otherwise_is_the_same(
@@ -338,7 +347,7 @@ def test_a_dataset_begun_here_is_finished_by_a_scheduler_s_workers(
         if patches:
             raise KeyboardInterrupt
 
-    options = [str(scene), "--oversampling", "2", "--patch", "8"]
+    options = ["--images", scene, "--oversampling", "2", "--patch", "8"]
     recipe = DatasetRecipe(
         (scene,), load_sensor("pleiades-degraded"), REFERENCE, oversampling=2, patch_px=8
     )
@@ -356,6 +365,68 @@ def test_a_scene_that_cannot_be_read_there_is_one_sentence(scene: Path, tmp_path
 
 def test_workers_and_a_scheduler_do_not_go_together(scene: Path, tmp_path: Path) -> None:
     both = ("--workers", "2", "--scheduler", "host:8786")
-    message = refused("simulate", scene, "--out", tmp_path / "d", *both)
-    assert "--workers: expected none beside --scheduler" in message
+    message = refused("simulate", "--images", scene, "--out", tmp_path / "d", *both)
+    assert "--workers has no effect with --scheduler" in message
     assert not (tmp_path / "d").exists()
+
+
+def test_a_folder_of_scenes_becomes_a_dataset_and_the_table_counts_its_pairs(
+    scene: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "d"
+    table = simulate(images=scene.parent, out=out, oversampling=2, patch=64, workers=1)
+    (row,) = table.rows
+    count = len((out / "manifest.jsonl").read_text().splitlines())
+    assert row.figures["pairs"].value == count > 0
+    assert table.inputs == (scene,)
+    assert table.title == f"wrote {out}"
+
+
+def test_the_explanation_has_each_effect_with_its_origin_and_writes_nothing(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    asked: dict[str, Any] = {"with_": ["prnu"], "without": ["veil"], "scene": "haze-over-sea"}
+    table = simulate(images=scene, oversampling=2, explain=True, **asked)
+    words = {row.name: row.text for row in table.rows}
+    assert words["prnu"]["from"] == "--with"
+    assert words["striping"]["from"] == "scene haze-over-sea"
+    assert words["mtf"]["from"] == "sensor pleiades-degraded"
+    assert all(text["decision"] and text["why"] for text in words.values())
+    bounds = [row.figures["bound"] for row in table.rows if row.figures]
+    assert {bound.unit for bound in bounds} == {"DN"}
+    assert all((bound.value or 0) >= 0 for bound in bounds)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--explain", "--out", "d"], "--explain has no effect with --out"),
+        (["--explain", "--resume"], "--resume has no effect without --out"),
+        (["--explain", "--workers", "2"], "--workers has no effect without --out"),
+        ([], "--out is missing. Give it, or add --explain"),
+        (["--images", "none", "--out", "d"], "no such file"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(
+    options: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert words in refused("simulate", *options)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"patch": 8}, "`patch` has no effect without `out`"),
+        ({"preset": "paper-test"}, "`preset` has no effect without `out`"),
+        ({"tolerance": 1.0}, "`tolerance` has no effect without `out`"),
+        ({"oversampling": 2.5}, "`oversampling` must be an integer without `out`, got 2.5"),
+        ({"images": ["a.tif", "b.tif"]}, "`images` must be one scene without `out`, got 2"),
+    ],
+)
+def test_what_a_pair_does_not_have_is_refused(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(OptionError, match=words):
+        simulate(**options)

@@ -1,4 +1,4 @@
-"""`restore --dry-run`: what restore would make of a file, shown before any pixel is restored."""
+"""`restore --dry-run` shows what `restore` would do, before any pixel is restored."""
 
 import json
 import math
@@ -11,10 +11,13 @@ import tifffile
 
 from beers_deploy.dry_run import preview_row
 from beers_deploy.model.raster.reader import GdalSource
-from beers_deploy.profiles import load_target
+from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.figures import Row
-from beers_deploy.restoration.options import Options
-from beers_deploy.restoration.run import restore_file
+from beers_deploy.profiles.target import load_target
+from beers_deploy.restoration.plan import Tiles
+from beers_deploy.restoration.prepare import NetworkPipeline
+from beers_deploy.restoration.reading import Reading
+from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import done
 from tests.shipped import shipped_pair
 
@@ -27,14 +30,23 @@ TAGS = [
 ]
 
 
-def about(image: Path, options: Options, measure: bool = False) -> Row:
-    return preview_row(image, options, load_target("vck190"), measure)
+def about(
+    image: Path,
+    network: NetworkLike,
+    tile_px: int = 640,
+    full_scale: float | None = None,
+    measure: bool = False,
+) -> Row:
+    """Return the facts of an image and of its restoration by a network."""
+    pipeline = NetworkPipeline({"": Network.load(network)}, Tiles(tile_px))
+    return preview_row(
+        image, pipeline, Reading(full_scale=full_scale), load_target("vck190"), measure
+    )
 
 
-def test_it_says_what_the_header_says(model: Path, tmp_path: Path) -> None:
+def test_it_shows_the_facts_of_the_header(model: Path, tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.ones((90, 70), np.uint16), extratags=TAGS)
-
-    row = about(tmp_path / "in.tif", Options(model, tile_px=23))
+    row = about(tmp_path / "in.tif", model, 23)
     assert [row.figures[key].value for key in ("width", "height", "bands")] == [70, 90, 1]
     assert row.text["pixels"] == "uint16"
     assert (row.text["full scale"], row.text["full scale from"]) == ("4095", "assumed: 12 bits")
@@ -59,15 +71,14 @@ def test_of_a_large_image_few_pixels_are_read(
 
     monkeypatch.setattr(GdalSource, "read", counting)
     monkeypatch.setattr("beers_deploy.restoration.detectors.look.LOOKED_PX", 200 * 700)
-    about(tmp_path / "in.tif", Options(model, tile_px=23))
+    about(tmp_path / "in.tif", model, 23)
     assert 100 < sum(rows) < 300
 
 
 def test_its_plan_is_that_of_the_restoration(model: Path, tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.ones((90, 70), np.uint16))
-    options = Options(model, tile_px=23)
-    plan = about(tmp_path / "in.tif", options)
-    row = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", options)
+    plan = about(tmp_path / "in.tif", model, 23)
+    (row,) = restore(tmp_path / "in.tif", tmp_path / "out.tif", network=model, tile=23)
     for key in ("tiles", "work factor"):
         assert plan.figures[key].value == row.figures[key].value
     for key in ("halo", "full scale", "full scale from"):
@@ -75,22 +86,18 @@ def test_its_plan_is_that_of_the_restoration(model: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("kind", ["uint8", "float32"])
-def test_a_full_scale_that_is_open_is_said_to_be(kind: str, model: Path, tmp_path: Path) -> None:
+def test_an_unknown_full_scale_is_reported_as_open(kind: str, model: Path, tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.ones((40, 40), kind))
-    text = about(tmp_path / "in.tif", Options(model)).text
+    text = about(tmp_path / "in.tif", model).text
     assert text["full scale"] == "open"
     assert "full scale" in text["full scale from"]
-    assert (
-        about(tmp_path / "in.tif", Options(model, full_scale=200)).text["full scale from"]
-        == "asked for"
-    )
+    text = about(tmp_path / "in.tif", model, full_scale=200).text
+    assert text["full scale from"] == "asked for"
 
 
 def test_time_here_is_predicted_from_what_was_timed(model: Path, tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.ones((90, 70), np.uint16))
-    figure = about(tmp_path / "in.tif", Options(model, tile_px=23), measure=True).figures[
-        "time here"
-    ]
+    figure = about(tmp_path / "in.tif", model, 23, measure=True).figures["time here"]
     assert figure.mode == "predicted"
     assert figure.value is not None
     assert figure.interval is not None
@@ -98,14 +105,13 @@ def test_time_here_is_predicted_from_what_was_timed(model: Path, tmp_path: Path)
 
 
 def test_time_on_the_board_is_the_cost_model_s(tmp_path: Path) -> None:
-    """Twice the height is twice the tiles, and twice the time but for a last batch."""
+    """Twice the height needs twice the tiles, and twice the time except for the last batch."""
     times = []
     for height in (6000, 12000):
         image = tifffile.memmap(tmp_path / f"{height}.tif", shape=(height, 6000), dtype="uint16")
         del image
-        times.append(
-            about(tmp_path / f"{height}.tif", Options(shipped_pair()[1])).figures["time on vck190"]
-        )
+        row = about(tmp_path / f"{height}.tif", shipped_pair()[1])
+        times.append(row.figures["time on vck190"])
     assert all(figure.mode == "predicted" for figure in times)
     first, second = (figure.value or math.nan for figure in times)
     assert second / first == pytest.approx(2, abs=0.1)

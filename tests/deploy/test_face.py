@@ -1,6 +1,4 @@
-"""The names of `import beers_deploy`: what they take and return, and what they refuse in one
-sentence.
-"""
+"""The names of `import beers_deploy`: what they accept and return, and the errors of bad input."""
 
 import copy
 import json
@@ -23,6 +21,7 @@ from beers_deploy.profiles.sensor import numbers_of
 from beers_deploy.profiles.sensor_file import sensor_names
 from beers_deploy.profiles.target import board_names
 from beers_deploy.results import SCHEMA_PATH
+from beers_deploy.studies.tradeoff.page import Tradeoff
 from tests.deploy.studies.tradeoff.small import small_studies
 
 SMALL = "convbeers-xs"
@@ -57,12 +56,19 @@ def tiny() -> bd.Network:
 
 @pytest.fixture(scope="module")
 def int8(tiny: bd.Network, samples: np.ndarray) -> bd.Network:
-    return bd.quantize(tiny, samples, board="zcu102", progress=False)
+    return bd.quantize(tiny, samples=samples, target="zcu102", progress=False)
+
+
+def simulated(**options: Any) -> bd.Pair:
+    """Simulate one pair: without a folder to write, `simulate` returns one."""
+    made = bd.simulate(**options)
+    assert isinstance(made, bd.Pair)
+    return made
 
 
 @pytest.fixture(scope="module")
 def pair() -> bd.Pair:
-    return bd.simulate(size=70, seed=1)
+    return simulated(size=70, seed=1)
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +121,7 @@ def test_int8_knows_its_float_network_and_its_layers(tiny: bd.Network, int8: bd.
 
 
 def test_the_gate_says_which_samples_calibration_saw(int8: bd.Network, samples: np.ndarray) -> None:
-    verdict = bd.gate(int8, samples=samples, board="zcu102", limits={"mae": 0.01})
+    verdict = bd.gate(int8, samples=samples, target="zcu102", limits={"mae": 0.01})
     verdict.raise_if_failed()
     assert "6 of the 8 samples were its calibration" in verdict.notes[0]
     assert verdict.comparison.result.patches == 8
@@ -137,34 +143,39 @@ def test_samples_of_any_kind_are_the_same(
         "batches": [[batch] for batch in (samples[:3], torch.from_numpy(samples[3:]))],
         "file": str(tmp_path / "samples.npy"),
     }
-    network = bd.quantize(tiny, forms[kind], board="zcu102", progress=False)
+    network = bd.quantize(tiny, samples=forms[kind], target="zcu102", progress=False)
     np.testing.assert_array_equal(network(samples), int8(samples))
 
 
-def test_a_board_says_whether_and_how_fast(int8: bd.Network) -> None:
-    result = bd.check(int8, "zcu102")
+def test_a_board_runs_a_network_at_a_predicted_speed(int8: bd.Network) -> None:
+    result = bd.check(int8, target="zcu102")
     assert result
-    assert not result.failed
-    speed = bd.predict(int8, ["zcu102", bd.Board.load("vck190")], size=(3000, 2000))
+    assert (result.refused, result.failed) == ((), ())
+    boards: list[Any] = ["zcu102", bd.Board.load("vck190")]
+    speed = bd.bench(int8, target=boards, size=(3000, 2000), traditional=False)
+    assert speed.arguments["target"] == "zcu102, vck190"
     frame = speed.to_pandas()
-    assert list(frame.index) == ["zcu102 B4096, tiles of 640", "vck190 C32B3, tiles of 640"]
-    assert frame.attrs["units"]["swath"] == "s"
+    names = [name for table, name in frame.index if table == "sweep"]
+    assert names == ["zcu102 B4096, tiles of 640", "vck190 C32B3, tiles of 640"]
+    assert frame.attrs["units"]["latency"] == "s"
     tidy = speed.to_pandas(tidy=True)
-    fps = tidy[tidy.figure == "fps"].iloc[0]
-    assert fps.low < fps.value < fps.high
-    assert fps["mode"] == "predicted"
-    one = bd.predict(int8, "zcu102")
-    assert one.layers.plot("time").get_xlabel() == "time (ms/batch)"
+    rate = tidy[tidy.figure == "throughput"].iloc[0]
+    assert rate.low < rate.value < rate.high
+    assert rate["mode"] == "predicted"
+    assert speed.layers == []
+    one = bd.bench(int8, target="zcu102", traditional=False)
+    assert len(one.layers) > 2
+    assert one.plot("time").get_xlabel() == "time (ms/batch)"
 
 
 def test_a_table_is_a_document_and_shows_itself(int8: bd.Network, tmp_path: Path) -> None:
-    table = bd.predict(int8, "all")
+    table = bd.bench(int8, target="all", traditional=False)
     document = json.loads(table.save(tmp_path / "figures.json").read_text())
     jsonschema.validate(document, json.loads(SCHEMA_PATH.read_text(encoding="utf-8")))
     assert document["inputs"][0]["sha256"] == int8.sha256
     assert document == {**table.to_dict(), "host": document["host"]}
     page = table._repr_html_()
-    assert page.count("<tr>") == len(table.rows) + 1
+    assert page.count("<tr>") == len(table.rows) + len(table.shown())
     assert 'title="cost model fitted on published networks' in page
     assert len(repr(table)) < 200
 
@@ -176,16 +187,18 @@ def test_a_kit_holds_what_a_board_computes(int8: bd.Network, tmp_path: Path) -> 
     assert (folder / "measure.py").read_text(encoding="utf-8").startswith("#!/usr/bin/env python3")
 
 
-def test_a_pair_is_read_as_evaluate_reads_it(pair: bd.Pair, tmp_path: Path) -> None:
+def test_a_pair_in_memory_is_evaluated_as_one_of_files(pair: bd.Pair, tmp_path: Path) -> None:
     degraded, reference = pair
     assert degraded.shape == reference.shape == pair.clean.shape == (70, 70)
-    from_files = bd.evaluate(["convbeers-half-xs"], pair.save(tmp_path / "pairs"), progress=False)
+    from_files = bd.evaluate(
+        methods=["convbeers-half-xs"], pairs=pair.save(tmp_path / "pairs"), progress=False
+    )
     ways: dict[str, Any] = {
         "network": "convbeers-half-xs",
         "half": lambda dn: dn / 2,
         "mine": Tiny(),
     }
-    in_memory = bd.evaluate(ways, [pair], progress=False)
+    in_memory = bd.evaluate(methods=ways, pairs=[pair], progress=False)
     names = {row.name: row.figures for row in in_memory.rows if row.table == "mean"}
     assert set(names) >= {"degraded", "network", "half", "mine"}
     assert names["network"]["PSNR"].value == next(
@@ -195,38 +208,40 @@ def test_a_pair_is_read_as_evaluate_reads_it(pair: bd.Pair, tmp_path: Path) -> N
     assert pair._repr_html_().count("<img") == 3
     assert repr(pair) == "Pair(70 x 70 px, pleiades-degraded -> pleiades-reference)"
     assert pair.ssim(pair.reference) == 1 > pair.ssim(pair.degraded) > 0
-    assert bd.simulate(np.full((700, 800), 90.0, np.float32)).degraded.shape == (76, 96)
+    scene = np.full((700, 800), 90.0, np.float32)
+    assert simulated(images=scene).degraded.shape == (76, 96)
     assert {row.name for row in bd.boards().rows} == set(board_names())
     assert [row.text["precision"] for row in bd.networks().rows] == ["float32", "int8"] * 5
 
 
-def test_tensors_and_masks_come_back_as_they_went(raw: np.ndarray) -> None:
-    expected = bd.restore(raw, SMALL)
-    tensor = bd.restore(torch.from_numpy(raw), SMALL)
+def test_tensors_and_masked_arrays_are_returned_as_such(raw: np.ndarray) -> None:
+    expected = bd.restore(raw, network=SMALL)
+    tensor = bd.restore(torch.from_numpy(raw), network=SMALL)
     assert torch.equal(tensor, torch.from_numpy(expected))
     for pixels, fill in ((raw, 65535), (raw.astype(np.float32), np.nan)):
         masked = np.ma.array(pixels, mask=raw < 400)
-        restored = bd.restore(masked, SMALL)
+        restored = bd.restore(masked, network=SMALL)
         filled = np.where(masked.mask, pixels.dtype.type(fill), pixels)
-        expected_pixels = bd.restore(filled, SMALL, nodata=None if fill != fill else fill)
+        nodata = None if fill != fill else fill
+        expected_pixels = bd.restore(filled, network=SMALL, nodata=nodata)
         np.testing.assert_array_equal(restored.mask, masked.mask)
         np.testing.assert_array_equal(restored.compressed(), expected_pixels[~masked.mask])
 
 
-def test_bands_are_told_by_name(raw: np.ndarray) -> None:
+def test_the_bands_of_xarray_are_found_by_name(raw: np.ndarray) -> None:
     xarray = pytest.importorskip("xarray", reason="no xarray")
     bands = np.stack([raw, raw[::-1], raw // 2])
-    expected = bd.restore(bands, SMALL)
+    expected = bd.restore(bands, network=SMALL)
     last = xarray.DataArray(
         np.moveaxis(bands, 0, -1), dims=("y", "x", "band"), coords={"band": [1, 2, 3]}
     )
-    restored = bd.restore(last, SMALL)
+    restored = bd.restore(last, network=SMALL)
     assert restored.dims == last.dims
     np.testing.assert_array_equal(restored.transpose("band", "y", "x").values, expected)
     scaled = xarray.DataArray(
         (raw // 16).astype(np.uint8), dims=("y", "x"), attrs={"full_scale": 255}
     )
-    assert bd.restore(scaled, SMALL).dtype == np.uint8
+    assert bd.restore(scaled, network=SMALL).dtype == np.uint8
 
 
 def test_the_traditional_pipeline_restores_arrays_as_files(raw: np.ndarray, tmp_path: Path) -> None:
@@ -234,9 +249,9 @@ def test_the_traditional_pipeline_restores_arrays_as_files(raw: np.ndarray, tmp_
     steps: list[Step] = []
     run = bd.restore(
         tmp_path / "raw.tif",
+        tmp_path / "r.tif",
         method="traditional",
         sensor="pleiades-degraded",
-        out=tmp_path / "r.tif",
         progress=steps.append,
     )
     assert steps[-1].done == steps[-1].total == len(raw)
@@ -245,67 +260,90 @@ def test_the_traditional_pipeline_restores_arrays_as_files(raw: np.ndarray, tmp_
     np.testing.assert_array_equal(array, tifffile.imread(run.path))
 
 
+def test_a_file_needs_an_output(raw: np.ndarray, tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "raw.tif", raw)
+    with pytest.raises(bd.BeersError, match="`out` is missing"):
+        bd.restore(tmp_path / "raw.tif")
+
+
 REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
     "bands last": (lambda raw: bd.restore(np.stack([raw] * 3, -1)), "moveaxis"),
-    "no array": (lambda _: bd.restore(3), "got int"),
-    "a path alone": (lambda _: bd.restore("raw.tif"), "out: expected a path"),
+    "no array": (lambda _: bd.restore(3), "but it is int"),
     "an array with out": (
-        lambda raw: bd.restore(raw, out="a.tif"),
-        "expected none beside an array",
+        lambda raw: bd.restore(raw, "a.tif"),
+        "`out` has no effect with an array",
     ),
     "a file's nodata": (
-        lambda _: bd.restore("raw.tif", out="a.tif", nodata=0),
-        "nodata: expected none",
+        lambda _: bd.restore("raw.tif", "a.tif", nodata=0),
+        "`nodata` has no effect with an image file, which states its own",
     ),
-    "no such sensor": (lambda raw: bd.restore(raw, sensor="none"), "expected one of"),
-    "no such network": (lambda raw: bd.restore(raw, "none"), "a shipped network"),
+    "no such sensor": (lambda raw: bd.restore(raw, sensor="none"), "'none'.*dior-high"),
+    "no such network": (lambda raw: bd.restore(raw, network="none"), "a shipped network"),
     "no network": (lambda _: bd.Network.load(3), r"torch.nn.Module"),  # type: ignore[arg-type]
     "a network of no use": (
-        lambda raw: bd.restore(raw, SMALL, method="traditional"),
-        "network: expected none",
+        lambda raw: bd.restore(raw, network=SMALL, method="traditional"),
+        "`network` has no effect with `method` traditional",
     ),
     "a tile of no use": (
         lambda raw: bd.restore(raw, tile=64, method="traditional"),
-        "tile: expected none",
+        "`tile` has no effect with `method` traditional",
     ),
     "a COG of an array": (
         lambda raw: bd.restore(raw, cog=True),
-        "cog: expected none beside an array",
+        "`cog` has no effect with an array",
     ),
-    "a COG of no use": (
-        lambda _: bd.restore("raw.tif", out="a.tif", method="traditional", resume=True),
-        "resume: exp",
+    "a resumption of no use": (
+        lambda _: bd.restore("raw.tif", "a.tif", method="traditional", resume=True),
+        "`resume` has no effect with `method` traditional",
     ),
-    "no method": (lambda _: bd.restore("raw.tif", out="a.tif", method="x"), "method: exp"),  # type: ignore[arg-type]
+    "no method": (
+        lambda _: bd.restore("raw.tif", "a.tif", method="x"),  # type: ignore[arg-type]
+        "`method` must be one of 'network', 'traditional', got 'x'",
+    ),
     "8 bits": (lambda raw: bd.restore(raw.astype(np.uint8)), "full_scale"),
     "shares": (lambda raw: bd.restore(raw / 4095), "full_scale"),
     "other channels": (
-        lambda raw: bd.quantize(Tiny(), raw[None, None, :32, :32].repeat(3, 1)),
+        lambda raw: bd.quantize(Tiny(), samples=raw[None, None, :32, :32].repeat(3, 1)),
         "1 channel",
     ),
-    "not 0..1": (lambda raw: bd.quantize(Tiny(), raw[None, None]), "values in"),
-    "INT8 again": (lambda _: bd.quantize(f"{SMALL}-int8"), "got an INT8 one"),
-    "no float network": (lambda _: bd.gate(f"{SMALL}-int8"), "against: expected the float network"),
-    "no limit": (lambda _: bd.gate(f"{SMALL}-int8", SMALL, limits={"maee": 1}), "named mae"),
-    "no DPU": (lambda _: bd.check(f"{SMALL}-int8", "host-cpu"), "a target with a DPU"),
-    "no board": (lambda _: bd.predict(SMALL, "none"), "expected one of"),
+    "not 0..1": (lambda raw: bd.quantize(Tiny(), samples=raw[None, None]), "[Vv]alues"),
+    "INT8 again": (lambda _: bd.quantize(f"{SMALL}-int8"), "an INT8 network"),
+    "no INT8 network": (
+        lambda _: bd.gate("float.onnx"),
+        "INT8 network of float.onnx is missing.*`int8_network`",
+    ),
+    "a module's INT8 network": (
+        lambda _: bd.gate(Tiny()),
+        "INT8 network of Tiny is missing.*`int8_network`",
+    ),
+    "no shipped pair": (lambda _: bd.gate("convbeers-m"), "no shipped weights 'convbeers-m'"),
+    "no limit": (lambda _: bd.gate(SMALL, limits={"maee": 1}), "named mae"),
+    "images and samples": (
+        lambda raw: bd.gate(SMALL, samples=raw[None, None] / 4095, images="scenes"),
+        "`images` has no effect with `samples`",
+    ),
+    "no DPU": (lambda _: bd.check(f"{SMALL}-int8", target="host-cpu"), "'host-cpu' has no DPU"),
+    "no board": (lambda _: bd.bench(SMALL, target="none"), "'none'.*vck190"),
     "no pairs": (
-        lambda raw: bd.quantize(Tiny(), (raw[None, None], raw[None, None].repeat(2, 0))),
+        lambda raw: bd.quantize(Tiny(), samples=(raw[None, None], raw[None, None].repeat(2, 0))),
         "a reference for each",
     ),
-    "no sample": (lambda _: bd.quantize(Tiny(), 3), "or a path"),
-    "no batch": (lambda raw: bd.quantize(Tiny(), [raw]), "a batch of"),
-    "empty": (lambda _: bd.quantize(Tiny(), []), "at least one sample"),
+    "no sample": (lambda _: bd.quantize(Tiny(), samples=3), "or a path"),
+    "no batch": (lambda raw: bd.quantize(Tiny(), samples=[raw]), "a batch of"),
+    "empty": (lambda _: bd.quantize(Tiny(), samples=[]), "`samples` contains no sample"),
     "no raw image": (lambda _: bd.characterize([]), "one or several"),
     "no module's size": (
         lambda _: bd.Network.load(Tiny(), example=(1, 9, 8, 8)),
-        "that torch exports",
+        "torch cannot export the module Tiny",
     ),
-    "no samples": (lambda raw: bd.quantize(Tiny(), {"image": raw}), "or a path"),
-    "no swath": (lambda _: bd.predict(SMALL, size=(0, 0)), "size: expected"),
-    "no size": (lambda _: bd.simulate(size=0), "size: expected"),
-    "other sizes": (lambda raw: bd.simulate(size=48).psnr(raw), "one of shape"),
-    "no figure": (lambda _: bd.sensors().plot("x"), "figure: expected one of"),
+    "no samples": (lambda raw: bd.quantize(Tiny(), samples={"image": raw}), "or a path"),
+    "no swath": (lambda _: bd.bench(SMALL, size=(0, 0)), r"`size` .*\(0, 0\)"),
+    "no size": (lambda _: bd.simulate(size=0), "`size` must be from 1 to 4096"),
+    "other sizes": (
+        lambda raw: simulated(size=48).psnr(raw),
+        r"`image` has the shape \(61, 83\)",
+    ),
+    "no figure": (lambda _: bd.sensors().plot("x"), "`figure` must be one of MTF.*'x'"),
     "no number": (lambda _: bd.Sensor.load("blind").replace(mtf=1), "mtf_nyquist"),
 }
 
@@ -325,16 +363,21 @@ def test_bad_input_is_one_sentence_and_the_class_that_one_expects(
 @pytest.mark.slow
 def test_from_raw_images_to_a_kit(tmp_path: Path) -> None:
     sensor = bd.Sensor.load("pleiades-degraded")
-    raws = [bd.simulate(sensor=sensor, size=1200, seed=0).degraded]
+    raws = [simulated(sensor=sensor, size=1200, seed=0).degraded]
     estimated = bd.characterize(raws, bits=12, progress=False)
     assert estimated.mtf_nyquist.low == pytest.approx(0.07, abs=0.02)
-    assert estimated.evidence is not None
-    low, high = estimated.evidence.rows[0].figures["MTF across at Nyquist"].interval or (0, 0)
+    assert estimated.table is not None
+    low, high = estimated.table.rows[0].figures["MTF across at Nyquist"].interval or (0, 0)
     assert low < 7 < high
     with small_studies():
         study = bd.tradeoff(
-            [SMALL], sensor=estimated, board="zcu104", budget="latency<=60s", progress=False
+            network=[SMALL],
+            sensor=estimated,
+            target="zcu104",
+            budget="latency<=60s",
+            progress=False,
         )
+    assert isinstance(study, Tradeoff)
     assert study.best is not None
     assert study.plot().get_xlabel().startswith("board latency")
     assert "recommended" in str(study)
@@ -361,14 +404,17 @@ import numpy as np
 import beers_deploy as bd
 
 samples = np.load("samples.npy")
-int8 = bd.quantize("tiny.onnx", samples, progress=False)
-assert bd.gate(int8, samples=samples, limits={"mae": 0.01}) and bd.check(int8) and bd.predict(int8)
-assert bd.restore(np.full((40, 50), 900, np.uint16), "convbeers-xs-int8").shape == (40, 50)
+image = np.full((40, 50), 900, np.uint16)
+int8 = bd.quantize("tiny.onnx", samples=samples, progress=False)
+assert bd.gate(int8, samples=samples, limits={"mae": 0.01}) and bd.check(int8)
+assert any("needs the package torch" in note for note in bd.bench(int8).notes)
+assert bd.restore(image, network="convbeers-xs-int8").shape == (40, 50)
 assert bd.simulate(size=48).degraded.shape == (48, 48)
-assert bd.quantize("tiny.onnx", patches=1, patch_px=48, progress=False).layers
+assert bd.quantize("tiny.onnx", patches=1, patch=48, progress=False).layers
 for call, extra in (
-    (lambda: bd.quantize("tiny.onnx", samples, finetune=1, progress=False), "torch"),
-    (lambda: bd.evaluate(["degraded"]), "torch"),
+    (lambda: bd.quantize("tiny.onnx", samples=samples, finetune=1, progress=False), "torch"),
+    (lambda: bd.evaluate(methods="degraded"), "torch"),
+    (lambda: bd.restore(image, method="traditional", sensor="pleiades-degraded"), "torch"),
     (lambda: bd.sensors().plot(), "study"),
     (lambda: bd.sensors().to_pandas(), "notebook"),
 ):

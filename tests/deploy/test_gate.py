@@ -1,4 +1,4 @@
-"""The gate catches what goes wrong in quantised files, and tells a CI job so."""
+"""The gate catches faults of quantised files, and a CI job can read its verdict."""
 
 import json
 import runpy
@@ -15,12 +15,12 @@ from onnx import numpy_helper
 from onnxruntime.quantization import quantize_static
 
 import beers_deploy as bd
-from beers_deploy.export import float_model
+from beers_deploy.float_onnx import float_model
 from beers_deploy.network import Network
-from beers_deploy.profiles import load_target
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.profiles.figures import Bound, Check
 from beers_deploy.profiles.sensor_file import BLIND
+from beers_deploy.profiles.target import load_target
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.gate import compare, judge, judge_saturation
 from beers_deploy.quant.limits import Limits, limits_of
@@ -56,7 +56,7 @@ def unseen() -> Patches:
 def failed(
     reference_model: onnx.ModelProto, unseen: Patches, folder: Path, spoil: Spoil
 ) -> set[str]:
-    """The names of the checks that a spoilt copy of the shipped file fails."""
+    """Return the names of the checks that a corrupted copy of the shipped file fails."""
     model = onnx.load(shipped_pair("convbeers-xs")[1])
     spoil(model)
     save_onnx(model, folder / "spoilt.onnx")
@@ -218,7 +218,7 @@ NO_LIMITS = [
 )
 def test_limits_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "gate.toml").write_text(text)
-    with pytest.raises(OptionError, match=r"gate\.toml: (?!.*sys\.set)"):
+    with pytest.raises(OptionError, match=r"gate\.toml(?!.*sys\.set).* mae\b"):
         limits_of(tmp_path / "gate.toml")
     with pytest.raises(OptionError, match="no such file"):
         limits_of(tmp_path / "none.toml")
@@ -299,9 +299,9 @@ def test_the_number_decides(value: float, limit: float, bound: Bound, expected: 
 def test_options_that_do_not_go_together_are_refused(tmp_path: Path) -> None:
     (tmp_path / "float.onnx").touch()
     (tmp_path / "gate.toml").write_text("mae = 0.01\nmae_growth = 1.0001\n")
-    assert "expected the INT8 network of float.onnx" in refused("gate", tmp_path / "float.onnx")
-    assert "--junit: expected a file" in refused("gate", "--junit", "-")
-    assert "--baseline: expected one" in refused("gate", "--limits", tmp_path / "gate.toml")
+    assert "INT8 network of float.onnx" in refused("gate", tmp_path / "float.onnx")
+    assert "--junit" in refused("gate", "--junit", "-")
+    assert "'mae_growth' needs a --baseline" in refused("gate", "--limits", tmp_path / "gate.toml")
 
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -310,7 +310,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_the_judged_file_does_not_choose_its_judges(model: Path) -> None:
     """Whatever samples it claims to be calibrated on, all are judged, and the claim is a note."""
     samples = np.random.default_rng(0).random((12, 1, 32, 40), np.float32)
-    int8 = bd.quantize(model, samples[:8])
+    int8 = bd.quantize(model, samples=samples[:8])
     mixed = np.concatenate([samples[10:], samples[2:7]])
     comparison = bd.compare(int8, samples=mixed)
     assert comparison.result.patches == 7
@@ -335,16 +335,17 @@ def test_what_is_no_image_is_compared_unclipped_and_other_shapes_are_refused() -
 
     pairs = [(np.random.default_rng(0).random((1, 1, 8, 9), np.float32), np.empty(0, np.float32))]
     assert compare(shifted(-2), shifted(-3), pairs).mae == pytest.approx(1)
-    with pytest.raises(ModelError, match="as in float"):
+    with pytest.raises(ModelError, match="1 x 3 x 8 x 9"):
         compare(shifted(0), shifted(0, 3), pairs)
 
 
 def test_samples_without_contrast_judge_nothing() -> None:
     samples = np.zeros((5, 1, 32, 40), np.float32)
     with pytest.raises(ImageError, match="contrast"):
-        bd.compare("convbeers-xs-int8", "convbeers-xs", samples)
+        bd.compare("convbeers-xs", samples=samples)
     samples[3] = np.random.default_rng(0).random((1, 32, 40))
-    assert bd.compare("convbeers-xs-int8", "convbeers-xs", samples).result.patches == 1
+    pair = "convbeers-xs", "convbeers-xs-int8"
+    assert bd.compare(*pair, samples=samples).result.patches == 1
 
 
 SMALL = "convbeers-xs"
@@ -440,7 +441,7 @@ def test_two_networks_of_one_kind_are_refused(
         ([path, path], "an INT8"),
         ([shipped_pair("convbeers-xs")[1]] * 2, "a float"),
     ):
-        assert f"expected {expected} network" in refused("gate", *pair)
+        assert f"must be {expected} network" in refused("gate", *pair)
 
 
 def test_samples_without_references_tell_no_loss_and_cannot_keep_a_limit_on_it(
@@ -454,7 +455,8 @@ def test_samples_without_references_tell_no_loss_and_cannot_keep_a_limit_on_it(
     assert "gate passed" in output
     assert "nan" not in output.lower()
     limits.write_text("psnr_drop_db = 0.25\n", encoding="utf-8")
-    assert "references for psnr_drop_db, got images alone" in refused(*command, "--limits", limits)
+    message = refused(*command, "--limits", limits)
+    assert "--samples must have references for the limit 'psnr_drop_db'" in message
 
 
 def test_references_that_do_not_fit_are_refused_and_the_sample_is_named(tmp_path: Path) -> None:
@@ -464,17 +466,17 @@ def test_references_that_do_not_fit_are_refused_and_the_sample_is_named(tmp_path
     limits.write_text("mae = 0.1\npsnr_drop_db = 20\n", encoding="utf-8")
     command = ["gate", *shipped_pair(SMALL), "--samples", path, "--limits", limits]
     np.savez(path, image=image, reference=image * 4095)
-    assert "s.npz[0]: expected a reference with values in [0, 1]" in refused(*command)
+    message = refused(*command)
+    assert "reference of s.npz[0]" in message
+    assert "[0, 1]" in message
     np.savez(path, image=image, reference=image[..., :20])
-    assert (
-        "s.npz[0]: expected a reference of the results' size for psnr_drop_db, got 1 x 40 x 20"
-        in refused(*command)
-    )
+    message = refused(*command)
+    assert "s.npz[0] must have a reference of the size" in message
+    assert "the limit 'psnr_drop_db'" in message
+    assert "1 x 40 x 20" in message
     # Without a limit on the PSNR drop no check needs the references.
     assert "gate passed" in done(*command[:-2], "--max-mae", 0.1)
-    assert "--metric: expected one of psnr" in refused(*command, "--metric", "PSNR")
+    assert "'PSNR' is not one of 'psnr'" in refused(*command, "--metric", "PSNR")
     mixed = [(image[:1], image[:1]), (image[1:], image[1:, ..., :20])]
-    with pytest.raises(
-        ImageError, match=r"samples\[1\]: expected a reference of the results' size"
-    ):
-        bd.compare("convbeers-xs-int8", SMALL, mixed)
+    with pytest.raises(ImageError, match=r"samples\[1\] must have a reference of the size"):
+        bd.compare(SMALL, samples=mixed)

@@ -1,5 +1,5 @@
-"""What a gate leaves behind: nothing of an older verdict, an error for the CI, and the digest of
-what was judged.
+"""The outputs of a gate: no older verdict stays, a CI job reads errors, and digests are those of
+the judged files.
 """
 
 import hashlib
@@ -15,8 +15,9 @@ import onnx
 import pytest
 
 import beers_deploy as bd
-from beers_deploy import verdict as gates
-from beers_deploy.export import float_model
+from beers_deploy import comparison
+from beers_deploy.cli.generate import in_options
+from beers_deploy.float_onnx import float_model
 from beers_deploy.kit.record import bill_of, record_of, write_record
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import ModelError, OptionError
@@ -24,6 +25,7 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.banked.family import FAMILY, WEIGHTS
 from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
 from beers_deploy.quant.samples import CALIBRATED_ON
+from beers_deploy.verbs.gate import gate
 from tests.deploy.command_line import done, refused
 from tests.quant.quick import change
 from tests.shipped import shipped_pair
@@ -74,10 +76,10 @@ def test_an_output_that_is_an_input_is_refused_and_stays(
 
 def test_notes_stand_in_the_document(tmp_path: Path) -> None:
     samples = np.random.default_rng(0).random((2, 1, 48, 40), np.float32) * 0.5
-    comparison = bd.compare("convbeers-xs-int8", "convbeers-xs", samples)
-    assert "nothing brighter was judged" in comparison.notes[0]
-    comparison.save(tmp_path / "found.json")
-    assert json.loads((tmp_path / "found.json").read_text())["notes"] == list(comparison.notes)
+    found = bd.compare("convbeers-xs", "convbeers-xs-int8", samples=samples)
+    assert "nothing brighter was judged" in found.notes[0]
+    found.save(tmp_path / "found.json")
+    assert json.loads((tmp_path / "found.json").read_text())["notes"] == list(found.notes)
 
 
 def test_the_digest_is_that_of_the_bytes_that_were_judged(
@@ -86,13 +88,13 @@ def test_the_digest_is_that_of_the_bytes_that_were_judged(
     """The INT8 file is replaced while the gate runs."""
     int8 = pair[1]
     before = hashlib.sha256(int8.read_bytes()).hexdigest()
-    compare = gates.differences_of  # type: ignore[attr-defined]
+    compare = comparison.differences_of  # type: ignore[attr-defined]
 
     def replaced(*arguments: object) -> object:
         int8.write_bytes(b"another file")
         return compare(*arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(gates, "differences_of", replaced)
+    monkeypatch.setattr(comparison, "differences_of", replaced)
     done("gate", *pair, "--patches", 1, "--json", tmp_path / "g.json", "--record", tmp_path / "r")
     document = json.loads((tmp_path / "g.json").read_text())
     assert {entry["name"]: entry["sha256"] for entry in document["inputs"]}["int8.onnx"] == before
@@ -108,7 +110,7 @@ def test_a_file_that_changes_while_it_is_read_is_refused(
         return model
 
     monkeypatch.setattr("beers_deploy.network.float_model", reading)
-    with pytest.raises(ModelError, match="stays as it is"):
+    with pytest.raises(ModelError, match="changed while it was read"):
         Network.load(pair[0])
 
 
@@ -118,12 +120,12 @@ def test_too_little_contrast_judges_nothing() -> None:
     dn = 2000 + generator.integers(0, 3, (3, 1, 48, 40))
     samples = dn.astype(np.float32) / np.float32(4095)
     with pytest.raises(OptionError, match="contrast"):
-        bd.gate("convbeers-xs-int8", "convbeers-xs", samples)
+        bd.gate("convbeers-xs", "convbeers-xs-int8", samples=samples)
 
 
 def test_a_note_says_if_the_default_limit_does_not_suit(model: Path) -> None:
     samples = np.random.default_rng(0).random((6, 1, 32, 40), np.float32)
-    verdict = bd.gate(bd.quantize(model, samples), samples=samples)
+    verdict = bd.gate(bd.quantize(model, samples=samples), samples=samples)
     (mae,) = (check for check in verdict.checks if check.name == "MAE")
     notes = [note for note in verdict.notes if "--max-mae" in note]
     assert len(notes) == (not mae.passed)
@@ -141,7 +143,7 @@ def test_claims_of_weights_are_verified(
     sensor = Sensor.load("pleiades-degraded")
     int8 = Network.load(pair[1])
     digest = metadata(int8.model)[WEIGHTS]
-    verdict = bd.gate(int8, Network.load(pair[0]), patches=1)
+    verdict = bd.gate(Network.load(pair[0]), int8, patches=1)
     assert record_of(verdict, int8, sensor)["weights_sha256"] == digest
     assert record_of(verdict, int8, sensor, Network.load(pair[0]))["training"] is not None
     other = onnx.ModelProto.FromString(int8.model.SerializeToString())
@@ -176,30 +178,35 @@ def test_a_file_without_its_description_loses_no_check_silently(
     onnx.helper.set_model_props(model, about)
     save_onnx(model, int8)
     output = " ".join(done("gate", *pair, "--patches", 1).split())
-    assert "note: not checked: faults of the encoding" in output
+    assert "not checked: faults of the encoding" in output
     output = done("gate", *pair, "--patches", 1, "--baseline", baseline, code=1)
     assert "does not describe its integers" in output
     onnx.helper.set_model_props(model, about | {"core": "{}"})
     save_onnx(model, int8)
-    assert "int8.onnx: expected metadata 'core'" in refused("gate", *pair, "--patches", 1)
+    assert "int8.onnx: The metadata 'core'" in refused("gate", *pair, "--patches", 1)
 
 
-def test_what_refuses_the_outputs_deletes_an_older_verdict_and_says_why(tmp_path: Path) -> None:
+def test_a_refusal_deletes_an_older_verdict_and_the_junit_file_gives_the_reason(
+    tmp_path: Path,
+) -> None:
     document = tmp_path / "gate.json"
     junit = tmp_path / "gate.xml"
     file = tmp_path / "file"
     file.touch()
     outputs = ["--json", document, "--junit", junit]
-    for words in (["--record", file], ["--max-mae", "nan"], ["--samples", file, "--patches", 2]):
+    for words in (["--max-mae", "nan"], ["--samples", file, "--patches", 2]):
         document.write_text('"passed"')
         message = refused("gate", *SMALL[:1], *outputs, *words)
         assert not document.exists()
         error = ET.fromstring(junit.read_text()).find("testcase/error")  # noqa: S314 - our own text
         assert error is not None
-        assert (error.text or "").rpartition(":")[2] in message
-    document.write_text('"passed"')
-    refused("gate", *SMALL, "--json", document, "--junit", tmp_path)
-    assert not document.exists()
+        assert in_options(error.text or "", gate) in message
+    for words in ([*outputs, "--record", file], ["--json", document, "--junit", tmp_path]):
+        document.write_text('"passed"')
+        junit.write_text("<testsuite/>")
+        refused("gate", *SMALL, *words)
+        assert not document.exists()
+        assert junit.exists() == (junit not in words)
 
 
 def test_a_record_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,7 +222,7 @@ def test_a_record_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.Monk
     assert not folder.exists()
     monkeypatch.setitem(sys.modules, "cyclonedx.output.json", None)
     message = refused("gate", *SMALL, "--json", document, "--record", folder)
-    assert "the package cyclonedx, got one that does not load" in message
+    assert "the package cyclonedx, which does not load" in message
 
 
 def test_claims_of_the_file_are_shown_as_claims(pair: tuple[Path, Path], tmp_path: Path) -> None:
@@ -230,7 +237,7 @@ def test_claims_of_the_file_are_shown_as_claims(pair: tuple[Path, Path], tmp_pat
     onnx.helper.set_model_props(model, {**metadata(model), **claims})
     save_onnx(model, tmp_path / "int8.onnx")
     int8 = Network.load(tmp_path / "int8.onnx")
-    verdict = bd.gate(int8, Network.load(pair[0]), patches=1)
+    verdict = bd.gate(Network.load(pair[0]), int8, patches=1)
     write_record(
         verdict, int8, Sensor.load("pleiades-degraded"), tmp_path / "r", verdict.comparison.floating
     )
@@ -249,7 +256,7 @@ def test_claims_of_the_file_are_shown_as_claims(pair: tuple[Path, Path], tmp_pat
 
 def test_a_bill_names_two_inputs_of_one_name(pair: tuple[Path, Path]) -> None:
     int8 = Network.load(pair[1])
-    verdict = bd.gate(int8, Network.load(pair[0]), patches=1)
+    verdict = bd.gate(Network.load(pair[0]), int8, patches=1)
     record = record_of(verdict, int8, Sensor.load("pleiades-degraded"))
     for entry in record["results"]["inputs"][:2]:
         entry["name"] = "net.onnx"

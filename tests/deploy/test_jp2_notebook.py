@@ -1,6 +1,4 @@
-"""The cells of docs/tutorials/jp2-to-cog.ipynb, as a reader would run them, and the words it keeps
-of such a run.
-"""
+"""The cells of docs/tutorials/jp2-to-cog.ipynb run, and print the outputs that are stored in it."""
 
 import contextlib
 import io
@@ -14,20 +12,18 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from beers_deploy.cli import app
+from beers_deploy.cli.commands import app
 
 pytestmark = pytest.mark.slow
 
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "tutorials" / "jp2-to-cog.ipynb"
 CELLS: list[dict[str, Any]] = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
 MOST_BYTES = 100_000
-"""Of the whole notebook with its picture: a clone carries every version of it."""
+"""Size of the whole notebook with its picture: a clone has every version of it."""
 
 
 def run_cell(source: str, names: dict[str, Any]) -> str:
-    """What a cell prints: of Python, or of the program where its line begins with an exclamation
-    mark.
-    """
+    """Run a cell of Python, or of a program after an exclamation mark; return what it prints."""
     stream = io.StringIO()
     if source.startswith("!beers-deploy "):
         result = CliRunner().invoke(app, source.split()[1:])
@@ -38,7 +34,7 @@ def run_cell(source: str, names: dict[str, Any]) -> str:
     return stream.getvalue()
 
 
-def test_its_cells_run_and_print_what_it_keeps(
+def test_its_cells_run_and_print_the_stored_outputs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("rasterio")
@@ -80,7 +76,7 @@ def test_it_is_small_and_shows_a_picture() -> None:
     assert sum(pictures) == 1
 
 
-def test_the_pages_beside_it_are_there() -> None:
+def test_the_pages_that_it_links_exist() -> None:
     texts = ["".join(cell["source"]) for cell in CELLS if cell["cell_type"] == "markdown"]
     for target in re.findall(r"\]\(([^)]+)\)", "".join(texts)):
         assert (NOTEBOOK.parent / target).is_file(), target

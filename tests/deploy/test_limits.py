@@ -8,11 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from beers_deploy.cli import COMMANDS
+from beers_deploy.cli.commands import COMMANDS
 from beers_deploy.model.processor import require_cores
 from beers_deploy.profiles.errors import OptionError
-from docs.make.options import parameters
+from beers_deploy.verbs.parameters import Interval
+from beers_deploy.verbs.verb import marker
 from tests.deploy.command_line import refused
+from tests.deploy.verb_parameters import options
 
 HUGE = str(10**23)
 
@@ -23,10 +25,12 @@ def test_threads_and_processes_are_at_most_the_cores(
 ) -> None:
     monkeypatch.setattr(os, "cpu_count", lambda: cores)
     for count in (0, 1, cores):
-        require_cores("--threads", count)
+        require_cores("threads", count)
     for count in (-1, cores + 1, 100_000):
-        with pytest.raises(OptionError, match=f"threads: expected 0 to {cores}, the cores"):
-            require_cores("--threads", count)
+        with pytest.raises(
+            OptionError, match=f"`threads` must be 0 to {cores}, the cores .* got {count}"
+        ):
+            require_cores("threads", count)
 
 
 @pytest.mark.parametrize(
@@ -42,8 +46,10 @@ def test_a_command_says_how_many(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "raw.tif").write_bytes(b"not read yet")
-    assert f"expected 0 to {os.cpu_count()}, the cores of this machine, got 9999" in refused(
-        *command.split(), "9999"
+    words = command.split()
+    assert (
+        f"{words[-1]} must be 0 to {os.cpu_count()}, the cores of this machine, got 9999"
+        in refused(*words, "9999")
     )
     assert [path.name for path in tmp_path.iterdir()] == ["raw.tif"]
 
@@ -51,9 +57,10 @@ def test_a_command_says_how_many(
 def bounded_options() -> Iterator[tuple[str, str]]:
     """Yield the command and the label of every option that has a largest value."""
     for name in COMMANDS:
-        for parameter in parameters(name):
-            if parameter.info.max:
-                yield name, parameter.label
+        for option in options(name).values():
+            interval = marker(option.parameter, Interval)
+            if interval is not None and interval.le is not None:
+                yield name, option.label
 
 
 @pytest.mark.parametrize(("command", "option"), list(bounded_options()))

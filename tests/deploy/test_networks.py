@@ -1,11 +1,8 @@
-"""Shipped networks by name, wherever one is taken, and by sensor: told each, in float32 and in
-INT8.
-"""
+"""Shipped networks by name, conditioned on any sensor, in float32 and in INT8."""
 
-import re
+import logging
 import subprocess
 import sys
-import warnings
 from collections import Counter
 from importlib import import_module
 from pathlib import Path
@@ -16,8 +13,8 @@ import pytest
 import tifffile
 
 import beers_deploy as bd
+from beers_deploy.comparison import pair_of
 from beers_deploy.model.io.files import sha256
-from beers_deploy.model.progress import once
 from beers_deploy.model.shipped import (
     INT8,
     SENSOR,
@@ -27,11 +24,7 @@ from beers_deploy.model.shipped import (
     shipped_weights,
 )
 from beers_deploy.network import Network
-from beers_deploy.network_files import (
-    pair_of,
-    told_int8,
-    weights_file,
-)
+from beers_deploy.network_files import told_int8, weights_file
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import numbers_of
 from beers_deploy.profiles.sensor_file import BLIND, BLIND_PROFILE, load_sensor
@@ -48,9 +41,7 @@ KNOWN = load_sensor(SENSOR)
 def test_the_same_numbers_are_the_same_sensor_and_others_are_not(
     conditioned: Path, tmp_path: Path
 ) -> None:
-    """Sources and descriptions make no other network; a number does, under the
-    same name of a file.
-    """
+    """Sources and descriptions change no network; a number does, under the same name of a file."""
     networks = []
     for folder, old, new in (
         ("a", "", ""),
@@ -68,7 +59,7 @@ def test_the_same_numbers_are_the_same_sensor_and_others_are_not(
 
 
 @pytest.mark.slow
-def test_int8_is_calibrated_once_and_then_told_any_sensor(
+def test_int8_is_calibrated_once_and_then_conditioned_on_any_sensor(
     conditioned: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(calibrate, "PATCHES", 3)
@@ -91,23 +82,23 @@ def test_int8_is_calibrated_once_and_then_told_any_sensor(
     assert again.SerializeToString(deterministic=True) == base.SerializeToString(deterministic=True)
 
 
-def test_weights_of_ones_own_are_calibrated_by_quantize_alone(conditioned: Path) -> None:
+def test_only_quantize_calibrates_weights_of_users(conditioned: Path) -> None:
     with pytest.raises(
-        ModelError, match=r"expected an INT8 network, got float weights; .*beers-deploy quantize"
+        ModelError, match=r"float weights, but an INT8 network is needed.*beers-deploy quantize"
     ):
         Network.load(conditioned, sensor=KNOWN, int8=True)
 
 
 @pytest.mark.parametrize("name", shipped_names())
 def test_the_shipped_int8_files_are_of_these_weights(name: str) -> None:
-    """Other weights need other files: docs/make/int8.py makes them."""
+    """Other weights need other files, which docs/make/int8.py makes."""
     header = metadata(load_onnx(SHIPPED / f"{name}{INT8}.onnx"))
     assert header[WEIGHTS] == sha256(shipped_weights(name))
     assert header["variant"] == name
     assert Network.load(name, sensor=KNOWN, int8=True).sensor == SENSOR
 
 
-def test_a_name_that_is_none_is_told_the_names_that_there_are() -> None:
+def test_an_unknown_name_is_refused_with_the_names_that_exist() -> None:
     for name in ("convbeers-z", "convbeers-z-int8"):
         with pytest.raises(
             ModelError, match=r"shipped network \(convbeers, convbeers-half, .*convbeers-xs"
@@ -125,24 +116,23 @@ def test_blind_is_the_middle_of_a_range_of_sensors() -> None:
     assert weights[0] == weights[1]
 
 
-def test_what_lies_outside_is_said_each_time(conditioned: Path, tmp_path: Path) -> None:
+def test_a_value_outside_the_training_is_reported_each_time(
+    conditioned: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     sensor = load_sensor(str(own_sensor(tmp_path, ("value = 0.07", "value = 0.004"))))
-    with warnings.catch_warnings(record=True, action="always") as caught:
-        for _ in range(2):
-            Network.load(conditioned, sensor=sensor)
-    messages = [str(warning.message) for warning in caught]
-    assert len(messages) == 4
-    assert all(
-        re.match("warning: mtf_(across|along) 0.004 is outside 0.015 to 0.15", sentence)
-        for sentence in messages
-    )
+    for _ in range(2):
+        Network.load(conditioned, sensor=sensor)
+    assert [record.levelno for record in caplog.records] == 4 * [logging.WARNING]
+    sentences = [f"mtf_{axis} 0.004 is outside 0.015 to 0.15" for axis in ("across", "along")]
+    for message, sentence in zip(caplog.messages, 2 * sentences, strict=True):
+        assert message.startswith(sentence)
 
 
 @pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-xs-int8"])
-def test_restoring_for_a_sensor_needs_no_torch_and_is_what_the_sensor_makes_of_it(
+def test_restoring_for_a_sensor_needs_no_torch_and_depends_on_the_sensor(
     name: str, tmp_path: Path
 ) -> None:
-    """At once: filters are written without what training needs."""
+    """Filters are computed without the packages that training needs."""
     dn = np.random.default_rng(0).integers(200, 1800, (37, 41)).astype(np.uint16)
     tifffile.imwrite(tmp_path / "in.tif", dn)
     sensor = own_sensor(tmp_path, ("value = 0.07", "value = 0.05"))
@@ -157,8 +147,8 @@ def test_restoring_for_a_sensor_needs_no_torch_and_is_what_the_sensor_makes_of_i
     ]
     call = f"app({words!r}, standalone_mode=False)"
     code = (
-        f"import sys; from beers_deploy.cli import app; {call}; print({{'torch', 'skimage'}} "
-        "& set(sys.modules))"
+        f"import sys; from beers_deploy.cli.commands import app; {call}; "
+        "print({'torch', 'skimage'} & set(sys.modules))"
     )
     process = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
@@ -170,23 +160,15 @@ def test_restoring_for_a_sensor_needs_no_torch_and_is_what_the_sensor_makes_of_i
     assert np.abs(restored[0] - restored[1]).max() > 5
 
 
-def test_a_network_that_is_made_for_one_sensor_takes_no_sensor_for_each_band(
+def test_a_network_that_is_made_for_one_sensor_refuses_a_sensor_for_each_band(
     tmp_path: Path,
 ) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.full((2, 20, 30), 900, np.uint16))
     words = ["--network", shipped_pair("convbeers-xs")[0], "--sensor", f"B0={SENSOR},B1={SENSOR}"]
-    assert "one sensor for all bands" in refused(
+    assert "Give one sensor for all bands" in refused(
         "restore", tmp_path / "in.tif", tmp_path / "out.tif", *words
     )
     assert not (tmp_path / "out.tif").exists()
-
-
-def test_what_several_networks_have_to_say_is_said_once() -> None:
-    messages: list[str] = []
-    tell = once(messages.append)
-    for sentence in ("a", "b", "a", "b", "c"):
-        tell(sentence)
-    assert messages == ["a", "b", "c"]
 
 
 @pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-s"])
@@ -209,11 +191,11 @@ def test_a_name_is_the_shipped_network_unless_a_file_has_it(
     assert weights_file(Path(name)) == Path(name)
 
 
-def test_nothing_is_the_default() -> None:
+def test_none_is_the_default_network() -> None:
     assert Network.load(None) == Network.load(f"{VARIANT}{INT8}")
 
 
-def test_commands_take_the_name(tmp_path: Path) -> None:
+def test_commands_accept_the_name(tmp_path: Path) -> None:
     tifffile.imwrite(
         tmp_path / "in.tif",
         np.random.default_rng(0).integers(200, 1800, (37, 41)).astype(np.uint16),
@@ -221,7 +203,7 @@ def test_commands_take_the_name(tmp_path: Path) -> None:
     for model in ("convbeers-xs-int8", str(shipped_pair("convbeers-xs", "blind")[1])):
         out = tmp_path / f"{len(model)}.tif"
         output = done("restore", tmp_path / "in.tif", out, "--network", model)
-        assert ("network: convbeers-xs-int8, told no sensor" in output) == (
+        assert ("network: convbeers-xs-int8, for an unknown sensor" in output) == (
             model == "convbeers-xs-int8"
         )
     first, second = (
@@ -239,14 +221,21 @@ def test_commands_take_the_name(tmp_path: Path) -> None:
         ["stress", "convbeers-xs", "convbeers-xs-int8", "--cases", "1 x 1", "--stages", "INT8"],
     ],
 )
-def test_judges_take_the_name(command: list[str]) -> None:
+def test_check_and_stress_accept_the_name(command: list[str]) -> None:
     assert f"{command[0]} passed" in done(*command)
 
 
-def test_the_gate_takes_the_names() -> None:
-    for int8 in ("convbeers-xs", "convbeers-xs-int8"):
-        names = pair_of(Path("convbeers-xs"), Path(int8))
-        assert tuple(map(str, names)) == ("convbeers-xs", "convbeers-xs-int8")
+def test_one_name_stands_for_a_shipped_pair() -> None:
+    for names in (
+        ("convbeers-xs", None),
+        ("convbeers-xs-int8", None),
+        ("convbeers-xs", "convbeers-xs"),
+        ("convbeers-xs", "convbeers-xs-int8"),
+    ):
+        pair = pair_of(*names, KNOWN)
+        assert [each.name for each in pair] == ["convbeers-xs", "convbeers-xs-int8"]
+        assert [each.precision for each in pair] == ["float32", "int8"]
+        assert {each.sensor for each in pair} == {SENSOR}
 
 
 def test_export_writes_a_shipped_networks_integers_for_the_host_and_the_board(
@@ -266,12 +255,12 @@ def test_export_writes_a_shipped_networks_integers_for_the_host_and_the_board(
 def test_a_tile_that_a_network_cannot_rearrange_is_refused(tmp_path: Path) -> None:
     out = tmp_path / "x.onnx"
     words = ("--network", "convbeers-half-xs-int8", "--tile", "65", "--out", out)
-    assert "--tile: expected a multiple of 2 px, got 65 px" in refused("export", *words)
+    assert "--tile must be a multiple of 2 px" in refused("export", *words)
     assert not out.exists()
 
 
 @pytest.mark.parametrize("as_array", [False, True])
-def test_a_run_parses_walks_and_opens_a_network_once(
+def test_a_run_parses_and_opens_a_network_once(
     as_array: bool, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     counts: Counter[str] = Counter()
@@ -291,9 +280,8 @@ def test_a_run_parses_walks_and_opens_a_network_once(
     pixels = np.random.default_rng(0).integers(0, 4096, (61, 83)).astype(np.uint16)
     tifffile.imwrite(tmp_path / "in.tif", pixels)
     # The processor is asked once how it adds, with a network of its own.
-    with warnings.catch_warnings(action="ignore"):
-        if as_array:
-            bd.restore(pixels, model, tile=23)
-        else:
-            bd.restore(tmp_path / "in.tif", model, tile=23, out=tmp_path / "out.tif")
+    if as_array:
+        bd.restore(pixels, network=model, tile=23)
+    else:
+        bd.restore(tmp_path / "in.tif", tmp_path / "out.tif", network=model, tile=23)
     assert counts == {"parse_onnx": 1, "tiling_of": 1, "InferenceSession": 1}

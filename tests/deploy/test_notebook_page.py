@@ -11,8 +11,7 @@ import tifffile
 
 import beers_deploy as bd
 from beers_deploy.profiles.toml import profile_path
-from beers_deploy.restoration.options import Options
-from beers_deploy.restoration.run import restore_file
+from beers_deploy.verbs.restore import restore
 from tests.shipped import shipped_pair
 
 NET = """
@@ -59,7 +58,7 @@ def test_the_page_gives_what_the_command_gives(
     names: dict[str, Any] = {}
     for code in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL):
         exec(code, names)  # noqa: S102 - our own page
-    restore_file(Path("raw.tif"), Path("expected.tif"), Options(shipped_pair()[1]))
+    restore(Path("raw.tif"), Path("expected.tif"), network=shipped_pair()[1])
     expected = tifffile.imread("expected.tif")
     with rasterio.open("restored.tif") as ours, rasterio.open("expected.tif") as theirs:
         np.testing.assert_array_equal(ours.read(1), expected)

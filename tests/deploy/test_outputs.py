@@ -1,117 +1,103 @@
 """One rule for every output of every command: no input, no other output, nothing but a regular file
 or a new name.
 
-docs/make/options.py says of every path that a command takes whether it is read or written.
+The annotation of a parameter says whether its path is read or written, and what a folder holds.
 """
 
 import os
 import socket
 import stat
 from collections.abc import Callable, Iterable, Iterator
-from itertools import chain, combinations, cycle
+from itertools import combinations, cycle
 from pathlib import Path
-from typing import Any, get_type_hints
 
 import pytest
-from typer.core import TyperGroup
-from typer.main import get_command
 from typer.testing import CliRunner
 
-from beers_deploy.cli import COMMANDS, app
-from docs.make.options import FILE, PATHS
+from beers_deploy.cli.commands import COMMANDS, app
+from beers_deploy.results import Table
+from tests.deploy.verb_parameters import options
 
-INSIDE = {
-    "demo": "int8.onnx",
-    "simulate": "recipe.json",
-    "train": "checkpoint.safetensors",
-    "quantize": "report.html",
-    "gate": "record.json",
-    "golden": "golden.json",
-    "evaluate": "report.html",
-    "detect": "report.html",
-    "tradeoff": "tradeoff.html",
+JSON = "json"
+SUFFIX = ".onnx"
+"""Of every name: some commands ask for it."""
+MORE = {
+    "stress": ("--bit-flips",),
+    "tradeoff": ("--network", "convbeers-xs"),
+    "simulate": ("--with", "haze"),
 }
-"""A file that a command writes into its output folders."""
-SUFFIXES = {"check": ".svg"}
-"""Of every name, where a command asks for one."""
-MORE = {"stress": ("--bit-flips",), "tradeoff": ("--network", "convbeers-xs")}
-"""Without which a command does not write, or computes for seconds before it looks at its images."""
+"""Without which a command does not write, or computes for seconds before it checks its images."""
 BESIDE = {
     ("restore", "sensor"): ("--method", "traditional"),
     ("train", "rounding"): ("--conditioned", "--start", "convbeers-xs"),
-    ("detect", "labels"): ("--images", "pictures"),
-    ("tradeoff", "detector"): ("--labelled", "pictures"),
+    ("evaluate", "labels"): ("--images", "pictures", "--detector", "detector.onnx"),
+    ("golden", "network"): (),
 }
 """What an option is refused without."""
+TOGETHER_REFUSED = {("golden", "compare"), ("export", "apply")}
+"""Inputs that no output goes with."""
 
 
-def outputs_of_commands() -> Iterator[tuple[str, str]]:
-    """Yield every command with each option that names an output."""
-    for name, paths in PATHS.items():
-        for option in paths.written:
-            yield name, option
+def written(name: str) -> dict[str, str]:
+    """The outputs of a command; of a folder the first file that it holds, of a file nothing."""
+    outputs = {}
+    for option in options(name).values():
+        if option.written is not None:
+            outputs[option.name] = option.holds.files[0] if option.holds else ""
+    if COMMANDS[name].has_table:
+        outputs[JSON] = ""
+    return outputs
 
 
-WRITERS = list(outputs_of_commands())
+def read(name: str) -> list[str]:
+    """The inputs of a command."""
+    return [option.name for option in options(name).values() if option.is_input]
+
+
+WRITERS = [(name, output) for name in COMMANDS for output in written(name)]
 TELLS_CI = ("gate", "junit")
 """What is written where nothing could be judged, too: a CI job then shows why."""
-FILES = [(name, option) for name, option in WRITERS if PATHS[name].written[option] == FILE]
+FILES = [(name, output) for name, output in WRITERS if not written(name)[output]]
 FOLDERS = [pair for pair in WRITERS if pair not in FILES]
 
 
 def in_turn(cases: Iterable[tuple[str, ...]], ways: Iterable[object]) -> list[tuple[object, ...]]:
-    """Each case one way, each way in its turn: one function looks at the
-    outputs of all commands.
-    """
+    """Each case one way, each way in its turn: one function checks the outputs of all commands."""
     return [(*case, way) for case, way in zip(cases, cycle(ways), strict=False)]
 
 
-def suffix_of(name: str) -> str:
-    return SUFFIXES.get(name, ".tif")
-
-
-def parameters(command: str) -> dict[str, Any]:
-    group = get_command(app)
-    assert isinstance(group, TyperGroup)
-    return {str(parameter.name): parameter for parameter in group.commands[command].params}
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_path_of_a_command_is_known_to_be_read_or_written(name: str) -> None:
-    hints = get_type_hints(COMMANDS[name][0]).items()
-    paths = {option for option, hint in hints if "Path" in str(hint)}
-    assert paths == {*PATHS[name].written, *PATHS[name].read}
-    assert set(PATHS[name].also_read) <= set(parameters(name))
+def test_every_folder_says_what_it_holds() -> None:
+    for name in COMMANDS:
+        for option in options(name).values():
+            if option.written is not None and option.written.folder:
+                assert option.holds is not None, (name, option.name)
 
 
 def arguments(name: str, values: dict[str, Path]) -> list[str]:
-    """The command with these values; arguments that it cannot do without get files that exist."""
-    options = list[str]()
-    positional = list[str]()
-    for key, parameter in parameters(name).items():
-        value = values.get(key)
-        if parameter.param_type_name == "argument":
-            positional += [str(value)] if value else []
-        elif value is not None:
-            options += [parameter.opts[0], str(value)]
-    more = chain.from_iterable(BESIDE.get((name, option), ()) for option in values)
-    return [name, *MORE.get(name, ()), *positional, *options, *more]
+    """The command with these values."""
+    words = [name, *MORE.get(name, ())]
+    for key, value in values.items():
+        if key == JSON:
+            words += ["--json", str(value)]
+        else:
+            words += options(name)[key].words(value)
+        words += BESIDE.get((name, key), ())
+    return words
 
 
-def command_with(name: str, folder: Path, **values: Path) -> list[str]:
+def command_with(command: str, folder: Path, /, **values: Path) -> list[str]:
     """As `arguments`: an input for each argument, an output for each that must be given, unless
-    told otherwise.
+    stated otherwise.
     """
-    paths = PATHS[name]
-    all_values = dict(values)
-    for key, parameter in parameters(name).items():
-        if key in all_values:
-            continue
-        if parameter.param_type_name == "argument" and key in paths.read:
-            all_values[key] = existing(folder / f"input-{key}{suffix_of(name)}")
-        elif key in paths.written and parameter.required:
-            all_values[key] = folder / f"output-{key}{suffix_of(name)}"
-    return arguments(name, all_values)
+    all_values: dict[str, Path] = {}
+    for key, option in options(command).items():
+        if key in values:
+            all_values[key] = values[key]
+        elif option.is_argument and option.is_input:
+            all_values[key] = existing(folder / f"input-{key}{SUFFIX}")
+        elif option.written is not None and (option.required or key == "out"):
+            all_values[key] = folder / f"output-{key}{SUFFIX}"
+    return arguments(command, {**all_values, **values})
 
 
 def existing(path: Path) -> Path:
@@ -122,10 +108,8 @@ def existing(path: Path) -> Path:
 
 def output_at(name: str, option: str, folder: Path) -> tuple[Path, Path]:
     """An option's value, and the file that the command will write for it."""
-    if (name, option) in FILES:
-        path = folder / f"place-{option}{suffix_of(name)}"
-        return path, path
-    return folder / f"place-{option}", folder / f"place-{option}" / INSIDE[name]
+    path = folder / f"place-{option}{SUFFIX}"
+    return path, path / written(name)[option] if written(name)[option] else path
 
 
 def state(folder: Path) -> dict[str, bytes | str]:
@@ -182,8 +166,8 @@ STANDS: dict[str, tuple[Callable[[Path], object], str]] = {
     "a folder": (Path.mkdir, "a folder"),
     "a link": (link, "a symbolic link"),
     "a link to nothing": (dangling, "a symbolic link"),
-    "a pipe": (pipe, "no regular file"),
-    "a device": (device, "no regular file"),
+    "a pipe": (pipe, "not a regular file"),
+    "a device": (device, "not a regular file"),
 }
 
 
@@ -214,9 +198,12 @@ def test_an_output_folder_is_a_folder(
 def test_what_is_refused_for_its_input_leaves_no_new_folder(
     name: str, option: str, tmp_path: Path
 ) -> None:
-    source = existing(tmp_path / f"source{suffix_of(name)}")
+    source = existing(tmp_path / f"source{SUFFIX}")
     value, _ = output_at(name, option, tmp_path / "new" / "below")
-    command = command_with(name, tmp_path, **{option: value, PATHS[name].read[0]: source})
+    values = {option: value}
+    if name != "golden":
+        values |= dict.fromkeys(read(name)[:1], source)
+    command = command_with(name, tmp_path, **values)
     before = state(tmp_path)
     assert CliRunner().invoke(app, command).exit_code == 2, command
     assert state(tmp_path) == before, command
@@ -224,8 +211,9 @@ def test_what_is_refused_for_its_input_leaves_no_new_folder(
 
 def inputs_met() -> Iterator[tuple[str, str, str]]:
     for name, option in WRITERS:
-        for source in (*PATHS[name].read, *PATHS[name].also_read):
-            yield name, option, source
+        for source in read(name):
+            if (name, source) not in TOGETHER_REFUSED:
+                yield name, option, source
 
 
 @pytest.mark.parametrize(
@@ -237,7 +225,7 @@ def test_no_output_is_an_input(
 ) -> None:
     value, file = output_at(name, option, tmp_path)
     file.parent.mkdir(parents=True, exist_ok=True)
-    source_path = existing(file if how == "itself" else tmp_path / f"source{suffix_of(name)}")
+    source_path = existing(file if how == "itself" else tmp_path / f"source{SUFFIX}")
     if how == "symbolic link":
         file.symlink_to(source_path)
     elif how == "hard link":
@@ -257,11 +245,9 @@ FOLDERS_READ = [
 def test_no_output_is_a_file_of_an_input_folder(
     name: str, option: str, source: str, tmp_path: Path
 ) -> None:
-    scene = existing(
-        tmp_path / "scenes" / ("scene.tif" if suffix_of(name) == ".json" else "scene.png")
-    )
+    scene = existing(tmp_path / "scenes" / f"scene{SUFFIX}")
     if source == "pairs":
-        scene = existing(tmp_path / "scenes" / "reference" / "scene.tif")
+        scene = existing(tmp_path / "scenes" / "reference" / f"scene{SUFFIX}")
     command = command_with(name, tmp_path, **{option: scene, source: tmp_path / "scenes"})
     refused(command, tmp_path, str(scene), "an input of this run")
 
@@ -269,7 +255,7 @@ def test_no_output_is_a_file_of_an_input_folder(
 def test_figures_of_an_earlier_run_beside_the_images_are_renewed(tmp_path: Path) -> None:
     """The rule does not stop a job that is run twice: it gets as far as reading the images."""
     existing(tmp_path / "scenes" / "scene.png")
-    figures = existing(tmp_path / "scenes" / "figures.json")
+    figures = Table(command="evaluate").save(tmp_path / "scenes" / "figures.json")
     result = CliRunner().invoke(
         app, ["evaluate", "--images", str(figures.parent), "--json", str(figures)]
     )
@@ -282,15 +268,15 @@ def test_pictures_do_not_go_where_images_are_read(command: str, tmp_path: Path) 
     scene = existing(tmp_path / "scenes" / "degraded" / "scene.tif")
     arguments_of = {
         "evaluate": ["--images", str(scene.parent), "--out", str(scene.parent)],
-        "simulate": [str(scene), "--out", str(tmp_path / "scenes")],
+        "simulate": ["--images", str(scene), "--out", str(tmp_path / "scenes")],
     }
     refused([command, *arguments_of[command]], tmp_path, "the folder of an input")
 
 
 def pairs_of_outputs() -> Iterator[tuple[str, str, str]]:
     """Yield every command with each two of its outputs."""
-    for name, paths in PATHS.items():
-        for one, other in combinations(paths.written, 2):
+    for name in COMMANDS:
+        for one, other in combinations(written(name), 2):
             yield name, one, other
 
 
@@ -320,4 +306,4 @@ def test_a_socket_is_no_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.chdir(tmp_path)
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind("figures.json")
-        refused(["bench", "--json", "figures.json"], tmp_path, "no regular file")
+        refused(["bench", "--json", "figures.json"], tmp_path, "not a regular file")

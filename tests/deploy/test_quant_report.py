@@ -1,4 +1,4 @@
-"""What `quantize` reports: layers in whole numbers, and where they err."""
+"""The report of `quantize`: its integer layers, and where INT8 errs."""
 
 import base64
 import json
@@ -10,18 +10,17 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from beers_deploy.export import to_onnx
+from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.variants import Variant
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import MAX_DN
-from beers_deploy.profiles.sensor_file import reference_for
+from beers_deploy.profiles.sensor_file import load_sensor, reference_for
 from beers_deploy.quant.calibration import draw_patches
 from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, save_onnx
 from beers_deploy.quant.sensitivity import Spread, kind_of_error, worst_row
-from beers_deploy.quantise import steps_of
+from beers_deploy.quantization import steps_of
 from beers_deploy.report.plots import FONT_PX, MOST_BARS, bins, histogram_url
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
@@ -40,7 +39,9 @@ def float_file(path: Path) -> str:
 @pytest.mark.parametrize("text", ["-1", "many", "2.5"])
 def test_steps_of_fine_tuning_are_whole_or_auto(text: str) -> None:
     assert (steps_of("auto"), steps_of(20), steps_of("0")) == (None, 20, 0)
-    with pytest.raises(OptionError, match="finetune: expected auto, or whole steps from 0"):
+    with pytest.raises(
+        OptionError, match="`finetune` must be 'auto' or a whole number of steps from 0"
+    ):
         steps_of(text)
 
 
@@ -162,11 +163,15 @@ def test_a_report_on_samples_shows_the_worst_of_them(tmp_path: Path) -> None:
     np.save(tmp_path / "s.npy", np.random.default_rng(0).random((8, 1, 40, 48), np.float32))
     samples = ["--samples", tmp_path / "s.npy"]
     options = [*samples, "--out", tmp_path / "i.onnx", "--report", tmp_path / "r"]
-    assert "none together with --samples" in refused(
+    assert "--patches has no effect with --samples" in refused(
         "quantize", tmp_path / "f.onnx", *options, "--patches", 3
     )
-    assert "dB" not in done("quantize", tmp_path / "f.onnx", *options).splitlines()[-1]
+    output = " ".join(done("quantize", tmp_path / "f.onnx", *options).split())
     document = json.loads((tmp_path / "r" / "report.json").read_text())
+    # Samples without references have no PSNR.
+    *_, losses = document["notes"]
+    assert "dB" not in losses
+    assert output.endswith(losses)
     rows = document["rows"]
     assert [entry["name"] for entry in document["inputs"]] == ["f.onnx", "i.onnx", "samples s.npy"]
     assert {row["name"] for row in rows if row["table"] == "worst samples"} == {
@@ -174,5 +179,5 @@ def test_a_report_on_samples_shows_the_worst_of_them(tmp_path: Path) -> None:
         "sample 1",
     }
     pair = (tmp_path / "f.onnx", tmp_path / "i.onnx")
-    output = done("gate", *pair, *samples, "--max-mae", "0.1")
+    output = " ".join(done("gate", *pair, *samples, "--max-mae", "0.1").split())
     assert "6 of the 8 samples were its calibration" in output

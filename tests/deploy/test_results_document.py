@@ -25,7 +25,7 @@ def test_a_document_is_read_as_it_was_written(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("content", "words"),
-    [(None, "no such file"), ("", "an empty file"), ("[]", "another document"), ("{}", "required")],
+    [(None, "no such file"), ("", "an empty file"), ("[]", "not of type"), ("{}", "required")],
 )
 def test_what_is_no_document_gets_one_sentence(
     content: str | None, words: str, tmp_path: Path

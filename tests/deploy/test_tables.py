@@ -18,7 +18,9 @@ from beers_deploy.profiles.figures import (
     published,
     unavailable,
 )
-from beers_deploy.results import LEGEND, PIPE_WIDTH, default_console, print_rows
+from beers_deploy.results import Table
+from beers_deploy.tables.columns import LEGEND
+from beers_deploy.tables.terminal import PIPE_WIDTH, default_console, print_rows
 
 TALL = [
     Row(
@@ -47,14 +49,14 @@ TABLES = {
 
 def shown(rows: list[Row], width: int) -> str:
     stream = io.StringIO()
-    print_rows("a title", rows, Console(file=stream, width=width))
+    Table(rows=tuple(rows)).print(Console(file=stream, width=width))
     return stream.getvalue()
 
 
 @pytest.mark.parametrize("width", [40, 80, 200])
 def test_values_modes_and_reasons_are_shown(width: int) -> None:
     text = shown(TALL, width)
-    for word in ("a title", "42", "published", "predicted", "no [counter]"):
+    for word in ("42", "published", "predicted", "no [counter]"):
         assert word in text
 
 
@@ -69,7 +71,7 @@ def test_every_figure_of_a_wide_row_is_read_at_80_columns() -> None:
     lines = shown(WIDE, 80).splitlines()
     for k in range(12):
         assert any(
-            f"figure {k} " in line and "measured" in line and f" {k + 0.5:g} " in line
+            f"figure {k} " in line and "measured" in line and line.endswith(f" {k + 0.5:g}")
             for line in lines
         )
 
@@ -129,10 +131,7 @@ def test_a_tag_is_a_word_and_no_unit() -> None:
         line_of_ours = next(
             line for line in shown(mixed[:1], width).splitlines() if "1.586" in line
         )
-        assert [cell.strip() for cell in line_of_ours.split("│")[1:-1]] in (
-            ["time", "s", "measured", "1.586"],
-            ["ours", "1.586"],
-        )
+        assert line_of_ours.split() in (["time", "s", "measured", "1.586"], ["ours", "1.586"])
 
 
 def test_a_table_of_words_needs_no_legend() -> None:

@@ -1,7 +1,6 @@
-"""A digital number means the same in a degraded image and in its reference, whatever the sensor's
-digitiser.
-"""
+"""A digital number means the same in a degraded image and in its reference, for any digitiser."""
 
+import logging
 from dataclasses import replace
 from functools import cache
 
@@ -14,10 +13,10 @@ from beers_deploy.model.dataset import DatasetRecipe
 from beers_deploy.model.simulator.mtf import mtf
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.training.patches import PatchRecipe
-from beers_deploy.profiles import Sensor, load_sensor
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import ProfileError
-from beers_deploy.profiles.sensor_file import reference_beside
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import load_sensor, reference_beside
 from beers_deploy.studies.evaluation.methods import method_named
 from beers_deploy.studies.evaluation.pairs import simulate_pairs
 from beers_deploy.studies.evaluation.scores import Instruments
@@ -36,8 +35,9 @@ def with_units(profile: Sensor, gain: float, bits: int, offset_dn: float = 0.0) 
 
 
 def rescaled(profile: Sensor, bits: int, dimmer: float, offset_dn: float) -> Sensor:
-    """Full scale, gain and offset grow alike with the bits; scenes are so many times dimmer, and
-    the gain higher.
+    """Return a sensor of other bits, whose full scale, gain and offset grow alike.
+
+    Its scenes are dimmer by a factor, and its gain is higher by the same factor.
     """
     times = (2**bits - 1) / 4095
     darker, brighter = (
@@ -51,7 +51,7 @@ def rescaled(profile: Sensor, bits: int, dimmer: float, offset_dn: float) -> Sen
 
 @cache
 def evaluated(bits: int, dimmer: float, offset_dn: float) -> tuple[np.ndarray, int]:
-    """PSNR in dB over full scale of each method, (3,), and the pixels it is a mean of."""
+    """Return the PSNR in dB over full scale of each method, (3,), and the number of pixels."""
     degraded, reference = (
         rescaled(profile, bits, dimmer, offset_dn)
         for profile in (DEGRADED, load_sensor("pleiades-reference"))
@@ -94,17 +94,19 @@ def test_radiance_gain_and_bits_scaled_together_change_nothing_but_rounding(
     assert np.argsort(scaled_db).tolist() == np.argsort(usual_db).tolist()
 
 
-def test_a_named_reference_of_other_units_is_converted_in_sight() -> None:
-    messages = list[str]()
+def test_a_named_reference_of_other_units_is_converted_and_logged(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO, "beers_deploy")
     degraded = with_units(DEGRADED, 40, 14, offset_dn=5)
-    assert reference_beside(degraded, None, messages.append).units == (40, 14, 5)
-    assert messages == []
-    assert reference_beside(degraded, "pleiades-reference", messages.append).units == (40, 14, 5)
-    (sentence,) = messages
+    assert reference_beside(degraded, None).units == (40, 14, 5)
+    assert caplog.messages == []
+    assert reference_beside(degraded, "pleiades-reference").units == (40, 14, 5)
+    (sentence,) = caplog.messages
     assert "pleiades-reference (10.2375 DN per W/m2/sr/um, 12 bits)" in sentence
     assert "40 DN per W/m2/sr/um, 14 bits, 5 DN of offset" in sentence
-    reference_beside(DEGRADED, "pleiades-reference", messages.append)
-    assert len(messages) == 1
+    reference_beside(DEGRADED, "pleiades-reference")
+    assert len(caplog.messages) == 1
 
 
 def test_recipes_refuse_a_reference_of_other_units() -> None:

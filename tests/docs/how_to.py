@@ -14,8 +14,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from docs.make.options import FOLDER, PATHS
-from tests.deploy.test_outputs import INSIDE
+from tests.deploy.test_outputs import written
 from tests.docs.test_commands_in_pages import NAME, context_of
 from tests.docs.walk import ROOT
 
@@ -33,6 +32,7 @@ LEFT_OUT = {
     "pytest tests/deploy/restoration/test_other_readers.py": "is a part of the suite",
     "xdputil query": "is a program of the board",
     "xdputil benchmark core.xmodel 3": "is a program of the board",
+    "beers-deploy golden results --compare kit/golden": "compares what a board wrote",
     "beers-deploy gate FLOAT INT8": "is a form: the page's own commands fill it in",
     **{
         (
@@ -61,9 +61,7 @@ SHORTER = {
     r"raw1\.tif:440,330,34,28": "raw1.tif:140,114,34,28",
     r"(formats\.py)": r"\1 --size 320x256",
     r"IMAGE OUT": "raw.tif restored.tif",
-    r"(beers-deploy detect) (--images)": r"\1 --methods degraded \2",
-    r"(tradeoff)": r"\1 --images aerial --calibration aerial --network narrow.safetensors",
-    r"(tradeoff .*)--out": r"\1--size 1500x1200 --out",
+    r"(beers-deploy evaluate)": r"\1 --methods degraded",
 }
 """Patterns in a command, and what stands there instead so that a test takes seconds."""
 
@@ -121,10 +119,9 @@ def packages(sitting: Sitting) -> set[str]:
 
 
 def outputs(command: str) -> list[Path]:
-    """Files that a command is said to write, relative to its folder."""
+    """Files that a command names as its outputs, relative to its folder; of a folder one file."""
     if not command.startswith(NAME):
         return [Path(name) for name in re.findall(r"--out (\S+)", command)]
     name = shlex.split(command)[1]
     values = context_of(command).params
-    pairs = [(key, kind) for key, kind in PATHS[name].written.items() if values[key]]
-    return [values[key] / INSIDE[name] if kind == FOLDER else values[key] for key, kind in pairs]
+    return [Path(values[key]) / inside for key, inside in written(name).items() if values[key]]

@@ -19,7 +19,7 @@ from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.toml import HERE as PROFILES
-from tests.deploy.studies.characterise.test_characterise import RATIO, SENSOR, SIDE, landscape
+from tests.deploy.studies.characterize.test_characterise import RATIO, SENSOR, SIDE, landscape
 from tests.deploy.studies.detection.folders import Object, dior
 from tests.deploy.studies.detection.networks import detector, raw
 from tests.docs.walk import ROOT, Walk
@@ -32,7 +32,7 @@ SCENE_PX = 820
 FEW = 2
 FEW_PX = 480
 MADE = """
-beers-deploy simulate scene.png --sensor pleiades-degraded --out made
+beers-deploy simulate --images scene.png --sensor pleiades-degraded --out made
 beers-deploy export --network narrow.safetensors --out float.onnx
 beers-deploy quantize float.onnx --patches 8 --patch 64 --out int8.onnx --board-file core.onnx
 beers-deploy gate float.onnx int8.onnx --patches 4 --json gate-main.json

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.deploy.studies.tradeoff.small import small_studies
 from tests.docs.how_to import LEFT_OUT, PAGES, Sitting, outputs, packages, shortened, sittings
 from tests.docs.how_to_files import prepare
 from tests.docs.walk import Walk
@@ -37,8 +36,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_it_runs_and_writes_what_it_names(sitting: Sitting, files: Path) -> None:
     for package in packages(sitting):
         pytest.importorskip(package, reason=f"no {package}")
-    # The folder lies next to those of the other tests, where studies share what they measured.
-    with tempfile.TemporaryDirectory(dir=files.parent) as folder, small_studies():
+    with tempfile.TemporaryDirectory(dir=files.parent) as folder:
         walk = Walk(Path(shutil.copytree(files, folder, dirs_exist_ok=True)))
         for command in sitting:
             run(walk, command)

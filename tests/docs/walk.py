@@ -33,13 +33,13 @@ from pathlib import Path
 
 from typer.testing import CliRunner
 
-from beers_deploy.cli import app
+from beers_deploy.cli.commands import app
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = [sys.executable]
 OURS = "beers-deploy"
 PROGRAMS = {
-    OURS: [*PYTHON, "-c", "from beers_deploy.cli import app; app()"],
+    OURS: [*PYTHON, "-c", "from beers_deploy.cli.commands import app; app()"],
     "python": PYTHON,
     "python3": PYTHON,
     "rio": [*PYTHON, "-c", "from rasterio.rio.main import main_group; main_group()"],

@@ -48,7 +48,7 @@ def test_bands_show_one_ground_with_a_gain_and_a_noise_of_their_own(scenes: list
 
 def test_images_too_small_for_four_bands_are_refused() -> None:
     small = [procedural_scene(120, 120, np.random.default_rng(0))]
-    with pytest.raises(ImageError, match="none large enough"):
+    with pytest.raises(ImageError, match="None of the training images is large enough"):
         next(batches("edsr4", small, 0))
 
 

@@ -25,10 +25,11 @@ from beers_deploy.model.io.lock import part_folder
 from beers_deploy.model.metrics.perceptual import read_tensors
 from beers_deploy.model.raster.images import read_pixels
 from beers_deploy.model.training.run import Log
-from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.figures import Check, Row, measured, predicted, unavailable
 from beers_deploy.profiles.response import read_response
 from beers_deploy.profiles.scene_call import load_scene_call
+from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.target import load_target
 from beers_deploy.quant.limits import limits_of
 from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.journal import FinishedRow, journal_text

@@ -1,5 +1,6 @@
-"""Sixteen raster layouts, and what `restore` makes of each: pixels and metadata, as GDAL reads
-them, or the refusal. Compressed bytes are not kept: they change with the writer.
+"""Raster layouts, and the result of `restore` for each: pixels and metadata, or the error.
+
+GDAL reads the results. Compressed bytes are not stored, because they change with the writer.
 """
 
 import hashlib
@@ -14,7 +15,7 @@ from rasterio.control import GroundControlPoint
 from rasterio.rpc import RPC
 from typer.testing import CliRunner
 
-from beers_deploy.cli import app
+from beers_deploy.cli.commands import app
 
 HEIGHT_PX = 48
 WIDTH_PX = 70
@@ -41,11 +42,11 @@ CREATION: dict[str, dict[str, object]] = {
     "vrt": {},
     "float with nan": {"dtype": "float32"},
 }
-"""By layout, what GDAL is told when it writes the file."""
+"""Creation options of GDAL by layout."""
 
 
 def scene() -> np.ndarray:
-    """(48, 70) of 12 bits: texture, an edge, and noise."""
+    """Return pixels (48, 70) of 12 bits: texture, an edge, and noise."""
     rows, columns = np.mgrid[:HEIGHT_PX, :WIDTH_PX] / 20
     even = 900 + 700 * np.sin(5 * rows) * np.cos(3 * columns) + 1400 * (rows + columns > 3)
     noise = 12 * np.random.default_rng(0).standard_normal(even.shape)
@@ -53,7 +54,7 @@ def scene() -> np.ndarray:
 
 
 def bands_of(name: str) -> list[np.ndarray]:
-    """The planes of a layout: the scene, and what the layout is about."""
+    """Return the planes of a layout: the scene, and what the layout is about."""
     image = scene()
     if name in ("nodata", "float with nan"):
         image = image.astype(np.float32) if name == "float with nan" else image
@@ -97,7 +98,7 @@ def describe(file: Any, name: str) -> None:
 
 
 def corner_points() -> list[GroundControlPoint]:
-    """The ground control points of the corners."""
+    """Return the ground control points of the corners."""
     corners = [(0, 0), (0, WIDTH_PX), (HEIGHT_PX, 0), (HEIGHT_PX, WIDTH_PX)]
     return [
         GroundControlPoint(row, column, 2.3 + column / 9e4, 48.8 - row / 9e4, 120.0)
@@ -106,7 +107,7 @@ def corner_points() -> list[GroundControlPoint]:
 
 
 def coefficients() -> RPC:
-    """Rational polynomials of a place: linear in longitude and latitude."""
+    """Return rational polynomials that are linear in longitude and latitude."""
     return RPC(
         err_bias=1.0,
         err_rand=0.5,
@@ -128,7 +129,7 @@ def coefficients() -> RPC:
 
 
 def virtual(source: Path) -> Path:
-    """Write a virtual raster of one file beside it."""
+    """Write a virtual raster of one file next to it."""
     path = source.with_suffix(".vrt")
     path.write_text(
         f"""<VRTDataset rasterXSize="{WIDTH_PX}" rasterYSize="{HEIGHT_PX}">
@@ -144,7 +145,7 @@ def virtual(source: Path) -> Path:
 
 
 def restored(name: str, network: str, folder: Path) -> Mapping[str, object]:
-    """Restore a layout by INT8; what GDAL reads of the result, or the exit code and what was said.
+    """Restore a layout by INT8, and return what GDAL reads of the result, or the error.
 
     Args:
         name: of the layout.
@@ -155,15 +156,15 @@ def restored(name: str, network: str, folder: Path) -> Mapping[str, object]:
     out = folder / f"{name}, restored.tif"
     top = "255" if name == "jpeg" else "4095"
     words = ["restore", str(image), str(out), "--network", network, "--full-scale", top]
-    result = CliRunner().invoke(app, [*words, "--tile", "64"], catch_exceptions=False)
+    result = CliRunner().invoke(app, [*words, "--tile", "64", "-q"], catch_exceptions=False)
     if result.exit_code:
-        said = result.stderr.replace(str(folder), "FOLDER")
-        return {"exit code": result.exit_code, "message": " ".join(said.split())}
+        error = result.stderr.replace(str(folder), "FOLDER")
+        return {"exit code": result.exit_code, "message": " ".join(error.split())}
     return read_back(out)
 
 
 def read_back(path: Path) -> dict[str, object]:
-    """What GDAL reads of a restored file, its pixels by their digest and mean."""
+    """Return what GDAL reads of a restored file, its pixels by their digest and mean."""
     with rasterio.open(path) as file:
         pixels = file.read()
         mask = file.dataset_mask()
@@ -188,6 +189,6 @@ def read_back(path: Path) -> dict[str, object]:
 
 
 def digest(content: bytes | str) -> str:
-    """The first sixteen digits of the SHA-256."""
+    """Return the first sixteen digits of the SHA-256."""
     whole = content.encode() if isinstance(content, str) else content
     return hashlib.sha256(whole).hexdigest()[:16]

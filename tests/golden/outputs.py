@@ -1,10 +1,11 @@
-"""What the verbs give for three networks and two small images, for sixteen layouts of rasters, for
-the twelve small networks and for wrong calls, in a form that is small to store and to compare.
+"""The results of the verbs for some networks, images, raster layouts and wrong calls.
+
+Their form is small to store and to compare.
 
     PYTHONPATH=. python tests/golden/outputs.py
 
-writes `outputs.npz` and `outputs.json` anew: to be done only where a change of them is meant, and
-said in its commit.
+writes `outputs.npz` and `outputs.json` again. Do that only if a change is intended, and state it in
+the commit.
 """
 
 import json
@@ -22,8 +23,8 @@ import torch
 from onnx import numpy_helper
 from typer.testing import CliRunner
 
-from beers_deploy.cli import app
-from beers_deploy.export import to_onnx
+from beers_deploy.cli.commands import app
+from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.shipped import shipped_names
@@ -45,7 +46,7 @@ PATCHES = ("--patches", "4", "--patch", "48")
 
 @dataclass(frozen=True)
 class Outputs:
-    """What is frozen.
+    """The outputs that must not change.
 
     Attributes:
         arrays: restored pixels, and the integers of INT8 files, by name.
@@ -101,17 +102,17 @@ def outputs(folder: Path) -> Outputs:
 
 
 def _evaluated(folder: Path) -> dict[str, Any]:
-    """What `evaluate` finds on one pair of 96 x 96 pixels."""
+    """Return the figures of `evaluate` on one pair of 96 x 96 pixels."""
     scene = folder / "scene.tif"
     rows, columns = np.mgrid[:384, :384] / 40
     tifffile.imwrite(scene, (60 + 30 * np.sin(3 * rows) * np.cos(2 * columns)).astype(np.float32))
-    _run("simulate", scene, "--out", folder / "pairs")
+    _run("simulate", "--images", scene, "--out", folder / "pairs")
     methods = ("--methods", f"degraded,{SHIPPED}-int8")
     return _figures("evaluate", folder, "evaluate", "--pairs", folder / "pairs", *methods)
 
 
 def _answers(folder: Path) -> dict[str, Any]:
-    """What wrong calls are answered, in a folder of their own."""
+    """Return the answers to wrong calls, which are run in a folder of their own."""
     inner = folder / "wrong"
     inner.mkdir()
     inputs(inner)
@@ -124,7 +125,7 @@ def _answers(folder: Path) -> dict[str, Any]:
 
 
 def _images(folder: Path) -> dict[str, Path]:
-    """A textured image of 12 bits, and one of floats with a hole."""
+    """Write a textured image of 12 bits, and one of floats with a hole."""
     rows, columns = np.mgrid[:61, :83] / 20
     scene = 900 + 700 * np.sin(5 * rows) * np.cos(3 * columns) + 1400 * (rows + columns > 4)
     noisy = scene + 12 * np.random.default_rng(0).standard_normal(scene.shape)
@@ -137,9 +138,7 @@ def _images(folder: Path) -> dict[str, Path]:
 
 
 def _networks(folder: Path) -> dict[str, tuple[str, str]]:
-    """The float and the INT8 file of each network: a shipped pair, and two of random weights
-    quantised here.
-    """
+    """Write the float and the INT8 file of a shipped pair and of two networks of random weights."""
     network = ConvBEERS(Variant(blocks=2, features=8))
     initialise(network, torch.Generator().manual_seed(0))
     save_onnx(to_onnx(network, {}), folder / f"{PLAIN}.onnx")
@@ -170,7 +169,7 @@ def _restored(model: str, image: Path, folder: Path) -> np.ndarray:
 
 
 def _integers(path: Path) -> dict[str, np.ndarray]:
-    """How often each value stands among the int8 weights, and the sum of the int32 biases."""
+    """Return how often each int8 weight has each value, and the sum of the int32 biases."""
     constants = [numpy_helper.to_array(each) for each in onnx.load(path).graph.initializer]
     weights = [each.ravel() for each in constants if each.dtype == np.int8 and each.ndim == 4]
     biases = [each.ravel() for each in constants if each.dtype == np.int32]
@@ -181,7 +180,7 @@ def _integers(path: Path) -> dict[str, np.ndarray]:
 
 
 def _figures(key: str, folder: Path, *command: object) -> dict[str, Any]:
-    """Figures of a command's JSON that no clock made: of a bench those of the DPU, whole."""
+    """Return the figures of a command's JSON that depend on no clock."""
     out = folder / "figures.json"
     _run(*command, "--json", out)
     figures = {}
@@ -198,7 +197,7 @@ def _figures(key: str, folder: Path, *command: object) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Write the stored outputs anew."""
+    """Write the stored outputs again."""
     with tempfile.TemporaryDirectory() as folder:
         made = outputs(Path(folder))
     np.savez_compressed(STORED.with_suffix(".npz"), **made.arrays)  # type: ignore[arg-type]

@@ -49,7 +49,7 @@ def quantised(name: str, folder: Path) -> Path:
     save(network.eval(), side_px, path)
     samples = Drawn.of(kind, None, 5, 1).images[:SAMPLES, :, :side_px, :side_px]
     int8 = path.with_suffix(".int8.onnx")
-    save_onnx(quantize(path, np.ascontiguousarray(samples), progress=False).model, int8)
+    save_onnx(quantize(path, samples=np.ascontiguousarray(samples), progress=False).model, int8)
     return int8
 
 

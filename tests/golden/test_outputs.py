@@ -1,4 +1,4 @@
-"""What users see stays as it was: see `outputs.py`, which writes the stored outputs anew."""
+"""What users see does not change: see `outputs.py`, which writes the stored outputs."""
 
 import json
 from typing import Any

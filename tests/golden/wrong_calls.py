@@ -1,6 +1,6 @@
-"""Forty calls that are wrong, and what is answered: exit code and message.
+"""Forty wrong calls, and their answers: exit code and message.
 
-Files are named by what is the matter with them; `inputs` writes them.
+Files are named by their faults; `inputs` writes them.
 """
 
 from pathlib import Path
@@ -11,7 +11,7 @@ import tifffile
 from onnx import TensorProto, helper
 from typer.testing import CliRunner
 
-from beers_deploy.cli import app
+from beers_deploy.cli.commands import app
 
 CALLS = (
     "restore",
@@ -49,13 +49,13 @@ CALLS = (
     "stress none.onnx none.onnx",
     "profiles none",
     "characterise none.tif --out out.toml",
-    "simulate --out out --scenes 0",
+    "simulate --images none --out out",
     "simulate --sensor broken.toml --out out",
     "train --recipe none --images none --out out",
     "none",
     "restore image.tif out.tif --none",
 )
-"""Words of each command line; files lie in the folder where it is run."""
+"""Command lines, which are run in the folder of the files."""
 
 
 def inputs(folder: Path) -> None:
@@ -73,7 +73,7 @@ def inputs(folder: Path) -> None:
 
 
 def pixelwise() -> onnx.ModelProto:
-    """A network of one convolution of 1 x 1."""
+    """Return a network of one convolution of 1 x 1."""
     sides: list[str | int] = ["batch", 1, "height", "width"]
     values = (
         helper.make_tensor_value_info(name, TensorProto.FLOAT, sides) for name in ("image", "out")
@@ -86,10 +86,13 @@ def pixelwise() -> onnx.ModelProto:
 
 
 def answer(words: str) -> dict[str, object]:
-    """Run a call in the current folder; its exit code, what it said, and what it left behind."""
+    """Run a call in the current folder; return its exit code, its error, and the files it left."""
     before = {path.name for path in Path().iterdir()}
     result = CliRunner(env={"COLUMNS": "200"}).invoke(app, words.split())
+    # Lines of the log come first. Some of them, such as the memory, differ between machines.
+    lines = result.stderr.splitlines()
+    error = next((line for line in lines if line.startswith("beers-deploy: ")), result.stderr)
     # Click draws a box around what is wrong with an option, under a line of usage.
-    message = " ".join(word for word in result.stderr.split() if not set(word) <= set("╭─│╮╰╯"))
+    message = " ".join(word for word in error.split() if not set(word) <= set("╭─│╮╰╯"))
     left = sorted({path.name for path in Path().iterdir()} - before)
     return {"exit code": result.exit_code, "message": message, "left behind": left}

@@ -17,10 +17,10 @@ from scipy.ndimage import gaussian_filter
 
 from beers_deploy.model.consistency import RAW_REACH_PX, REACH_PX, Consistency, Placed
 from beers_deploy.model.simulator.mtf import sensor_mtf
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.effects import AntiAlias, Offset, Smear
 from beers_deploy.profiles.response import PointSpread, packed, unpacked
 from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.sensor_file import load_sensor
 from tests.model.simulator.stages import (
     formula_table,
     gaussian_pixel,

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from beers_deploy.model.curves import FREQUENCIES, OBSCURATIONS, draw_table, pupil_contrast
 from beers_deploy.model.departure import departure
 from beers_deploy.model.family import SensorFamily, sensor_vector
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.response import READING, MtfTable
 from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.sensor_file import load_sensor
 
 NOMINAL = load_sensor("pleiades-degraded").nominal()
 CONTRAST = st.floats(0.015, 0.15)

@@ -18,8 +18,8 @@ from beers_deploy.model.exposure import (
     factors_for,
 )
 from beers_deploy.model.family import RANGES, sensor_values
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.sensor_file import load_sensor
 
 FULL_SCALE = 4095.0
 NOMINAL = load_sensor("pleiades-degraded").nominal()

@@ -10,10 +10,14 @@ import tifffile
 from PIL import Image
 
 from beers_deploy.model.dataset import DatasetRecipe, profiles_for, read_pairs_recipe, write_dataset
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import OptionError, ProfileError
 from beers_deploy.profiles.sensor import same_instrument
-from beers_deploy.profiles.sensor_file import reference_for, sensor_from_json, sensor_names
+from beers_deploy.profiles.sensor_file import (
+    load_sensor,
+    reference_for,
+    sensor_from_json,
+    sensor_names,
+)
 from beers_deploy.studies.evaluation.pairs import oversamplings_of, read_pairs
 
 SEVERE = load_sensor("dior-high")
@@ -38,22 +42,21 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_sensor_that_made_the_pairs_is_known(folder: Path) -> None:
-    degraded, reference = profiles_for(None, None, read_pairs_recipe(folder), pytest.fail)
+    degraded, reference = profiles_for(None, None, read_pairs_recipe(folder))
     assert same_instrument(degraded, SEVERE)
     assert (degraded.name, reference.name) == ("dior-high", "pleiades-reference")
 
 
 def test_a_sensor_that_contradicts_the_recipe_is_refused(folder: Path) -> None:
     recipe = read_pairs_recipe(folder)
-    assert (
-        profiles_for("dior-high", "pleiades-reference", recipe, pytest.fail)[0].name == "dior-high"
-    )
+    assert profiles_for("dior-high", "pleiades-reference", recipe)[0].name == "dior-high"
     with pytest.raises(
-        OptionError, match=r"sensor: expected the sensor that made the pairs, dior-high"
+        OptionError,
+        match=r"`sensor` must be the sensor that made the pairs, dior-high.* is pleiades-degraded",
     ):
-        profiles_for("pleiades-degraded", None, recipe, pytest.fail)
-    with pytest.raises(OptionError, match="reference"):
-        profiles_for(None, "dior-medium", recipe, pytest.fail)
+        profiles_for("pleiades-degraded", None, recipe)
+    with pytest.raises(OptionError, match="`reference` must"):
+        profiles_for(None, "dior-medium", recipe)
 
 
 def test_frames_and_patches_of_a_site_are_one_site(folder: Path) -> None:
@@ -64,8 +67,8 @@ def test_frames_and_patches_of_a_site_are_one_site(folder: Path) -> None:
 
 def test_without_a_recipe_the_sensor_is_the_one_named(tmp_path: Path) -> None:
     assert read_pairs_recipe(tmp_path) is None
-    assert profiles_for("dior-high", None, None, pytest.fail)[0] == SEVERE
-    assert profiles_for(None, None, None, pytest.fail)[0].name == "pleiades-degraded"
+    assert profiles_for("dior-high", None, None)[0] == SEVERE
+    assert profiles_for(None, None, None)[0].name == "pleiades-degraded"
 
 
 @pytest.mark.parametrize(

@@ -136,7 +136,7 @@ def test_a_missing_file_and_an_unknown_variant(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(MachineError, match="place to write"):
+    with pytest.raises(MachineError, match="cannot be written"):
         save_network(tmp_path / "file" / "w.safetensors", plain(Variant(1, 4)), {})
 
 
@@ -188,9 +188,9 @@ def test_conditioned_and_plain_weights_are_not_taken_for_one_another(tmp_path: P
     save_network(tmp_path / "plain.safetensors", plain(Variant(1, 4)), {})
     assert is_conditioned(tmp_path / "conditioned.safetensors")
     assert not is_conditioned(tmp_path / "plain.safetensors")
-    with pytest.raises(ModelError, match="sensor"):
+    with pytest.raises(ModelError, match="is conditioned on a sensor"):
         read_plain(tmp_path / "conditioned.safetensors")
-    with pytest.raises(ModelError, match="told no sensor"):
+    with pytest.raises(ModelError, match="not conditioned on a sensor"):
         read_conditioned(tmp_path / "plain.safetensors")
 
 

@@ -1,4 +1,4 @@
-"""`restore`: the integer reference's pixels, whatever the tiles, threads and ways in."""
+"""`restore` gives the pixels of the integer reference, for any tiles and threads."""
 
 from pathlib import Path
 
@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import tifffile
 
-from beers_deploy.library import restore
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import done
 from tests.shipped import shipped_pair
 
@@ -18,7 +18,7 @@ MAX_DN = np.float32(4095)
 
 
 def raw(height: int, width: int) -> np.ndarray:
-    """Digital numbers (H, W) of every size, smooth here and rough there."""
+    """Return digital numbers (H, W) of every size, smooth on the left and rough on the right."""
     y, x = np.mgrid[:height, :width]
     smooth = 2048 + 1500 * np.sin(y / 9) * np.cos(x / 7)
     rough = np.random.default_rng(4).normal(0, 600, (height, width)) * (x > width // 2)
@@ -26,7 +26,7 @@ def raw(height: int, width: int) -> np.ndarray:
 
 
 def by_reference(dn: np.ndarray, name: str) -> np.ndarray:
-    """What whole numbers alone make of digital numbers (H, W)."""
+    """Restore digital numbers (H, W) by integers alone."""
     core = read_core(load_onnx(shipped_pair(name)[1]))
     image = (dn.astype(np.float32) / MAX_DN)[None, None]
     tensors, _ = run_core(core, core.ends.split(image), half_even=True)
@@ -35,13 +35,15 @@ def by_reference(dn: np.ndarray, name: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-s"])
-def test_an_array_becomes_what_the_integer_reference_says(name: str) -> None:
+def test_an_array_has_the_pixels_of_the_integer_reference(name: str) -> None:
     dn = raw(61, 97)
     model = shipped_pair(name)[1]
     expected = by_reference(dn, name)
     assert (expected != dn).mean() > 0.5
     for tile_px, threads in ((640, 1), (48, 2)):
-        np.testing.assert_array_equal(restore(dn, model, tile=tile_px, threads=threads), expected)
+        np.testing.assert_array_equal(
+            restore(dn, network=model, tile=tile_px, threads=threads), expected
+        )
 
 
 PLAIN = ("--no-consistency", "--no-exposure")

@@ -61,5 +61,5 @@ HEADERS += [
 def test_a_header_that_cannot_be_is_a_value_error(header: str, tmp_path: Path) -> None:
     text = header.encode().ljust(117) + b"\n"
     (tmp_path / "x.npy").write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text)
-    with pytest.raises(ValueError, match="another file"):
+    with pytest.raises(ValueError, match="another format"):
         load_arrays(tmp_path / "x.npy")

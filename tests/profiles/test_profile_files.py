@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beers_deploy.profiles import load_sensor, load_target
 from beers_deploy.profiles.errors import ProfileError
 from beers_deploy.profiles.sensor import TABLES, noise_from_snr, snr_0_bounds
+from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.target import load_target
 from tests.profiles.own_sensor import SHIPPED, own_sensor
 
 KEYS: list[tuple[str, str]] = []
@@ -18,33 +19,30 @@ for name, ways in TABLES.items():
     KEYS += product([name], ways[0][0])
 
 
-def refusal(path: Path) -> ProfileError:
-    """The error, after checking that it is one whole sentence."""
+def refusal(path: Path) -> str:
+    """Return the message, after checking that it names the file and ends like a sentence."""
     with pytest.raises(ProfileError) as caught:
         load_sensor(str(path))
-    error = caught.value
-    assert (
-        str(error) == f"{error.where}: expected {error.expected}, got {error.got}; {error.remedy}."
-    )
-    assert all(part.strip() for part in (error.where, error.expected, error.got, error.remedy))
-    assert "mine" in error.where
-    assert "\n" not in str(error)
-    return error
+    message = str(caught.value)
+    assert "mine" in message
+    assert message.endswith(".")
+    assert message.isprintable()
+    assert not message.endswith(("..", " .", ":."))
+    return message
 
 
 @pytest.mark.parametrize(("table", "key"), KEYS)
 def test_a_missing_key_is_named_with_its_table(table: str, key: str, tmp_path: Path) -> None:
     lines = [line for line in SHIPPED.splitlines() if not line.startswith(f"{key} =")]
-    error = refusal(own_sensor(tmp_path, text="\n".join(lines)))
-    assert f"[{table}]" in error.where
-    assert repr(key) in error.expected
+    assert f"[{table}] has no key {key!r}" in refusal(own_sensor(tmp_path, text="\n".join(lines)))
 
 
 @pytest.mark.parametrize("table", TABLES)
 def test_a_missing_table_is_named(table: str, tmp_path: Path) -> None:
     head, _, rest = SHIPPED.partition(f"[{table}]")
     following = rest[rest.index("\n[") :] if "\n[" in rest else ""
-    assert repr(table) in refusal(own_sensor(tmp_path, text=head + following)).expected
+    message = refusal(own_sensor(tmp_path, text=head + following))
+    assert f"mine.toml has no key {table!r}" in message
 
 
 @pytest.mark.parametrize(
@@ -52,14 +50,13 @@ def test_a_missing_table_is_named(table: str, tmp_path: Path) -> None:
     ["-1", "-0.07", "1e-200", "nan", "inf", "true", "[]", "[0.01, 0.02, 0.03]", '"7 %"', "1" * 400],
 )
 def test_an_mtf_that_is_no_contrast_is_refused(value: str, tmp_path: Path) -> None:
-    assert (
-        "mtf_nyquist" in refusal(own_sensor(tmp_path, ("value = 0.07", f"value = {value}"))).where
-    )
+    message = refusal(own_sensor(tmp_path, ("value = 0.07", f"value = {value}")))
+    assert "mine.toml [mtf] mtf_nyquist must " in message
 
 
 def test_text_that_is_not_unicode_is_refused(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_bytes(b"description = '\xff\xfe'")
-    assert refusal(tmp_path / "mine.toml").expected == "TOML text"
+    assert "TOML" in refusal(tmp_path / "mine.toml")
 
 
 @pytest.mark.parametrize(
@@ -121,9 +118,9 @@ def test_noise_reproduces_any_two_points(
         ("description = 'x'\n[dpu]\nclock_mhz = { value = 333 }", ("clock_mhz", "'source'")),
         (
             "description = 'x'\ndefault_configuration = 'Z'\n[configurations.A]\nn = 3",
-            ("configuration out of A",),
+            ("configuration 'Z'", "`dpu`: A."),
         ),
-        ("description = 'x'\nconfigurations = 3", ("table of constants",)),
+        ("description = 'x'\nconfigurations = 3", ("configurations", "table of constants")),
     ],
 )
 def test_a_wrong_target_gets_one_sentence(
@@ -131,7 +128,7 @@ def test_a_wrong_target_gets_one_sentence(
 ) -> None:
     with pytest.raises(ProfileError) as caught:
         load_target(str(own_sensor(tmp_path, text=text)))
-    for word in ("mine", "expected", "got", *words):
+    for word in ("mine", *words):
         assert word in str(caught.value)
 
 

@@ -15,11 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from beers_deploy.cli import app
-from beers_deploy.profiles import Sensor, load_sensor
+from beers_deploy.cli.commands import app
 from beers_deploy.profiles.response import MtfTable, PointSpread, centroid, packed, unpacked
-from beers_deploy.profiles.sensor import same_instrument
-from beers_deploy.profiles.sensor_file import sensor_from_json
+from beers_deploy.profiles.sensor import Sensor, same_instrument
+from beers_deploy.profiles.sensor_file import load_sensor, sensor_from_json
 from tests.profiles.own_sensor import SHIPPED, own_sensor
 from tests.profiles.test_profile_files import refusal
 
@@ -171,7 +170,7 @@ def test_a_profile_comes_back_from_json_without_its_file(
 
 def test_another_contrast_beside_a_response_is_refused(tmp_path: Path) -> None:
     sensor = load_sensor(str(sensor_file(tmp_path, TABLE))).nominal()
-    with pytest.raises(ValueError, match="beside a response"):
+    with pytest.raises(ValueError, match="but the response has"):
         replace(sensor, mtf_nyquist=0.2)
     assert replace(sensor, mtf_nyquist=0.2, mtf_nyquist_along=None, response=None).mtf_axes == (
         0.2,
@@ -184,44 +183,47 @@ def test_another_contrast_beside_a_response_is_refused(tmp_path: Path) -> None:
     [
         (
             TABLE + "\nmtf_nyquist = 0.07",
-            ("one of mtf_nyquist, or frequency and across, or psf", "keep one"),
+            ("one of mtf_nyquist, or frequency and across, or psf", "Keep one"),
         ),
-        (TABLE + "\n" + PSF, ("keep one",)),
-        (PSF + "\nmtf_nyquist_along = 0.07", ("keep one",)),
+        (TABLE + "\n" + PSF, ("Keep one",)),
+        (PSF + "\nmtf_nyquist_along = 0.07", ("Keep one",)),
         ("across = [1, 0.1]", ("'frequency'",)),
         ("frequency = [0, 0.5]", ("'across'",)),
         ("psf_samples_per_px = 8", ("'psf'",)),
-        (TABLE.replace("0.25", "0.6"), ("ascending",)),
+        (TABLE.replace("0.25", "0.6"), ("that are not ascending",)),
         (TABLE.replace("[0, 0.25", "[0.1, 0.25"), ("ascending from 0",)),
-        (TABLE.replace("0.25, 0.5]", "0.25, 0.4]"), ("to 0.5 at least",)),
+        (TABLE.replace("0.25, 0.5]", "0.25, 0.4]"), ("to at least 0.5", "to 0.4.")),
         (TABLE.replace("0.25, 0.5]", "0.25, 1.0]"), ("below 1",)),
         (TABLE.replace("0.5]", "nan]"), ("finite numbers",)),
         (TABLE.replace("0.25, 0.5]", '0.25, "x"]'), ("finite numbers",)),
         (TABLE.replace("0.25, 0.5]", f"0.25, {'9' * 320}]"), ("finite numbers",)),
         (TABLE.replace("0.25", "1e-310"), ("0.0001 apart",)),
-        (TABLE.replace("[1, 0.4", "[0.9, 0.4"), ("the first of them 1", "along")),
+        (
+            TABLE.replace("[1, 0.4", "[0.9, 0.4"),
+            ("the first of them 1,", "the first of them 0.9", "along"),
+        ),
         (TABLE.replace("[1, 0.4, 0.05]", "[1, 0.4]"), ("3 contrasts", "along")),
         (TABLE.replace("0.12", "0"), ("above 0", "across", "psf")),
         (TABLE.replace("0.05]", "-0.05]"), ("above 0", "along", "psf")),
         (TABLE.replace("1, 0.5, 0.12", "1, 0.95, 0.12"), ("0.9003", "sinc")),
-        (TABLE + "\n[antialias]\nsigma_px = 0.1", ("[antialias]", "no such table")),
+        (TABLE + "\n[antialias]\nsigma_px = 0.1", ("no table [antialias]", "MTF table", "Remove")),
         (PSF.replace("4", "1"), ("2 to 64",)),
         (PSF.replace("4", "true"), ("2 to 64",)),
         (PSF.replace("4", '"x"'), ("2 to 64",)),
         (PSF.replace("psf.npy", "none.npy"), ("no such file", "none.npy")),
         (PSF.replace("psf.npy", "psf.png"), (".npy", "'.png'")),
         (PSF.replace("psf.npy", "."), (".npy",)),
-        (PSF.replace("psf.npy", "../psf.npy"), ("beneath",)),
-        (PSF.replace("psf.npy", "/psf.npy"), ("beneath",)),
-        (PSF.replace('"psf.npy"', "3"), ("beneath",)),
+        (PSF.replace("psf.npy", "../psf.npy"), ("or below it", "'../psf.npy'")),
+        (PSF.replace("psf.npy", "/psf.npy"), ("or below it", "'/psf.npy'")),
+        (PSF.replace('"psf.npy"', "3"), ("or below it", "got 3")),
     ],
 )
 def test_a_wrong_blur_gets_one_sentence(mtf: str, words: tuple[str, ...], tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     for folder in (tmp_path, tmp_path / "in"):
         np.save(folder / "psf.npy", lopsided())
-    error = refusal(sensor_file(tmp_path / "in", mtf))
-    assert all(word in str(error) for word in words)
+    message = refusal(sensor_file(tmp_path / "in", mtf))
+    assert all(word in message for word in words)
 
 
 def spoilt(change: Callable[[np.ndarray], object]) -> np.ndarray:
@@ -236,7 +238,7 @@ def spoilt(change: Callable[[np.ndarray], object]) -> np.ndarray:
         (spoilt(lambda s: s.__setitem__((3, 4), np.nan)), ("finite", "NaN")),
         (spoilt(lambda s: s.__setitem__((3, 4), np.inf)), ("finite",)),
         (-lopsided(), ("sum is above 0",)),
-        (np.zeros((5, 5)), ("a sum of 0",)),
+        (np.zeros((5, 5)), ("their sum is 0.",)),
         (np.stack([lopsided()] * 3), ("(rows, columns)", "(3, 33, 44)")),
         (np.ones(7), ("(rows, columns)",)),
         (np.ones((0, 7)), ("(rows, columns)",)),
@@ -252,8 +254,8 @@ def test_samples_that_are_no_point_spread_get_one_sentence(
     samples: np.ndarray, words: tuple[str, ...], tmp_path: Path
 ) -> None:
     np.save(tmp_path / "psf.npy", samples)
-    error = refusal(sensor_file(tmp_path, PSF))
-    assert all(word in str(error) for word in words)
+    message = refusal(sensor_file(tmp_path, PSF))
+    assert all(word in message for word in words)
 
 
 @pytest.mark.parametrize(
@@ -295,9 +297,9 @@ def test_alpha_and_beta_are_the_noise_itself(tmp_path: Path) -> None:
     [
         ("alpha = -1\nbeta = 1", ("alpha", "0 or more")),
         ("alpha = 1\nbeta = [-1, 1]", ("beta", "0 or more")),
-        ("alpha = 0\nbeta = 0", ("not both 0",)),
+        ("alpha = 0\nbeta = 0", ("not both be 0",)),
         ("alpha = 1", ("'beta'",)),
-        ("alpha = 1\nbeta = 1\nsnr_0 = 50", ("alpha and beta", "keep one")),
+        ("alpha = 1\nbeta = 1\nsnr_0 = 50", ("alpha and beta", "Keep one")),
         ("alpha = 1\nbeta = 1\nradiance_0 = 300", ("below radiance_1, 100",)),
         ("alpha = 1\nbeta = 1\nradiance_1 = [3, 4]", ("one number",)),
         ("radiance_0 = 25\nradiance_1 = 100", ("'snr_0'",)),
@@ -306,8 +308,8 @@ def test_alpha_and_beta_are_the_noise_itself(tmp_path: Path) -> None:
 def test_a_wrong_noise_gets_one_sentence(
     noise: str, words: tuple[str, ...], tmp_path: Path
 ) -> None:
-    error = refusal(sensor_file(tmp_path, "mtf_nyquist = 0.07", noise))
-    assert all(word in str(error) for word in words)
+    message = refusal(sensor_file(tmp_path, "mtf_nyquist = 0.07", noise))
+    assert all(word in message for word in words)
 
 
 def test_profiles_print_the_response_and_its_source(tmp_path: Path) -> None:

@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beers_deploy.profiles import load_sensor, load_target, sensor_names, target_names
 from beers_deploy.profiles.effects import Smear
 from beers_deploy.profiles.errors import ProfileError
 from beers_deploy.profiles.sensor import TABLES, noise_from_snr, snr_0_bounds
+from beers_deploy.profiles.sensor_file import load_sensor, sensor_names
+from beers_deploy.profiles.target import load_target, target_names
 from beers_deploy.profiles.toml import HERE
 from tests.profiles.own_sensor import own_sensor
 from tests.profiles.test_profile_files import refusal
@@ -57,7 +58,7 @@ def test_every_target_constant_has_a_source(name: str) -> None:
         ("value = 50,", "value = 90,", ("27.5 to 55", "90", "not dB")),
         ("value = 50,", "value = 20,", ("27.5 to 55", "20")),
         ("value = 12,", "value = 0,", ("bits", "1 to 16")),
-        ("value = 5,", "value = 2.5,", ("oversampling", "whole numbers")),
+        ("value = 5,", "value = 2.5,", ("oversampling", "integer of at least 1", "2.5")),
         ("[mtf]", "[mtf", ("TOML",)),
         ("[noise]", "mtf_nyquist_along = 0.7\n[noise]", ("mtf_nyquist_along", "0.6366", "0.7")),
         (
@@ -78,7 +79,7 @@ def test_every_target_constant_has_a_source(name: str) -> None:
 def test_a_wrong_file_gets_one_sentence(
     old: str, new: str, words: tuple[str, ...], tmp_path: Path
 ) -> None:
-    message = str(refusal(own_sensor(tmp_path, (old, new))))
+    message = refusal(own_sensor(tmp_path, (old, new)))
     assert all(word in message for word in words)
 
 
@@ -171,7 +172,7 @@ def test_a_table_calls_for_its_effect(tmp_path: Path) -> None:
 def test_a_wrong_effect_gets_one_sentence(
     table: str, words: tuple[str, ...], tmp_path: Path
 ) -> None:
-    message = str(refusal(with_table(tmp_path, table)))
+    message = refusal(with_table(tmp_path, table))
     assert all(word in message for word in words)
 
 

@@ -12,7 +12,7 @@ import pytest
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from beers_deploy.cli import app
+from beers_deploy.cli.commands import app
 from beers_deploy.profiles.constant import Status, read_constant
 from beers_deploy.profiles.effects import TABLES as EFFECTS
 from beers_deploy.profiles.sensor import MTF_NYQUIST_MAX, TABLES, same_instrument, table_keys

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beers_deploy.profiles import load_target
 from beers_deploy.profiles.errors import ProfileError
-from beers_deploy.profiles.target import target_names
+from beers_deploy.profiles.target import load_target, target_names
 from beers_deploy.profiles.target_limits import CONFIGURATION, TABLES, Limits
 from docs.make.target_file import BUILD, KEYS
 from tests.deploy.command_line import done, refused
@@ -109,11 +108,9 @@ def test_commands_name_file_key_and_value(key: str, value: str, tmp_path: Path) 
         ("profiles", path),
     ):
         message = refused(*words)
-        assert (
-            f"my-board.toml [configurations.C32B3] {key}: expected a whole number of at least 1"
-            in message
-        )
-        assert f"got {value}" in message
+        assert f"my-board.toml [configurations.C32B3] {key} must be an integer" in message
+        assert "at least 1 " in message
+        assert f"it is {value}," in message
 
 
 def test_every_key_of_the_reference_has_limits() -> None:
@@ -138,9 +135,9 @@ def test_a_published_figure_is_above_0(tmp_path: Path) -> None:
     assert done("profiles", board(tmp_path, "published_latency_ms", '"a network"', "3"))
 
 
-def test_limits_say_whole_and_above_0() -> None:
+def test_limits_say_integer_and_the_least() -> None:
     limits = Limits(1, 8, whole=True)
     assert (str(limits), str(replace(limits, whole=False))) == (
-        "a whole number of at least 1 and at most 8",
+        "an integer of at least 1 and at most 8",
         "a number of at least 1 and at most 8",
     )

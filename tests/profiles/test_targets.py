@@ -6,11 +6,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from beers_deploy.cli import app
+from beers_deploy.cli.commands import app
 from beers_deploy.dpu.board import load_dpu
-from beers_deploy.profiles import load_target, target_names
 from beers_deploy.profiles.errors import BeersError, ProfileError
-from beers_deploy.profiles.target import board_names
+from beers_deploy.profiles.target import board_names, load_target, target_names
 from beers_deploy.profiles.toml import HERE
 from tests.deploy.command_line import done, refused
 
@@ -74,7 +73,7 @@ def test_the_zcu104_is_the_zcu102_but_for_cores_clock_and_memory() -> None:
     [
         ('"zcu102"', '"zcu999"', ("base", "zcu102", "'zcu999'")),
         ('"zcu102"', '"./zcu102.toml"', ("base", "shipped")),
-        ('"zcu102"', "3", ("base", "got 3")),
+        ('"zcu102"', "3", ("base", "shipped", "got 3")),
         ('"zcu102"', '["zcu102"]', ("base", "shipped")),
         ("value = 250e6", 'value = "fast"', ("pl_clock_hz", "finite number")),
         (
@@ -84,7 +83,7 @@ def test_the_zcu104_is_the_zcu102_but_for_cores_clock_and_memory() -> None:
         ),
         ("[tile]", '[activations]\nconf = ["ReLU"]\n[tile]', ("'conf'", "conv")),
         ("[tile]", '[documents]\nmanual = "mine"\n[tile]', ("'manual'", "operators")),
-        ("cores = { value = 2,", "cores = { value = 0,", ("cores", "at least 1", "got 0")),
+        ("cores = { value = 2,", "cores = { value = 0,", ("cores", "at least 1", "it is 0")),
     ],
 )
 def test_a_wrong_board_gets_one_sentence(
@@ -94,7 +93,7 @@ def test_a_wrong_board_gets_one_sentence(
     with pytest.raises(ProfileError) as caught:
         load_dpu(written(tmp_path, EXAMPLE.replace(old, new)))
     assert "\n" not in str(caught.value)
-    for word in ("my-board", "expected", "got", *words):
+    for word in ("my-board", *words):
         assert word in str(caught.value)
 
 
@@ -113,7 +112,7 @@ def test_a_misspelt_constant_does_not_silence_its_rule(tmp_path: Path) -> None:
 def test_a_board_without_a_base_names_its_documents(tmp_path: Path) -> None:
     text = (HERE / "targets" / "vek280.toml").read_text(encoding="utf-8")
     without = re.sub(r"\[documents].*?\n\n", "", text, flags=re.DOTALL)
-    with pytest.raises(ProfileError, match=r"a table \[documents\], got none"):
+    with pytest.raises(ProfileError, match=r"my-board has no table \[documents\]"):
         load_dpu(written(tmp_path, without))
 
 

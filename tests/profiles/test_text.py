@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beers_deploy.profiles import load_sensor, load_target
-from beers_deploy.profiles.errors import BeersError, OptionError, ProfileError
+from beers_deploy.profiles.errors import BeersError, OptionError, ProfileError, printable
 from beers_deploy.profiles.scene_call import load_scene_call
+from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.target import load_target
 from beers_deploy.profiles.toml import (
     JSON_BYTES,
     QUOTED,
@@ -120,8 +121,11 @@ def test_huge_files_are_not_read(tmp_path: Path) -> None:
 
 
 def test_a_message_shows_what_a_file_holds_on_one_short_line() -> None:
-    error = OptionError("a\nb", expected="c", got="\x1b[2J\ud800" + "x" * 10_000, remedy="d")
+    content = "\x1b[2J\ud800" + "x" * 10_000
+    error = OptionError(f"a\nb has {printable(content)}. Remove it.")
     assert str(error).isprintable()
     assert "\\x1b[2J\\ud800xxx" in str(error)
+    assert str(error).endswith("x.... Remove it.")
     assert len(str(error)) < 600
     str(error).encode()
+    assert len(str(OptionError(content))) < 2600

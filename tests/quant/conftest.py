@@ -4,7 +4,7 @@ import onnx
 import pytest
 import torch
 
-from beers_deploy.export import to_onnx
+from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.graph import Graph, correction_graph, read_planes

@@ -50,20 +50,20 @@ def twice(values: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda _: (), "no operation"),
+        (lambda _: (), "does not exist"),
         (
             lambda g: with_conv(g, "head", weight=lambda w: np.repeat(w, 3, axis=1)),
-            "3 channels for head",
+            "head needs 3 channels, got 1",
         ),
-        (lambda g: g[:-1], "a last operation that writes the result"),
-        (lambda g: with_conv(g, "head", bias=lambda b: b * np.nan), "NaN or infinity in head"),
+        (lambda g: g[:-1], "last operation must write the network's result, but it is "),
+        (lambda g: with_conv(g, "head", bias=lambda b: b * np.nan), "head contain NaN or infinity"),
         (
             lambda g: with_conv(g, "body.0.second", weight=twice, bias=twice),
-            "two tensors of one width",
+            "one number of channels, got ",
         ),
         (
             lambda g: with_conv(g, "body.0.second", input=lambda _: "before the relu"),
-            "before the relu",
+            "reads 'before the relu' before it is computed",
         ),
     ],
 )
@@ -107,5 +107,5 @@ def test_sizes_beyond_all_shifts_are_refused(graph: Graph) -> None:
         read_planes(graph), "body.0.second", weight=lambda weight: weight * np.float32(1e30)
     )
     frac_bits = {PLANES: 7, **{op.output: 8 for op in huge}}
-    with pytest.raises(ModelError, match="shifts reach"):
+    with pytest.raises(ModelError, match="shifts do not reach"):
         build_core(huge, frac_bits)

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.response import MtfTable
+from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.quant.calibration import draw_patches, stratified
 from beers_deploy.quant.graph import PLANES, Graph, graph_to_onnx, tensors
 from beers_deploy.quant.quantise import choose_frac_bits

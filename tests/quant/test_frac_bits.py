@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beers_deploy.profiles import load_target
 from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.target import load_target
 from beers_deploy.quant.core import (
     SHIFTS,
     best_frac_bits,

@@ -73,7 +73,7 @@ def test_a_network_without_a_global_add_is_refused(float_onnx: onnx.ModelProto) 
 def test_a_strided_convolution_is_refused(float_onnx: onnx.ModelProto) -> None:
     model = copied(float_onnx)
     model.graph.node[0].attribute.append(helper.make_attribute("strides", [2, 2]))
-    with pytest.raises(ModelError, match="stride 1, ReLU and adds, got head"):
+    with pytest.raises(ModelError, match="stride 1, ReLU and adds, but it has head"):
         correction_graph(model)
 
 
@@ -138,10 +138,10 @@ def test_a_nearest_resize_is_taken_where_it_makes_blocks(
 @pytest.mark.parametrize(
     ("attributes", "message"),
     [
-        ({"strides": [2, 1]}, "one stride"),
-        ({"strides": [2, 2], "dilations": [2, 2]}, "one stride"),
+        ({"strides": [2, 1]}, "one stride.*got strides \\[2, 1\\]"),
+        ({"strides": [2, 2], "dilations": [2, 2]}, "no dilation"),
         ({"strides": [2, 2], "output_padding": [1, 1]}, "output padding"),
-        ({"strides": [2, 2], "auto_pad": "SAME_UPPER"}, "stated pads"),
+        ({"strides": [2, 2], "auto_pad": "SAME_UPPER"}, "auto_pad"),
     ],
 )
 def test_transposed_convolutions_that_the_dpu_lacks_are_refused(
@@ -156,7 +156,7 @@ def test_transposed_convolutions_that_the_dpu_lacks_are_refused(
             **attributes,
         )
 
-    with pytest.raises(ModelError, match=f"{message}.* at ConvTranspose up"):
+    with pytest.raises(ModelError, match=f"ConvTranspose up must .*{message}"):
         read_network(behind_conv(write))
 
 
@@ -165,5 +165,5 @@ def test_two_outputs_are_refused_by_name() -> None:
     model.graph.output.append(
         helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, ["N", 2, "H", "W"])
     )
-    with pytest.raises(ModelError, match="one output, got 2: restored, x"):
+    with pytest.raises(ModelError, match="one output, but it has 2: restored, x"):
         read_network(model)

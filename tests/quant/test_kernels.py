@@ -266,7 +266,7 @@ def test_weights_that_are_computed_are_refused_in_a_sentence() -> None:
     model.graph.input.append(
         helper.make_tensor_value_info("weight", TensorProto.INT8, [4, 4, 1, 1])
     )
-    with pytest.raises(ModelError, match="QLinearConv 'convolution' with computed weights"):
+    with pytest.raises(ModelError, match=r"QLinearConv 'convolution' .* has computed weights"):
         open_session(model, exact=True)
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.quant.calibration import Calibration, draw_patches, unseen_patches
 from beers_deploy.quant.lighting import (
     CALIBRATION,

@@ -59,7 +59,7 @@ def test_images_are_measured_as_everywhere_else() -> None:
 )
 def test_references_of_another_kind_are_refused(name: str, shape: tuple[int, ...]) -> None:
     with pytest.raises(
-        OptionError, match=r"metric: expected (references|numbers of classes) of 1 x "
+        OptionError, match=r"`metric`.* (references|numbers of classes as references) of 1 x "
     ):
         parts_of(name, np.zeros((1, 2, 23, 31)), np.zeros(shape))
 
@@ -74,7 +74,7 @@ def test_a_gate_speaks_of_classes() -> None:
     images = np.random.default_rng(0).random((12, 1, 32, 32), dtype=np.float32)
     classes = network(images).argmax(1)
     with one_guess():
-        int8 = bd.quantize(network, images[:8], progress=False)
+        int8 = bd.quantize(network, samples=images[:8], progress=False)
     samples = images[8:], classes[8:]
     verdict = bd.gate(
         int8, samples=samples, metric="iou", limits={"metric_loss": 0.5, "mae": 0.1}, progress=False
@@ -91,9 +91,10 @@ def test_a_gate_speaks_of_classes() -> None:
         progress=False,
     )
     assert refused_verdict.rows[0].figures["top1 float"].value == 0
-    with pytest.raises(OptionError, match="one beside the limit metric_loss"):
+    with pytest.raises(OptionError, match="'metric_loss' needs a `metric`"):
         bd.gate(int8, samples=samples, limits={"metric_loss": 0.1}, progress=False)
-    with pytest.raises(OptionError, match=f"metric: expected one of {', '.join(METRICS)}"):
-        bd.gate(int8, samples=samples, metric="auc", progress=False)
-    with pytest.raises(OptionError, match="references for a metric"):
+    names = ", ".join(map(repr, METRICS))
+    with pytest.raises(OptionError, match=f"`metric` must be one of {names}, got 'auc'"):
+        bd.gate(int8, samples=samples, metric="auc", progress=False)  # type: ignore[arg-type]
+    with pytest.raises(OptionError, match="must have references for `metric`"):
         bd.gate(int8, samples=samples[0], metric="iou", progress=False)

@@ -254,11 +254,11 @@ def flattened_elsewhere(w: Sketch) -> onnx.ModelProto:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (unshuffled_inside, "Reshape|pixel unshuffle of several channels at the image alone"),
-        (column_by_column, "one number a channel, got one of 36 at Mul out"),
-        (squeezed, "tensors of one size for gated, got 1 x 1 and 36 x 36"),
-        (shares_inside, "Softmax of channels at the end alone, got another at Softmax shares"),
-        (flattened_elsewhere, "Flatten at the end"),
+        (unshuffled_inside, "pixel unshuffle of several channels within the network"),
+        (column_by_column, "Mul out must have a constant of one number for each channel, got 36"),
+        (squeezed, "gated needs tensors of one size, but they have 1 x 1 and 36 x 36"),
+        (shares_inside, "Softmax shares is supported along the channels at the end"),
+        (flattened_elsewhere, "Flatten .* is supported at the end"),
     ],
 )
 def test_what_would_be_computed_wrongly_is_refused(

@@ -7,6 +7,7 @@ import numpy as np
 import onnx
 import pytest
 
+from beers_deploy.model.progress import Step, progress, reporting
 from beers_deploy.quant.core import SHIFTS, IntConv, op_shifts
 from beers_deploy.quant.ends import FINE_MAX, GAIN, Ends
 from beers_deploy.quant.gate import compare
@@ -300,7 +301,9 @@ def test_all_passes_lose_far_less_than_none(
     assert mae(quantised) < 0.5 * mae(rounded)
 
 
-def test_each_step_is_told(float_onnx: onnx.ModelProto, patches: Patches) -> None:
-    messages: list[str] = []
-    quickly(float_onnx, patches, log=messages.append)
-    assert [step.split(" ")[0] for step in messages] == ["scale", "equalising", "rounding"]
+def test_each_step_is_named(float_onnx: onnx.ModelProto, patches: Patches) -> None:
+    reported: list[Step] = []
+    with reporting(reported.append), progress("calibrating"):
+        quickly(float_onnx, patches)
+    names = [step.what.removeprefix("calibrating: ") for step in reported]
+    assert [name.split(" ")[0] for name in names] == ["scale", "equalising", "rounding"]

@@ -99,36 +99,36 @@ def with_reference(
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        (of(RAMP), "expected 1 channels"),
-        (of(RAMP[:, :1] * 300), "values in"),
-        (of(np.full((1, 1, 9, 9), np.nan)), "got nan"),
+        (of(RAMP), "must have 1 channels of numbers.*got 2"),
+        (of(RAMP[:, :1] * 300), "in \\[0, 1\\], but they are 0 to "),
+        (of(np.full((1, 1, 9, 9), np.nan)), "but they are nan"),
         (of(RAMP[0, 0]), "a batch of"),
-        (of(RAMP[:, :1, :3, :3]), "at least 4 pixels"),
-        (of(RAMP[:0, :1]), "at least one sample"),
+        (of(RAMP[:, :1, :3, :3]), "at least 4 pixels a side, got 3 x 3"),
+        (of(RAMP[:0, :1]), "contains no sample"),
         (of(RAMP[:, :1].astype(np.complex64)), "numbers"),
-        (pickled, "a .npy or .npz file of numbers, or a folder"),
+        (pickled, "a .npy or .npz file of numbers, or a folder.*x\\.npy"),
         (two_arrays, "got first, second"),
         (cut_off, "a .npy or .npz file of numbers"),
-        (with_reference(np.array(0.5)), "as many references as images"),
-        (with_reference(np.zeros((2, 1))), "as many references as images"),
+        (with_reference(np.array(0.5)), "a reference for each of its 3 images"),
+        (with_reference(np.zeros((2, 1))), "a reference for each of its 3 images"),
         (
             with_reference(np.full((3, 2), "text")),
-            r"x.npz\[0\]: expected a reference of real numbers",
+            r"The reference of x.npz\[0\] must be of real numbers",
         ),
         (with_reference(np.zeros((3, 2), np.complex64)), "got complex64"),
         (with_reference(np.zeros((3, 2), "datetime64[s]")), "got datetime64"),
-        (with_reference(np.zeros((3, 2), [("a", "f4")])), "a reference of real numbers"),
+        (with_reference(np.zeros((3, 2), [("a", "f4")])), "must be of real numbers"),
         (
             with_reference(np.array([0.5, np.nan, 0.5])),
-            r"x.npz\[1\]: expected a reference of finite numbers",
+            r"x.npz\[1\] has 1 values that are NaN or infinite",
         ),
         (
             with_reference(np.array([0.5, 0.5, np.inf])),
-            r"x.npz\[2\]: expected a reference of finite numbers",
+            r"x.npz\[2\] has 1 values that are NaN or infinite",
         ),
-        (with_reference(np.zeros((3, 2)), RAMP[:, :1, :0]), "an image with pixels"),
+        (with_reference(np.zeros((3, 2)), RAMP[:, :1, :0]), "has no pixels"),
         (lambda folder: folder / "missing.npy", "no such file"),
-        (lambda folder: folder, "at least one sample"),
+        (lambda folder: folder, "contains no sample"),
     ],
 )
 def test_what_are_no_samples_is_refused(
@@ -158,5 +158,5 @@ def test_networks_that_simulated_patches_do_not_suit_ask_for_samples(tmp_path: P
         value.CopyFrom(
             helper.make_tensor_value_info(value.name, TensorProto.FLOAT, ["N", 1, 32, 32])
         )
-    with pytest.raises(OptionError, match="32 x 32 pixels alone"):
+    with pytest.raises(OptionError, match="only images of 32 x 32 pixels"):
         samples_of(pooled, None)

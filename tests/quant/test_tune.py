@@ -12,6 +12,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from beers_deploy.model.progress import Step, progress, reporting
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.quant.core import IntConv, IntCore, build_core, shift_faults
 from beers_deploy.quant.ends import Ends
@@ -187,7 +188,7 @@ def test_a_reference_of_another_size_is_one_sentence(
     degraded, reference = patches.pairs[0]
     short = Remade(lambda _: (degraded, reference[..., :-2]), 2)
     with pytest.raises(
-        ImageError, match=r"reference: expected one of 1 x 1 x 128 x 128, got 1 x 1 x 128 x 126"
+        ImageError, match=r"reference has the size 1 x 1 x 128 x 126, but .* 1 x 1 x 128 x 128"
     ):
         trained(quantised.core, float_onnx, Tuning(short, 1))
 
@@ -197,10 +198,11 @@ def test_the_same_seed_gives_the_same_numbers(
     float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
     def made(seed: int) -> bytes:
-        messages: list[str] = []
+        reported: list[Step] = []
         tuning = Tuning(patches.pairs, 3, rate=0.3, seed=seed)
-        model = quantise_model(float_onnx, patches, {}, tuning=tuning, log=messages.append)
-        assert messages[-1].startswith("fine-tuning, step 3 of 3: ")
+        with reporting(reported.append), progress("calibrating"):
+            model = quantise_model(float_onnx, patches, {}, tuning=tuning)
+        assert reported[-1].what.startswith("calibrating: fine-tuning, step 3 of 3: ")
         assert {entry.key: entry.value for entry in model.host.metadata_props}[
             "finetune"
         ].startswith("3 steps")

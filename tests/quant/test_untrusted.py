@@ -36,7 +36,7 @@ def refusal(model: onnx.ModelProto, to_run: bool = True) -> str:
     with patch("onnxruntime.InferenceSession") as session, pytest.raises(ModelError) as caught:
         open_session(parse_onnx(model.SerializeToString(), "untrusted.onnx", to_run), 1)
     assert not session.called
-    assert str(caught.value).startswith("untrusted.onnx: expected ")
+    assert "untrusted.onnx" in str(caught.value)
     return str(caught.value)
 
 
@@ -59,7 +59,7 @@ def test_weights_in_other_files_are_never_looked_for(
         tensor.ClearField("raw_data")
         tensor.data_location = TensorProto.EXTERNAL
     with patch("onnx.checker.check_model") as checker:
-        assert f"kept in another file, {place!r}" in refusal(model)
+        assert f"in another file, {place!r}" in refusal(model)
     assert not checker.called
 
 
@@ -87,10 +87,10 @@ def typed(kind: int) -> Change:
     ("change", "words"),
     [
         (stating(10**6, 10**6, 10**6), "1000000 x 1000000 x 1000000"),
-        (stating(2**62, 4), "as many as it states"),
-        (stating(-4, 1, 3, 3), "sizes from 0 on"),
+        (stating(2**62, 4), "4.61168601843e+18 x 4 values, but the file holds 36"),
+        (stating(-4, 1, 3, 3), "each 0 or more"),
         (stating(4, 1, 3, 4), "holds 36"),
-        (stating(*[1] * 17), "at most 16 sizes"),
+        (stating(*[1] * 17), "at most 16 dimensions"),
         (stating(0), "holds 36"),
         (sized(1, 1, 2**40, 2**40), "values"),
         (sized(1, 1, -5, 640), "-5"),
@@ -139,10 +139,16 @@ def filled(to: str, by: str = "n") -> onnx.NodeProto:
         ([node("Evil", "image", domain="ai.foreign")], "Evil y of 'ai.foreign'"),
         ([node("FusedConv", "image", domain="com.microsoft")], "FusedConv"),
         ([node("LinearRegressor", "image", domain="ai.onnx.ml")], "LinearRegressor"),
-        ([helper.make_node("Loop", ["", ""], [], body=LOOP)], "Loop with a graph within"),
+        (
+            [helper.make_node("Loop", ["", ""], [], body=LOOP)],
+            "Loop in untrusted.onnx contains a graph",
+        ),
         ([constant("n", 2**20, 2**20), filled("y")], "values"),
-        ([constant("n", 2**27 + 1), filled("a"), filled("b")], "what constants fill"),
-        ([SIZE_5000, filled("a"), filled("b", by="a")], "a computed one"),
+        (
+            [constant("n", 2**27 + 1), filled("a"), filled("b")],
+            "'all filled constants' in untrusted.onnx has the size 268435458",
+        ),
+        ([SIZE_5000, filled("a"), filled("b", by="a")], "a size that other nodes compute"),
         (
             [
                 SIZE_3000,
@@ -150,20 +156,23 @@ def filled(to: str, by: str = "n") -> onnx.NodeProto:
                 node("Concat", "a", "a", to="b", axis=0),
                 node("Add", "b", "b", to="c"),
             ],
-            "Concat b of constants alone",
+            "Concat b in untrusted.onnx reads constants only",
         ),
-        ([constant("n", 9, 9), node("Expand", "n", "n")], "constants alone"),
+        ([constant("n", 9, 9), node("Expand", "n", "n")], "reads constants only"),
         (
             [constant("n", 9, 9), constant("i", 7), node("Gather", "n", "i")],
-            "Gather y of constants alone",
+            "Gather y in untrusted.onnx reads constants only",
         ),
         ([node("RandomNormal", shape=[2**20, 2**20])], "values"),
         ([constant("n", 1, 1, 2**20, 2**20), node("Expand", "image", "n")], "Expand"),
-        ([constant("n", 1, 1, 2000, 1), node("Tile", "image", "n")], "enlargements"),
-        ([constant("n", *[9**9] * 8), node("Pad", "image", "n")], "enlargements"),
+        (
+            [constant("n", 1, 1, 2000, 1), node("Tile", "image", "n")],
+            "Tile y in untrusted.onnx enlarges by",
+        ),
+        ([constant("n", *[9**9] * 8), node("Pad", "image", "n")], "enlarges by"),
         (
             [constant("s", 1, 1, 1e6, 1e6, kind=np.float32), node("Resize", "image", "", "s")],
-            "enlargements",
+            "enlarges by 1 x 1 x 1000000 x 1000000",
         ),
         ([constant("a", 1, 1, 9, 9), node("Neg", "a", to="b"), node("Expand", "image", "b")], "-9"),
         (
@@ -174,9 +183,15 @@ def filled(to: str, by: str = "n") -> onnx.NodeProto:
             ],
             "268435456",
         ),
-        ([SIZE_5000, filled("a"), node("Expand", "image", "a")], "a computed one in Expand"),
-        ([node("MaxPool", "image", kernel_shape=[3, 3], pads=[2**30] * 4)], "pads"),
-        ([node("DepthToSpace", "image", blocksize=2**20)], "blocksize"),
+        (
+            [SIZE_5000, filled("a"), node("Expand", "image", "a")],
+            "Expand y in untrusted.onnx has a size that other nodes compute",
+        ),
+        (
+            [node("MaxPool", "image", kernel_shape=[3, 3], pads=[2**30] * 4)],
+            "has pads of 1073741824",
+        ),
+        ([node("DepthToSpace", "image", blocksize=2**20)], "has blocksize of 1048576"),
     ],
 )
 def test_what_a_runtime_would_do_for_an_untrusted_file_is_refused(

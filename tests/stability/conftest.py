@@ -7,7 +7,7 @@ import onnx
 import pytest
 import torch
 
-from beers_deploy.export import to_onnx
+from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS
 from beers_deploy.model.traditional.rows import one_thread_per_operation
 from beers_deploy.model.variants import Variant

@@ -8,10 +8,10 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from beers_deploy.bench.swath import predict_network
 from beers_deploy.dpu.board import load_dpu
-from beers_deploy.profiles import load_sensor
+from beers_deploy.performance.swath import predict_network
 from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.profiles.target import TILE_PX
 from beers_deploy.quant.calibration import Calibration
 from beers_deploy.quant.core import IntConv
@@ -49,7 +49,7 @@ SOURCE = Calibration(load_sensor("pleiades-degraded"), None, patches=2, patch_px
 @pytest.fixture(scope="module")
 def target() -> FaultTarget:
     """A trained network: what a new one makes is hardly worse with bits flipped."""
-    return make_target(open_subject(Path("convbeers-xs"), None), SOURCE)
+    return make_target(open_subject("convbeers-xs"), SOURCE)
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +113,7 @@ def test_at_half_resolution_maps_have_a_bit_for_each_channel_of_each_place(coars
 
 @pytest.mark.parametrize("variant", ["convbeers-xs", "convbeers-s", "convbeers"])
 def test_all_guards_cost_under_two_per_cent_on_the_board(variant: str) -> None:
-    core = as_stored(open_subject(Path(variant), None).core)
+    core = as_stored(open_subject(variant).core)
     relus = {
         op.output: 96
         for op in core.ops
@@ -143,17 +143,23 @@ def test_the_command(pair: list[Path], tmp_path: Path) -> None:
     assert len(picture.findall(CURVES)) == 2 * len(MEMORIES)
 
 
+LITTLE = ["FLOAT", "INT8", "--bit-flips", "--draws", "1", "--side", "32"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["FLOAT", "--bit-flips"], "INT8 network"),
-        (["FLOAT", "INT8", "--bit-flips", "--cases", "snow"], "--bit-flips"),
-        (["FLOAT", "INT8", "--draws", "6"], "--draws: expected --bit-flips"),
+        (
+            ["FLOAT", "INT8", "--bit-flips", "--cases", "snow"],
+            "--cases has no effect with --bit-flips",
+        ),
+        (["FLOAT", "INT8", "--draws", "5"], "--draws has no effect without --bit-flips"),
         (["FLOAT", "INT8", "--bit-flips", "--sensor", "nobody"], "nobody"),
         (["FLOAT", "INT8", "--bit-flips", "--target", "nobody"], "nobody"),
         (["FLOAT", "INT8", "--bit-flips", "--images", "nowhere"], "nowhere"),
         (["FLOAT", "INT8", "--bit-flips", "--out", "x.svg"], "x.svg"),
-        (["FLOAT", "INT8", "--bit-flips", "--out", "x.md", "--json", "x.svg"], "x.svg"),
+        ([*LITTLE, "--out", "x.md", "--json", "x.svg"], "x.svg is another output"),
     ],
 )
 def test_wrong_arguments(
@@ -174,7 +180,7 @@ def test_the_page_is_fresh() -> None:
     assert page.startswith(maker.OPENING + maker.FINDINGS)
     dpu = load_dpu("vck190", None)
     for variant in maker.VARIANTS:
-        target = make_target(open_subject(Path(variant), None), maker.SOURCE)
+        target = make_target(open_subject(variant), maker.SOURCE)
         rows = price_rows(target, predict_network(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
         assert all(line in page for line in maker.price_lines({variant: rows}))
     for name, memory in MEMORIES.items():

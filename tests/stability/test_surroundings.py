@@ -24,10 +24,9 @@ from beers_deploy.model.simulator.plan import ringing_of, scene_stats
 from beers_deploy.model.simulator.sampling import read_scene, sample, scene_spectrum
 from beers_deploy.model.traditional.pipeline import Chain, restore_strips, restore_traditional
 from beers_deploy.model.training.losses import LossWeights, RestorationLoss
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import BeersError
 from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.profiles.sensor_file import REFERENCE
+from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
 from beers_deploy.studies.stress.cases import CASES, FULL_DN, Case
 from beers_deploy.studies.stress.checks import FLAT_DN, gain, ringing
 

@@ -23,8 +23,8 @@ from beers_deploy.model.traditional.nl_bayes import (
 )
 from beers_deploy.model.traditional.noise import Noise
 from beers_deploy.model.traditional.pipeline import Chain, Order, restore_traditional
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.sensor_file import load_sensor
 from tests.model.traditional.whole import compensate
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -213,9 +213,9 @@ def _facts(dpu: Dpu) -> Mapping[str, Mapping[str, object]]:
 def _template(rule: Callable[..., object]) -> str:
     text = inspect.getdoc(rule)
     if text is None:
-        remedy = "start it without -OO and PYTHONOPTIMIZE=2"
         raise MachineError(
-            "Python", expected="docstrings, where the rules' texts stand", got="none", remedy=remedy
+            "Python removed the docstrings, which contain the texts of the rules. Start it without "
+            "-OO and PYTHONOPTIMIZE=2."
         )
     return " ".join(text.split())
 

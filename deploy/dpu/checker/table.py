@@ -1,21 +1,23 @@
-"""`check`: where each node of a network goes, as rows of results and as a few lines.
+"""`check`: where each node of a network runs, as a table.
 
 Of an NPU AMD publishes a table of operators, Y or N/A, and no limits. Where its nodes would run is
 the table's word: nothing here has seen the compiler.
 """
 
+from collections import Counter
 from dataclasses import dataclass
 
 import onnx
 
-from beers_deploy.dpu.board import BoardLike, Dpu, ruled
+from beers_deploy.dpu.board import Dpu, ruled
+from beers_deploy.dpu.checker.finding import Finding
 from beers_deploy.dpu.checker.placement import Cut, PlacedNode, Placement, place
 from beers_deploy.dpu.checker.remarks import is_island, remarks_on
 from beers_deploy.dpu.reading import network_of, own_tile_px
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.figures import Check, Figure, Row, predicted, unavailable
-from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, TargetProfile, require_side
+from beers_deploy.profiles.target import TILE_PX, TargetProfile, require_side
 from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.graph import refusal
 from beers_deploy.quant.onnx_file import is_quantised, metadata
@@ -29,13 +31,13 @@ OTHERS_NOTE = "quantised by operators that are not ONNX's: judged without their 
 class Checked(Table):
     """Every node of a network on the host, the DPU or the CPU.
 
-    It is true where the core runs whole on the DPU.
+    It is true if the core runs whole on the DPU.
 
     Attributes:
         placement: the nodes, in order.
-        dpu: the board's configuration that was asked.
+        dpu: the configuration of the board.
         tile_px: side of the tile.
-        network: that was looked at.
+        network: that was checked.
     """
 
     placement: Placement
@@ -44,81 +46,81 @@ class Checked(Table):
     network: Network
 
     @property
-    def failed(self) -> tuple[PlacedNode, ...]:
+    def refused(self) -> tuple[PlacedNode, ...]:
         """The nodes that should run on the DPU and cannot, with the rules that they break."""
         return self.placement.failed
 
     @property
-    def title(self) -> str:
-        """What was asked."""
-        return (
-            f"{self.network.input.name} on {self.dpu.target.name} {self.dpu.name}, tile "
-            f"{self.tile_px}"
-        )
-
-    @property
-    def lines(self) -> list[str]:
-        """What a person wants to know, in a few lines."""
-        placement = self.placement
-        npu = self.dpu.target.npu
-        lines = [] if npu else _crossings(placement)
-        lines += [
-            f"{name}: {text}"
-            for name, text in remarks_on(placement, self.dpu, self.tile_px).items()
-        ]
-        if placement.note:
-            refused = refusal(self.network.model)
-            note = OTHERS_NOTE if is_quantised(self.network.model) else placement.note
-            lines += [
-                note,
-                f"'quantize' does not take it: {refused}" if refused else "'quantize' takes it",
-            ]
-        failed = "; ".join(str(check) for check in self.checks if not check.passed)
-        sound = "no rule is broken, not compiled" if npu else "the core runs whole on the DPU"
-        return [*lines, f"check FAILED: {failed}" if failed else f"check passed: {sound}"]
+    def verdict(self) -> str:
+        """A sentence that says whether the network fits."""
+        if self.failed:
+            return f"check FAILED: {'; '.join(map(str, self.failed))}"
+        if self.dpu.target.npu:
+            return "check passed: no rule is broken; nothing was compiled"
+        return "check passed: the core runs whole on the DPU"
 
 
-def check(
-    network: NetworkLike,
-    board: BoardLike = DEFAULT_TARGET,
-    *,
-    dpu: str | None = None,
-    tile: int | None = None,
+def check_network(
+    network: NetworkLike | None, target: TargetProfile, dpu: str | None, tile: int | None
 ) -> Checked:
-    """Place every node of a network on the host, the DPU or the CPU, and say which rules are
-    broken.
+    """Place every node of a network and return the rules that are broken.
 
     Args:
-        network: float, INT8 or a board's core, anyone's.
-        board: with a DPU or an NPU.
-        dpu: configuration of the DPU that the board's file lists; its own default if None.
-        tile: side of a tile in pixels; the network's own where it has one, else 640.
+        network: float, INT8 or a board's core; the shipped INT8 one if None.
+        target: a board with a DPU or an NPU.
+        dpu: configuration of the DPU; the board's default if None.
+        tile: side of a tile in pixels; the network's own, else 640, if None.
 
     Raises:
         ModelError: no ONNX network of images.
-        ProfileError: no such board or configuration.
-        OptionError: a board without a DPU or NPU, or a tile of no pixels.
-
-    Examples:
-        >>> bool(bd.check("convbeers-xs-int8", "kv260"))
-        True
+        ProfileError: no such configuration.
+        OptionError: a target without DPU or NPU.
     """
-    source = Network.load(network, sensor=SENSOR, to_run=False)
-    build = ruled(TargetProfile.load(board), dpu)
+    source = Network.load(network, sensor=SENSOR, int8=True, to_run=False)
+    build = ruled(target, dpu)
     tile_px = own_tile_px(source.model) or TILE_PX if tile is None else require_side(tile)
     placement = place(network_of(source.model, tile_px, source.label), build)
-    arguments: dict[str, object] = {"target": build.target.name, "dpu": build.name, "tile": tile_px}
-    rows = tuple(_rows(placement, build, tile_px))
-    npu = bool(build.target.npu)
+    npu = bool(target.npu)
     checks = [legality(placement, npu=npu), *(_file_checks(source.model, build) if npu else [])]
-    about = ("check", arguments, (source.input,), rows, tuple(checks))
-    return Checked(*about, placement=placement, dpu=build, tile_px=tile_px, network=source)
+    return Checked(
+        title=f"{source.input.name} on {target.name} {build.name}, tile {tile_px}",
+        arguments={"target": target.name, "dpu": build.name, "tile": tile_px},
+        inputs=(source.input,),
+        rows=tuple(_rows(placement, build, tile_px)),
+        checks=tuple(checks),
+        notes=tuple(_notes(placement, source)),
+        headings=HEADINGS,
+        details=DETAILS,
+        placement=placement,
+        dpu=build,
+        tile_px=tile_px,
+        network=source,
+    )
+
+
+HEADINGS = {
+    "devices": "where the nodes run",
+    "refusals": "what is refused, by rule",
+    "cuts": "tensors that cross between host and DPU",
+    "remarks": "also to know",
+}
+DETAILS = frozenset({"nodes", "subgraphs", "summary"})
+"""Tables for a closer look: a line for each node."""
+
+
+def _notes(placement: Placement, source: Network) -> list[str]:
+    """Return what a reader must know of a network that was not quantised here."""
+    if not placement.note:
+        return []
+    refused = refusal(source.model)
+    note = OTHERS_NOTE if is_quantised(source.model) else placement.note
+    return [note, f"'quantize' refuses it: {refused}" if refused else "'quantize' accepts it"]
 
 
 def _rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:
-    """Every node, then the subgraphs, the tensors that cross, what else to know, and the counts."""
+    """Return all rows: devices, refusals, nodes, subgraphs, crossing tensors, remarks, counts."""
     npu = dpu.target.npu
-    nodes: list[Row] = []
+    nodes = [*_device_rows(placement, dpu), *_refusal_rows(placement)]
     for node in placement.nodes:
         nodes += _node_rows(node, placement, dpu)
     texts = remarks_on(placement, dpu, tile_px)
@@ -163,14 +165,32 @@ def _file_checks(model: onnx.ModelProto, dpu: Dpu) -> list[Check]:
     ]
 
 
-def _crossings(placement: Placement) -> list[str]:
-    pieces = len({node.subgraph for node in placement.nodes})
-    lines = [f"device subgraphs: {pieces}, DPU subgraphs: {placement.dpu_subgraphs}"]
-    for cut in placement.cuts:
-        size = "a size unknown" if cut.size_bytes is None else f"{cut.size_bytes / 1e6:.2f} MB"
-        direction = "to" if cut.onto_dpu else "from"
-        lines.append(f"{direction} the DPU: {cut.tensor}, {size} an image as int8")
-    return lines
+def _device_rows(placement: Placement, dpu: Dpu) -> list[Row]:
+    """Return a row for each device: how many nodes it runs, and which operators."""
+    operators: dict[str, Counter[str]] = {}
+    for node in placement.nodes:
+        device = _npu_words(node, placement, dpu) if dpu.target.npu else node.device
+        operators.setdefault(device, Counter())[node.op.op_type] += 1
+    rows = []
+    for device, counts in operators.items():
+        words = ", ".join(f"{name} {count}" for name, count in counts.most_common())
+        figures = {"count": _count(counts.total(), "node")}
+        rows.append(Row("devices", device, figures, {"operators": words}))
+    return rows
+
+
+def _refusal_rows(placement: Placement) -> list[Row]:
+    """Return a row for each rule that is broken: by how many nodes, the first one, and a remedy."""
+    broken: dict[str, list[tuple[PlacedNode, Finding]]] = {}
+    for node in placement.failed:
+        for breach in node.broken:
+            broken.setdefault(breach.text, []).append((node, breach.finding))
+    rows = []
+    for rule, breaches in broken.items():
+        node, finding = breaches[0]
+        words = {"first": f"{node.op.name}: {finding.reason}", "remedy": finding.remedy}
+        rows.append(Row("refusals", rule, {"count": _count(len(breaches), "node")}, words))
+    return rows
 
 
 def _node_rows(node: PlacedNode, placement: Placement, dpu: Dpu) -> list[Row]:

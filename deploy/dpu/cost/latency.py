@@ -36,7 +36,7 @@ from beers_deploy.dpu.cost.model import (
 )
 from beers_deploy.dpu.cost.work import Work, count_work, largest_map_bytes
 from beers_deploy.dpu.graph import Operation
-from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.profiles.figures import Figure, predicted, unavailable
 
 
@@ -183,17 +183,17 @@ def predict(
     """
     if placement.cutting:
         names = ", ".join(node.op.name for node in placement.cutting[:3])
-        remedy = "run 'beers-deploy check' for the reasons and remedies"
         raise ModelError(
-            "cost model", expected="a core that runs whole on the DPU", got=names, remedy=remedy
+            "The cost model needs a core that runs on the DPU as a whole, but the DPU refuses "
+            f"{printable(names)}. Run 'beers-deploy check' for the reasons and remedies."
         )
     constants = Constants.of(dpu)
     structure = Structure.of(dpu)
     works = count_work(placement.core, dpu)
     if not any(work.operations for work in works):
-        remedy = "give a network with convolutions"
         raise ModelError(
-            "cost model", expected="work for the DPU", got="no convolution", remedy=remedy
+            "The cost model finds no work for the DPU, because the network has no convolution. "
+            "Give a network with convolutions."
         )
     columns = Layers.of(works, dpu)
     # These are the factors of an owner's runs, and 1 without any.

@@ -20,11 +20,11 @@ from beers_deploy.dpu.cost.latency import Prediction, predict
 from beers_deploy.dpu.cost.model import OWN_SPEEDS
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.profiles.constant import Constant
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.figures import Row, predicted, published
 from beers_deploy.profiles.toml import read_json, unreadable
 
-EXAMPLE = 'write [{"model": "core.onnx", "configuration": "C32B3", "tile_px": 640, "fps": 9.5}]'
+EXAMPLE = 'Write [{"model": "core.onnx", "configuration": "C32B3", "tile_px": 640, "fps": 9.5}].'
 RUNS = 1000
 TILE_PX = (16, 1 << 16)
 FAR = 10_000
@@ -96,7 +96,7 @@ class OwnRuns:
 def read_own_runs(path: Path, dpu: Dpu) -> OwnRuns:
     """Compare the runs in a file with what is predicted of them on `dpu`'s board."""
     runs = [
-        _run(entry, path, f"{path.name}, run {number}", dpu)
+        _run(entry, path, f"Run {number} in {path.name}", dpu)
         for number, entry in enumerate(_read(path), 1)
     ]
     ratios = [
@@ -118,37 +118,37 @@ def _read(path: Path) -> Sequence[Mapping[str, object]]:
     try:
         runs = read_json(path)
     except (OSError, ValueError) as error:
-        fault = unreadable(path)
-        got = fault or str(error)
-        remedy = "check the path" if fault else EXAMPLE
-        raise OptionError(str(path), expected="a file of JSON", got=got, remedy=remedy) from error
+        if fault := unreadable(path):
+            message = f"{path} cannot be read: {fault}. Check the path."
+        else:
+            message = f"{path} is not a valid JSON file: {printable(str(error))}. {EXAMPLE}"
+        raise OptionError(message) from error
     if (
         not isinstance(runs, list)
         or not 0 < len(runs) <= RUNS
         or not all(isinstance(run, dict) for run in runs)
     ):
-        expected = f"a list of 1 to {RUNS} runs"
-        got = type(runs).__name__
-        raise OptionError(str(path), expected=expected, got=got, remedy=EXAMPLE)
+        found = f"a list of {len(runs)}" if isinstance(runs, list) else type(runs).__name__
+        raise OptionError(f"{path} must be a list of 1 to {RUNS} runs, got {found}. {EXAMPLE}")
     return runs
 
 
 def _run(entry: Mapping[str, object], path: Path, where: str, board: Dpu) -> Run:
     if "model" not in entry or set(entry) - KEYS:
-        expected = ", ".join(sorted(KEYS))
-        raise OptionError(where, expected=expected, got=str(sorted(entry)), remedy=EXAMPLE)
+        given = printable(", ".join(sorted(entry)) or "none")
+        others = ", ".join(sorted(KEYS - {"model"}))
+        raise OptionError(
+            f"{where} must have the key model, and may have {others}, got {given}. {EXAMPLE}"
+        )
     # onnxruntime's CPU provider runs the file on a processor: its rate says nothing of the DPU.
     if entry.get("provider") == "CPUExecutionProvider":
-        expected = "a run of the board"
-        got = "one of onnxruntime's CPU provider"
         raise OptionError(
-            where, expected=expected, got=got, remedy="measure it with the board's provider"
+            f"{where} is a run of onnxruntime's CPU provider, not of the board. Measure it with "
+            "the board's provider."
         )
     tile_px = _number(entry.get("tile_px", 640), "tile_px", TILE_PX, where)
     if tile_px != int(tile_px):
-        raise OptionError(
-            where, expected="tile_px in whole pixels", got=str(tile_px), remedy=EXAMPLE
-        )
+        raise OptionError(f"{where} must have tile_px in whole pixels, got {tile_px}. {EXAMPLE}")
     dpu = Dpu(
         board.target, *board.target.configuration(str(entry.get("configuration", "")) or None)
     )
@@ -169,6 +169,8 @@ def _number(value: object, key: str, ends: tuple[float, float], where: str) -> f
         or not isinstance(value, int | float)
         or not ends[0] <= value <= ends[1]
     ):
-        expected = f"{key} of {ends[0]:g} to {ends[1]:g}"
-        raise OptionError(where, expected=expected, got=repr(value), remedy=EXAMPLE)
+        raise OptionError(
+            f"{where} must have {key} of {ends[0]:g} to {ends[1]:g}, got "
+            f"{printable(repr(value))}. {EXAMPLE}"
+        )
     return float(value)

@@ -14,9 +14,10 @@ import numpy as np
 
 from beers_deploy.model.io.files import write_text
 from beers_deploy.model.raster.facts import Raster
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError, printable
 
 OPTION = "--fix-detectors"
+LINES = "Write lines 'column,row', counted from 0, with '*' as the row for a whole column."
 FOUND = "found"
 HEADER = ("column", "row", "band")
 ALL = "*"
@@ -119,16 +120,17 @@ def read_list(path: Path, raster: Raster) -> FaultList:
         path: of the file.
         raster: of the image.
     """
-    remedy = "write lines `column,row`, counted from 0, with `*` as the row for a whole column"
-    expected = f"'{FOUND}' or a list of faulty detectors"
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except OSError as error:
-        got = f"{path}: {error.strerror or error}"
-        raise OptionError(OPTION, expected=expected, got=got, remedy=remedy) from error
+        raise OptionError(
+            f"`fix_detectors` must be '{FOUND}' or a list of faulty detectors, but {path} cannot "
+            f"be read: {error.strerror or error}. {LINES}"
+        ) from error
     except UnicodeDecodeError as error:
         raise OptionError(
-            OPTION, expected=expected, got=f"{path}, which is no text", remedy=remedy
+            f"`fix_detectors` must be '{FOUND}' or a list of faulty detectors, but {path} is not "
+            f"a text file. {LINES}"
         ) from error
     faults = []
     for number, line in enumerate(lines, 1):
@@ -136,17 +138,19 @@ def read_list(path: Path, raster: Raster) -> FaultList:
         # Files of all bands have no column for the band, and so a shorter header.
         if not any(cells) or line.startswith("#") or cells in (HEADER, HEADER[:2]):
             continue
-        faults.append(_fault(f"{path}, line {number}", line, cells, raster))
+        faults.append(_fault(path, number, line, raster))
     if not faults:
-        raise OptionError(OPTION, expected=expected, got=f"{path} without any", remedy=remedy)
+        raise OptionError(
+            f"`fix_detectors` must be '{FOUND}' or a list of faulty detectors, but {path} lists "
+            f"none. {LINES}"
+        )
     return FaultList(tuple(sorted(set(faults))))
 
 
-def _fault(where: str, line: str, cells: tuple[str, ...], raster: Raster) -> Fault:
-    """Return the fault of one line."""
+def _fault(path: Path, number: int, line: str, raster: Raster) -> Fault:
+    """Return the fault of one line, the `number`-th of the file."""
     sizes = raster.width_px, raster.height_px, raster.bands + 1
-    expected = "column,row or column,row,band"
-    numbers = [_number(cell) for cell in cells]
+    numbers = [_number(cell.strip()) for cell in line.split(",")]
     # Bands count from 1, and no band may be '*': a line without a band holds for all.
     if (
         len(numbers) not in (2, 3)
@@ -154,17 +158,17 @@ def _fault(where: str, line: str, cells: tuple[str, ...], raster: Raster) -> Fau
         or numbers[:2] == [-1, -1]
         or numbers[2:] in ([-1], [0])
     ):
-        got = repr(line[:40])
         raise OptionError(
-            OPTION, expected=expected, got=f"{where}: {got}", remedy="correct or delete the line"
+            f"Line {number} of {path} must be column,row or column,row,band, got {line[:40]!r}. "
+            "Correct or delete the line."
         )
-    placed = [number for number in numbers if number is not None]
+    placed = [value for value in numbers if value is not None]
     # A line without a band has two numbers for the three sizes.
-    if any(number >= size for number, size in zip(placed, sizes, strict=False)):
-        image = f"{raster.width_px} columns, {raster.height_px} rows and {raster.bands} bands"
-        got = f"{where}: {line.strip()}"
+    if any(value >= size for value, size in zip(placed, sizes, strict=False)):
         raise OptionError(
-            OPTION, expected=f"pixels of an image of {image}", got=got, remedy="count from 0"
+            f"Line {number} of {path} ({printable(line.strip())}) lies outside the image of "
+            f"{raster.width_px} columns, {raster.height_px} rows and {raster.bands} bands. Count "
+            "columns and rows from 0."
         )
     return Fault(*placed)
 

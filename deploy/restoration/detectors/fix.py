@@ -4,6 +4,7 @@ The faults are those of a list, or found in a pass over the whole image before t
 restored: so the same command, resumed or not, replaces the same pixels.
 """
 
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,12 +12,13 @@ import numpy as np
 
 from beers_deploy.model.metrics.detector_lines import Stripes, constant_columns
 from beers_deploy.model.metrics.detector_pixels import PATCH_PX, wrong_pixels
-from beers_deploy.model.progress import Log
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.source import Source, strips
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.restoration.detectors.fault_list import FOUND, Fault, FaultList, read_list
 from beers_deploy.restoration.detectors.look import as_floats, look_at_detectors, value_steps
+
+logger = logging.getLogger(__name__)
 
 REACH_PX = 16
 """How far away a sound neighbour may lie."""
@@ -43,24 +45,21 @@ a column, aslant.
 """
 
 
-def faults_of(source: Source, wanted: str, name: str, log: Log) -> FaultList:
+def faults_of(source: Source, wanted: str, name: str) -> FaultList:
     """Return the faults that `restore --fix-detectors` names.
 
     Args:
         source: the image.
         wanted: 'found', or the file of a list; empty for none.
         name: of the image, for messages.
-        log: is told how many will be replaced.
     """
     if not wanted:
         return FaultList(())
     faults = (
         find_faults(source, name) if wanted == FOUND else read_list(Path(wanted), source.raster)
     )
-    log(
-        f"faulty detectors: {faults.words} {'found' if wanted == FOUND else 'listed'}, to be "
-        "interpolated"
-    )
+    origin = "found" if wanted == FOUND else "listed"
+    logger.info("faulty detectors: %s %s, to be interpolated", faults.words, origin)
     return faults
 
 
@@ -90,9 +89,10 @@ def find_faults(source: Source, name: str) -> FaultList:
         (lines if fault.column < 0 else pixels).add(fault)
 
         if len(pixels) > MANY * raster.height_px * raster.width_px * raster.bands:
-            got = f"more than {MANY:.0%} of the pixels alone"
-            remedy = "list the faulty ones in a file"
-            raise ImageError(name, expected="few faulty pixels", got=got, remedy=remedy)
+            raise ImageError(
+                f"{name} has too many faulty pixels: more than {MANY:.0%}, apart from those of "
+                "faulty columns and rows. List the faulty pixels in a file."
+            )
     columns = {(fault.column, fault.band) for fault in lines if fault.row < 0}
     rows = {(fault.row, fault.band) for fault in lines if fault.column < 0}
     alone = {

@@ -1,15 +1,17 @@
 """What `restore` says of the faults of detectors: sentences and figures."""
 
+import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
 from beers_deploy.model.metrics.detector_lines import Stripes
 from beers_deploy.model.metrics.detector_phases import COLOUR, Pattern
-from beers_deploy.model.progress import Log
 from beers_deploy.model.raster.source import Source
 from beers_deploy.profiles.figures import Figure, measured, unavailable
 from beers_deploy.restoration.detectors.fault_list import FOUND, OPTION
 from beers_deploy.restoration.detectors.look import BandFaults, look_at_detectors
+
+logger = logging.getLogger(__name__)
 
 SHARPENS = "restoration about doubles it"
 EQUALISE = "equalise the image first"
@@ -22,17 +24,16 @@ NAMED = 3
 """Places that a sentence names."""
 
 
-def warn_of_detectors(source: Source, full_scale: float, log: Log) -> Mapping[str, Figure]:
-    """Look for faults of detectors, log a sentence for each kind, and return the figures.
+def warn_of_detectors(source: Source, full_scale: float) -> Mapping[str, Figure]:
+    """Look for faults of detectors, log a warning for each kind, and return the figures.
 
     Args:
         source: the image.
         full_scale: the pixel value from which on a pixel is no measurement.
-        log: is told of each kind.
     """
     bands = look_at_detectors(source, full_scale)
     for sentence in sentences(bands):
-        log(sentence)
+        logger.warning(sentence)
     return figures(bands)
 
 

@@ -23,7 +23,7 @@ from beers_deploy.restoration.radiometry import require_room
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 from beers_deploy.restoration.tiles.missing import fill_from_nearest
 
-NAME = "image"
+NAME = "The image"
 """What messages call an image that came without a file."""
 
 Window = tuple[slice, slice, slice]
@@ -316,14 +316,13 @@ def checked_strip(
     # Where no pixel is valid both are 0, which lies within full scale.
     low, high = (float(extreme(pixels, where=valid, initial=0)) for extreme in (np.min, np.max))
     if low < 0 or (high > full_scale and not (clips and np.isfinite(high))):
-        where = f"{name}, rows {top} to {top + pixels.shape[1] - 1}"
-        remedy = (
-            "give the sensor's highest number as `full_scale`, or mark missing pixels as nodata"
+        too_large = (
+            "Give the sensor's highest number as `full_scale`, or mark missing pixels as nodata."
         )
-        got = f"values from {low:g} to {high:g}"
-        remedy = remedy_outside(low, high, remedy)
         raise ImageError(
-            where, expected=f"digital numbers of 0 to {full_scale:g}", got=got, remedy=remedy
+            f"{name} has values from {low:g} to {high:g} in rows {top} to "
+            f"{top + pixels.shape[1] - 1}, outside the digital numbers of 0 to {full_scale:g}. "
+            f"{remedy_outside(low, high, too_large)}"
         )
     return Strip(top, pixels, missing, high > full_scale, left)
 

@@ -115,9 +115,10 @@ def tiles_by_factor(
 
 def _require_shape(restored: np.ndarray, shape: tuple[int, ...]) -> None:
     if restored.shape != shape:
-        expected = f"a result of {times(shape)}, as its file says"
-        remedy = "export it for images of any size, or check its sizes"
-        raise ModelError("ONNX model", expected=expected, got=times(restored.shape), remedy=remedy)
+        raise ModelError(
+            f"The network returned a result of {times(restored.shape)}, but its file states "
+            f"{times(shape)}. Export it for images of any size, or check its sizes."
+        )
 
 
 def restore_window(dn: np.ndarray, infer: Infer, full_scale: float = MAX_DN) -> np.ndarray:
@@ -138,10 +139,7 @@ def restore_window(dn: np.ndarray, infer: Infer, full_scale: float = MAX_DN) -> 
         restored = infer(image)[0] * np.float32(full_scale)
     if not np.isfinite(restored).all():
         raise ImageError(
-            "restored tile",
-            expected="finite pixels",
-            got="NaN",
-            remedy="check the model with 'gate'",
+            "The network returned NaN or infinite pixels for a tile. Check the model with 'gate'."
         )
     restored = np.clip(restored, 0, np.float32(full_scale))
     return np.asarray(restored[0] if dn.ndim == 2 else restored)

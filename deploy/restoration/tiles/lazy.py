@@ -14,11 +14,12 @@ import onnx
 
 from beers_deploy.model.consistency import RAW_REACH_PX, REACH_PX
 from beers_deploy.model.raster.facts import Raster
-from beers_deploy.network import Network
 from beers_deploy.quant.tiling.walk import Tiling
-from beers_deploy.restoration.options import Options
+from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.plan import Plan, Span, plan_for
+from beers_deploy.restoration.prepare import NetworkPipeline
 from beers_deploy.restoration.radiometry import full_scale_of
+from beers_deploy.restoration.reading import Reading
 from beers_deploy.restoration.runtime import Packed
 from beers_deploy.restoration.steps import consistency_steps, exposed_networks
 from beers_deploy.restoration.tiles.engine import NAME, Restorer, checked_strip
@@ -28,7 +29,7 @@ from beers_deploy.restoration.tiles.rows import Steps
 
 @dataclass(frozen=True)
 class Task:
-    """What all tiles of a lazy array share, as it is sent to Dask's workers.
+    """What all tiles of a lazy array, or of one band of it, share: Dask's workers get it.
 
     It holds networks, not their paths: a worker on another machine has no such files.
 
@@ -58,29 +59,42 @@ class Task:
         )
 
 
-def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
-    """A lazy (bands, H, W) array of Dask; errors in options and model come at once, in pixels when
-    it is computed.
+def restore_lazily(bands: Any, raster: Raster, pipeline: NetworkPipeline, reading: Reading) -> Any:
+    """Return a lazy (bands, H, W) array of Dask.
 
-    A tile is finished from its own pixels and those that the network gave of the tiles around it.
+    Errors in options and model come at once, those in pixels when it is computed. A tile is
+    finished from its own pixels and those that the network returned for the tiles around it.
     """
     da: Any = import_module("dask.array")
     delayed: Any = import_module("dask").delayed
-    network = Network.load(options.network)
-    plan = plan_for(network, raster.shape, options)
+    networks = in_order(pipeline.networks, raster)
+    require_alike(networks)
+    plan = plan_for(networks[0], raster.shape, pipeline.tiles)
     # The type alone decides the scale at once. Pixels may lead to a refusal later, but not to
     # another scale.
-    full_scale = full_scale_of(NAME, raster, (), options.full_scale, options.sensor_bits).value
-    about = options, raster, plan.tiling, full_scale
+    full_scale = full_scale_of(NAME, raster, (), reading.full_scale, reading.sensor_bits).value
+    engine = pipeline.engine
 
     def packed(model: onnx.ModelProto, at_first_call: bool) -> Packed:  # noqa: ARG001
-        return Packed(model.SerializeToString(), options.runtime, options.threads or 1)
+        return Packed(model.SerializeToString(), engine.runtime, engine.threads or 1)
 
-    exposed = exposed_networks([network], options, plan.tiling, full_scale, packed)
-    steps, _ = consistency_steps(*about)
-    task = delayed(
-        Task(raster, exposed, options.full_scale, options.sensor_bits, plan.tiling, steps)
-    )
+    around = pipeline.around
+    exposed = exposed_networks(networks, around, plan.tiling, full_scale, packed)
+    steps, _ = consistency_steps(around, reading.sensors, raster, plan.tiling, full_scale)
+    # A window holds one band only, so a task has the network and the step of that band.
+    tasks = [
+        delayed(
+            Task(
+                raster,
+                exposed[band : band + 1],
+                reading.full_scale,
+                reading.sensor_bits,
+                plan.tiling,
+                steps if len(networks) < 2 else steps[band : band + 1],
+            )
+        )
+        for band in range(len(networks))
+    ]
     reach_px = REACH_PX if steps else 0
     tile = delayed(restore_tile)
     finish = delayed(finish_tile)
@@ -90,14 +104,17 @@ def restore_lazily(bands: Any, raster: Raster, options: Options) -> Any:
         place: _read(bands, plan, margin_px, *place)
         for place in product(groups, plan.rows, plan.columns)
     }
-    restored = {place: tile(task, *windows[place], *place[1:]) for place in windows}
+    restored = {
+        place: tile(tasks[place[0] % len(tasks)], *windows[place], *place[1:]) for place in windows
+    }
 
     def block(group: int, row: Span, column: Span) -> Any:
         down = [tile for tile in plan.rows if _near(tile, row, reach_px)]
         across = [tile for tile in plan.columns if _near(tile, column, reach_px)]
         around = [[restored[group, down_tile, tile] for tile in across] for down_tile in down]
         at = down[0].keep_start, across[0].keep_start
-        finished = finish(task, *windows[group, row, column], around, at, row, column)
+        window = windows[group, row, column]
+        finished = finish(tasks[group % len(tasks)], *window, around, at, row, column)
         sides = ((span.keep_stop - span.keep_start) * plan.scale for span in (row, column))
         return da.from_delayed(finished, (plan.tiling.channels_out, *sides), raster.out_dtype)
 

@@ -277,10 +277,9 @@ def restore_floats(
     NaN is a missing pixel, and stays.
     """
     if plan.out_shape != (1, *dn.shape):
-        got = f"one of {times(plan.out_shape)}"
-        remedy = "restore files with it, or arrays by beers_deploy.library"
         raise ModelError(
-            "ONNX model", expected=f"a result of {times(dn.shape)}", got=got, remedy=remedy
+            f"The network returns a result of {times(plan.out_shape)} for an image of "
+            f"{times(dn.shape)}. Restore files with it, or arrays with beers_deploy.restore."
         )
     pixels = np.asarray(dn, np.float32)[None]
     _, height_px, width_px = pixels.shape

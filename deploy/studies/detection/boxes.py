@@ -155,9 +155,10 @@ class Letterbox:
         width = round(width_px * share)
         self._inner = (height, width)
         if min(self._inner) < 1:
-            got = f"{height_px} x {width_px} px"
-            expected = f"an image that keeps a pixel in a detector's input of {size_px} px"
-            raise OptionError("image", expected=expected, got=got, remedy="cut it into squares")
+            raise OptionError(
+                f"The image of {height_px} x {width_px} px is too narrow: its short side has less "
+                f"than a pixel in the detector's input of {size_px} px. Cut it into squares."
+            )
         top = (size_px - height) // 2
         left = (size_px - width) // 2
         self._border = (top, size_px - height - top), (left, size_px - width - left), (0, 0)

@@ -19,7 +19,7 @@ import numpy as np
 import onnx
 from onnxruntime import InferenceSession
 
-from beers_deploy.profiles.errors import CODE_FAULTS, ModelError, OptionError
+from beers_deploy.profiles.errors import CODE_FAULTS, LONGEST, ModelError, OptionError, printable
 from beers_deploy.quant.onnx_file import constants, fixed_tile_px, load_onnx, metadata
 from beers_deploy.quant.session import open_session
 from beers_deploy.studies.detection.boxes import MOST, Boxes, Letterbox, suppress
@@ -36,8 +36,7 @@ LITERAL = 1 << 16
 """Characters of a Python literal in the metadata; the names of 1 200 classes take half of it."""
 ROUNDING = 1e-3
 """By how much a score may pass 0 or 1."""
-REMEDY = "export it by Ultralytics for detection, with format='onnx'"
-OPTION = "classes"
+REMEDY = "Export it with Ultralytics for detection, with format='onnx'."
 
 
 @dataclass(frozen=True)
@@ -76,14 +75,20 @@ class Detector:
         """
         if not _is_read(output.shape, len(self.names)):
             sizes = " x ".join(map(str, output.shape))
-            raise _refused("an answer of the sizes that its file states", sizes)
+            raise ModelError(
+                f"The detector's output must have the sizes that its file states, but it has "
+                f"{sizes}. {REMEDY}"
+            )
         if not np.isfinite(output).all():
-            raise _refused("finite boxes and scores", "NaN or infinity")
+            raise ModelError(f"The detector returns NaN or infinity as box or score. {REMEDY}")
         # A raw answer has at least the 21 anchors of an input of 32 px.
         final = output.shape[2] == 6
         scores = output[:, :, 4] if final else output[:, 4:]
         if scores.min(initial=0) < -ROUNDING or scores.max(initial=0) > 1 + ROUNDING:
-            raise _refused("scores in 0 to 1", "others: logits or an objectness perhaps")
+            raise ModelError(
+                f"The detector returns scores outside 0 to 1, perhaps logits or an objectness. "
+                f"{REMEDY}"
+            )
         return _final(output[0], len(self.names)) if final else suppress(_raw(output[0]))
 
 
@@ -101,7 +106,10 @@ def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> D
     names = class_names(about.get("names"))
     if not names:
         stated = repr(about["names"])[:80] if "names" in about else "none"
-        raise _refused("the names of its classes in its metadata, {0: 'ship', ...}", stated, path)
+        raise ModelError(
+            f"The metadata of {path} must have the names of its classes, such as "
+            f"{{0: 'ship', ...}}, but it has {stated}. {REMEDY}"
+        )
     _require_layout(model, about.get("task", "detect"), len(names), path)
     size = _size_px(fixed_tile_px(model), about.get("imgsz"), size_px, path)
     return Detector(names, size, _flag(model), partial(_answer, open_session(model, threads), path))
@@ -114,10 +122,9 @@ def _answer(session: InferenceSession, path: Path, image: np.ndarray) -> np.ndar
         raise
     except Exception as error:
         # onnxruntime raises a class of its own for each status code.
-        got = " ".join(str(error).split())[:160]
-        remedy = "export it again, for one size of image"
+        reason = " ".join(str(error).split())[:160]
         raise ModelError(
-            str(path), expected="a detector that runs", got=got, remedy=remedy
+            f"The detector {path} does not run: {reason}. Export it again, for one size of image."
         ) from error
 
 
@@ -135,13 +142,13 @@ def _require_layout(model: onnx.ModelProto, task: Any, classes: int, path: Path)
     outputs = [_sizes(value) for value in model.graph.output]
     if task == "detect" and channels == [3] and len(outputs) == 1 and _is_read(outputs[0], classes):
         return
-    layout = (
-        f"for RGB, 1 x {4 + classes} x anchors for {classes} classes (raw) or 1 x N x 6 "
-        "(nms=True or end2end)"
-    )
     shapes = ", ".join(" x ".join(map(str, sizes)) for sizes in outputs)
-    got = f"task {task}, {' '.join(map(str, channels))} channels, output {shapes}"
-    raise _refused(f"a detector's output as Ultralytics exports it {layout}", got, path)
+    found = f"task {task}, {' '.join(map(str, channels))} channels, output {shapes}"
+    raise ModelError(
+        f"{path} must have a detector's output as Ultralytics exports it for RGB, "
+        f"1 x {4 + classes} x anchors for {classes} classes (raw) or 1 x N x 6 (nms=True or "
+        f"end2end), but it has {printable(found)}. {REMEDY}"
+    )
 
 
 def _is_read(shape: Sequence[int], classes: int) -> bool:
@@ -158,15 +165,18 @@ def _sizes(value: onnx.ValueInfoProto) -> list[int]:
 
 def _size_px(fixed: int | None, stated: Any, requested: int | None, path: Path) -> int:
     if fixed and requested not in (None, fixed):
-        expected = f"{fixed}, which {path.name} is fixed to"
-        remedy = f"export it for {requested} px, or leave `side` out"
-        raise OptionError("side", expected=expected, got=f"{requested}", remedy=remedy)
+        raise OptionError(
+            f"`side` must be {fixed} px, which {path.name} is fixed to, but it is {requested} px. "
+            f"Export the detector for {requested} px, or leave `side` out."
+        )
     if isinstance(stated, list) and len(stated) == 2 and stated[0] == stated[1]:
         stated = stated[0]
     size = fixed or requested or stated
     if not isinstance(size, int) or size < 1:
-        expected = "the side of the detector's square input in px"
-        raise OptionError("side", expected=expected, got=f"{size}", remedy="say it")
+        raise OptionError(
+            "The side of the detector's square input must be a number of px, but "
+            f"{path.name} states {printable(str(size))}. Give `side`."
+        )
     return size
 
 
@@ -203,13 +213,12 @@ def _final(output: np.ndarray, classes: int) -> Boxes:
     """Rows with a score that counts, the best first: the rest pads the list with zeros."""
     rows = output[output[:, 4] > LEAST_SCORE]
     if not np.isin(rows[:, 5], np.arange(classes)).all():
-        raise _refused(f"classes from 0 to {classes - 1} in its sixth column", "others")
+        raise ModelError(
+            f"The detector returns classes other than 0 to {classes - 1} in its sixth column. "
+            f"{REMEDY}"
+        )
     rows = rows[np.argsort(-rows[:, 4], kind="stable")[:MOST]]
     return Boxes.of(rows[:, :4], rows[:, 5], rows[:, 4])
-
-
-def _refused(expected: str, got: str, path: Path | str = "detector") -> ModelError:
-    return ModelError(str(path), expected=expected, got=got, remedy=REMEDY)
 
 
 def letters(name: str) -> str:
@@ -240,9 +249,10 @@ def parse_classes(text: str) -> dict[str, str]:
     ]
     sound = pairs and all(len(pair) == 2 and all(map(letters, pair)) for pair in pairs)
     if not sound or len({letters(pair[0]) for pair in pairs}) < len(pairs):
-        expected = "LABELLED=DETECTOR,..., each labelled class once"
-        remedy = "write car=vehicle,minibus=vehicle"
-        raise OptionError(OPTION, expected=expected, got=repr(text), remedy=remedy)
+        raise OptionError(
+            "`classes` must be LABELLED=DETECTOR,..., each labelled class once, such as "
+            f"car=vehicle,minibus=vehicle, but it is {printable(repr(text))}."
+        )
     return dict(pairs)
 
 
@@ -262,10 +272,9 @@ def class_numbers(
     """
     number = {letters(name): i for i, name in enumerate(detector)}
     if len(number) < len(detector):
-        expected = "classes told apart by their letters"
-        got = "two classes of the same letters"
         raise OptionError(
-            "detector", expected=expected, got=got, remedy="export one whose classes differ"
+            "`detector` must have classes that differ in their letters, but two have the same "
+            "letters. Export one whose classes differ."
         )
     for whose, requested, names in (
         ("the labelled", given, labelled),
@@ -273,9 +282,9 @@ def class_numbers(
     ):
         for name in requested:
             if letters(name) not in map(letters, names):
-                expected = f"one of {whose} classes ({', '.join(names)})"
                 raise OptionError(
-                    OPTION, expected=expected, got=repr(name), remedy="correct the name"
+                    f"{printable(repr(name))} in `classes` is not one of {whose} classes "
+                    f"({printable(', '.join(names), 4 * LONGEST)}). Correct the name."
                 )
     detector_letters = {letters(name): letters(own) for name, own in given.items()}
     labelled_letters = [letters(name) for name in labelled]
@@ -283,9 +292,9 @@ def class_numbers(
         [number.get(detector_letters.get(key, key), -1) for key in labelled_letters], np.int64
     )
     if not (numbers >= 0).any():
-        expected = f"a labelled class that the detector knows ({', '.join(detector)})"
-        remedy = f"say which is which: {OPTION} LABELLED=DETECTOR"
         raise OptionError(
-            OPTION, expected=expected, got=", ".join(labelled) or "none", remedy=remedy
+            f"The labelled classes ({printable(', '.join(labelled)) or 'none'}) have no class in "
+            f"common with the detector ({printable(', '.join(detector), 4 * LONGEST)}). Give "
+            "`classes` as LABELLED=DETECTOR."
         )
     return numbers

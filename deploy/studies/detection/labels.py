@@ -23,7 +23,7 @@ import numpy as np
 from beers_deploy.model.io.files import IMAGE_SUFFIXES
 from beers_deploy.model.raster.images import image_size_px, list_images
 from beers_deploy.model.raster.index import parse_xml
-from beers_deploy.profiles.errors import MissingExtraError, OptionError
+from beers_deploy.profiles.errors import MissingExtraError, OptionError, printable
 from beers_deploy.profiles.toml import read_json, read_whole
 from beers_deploy.studies.detection.boxes import Boxes, areas
 from beers_deploy.studies.detection.detector import class_names, letters
@@ -32,7 +32,8 @@ SPLITS = ("test", "val", "valid", "train")
 """Where no split is asked for, the first that is there: what a detector was
 trained on comes last.
 """
-LAYOUTS = "labels as VOC (.xml), COCO (.json) or YOLO (.txt)"
+LAYOUTS = "VOC (.xml), COCO (.json) or YOLO (.txt) labels"
+CORRECT = "Correct the labels."
 LABEL_BYTES = 1 << 23
 NAMES_BYTES = 1 << 16
 """Limits of a file of labels (25 000 boxes of XML), and of data.yaml, of which PyYAML reads so much
@@ -101,7 +102,7 @@ def _image_folder(top: Path, split: str | None) -> Path:
             if _holds(path, IMAGE_SUFFIXES):
                 return path
     if split:
-        raise _faulty(top, f"images of the split {split!r}", "none", "name a split that is there")
+        raise OptionError(f"{top} has no images of the split {split!r}. Name a split that it has.")
     return top / "images" if (top / "images").is_dir() else top
 
 
@@ -116,12 +117,17 @@ def _labels_near(top: Path, folder: Path) -> Path:
             return path
         json_files = sorted(path.glob("*.json"))
         if len(json_files) > 1:
-            raise _faulty(path, "one file of labels", f"{len(json_files)}", "name it as `labels`")
+            raise OptionError(
+                f"{path} has {len(json_files)} JSON files, but one file of labels is needed. Name "
+                "it as `labels`."
+            )
         if json_files:
             return json_files[0]
     # This call says so where there is no image either.
     list_images(folder)
-    raise _faulty(folder, LAYOUTS, "none beside the images", "give them as `labels`")
+    raise OptionError(
+        f"There are no labels for the images in {folder}. Give {LAYOUTS} as `labels`."
+    )
 
 
 def _holds(folder: Path, suffixes: Iterable[str], but: str = "") -> bool:
@@ -132,20 +138,23 @@ def _holds(folder: Path, suffixes: Iterable[str], but: str = "") -> bool:
 
 def _read_each(images: Sequence[Path], where: Path, named_in: Sequence[Path]) -> list[_File]:
     if not where.is_dir():
-        raise _faulty(
-            where, LAYOUTS, "another file" if where.exists() else "no such folder", "give a folder"
-        )
+        fault = "is another file" if where.exists() else "does not exist"
+        raise OptionError(f"{where} {fault}. Give a folder of {LAYOUTS}.")
     names_there = {path.name for path in where.iterdir()}
     absent = [f"{image.stem}.xml" for image in images if f"{image.stem}.xml" not in names_there]
     if not absent:
         return [_read_voc(image, where / f"{image.stem}.xml") for image in images]
     if len(absent) < len(images):
-        got = f"{len(absent)} of {len(images)} missing, the first {absent[0]}"
-        remedy = "leave those images out, or give them files without objects"
-        raise _faulty(where, "a file of labels for every image", got, remedy)
+        raise OptionError(
+            f"{where} must have a file of labels for every image, but {len(absent)} of "
+            f"{len(images)} are missing, the first {absent[0]}. Leave those images out, or give "
+            "them files without objects."
+        )
     if not any(f"{image.stem}.txt" in names_there for image in images):
-        got = f"none named as one of the {len(images)} images"
-        raise _faulty(where, LAYOUTS, got, "name each file as its image")
+        raise OptionError(
+            f"{where} has no {LAYOUTS} named as one of the {len(images)} images. Name each file "
+            "as its image."
+        )
     names = yolo_names(named_in)
     return [_read_yolo(image, where / f"{image.stem}.txt", names) for image in images]
 
@@ -167,9 +176,9 @@ def _labelled_set(files: Sequence[_File], notes: Sequence[str] = ()) -> Labelled
         lost += [one.source.name] * (len(labelled) - len(inside))
         images.append((one.image, inside))
     if not any(len(truth) for _, truth in images):
-        got = f"none on {len(images)} images"
         raise OptionError(
-            "labels", expected="one object at least", got=got, remedy="check the labels"
+            f"The labels must have at least one object, but they have none on {len(images)} "
+            "images. Check the labels."
         )
     remarks = [*notes, *_remarks([truth for _, truth in images], lost)]
     return LabelledSet(images, names, remarks)
@@ -180,9 +189,10 @@ def _size_px(one: _File) -> tuple[int, int]:
     height, width = image_size_px(one.image)
     # Boxes in pixels fit only the image that they were drawn on.
     if min(one.size_px) > 0 and one.size_px != (height, width):
-        expected = f"labels of an image of {height} x {width} px"
-        got = f"{one.size_px[0]:g} x {one.size_px[1]:g} px"
-        raise _faulty(one.source, expected, got, "give the image that was labelled")
+        raise OptionError(
+            f"{one.source} labels an image of {one.size_px[0]:g} x {one.size_px[1]:g} px, but the "
+            f"image has {height} x {width} px. Give the image that was labelled."
+        )
     return height, width
 
 
@@ -232,16 +242,16 @@ def _read_voc_tree(folder: Path, split: str | None) -> list[_File]:
         # A list of one class has a number behind each name.
         stems = sorted({line.split()[0] for line in _lines(lists[list_name])})
     elif split:
-        raise _faulty(
-            folder,
-            f"one of its splits ({', '.join(lists) or 'none'})",
-            repr(split),
-            "name one of them",
+        raise OptionError(
+            f"`split` must be one of the splits of {folder} ({', '.join(lists) or 'none'}), but "
+            f"it is {split!r}."
         )
     absent = [stem for stem in stems if stem not in images]
     if absent:
-        got = f"{len(absent)} of {len(stems)} missing, the first {absent[0]!r}"
-        raise _faulty(folder, f"every image of {list_name}", got, "unpack the images whole")
+        raise OptionError(
+            f"{folder} must have every image of {list_name}, but {len(absent)} of {len(stems)} "
+            f"are missing, the first {printable(repr(absent[0]))}. Unpack all images."
+        )
     return [_read_voc(images[stem], labels / f"{stem}.xml") for stem in stems]
 
 
@@ -251,10 +261,12 @@ def _read_voc(image: Path, labels: Path) -> _File:
         root = parse_xml(text)
     except (ValueError, LookupError, RecursionError) as error:
         # A LookupError is that of an unknown encoding.
-        raise _faulty(labels, "plain XML", " ".join(str(error).split())[:100]) from error
+        reason = " ".join(str(error).split())[:100]
+        raise OptionError(f"{labels} is not plain XML: {reason}. {CORRECT}") from error
     if root.tag != "annotation":
-        raise _faulty(
-            labels, "Pascal VOC, an 'annotation'", f"<{root.tag}>"[:80], "give labels of VOC"
+        raise OptionError(
+            f"{labels} must be Pascal VOC, an 'annotation', but it is {f'<{root.tag}>'[:80]}. "
+            "Give labels of VOC."
         )
     height, width = _numbers(
         [root.findtext(f"size/{name}", "0") for name in ("height", "width")], labels, "size"
@@ -267,7 +279,7 @@ def _read_voc(image: Path, labels: Path) -> _File:
 def _voc_box(entry: ET.Element, path: Path) -> Box:
     name = (entry.findtext("name") or "").strip()
     if not name:
-        raise _faulty(path, "a name for every object", "none")
+        raise OptionError(f"{path} has an object without a name. {CORRECT}")
     corners = [entry.findtext(f"bndbox/{corner}", "none") for corner in CORNERS]
     left, top, right, bottom = _numbers(corners, path, f"{', '.join(CORNERS)} of a {name!r}")
     # VOC's corners count pixels from 1 and belong to the box.
@@ -306,18 +318,16 @@ def _read_coco(labels: Path, folder: Path) -> tuple[list[_File], list[str]]:
             if (path := _inside(folder, entry["file_name"]))
         ]
     except (OSError, LookupError, TypeError, ValueError, OverflowError) as error:
-        got = f"{type(error).__name__}: {' '.join(str(error).split())[:100]}"
-        remedy = "give COCO's JSON file"
-        raise _faulty(
-            labels, "COCO's lists of images, annotations and categories", got, remedy
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:100]}"
+        raise OptionError(
+            f"{labels} must have COCO's lists of images, annotations and categories, but they "
+            f"cannot be read ({reason}). Give COCO's JSON file."
         ) from error
     listed = len(content["images"])
     if not files:
-        raise _faulty(
-            labels,
-            f"its images in {folder}",
-            f"none of {listed}",
-            "give the folder that holds them",
+        raise OptionError(
+            f"None of the {listed} images that {labels} lists is in {folder}. Give the folder "
+            "that holds them."
         )
     absent = listed - len(files)
     if not absent:
@@ -345,15 +355,20 @@ def _read_yolo(image: Path, labels: Path, names: Sequence[str]) -> _File:
 def _yolo_box(line: str, path: Path, names: Sequence[str], size_px: tuple[int, int]) -> Box:
     words = line.split()
     if len(words) != 5 and (len(words) < 7 or len(words) % 2 == 0):
-        raise _faulty(path, "YOLO's 'class cx cy w h'", repr(line[:80]))
+        raise OptionError(
+            f"A line of {path} must be YOLO's 'class cx cy w h', but it is {line[:80]!r}. {CORRECT}"
+        )
     number, *shares = _numbers(words, path, "class and coordinates")
     if number not in range(len(names)):
-        expected = f"a class from 0 to {len(names) - 1}"
-        remedy = "name it in data.yaml or classes.txt"
-        raise _faulty(path, f"{expected}, of which there is a name", words[0][:20], remedy)
+        raise OptionError(
+            f"{path} has the class {words[0][:20]}, but only classes from 0 to {len(names) - 1} "
+            "have a name. Name it in data.yaml or classes.txt."
+        )
     if min(shares) < -SPAN or max(shares) > 1 + SPAN:
-        remedy = "divide pixels by the image's width and height"
-        raise _faulty(path, "coordinates as shares of the image, 0 to 1", repr(line[:80]), remedy)
+        raise OptionError(
+            f"{path} must have coordinates as fractions of the image, 0 to 1, but it has "
+            f"{line[:80]!r}. Divide pixels by the image's width and height."
+        )
     # The size is height and width, and the points are x and y.
     points = np.reshape(shares, (-1, 2)) * size_px[::-1]
     if len(shares) == 4:
@@ -372,10 +387,10 @@ def yolo_names(folders: Sequence[Path]) -> tuple[str, ...]:
                 return names
         if (folder / "classes.txt").is_file():
             return tuple(line.strip() for line in _lines(folder / "classes.txt"))
-    expected = "data.yaml or classes.txt with the names of the classes"
     places = ", ".join(map(str, folders))
     raise OptionError(
-        "YOLO labels", expected=expected, got=f"neither in {places}", remedy="add one"
+        "YOLO labels need data.yaml or classes.txt with the names of the classes, but neither is "
+        f"in {places}. Add one."
     )
 
 
@@ -384,21 +399,23 @@ def _yaml_names(path: Path) -> tuple[str, ...]:
     try:
         import yaml  # type: ignore[import-untyped]  # its stubs are one more package, for one function
     except ImportError as error:
-        got = "no such package"
-        remedy = "pip install 'beers-deploy[detect]', or write classes.txt"
         raise MissingExtraError(
-            str(path), expected="PyYAML to read it", got=got, remedy=remedy
+            f"{path} cannot be read, because the package PyYAML is not installed. Run pip install "
+            "'beers-deploy[detect]', or write classes.txt."
         ) from error
     text = _read_bytes(path, NAMES_BYTES)
     try:
         content: Any = yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise _faulty(path, "YAML", " ".join(str(error).split())[:100]) from error
+        reason = " ".join(str(error).split())[:100]
+        raise OptionError(f"{path} is not YAML: {reason}. {CORRECT}") from error
     if not isinstance(content, dict) or "names" not in content:
         return ()
     names = class_names(content["names"])
     if not names:
-        raise _faulty(path, "names: a list, or a table by number from 0", "other names")
+        raise OptionError(
+            f"The names in {path} must be a list, or a table by number from 0. {CORRECT}"
+        )
     return names
 
 
@@ -411,9 +428,8 @@ def _read_bytes(path: Path, limit_bytes: int = LABEL_BYTES) -> bytes:
     try:
         return read_whole(path, limit_bytes)
     except (OSError, ValueError) as error:
-        raise _faulty(
-            path, "a file of labels", getattr(error, "strerror", None) or str(error)
-        ) from error
+        reason = getattr(error, "strerror", None) or str(error)
+        raise OptionError(f"{path} is not a file of labels: {reason}. {CORRECT}") from error
 
 
 def _numbers(texts: Sequence[str], path: Path, what: str) -> list[float]:
@@ -422,9 +438,8 @@ def _numbers(texts: Sequence[str], path: Path, what: str) -> list[float]:
     except ValueError:
         numbers = [math.nan]
     if not all(map(math.isfinite, numbers)):
-        raise _faulty(path, f"numbers as {what}", repr(" ".join(texts))[:80])
+        raise OptionError(
+            f"{path} must have numbers as {printable(what)}, but it has "
+            f"{repr(' '.join(texts))[:80]}. {CORRECT}"
+        )
     return numbers
-
-
-def _faulty(path: Path, expected: str, got: str, remedy: str = "correct the labels") -> OptionError:
-    return OptionError(str(path), expected=expected, got=got, remedy=remedy)

@@ -13,13 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from beers_deploy.model.io.pictures import stretch_of
-from beers_deploy.model.progress import Log, no_log, once, steps
+from beers_deploy.model.progress import steps
 from beers_deploy.model.raster.images import site_of
 from beers_deploy.model.simulator.acquire import acquire_padded
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import read_scene
+from beers_deploy.network import SensorLike
 from beers_deploy.profiles.sensor import Instrument, Sensor
-from beers_deploy.profiles.sensor_file import load_sensor, reference_beside
+from beers_deploy.profiles.sensor_file import reference_beside
 from beers_deploy.studies.detection.average_precision import (
     Figures,
     Hits,
@@ -154,12 +155,11 @@ class Comparison:
 def run_study(
     detector: Detector,
     scenes: Sequence[LabelledScene],
-    sensors: Sequence[str],
+    sensors: Sequence[Sensor],
     methods: Sequence[str],
     *,
-    reference: str | None = None,
+    reference: SensorLike | None = None,
     seed: int = 0,
-    say: Log = no_log,
 ) -> list[Comparison]:
     """Show a detector the same scenes as the reference sees them, degraded and restored, under each
     sensor.
@@ -167,19 +167,14 @@ def run_study(
     Args:
         detector: that is shown the pictures.
         scenes: labelled.
-        sensors: profiles of degraded images, by name or file.
+        sensors: of the degraded images.
         methods: names of the rows besides the reference, the degraded images among them.
         reference: profile of the reference images; None for the default one.
         seed: of every random draw.
-        say: is told what a user should know on the way.
     """
-    log_once = once(say)
-    pairs = [
-        SensorPair(profile, reference_beside(profile, reference, log_once))
-        for profile in map(load_sensor, sensors)
-    ]
+    pairs = [SensorPair(profile, reference_beside(profile, reference)) for profile in sensors]
     rows = [
-        {name: method_named(name, pair.degraded, pair.reference, log_once) for name in methods}
+        {name: method_named(name, pair.degraded, pair.reference) for name in methods}
         for pair in pairs
     ]
     return [_compared(detector, scenes, *inputs, seed) for inputs in zip(pairs, rows, strict=True)]

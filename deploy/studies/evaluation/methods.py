@@ -13,20 +13,20 @@ from typing import Final
 import onnx
 import torch
 
-from beers_deploy.model.progress import Log, no_log
 from beers_deploy.model.shipped import INT8, shipped_names
 from beers_deploy.model.traditional.nl_bayes import QUALITIES
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.model.traditional.pipeline import Chain, Order, restore_traditional
 from beers_deploy.network import Network
-from beers_deploy.network_files import conditioned
+from beers_deploy.network_files import conditioned, warn_outside
 from beers_deploy.profiles.constant import Constant
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.sensor import Instrument, Sensor
 from beers_deploy.profiles.sensor_file import BLIND as NOT_KNOWN
 from beers_deploy.profiles.sensor_file import BLIND_PROFILE, load_sensor
 from beers_deploy.quant.onnx_file import metadata
-from beers_deploy.restoration.method import BOTH, Around, Restore, network_method
+from beers_deploy.restoration.method import Restore, network_method
+from beers_deploy.restoration.steps import BOTH, Around
 
 Specialise = Callable[[Instrument], Restore]
 """A sensor to the restoration of images that it acquired."""
@@ -95,26 +95,21 @@ def method_without_network(name: str, degraded: Instrument, reference: Instrumen
     return Method(name, specialise(degraded), KNOWN, specialise)
 
 
-EXPECTED = (
+METHOD_NAMES = (
     f"degraded, {TRADITIONAL}, {DECONVOLVE_FIRST} (each also with -fast or -best), "
-    f"{', '.join(PEERS)}, "
-    f"a shipped network ({', '.join(shipped_names())}, each also with -int8, and with @SENSOR "
-    "or @blind to know "
-    "another), or an ONNX or safetensors file"
+    f"{', '.join(PEERS)}, a shipped network ({', '.join(shipped_names())}, each also with -int8, "
+    "and with @SENSOR or @blind for another sensor), or an ONNX or safetensors file"
 )
 
 
-def method_named(
-    name: str, degraded: Sensor, reference: Sensor, log: Log = no_log, around: Around = BOTH
-) -> Method:
+def method_named(name: str, degraded: Sensor, reference: Sensor, around: Around = BOTH) -> Method:
     """The method of that name; the traditional ones know both sensors, a shipped network the
     degraded one.
 
     Args:
-        name: as in EXPECTED.
+        name: one of METHOD_NAMES.
         degraded: the sensor of the images.
         reference: the one that is aimed at.
-        log: is told what of the sensor lies outside the range that a network was trained for.
         around: which steps around a network are taken.
     """
     if name in WITHOUT_NETWORK:
@@ -122,21 +117,24 @@ def method_named(
     network, _, other = name.partition("@")
     shipped = network.removesuffix(INT8) in shipped_names()
     if not shipped and Path(network).suffix not in (".onnx", ".safetensors"):
-        raise OptionError("methods", expected=EXPECTED, got=repr(name), remedy="correct that name")
+        raise OptionError(
+            f"{printable(repr(name))} in `methods` is not a method. Give {METHOD_NAMES}."
+        )
     sensor = load_sensor(other) if other else degraded
     weights = conditioned(Path(network))
     if weights is None:
         return method_of(name, Network.load(network), sensor, reference, around, degraded.name)
     int8 = network.endswith(INT8)
-    told = Network.for_sensor(weights, sensor, int8=int8, log=log)
-    method = method_of(name, told, sensor, reference, around, degraded.name)
+    warn_outside(sensor, weights.kernels)
+    network_for = Network.for_sensor(weights, sensor, int8=int8)
+    method = method_of(name, network_for, sensor, reference, around, degraded.name)
     # A name with @SENSOR asks for that sensor: another one does not take its place.
     if other:
         return method
 
     def specialise(instrument: Instrument) -> Restore:
         profile = profile_of(instrument, degraded)
-        drawn = Network.for_sensor(weights, profile, int8=int8, log=log)
+        drawn = Network.for_sensor(weights, profile, int8=int8)
         return network_restore(drawn, profile, reference.nominal(), around)
 
     return replace(method, specialise=specialise)

@@ -86,9 +86,10 @@ def check_brightness(brightness: Iterable[float]) -> list[float]:
     factors = list(dict.fromkeys((1.0, *brightness)))
     for factor in factors:
         if not 0 < factor <= 1:
-            expected = "factors of radiance above 0 and up to 1"
-            remedy = "give factors such as 1,0.25,0.05"
-            raise OptionError("brightness", expected=expected, got=f"{factor:g}", remedy=remedy)
+            raise OptionError(
+                "`brightness` must be factors of radiance above 0 and at most 1, but one is "
+                f"{factor:g}. Give factors such as 1,0.25,0.05."
+            )
     return factors
 
 
@@ -132,9 +133,10 @@ def simulate_pairs(
         )
     if not pairs:
         least = oversamplings[-1] * (2 * acquire.MARGIN_PX + acquire.LEAST_SIDE_PX)
-        expected = f"scenes of {least} pixels a side or more"
-        got = f"{len(small)} smaller ones"
-        raise ImageError("images", expected=expected, got=got, remedy="give larger images")
+        raise ImageError(
+            f"The scenes in `images` must have {least} pixels a side or more, but all "
+            f"{len(small)} are smaller. Give larger images."
+        )
     return pairs, small
 
 
@@ -181,9 +183,10 @@ def read_pairs(
             sizes = " and ".join(
                 f"{image.shape[1]} x {image.shape[0]}" for image in (degraded_dn, reference_dn)
             )
-            expected = "two images of one size"
-            remedy = "crop them alike"
-            raise ImageError(f"pair {degraded.stem}", expected=expected, got=sizes, remedy=remedy)
+            raise ImageError(
+                f"The two images of the pair {degraded.stem} must have one size, but they have "
+                f"{sizes} px. Crop them alike."
+            )
         place = recipe.site(degraded.stem) if recipe else None
         pairs.append(NamedPair(degraded.stem, degraded_dn, reference_dn, place))
     return pairs

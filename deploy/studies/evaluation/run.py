@@ -14,7 +14,7 @@ from typing import cast
 import numpy as np
 from PIL import Image
 
-from beers_deploy.model.dataset import profiles_for, read_pairs_recipe
+from beers_deploy.model.dataset import read_pairs_recipe
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.pictures import (
     busiest_windows,
@@ -25,20 +25,18 @@ from beers_deploy.model.io.pictures import (
     strip_row,
 )
 from beers_deploy.model.metrics.bootstrap import too_few
-from beers_deploy.model.progress import Log, Progress, no_log, once, reporting
 from beers_deploy.model.raster.images import list_images
-from beers_deploy.network import Network, NetworkLike, SensorLike
+from beers_deploy.network import Network, NetworkLike
 from beers_deploy.pairs import Pair
-from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.report.page import Picture, Report, Section, write_report
-from beers_deploy.restoration.method import Around, Restore
+from beers_deploy.restoration.method import Restore
 from beers_deploy.restoration.sensor_check import WINDOW_PX, held_against
+from beers_deploy.restoration.steps import Around
 from beers_deploy.results import Table
 from beers_deploy.studies.evaluation import scores, targets
 from beers_deploy.studies.evaluation.methods import (
-    DEGRADED,
     Method,
     knowledge_of,
     method_named,
@@ -46,15 +44,11 @@ from beers_deploy.studies.evaluation.methods import (
 )
 from beers_deploy.studies.evaluation.pairs import (
     NamedPair,
-    check_brightness,
     pairs_of_scenes,
     read_pairs,
     table_at,
 )
 from beers_deploy.studies.evaluation.sweep import run_sweep
-
-Methods = Mapping[str, NetworkLike | Restore] | Sequence[str]
-"""Names of methods, or what restores by the name that it is listed under."""
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -71,15 +65,6 @@ class Evaluation(Table):
     sensors: tuple[Sensor, Sensor]
     methods: Sequence[Method]
     pairs: Sequence[NamedPair]
-
-    @property
-    def title(self) -> str:
-        """The two sensors, and how many images."""
-        degraded, reference = self.sensors
-        return (
-            f"{degraded.name} -> {reference.name}, {len(self.pairs)} "
-            f"image{'' if len(self.pairs) == 1 else 's'}"
-        )
 
     @property
     def mean(self) -> list[Row]:
@@ -104,129 +89,90 @@ class Evaluation(Table):
         return page
 
 
-def evaluate(
-    methods: Methods,
-    pairs: Iterable[Pair] | str | os.PathLike[str] | None = None,
-    *,
-    images: str | os.PathLike[str] | None = None,
-    sensor: SensorLike | None = None,
-    reference: SensorLike | None = None,
-    lpips: str | os.PathLike[str] | None = None,
-    sweep: bool = False,
-    brightness: Sequence[float] = (1.0,),
-    strict: bool = False,
-    consistency: bool = True,
-    exposure: bool = True,
-    seed: int = 0,
-    progress: Progress = None,
-    log: Log = no_log,
-) -> Evaluation:
-    """Compare restorations on the same pairs and targets; the degraded input is always a row.
+@dataclass(frozen=True)
+class Plan:
+    """What is compared, and how.
 
-    Args:
-        methods: names such as "traditional" or "convbeers-s-int8"; or a mapping of the name in the
-            table to such a name, a network, or a function of an image (H, W) of digital numbers.
-        pairs: simulated ones, or a folder with degraded/ and reference/; None simulates them.
-        images: folder of scenes to simulate pairs from; drawn ones if None.
-        sensor: of the degraded images; of pairs the one that made them, else the default one.
-        reference: the sensor that is aimed at.
-        lpips: weights of SqueezeNet 1.1, or a folder of backbones, for LPIPS.
-        sweep: whether other blurs, noises and gains are looked at too.
-        brightness: factors of the scenes' radiance before they are acquired, above 0 and up to 1;
-            tables of a factor other than 1 have it in their name. 1 is always evaluated.
-        strict: whether pairs are refused whose degraded images contradict the sensor, instead of a
-            note.
-        consistency: whether networks take the consistency step where they know the sensor.
-        exposure: whether shipped networks restore dark parts at a higher exposure.
+    Attributes:
+        methods: names, networks or functions, by the name of their row.
+        sensors: of the degraded and of the reference images.
+        scenes: folder of scenes to simulate pairs from; None for drawn ones.
+        folder: of stored pairs; None if there are none.
+        given: pairs in memory; None if there are none.
+        lpips: weights for LPIPS, or None.
+        factors: of the scenes' radiance; the first is 1.
+        sweep: whether other blurs, noises and gains are compared too.
+        strict: whether stored pairs that contradict the sensor are refused.
+        around: which steps around networks are used.
         seed: of every random draw.
-        progress: a function that is told each step, False for silence, None for a bar or lines on
-            standard error.
-        log: is told where a reference is taken in other units than it states.
-
-    Raises:
-        OptionError: no such method; or a brightness out of range, or with pairs, which are as they
-            are.
-        ImageError: pairs that cannot be read, or differ in size.
-        ProfileError: no such sensor.
-
-    Examples:
-        >>> pair = bd.simulate(size=96)
-        >>> methods = {"mine": lambda image: image, "convbeers-xs": "convbeers-xs"}
-        >>> evaluation = bd.evaluate(methods, [pair])
-        >>> [row.name for row in evaluation.mean][:3]
-        ['degraded', 'mine', 'convbeers-xs']
     """
-    named_methods = {
-        DEGRADED: DEGRADED,
-        **(methods if isinstance(methods, Mapping) else {name: name for name in methods}),
-    }
-    folder = Path(pairs) if isinstance(pairs, str | os.PathLike) else None
-    given_pairs = None if pairs is None or isinstance(pairs, str | os.PathLike) else list(pairs)
-    if given_pairs and sensor is None:
-        # Simulated pairs know the sensors that made them.
-        sensor, reference = given_pairs[0].profiles
-    factors = check_brightness(brightness)
-    if pairs is not None and len(factors) > 1:
-        expected = "no brightness with pairs, which are as they are"
-        remedy = "give images instead of pairs"
-        raise OptionError("brightness", expected=expected, got="both", remedy=remedy)
-    recipe = read_pairs_recipe(folder) if folder else None
-    sensors = profiles_for(sensor, reference, recipe, log)
-    scenes, weights = (None if path is None else Path(path) for path in (images, lpips))
-    log_once = once(log)
-    with reporting(progress):
-        around = Around(consistency, exposure)
-        compared = [
-            _method(name, source, sensors, log_once, around)
-            for name, source in named_methods.items()
-        ]
-        nominal = sensors[0].nominal()
-        distances = scores.perceptual_distances(weights)
-        instruments = scores.Instruments(distances, nominal.max_dn, nominal.offset_dn)
-        remarks = list[str]()
-        sensor_rows = list[Row]()
-        if given_pairs is not None:
-            loaded = [_named(number, pair) for number, pair in enumerate(given_pairs)]
-        elif folder is not None:
-            loaded = read_pairs(folder, sensors[0].nominal().max_dn, recipe)
-            sensor_rows = [_seen(loaded, sensors[0], str(folder), strict, remarks.append)]
-        else:
-            loaded, remarks = pairs_of_scenes(scenes, *sensors, seed)
-        rows = _compared(compared, loaded, sensors, instruments, seed)
-        for factor in factors[1:]:
-            dimmed, _ = pairs_of_scenes(scenes, *sensors, seed, factor)
-            for method in compared:
-                scored = scores.score(method, dimmed, instruments, seed)
-                rows += [replace(row, table=table_at(factor, row.table)) for row in scored]
-        swept = list[Row]()
-        for factor in factors if sweep else ():
-            swept += run_sweep(compared, scenes, *sensors, seed, factor).rows
+
+    methods: Mapping[str, NetworkLike | Restore]
+    sensors: tuple[Sensor, Sensor]
+    scenes: Path | None
+    folder: Path | None
+    given: Sequence[Pair] | None
+    lpips: Path | None
+    factors: Sequence[float]
+    sweep: bool
+    strict: bool
+    around: Around
+    seed: int
+
+
+def run_evaluation(plan: Plan) -> Evaluation:
+    """Compare restorations on the same pairs and targets; the degraded input is always a row."""
+    sensors = plan.sensors
+    seed = plan.seed
+    methods = [_method(name, source, sensors, plan.around) for name, source in plan.methods.items()]
+    nominal = sensors[0].nominal()
+    distances = scores.perceptual_distances(plan.lpips)
+    instruments = scores.Instruments(distances, nominal.max_dn, nominal.offset_dn)
+    remarks = list[str]()
+    sensor_rows = list[Row]()
+    if plan.given is not None:
+        loaded = [_named(number, pair) for number, pair in enumerate(plan.given)]
+    elif plan.folder is not None:
+        loaded = read_pairs(plan.folder, nominal.max_dn, read_pairs_recipe(plan.folder))
+        sensor_rows = [_seen(loaded, sensors[0], str(plan.folder), plan.strict)]
+    else:
+        loaded, remarks = pairs_of_scenes(plan.scenes, *sensors, seed)
+    rows = _compared(methods, loaded, sensors, instruments, seed)
+    for factor in plan.factors[1:]:
+        dimmed, _ = pairs_of_scenes(plan.scenes, *sensors, seed, factor)
+        for method in methods:
+            scored = scores.score(method, dimmed, instruments, seed)
+            rows += [replace(row, table=table_at(factor, row.table)) for row in scored]
+    swept = list[Row]()
+    for factor in plan.factors if plan.sweep else ():
+        swept += run_sweep(methods, plan.scenes, *sensors, seed, factor).rows
     # Images of one site resemble one another: sites are counted, not images.
     few = too_few(len({pair.site for pair in loaded}))
     notes = [note for note in (few, scores.inner_note(loaded), *remarks) if note]
-    arguments: dict[str, object] = {
-        "images": images,
-        "pairs": folder,
-        "sensor": sensors[0].name,
-        "lpips": lpips,
-        "reference": sensors[1].name,
-        "methods": ",".join(named_methods),
-        "sweep": sweep,
-        "seed": seed,
-        "consistency": consistency,
-        "exposure": exposure,
-        "brightness": ",".join(f"{factor:g}" for factor in factors),
-    }
+    names = f"{sensors[0].name} -> {sensors[1].name}"
+    every = (*_in_order([*rows, *scores.paper_rows()]), *sensor_rows, *swept)
     return Evaluation(
-        "evaluate",
-        arguments,
-        tuple(_inputs(named_methods, weights, scenes, folder)),
-        (*_in_order([*rows, *scores.paper_rows()]), *sensor_rows, *swept),
+        title=f"{names}, {len(loaded)} image{'' if len(loaded) == 1 else 's'}",
+        arguments={
+            "sensor": sensors[0].name,
+            "reference": sensors[1].name,
+            "methods": ",".join(plan.methods),
+            "brightness": ",".join(f"{factor:g}" for factor in plan.factors),
+        },
+        inputs=tuple(_inputs(plan.methods, plan.lpips, plan.scenes, plan.folder)),
+        rows=every,
         notes=tuple(notes),
+        headings={"mean": "means over all pairs"},
+        # Single images are for the document alone.
+        details=frozenset({row.table for row in every if row.table.startswith("images")} | WORDY),
         sensors=sensors,
-        methods=compared,
+        methods=methods,
         pairs=loaded,
     )
+
+
+WORDY = frozenset({"sensor"})
+"""Words that are shown in detail only."""
 
 
 def _compared(
@@ -259,13 +205,13 @@ def _in_order(rows: Iterable[Row]) -> list[Row]:
     return [*means, *tables[targets.TARGETS], *scores.site_rows(tables["images"]), *images]
 
 
-def _seen(pairs: Sequence[NamedPair], sensor: Sensor, name: str, strict: bool, log: Log) -> Row:
+def _seen(pairs: Sequence[NamedPair], sensor: Sensor, name: str, strict: bool) -> Row:
     """The degraded images held against the sensor that they are said to be from."""
     # Every n-th pair, n rounded up, so that at most HELD of them are checked.
     sample = pairs[:: -(-len(pairs) // HELD)]
     windows = [pair.degraded[:WINDOW_PX, :WINDOW_PX] for pair in sample]
     comparison = held_against(windows, sensor, sensor.nominal().max_dn)
-    check = comparison.settled(name, sensor.name, strict, log)
+    check = comparison.settled(name, sensor.name, strict)
     return Row("sensor of the degraded images", sensor.name, check.figures, check.text)
 
 
@@ -295,11 +241,10 @@ def _method(
     name: str,
     source: NetworkLike | Restore,
     sensors: tuple[Sensor, Sensor],
-    log: Log,
     around: Around,
 ) -> Method:
     if isinstance(source, str):
-        return replace(method_named(source, *sensors, log, around), name=name)
+        return replace(method_named(source, *sensors, around), name=name)
     # A module of torch is callable too, but it is a network and no function.
     if callable(source) and not isinstance(source, Network) and not hasattr(source, "state_dict"):
         return Method(name, source, "what the function knows")

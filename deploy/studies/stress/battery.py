@@ -6,21 +6,19 @@ import math
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import chain
 
 import numpy as np
 
-from beers_deploy.frames import words_of
 from beers_deploy.model.progress import steps
 from beers_deploy.model.traditional.rows import one_thread_per_operation
-from beers_deploy.profiles.errors import BeersError, OptionError
-from beers_deploy.profiles.figures import Figure, Row, by_table, measured, predicted
+from beers_deploy.profiles.errors import BeersError, OptionError, printable
+from beers_deploy.profiles.figures import Check, Figure, Row, by_table, measured, predicted
 from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.integer.reference import INT32_BITS
-from beers_deploy.results import common_mode, markdown_text, missing, unit_of
 from beers_deploy.studies.stress.cases import CASES, SIDE_PX, Case
 from beers_deploy.studies.stress.checks import Limitation, Measure, limitation_of
 from beers_deploy.studies.stress.networks import STAGES, Subject
+from beers_deploy.tables.markdown import markdown_table
 
 
 @dataclass(frozen=True)
@@ -129,15 +127,22 @@ def _excess(measure: Measure) -> float:
     return math.inf if math.isnan(measure.value) else measure.value - measure.allowed
 
 
-def chosen(names: str | None, known: Iterable[str], option: str) -> list[str]:
-    """The names in a list with commas; all where none is given."""
+def chosen(names: str | Sequence[str] | None, known: Iterable[str], option: str) -> list[str]:
+    """Return names of a list, or of text with commas; all if None.
+
+    Raises:
+        OptionError: a name that is not known.
+    """
     every = list(known)
-    selection = every if names is None else [name.strip() for name in names.split(",")]
+    if names is None:
+        return every
+    parts = names.split(",") if isinstance(names, str) else names
+    selection = [name.strip() for name in parts]
     for name in selection:
         if name not in every:
-            expected = f"some of {', '.join(every)}"
             raise OptionError(
-                option, expected=expected, got=repr(name), remedy="separate them by commas"
+                f"`{option}` must be some of {', '.join(every)}, separated by commas, but it has "
+                f"{printable(repr(name))}."
             )
     return selection
 
@@ -255,47 +260,37 @@ NOTES = {
 }
 
 
+def battery_checks(subject: Subject, results: Sequence[StageResult]) -> list[Check]:
+    """Return the verdict: what failed, and sums that might overflow."""
+    failed = [result for result in results if result.failed]
+    words = "; ".join(
+        f"{result.case.name}, {result.stage}: {result.verdict.removeprefix('FAILED: ')}"
+        for result in failed
+    )
+    checks = [Check("failures", len(failed), 0, "result", detail=words)]
+    # A sum that might overflow is a failure, even if no case makes it overflow.
+    overflowing = [
+        row.name for row in layer_rows(subject) if row.text["can it overflow int32"] != "no"
+    ]
+    layers = ", ".join(overflowing)
+    checks.append(Check("sums that might overflow", len(overflowing), 0, "layer", detail=layers))
+    return checks
+
+
+def skipped(results: Sequence[StageResult]) -> list[str]:
+    """Return a sentence for each reason why a stage was not checked."""
+    reasons = dict.fromkeys(result.reason for result in results if result.reason)
+    return [f"not checked: {reason}" for reason in reasons]
+
+
 def markdown(rows: Sequence[Row]) -> str:
-    """A section for each table."""
+    """Return a section for each table."""
     parts = []
     for table, table_rows in by_table(rows).items():
         parts += [
             f"## {TITLES[table]}\n",
             *([NOTES[table], ""] if table in NOTES else []),
-            *table_lines(table_rows),
+            *markdown_table(table_rows),
             "",
         ]
     return "\n".join(parts)
-
-
-def table_lines(rows: Sequence[Row]) -> list[str]:
-    """The lines of one table; unit and mode stand in its head where they are those of a whole
-    column.
-    """
-    table = list(rows)
-    words = words_of(list(rows))
-    keys = dict.fromkeys(chain.from_iterable(row.figures for row in table))
-    common = {key: (unit_of(key, table), common_mode(key, table)) for key in keys}
-    abouts = {key: ", ".join(filter(None, head)) for key, head in common.items()}
-    lines = [["", *(f"{key} ({about})" if about else key for key, about in abouts.items()), *words]]
-    lines.append(["---"] * len(lines[0]))
-    for row in table:
-        figures = [_cell(row.figures.get(key), *head) for key, head in common.items()]
-        lines.append([row.name, *figures, *(row.text.get(word, "") for word in words)])
-    reasons = missing(table)
-    texts = [f"| {' | '.join(map(markdown_text, cells))} |" for cells in lines]
-    if reasons:
-        # A line already is an item of a list: its dash must not be escaped as text.
-        texts += ["", *(f"- {markdown_text(line.removeprefix('- '))}" for line in reasons)]
-    return texts
-
-
-def _cell(figure: Figure | None, unit: str, mode: str) -> str:
-    if figure is None or figure.value is None:
-        return "" if figure is None else "-"
-    words = [str(figure)]
-    if not unit:
-        words.append(figure.unit)
-    if not mode:
-        words.append(figure.mode)
-    return " ".join(words)

@@ -11,14 +11,14 @@ from math import exp
 
 import numpy as np
 
-from beers_deploy.bench.swath import predict_network
-from beers_deploy.dpu.board import Dpu, load_dpu
+from beers_deploy.dpu.board import Dpu, dpu_of
 from beers_deploy.dpu.cost.latency import Prediction
 from beers_deploy.dpu.cost.model import Constants
 from beers_deploy.model.metrics.fidelity import psnr_db
 from beers_deploy.model.progress import steps
+from beers_deploy.performance.swath import predict_network
 from beers_deploy.profiles.figures import Row, measured, predicted
-from beers_deploy.profiles.target import TILE_PX
+from beers_deploy.profiles.target import TILE_PX, TargetProfile
 from beers_deploy.quant.calibration import HELD_OUT_SEED, Calibration
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.graph import Activation
@@ -30,7 +30,7 @@ from beers_deploy.studies.stress.networks import Subject
 CALIBRATION_PATCHES = 16
 
 
-def flip_rows(subject: Subject, source: Calibration, board: str) -> list[Row]:
+def flip_rows(subject: Subject, source: Calibration, board: TargetProfile) -> list[Row]:
     """The rows of the whole study: quality against flips, and what guards cost.
 
     Args:
@@ -41,7 +41,7 @@ def flip_rows(subject: Subject, source: Calibration, board: str) -> list[Row]:
     """
     # A file without an integer core is refused before anything is drawn.
     _ = subject.core
-    dpu = load_dpu(board, None)
+    dpu = dpu_of(board)
     prediction = predict_network(subject.opened[-1], dpu, TILE_PX)
     # So is a board that cannot price the guards.
     dpu.limit("cpu", "clock_ghz")

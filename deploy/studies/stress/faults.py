@@ -64,7 +64,7 @@ def as_stored(core: IntCore) -> IntCore:
     # A shift has six bits in memory, in two's complement.
     for (op, field), shift in shifts_of(core).items():
         if not -(1 << (SHIFT_BITS - 1)) <= shift < 1 << (SHIFT_BITS - 1):
-            raise _refuse(f"{field} {shift} at {op}")
+            raise _refused(f"{field} {shift} at {op}")
     return replace(
         core, ops=tuple(_narrow(op) if isinstance(op, IntConv) else op for op in core.ops)
     )
@@ -77,7 +77,7 @@ def _narrow(op: IntConv) -> IntConv:
     while (np.clip(bias >> shift, INT8_MIN, INT8_MAX) != bias >> shift).any():
         shift += 1
     if ((bias >> shift) << shift != bias).any():
-        raise _refuse(
+        raise _refused(
             f"a bias of {int(np.abs(bias).max())} at {op.name}, finer than its size allows"
         )
     return replace(
@@ -85,10 +85,10 @@ def _narrow(op: IntConv) -> IntConv:
     )
 
 
-def _refuse(got: str) -> ModelError:
-    remedy = "make it with 'beers-deploy quantize'"
+def _refused(found: str) -> ModelError:
     return ModelError(
-        "INT8 core", expected="bias and shifts as the board stores them", got=got, remedy=remedy
+        "The INT8 core must have bias and shifts as the board stores them, but it has "
+        f"{found}. Make it with 'beers-deploy quantize'."
     )
 
 

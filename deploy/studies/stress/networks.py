@@ -3,6 +3,7 @@ hard case.
 """
 
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -15,11 +16,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, pixel_shuffle, pixel_unshuffle
 
+from beers_deploy.comparison import pair_of
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network as Opened
-from beers_deploy.network_files import pair_of
-from beers_deploy.profiles import load_sensor
+from beers_deploy.network import NetworkLike, SensorLike
 from beers_deploy.profiles.errors import BeersError, ModelError
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import read_core
@@ -111,25 +113,46 @@ class Subject:
     def quantised(self) -> Network:
         """The INT8 network."""
         if self.int8 is None:
-            remedy = "give it as the second argument"
-            raise ModelError("INT8 network", expected="a file", got="none", remedy=remedy)
+            raise ModelError("The INT8 network is missing. Give its file as the second argument.")
         return self.int8
 
 
-def open_subject(float_path: Path | None, int8_path: Path | None, sensor: str = SENSOR) -> Subject:
-    """The files given, or a shipped network in both precisions by its name, told the sensor."""
-    if int8_path is None and (float_path is None or not (float_path.suffix or float_path.exists())):
-        float_path, int8_path = pair_of(float_path, None)
-    profile = load_sensor(sensor)
-    opened = [Opened.load(float_path, sensor=profile, int8=False)]
-    if int8_path is not None:
-        opened.append(Opened.load(int8_path, sensor=profile, int8=True))
-    networks = [Network(source.model) for source in opened]
-    for source, network, is_int8 in zip(opened, networks, (False, True), strict=False):
-        require_quantised(network.model, source.label, is_int8)
+def open_subject(
+    float_network: NetworkLike | None = None,
+    int8_network: NetworkLike | None = None,
+    sensor: SensorLike = SENSOR,
+) -> Subject:
+    """Open a float network and its INT8 network, if there is one.
+
+    Args:
+        float_network: a shipped name, or an INT8 network that was quantised in this process, stands
+            for both; the default pair if None.
+        int8_network: None tests the float network alone, unless `float_network` stands for both.
+        sensor: that shipped networks are conditioned on.
+    """
+    profile = Sensor.load(sensor)
+    opened: tuple[Opened, ...]
+    if int8_network is not None or _is_pair(float_network):
+        opened = pair_of(float_network, int8_network, profile)
+        networks = [Network(source.model) for source in opened]
+    else:
+        floating = Opened.load(float_network, sensor=profile, int8=False)
+        require_quantised(floating.model, floating.label, wanted=False)
+        opened = (floating,)
+        networks = [Network(floating.model)]
+    for network in networks:
         # What cannot be tiled is refused before anything runs.
         _ = network.tiling
-    return Subject(networks[0], networks[1] if int8_path else None, tuple(opened))
+    return Subject(networks[0], networks[1] if len(networks) > 1 else None, opened)
+
+
+def _is_pair(network: NetworkLike | None) -> bool:
+    """Return True if a network stands for a pair: the default one, a shipped name, or an origin."""
+    if isinstance(network, Opened):
+        return network.origin is not None
+    if isinstance(network, str | os.PathLike):
+        return not (Path(network).suffix or Path(network).exists())
+    return network is None
 
 
 def in_torch(graph: Graph, image: Tensor) -> Tensor:

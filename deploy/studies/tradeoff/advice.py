@@ -17,7 +17,7 @@ import numpy as np
 
 from beers_deploy.model.metrics.bootstrap import site_interval
 from beers_deploy.network import Network
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.figures import Figure, Row, measured, number, predicted
 from beers_deploy.studies.tradeoff.measure import Scores
 from beers_deploy.studies.tradeoff.points import UNITS, Point
@@ -25,12 +25,10 @@ from beers_deploy.studies.tradeoff.points import UNITS, Point
 LATENCY = "board latency"
 COSTS = (LATENCY, "board energy", "host p50")
 PSNR = "PSNR"
-MAP50 = "mAP50"
 NAMES: dict[str, tuple[str, str]] = {
     "psnr": (PSNR, "dB"),
     "ssim": ("SSIM", "ratio"),
     "lpips": ("LPIPS-squeeze", "distance"),
-    "map50": (MAP50, "%"),
     "host": ("host p50", "s/Mpx"),
     "host-p90": ("host p90", "s/Mpx"),
     **{key.removeprefix("board "): (key, unit) for key, unit in UNITS.items()},
@@ -80,8 +78,7 @@ class Measured:
     def network(self) -> Network:
         """The network that restores here."""
         if self.point is None or self.point.variant.network is None:
-            remedy = "take a point of a network"
-            raise OptionError("point", expected="one with a network", got=self.name, remedy=remedy)
+            raise OptionError(f"The point {self.name} has no network. Choose a point of a network.")
         return self.point.variant.network
 
 
@@ -266,19 +263,21 @@ def parse_constraints(option: str, text: str | None) -> list[Constraint]:
 def _parse(option: str, text: str) -> Constraint:
     fields = CONSTRAINT.fullmatch(text.lower())
     if fields is None or not math.isfinite(float(fields["limit"])):
-        expected = "NAME<=NUMBER or NAME>=NUMBER"
-        remedy = "write 'latency<=20s' or 'psnr>=44'"
-        raise OptionError(option, expected=expected, got=repr(text), remedy=remedy)
-    if fields["name"] not in NAMES:
-        expected = f"one of {', '.join(NAMES)}"
         raise OptionError(
-            option, expected=expected, got=repr(fields["name"]), remedy="correct the name"
+            f"`{option}` must be NAME<=NUMBER or NAME>=NUMBER, such as 'latency<=20s' or "
+            f"'psnr>=44', but it is {printable(repr(text))}."
+        )
+    if fields["name"] not in NAMES:
+        raise OptionError(
+            f"`{option}` must name one of {', '.join(NAMES)}, but it names "
+            f"{printable(repr(fields['name']))}."
         )
     key, unit = NAMES[fields["name"]]
     if fields["unit"] not in ("", unit.lower()):
-        remedy = f"write {fields['name']}{fields['side']}{fields['limit']}{unit}"
         raise OptionError(
-            option, expected=f"{key} in {unit}", got=repr(fields["unit"]), remedy=remedy
+            f"`{option}` must give {key} in {unit}, but its unit is "
+            f"{printable(repr(fields['unit']))}. Write "
+            f"{fields['name']}{fields['side']}{fields['limit']}{unit}."
         )
     return Constraint(key, fields["side"] == "<=", float(fields["limit"]), unit)
 

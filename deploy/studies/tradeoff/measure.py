@@ -18,42 +18,27 @@ import numpy as np
 import psutil
 
 from beers_deploy import __version__
-from beers_deploy.bench.swath import Swath
-from beers_deploy.bench.timing import interleaved
-from beers_deploy.bench.traditional import drawn_acquisition
 from beers_deploy.model.consistency import Consistency
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.metrics.perceptual import find_backbone
 from beers_deploy.model.processor import processor_name
 from beers_deploy.model.raster.images import list_images
-from beers_deploy.model.shipped import DETECTOR
 from beers_deploy.network import Network
-from beers_deploy.profiles import load_sensor, sensor_names
+from beers_deploy.performance.swath import Swath
+from beers_deploy.performance.timing import interleaved
+from beers_deploy.performance.traditional import drawn_acquisition
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.figures import Figure, measured, unavailable
+from beers_deploy.profiles.figures import Figure, measured
 from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import load_sensor, sensor_names
 from beers_deploy.quant.calibration import Calibration
 from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.restoration.method import Restore
-from beers_deploy.restoration.options import Runtime
 from beers_deploy.restoration.plan import Plan, make_plan
 from beers_deploy.restoration.runtime import AtFirstCall, open_runtime
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork, tiles_by_factor
 from beers_deploy.restoration.tiles.rows import restore_dn
-from beers_deploy.studies.detection.average_precision import (
-    find_hits,
-    interval,
-    map50,
-    site_weights,
-)
-from beers_deploy.studies.detection.detector import Detector, open_detector, parse_classes
-from beers_deploy.studies.detection.study import (
-    LabelledScene,
-    SensorPair,
-    acquired,
-    labelled_scenes,
-)
 from beers_deploy.studies.evaluation.methods import Method
 from beers_deploy.studies.evaluation.pairs import NamedPair
 from beers_deploy.studies.evaluation.scores import DETAILS, Instruments, perceptual_distances
@@ -106,10 +91,9 @@ class Measurements:
         try:
             return cls(path, dict(json.loads(path.read_text(encoding="utf-8"))["measurements"]))
         except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
-            expected = "measurements that this command kept"
-            remedy = "remove it: they are made anew"
             raise OptionError(
-                str(path), expected=expected, got="another file", remedy=remedy
+                f"{path} does not hold measurements that this command stored. Remove the file, "
+                "and they are measured again."
             ) from error
 
     def make(self, key: str, measure: Callable[[], Any]) -> Any:
@@ -237,9 +221,9 @@ def restore_in_tiles(point: Point, degraded: Sensor, reference: Sensor) -> Resto
     """A network in a point's tiles, with the steps around it that `restore` takes."""
     source = network_of_variant(point.variant)
     sensor = degraded.nominal()
-    infer, _ = open_runtime(Runtime.onnxruntime, source.model, threads=0)
+    infer, _ = open_runtime("onnxruntime", source.model, threads=0)
     others = {
-        factor: AtFirstCall(partial(open_runtime, Runtime.onnxruntime, other.model, 0))
+        factor: AtFirstCall(partial(open_runtime, "onnxruntime", other.model, 0))
         for factor, other in source.exposures.items()
     }
     network = ExposedNetwork({1: infer, **others}, source.tiling.halo_px, sensor.offset_dn)
@@ -260,85 +244,6 @@ def tiles_of_point(point: Point, shape: tuple[int, ...]) -> Plan:
     # Half of the shorter side, rounded up to the halo's step: an image in one tile has no seam.
     half_px = HALO_STEP_PX * -(-(min(shape) // 2) // HALO_STEP_PX) + 2 * halo_px
     return make_plan((1, *shape), min(point.tile_px, half_px), halo_px, tiling)
-
-
-@dataclass(frozen=True)
-class Labelled:
-    """Labelled scenes and the detector that looks at them.
-
-    Attributes:
-        detector: that is shown the restored images.
-        scenes: labelled.
-        benchmark: whose sensors acquire them, and whose seed draws.
-        digest: of detector, scenes, labels and sensors.
-        notes: what a reader must know of labels and detector.
-    """
-
-    detector: Detector
-    scenes: Sequence[LabelledScene]
-    benchmark: Benchmark
-    digest: str
-    notes: Sequence[str]
-
-    @classmethod
-    def open(
-        cls, images: Path, detector: Path | None, classes: str | None, benchmark: Benchmark
-    ) -> "Labelled":
-        """Read the labels and open the detector; no image is read yet.
-
-        Args:
-            images: folder of labelled images.
-            detector: ONNX file; the embedded one if None.
-            classes: labelled classes under the detector's names, as the user writes them.
-            benchmark: as the attribute.
-        """
-        file = detector or DETECTOR
-        opened = open_detector(file)
-        scenes, notes = labelled_scenes(
-            opened.names, parse_classes(classes) if classes else {}, images
-        )
-        files = [sha256(scene.path) for scene in scenes if scene.path]
-        labels = [
-            files,
-            *((scene.site, scene.truth.corners, scene.truth.classes) for scene in scenes),
-        ]
-        sensors = benchmark.degraded, benchmark.reference
-        digest = key_of(detector=sha256(file), scenes=labels, seed=benchmark.seed, sensors=sensors)
-        sentences = [sentence for sentence in (opened.flag, *notes) if sentence]
-        return cls(opened, scenes, benchmark, digest, sentences)
-
-    def measure(self, method: Method) -> dict[str, object]:
-        """mAP50 of the detector on every scene as a method restores it, and its interval over
-        sites.
-        """
-        sensors = SensorPair(self.benchmark.degraded, self.benchmark.reference)
-        seed = self.benchmark.seed
-        boxes = [
-            scene.boxes(self.detector, method) for scene in acquired(self.scenes, sensors, seed)
-        ]
-        hits = find_hits([scene.truth for scene in self.scenes], boxes, len(self.detector.names))
-        sites = [scene.site for scene in self.scenes]
-        values = map50(hits, site_weights(sites, seed))
-        value = None if np.isnan(values[0]) else float(values[0])
-        return {"value": value, "interval": interval(values, len(set(sites)))}
-
-    def figure(self, point: Point, method: Method, kept: Measurements) -> Figure:
-        """What `measure` gives, in %; how often a seam cuts an object is not known."""
-        # How often a seam cuts an object is not known.
-        if point.halo_px is not None:
-            return unavailable("%", "measured with exact halos alone")
-        key = key_of(map50=self.benchmark.depends(point.variant), labelled=self.digest)
-        result = kept.make(key, lambda: self.measure(method))
-        if result["value"] is None:
-            return unavailable("%", "no labelled object")
-        sites = len({scene.site for scene in self.scenes})
-        ends = result["interval"]
-        source = (
-            f"{len(self.scenes)} labelled images of {sites} sites, interval by bootstrap over sites"
-        )
-        return measured(
-            100 * result["value"], "%", source, (100 * ends[0], 100 * ends[1]) if ends else None
-        )
 
 
 TILE_PX = 256

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from beers_deploy.model.io.files import write_text
-from beers_deploy.profiles.errors import one_line, optional
+from beers_deploy.profiles.errors import optional
 from beers_deploy.profiles.figures import Row
 from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.report.plots import data_url
 from beers_deploy.results import Table
 from beers_deploy.studies.tradeoff.advice import PSNR, Constraint, Measured
-from beers_deploy.studies.tradeoff.boards import lines
 from beers_deploy.studies.tradeoff.plot import CAPTION, Drawn, draw, plot_svg
 
 if TYPE_CHECKING:
@@ -47,7 +46,7 @@ POINTS_CAPTION = (
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Tradeoff(Table):
     """What accuracy costs in time: the recommended point, the Pareto front, and every point with
-    its figures.
+    its figures. It is true if a point keeps the budget and the need.
 
     Attributes:
         boards: the names of all boards that were compared.
@@ -59,6 +58,7 @@ class Tradeoff(Table):
         cost: the figure that the front is against.
         best: the recommended point; None where none keeps the budget and the need.
         line: that recommends it.
+        remarks: how the figures were found.
     """
 
     boards: Sequence[str]
@@ -70,6 +70,7 @@ class Tradeoff(Table):
     cost: str
     best: Measured | None
     line: str
+    remarks: Sequence[str]
 
     @property
     def board(self) -> str:
@@ -113,16 +114,6 @@ class Tradeoff(Table):
         write_report(report_of(self, svg), page)
         return page
 
-    @property
-    def lines(self) -> list[str]:
-        """The recommendation, then for each board how its best point compares,
-        or why it has none.
-        """
-        return [self.line, *lines(self.board_rows)]
-
-    def __str__(self) -> str:
-        return "\n".join(map(one_line, self.lines))
-
 
 def report_of(study: Tradeoff, svg: str) -> Report:
     """The page in reading order."""
@@ -143,5 +134,5 @@ def report_of(study: Tradeoff, svg: str) -> Report:
     ]
     headline = f"{study.line[0].upper()}{study.line[1:]}."
     return Report(
-        "What accuracy costs in time", headline, tables, [picture], study.notes, sorts=True
+        "What accuracy costs in time", headline, tables, [picture], study.remarks, sorts=True
     )

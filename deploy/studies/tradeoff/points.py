@@ -6,6 +6,7 @@ network on one configuration of a board's DPU, in tiles with a halo; a tradition
 board's processor; or anything on this machine alone.
 """
 
+import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -13,8 +14,6 @@ from functools import cache
 from itertools import product
 from pathlib import Path
 
-from beers_deploy.bench import tables
-from beers_deploy.bench.swath import Swath, chain_rate, efficiency, energy, swath_latency
 from beers_deploy.dpu.board import Dpu, dpu_of
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import dpu_power, predict
@@ -24,12 +23,15 @@ from beers_deploy.model.shipped import shipped_names
 from beers_deploy.model.traditional.nl_bayes import QUALITIES
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.network import Network, NetworkLike
-from beers_deploy.profiles import TargetProfile
-from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.performance import tables
+from beers_deploy.performance.swath import Swath, chain_rate, efficiency, energy, swath_latency
+from beers_deploy.profiles.errors import ModelError, OptionError, printable
 from beers_deploy.profiles.figures import Figure, predicted, unavailable
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, board_names
+from beers_deploy.profiles.target import TILE_PX, TargetProfile
 from beers_deploy.quant.tiling.walk import Tiling
+
+logger = logging.getLogger(__name__)
 
 FLOAT = "float32"
 INT8 = "INT8"
@@ -98,24 +100,10 @@ class Point:
         )
 
 
-def parse_targets(text: str) -> tuple[str, ...]:
-    """Read the boards of `--target`: one, several with commas, or all shipped ones, the default
-    first.
-    """
-    if text == "all":
-        return DEFAULT_TARGET, *(name for name in board_names() if name != DEFAULT_TARGET)
-    names = tuple(name.strip() for name in text.split(","))
-    if not all(names) or len(set(names)) < len(names):
-        remedy = "write vck190, or vck190,zcu102, or all"
-        raise OptionError("target", expected="boards, each once", got=repr(text), remedy=remedy)
-    return names
-
-
 def network_variants(
     given: Iterable[NetworkLike],
     sensor: Sensor,
     make_int8: Callable[[Network], Network],
-    log: Callable[[str], None],
 ) -> list[Variant]:
     """Networks in float32 and INT8; shipped ones with the sensor's profile, INT8 files as they are.
 
@@ -123,17 +111,16 @@ def network_variants(
         given: shipped names, ONNX and safetensors files, or networks in memory.
         sensor: that acquires the images.
         make_int8: quantises a float network.
-        log: is told which network has no INT8, and what of the sensor lies outside the range that
-            was trained.
     """
     variants: list[Variant] = []
     for network in dict.fromkeys(each.strip() if isinstance(each, str) else each for each in given):
-        variants += _variants(network, sensor, make_int8, log)
+        variants += _variants(network, sensor, make_int8)
     variant_names = [variant.name for variant in variants]
     if len(set(variant_names)) < len(variant_names):
         twice = max(variant_names, key=variant_names.count)
         raise OptionError(
-            "network", expected="names that differ", got=f"two {twice!r}", remedy="rename one file"
+            f"The names of the networks in `network` must differ, but two are named {twice!r}. "
+            "Rename one file."
         )
     return variants
 
@@ -142,7 +129,6 @@ def _variants(
     given: NetworkLike,
     sensor: Sensor,
     make_int8: Callable[[Network], Network],
-    log: Callable[[str], None],
 ) -> Iterator[Variant]:
     is_shipped = given in shipped_names()
     if (
@@ -150,10 +136,10 @@ def _variants(
         and not is_shipped
         and Path(given).suffix not in (".onnx", ".safetensors")
     ):
-        expected = (
-            f"a shipped network ({', '.join(shipped_names())}), or an ONNX or safetensors file"
+        raise OptionError(
+            f"`network` must be a shipped network ({', '.join(shipped_names())}), or an ONNX or "
+            f"safetensors file, but it is {printable(repr(given))}."
         )
-        raise OptionError("network", expected=expected, got=repr(given), remedy="correct that name")
     network = Network.load(given, sensor=sensor)
     _require_tiles(network.label, network.tiling)
     if network.precision == "int8":
@@ -166,20 +152,22 @@ def _variants(
     try:
         int8 = make_int8(network)
     except ModelError as error:
-        log(f"{network.label} is compared in float32 alone: {error}")
+        logger.warning("%s is compared in float32 alone: %s", network.label, error)
         return
     yield Variant(network.name, INT8, int8)
 
 
 def _require_tiles(name: str, tiling: Tiling) -> None:
-    """Refuse a network that does not take one band in tiles of any multiple of the steps."""
+    """Raise OptionError if a network does not restore one band in tiles of any multiple of the
+    halo's steps.
+    """
     plain = replace(tiling, lattice_px=1, least_px=1, fixed_px=None) == Tiling(tiling.halo_px)
     if tiling.fixed_px is not None or not plain or HALO_STEP_PX % tiling.lattice_px:
         fixed = ", fixed to one tile size" if tiling.fixed_px is not None else ""
-        expected = f"a network of one band in tiles of any multiple of {HALO_STEP_PX} px"
-        remedy = "export it with free sizes, or bench it by itself"
         raise OptionError(
-            "network", expected=expected, got=f"{name}, {tiling.words}{fixed}", remedy=remedy
+            f"`network` must restore one band in tiles of any multiple of {HALO_STEP_PX} px, but "
+            f"{name} is a network {tiling.words}{fixed}. Export it with free sizes, or bench it "
+            "by itself."
         )
 
 

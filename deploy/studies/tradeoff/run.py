@@ -2,39 +2,37 @@
 recommendation.
 """
 
-import os
+import logging
+from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from beers_deploy.bench.swath import PAPER_SIZE, Swath, parse_size
-from beers_deploy.bench.tables import PAPER_TARGET, published_rows
-from beers_deploy.dpu.board import BoardLike, boards_of, dpu_of
+from beers_deploy.dpu.board import dpu_of
 from beers_deploy.dpu.cost.model import Constants
 from beers_deploy.model.metrics.bootstrap import too_few
 from beers_deploy.model.metrics.perceptual import find_backbone
-from beers_deploy.model.progress import Log, Progress, no_log, reporting, steps
+from beers_deploy.model.progress import steps
 from beers_deploy.model.raster.images import list_images
-from beers_deploy.model.shipped import SENSOR
-from beers_deploy.network import Network, NetworkLike, SensorLike
-from beers_deploy.profiles import TargetProfile
+from beers_deploy.network import Network, NetworkLike
+from beers_deploy.performance.swath import PAPER_SIZE, Swath, parse_size
+from beers_deploy.performance.tables import PAPER_TARGET, published_rows
+from beers_deploy.performance.timing import interleaved
 from beers_deploy.profiles.errors import MachineError, OptionError
-from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.figures import Check, Row, predicted
 from beers_deploy.profiles.figures import measured as measured_figure
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import REFERENCE
-from beers_deploy.profiles.target import DEFAULT_TARGET
-from beers_deploy.results import input_of
+from beers_deploy.profiles.target import TargetProfile
+from beers_deploy.results import Input, Table, input_of
 from beers_deploy.studies.evaluation.methods import Method, method_named, method_of
 from beers_deploy.studies.evaluation.pairs import pairs_of_scenes
 from beers_deploy.studies.tradeoff import advice
-from beers_deploy.studies.tradeoff.boards import Question, board_rows
+from beers_deploy.studies.tradeoff.boards import Question, board_rows, lines
 from beers_deploy.studies.tradeoff.measure import (
     Benchmark,
-    Labelled,
     Measurements,
     make_int8,
     measure_host,
@@ -49,128 +47,163 @@ from beers_deploy.studies.tradeoff.points import (
     points_of,
 )
 
+logger = logging.getLogger(__name__)
 
-def tradeoff(
-    networks: Sequence[NetworkLike],
-    *,
-    images: str | os.PathLike[str] | None = None,
-    sensor: SensorLike = SENSOR,
-    reference: SensorLike | None = None,
-    board: BoardLike | Sequence[BoardLike] = DEFAULT_TARGET,
-    size: tuple[int, int] | str = PAPER_SIZE,
-    budget: str | None = None,
-    need: str | None = None,
-    lpips: str | os.PathLike[str] | None = None,
-    calibration: str | os.PathLike[str] | None = None,
-    labelled: str | os.PathLike[str] | None = None,
-    detector: Path | None = None,
-    classes: str | None = None,
-    seed: int = 0,
-    cache: str | os.PathLike[str] | None = None,
-    progress: Progress = None,
-    log: Log = no_log,
-) -> Tradeoff:
-    """Measure networks and traditional pipelines on the same images, predict their runs, and
-    recommend a point.
+
+@dataclass(frozen=True)
+class Study:
+    """What is compared, and on what.
+
+    Attributes:
+        networks: shipped names, files, or networks in memory; float ones are quantised.
+        boards: whose points are compared.
+        sensors: of the degraded and of the reference images.
+        scenes: folder of held-out scenes; None for drawn ones.
+        lpips: weights for LPIPS, or None.
+        calibration: folder of scenes to quantise networks on; None for drawn ones.
+        size: (width, height) of the swath in pixels.
+        budget: limits of what can be afforded.
+        need: limits of what must be reached.
+        seed: of every random draw.
+    """
+
+    networks: Sequence[NetworkLike]
+    boards: Sequence[TargetProfile]
+    sensors: tuple[Sensor, Sensor]
+    scenes: Path | None
+    lpips: Path | None
+    calibration: Path | None
+    size: tuple[int, int]
+    budget: Sequence[advice.Constraint]
+    need: Sequence[advice.Constraint]
+    seed: int
+
+    def __post_init__(self) -> None:
+        _require_different(self.boards)
+        for profile in self.boards:
+            # A board without constants is refused before anything is measured.
+            Constants.of(dpu_of(profile))
+
+    @property
+    def names(self) -> list[str]:
+        """The networks as they are given: names and paths."""
+        return [
+            each if isinstance(each, str) else Network.load(each).label for each in self.networks
+        ]
+
+    @property
+    def board_names(self) -> list[str]:
+        """The names of the boards."""
+        return [profile.name for profile in self.boards]
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        """All files that the figures rest on."""
+        files = [path for path in map(Path, self.names) if path.is_file()]
+        for source in (self.scenes, self.calibration):
+            files += list_images(source) if source else []
+        backbone = find_backbone("squeeze", self.lpips)
+        files += [backbone] if backbone else []
+        return tuple(map(input_of, files))
+
+
+def benchmark_of(study: Study) -> tuple[Benchmark, list[str]]:
+    """Return the pairs that all methods are measured on, and remarks on them."""
+    pairs, remarks = pairs_of_scenes(study.scenes, *study.sensors, study.seed)
+    return Benchmark(pairs, *study.sensors, study.lpips, study.seed), remarks
+
+
+def points_for(study: Study, folder: Path) -> list[Point]:
+    """Return the points of a study; float networks are quantised into a folder."""
+    quantise = partial(
+        make_int8,
+        folder=folder / "int8",
+        scenes=study.calibration,
+        sensor=study.sensors[0],
+        seed=study.seed,
+    )
+    variants = network_variants(list(study.networks), study.sensors[0], quantise)
+    return points_of(variants, study.boards, Swath(*study.size))
+
+
+def run_tradeoff(study: Study, folder: Path) -> Tradeoff:
+    """Measure every point of a study, and recommend one.
 
     Args:
-        networks: shipped names, files, or networks in memory; float ones are quantised on the way.
-        images: folder of held-out scenes to simulate from; drawn ones if None.
-        sensor: of the degraded images.
-        reference: the sensor that is aimed at; the shipped one if None.
-        board: one or several, compared in one front; "all" for the shipped ones. Their order
-            changes nothing.
-        size: (width, height) of the swath in pixels, or as text.
-        budget: what can be afforded, such as "latency<=20s".
-        need: what must be reached, such as "psnr>=44".
-        lpips: weights of SqueezeNet 1.1, or a folder of backbones, for LPIPS.
-        calibration: folder of scenes to quantise networks on; drawn ones if None.
-        labelled: folder of labelled pictures for a detector, whose mAP50 is then a figure of each
-            point.
-        detector: ONNX file; the embedded one if None.
-        classes: labelled classes under the detector's names, such as "car=vehicle".
-        seed: of every random draw.
-        cache: folder of measurements that a later run goes on with; None keeps none.
-        progress: a function that is told each step, False for silence, None for a bar or lines on
-            standard error.
-        log: is told which network has no INT8, and what of the sensor lies outside the range that
-            was trained.
-
-    Raises:
-        BeersError: a network, an image, a profile or weights that cannot be used.
-
-    Examples:
-        >>> found = bd.tradeoff(["convbeers-xs"], budget="latency<=20s")
-        >>> found.best.network.precision
-        'int8'
+        study: what is compared.
+        folder: of measurements that a later run goes on with.
     """
-    boards = boards_of(board)
-    width_height = parse_size(size) if isinstance(size, str) else size
-    _require_different(boards)
-    for profile in boards:
-        # A board without constants is refused before anything is measured.
-        Constants.of(dpu_of(profile))
-    limits = advice.parse_constraints("budget", budget), advice.parse_constraints("need", need)
-    scenes, weights, calibration_folder = (
-        None if path is None else Path(path) for path in (images, lpips, calibration)
-    )
-    degraded = Sensor.load(sensor)
-    aim = Sensor.load(reference or REFERENCE).in_units_of(degraded)
-    given = list(networks)
-    names = [each if isinstance(each, str) else Network.load(each).label for each in given]
-    board_names = [profile.name for profile in boards]
-    keep = nullcontext(cache) if cache is not None else TemporaryDirectory(prefix="beers-deploy-")
-    with keep as folder, reporting(progress):
-        measurements = Measurements.open(Path(folder) / "measurements.json")
-        swath = Swath(*width_height)
-        quantise = partial(
-            make_int8,
-            folder=Path(folder) / "int8",
-            scenes=calibration_folder,
-            sensor=degraded,
-            seed=seed,
-        )
-        points = points_of(network_variants(given, degraded, quantise, log), boards, swath)
-        pairs, remarks = pairs_of_scenes(scenes, degraded, aim, seed)
-        benchmark = Benchmark(pairs, degraded, aim, weights, seed)
-        pictures = Labelled.open(Path(labelled), detector, classes, benchmark) if labelled else None
-        results = _measured(points, benchmark, pictures, measurements, swath, log)
-    if PAPER_TARGET in board_names and width_height == parse_size(PAPER_SIZE):
+    measurements = Measurements.open(folder / "measurements.json")
+    points = points_for(study, folder)
+    benchmark, remarks = benchmark_of(study)
+    results = _measured(points, benchmark, measurements, Swath(*study.size))
+    if PAPER_TARGET in study.board_names and study.size == parse_size(PAPER_SIZE):
         # The rows stand as printed: the paper's images are others.
         for row in published_rows():
             figures = {f"board {key}": figure for key, figure in row.figures.items()}
             results.append(advice.Measured(row.name, figures, {"board": PAPER_TARGET}))
-    notes = (
-        *_notes(benchmark, board_names),
-        *(pictures.notes if pictures else ()),
-        *remarks,
+    question = Question(study.budget, study.need, advice.Comparison(benchmark.sites, study.seed))
+    arguments = {
+        "images": study.scenes,
+        "calibration": study.calibration,
+        "sensor": study.sensors[0].name,
+        "reference": study.sensors[1].name,
+        "target": ",".join(study.board_names),
+        "network": ",".join(study.names),
+        "size": "x".join(map(str, study.size)),
+        "budget": ",".join(map(str, study.budget)),
+        "need": ",".join(map(str, study.need)),
+        "seed": study.seed,
+    }
+    notes = (*_notes(benchmark, study.board_names), *remarks)
+    about = {"arguments": arguments, "inputs": study.inputs, "notes": notes}
+    return weigh(results, study.board_names, question, **about)
+
+
+PREVIEW_PX = 256
+PREVIEW_RUNS = 3
+
+
+def preview(study: Study) -> Table:
+    """Return what a study would measure and about how long that takes, from a crop timed here."""
+    benchmark, _ = benchmark_of(study)
+    with TemporaryDirectory(prefix="beers-deploy-") as folder:
+        points = points_for(study, Path(folder))
+    methods = _methods([point.variant for point in points], benchmark)
+    first = benchmark.pairs[0]
+    side = slice(0, PREVIEW_PX)
+    crop = replace(
+        first,
+        degraded=first.degraded[side, side],
+        reference=first.reference[side, side],
+        noise_free=None if first.noise_free is None else first.noise_free[side, side],
     )
-    files = [path for path in map(Path, names) if path.is_file()]
-    for source in (scenes, calibration_folder):
-        files += list_images(source) if source else []
-    files += [path for path in (find_backbone("squeeze", weights), detector) if path]
-    files += [scene.path for scene in pictures.scenes if scene.path] if pictures else []
-    arguments: dict[str, object] = {
-        "images": images,
-        "sensor": degraded.name,
-        "reference": aim.name,
-        "need": need,
-        "size": "x".join(map(str, width_height)),
-        "budget": budget,
-        "calibration": calibration,
-        "seed": seed,
-        "target": ",".join(board_names),
-        "network": ",".join(names),
+    small = replace(benchmark, pairs=[crop])
+    calls = [partial(small.score, method.restore) for method in methods.values()]
+    times = interleaved(calls, PREVIEW_RUNS)
+    pixels = sum(pair.degraded.size for pair in benchmark.pairs)
+    # A point with seams restores each image twice: in its tiles, and exactly.
+    weights = Counter(point.variant for point in points if point.halo_px is not None)
+    low_s = high_s = 0.0
+    for variant, samples in zip(methods, times, strict=True):
+        per_px = [time_s / crop.degraded.size for time_s, _ in samples]
+        runs = 1 + 2 * weights[variant]
+        low_s += runs * min(per_px) * pixels
+        high_s += runs * max(per_px) * pixels
+    how = f"{PREVIEW_RUNS} runs of each method on a crop of {PREVIEW_PX} px, times the pixels"
+    counted = "the plan of the study"
+    figures = {
+        "points": measured_figure(len(points), "point", counted),
+        "methods": measured_figure(len(methods), "method", counted),
+        "images": measured_figure(len(benchmark.pairs), "image", counted),
+        "time here": predicted((low_s + high_s) / 2, "s", (low_s, high_s), how),
     }
-    if labelled:
-        arguments |= {"labelled": labelled, "detector": detector, "classes": classes}
-    about: dict[str, Any] = {
-        "arguments": arguments,
-        "inputs": tuple(map(input_of, files)),
-        "notes": notes,
-    }
-    question = Question(*limits, advice.Comparison(benchmark.sites, seed))
-    return weigh(results, board_names, question, **about)
+    return Table(
+        title="what a study of these options measures",
+        inputs=study.inputs,
+        rows=(Row("preview", "study", figures),),
+        headings={"preview": ""},
+    )
 
 
 def _require_different(boards: Sequence[TargetProfile]) -> None:
@@ -179,7 +212,7 @@ def _require_different(boards: Sequence[TargetProfile]) -> None:
     if len(set(names)) < len(names):
         twice = max(names, key=names.count)
         raise OptionError(
-            "board", expected="boards, each once", got=f"two {twice!r}", remedy="leave one out"
+            f"`target` must name each board once, but two are named {twice!r}. Leave one out."
         )
 
 
@@ -203,9 +236,15 @@ def weigh(
     figures = best.figures if best else {}
     every = (Row("points", point.name, point.figures, point.text) for point in points)
     rows = (Row("recommended", name, figures, {"line": line}), *by_board, *numbered, *every)
+    remarks = tuple(about.pop("notes", ()))
+    fits = Check("points within budget and need", int(best is not None), 1, "point", "at least")
     return Tradeoff(
-        "tradeoff",
+        command="tradeoff",
+        title="what accuracy costs in time",
         rows=rows,
+        checks=(fits,),
+        notes=(line, *lines(by_board), *remarks),
+        details=frozenset({"recommended", "boards", "points"}),
         points=points,
         front=front,
         front_rows=numbered,
@@ -215,6 +254,7 @@ def weigh(
         boards=tuple(boards),
         board_rows=by_board,
         constraints=asked.constraints,
+        remarks=remarks,
         **about,
     )
 
@@ -222,13 +262,11 @@ def weigh(
 def _measured(
     points: Sequence[Point],
     benchmark: Benchmark,
-    labelled: Labelled | None,
     measurements: Measurements,
     swath: Swath,
-    log: Log,
 ) -> list[advice.Measured]:
     """Every point with its figures; a method whose library is not installed is left out."""
-    methods = _methods([point.variant for point in points], benchmark, log)
+    methods = _methods([point.variant for point in points], benchmark)
     runnable = [point for point in points if point.variant in methods]
     results = list[advice.Measured]()
     with steps("tradeoff", len(runnable) + 1) as bar:
@@ -237,8 +275,6 @@ def _measured(
             method = methods[point.variant]
             scores = benchmark.scores(point, method.restore, measurements)
             figures = benchmark.means(scores)
-            if labelled is not None:
-                figures[advice.MAP50] = labelled.figure(point, method, measurements)
             results.append(
                 advice.Measured(point.name, figures, _text(point, method), point, scores)
             )
@@ -260,14 +296,14 @@ def _measured(
     return results
 
 
-def _methods(variants: Sequence[Variant], benchmark: Benchmark, log: Log) -> dict[Variant, Method]:
+def _methods(variants: Sequence[Variant], benchmark: Benchmark) -> dict[Variant, Method]:
     methods: dict[Variant, Method] = {}
     for variant in dict.fromkeys(variants):
         try:
             methods[variant] = _method(variant, benchmark)
         except MachineError as error:
             # The library of this method is not installed: the study goes on without it.
-            log(f"{variant.name} is left out: {error}")
+            logger.warning("%s is left out: %s", variant.name, error)
     return methods
 
 

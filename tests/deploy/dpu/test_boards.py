@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beers_deploy.bench.swath import efficiency, energy
 from beers_deploy.dpu.board import load_dpu, ruled
 from beers_deploy.dpu.checker.conv_rules import conv_area, conv_weight_bank
 from beers_deploy.dpu.checker.operators import all_rules, applies, rule_name, rule_text
@@ -20,9 +19,9 @@ from beers_deploy.dpu.cost.latency import dpu_power
 from beers_deploy.dpu.graph import Operation, Window
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.model.shipped import shipped_names
-from beers_deploy.profiles import load_target
+from beers_deploy.performance.swath import efficiency, energy
 from beers_deploy.profiles.figures import predicted
-from beers_deploy.profiles.target import board_names, npu_names
+from beers_deploy.profiles.target import board_names, load_target, npu_names
 from beers_deploy.quant.core import SHIFTS, target_shifts
 from beers_deploy.quant.onnx_file import load_onnx
 from tests.deploy.dpu.draws import (

@@ -18,7 +18,7 @@ from beers_deploy.dpu.checker import number_rules
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.graph import Operation, Scale
 from beers_deploy.dpu.reading import network_of, read_network
-from beers_deploy.export import to_onnx
+from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.shipped import shipped_names
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.encodings import board_model

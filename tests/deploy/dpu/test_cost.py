@@ -3,13 +3,13 @@ from pathlib import Path
 
 import pytest
 
-from beers_deploy.bench.swath import predict_network
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import Prediction, counted_power, layer_energy_j
 from beers_deploy.dpu.cost.model import LARGE_MAP_BYTES, regime_of
 from beers_deploy.dpu.cost.work import BURST_BYTES, Work, count_work
 from beers_deploy.dpu.reading import read_network
+from beers_deploy.performance.swath import predict_network
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.target import TILE_PX
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers

@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import helper, numpy_helper
 
-from beers_deploy.dpu.checker.table import check
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.target import board_names, npu_names
 from beers_deploy.quant.domains import INTEGER_OPERATORS, is_foreign, operator_name
 from beers_deploy.quant.graph import refusal
 from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.verbs.check import check
 from tests.deploy.command_line import done, refused
 from tests.deploy.dpu.graphs import Sketch
 
@@ -54,8 +54,8 @@ def test_a_foreign_domain_is_not_legal_and_not_run(
 ) -> None:
     path = network(tmp_path_factory.mktemp("foreign") / "a.onnx", place, domain)
     (node,) = (node for node in onnx.load_model(path).graph.node if node.domain == domain)
-    result = check(str(path), board, tile=64)
-    (refusing,) = (placed for placed in result.failed if placed.op.name == node.name)
+    result = check(path, target=board, tile=64)
+    (refusing,) = (placed for placed in result.refused if placed.op.name == node.name)
     assert not result
     assert f"{domain}::{node.op_type}" in refusing.broken[0].finding.reason
     for message in (refusal(result.network.model), refused_by_load(path)):
@@ -69,7 +69,7 @@ def refused_by_load(path: Path) -> str:
 
 
 def test_the_same_network_without_another_domain_is_legal(tmp_path: Path) -> None:
-    assert check(str(network(tmp_path / "a.onnx", "nowhere", "my.ops")), tile=64)
+    assert check(network(tmp_path / "a.onnx", "nowhere", "my.ops"), tile=64)
 
 
 def with_function(path: Path, domain: str) -> Path:
@@ -91,7 +91,9 @@ def test_a_function_of_the_file_is_no_operator_of_onnx(domain: str, tmp_path: Pa
     path = with_function(tmp_path / "a.onnx", domain)
     output = done("check", path, "--tile", "64", code=1)
     assert f"{domain}::Relu" in output
-    assert f"Relu of {domain!r}, a function of the file; inline" in refused_by_load(path)
+    message = refused_by_load(path)
+    assert f"Relu of {domain!r}, a function" in message
+    assert "inline its functions" in message
 
 
 def test_a_constant_of_another_domain_is_not_dropped(tmp_path: Path) -> None:
@@ -123,7 +125,8 @@ def test_commands_refuse_it_in_one_sentence(command: str, tmp_path: Path) -> Non
         "gate": (path, path),
     }
     message = refused(command, *words[command])
-    assert "of 'my.ops'; export the network with operators of ONNX itself." in message
+    assert "of 'my.ops'" in message
+    assert "xport the network with operators of ONNX itself." in message
 
 
 def test_onnxruntimes_optimised_file_names_the_remedy(tmp_path: Path) -> None:

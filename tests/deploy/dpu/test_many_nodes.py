@@ -11,7 +11,7 @@ from typing import Any
 import onnx
 import pytest
 
-from beers_deploy.dpu.checker.table import check
+from beers_deploy.verbs.check import check
 from benchmarks.check_nodes import KINDS, Chain, network
 
 TraceFunction = Callable[[FrameType, str, Any], Any]
@@ -46,7 +46,7 @@ def steps(model: onnx.ModelProto, path: Path) -> int:
     before = sys.gettrace()
     sys.settrace(called)
     try:
-        check(str(path))
+        check(path)
     finally:
         sys.settrace(before)
     return count

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from beers_deploy.bench.swath import predict_network
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.cost.own_runs import SCATTER, OwnRuns, read_own_runs
+from beers_deploy.performance.swath import predict_network
 from beers_deploy.profiles.errors import OptionError
 from tests.deploy.dpu.graphs import Sketch, integer_convbeers
 

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beers_deploy.bench.swath import predict_network
-from beers_deploy.bench.tables import host_words
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import Prediction
 from beers_deploy.dpu.cost.model import between, refused_interval_s
 from beers_deploy.dpu.reading import read_network
+from beers_deploy.performance.swath import predict_network
+from beers_deploy.performance.tables import host_words
 from beers_deploy.profiles.errors import ModelError
 from tests.deploy.dpu.graphs import IntegerSketch, Sketch
 

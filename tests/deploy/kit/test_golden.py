@@ -1,4 +1,4 @@
-"""Golden vectors, held against boards that compute wrongly in ways of our own making."""
+"""Golden vectors, compared with simulated boards that compute wrongly in known ways."""
 
 import json
 import shutil
@@ -13,6 +13,7 @@ import torch
 
 import beers_deploy as bd
 from beers_deploy.kit.golden import (
+    CASES,
     INDEX,
     Golden,
     compare_golden,
@@ -40,7 +41,9 @@ def network(name: str) -> bd.Network:
     samples = np.random.default_rng(0).random((4, 1, 32, 32), dtype=np.float32)
     with one_guess():
         return bd.quantize(
-            to_onnx(name, build(name, torch.Generator().manual_seed(0))), samples, progress=False
+            to_onnx(name, build(name, torch.Generator().manual_seed(0))),
+            samples=samples,
+            progress=False,
         )
 
 
@@ -232,8 +235,8 @@ def test_results_are_taken_as_boards_write_them(tmp_path: Path) -> None:
     np.save(folder / three, (tensors[third] * golden.core.scale(third)).astype(np.float32))
     assert compare_golden(vectors, tmp_path / "r")
     for values, message in (
-        (tensors[third][:, :1], "expected shape"),
-        (tensors[third] + 0.3, "whole multiples"),
+        (tensors[third][:, :1], "must have the shape"),
+        (tensors[third] + 0.3, "integer multiples of 2"),
     ):
         np.save(folder / three, values)
         with pytest.raises(BeersError, match=message):
@@ -246,20 +249,28 @@ def test_results_are_taken_as_boards_write_them(tmp_path: Path) -> None:
 def test_the_command_writes_and_compares(tmp_path: Path) -> None:
     out = tmp_path / "golden"
     folder = tmp_path / "seen"
-    done("golden", "convbeers-xs", "--tile", TILE_PX, "--out", out)
+    cases = done("golden", "convbeers-xs", "--tile", TILE_PX, "--out", out)
+    assert all(case in cases for case in CASES)
     for case in ("scene", "noise"):
         shutil.copytree(out / case, folder / case)
     assert "no layer differs: 20 compared" in done("golden", folder, "--compare", out)
     path = next((folder / "noise").glob("19-*"))
     np.save(path, np.load(path) + 1)
-    assert "the first to differ is joined" in done("golden", folder, "--compare", out, code=1)
-    assert "expected one of --out and --compare" in refused("golden", folder)
-    assert "golden.json: expected the index" in refused("golden", folder, "--compare", folder)
+    output = " ".join(done("golden", folder, "--compare", out, code=1).split())
+    assert "the first to differ is joined" in output
+    assert "Neither --out nor --compare is given" in refused("golden", folder)
+    for option, value in (("--out", out), ("--tile", TILE_PX), ("--target", "zcu104")):
+        assert f"{option} has no effect with --compare" in refused(
+            "golden", folder, "--compare", out, option, value
+        )
+    assert "golden.json cannot be read: no such file." in refused(
+        "golden", folder, "--compare", folder
+    )
     assert "multiple of 2 px" in refused(
         "golden", "convbeers-half-xs", "--tile", 33, "--out", tmp_path / "x"
     )
     np.save(out / "noise" / "00-planes.npy", np.zeros((1, 4, 38, 38), np.int8))
-    assert "other numbers in noise" in refused("golden", folder, "--compare", out)
+    assert "noise/00-planes.npy has other numbers" in refused("golden", folder, "--compare", out)
 
 
 @pytest.fixture(scope="module")
@@ -315,7 +326,7 @@ def test_an_index_leads_nowhere_else_and_its_claims_are_no_inputs(
     (copied / INDEX).write_text(
         json.dumps(index | {"cases": {"../noise": index["cases"]["noise"]}})
     )
-    assert "got a damaged one (ValueError: the case '../noise')" in refused(
+    assert "is damaged (ValueError: the case '../noise')" in refused(
         "golden", tmp_path, "--compare", copied
     )
 

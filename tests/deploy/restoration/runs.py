@@ -3,7 +3,7 @@
 import subprocess
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,8 @@ import rasterio
 import tifffile
 
 from beers_deploy.profiles.figures import Row
-from beers_deploy.restoration.options import Options
-from beers_deploy.restoration.run import restore_file
 from beers_deploy.restoration.tiles.engine import Restorer, Tile
+from beers_deploy.verbs.restore import restore
 
 
 def noise(*shape: int, seed: int = 1) -> np.ndarray:
@@ -25,11 +24,18 @@ def noise(*shape: int, seed: int = 1) -> np.ndarray:
 
 
 def restored(
-    folder: Path, pixels: np.ndarray, options: Options, **tags: Any
+    folder: Path, pixels: np.ndarray, tags: Mapping[str, Any] | None = None, **options: Any
 ) -> tuple[np.ndarray, Row]:
-    """Write pixels, restore them, and read the result again."""
-    tifffile.imwrite(folder / "in.tif", pixels, **tags)
-    row = restore_file(folder / "in.tif", folder / "out.tif", options)
+    """Write pixels to a file, restore it, and read the result.
+
+    Args:
+        folder: of the two files.
+        pixels: of the image.
+        tags: of its TIFF, as tifffile takes them.
+        options: of `restore`.
+    """
+    tifffile.imwrite(folder / "in.tif", pixels, **(tags or {}))
+    (row,) = restore(folder / "in.tif", folder / "out.tif", overwrite=True, **options).rows
     with warnings.catch_warnings(action="ignore"), rasterio.open(folder / "out.tif") as file:
         pixels = file.read()
     return pixels if len(pixels) > 1 else pixels[0], row
@@ -40,7 +46,7 @@ def begin(image: Path, out: Path, *options: object) -> subprocess.Popen[str]:
     command = [
         sys.executable,
         "-c",
-        "from beers_deploy.cli import app; app()",
+        "from beers_deploy.cli.commands import app; app()",
         "restore",
         image,
         out,
@@ -56,7 +62,7 @@ def begin(image: Path, out: Path, *options: object) -> subprocess.Popen[str]:
 
 
 def until(running: subprocess.Popen[str], word: str) -> bool:
-    """Wait until a run says so, or is done; whether it said so."""
+    """Wait until a run prints a word or ends; return True if it printed the word."""
     assert running.stdout is not None
     return any(word in line for line in running.stdout)
 
@@ -76,7 +82,7 @@ def stop_after(tiles: int, patch: pytest.MonkeyPatch, error: BaseException) -> N
 
 @contextmanager
 def stopped_after(tiles: int, error: BaseException | None = None) -> Iterator[None]:
-    """What runs here ends after so many tiles, as by Ctrl-C unless told an error."""
+    """Stop the run in this block after some tiles, by an error or as Ctrl-C does, and expect it."""
     error = error or KeyboardInterrupt()
     with pytest.MonkeyPatch.context() as patch:
         stop_after(tiles, patch, error)

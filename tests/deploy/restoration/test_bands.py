@@ -1,4 +1,4 @@
-"""A sensor for each band: each band is restored by its own network, found by its name."""
+"""Each band of an image may have its own sensor, and so a network of its own."""
 
 from pathlib import Path
 
@@ -9,7 +9,8 @@ import tifffile
 
 from beers_deploy.model.raster.reader import open_raster
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.restoration.bands import parse_sensors
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.restoration.bands import sensors_of
 from tests.deploy.command_line import done, refused
 from tests.model.raster import formats as images
 
@@ -26,7 +27,7 @@ def restored(image: Path, sensor: str, *more: str) -> tuple[np.ndarray, str]:
 
 @pytest.mark.parametrize("names", [("B0", "B1"), ("B1", "B0")])
 def test_each_band_has_its_own_network(names: tuple[str, str], tmp_path: Path) -> None:
-    """Named in either order; the bands of the file are B0 and B1."""
+    """The bands of the file are B0 and B1, whatever the order of the option."""
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
     of = dict(zip(names, (FIRST, SECOND), strict=True))
     result, _ = restored(image, f"{names[0]}={FIRST},{names[1]}={SECOND}", "--tile", "64")
@@ -36,7 +37,7 @@ def test_each_band_has_its_own_network(names: tuple[str, str], tmp_path: Path) -
         np.testing.assert_array_equal(result[band], alone[of[f"B{band}"]][band])
 
 
-def test_bands_without_names_are_taken_in_order(tmp_path: Path) -> None:
+def test_bands_without_names_are_used_in_order(tmp_path: Path) -> None:
     tifffile.imwrite(
         tmp_path / "in.tif",
         images.digital_numbers(),
@@ -65,9 +66,9 @@ def test_a_cog_names_the_sensors_in_the_order_of_the_bands(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("sensor", "words"),
     [
-        (f"B0={FIRST}", "a sensor for each of 2 bands: B0, B1"),
-        (f"B0={FIRST},B7={FIRST}", "a sensor for each of 2 bands: B0, B1"),
-        (f"B0={FIRST},B0={SECOND}", "name each band once"),
+        (f"B0={FIRST}", "a sensor for each of 2 bands (B0, B1)"),
+        (f"B0={FIRST},B7={FIRST}", "a sensor for each of 2 bands (B0, B1)"),
+        (f"B0={FIRST},B0={SECOND}", "Name each band once"),
         (f"B0={FIRST},{SECOND}", "BAND=PROFILE"),
     ],
 )
@@ -78,7 +79,10 @@ def test_what_does_not_fit_is_refused(sensor: str, words: str, tmp_path: Path) -
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]
 
 
-def test_the_path_of_a_profile_is_for_all_bands() -> None:
-    assert parse_sensors("my.toml") == {"": "my.toml"}
+def test_one_profile_is_for_all_bands(tmp_path: Path) -> None:
+    """The path of a file may have an equals sign in it."""
+    path = Sensor.load(FIRST).save(tmp_path / "gain=2.toml")
+    assert sensors_of(str(path)) == {"": Sensor.load(path)}
+    assert sensors_of(FIRST) == {"": Sensor.load(FIRST)}
     with pytest.raises(OptionError):
-        parse_sensors("=a,B1=b")
+        sensors_of("=a,B1=b")

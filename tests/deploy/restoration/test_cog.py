@@ -1,11 +1,8 @@
-"""Cloud-Optimised GeoTIFFs: valid, with the pixels and the place of the plain output, and what was
-done.
-"""
+"""Cloud-Optimised GeoTIFFs are valid, and have the pixels and the place of the plain output."""
 
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -17,33 +14,32 @@ from beers_deploy.model.io.files import sha256
 from beers_deploy.model.raster.compression import Compression
 from beers_deploy.model.raster.writer import cog_bytes
 from beers_deploy.profiles.errors import MachineError
-from beers_deploy.restoration.options import Options
-from beers_deploy.restoration.run import restore_file
+from beers_deploy.verbs.restore import restore
 from tests.model.raster import formats as images
 from tests.shipped import shipped_pair
 
 cogeo: Any = pytest.importorskip("rio_cogeo")
 
 
-def both(folder: Path, pixels: np.ndarray, options: Options) -> tuple[Path, Path]:
-    """The plain output and the cloud-optimised one of an image."""
+def both(folder: Path, pixels: np.ndarray, network: Path, **options: Any) -> tuple[Path, Path]:
+    """Return the plain output and the cloud-optimised one of an image."""
     image = images.write_tiff(folder / "in.tif", pixels)
-    restore_file(image, folder / "plain.tif", options)
-    restore_file(image, folder / "cog.tif", replace(options, cog=True))
+    restore(image, folder / "plain.tif", network=network, **options)
+    restore(image, folder / "cog.tif", network=network, cog=True, **options)
     assert sorted(path.name for path in folder.iterdir()) == ["cog.tif", "in.tif", "plain.tif"]
     return folder / "plain.tif", folder / "cog.tif"
 
 
-@pytest.mark.parametrize("compression", Compression)
+@pytest.mark.parametrize("compression", get_args(Compression))
 def test_it_is_valid_and_holds_the_same(
     compression: Compression, model: Path, tmp_path: Path
 ) -> None:
     pixels = np.tile(images.digital_numbers(), (1, 4, 5))
-    if compression is Compression.none:
+    if compression == "none":
         pixels = pixels.astype(np.float32)
-    options = Options(model, compression=Compression.zlib)
-    plain, cog = both(tmp_path, pixels, options)
-    restore_file(tmp_path / "in.tif", cog, replace(options, compression=compression, cog=True))
+    plain, cog = both(tmp_path, pixels, model)
+    options: dict[str, Any] = {"compression": compression, "cog": True, "overwrite": True}
+    restore(tmp_path / "in.tif", cog, network=model, **options)
     valid, errors, warnings = cogeo.cog_validate(cog, strict=True)
     assert (valid, errors, warnings) == (True, [], [])
     with rasterio.open(plain) as before, rasterio.open(cog) as after:
@@ -55,17 +51,17 @@ def test_it_is_valid_and_holds_the_same(
         assert (after.descriptions, after.scales) == (("B0", "B1"), (0.1, 0.2))
         assert after.overviews(1) == [2]
         # GDAL 3.10 marks no file of uncompressed planes as a COG.
-        if compression is not Compression.none:
+        if compression != "none":
             assert after.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
         names = {"zlib": "deflate", "zstd": "zstd", "lzw": "lzw", "none": None}
-        assert (after.compression and after.compression.value.lower()) == names[compression.value]
+        assert (after.compression and after.compression.value.lower()) == names[compression]
         predictor = after.tags(ns="IMAGE_STRUCTURE").get("PREDICTOR")
-    assert predictor == (None if compression is Compression.none else "2")
+    assert predictor == (None if compression == "none" else "2")
 
 
-def test_it_says_what_was_done(tmp_path: Path) -> None:
+def test_it_records_what_was_done(tmp_path: Path) -> None:
     int8 = shipped_pair("convbeers-xs")[1]
-    _, cog = both(tmp_path, images.digital_numbers(), Options(int8, tile_px=64))
+    _, cog = both(tmp_path, images.digital_numbers(), int8, tile=64)
     with rasterio.open(cog) as file:
         tags = file.tags()
     assert tags["RESTORED_NETWORK_SHA256"] == sha256(int8)
@@ -79,7 +75,7 @@ def test_missing_pixels_are_kept(model: Path, tmp_path: Path) -> None:
     pixels = np.maximum(images.digital_numbers(), 1)
     pixels[:, 30:60, 20:90] = 0
     image = images.write_tiff(tmp_path / "in.tif", pixels, nodata=0)
-    restore_file(image, tmp_path / "out.tif", Options(model, tile_px=64, cog=True))
+    restore(image, tmp_path / "out.tif", network=model, tile=64, cog=True)
     with rasterio.open(tmp_path / "out.tif") as file:
         assert file.nodata == 0
         np.testing.assert_array_equal(file.read() == 0, pixels == 0)
@@ -88,9 +84,9 @@ def test_missing_pixels_are_kept(model: Path, tmp_path: Path) -> None:
 def test_a_run_stopped_while_it_is_written_goes_on(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    options = Options(model, tile_px=64, cog=True)
+    options: dict[str, Any] = {"network": model, "tile": 64, "cog": True}
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    restore_file(image, tmp_path / "expected.tif", options)
+    restore(image, tmp_path / "expected.tif", **options)
     (tmp_path / "out.tif").write_bytes(b"the old one")
 
     def full(*_: object, **__: object) -> None:
@@ -100,13 +96,13 @@ def test_a_run_stopped_while_it_is_written_goes_on(
     with monkeypatch.context() as patch:
         patch.setattr("beers_deploy.model.raster.writer.copy", full)
         with pytest.raises(MachineError, match=r"no space left.*`resume` from row 150 of 150"):
-            restore_file(image, tmp_path / "out.tif", options)
+            restore(image, tmp_path / "out.tif", overwrite=True, **options)
     assert (tmp_path / "out.tif").read_bytes() == b"the old one"
     calls: list[str] = []
     monkeypatch.setattr(
         "beers_deploy.restoration.tiles.exposures.restore_window", lambda *_: calls.append("tile")
     )
-    restore_file(image, tmp_path / "out.tif", replace(options, resume=True))
+    restore(image, tmp_path / "out.tif", resume=True, **options)
     assert calls == []
     assert (tmp_path / "out.tif").read_bytes() == (tmp_path / "expected.tif").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["expected.tif", "in.tif", "out.tif"]
@@ -117,27 +113,28 @@ def test_a_run_stopped_while_it_is_written_goes_on(
 @example(height=600, width=1)
 def test_it_is_valid_at_any_size(height: int, width: int, model: Path, tmp_path: Path) -> None:
     images.write_tiff(tmp_path / "in.tif", np.full((1, height, width), 700, np.uint16))
-    restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=256, cog=True))
+    options: dict[str, Any] = {"tile": 256, "cog": True, "overwrite": True}
+    restore(tmp_path / "in.tif", tmp_path / "out.tif", network=model, **options)
     assert cogeo.cog_validate(tmp_path / "out.tif")[0]
 
 
 @pytest.mark.parametrize("shape", [(1, 150, 118), (2, 520, 90), (2, 90, 1700), (3, 1100, 700)])
-def test_the_disk_is_asked_for_all_that_stands_on_it_at_a_time(
+def test_all_that_is_on_the_disk_at_a_time_is_checked_before_the_run(
     shape: tuple[int, int, int], model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One byte less is refused before any work; what was asked for is taken, and tags and indexes
-    beside it.
+    """One byte less is refused before any work. The space that is asked for is used, apart from
+    tags and indexes.
     """
     image = images.write_tiff(tmp_path / "in.tif", np.full(shape, 700, np.uint16))
     out = tmp_path / "out.tif"
-    options = Options(model, tile_px=256, cog=True, compression=Compression.none)
+    options: dict[str, Any] = {"network": model, "tile": 256, "cog": True, "compression": "none"}
     free = 0
     tiles = shape[0] * -(-shape[1] // 256) * -(-shape[2] // 256) * 256**2
     needed = 2 * shape[0] * shape[1] * shape[2] + 2 * tiles + cog_bytes(shape, 2)
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=free))
     free = needed - 1
     with pytest.raises(MachineError, match="of disk"):
-        restore_file(image, out, options)
+        restore(image, out, **options)
     assert [path.name for path in tmp_path.iterdir()] == ["in.tif"]
     free = needed
     used_bytes = list[int]()
@@ -149,5 +146,5 @@ def test_the_disk_is_asked_for_all_that_stands_on_it_at_a_time(
         return replace_file(self, target)
 
     monkeypatch.setattr(Path, "replace", counted)
-    restore_file(image, out, options)
+    restore(image, out, **options)
     assert 0.4 * needed < used_bytes[0] < needed + 64_000

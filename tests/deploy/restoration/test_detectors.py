@@ -1,8 +1,7 @@
-"""Faulty detectors are told, listed, replaced before restoration and written; what does not fit is
-refused.
-"""
+"""Faulty detectors are reported, listed, and replaced before the restoration."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,8 +16,7 @@ from beers_deploy.restoration.detectors.fault_list import Fault, FaultList, read
 from beers_deploy.restoration.detectors.fix import REACH_PX, FixedSource, find_faults
 from beers_deploy.restoration.detectors.look import LOOKED_PX, look_at_detectors
 from beers_deploy.restoration.detectors.words import sentences
-from beers_deploy.restoration.options import Options
-from beers_deploy.restoration.run import restore_file
+from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import done, refused
 from tests.deploy.restoration.runs import stopped_after
 
@@ -82,7 +80,7 @@ def test_the_same_is_found_in_floats_with_missing_pixels() -> None:
 
 @settings(deadline=None, max_examples=20)
 @given(st.integers(1, 300), st.integers(0, 2**20))
-def test_however_rows_are_read_the_same_pixels_come(step_px: int, seed: int) -> None:
+def test_the_pixels_are_the_same_however_rows_are_read(step_px: int, seed: int) -> None:
     generator = np.random.default_rng(seed)
     pixels = ground(2, HEIGHT, WIDTH, seed=seed)
     places = generator.integers((0, 0, 0), (WIDTH, HEIGHT, 3), (30, 3))
@@ -137,7 +135,7 @@ def test_a_replaced_pixel_never_falls_on_the_nodata_value() -> None:
     assert FixedSource(source_of(pixels, nodata=10.0), faults).read(0, 9)[0, 4, 4] in (9, 11)
 
 
-def test_what_no_sound_pixel_is_near_stays() -> None:
+def test_a_fault_without_a_sound_pixel_nearby_stays() -> None:
     pixels = ground(5, 80)
     faults = FaultList(tuple(Fault(column, -1) for column in range(80)))
     np.testing.assert_array_equal(FixedSource(source_of(pixels), faults).read(0, 5)[0], pixels)
@@ -167,14 +165,14 @@ def test_a_list_is_read_as_it_was_written(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "without any"),
-        ("column,row\n", "without any"),
-        ("12,3", "line 1: 12,3"),
-        ("column,row\n1,8", "line 2: 1,8"),
+        ("", "lists none"),
+        ("column,row\n", "lists none"),
+        ("12,3", "list.csv (12,3) lies outside"),
+        ("column,row\n1,8", "list.csv (1,8) lies outside"),
         ("1,2,4", "3 bands"),
         ("1,2,0", "column,row"),
         ("*,*", "column,row"),
-        ("1", "column,row"),
+        ("1", "Line 1 of"),
         ("1,2,3,4", "column,row"),
         ("-1,2", "column,row"),
         ("1.5,2", "column,row"),
@@ -204,7 +202,7 @@ def test_what_is_no_text_file_is_refused(tmp_path: Path, content: bytes | None) 
 def test_an_image_full_of_single_pixels_has_no_single_faults() -> None:
     pixels = ground(HEIGHT, WIDTH)
     pixels[5::7, 5::7] = 4095
-    with pytest.raises(ImageError, match="few faulty pixels"):
+    with pytest.raises(ImageError, match="too many faulty pixels"):
         find_faults(source_of(pixels), "image")
 
 
@@ -248,14 +246,15 @@ def image(tmp_path: Path) -> Path:
 def test_a_restoration_sees_the_replaced_pixels(image: Path, model: Path, tmp_path: Path) -> None:
     fixed = FixedSource(source_of(faulty()), FaultList(tuple(FAULTS))).read(0, HEIGHT)[0]
     tifffile.imwrite(tmp_path / "fixed.tif", fixed)
-    restore_file(tmp_path / "fixed.tif", tmp_path / "expected.tif", Options(model, 64))
-    row = restore_file(image, tmp_path / "out.tif", Options(model, 64, fix_detectors="found"))
+    options: dict[str, Any] = {"network": model, "tile": 64}
+    restore(tmp_path / "fixed.tif", tmp_path / "expected.tif", **options)
+    (row,) = restore(image, tmp_path / "out.tif", fix_detectors="found", **options)
     assert row.text["detectors replaced"] == "2 pixels, 1 column, 1 row"
     expected = tifffile.imread(tmp_path / "expected.tif")
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "out.tif"), expected)
     listed = tmp_path / "out.detectors.csv"
     assert listed.read_text() == "column,row\n*,100\n40,*\n80,20\n90,70\n"
-    restore_file(image, tmp_path / "again.tif", Options(model, 64, fix_detectors=str(listed)))
+    restore(image, tmp_path / "again.tif", fix_detectors=str(listed), **options)
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "again.tif"), expected)
     assert not (tmp_path / "again.detectors.csv").exists()
 
@@ -265,27 +264,27 @@ def test_a_stopped_run_goes_on_with_the_same_faults_and_no_others(
 ) -> None:
     (tmp_path / "list.csv").write_text("7,8\n")
     out = tmp_path / "out.tif"
-    options = Options(model, 64, fix_detectors="found")
-    restore_file(image, tmp_path / "expected.tif", options)
+    options: dict[str, Any] = {"network": model, "tile": 64}
+    restore(image, tmp_path / "expected.tif", fix_detectors="found", **options)
     with stopped_after(4):
-        restore_file(image, out, options)
+        restore(image, out, fix_detectors="found", **options)
     assert not (tmp_path / "out.detectors.csv").exists()
-    for other in ("", str(tmp_path / "list.csv")):
+    for other in (None, str(tmp_path / "list.csv")):
         with pytest.raises(OptionError, match="resume"):
-            restore_file(image, out, Options(model, 64, fix_detectors=other, resume=True))
-    restore_file(image, out, Options(model, 64, fix_detectors="found", resume=True))
+            restore(image, out, fix_detectors=other, resume=True, **options)
+    restore(image, out, fix_detectors="found", resume=True, **options)
     assert out.read_bytes() == (tmp_path / "expected.tif").read_bytes()
     assert (tmp_path / "out.detectors.csv").exists()
 
 
-def test_commands_say_it(image: Path, model: Path, tmp_path: Path) -> None:
+def test_commands_report_it(image: Path, model: Path, tmp_path: Path) -> None:
     network = ("--network", model)
     output = done("restore", image, "--dry-run", *network)
     assert "look at the detectors: 1 dead column" in output
     assert "dead lines" in output
     out = tmp_path / "out.tif"
     assert "look at the detectors: 1 dead column" in done("restore", image, out, *network)
-    assert "add --overwrite" in refused("restore", image, out, *network)
+    assert "Add --overwrite" in refused("restore", image, out, *network)
     again = ("restore", image, out, "--overwrite", *network)
     output = done(*again, "--fix-detectors", "found")
     assert "2 pixels, 1 column, 1 row found" in output

@@ -63,7 +63,7 @@ def test_as_many_tiles_are_in_work_as_were_asked_for() -> None:
 
 @pytest.mark.parametrize(
     ("factor", "error", "words"),
-    [(np.nan, ImageError, "finite pixels"), (1, KeyboardInterrupt, "a stop")],
+    [(np.nan, ImageError, "NaN or infinite pixels"), (1, KeyboardInterrupt, "a stop")],
 )
 def test_after_an_error_or_a_stop_no_further_tile_is_begun(
     factor: float, error: type[BaseException], words: str

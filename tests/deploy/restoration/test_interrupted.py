@@ -1,7 +1,8 @@
-"""Files may be damaged or replaced between two runs: the pixels are right, or one sentence says
-why.
+"""Files may be damaged or replaced between two runs: the pixels are right, or an error says why
+not.
 """
 
+import logging
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -18,12 +19,11 @@ from beers_deploy.model.io.lock import part_folder
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.restoration.checkpoint import Checkpoint
-from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Span
-from beers_deploy.restoration.run import restore_file
 from beers_deploy.restoration.tiles.engine import Restorer
 from beers_deploy.restoration.tiles.rows import RestoredRow
+from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import noise, stopped_after
 from tests.model.raster import formats
 
@@ -103,27 +103,26 @@ def test_a_journal_with_any_bit_flipped_is_refused_or_the_same(bit: int) -> None
 
 @pytest.fixture
 def image(tmp_path: Path) -> Path:
-    """An image whose middle is farther than 64 KiB from both ends of its file."""
+    """Write an image whose middle is farther than 64 KiB from both ends of its file."""
     tifffile.imwrite(tmp_path / "in.tif", noise(700, 260), tile=(16, 16))
     return tmp_path / "in.tif"
 
 
-def test_damaged_rows_are_made_again_and_it_is_said(
-    image: Path, model: Path, tmp_path: Path
+def test_damaged_rows_are_restored_again_with_a_warning(
+    image: Path, model: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     expected = tmp_path / "whole.tif"
     out = tmp_path / "out.tif"
-    restore_file(image, expected, Options(model, TILE_PX))
+    restore(image, expected, network=model, tile=TILE_PX)
     with stopped_after(40):
-        restore_file(image, out, Options(model, TILE_PX))
+        restore(image, out, network=model, tile=TILE_PX)
     raw = part_folder(out) / "rows.raw"
     raw.write_bytes(raw.read_bytes()[:-2000])
-    messages: list[str] = []
-    restore_file(image, out, Options(model, TILE_PX, resume=True), messages.append)
+    with caplog.at_level(logging.WARNING, "beers_deploy"):
+        restore(image, out, network=model, tile=TILE_PX, resume=True)
     assert out.read_bytes() == expected.read_bytes()
-    assert any(
-        "do not match their digests: they are made again" in sentence for sentence in messages
-    )
+    words = "do not match their digests: they are restored again"
+    assert any(words in sentence for sentence in caplog.messages)
     assert not part_folder(out).exists()
 
 
@@ -175,17 +174,17 @@ def test_whatever_is_read_is_part_of_the_job(
     out = tmp_path / "out.tif"
     before(image)
     with stopped_after(40):
-        restore_file(image, out, Options(model, TILE_PX))
+        restore(image, out, network=model, tile=TILE_PX)
     with same_size_and_time(tmp_path / name):
         after(image)
     with pytest.raises(OptionError, match="the image, the model and the options"):
-        restore_file(image, out, Options(model, TILE_PX, resume=True))
+        restore(image, out, network=model, tile=TILE_PX, resume=True)
     assert not out.exists()
     # With the file back as it was, the run goes on.
     with same_size_and_time(tmp_path / name):
         (flip_the_middle if kind == "middle" else before)(image)
-    restore_file(image, out, Options(model, TILE_PX, resume=True))
-    restore_file(image, tmp_path / "whole.tif", Options(model, TILE_PX))
+    restore(image, out, network=model, tile=TILE_PX, resume=True)
+    restore(image, tmp_path / "whole.tif", network=model, tile=TILE_PX)
     assert out.read_bytes() == (tmp_path / "whole.tif").read_bytes()
 
 
@@ -193,10 +192,10 @@ def test_a_sidecar_that_comes_or_goes_is_another_image(
     image: Path, model: Path, tmp_path: Path
 ) -> None:
     with stopped_after(40):
-        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX))
+        restore(image, tmp_path / "out.tif", network=model, tile=TILE_PX)
     write_nodata(image, 1000)
     with pytest.raises(OptionError, match="the image"):
-        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX, resume=True))
+        restore(image, tmp_path / "out.tif", network=model, tile=TILE_PX, resume=True)
 
 
 @pytest.mark.parametrize("touched", [False, True])
@@ -218,10 +217,10 @@ def test_an_image_that_is_replaced_while_it_is_read_is_refused(
 
     monkeypatch.setattr(Restorer, "finish", replacing)
     if touched:
-        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX))
+        restore(image, tmp_path / "out.tif", network=model, tile=TILE_PX)
         return
-    with pytest.raises(ImageError, match="a change while it was read"):
-        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX))
+    with pytest.raises(ImageError, match="changed while it was read"):
+        restore(image, tmp_path / "out.tif", network=model, tile=TILE_PX)
     assert not (tmp_path / "out.tif").exists()
     assert not part_folder(tmp_path / "out.tif").exists()
 
@@ -237,5 +236,5 @@ def test_a_network_that_is_replaced_while_it_is_read_is_refused(
         return object()
 
     monkeypatch.setattr("beers_deploy.network.float_model", replacing)
-    with pytest.raises(ModelError, match="a change while it was read"):
+    with pytest.raises(ModelError, match="changed while it was read"):
         Network.load(path)

@@ -1,4 +1,4 @@
-"""Two runs never write one output at once, and no dead one stands in the way."""
+"""Two runs never write one output at once, and a killed run blocks no other."""
 
 import errno
 import subprocess
@@ -13,11 +13,8 @@ import tifffile
 from beers_deploy.model.io import lock
 from beers_deploy.model.io.lock import only_run
 from beers_deploy.profiles.errors import MachineError
-from beers_deploy.profiles.sensor_file import BLIND
-from beers_deploy.restoration.options import Options
-from beers_deploy.restoration.run import restore_file
+from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import begin, noise, until
-from tests.shipped import shipped_pair
 
 TILE_PX = 64
 
@@ -29,14 +26,10 @@ def image(tmp_path: Path) -> Path:
 
 
 def begun(image: Path, out: Path) -> subprocess.Popen[str]:
-    """A run in the middle of its rows."""
+    """Start a run, and return it in the middle of its rows."""
     running = begin(image, out, "--tile", TILE_PX)
     assert until(running, "memory")
     return running
-
-
-def restore(image: Path, out: Path, resume: bool = False) -> None:
-    restore_file(image, out, Options(shipped_pair(sensor=BLIND)[1], TILE_PX, resume=resume))
 
 
 @pytest.mark.slow
@@ -44,23 +37,25 @@ def test_a_second_run_is_refused_and_the_first_one_unharmed(image: Path, tmp_pat
     out = tmp_path / "out.tif"
     with begun(image, out) as first:
         for resume in (False, True):
-            with pytest.raises(MachineError, match=r"out.tif: expected no other run"):
-                restore(image, out, resume)
+            with pytest.raises(
+                MachineError, match=r"Another run is at work on the output .*out\.tif\."
+            ):
+                restore(image, out, tile=TILE_PX, resume=resume)
         assert first.poll() is None
         # The lock is on the output, so a run to another one is allowed.
-        restore(image, tmp_path / "other.tif")
+        restore(image, tmp_path / "other.tif", tile=TILE_PX)
         output, _ = first.communicate(timeout=120)
     assert first.returncode == 0, output
     assert out.read_bytes() == (tmp_path / "other.tif").read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.tif", "other.tif", "out.tif"]
 
 
-def test_a_killed_run_stands_in_nobody_s_way(image: Path, tmp_path: Path) -> None:
+def test_a_killed_run_blocks_no_other(image: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.tif"
     with begun(image, out) as running:
         running.kill()
     assert (tmp_path / ".out.tif.part" / lock.NAME).is_file()
-    restore(image, out, resume=True)
+    restore(image, out, tile=TILE_PX, resume=True)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.tif", "out.tif"]
 
 
@@ -144,7 +139,7 @@ def test_a_run_that_ends_just_then_takes_no_lock_along(
     with only_run(tmp_path / "out"):
         monkeypatch.undo()
         assert (folder / lock.NAME).is_file()
-        with pytest.raises(MachineError, match="no other run"), only_run(tmp_path / "out"):
+        with pytest.raises(MachineError, match="Another run"), only_run(tmp_path / "out"):
             pass
 
 
@@ -177,7 +172,6 @@ def test_many_that_try_are_never_two_at_once(tmp_path: Path) -> None:
 def test_links_in_the_place_of_a_run_s_files_are_refused_and_nothing_behind_them_changes(
     image: Path, tmp_path: Path
 ) -> None:
-    model = shipped_pair("convbeers-xs", BLIND)[1]
     mine = tmp_path / "mine"
     out = tmp_path / "out.tif"
     mine.mkdir()
@@ -185,10 +179,10 @@ def test_links_in_the_place_of_a_run_s_files_are_refused_and_nothing_behind_them
         (mine / name).write_bytes(b"mine")
     lock.part_folder(out).symlink_to(mine, target_is_directory=True)
     with pytest.raises(MachineError, match="a symbolic link"):
-        restore_file(image, out, Options(model, TILE_PX))
+        restore(image, out, network="convbeers-xs-int8", tile=TILE_PX)
     lock.part_folder(out).unlink()
     lock.part_folder(out).mkdir()
     (lock.part_folder(out) / "rows.raw").symlink_to(mine / "rows.raw")
     with pytest.raises(MachineError, match="a symbolic link"):
-        restore_file(image, out, Options(model, TILE_PX, resume=True))
+        restore(image, out, network="convbeers-xs-int8", tile=TILE_PX, resume=True)
     assert {path.read_bytes() for path in mine.iterdir()} == {b"mine"}

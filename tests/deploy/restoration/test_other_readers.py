@@ -1,6 +1,4 @@
-"""The restored COG in programs that are not ours: gdalinfo, and QGIS's own reader, both of the
-system.
-"""
+"""The restored COG as other programs read it: gdalinfo and QGIS, both of the system."""
 
 import json
 import shutil
@@ -14,9 +12,8 @@ import pytest
 import rasterio
 
 from beers_deploy.profiles.sensor_file import BLIND
-from beers_deploy.restoration.options import Options
-from beers_deploy.restoration.run import restore_file
 from beers_deploy.restoration.stac import write_item
+from beers_deploy.verbs.restore import restore
 from tests.model.raster import formats as images
 from tests.shipped import shipped_pair
 
@@ -79,7 +76,7 @@ print(json.dumps(said | {"features": layer.featureCount()}))
 
 
 def answer(*command: str | Path) -> dict[str, Any]:
-    """What a program prints as JSON."""
+    """Return what a program prints as JSON."""
     process = subprocess.run(
         list(map(str, command)), capture_output=True, text=True, check=True, timeout=300
     )
@@ -89,7 +86,7 @@ def answer(*command: str | Path) -> dict[str, Any]:
 
 @pytest.fixture
 def gdalinfo() -> str:
-    """The path of the program."""
+    """Return the path of the program."""
     if (path := shutil.which("gdalinfo")) is None:
         pytest.skip("no gdalinfo: apt-get install gdal-bin")
     return path
@@ -97,7 +94,7 @@ def gdalinfo() -> str:
 
 @pytest.fixture
 def qgis() -> Path:
-    """A Python that has QGIS."""
+    """Return the path of a Python that has QGIS."""
     if (
         not PYTHON.is_file()
         or subprocess.run([PYTHON, "-c", "import qgis.core"], capture_output=True).returncode
@@ -111,7 +108,7 @@ def test_gdalinfo_finds_it_where_the_input_was(
     name: str, gdalinfo: str, model: Path, tmp_path: Path
 ) -> None:
     image = images.FORMATS[name](tmp_path / name, images.digital_numbers())
-    restore_file(image, tmp_path / "out.tif", Options(model, cog=True))
+    restore(image, tmp_path / "out.tif", network=model, cog=True)
     before, after = (answer(gdalinfo, "-json", path) for path in (image, tmp_path / "out.tif"))
     assert after["geoTransform"] == pytest.approx(before["geoTransform"], rel=0, abs=1e-9)
     for corner, place in before["cornerCoordinates"].items():
@@ -145,11 +142,11 @@ def test_gdalinfo_finds_bands_nodata_and_overviews(
 
 
 def restore_with_a_hole(folder: Path, model: Path) -> np.ndarray:
-    """Restore an image that misses pixels into the COG out.tif; its pixels."""
+    """Restore an image with missing pixels into the COG out.tif, and return its pixels."""
     pixels = np.maximum(PIXELS, 1)
     pixels[:, 30:60, 20:90] = 0
     image = images.write_tiff(folder / "in.tif", pixels, nodata=0)
-    restore_file(image, folder / "out.tif", Options(model, cog=True))
+    restore(image, folder / "out.tif", network=model, cog=True)
     with rasterio.open(folder / "out.tif") as file:
         restored: np.ndarray = file.read()
     return restored
@@ -178,13 +175,10 @@ def test_qgis_shows_what_was_written(qgis: Path, model: Path, tmp_path: Path) ->
 
 
 def test_qgis_s_toolbox_restores(qgis: Path, tmp_path: Path) -> None:
-    """With what is example code for its users; what the program refuses is QGIS's error."""
+    """The script is an example for users; an error of the program is an error of QGIS."""
     image = images.write_tiff(tmp_path / "raw.tif", images.digital_numbers(bands=1))
     program = tmp_path / "beers-deploy"
-    program.write_text(
-        f'#!/bin/sh\nPYTHONPATH={ROOT} exec {sys.executable} -c "from beers_deploy.cli import '
-        'app; app()" "$@"\n'
-    )
+    program.write_text(f'#!/bin/sh\nPYTHONPATH={ROOT} exec {sys.executable} -m beers_deploy "$@"\n')
     program.chmod(0o755)
     script = ROOT / "examples" / "qgis_restore.py"
     outs = [tmp_path / "restored.tif", tmp_path / "restored.xyz"]
@@ -193,8 +187,8 @@ def test_qgis_s_toolbox_restores(qgis: Path, tmp_path: Path) -> None:
     )["runs"]
     assert first_done
     assert not second_done
-    assert "expected a TIFF's name" in log
-    restore_file(image, tmp_path / "expected.tif", Options(shipped_pair(sensor=BLIND)[1]))
+    assert "must have the name of a TIFF" in log
+    restore(image, tmp_path / "expected.tif", network=shipped_pair(sensor=BLIND)[1])
     with (
         rasterio.open(outs[0]) as ours,
         rasterio.open(tmp_path / "expected.tif") as theirs,
@@ -206,7 +200,7 @@ def test_qgis_s_toolbox_restores(qgis: Path, tmp_path: Path) -> None:
 def test_qgis_draws_the_footprint_of_a_stac_item(qgis: Path, model: Path, tmp_path: Path) -> None:
     pytest.importorskip("pystac")
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    restore_file(image, tmp_path / "out.tif", Options(model, cog=True))
+    restore(image, tmp_path / "out.tif", network=model, cog=True)
     write_item(tmp_path / "out.tif", tmp_path / "out.json")
     layer = answer(qgis, "-c", IN_QGIS.replace("{}", FOOTPRINT), tmp_path / "out.json")
     assert (layer["features"], layer["crs"]) == (1, "EPSG:4326")

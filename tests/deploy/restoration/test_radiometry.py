@@ -1,9 +1,12 @@
-"""Which value is full scale and who says so; what lies above it; and that the type of the pixels is
-kept.
+"""Which value is full scale and what states it; what lies above it; and that the type of the pixels
+is kept.
 """
 
+import logging
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -12,38 +15,45 @@ import tifffile
 
 from beers_deploy.model.raster.facts import Extent, Raster
 from beers_deploy.model.raster.reader import open_raster
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.restoration.options import Options
+from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
-from beers_deploy.restoration.run import restore_file
+from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import restored
+from tests.model.raster import formats as images
 
 SHAPE = 61, 47
+Run = Callable[..., tuple[np.ndarray, Row, list[str]]]
 
 
 def noise(bits: int) -> np.ndarray:
     return np.random.default_rng(bits).integers(1, 1 << bits, SHAPE).astype(np.uint16)
 
 
-def sensors_of_bits(bits: int) -> dict[str, Sensor]:
-    return {"": load_sensor("pleiades-degraded").replace(bits=bits)}
+def sensor_of_bits(bits: int) -> Sensor:
+    return load_sensor("pleiades-degraded").replace(bits=bits)
 
 
-def run(folder: Path, pixels: np.ndarray, options: Options) -> tuple[np.ndarray, Row, list[str]]:
-    tifffile.imwrite(folder / "in.tif", pixels)
-    messages: list[str] = []
-    row = restore_file(folder / "in.tif", folder / "out.tif", options, messages.append)
-    return tifffile.imread(folder / "out.tif"), row, messages
+@pytest.fixture
+def run(model: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> Run:
+    """Return what restores pixels by a file, and returns the result, the row and the log."""
+
+    def run(pixels: np.ndarray, **options: Any) -> tuple[np.ndarray, Row, list[str]]:
+        caplog.clear()
+        with caplog.at_level(logging.INFO, "beers_deploy"):
+            result, row = restored(tmp_path, pixels, network=model, tile=23, **options)
+        return result, row, caplog.messages.copy()
+
+    return run
 
 
 def scale(raster: Raster, option: float | None = None, bits: int | None = None) -> FullScale:
     return full_scale_of("x", raster, (), option, bits)
 
 
-def test_the_user_goes_before_the_file_and_the_file_before_the_sensor() -> None:
+def test_the_user_overrides_the_file_and_the_file_overrides_the_sensor() -> None:
     silent = Raster(1, 9, 9, np.dtype(np.uint16))
     ten_bits = replace(silent, bits=10)
     assert scale(ten_bits, 16383, 14) == FullScale(16383, "asked for")
@@ -71,48 +81,40 @@ def test_floats_of_digital_numbers_have_the_sensor_s_full_scale_and_shares_none(
 
 
 @pytest.mark.parametrize("bits", [10, 14, 16])
-def test_a_file_of_such_bits_is_restored_to_its_own_full_scale(
-    bits: int, model: Path, tmp_path: Path
-) -> None:
-    """Three ways to state it give the same pixels; that they reach half of it shows that none took
-    12 bits.
-    """
+def test_a_file_of_other_bits_is_restored_to_its_own_full_scale(bits: int, run: Run) -> None:
+    """An option and a sensor give the same pixels, and no result of 12 bits reaches half of it."""
     full = 2**bits - 1
-    by_option, row, _ = run(tmp_path, noise(bits), Options(model, 23, full_scale=full))
+    by_option, row, _ = run(noise(bits), full_scale=full)
     assert row.text["full scale from"] == "asked for"
     assert by_option.dtype == np.uint16
     assert full / 2 < by_option.max() <= full
-    by_sensor, row, _ = run(
-        tmp_path, noise(bits), Options(model, 23, sensors=sensors_of_bits(bits), consistency=False)
-    )
+    by_sensor, row, _ = run(noise(bits), sensor=sensor_of_bits(bits), consistency=False)
     assert row.text["full scale"] == f"{full:g}"
     assert row.text["full scale from"] == f"{bits} bits, of the sensor"
     np.testing.assert_array_equal(by_sensor, by_option)
     if bits == 10:
-        _, row, messages = run(tmp_path, noise(bits), Options(model, 23))
+        _, row, messages = run(noise(bits))
         assert row.text["full scale from"] == "assumed: 12 bits"
         assert not any("clipped" in sentence for sentence in messages)
     else:
         with pytest.raises(ImageError, match=r"0 to 4095.*full_scale"):
-            run(tmp_path, noise(bits), Options(model, 23))
+            run(noise(bits))
 
 
 @pytest.mark.parametrize("bits", [10, 14])
 def test_a_file_states_its_bits(bits: int, model: Path, tmp_path: Path) -> None:
-    images = pytest.importorskip("tests.deploy.restoration.images", exc_type=ImportError)
     pixels = images.digital_numbers(bits)
-    options = Options(model, 64, full_scale=2**bits - 1)
-    restore_file(images.write_tiff(tmp_path / "a.tif", pixels), tmp_path / "out.tif", options)
+    tiff = images.write_tiff(tmp_path / "a.tif", pixels)
+    restore(tiff, tmp_path / "out.tif", network=model, tile=64, full_scale=2**bits - 1)
     expected = tifffile.imread(tmp_path / "out.tif")
     jp2 = images.write_jp2(tmp_path / "a.jp2", pixels, NBITS=bits)
     for image in (jp2, images.write_dimap(tmp_path / "DIM.XML", pixels, bits)):
-        row = restore_file(image, tmp_path / "out.tif", Options(model, 64))
+        (row,) = restore(image, tmp_path / "out.tif", network=model, tile=64, overwrite=True).rows
         assert row.text["full scale from"] == f"{bits} bits, as the file states"
         np.testing.assert_array_equal(tifffile.imread(tmp_path / "out.tif"), expected)
 
 
 def test_a_container_states_nothing_and_a_product_s_range_does(tmp_path: Path) -> None:
-    images = pytest.importorskip("tests.deploy.restoration.images", exc_type=ImportError)
     pixels = images.digital_numbers()
     bits = []
     for image in (
@@ -132,14 +134,12 @@ def test_a_container_states_nothing_and_a_product_s_range_does(tmp_path: Path) -
     assert bits == [None, None, None, 12, 12]
 
 
-def test_values_above_a_stated_full_scale_are_clipped_counted_and_told(
-    model: Path, tmp_path: Path
-) -> None:
-    """Counted once each, though tiles overlap; restored as if they were full scale."""
+def test_values_above_a_stated_full_scale_are_clipped_counted_and_reported(run: Run) -> None:
+    """Each is counted once, though tiles overlap, and restored as if it were full scale."""
     pixels = noise(10)
     pixels[5:9, 3:40] = 5000
     pixels[30, 30] = 1024
-    clipped, row, messages = run(tmp_path, pixels, Options(model, 23, full_scale=1023))
+    clipped, row, messages = run(pixels, full_scale=1023)
     assert row.figures["clipped pixels"].value == 4 * 37 + 1
     assert (
         sum(
@@ -148,60 +148,50 @@ def test_values_above_a_stated_full_scale_are_clipped_counted_and_told(
         )
         == 1
     )
-    expected, row, messages = run(
-        tmp_path, np.minimum(pixels, 1023), Options(model, 23, full_scale=1023)
-    )
+    expected, row, messages = run(np.minimum(pixels, 1023), full_scale=1023)
     np.testing.assert_array_equal(clipped, expected)
     assert row.figures["clipped pixels"].value == 0
     assert not any("clipped" in message for message in messages)
-    _, _, messages = run(tmp_path, noise(10), Options(model, 23, full_scale=255))
+    _, _, messages = run(noise(10), full_scale=255)
     (warning,) = (message for message in messages if "were clipped" in message)
     assert warning.endswith("% of the image; is that its full scale?")
 
 
-def test_missing_pixels_are_not_above(model: Path, tmp_path: Path) -> None:
+def test_missing_pixels_are_not_above_full_scale(run: Run) -> None:
     pixels = noise(10)
     pixels[5:9, 3:40] = 65535
     pixels[30, 30] = 2000
     nodata = [(42113, "s", 0, "65535", True)]
-    result, row = restored(tmp_path, pixels, Options(model, 23, full_scale=1023), extratags=nodata)
+    result, row, _ = run(pixels, full_scale=1023, tags={"extratags": nodata})
     assert row.figures["clipped pixels"].value == 1
     np.testing.assert_array_equal(result == 65535, pixels == 65535)
     assert result[pixels != 65535].max() <= 1023
 
 
-def test_the_count_outlives_a_stop(
-    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_count_outlives_a_stop(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     pixels = noise(10)
     pixels[2, :] = 3000
-    options = Options(model, 23, full_scale=1023)
-
-    monkeypatch.setattr(
-        "beers_deploy.restoration.run.write_output", Mock(side_effect=KeyboardInterrupt)
-    )
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path, pixels, options)
-    monkeypatch.undo()
-    row = restore_file(tmp_path / "in.tif", tmp_path / "out.tif", replace(options, resume=True))
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            "beers_deploy.restoration.run.write_output", Mock(side_effect=KeyboardInterrupt)
+        )
+        with pytest.raises(KeyboardInterrupt):
+            run(pixels, full_scale=1023)
+    _, row, _ = run(pixels, full_scale=1023, resume=True)
     assert row.figures["clipped pixels"].value == SHAPE[1]
 
 
 @pytest.mark.parametrize("value", [-1.0, np.inf])
-def test_negative_and_infinite_values_stay_an_error(
-    value: float, model: Path, tmp_path: Path
-) -> None:
+def test_negative_and_infinite_values_stay_an_error(value: float, run: Run) -> None:
     pixels = noise(10).astype(np.float32)
     pixels[4, 4] = value
-    with pytest.raises(ImageError, match="expected digital numbers of 0 to 1023"):
-        run(tmp_path, pixels, Options(model, 23, full_scale=1023))
+    with pytest.raises(ImageError, match="digital numbers of 0 to 1023"):
+        run(pixels, full_scale=1023)
 
 
-def test_8_bits_come_back_as_8_bits(model: Path, tmp_path: Path) -> None:
+def test_8_bits_come_back_as_8_bits(run: Run) -> None:
     eight = (noise(10) >> 2).astype(np.uint8)
     kinds: list[np.ndarray] = [eight, eight.astype(np.uint16)]
-    narrow, wide = (
-        restored(tmp_path, image, Options(model, 23, full_scale=255))[0] for image in kinds
-    )
+    narrow, wide = (run(image, full_scale=255)[0] for image in kinds)
     assert narrow.dtype == np.uint8
     np.testing.assert_array_equal(narrow, wide)

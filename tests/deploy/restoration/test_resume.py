@@ -9,7 +9,6 @@ import os
 import signal
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,11 +17,10 @@ import numpy as np
 import pytest
 import tifffile
 
-from beers_deploy.model.raster.compression import Compression
+from beers_deploy.cli.run import INTERRUPTED
 from beers_deploy.profiles.errors import MachineError, OptionError
-from beers_deploy.restoration.options import Options
 from beers_deploy.restoration.output import RestoredPixels
-from beers_deploy.restoration.run import restore_file
+from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import begin, noise, stop_after, stopped_after, until
 
 pytestmark = pytest.mark.slow
@@ -39,8 +37,8 @@ def image(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def expected(image: Path, model: Path, tmp_path: Path) -> bytes:
-    """The bytes of a run that nothing disturbs."""
-    restore_file(image, tmp_path / "expected.tif", Options(model, TILE_PX))
+    """Return the bytes of a run that nothing disturbs."""
+    restore(image, tmp_path / "expected.tif", network=model, tile=TILE_PX)
     return (tmp_path / "expected.tif").read_bytes()
 
 
@@ -71,19 +69,19 @@ def test_killed_at_random_moments_it_is_resumed_to_the_same_bytes(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no other process can send Ctrl-C on Windows")
-def test_ctrl_c_says_how_to_go_on(
+def test_ctrl_c_prints_how_to_resume(
     image: Path, model: Path, expected: bytes, tmp_path: Path
 ) -> None:
     running = begin(image, tmp_path / "out.tif", *resume_options(model))
     until(running, "memory")
     running.send_signal(signal.SIGINT)
     output, _ = running.communicate(timeout=60)
-    assert running.returncode not in (0, 2)
+    assert running.returncode == INTERRUPTED
     assert "--resume" in output
     assert "Traceback" not in output
     assert not (tmp_path / "out.tif").exists()
-    options = Options(model, TILE_PX, threads=1, resume=True)
-    restore_file(image, tmp_path / "out.tif", options)
+    out = tmp_path / "out.tif"
+    restore(image, out, network=model, tile=TILE_PX, threads=1, resume=True)
     assert (tmp_path / "out.tif").read_bytes() == expected
 
 
@@ -91,14 +89,13 @@ def test_finished_rows_are_not_restored_again(
     image: Path, model: Path, expected: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out.tif"
-    options = Options(model, TILE_PX)
+    options: dict[str, Any] = {"network": model, "tile": TILE_PX}
     with stopped_after(50):
-        restore_file(image, out, options)
+        restore(image, out, **options)
     with pytest.raises(OptionError, match="resume"):
-        restore_file(image, out, replace(options, halo="3", resume=True))
-    messages: list[str] = []
+        restore(image, out, **options, halo=3, resume=True)
     stop_after(50, monkeypatch, AssertionError("restored more than what was left"))
-    restore_file(image, out, replace(options, resume=True), messages.append)
+    restore(image, out, **options, resume=True)
     assert out.read_bytes() == expected
 
 
@@ -106,16 +103,16 @@ def test_another_image_of_the_same_name_is_not_mixed_in(
     image: Path, model: Path, tmp_path: Path
 ) -> None:
     with stopped_after(50):
-        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX))
+        restore(image, tmp_path / "out.tif", network=model, tile=TILE_PX)
     tifffile.imwrite(image, np.zeros((900, 260), np.uint16), tile=(16, 16))
     with pytest.raises(OptionError, match="the image"):
-        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX, resume=True))
-    restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX))
+        restore(image, tmp_path / "out.tif", network=model, tile=TILE_PX, resume=True)
+    restore(image, tmp_path / "out.tif", network=model, tile=TILE_PX)
     assert tifffile.imread(tmp_path / "out.tif").max() < 4095
 
 
 @pytest.mark.parametrize("calls", [0, 4, 1000])
-def test_a_full_disk_is_one_sentence_and_loses_no_finished_row(
+def test_a_full_disk_is_an_error_of_one_line_and_loses_no_finished_row(
     calls: int,
     image: Path,
     model: Path,
@@ -125,7 +122,7 @@ def test_a_full_disk_is_one_sentence_and_loses_no_finished_row(
 ) -> None:
     """The disk fills up at the first rows, at later ones, or while the output is written."""
     out = tmp_path / "out.tif"
-    options = Options(model, TILE_PX)
+    options: dict[str, Any] = {"network": model, "tile": TILE_PX}
     count = iter(range(10**6))
     sync = os.fsync
 
@@ -140,10 +137,10 @@ def test_a_full_disk_is_one_sentence_and_loses_no_finished_row(
         monkeypatch.setattr(os, "fsync", full)
     out.write_bytes(b"old")
     with pytest.raises(MachineError, match=r"No space left.*resume"):
-        restore_file(image, out, replace(options, compression=Compression.none))
+        restore(image, out, **options, compression="none", overwrite=True)
     monkeypatch.undo()
     assert out.read_bytes() == b"old"
-    restore_file(image, out, replace(options, resume=True))
+    restore(image, out, **options, resume=True)
     assert out.read_bytes() == expected
 
 
@@ -152,5 +149,5 @@ def test_a_swath_that_the_disk_cannot_hold_is_refused_first(
 ) -> None:
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
     with pytest.raises(MachineError, match="free"):
-        restore_file(image, tmp_path / "out.tif", Options(model, TILE_PX))
+        restore(image, tmp_path / "out.tif", network=model, tile=TILE_PX)
     assert [p.name for p in tmp_path.iterdir()] == ["in.tif"]

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from beers_deploy.model.io.lock import part_folder
-from beers_deploy.restoration.options import Options
-from beers_deploy.restoration.run import restore_file
+from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import begin
 from tests.model.raster import formats as images
 
@@ -25,7 +24,7 @@ def test_killed_among_its_rows_and_at_its_cog_it_is_resumed_to_the_same_bytes(
     image = images.FORMATS[name](tmp_path / name, images.digital_numbers())
     expected = tmp_path / "expected.tif"
     out = tmp_path / "out.tif"
-    restore_file(image, expected, Options(model, TILE_PX, threads=1, cog=True))
+    restore(image, expected, network=model, tile=TILE_PX, threads=1, cog=True)
     before = {path.name for path in tmp_path.iterdir()}
     out.write_bytes(b"old")
     killed = []

@@ -1,11 +1,10 @@
-"""Files restored by the swath engine: the whole image's result bit for bit, and what is kept beside
-the pixels.
-"""
+"""Files restored in tiles: the pixels of the whole image's result bit for bit, and the metadata."""
 
+import logging
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -17,31 +16,29 @@ from beers_deploy.profiles.errors import BeersError, ImageError, MachineError, O
 from beers_deploy.profiles.figures import Row
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session, run
-from beers_deploy.restoration import run as swath
 from beers_deploy.restoration import runtime
-from beers_deploy.restoration.options import Options, Runtime
 from beers_deploy.restoration.runtime import Infer, open_runtime
 from beers_deploy.restoration.tiles.exposures import restore_window
 from beers_deploy.restoration.tiles.missing import fill_from_nearest
-from tests.deploy.restoration.runs import noise
-from tests.deploy.restoration.runs import restored as restored_by_file
+from beers_deploy.verbs.restore import restore
+from tests.deploy.restoration.runs import noise, restored
 from tests.shipped import shipped_pair
 
 RADIUS_PX = 5
 SHAPES = [(61, 83), (17, 130), (1, 40), (40, 1), (29, 29), (3, 5)]
 
 
-def restore(
-    folder: Path, pixels: np.ndarray, options: Options, **tags: Any
+def by_file(
+    folder: Path, pixels: np.ndarray, tags: dict[str, Any] | None = None, **options: Any
 ) -> tuple[np.ndarray, Row]:
-    """Write, restore and read again."""
-    result = restored_by_file(folder, pixels, options, **tags)
+    """Write, restore and read again, and check that no other file is left."""
+    result = restored(folder, pixels, tags, **options)
     assert sorted(p.name for p in folder.iterdir()) == ["in.tif", "out.tif"]
     return result
 
 
 def whole_image(model: Path, pixels: np.ndarray) -> np.ndarray:
-    """The result without any tiling, float32."""
+    """Return the result without any tiling, float32."""
     return restore_window(pixels, partial(run, open_session(load_onnx(model))))
 
 
@@ -49,22 +46,22 @@ def whole_image(model: Path, pixels: np.ndarray) -> np.ndarray:
 def test_tiled_equals_whole_bit_for_bit(
     shape: tuple[int, int], model: Path, tmp_path: Path
 ) -> None:
-    options = Options(model, tile_px=23)
     pixels = noise(*shape)
-    restored, _ = restore(tmp_path, pixels, options, tile=(16, 16), compression="zlib")
-    assert restored.dtype == np.uint16
-    np.testing.assert_array_equal(restored, np.rint(whole_image(model, pixels)).astype(np.uint16))
-    floats, _ = restore(tmp_path, pixels.astype(np.float32), options)
+    tags = {"tile": (16, 16), "compression": "zlib"}
+    result, _ = by_file(tmp_path, pixels, tags, network=model, tile=23)
+    assert result.dtype == np.uint16
+    np.testing.assert_array_equal(result, np.rint(whole_image(model, pixels)).astype(np.uint16))
+    floats, _ = by_file(tmp_path, pixels.astype(np.float32), network=model, tile=23)
     assert floats.dtype == np.float32
     np.testing.assert_array_equal(floats, whole_image(model, pixels))
 
 
-def test_one_pixel_less_than_the_radius_shows_seams_and_says_so(
+def test_one_pixel_less_than_the_radius_gives_seams_that_are_measured(
     model: Path, tmp_path: Path
 ) -> None:
     pixels = noise(61, 83).astype(np.float32)
-    restored, row = restore(tmp_path, pixels, Options(model, tile_px=23, halo=str(RADIUS_PX - 1)))
-    assert (restored != whole_image(model, pixels)).any()
+    result, row = by_file(tmp_path, pixels, network=model, tile=23, halo=RADIUS_PX - 1)
+    assert (result != whole_image(model, pixels)).any()
     largest = row.figures["seam error max"]
     mean = row.figures["seam error mean"]
     assert largest.value is not None
@@ -75,10 +72,10 @@ def test_one_pixel_less_than_the_radius_shows_seams_and_says_so(
 
 def test_the_seam_error_is_that_of_the_tile_in_the_middle(model: Path, tmp_path: Path) -> None:
     pixels = noise(60, 60).astype(np.float32)
-    restored, row = restore(tmp_path, pixels, Options(model, tile_px=24, halo="2"))
+    result, row = by_file(tmp_path, pixels, network=model, tile=24, halo=2)
     # Tiles of 23 pixels keep rows 0 to 20, 21 to 39 and 40 to 59.
     middle = np.s_[21:40, 21:40]
-    error = np.abs(restored.astype(np.float64) - whole_image(model, pixels))[middle]
+    error = np.abs(result.astype(np.float64) - whole_image(model, pixels))[middle]
     assert row.figures["seam error max"].value == pytest.approx(error.max())
     assert row.figures["seam error mean"].value == pytest.approx(error.mean())
 
@@ -87,23 +84,22 @@ def test_the_seam_error_is_that_of_the_tile_in_the_middle(model: Path, tmp_path:
 def test_bands_are_restored_one_by_one(layout: dict[str, str], model: Path, tmp_path: Path) -> None:
     bands = noise(3, 41, 35)
     pixels = bands if layout["planarconfig"] == "separate" else np.moveaxis(bands, 0, 2)
-    restored, row = restore(
-        tmp_path, pixels, Options(model, tile_px=23), photometric="rgb", **layout
-    )
-    for band, result in zip(bands, restored, strict=True):
+    tags = {"photometric": "rgb", **layout}
+    results, row = by_file(tmp_path, pixels, tags, network=model, tile=23)
+    for band, result in zip(bands, results, strict=True):
         np.testing.assert_array_equal(result, np.rint(whole_image(model, band)))
     assert row.figures["tiles"].value == 3 * 3 * 2
 
 
 def test_full_scale_is_what_the_network_sees_as_one(model: Path, tmp_path: Path) -> None:
     pixels = noise(40, 30)
-    twelve, _ = restore(tmp_path, pixels, Options(model, tile_px=23))
-    fourteen, _ = restore(tmp_path, pixels * 4, Options(model, tile_px=23, full_scale=4095 * 4))
+    options: dict[str, Any] = {"network": model, "tile": 23}
+    twelve, _ = by_file(tmp_path, pixels, **options)
+    fourteen, _ = by_file(tmp_path, pixels * 4, **options, full_scale=4095 * 4)
     # Rounding moves the result of 12 bits by up to 0.5, and that of 14 bits by up to 0.5 / 4.
     assert np.abs(fourteen / 4 - twelve.astype(float)).max() <= 0.625
-    unit, _ = restore(
-        tmp_path, (pixels / 4095).astype(np.float32), Options(model, tile_px=23, full_scale=1)
-    )
+    shares = (pixels / 4095).astype(np.float32)
+    unit, _ = by_file(tmp_path, shares, **options, full_scale=1)
     assert np.abs(unit * 4095 - twelve.astype(float)).max() <= 0.51
 
 
@@ -112,13 +108,12 @@ def test_floats_of_about_0_to_1_are_refused_until_their_scale_is_named(
 ) -> None:
     shares = (noise(61, 37) / 4095).astype(np.float32)
     shares[5:9] = np.nan
-    refused(
-        tmp_path, shares, Options(model, tile_px=23), ImageError, "floats of at most 1", "`full"
-    )
-    refused(tmp_path, shares * 1.9, Options(model, tile_px=23), ImageError, "full_scale")
+    options: dict[str, Any] = {"network": model, "tile": 23}
+    refused(tmp_path, shares, ImageError, "floats of at most 1", "`full_scale`", **options)
+    refused(tmp_path, shares * 1.9, ImageError, "`full_scale`", **options)
     (tmp_path / "out.tif").unlink()
-    restored, _ = restore(tmp_path, shares, Options(model, tile_px=23, full_scale=1))
-    assert 0 < np.nanmean(restored) < np.nanmax(restored) <= 1
+    result, _ = by_file(tmp_path, shares, **options, full_scale=1)
+    assert 0 < np.nanmean(result) < np.nanmax(result) <= 1
 
 
 def test_one_bright_row_at_the_end_makes_floats_digital_numbers(
@@ -126,8 +121,8 @@ def test_one_bright_row_at_the_end_makes_floats_digital_numbers(
 ) -> None:
     dark = np.full((70, 37), 0.5, np.float32)
     dark[-1, 3] = 900
-    assumed, row = restore(tmp_path, dark, Options(model, tile_px=23))
-    scaled, _ = restore(tmp_path, dark, Options(model, tile_px=23, full_scale=4095))
+    assumed, row = by_file(tmp_path, dark, network=model, tile=23)
+    scaled, _ = by_file(tmp_path, dark, network=model, tile=23, full_scale=4095)
     np.testing.assert_array_equal(assumed, scaled)
     assert row.text["full scale"] == "4095"
 
@@ -137,7 +132,7 @@ def test_nodata_settles_no_scale(model: Path, tmp_path: Path) -> None:
     shares[3:7] = -9999
     tifffile.imwrite(tmp_path / "in.tif", shares, extratags=[(42113, "s", 0, "-9999", True)])
     with pytest.raises(ImageError, match="full_scale"):
-        swath.restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=23))
+        restore(tmp_path / "in.tif", tmp_path / "out.tif", network=model, tile=23)
 
 
 def test_georeference_and_rpcs_are_kept(model: Path, tmp_path: Path) -> None:
@@ -149,7 +144,7 @@ def test_georeference_and_rpcs_are_kept(model: Path, tmp_path: Path) -> None:
         (42113, "s", 0, "0", True),
         (50844, "d", 92, tuple(np.linspace(-1, 1, 92)), True),
     ]
-    restore(tmp_path, noise(20, 20), Options(model), extratags=tags)
+    by_file(tmp_path, noise(20, 20), {"extratags": tags}, network=model)
     with (
         tifffile.TiffFile(tmp_path / "in.tif") as before,
         tifffile.TiffFile(tmp_path / "out.tif") as after,
@@ -165,7 +160,7 @@ def test_georeference_and_rpcs_are_kept(model: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["nan", "tag"])
-def test_missing_pixels_stay_and_spoil_nothing(kind: str, model: Path, tmp_path: Path) -> None:
+def test_missing_pixels_stay_and_corrupt_no_others(kind: str, model: Path, tmp_path: Path) -> None:
     ground = noise(70, 90).astype(np.float32)
     missing = np.zeros((70, 90), bool)
     missing[20:60, 30:75] = missing[3, 5] = True
@@ -175,14 +170,15 @@ def test_missing_pixels_stay_and_spoil_nothing(kind: str, model: Path, tmp_path:
     else:
         pixels = np.where(missing, 7, np.where(ground == 7, 8, ground)).astype(np.uint16)
         tags = [(42113, "s", 0, "7", True)]
-    options = [Options(model, tile_px=tile_px) for tile_px in (19, 31, 640)]
-    results = [restore(tmp_path, pixels, option, extratags=tags)[0] for option in options]
+    results = [
+        by_file(tmp_path, pixels, {"extratags": tags}, network=model, tile=tile_px)[0]
+        for tile_px in (19, 31, 640)
+    ]
     np.testing.assert_array_equal(results[0], results[2])
     np.testing.assert_array_equal(results[1], results[2])
     np.testing.assert_array_equal(results[0][missing], pixels[missing])
-    filled, _ = restore(
-        tmp_path, np.where(missing, 999, ground).astype(pixels.dtype), Options(model)
-    )
+    other = np.where(missing, 999, ground).astype(pixels.dtype)
+    filled, _ = by_file(tmp_path, other, network=model)
     differs = (results[0] != filled) & ~missing
     rows, columns = np.nonzero(missing)
     for row, column in np.argwhere(differs):
@@ -201,13 +197,13 @@ def test_a_filled_pixel_is_the_nearest_known_one() -> None:
 
 
 def refused(
-    folder: Path, pixels: np.ndarray, options: Options, error: type[BeersError], *words: str
+    folder: Path, pixels: np.ndarray, error: type[BeersError], *words: str, **options: Any
 ) -> None:
-    """One sentence, the old output as it was, and nothing beside it."""
+    """Expect an error with these words, the old output as it was, and no other file."""
     tifffile.imwrite(folder / "in.tif", pixels, tile=(16, 16))
     (folder / "out.tif").write_bytes(b"the old one")
     with pytest.raises(error) as caught:
-        swath.restore_file(folder / "in.tif", folder / "out.tif", options)
+        restore(folder / "in.tif", folder / "out.tif", overwrite=True, **options)
     for word in words:
         assert word in str(caught.value)
     assert (folder / "out.tif").read_bytes() == b"the old one"
@@ -222,67 +218,82 @@ def refused(
             np.pad(noise(89, 40), ((0, 1), (0, 0)), constant_values=60000),
             ("60000", "full_scale"),
         ),
-        (-noise(90, 40).astype(np.float32), ("-4", "add the offset")),
-        (np.full((20, 20), np.inf, np.float32), ("inf", "write NaN")),
+        (-noise(90, 40).astype(np.float32), ("-4", "Add the offset")),
+        (np.full((20, 20), np.inf, np.float32), ("inf", "Write NaN")),
         (np.full((60, 40), np.nan, np.float32), ("NaN",)),
     ],
 )
-def test_values_that_cannot_be_leave_the_old_output(
+def test_invalid_values_leave_the_old_output(
     pixels: np.ndarray, words: tuple[str, ...], model: Path, tmp_path: Path
 ) -> None:
-    refused(tmp_path, pixels, Options(model, tile_px=23), ImageError, *words)
+    refused(tmp_path, pixels, ImageError, *words, network=model, tile=23)
 
 
 @pytest.mark.parametrize(
     ("word", "changes"),
     [
-        ("tile", {"tile_px": 16, "halo": "8"}),
-        ("halo", {"halo": "wide"}),
-        ("full_scale", {"full_scale": 0.5}),
+        ("`tile`", {"tile": 16, "halo": 8}),
+        ("`tile`", {"tile": 15}),
+        ("`halo`", {"halo": "wide"}),
+        ("`full_scale`", {"full_scale": 0.5}),
+        ("`compression`", {"compression": "jpeg"}),
+        ("`runtime`", {"runtime": "tensorrt"}),
     ],
 )
-def test_options_that_cannot_be_are_refused(
+def test_invalid_options_are_refused(
     word: str, changes: dict[str, Any], model: Path, tmp_path: Path
 ) -> None:
-    refused(
-        tmp_path, noise(40, 40), Options(model, **{"tile_px": 23, **changes}), OptionError, word
-    )
+    options = {"network": model, "tile": 23, **changes}
+    refused(tmp_path, noise(40, 40), OptionError, word, **options)
 
 
 def test_a_budget_that_does_not_suffice_is_refused_before_the_run(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = "memory", "1.00 kB", "give it more than"
-    refused(tmp_path, noise(40, 40), Options(model, memory_bytes=1000), MachineError, *words)
+    words = "memory", "1.00 kB", "Allow more memory than"
+    refused(tmp_path, noise(40, 40), MachineError, *words, network=model, memory=1e-6)
     tifffile.imwrite(tmp_path / "in.tif", noise(1000, 3000), compression="zlib", rowsperstrip=1000)
     # What a process of many tests holds moves by more than the rows of the image.
     memory = SimpleNamespace(memory_info=lambda: SimpleNamespace(rss=100_000_000))
     monkeypatch.setattr("beers_deploy.restoration.plan.psutil.Process", lambda: memory)
-    options = Options(model, tile_px=64, memory_bytes=108_000_000)
     with pytest.raises(MachineError, match="TILED=YES"):
-        swath.restore_file(tmp_path / "in.tif", tmp_path / "out.tif", options)
+        restore(
+            tmp_path / "in.tif",
+            tmp_path / "out.tif",
+            network=model,
+            tile=64,
+            memory=0.108,
+            overwrite=True,
+        )
 
 
-def test_memory_is_stated_before_anything_is_written(model: Path, tmp_path: Path) -> None:
+def test_memory_is_stated_before_anything_is_written(
+    model: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     tifffile.imwrite(tmp_path / "in.tif", noise(80, 40))
-    messages: list[str] = []
+    logged: list[tuple[str, bool]] = []
 
-    def say(text: str) -> None:
-        messages.append(text)
-        assert not (tmp_path / "out.tif").exists()
+    def noting(record: logging.LogRecord) -> bool:
+        logged.append((record.getMessage(), (tmp_path / "out.tif").exists()))
+        return True
 
-    swath.restore_file(tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=23), say)
-    assert "work factor" in messages[0]
-    assert "memory" in messages[1]
+    monkeypatch.setattr(caplog.handler, "filters", [noting])
+    with caplog.at_level(logging.INFO, "beers_deploy"):
+        restore(tmp_path / "in.tif", tmp_path / "out.tif", network=model, tile=23)
+    (plan, early), (memory, late), *_ = logged
+    assert "work factor" in plan
+    assert "memory" in memory
+    assert not early
+    assert not late
 
 
-@pytest.mark.parametrize("compression", Compression)
-def test_compressions_are_lossless(compression: Compression, model: Path, tmp_path: Path) -> None:
-    restored, _ = restore(tmp_path, noise(40, 50), Options(model, compression=compression))
-    np.testing.assert_array_equal(restored, np.rint(whole_image(model, noise(40, 50))))
+@pytest.mark.parametrize("compression", get_args(Compression))
+def test_compressions_are_lossless(compression: str, model: Path, tmp_path: Path) -> None:
+    result, _ = by_file(tmp_path, noise(40, 50), network=model, compression=compression)
+    np.testing.assert_array_equal(result, np.rint(whole_image(model, noise(40, 50))))
     with tifffile.TiffFile(tmp_path / "out.tif") as file:
         assert file.pages.first.is_tiled
-        assert (file.pages.first.compression == 1) == (compression is Compression.none)
+        assert (file.pages.first.compression == 1) == (compression == "none")
 
 
 @pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
@@ -292,9 +303,9 @@ def test_integers_are_packed_as_differences_and_gdal_reads_them(
 ) -> None:
     # The image is not square.
     pixels: np.ndarray = np.tile(noise(70, 90) // 20, (1, 4, 4)).astype(dtype)
-    restored, _ = restore(tmp_path, pixels, Options(model, full_scale=255))
+    result, _ = by_file(tmp_path, pixels, network=model, full_scale=255)
     with rasterio.open(tmp_path / "out.tif") as file:
-        np.testing.assert_array_equal(file.read(), restored.reshape(-1, *restored.shape[-2:]))
+        np.testing.assert_array_equal(file.read(), result.reshape(-1, *result.shape[-2:]))
     with tifffile.TiffFile(tmp_path / "out.tif") as file:
         assert file.pages.first.predictor == predictor
 
@@ -311,7 +322,7 @@ def test_a_tile_without_known_pixels_costs_no_inference(
     monkeypatch.setattr("beers_deploy.restoration.tiles.exposures.restore_window", counting)
     pixels = noise(30, 300).astype(np.float32)
     pixels[:, 100:] = np.nan
-    _, row = restore(tmp_path, pixels, Options(model, tile_px=30))
+    _, row = by_file(tmp_path, pixels, network=model, tile=30)
     assert row.figures["tiles"].value == 15
     # The first tile keeps 25 columns, those after it 20.
     assert len(shapes) == 5
@@ -322,10 +333,9 @@ def test_openvino_gives_the_same_int8_numbers(tmp_path: Path) -> None:
     pixels = np.concatenate(
         [noise(100, 110), np.linspace(0, 4095, 11000).reshape(100, 110).astype(np.uint16)]
     )
-    by_onnxruntime, _ = restore(tmp_path, pixels, Options(shipped_pair()[1], tile_px=64))
-    by_openvino, row = restore(
-        tmp_path, pixels, Options(shipped_pair()[1], tile_px=64, runtime=Runtime.openvino)
-    )
+    options: dict[str, Any] = {"network": shipped_pair()[1], "tile": 64}
+    by_onnxruntime, _ = by_file(tmp_path, pixels, **options)
+    by_openvino, row = by_file(tmp_path, pixels, **options, runtime="openvino")
     np.testing.assert_array_equal(by_openvino, by_onnxruntime)
     assert row.text["runtime"].startswith("openvino")
 
@@ -333,7 +343,9 @@ def test_openvino_gives_the_same_int8_numbers(tmp_path: Path) -> None:
 def test_openvino_gives_them_on_processors_whose_kernels_saturate_too(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """In the ways that are taken there; the image is of the extremes, at which sums are largest."""
+    """The network is rewritten as on such a processor; the image has the two extreme values, whose
+    sums are largest.
+    """
     pytest.importorskip("openvino")
     image = np.random.default_rng(3).integers(0, 2, (1, 1, 41, 67)).astype(np.float32)
     model = load_onnx(shipped_pair()[1])
@@ -347,9 +359,9 @@ def test_openvino_gives_the_same_float_numbers_within_a_hundredth_of_a_dn(
 ) -> None:
     pytest.importorskip("openvino")
     pixels = noise(61, 83).astype(np.float32)
-    by_onnxruntime, _ = restore(tmp_path, pixels, Options(model, tile_px=30))
-    by_openvino, _ = restore(tmp_path, pixels, Options(model, tile_px=30, runtime=Runtime.openvino))
-    untiled, _ = restore(tmp_path, pixels, Options(model, runtime=Runtime.openvino))
+    by_onnxruntime, _ = by_file(tmp_path, pixels, network=model, tile=30)
+    by_openvino, _ = by_file(tmp_path, pixels, network=model, tile=30, runtime="openvino")
+    untiled, _ = by_file(tmp_path, pixels, network=model, runtime="openvino")
     np.testing.assert_array_equal(by_openvino, untiled)
     assert np.abs(by_openvino - by_onnxruntime).max() < 0.01
 
@@ -357,4 +369,15 @@ def test_openvino_gives_the_same_float_numbers_within_a_hundredth_of_a_dn(
 def test_a_missing_openvino_is_one_sentence(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "openvino", None)
     with pytest.raises(MachineError, match=r"pip install 'beers-deploy\[openvino\]'"):
-        open_runtime(Runtime.openvino, load_onnx(model), 1)
+        open_runtime("openvino", load_onnx(model), 1)
+
+
+def test_an_array_with_a_coordinate_system_is_no_file(model: Path) -> None:
+    xarray = pytest.importorskip("xarray")
+    pixels = noise(40, 50)
+    image = xarray.DataArray(pixels, dims=("y", "x"), attrs={"crs": "EPSG:32631"})
+    result = restore(image, network=model)
+    np.testing.assert_array_equal(result, np.rint(whole_image(model, pixels)))
+    assert result.attrs == image.attrs
+    with pytest.raises(OptionError, match="`compression` has no effect with an array"):
+        restore(pixels, network=model, compression="none")

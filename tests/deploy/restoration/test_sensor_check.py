@@ -1,7 +1,6 @@
-"""An image held against its sensor: what is told rightly passes, what is told wrongly is said, or
-refused.
-"""
+"""An image is compared with its sensor: a wrong sensor leads to a warning, or to an error."""
 
+import logging
 import re
 import time
 from pathlib import Path
@@ -64,7 +63,7 @@ def test_the_true_sensor_is_found_again(raw: np.ndarray) -> None:
         ({"gain_dn_per_radiance": 25.0}, "looks like SNR"),
     ],
 )
-def test_another_sensor_is_told_apart(
+def test_another_sensor_is_recognised(
     numbers: dict[str, float], words: str, raw: np.ndarray
 ) -> None:
     (doubt, *_) = check(raw, SENSOR.replace(**numbers)).doubts
@@ -78,7 +77,7 @@ def test_pixels_above_the_sensor_s_full_scale_contradict_it(raw: np.ndarray) -> 
     )
 
 
-def test_bands_are_held_one_by_one_against_their_own_sensors(raw: np.ndarray) -> None:
+def test_each_band_is_compared_with_its_own_sensor(raw: np.ndarray) -> None:
     two = check_source(
         ArraySource(np.stack([raw, raw]), Raster(2, 320, 320, raw.dtype)),
         [SENSOR, SENSOR.replace(snr_0=25, snr_1=55)],
@@ -89,7 +88,7 @@ def test_bands_are_held_one_by_one_against_their_own_sensors(raw: np.ndarray) ->
 
 
 def test_a_restored_image_holds_no_raw_noise(raw: np.ndarray) -> None:
-    (doubt, *_) = check(bd.restore(raw, "convbeers-xs-int8", sensor=SENSOR)).doubts
+    (doubt, *_) = check(bd.restore(raw, network="convbeers-xs-int8", sensor=SENSOR)).doubts
     assert "restored, resampled or compressed" in doubt
 
 
@@ -108,7 +107,7 @@ def test_what_cannot_be_seen_is_no_contradiction() -> None:
         )
 
 
-def test_commands_say_it_and_strict_refuses(raw: np.ndarray, tmp_path: Path) -> None:
+def test_commands_warn_and_strict_refuses(raw: np.ndarray, tmp_path: Path) -> None:
     image = tmp_path / "raw.tif"
     out = tmp_path / "out.tif"
     tifffile.imwrite(image, raw)
@@ -121,33 +120,37 @@ def test_commands_say_it_and_strict_refuses(raw: np.ndarray, tmp_path: Path) -> 
     assert "look at the sensor" not in done(*preview, "--sensor", NAME, "--strict")
     out.unlink()
     for words in (("restore", image, out, *network), preview):
-        assert "expected an image of wrong" in refused(*words, "--sensor", profile, "--strict")
+        assert "contradicts the sensor wrong" in refused(*words, "--sensor", profile, "--strict")
     refused("restore", image, out, "--method", "traditional", "--sensor", profile, "--strict")
     assert not out.exists()
 
 
-def test_the_library_warns_and_strict_refuses(raw: np.ndarray) -> None:
+def test_the_library_logs_a_warning_and_strict_refuses(
+    raw: np.ndarray, caplog: pytest.LogCaptureFixture
+) -> None:
     noisy = SENSOR.replace(snr_0=25, snr_1=55)
-    with pytest.warns(UserWarning, match="look at the sensor: noise at"):
-        bd.restore(raw, "convbeers-xs-int8", sensor=noisy)
-    with pytest.raises(ValueError, match="expected an image of"):
-        bd.restore(raw, "convbeers-xs-int8", sensor=noisy, strict=True)
+    bd.restore(raw, network="convbeers-xs-int8", sensor=noisy)
+    (record,) = caplog.records
+    assert record.levelno == logging.WARNING
+    assert record.getMessage().startswith("look at the sensor: noise at")
+    with pytest.raises(ValueError, match="contradicts the sensor"):
+        bd.restore(raw, network="convbeers-xs-int8", sensor=noisy, strict=True)
 
 
-def test_pairs_that_are_evaluated_are_held_against_it(tmp_path: Path) -> None:
+def test_pairs_are_compared_with_the_sensor_before_an_evaluation(tmp_path: Path) -> None:
     profile = SENSOR.replace(snr_0=25, snr_1=55).save(tmp_path / "wrong.toml")
     pairs = bd.simulate(sensor=SENSOR, size=320, seed=3).save(tmp_path / "pairs")
     (pairs / "recipe.json").unlink()
     words = ("evaluate", "--pairs", pairs, "--methods", "degraded")
     assert "look at the sensor: noise at" in done(*words, "--sensor", profile)
-    assert "expected an image of wrong" in refused(*words, "--sensor", profile, "--strict")
-    result = bd.evaluate(["degraded"], pairs, sensor=SENSOR, strict=True, progress=False)
+    assert "contradicts the sensor wrong" in refused(*words, "--sensor", profile, "--strict")
+    result = bd.evaluate(methods=["degraded"], pairs=pairs, sensor=SENSOR, strict=True)
     assert next(row for row in result.rows if "sensor" in row.table).text == {
         "sensor told": "agrees"
     }
 
 
-def test_its_time_is_no_part_of_the_restoration_s(
+def test_the_time_of_the_check_is_not_that_of_the_restoration(
     raw: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image = tmp_path / "raw.tif"
@@ -157,10 +160,10 @@ def test_its_time_is_no_part_of_the_restoration_s(
         time.sleep(2)
         return SensorCheck()
 
-    monkeypatch.setattr("beers_deploy.restoration.prepare.told_sensor", slow)
+    monkeypatch.setattr("beers_deploy.restoration.prepare.checked_sensor", slow)
     start_s = time.perf_counter()
     result = bd.restore(
-        image, "convbeers-xs-int8", sensor=SENSOR, out=tmp_path / "out.tif", progress=False
+        image, tmp_path / "out.tif", network="convbeers-xs-int8", sensor=SENSOR, progress=False
     )
     whole_s = time.perf_counter() - start_s
     (row,) = result.rows

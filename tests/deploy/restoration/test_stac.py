@@ -1,4 +1,4 @@
-"""STAC items: valid by the core schema, on the place of the image, with what was done."""
+"""STAC items are valid by the core schema, and have the place of the image and what was done."""
 
 import json
 import sys
@@ -21,7 +21,7 @@ def restored_item(image: Path, item: Path, model: Path) -> dict[str, Any]:
     return content
 
 
-def test_an_item_is_valid_and_lies_where_the_image_does(model: Path, tmp_path: Path) -> None:
+def test_an_item_is_valid_and_has_the_place_of_the_image(model: Path, tmp_path: Path) -> None:
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
     content = restored_item(image, tmp_path / "catalogue" / "item.json", model)
     pystac.Item.from_dict(content).validate()
@@ -36,7 +36,7 @@ def test_an_item_is_valid_and_lies_where_the_image_does(model: Path, tmp_path: P
     assert content["bbox"] == pytest.approx(list(expected), abs=1e-8)
 
 
-def test_an_image_that_lies_nowhere_has_no_geometry(model: Path, tmp_path: Path) -> None:
+def test_an_image_without_a_place_has_no_geometry(model: Path, tmp_path: Path) -> None:
     image = images.write_tiff(
         tmp_path / "in.tif", images.digital_numbers(), crs=None, transform=None
     )
@@ -46,13 +46,16 @@ def test_an_image_that_lies_nowhere_has_no_geometry(model: Path, tmp_path: Path)
     assert "bbox" not in content
 
 
-def test_it_goes_with_a_cog_and_needs_its_package(
+def test_an_item_needs_a_cog_and_its_package(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
     outputs = (tmp_path / "out.tif", "--stac", tmp_path / "i.json")
     words = ("restore", image, *outputs, "--network", model)
     monkeypatch.setitem(sys.modules, "pystac", None)
-    for more, sentence in (([], "--stac: expected --cog"), (["--cog"], "beers-deploy[stac]")):
+    for more, sentence in (
+        ([], "--stac has no effect without --cog"),
+        (["--cog"], "beers-deploy[stac]"),
+    ):
         assert sentence in refused(*words, *more)
         assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]

@@ -3,9 +3,7 @@ changes.
 """
 
 import json
-import warnings
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,17 +13,13 @@ import onnx
 import pytest
 import tifffile
 
-import beers_deploy as bd
 from beers_deploy.model.consistency import REACH_PX
-from beers_deploy.network import Network
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import MachineError, OptionError
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import BLIND
+from beers_deploy.profiles.sensor_file import BLIND, load_sensor
 from beers_deploy.quant.onnx_file import save_onnx
-from beers_deploy.restoration.options import Options
-from beers_deploy.restoration.run import restore_file
 from beers_deploy.restoration.tiles.rows import HeldRows, NetworkRow
+from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import done
 from tests.deploy.restoration.runs import restored, stopped_after
 from tests.quant.tiling.small_networks import espcn, four_bands
@@ -45,8 +39,8 @@ NODATA = 0
 
 @cache
 def image() -> np.ndarray:
-    """Dark, medium and bright ground (H, W) uint16, so that some pixels take each of the factors 1,
-    4 and 8.
+    """Return dark, medium and bright ground (H, W) uint16, so that some pixels need each of the
+    factors 1, 4 and 8.
     """
     generator = np.random.default_rng(7)
     pixels = generator.integers(1500, 3500, SHAPE)
@@ -57,7 +51,7 @@ def image() -> np.ndarray:
 
 @cache
 def lacking() -> np.ndarray:
-    """The same with missing pixels, an area of them across tiles, and saturated ones."""
+    """Return the same with missing pixels, an area of them across tiles, and saturated ones."""
     pixels = image().copy()
     pixels[60:110, 40:90] = NODATA
     pixels[[3, 77, 128], [5, 120, 140]] = NODATA
@@ -66,44 +60,34 @@ def lacking() -> np.ndarray:
 
 
 def as_floats(pixels: np.ndarray) -> np.ndarray:
-    """Missing pixels are NaN."""
+    """Return pixels as float32, with NaN for missing ones."""
     return np.where(pixels == NODATA, np.float32(np.nan), pixels.astype(np.float32))
 
 
-def options(
-    name: str, sensors: Mapping[str, Sensor] | None = None, exposure: bool = True, **more: Any
-) -> Options:
-    """Build what the command makes of --network, --sensor and --no-exposure."""
-    by_band = sensors or {"": SENSOR}
-    with warnings.catch_warnings(action="ignore"):
-        networks = {band: Network.load(name, sensor=sensor) for band, sensor in by_band.items()}
-    return Options(
-        next(iter(networks.values())),
-        sensors=by_band,
-        bands={} if "" in networks else networks,
-        exposure=exposure,
-        **more,
-    )
+DEFAULTS: dict[str, Any] = {"sensor": SENSOR, "full_scale": 4095}
+"""Options of each restoration that names no others."""
 
 
-def by_array(pixels: Any, name: str, **more: Any) -> Any:
-    """Restore an array; that noise is no image of the sensor is told as a warning."""
-    with warnings.catch_warnings(action="ignore"):
-        return bd.restore(
-            pixels, name, progress=None, **{"sensor": SENSOR, "full_scale": 4095, **more}
-        )
+def by_array(pixels: Any, network: str | Path, **options: Any) -> Any:
+    """Restore an array."""
+    return restore(pixels, network=network, **{**DEFAULTS, **options})
 
 
-def by_file(folder: Path, pixels: np.ndarray, how: Options, **tiff_options: Any) -> np.ndarray:
-    tags = {"extratags": [(42113, "s", 0, f"{NODATA}", True)]} if pixels.dtype == np.uint16 else {}
-    return restored(folder, pixels, replace(how, full_scale=4095), **tags, **tiff_options)[0]
+def by_file(
+    folder: Path, pixels: np.ndarray, layout: dict[str, Any] | None = None, **options: Any
+) -> np.ndarray:
+    """Restore a file, `layout` of which is what tifffile takes."""
+    tags = dict(layout or {})
+    if pixels.dtype == np.uint16:
+        tags["extratags"] = [(42113, "s", 0, f"{NODATA}", True)]
+    return restored(folder, pixels, tags, **{**DEFAULTS, **options})[0]
 
 
 @pytest.mark.parametrize(("name", "floats"), [(FLOAT, True), (INT8, False)])
 def test_tiles_and_files_give_the_whole_image_s_pixels(
     name: str, floats: bool, tmp_path: Path
 ) -> None:
-    """With both steps, missing and saturated pixels, bit for bit."""
+    """The pixels are the same bit for bit, with both steps, missing and saturated pixels."""
     pixels = as_floats(lacking()) if floats else lacking()
     nodata = None if floats else NODATA
     untiled = by_array(pixels, name, nodata=nodata)
@@ -111,9 +95,8 @@ def test_tiles_and_files_give_the_whole_image_s_pixels(
     for tile_px in TILES_PX:
         tiled = by_array(pixels, name, nodata=nodata, tile=tile_px)
         np.testing.assert_array_equal(tiled, untiled, err_msg=f"tiles of {tile_px}")
-    np.testing.assert_array_equal(
-        by_file(tmp_path, pixels, options(name, tile_px=TILES_PX[0])), untiled
-    )
+    written = by_file(tmp_path, pixels, network=name, tile=TILES_PX[0])
+    np.testing.assert_array_equal(written, untiled)
     missing = lacking() == NODATA
     np.testing.assert_array_equal(np.isnan(untiled) if floats else untiled == NODATA, missing)
 
@@ -121,7 +104,7 @@ def test_tiles_and_files_give_the_whole_image_s_pixels(
 def test_a_dask_array_gives_the_same_and_its_workers_read_no_files(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A worker on another machine has none of the networks' files, of any exposure."""
+    """A worker on another machine has no file of a network, at any exposure."""
     da = pytest.importorskip("dask.array", reason="the extra 'dask' is not installed")
     untiled = by_array(lacking(), INT8, nodata=NODATA)
     lazy = by_array(da.from_array(lacking(), chunks=50), INT8, nodata=NODATA, tile=TILES_PX[0])
@@ -148,44 +131,69 @@ def test_a_dask_array_has_the_full_scale_of_its_sensor(floats: bool) -> None:
 def test_each_band_takes_the_steps_of_its_own_sensor(
     sensors: tuple[Sensor, Sensor], tmp_path: Path
 ) -> None:
-    """Also where one band's sensor allows no factor above 1, or is not known."""
+    """The sensor of one band allows no factor above 1, or is not known."""
     bands = np.stack([image(), image()[::-1]])
     separate: dict[str, Any] = {"planarconfig": "separate", "photometric": "minisblack"}
     by_name = {f"B{number}": sensor for number, sensor in enumerate(sensors)}
-    results = by_file(tmp_path, bands, options(INT8, by_name, tile_px=64), **separate)
+    results = by_file(tmp_path, bands, separate, network=INT8, sensor=by_name, tile=64)
     for band, sensor, result in zip(bands, sensors, results, strict=True):
         np.testing.assert_array_equal(result, by_array(band, INT8, sensor=sensor, nodata=NODATA))
+    da = pytest.importorskip("dask.array", reason="the extra 'dask' is not installed")
+    chunks = da.from_array(bands, chunks=(1, 50, 50))
+    lazy = by_array(chunks, INT8, sensor=by_name, nodata=NODATA, tile=64)
+    np.testing.assert_array_equal(lazy.compute(scheduler="synchronous"), results)
 
 
-def stopped(folder: Path, how: Options, tiles: int) -> Options:
-    """Stop a run after so many tiles, the first rows of them finished; return the options to resume
-    it.
-    """
-    error = MachineError("machine", expected="power", got="none", remedy="wait")
+def test_a_result_names_the_network_of_each_band(tmp_path: Path) -> None:
+    """The user may name the bands in any order."""
+    layout: dict[str, Any] = {"planarconfig": "separate", "photometric": "minisblack"}
+    tifffile.imwrite(tmp_path / "in.tif", np.stack([image(), image()[::-1]]), **layout)
+    sensors = {"B0": SENSOR, "B1": NOISY}
+    networks = []
+    for names in (["B0", "B1"], ["B1", "B0"]):
+        run = restore(
+            tmp_path / "in.tif",
+            tmp_path / "out.tif",
+            network=INT8,
+            sensor={name: sensors[name] for name in names},
+            overwrite=True,
+        )
+        networks.append({item.name: item.sha256 for item in run.inputs[:2]})
+    assert networks[0] == networks[1]
+    assert set(networks[0]) == {f"{INT8}.onnx, {band}" for band in sensors}
+    assert len(set(networks[0].values())) == 2
+
+
+HOW: dict[str, Any] = {**DEFAULTS, "network": INT8, "tile": 57, "threads": 1}
+"""Options of the runs that are stopped."""
+
+
+def stop(folder: Path, tiles: int) -> None:
+    """Stop a run after a number of tiles, when its first rows are finished."""
+    error = MachineError("The machine has no power. Wait.")
     with stopped_after(tiles, error):
-        restore_file(folder / "in.tif", folder / "out.tif", how)
-    return replace(how, resume=True)
+        restore(folder / "in.tif", folder / "out.tif", **HOW)
 
 
 def test_a_run_that_was_stopped_twice_is_resumed_to_the_same_bytes(tmp_path: Path) -> None:
-    how = options(INT8, tile_px=57, threads=1, full_scale=4095)
+    out = tmp_path / "out.tif"
     tall = np.concatenate([lacking(), image()])
-    by_file(tmp_path, tall, how)
-    expected = (tmp_path / "out.tif").read_bytes()
-    resumed = stopped(tmp_path, how, tiles=25)
+    by_file(tmp_path, tall, **HOW)
+    expected = out.read_bytes()
+    out.unlink()
+    stop(tmp_path, tiles=25)
     with stopped_after(24):
-        restore_file(tmp_path / "in.tif", tmp_path / "out.tif", resumed)
-    restore_file(tmp_path / "in.tif", tmp_path / "out.tif", resumed)
-    assert (tmp_path / "out.tif").read_bytes() == expected
+        restore(tmp_path / "in.tif", out, **HOW, resume=True)
+    restore(tmp_path / "in.tif", out, **HOW, resume=True)
+    assert out.read_bytes() == expected
 
 
 @pytest.mark.parametrize("switch", [{"consistency": False}, {"exposure": False}])
 def test_a_run_is_not_resumed_with_other_steps(switch: dict[str, Any], tmp_path: Path) -> None:
-    how = options(INT8, tile_px=57, threads=1, full_scale=4095)
     tifffile.imwrite(tmp_path / "in.tif", np.concatenate([image(), image()]))
-    resumed = stopped(tmp_path, how, tiles=25)
+    stop(tmp_path, tiles=25)
     with pytest.raises(OptionError, match="resume"):
-        restore_file(tmp_path / "in.tif", tmp_path / "out.tif", replace(resumed, **switch))
+        restore(tmp_path / "in.tif", tmp_path / "out.tif", **HOW, **switch, resume=True)
 
 
 CONSISTENCY = "consistency step"
@@ -195,8 +203,8 @@ BRIGHTENED = "brightened pixels"
 
 @cache
 def share_of_dark() -> float:
-    """The share of pixels in percent that have no pixel above 614 DN within the receptive radius of
-    14 px.
+    """Return the share of pixels in percent that have no pixel above 614 DN within the receptive
+    radius of 14 px.
     """
     return 100 * (BRIGHT_FROM - RADIUS_PX) / SHAPE[1]
 
@@ -214,7 +222,7 @@ def share_of_dark() -> float:
         (("--no-consistency", "--no-exposure"), set(), {"consistency": "off", "exposures": None}),
     ],
 )
-def test_the_command_says_which_steps_were_taken(
+def test_the_command_reports_which_steps_were_taken(
     words: tuple[str, ...], figures: set[str], text: dict[str, str | None], tmp_path: Path
 ) -> None:
     tifffile.imwrite(tmp_path / "in.tif", image())
@@ -236,7 +244,7 @@ def test_the_command_says_which_steps_were_taken(
 
 
 def test_each_step_changes_what_it_is_for() -> None:
-    """Exposure changes dark pixels alone, the consistency step all of them, by little."""
+    """Exposure changes dark pixels alone; the consistency step changes all of them a little."""
     pixels = as_floats(image())
     switches = {
         "none": (False, False),
@@ -260,7 +268,7 @@ def test_each_step_changes_what_it_is_for() -> None:
 def test_without_a_sensor_the_consistency_step_is_off(
     sensor: tuple[str, ...], tmp_path: Path
 ) -> None:
-    """The two mean the same."""
+    """No sensor and a blind one are the same."""
     tifffile.imwrite(tmp_path / "in.tif", image())
     results = tmp_path / "results.json"
     files = (tmp_path / "in.tif", tmp_path / "out.tif", "--json", results)
@@ -278,13 +286,14 @@ def test_without_a_sensor_the_consistency_step_is_off(
 def test_a_network_of_the_user_s_gets_the_consistency_step_and_no_exposure(
     model: Path, tmp_path: Path
 ) -> None:
-    own = Options(model, 23, sensors={"": SENSOR}, full_scale=4095)
-    tiled, row = restored(tmp_path, lacking().astype(np.float32), own)
+    pixels = lacking().astype(np.float32)
+    own: dict[str, Any] = {**DEFAULTS, "network": model}
+    tiled, row = restored(tmp_path, pixels, **own, tile=23)
     assert row.text["consistency"] == "on"
     assert "exposures" not in row.text
-    untiled, _ = restored(tmp_path, lacking().astype(np.float32), replace(own, tile_px=512))
+    untiled, _ = restored(tmp_path, pixels, **own, tile=512)
     np.testing.assert_array_equal(tiled, untiled)
-    without, row = restored(tmp_path, lacking().astype(np.float32), replace(own, consistency=False))
+    without, row = restored(tmp_path, pixels, **own, tile=23, consistency=False)
     assert row.text["consistency"] == "off"
     assert (tiled != without).mean() > 0.8
 
@@ -295,20 +304,20 @@ def test_a_network_of_other_pixels_or_bands_gets_none(
 ) -> None:
     save_onnx(make(), tmp_path / "network.onnx")
     pixels = np.stack([image()] * bands) if bands > 1 else image()
-    layout: dict[str, Any] = {"planarconfig": "separate"} if bands > 1 else {}
-    how = Options(tmp_path / "network.onnx", 56, sensors={"": SENSOR}, full_scale=4095, force=True)
-    result, row = restored(tmp_path, pixels, how, photometric="minisblack", **layout)
+    layout = {"photometric": "minisblack"}
+    if bands > 1:
+        layout["planarconfig"] = "separate"
+    how: dict[str, Any] = {**DEFAULTS, "network": tmp_path / "network.onnx", "tile": 56}
+    result, row = restored(tmp_path, pixels, layout, **how, force=True)
     assert row.text["consistency"] == "off: the network makes other pixels or bands"
-    without, _ = restored(
-        tmp_path, pixels, replace(how, consistency=False), photometric="minisblack", **layout
-    )
+    without, _ = restored(tmp_path, pixels, layout, **how, force=True, consistency=False)
     np.testing.assert_array_equal(result, without)
 
 
 @pytest.mark.parametrize("name", [FLOAT, INT8])
 def test_the_mean_of_a_dark_image_is_kept(name: str) -> None:
-    """Measured at 30 DN: 3.3 and 3.8 % darker without the steps, less than
-    0.001 % off with both.
+    """At 30 DN the result was 3.3 and 3.8 % darker without the steps, and differed by less than
+    0.001 % with both (measured).
     """
     nominal = SENSOR.nominal()
     level_dn = 30
@@ -323,8 +332,8 @@ def test_the_mean_of_a_dark_image_is_kept(name: str) -> None:
 
 
 def test_few_rows_are_held_of_a_tall_image(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The consistency step needs its reach above and below a row of tiles, which ends within two
-    others.
+    """The consistency step needs its reach above and below a row of tiles, and that reach ends
+    within two others.
     """
     most = [0]
     add = HeldRows.add
@@ -334,5 +343,5 @@ def test_few_rows_are_held_of_a_tall_image(model: Path, monkeypatch: pytest.Monk
         most[0] = max(most[0], sum(part.shape[1] for part in self.parts))
 
     monkeypatch.setattr(HeldRows, "add", counting)
-    by_array(np.full((800, 9), 900, np.uint16), str(model), tile=40)
+    by_array(np.full((800, 9), 900, np.uint16), model, tile=40)
     assert 2 * REACH_PX < most[0] <= 2 * REACH_PX + 3 * 40

@@ -1,6 +1,4 @@
-"""The traditional pipeline on files: the pixels of the chain on the whole array, whatever the
-sensor.
-"""
+"""The traditional pipeline gives of a file the pixels of the chain on the whole array."""
 
 import warnings
 from pathlib import Path
@@ -12,36 +10,42 @@ import rasterio
 import tifffile
 import torch
 
-from beers_deploy.model.progress import no_log
 from beers_deploy.model.traditional.pipeline import Chain, restore_traditional
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError, MachineError
-from beers_deploy.restoration.options import Method, Options
-from beers_deploy.restoration.run import restore_file
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import done, refused
 from tests.profiles.own_sensor import own_sensor
 
 SHAPE = (151, 67)
 
 
-def request(**more: Any) -> Options:
-    sensors = {"": load_sensor("pleiades-degraded")}
-    return Options(**{"method": Method.traditional, "sensors": sensors, **more})
+SENSOR = Sensor.load("pleiades-degraded")
 
 
 def noise(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(300, 1500, SHAPE).astype(np.uint16)
 
 
-def of_array(pixels: np.ndarray, options: Options) -> np.ndarray:
-    sensor = options.sensors[""]
+def of_array(pixels: np.ndarray, sensor: Sensor = SENSOR) -> np.ndarray:
     chain = Chain(sensor.nominal(), sensor.reference.nominal())
     return restore_traditional(torch.from_numpy(pixels.astype(np.float32)), chain).numpy()
 
 
-def of_file(folder: Path, pixels: np.ndarray, options: Options, **tags: object) -> np.ndarray:
-    tifffile.imwrite(folder / "in.tif", pixels, **tags)  # type: ignore[arg-type]
-    row = restore_file(folder / "in.tif", folder / "out.tif", options, no_log)
+def of_file(
+    folder: Path, pixels: np.ndarray, options: dict[str, Any] | None = None, **tags: Any
+) -> np.ndarray:
+    """Restore pixels by way of files.
+
+    Args:
+        folder: of the files.
+        pixels: of the image.
+        options: of `restore`, besides the method, and the sensor of the tests.
+        tags: of the image's file.
+    """
+    tifffile.imwrite(folder / "in.tif", pixels, **tags)
+    chosen = {"method": "traditional", "sensor": SENSOR, "overwrite": True, **(options or {})}
+    (row,) = restore(folder / "in.tif", folder / "out.tif", **chosen)
     assert row.text["method"] == "traditional"
     assert sorted(path.name for path in folder.iterdir()) == ["in.tif", "out.tif"]
     with warnings.catch_warnings(action="ignore"), rasterio.open(folder / "out.tif") as file:
@@ -50,22 +54,20 @@ def of_file(folder: Path, pixels: np.ndarray, options: Options, **tags: object) 
 
 
 def other_sensor(folder: Path) -> Path:
-    """Of another gain, and of 14 bits."""
+    """Return the file of a sensor of another gain, and of 14 bits."""
     return own_sensor(
         folder, ("bits = { value = 12", "bits = { value = 14"), ("value = 10.2375", "value = 40.0")
     )
 
 
 def test_a_file_gives_the_pixels_of_the_array(tmp_path: Path) -> None:
-    expected = of_array(noise(), request())
+    expected = of_array(noise())
     tags = [(33550, "d", 3, (0.5, 0.5, 0.0), True)]
-    restored = of_file(
-        tmp_path, noise(), request(), rowsperstrip=16, compression="zlib", extratags=tags
-    )
+    restored = of_file(tmp_path, noise(), rowsperstrip=16, compression="zlib", extratags=tags)
     np.testing.assert_array_equal(restored, np.rint(expected).astype(np.uint16))
     with tifffile.TiffFile(tmp_path / "out.tif") as file:
         assert file.pages.first.tags[33550].value == (0.5, 0.5, 0.0)
-    floats = of_file(tmp_path, noise().astype(np.float32), request())
+    floats = of_file(tmp_path, noise().astype(np.float32))
     np.testing.assert_array_equal(floats, expected)
     # The pipeline changes the image by more than rounding.
     assert np.abs(expected - noise()).mean() > 10
@@ -74,40 +76,36 @@ def test_a_file_gives_the_pixels_of_the_array(tmp_path: Path) -> None:
 def test_missing_pixels_stay(tmp_path: Path) -> None:
     pixels = noise()
     pixels[20:40, 5:9] = 7
-    restored = of_file(tmp_path, pixels, request(), extratags=[(42113, "s", 0, "7", True)])
+    restored = of_file(tmp_path, pixels, extratags=[(42113, "s", 0, "7", True)])
     np.testing.assert_array_equal(restored == 7, pixels == 7)
     with_nan = np.where(pixels == 7, np.nan, pixels).astype(np.float32)
-    np.testing.assert_array_equal(
-        of_file(tmp_path, with_nan, request()), of_array(with_nan, request())
-    )
+    np.testing.assert_array_equal(of_file(tmp_path, with_nan), of_array(with_nan))
 
 
 def test_bands_are_restored_one_by_one_each_for_its_sensor(tmp_path: Path) -> None:
     bands = np.stack([noise(0), noise(1)])
-    mine = load_sensor("pleiades-degraded")
-    other = load_sensor("dior-medium")
-    for sensors in ({"": mine}, {"B1": mine, "B2": other}):
+    for sensors in ({"": SENSOR}, {"B1": SENSOR, "B2": Sensor.load("dior-medium")}):
         (tmp_path / "files").mkdir(exist_ok=True)
         restored = of_file(
             tmp_path / "files",
             bands,
-            request(sensors=sensors),
+            {"sensor": sensors},
             planarconfig="separate",
             photometric="minisblack",
         )
         for band, pixels in enumerate(bands):
             sensor = list(sensors.values())[band % len(sensors)]
-            expected = of_array(pixels, request(sensors={"": sensor}))
+            expected = of_array(pixels, sensor)
             np.testing.assert_array_equal(restored[band], np.rint(expected).astype(np.uint16))
 
 
-def test_alpha_and_a_cog_come_with_it(tmp_path: Path) -> None:
+def test_alpha_is_copied_into_a_cog(tmp_path: Path) -> None:
     alpha = np.full(SHAPE, 4095, np.uint16)
     alpha[:9] = 0
     restored = of_file(
         tmp_path,
         np.stack([noise(), alpha]),
-        request(cog=True),
+        {"cog": True},
         planarconfig="separate",
         photometric="minisblack",
         extrasamples=["unassalpha"],
@@ -118,15 +116,14 @@ def test_alpha_and_a_cog_come_with_it(tmp_path: Path) -> None:
 
 
 def test_the_output_has_the_scale_of_the_input_whatever_the_gain(tmp_path: Path) -> None:
-    mine = request(sensors={"": load_sensor(str(other_sensor(tmp_path)))})
+    mine = {"sensor": other_sensor(tmp_path)}
     (tmp_path / "files").mkdir()
     flat = np.full(SHAPE, 8000, np.uint16)
     restored = of_file(tmp_path / "files", flat, mine)
     assert abs(float(restored.mean()) / 8000 - 1) < 0.01
-    share = of_file(
-        tmp_path / "files", (noise() / 4095).astype(np.float32), request(full_scale=1.0)
-    )
-    np.testing.assert_allclose(share * 4095, of_array(noise(), request()), atol=0.5)
+    shares = (noise() / 4095).astype(np.float32)
+    restored = of_file(tmp_path / "files", shares, {"full_scale": 1.0})
+    np.testing.assert_allclose(restored * 4095, of_array(noise()), atol=0.5)
 
 
 @pytest.mark.parametrize(
@@ -135,26 +132,25 @@ def test_the_output_has_the_scale_of_the_input_whatever_the_gain(tmp_path: Path)
         (np.full(SHAPE, 5000, np.uint16), "above full scale"),
         (np.full(SHAPE, 200, np.uint8), "full_scale"),
         (np.full(SHAPE, 0.5, np.float32), "full_scale"),
-        (np.full(SHAPE, np.nan, np.float32), "NaN or nodata everywhere"),
+        (np.full(SHAPE, np.nan, np.float32), "only NaN or nodata"),
     ],
 )
 def test_what_it_cannot_restore_leaves_the_old_output(
     pixels: np.ndarray, words: str, tmp_path: Path
 ) -> None:
-    tifffile.imwrite(tmp_path / "in.tif", pixels)
     (tmp_path / "out.tif").write_bytes(b"the old one")
     with pytest.raises(ImageError, match=words):
-        restore_file(tmp_path / "in.tif", tmp_path / "out.tif", request(), no_log)
+        of_file(tmp_path, pixels)
     assert (tmp_path / "out.tif").read_bytes() == b"the old one"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif", "out.tif"]
 
 
 def test_a_budget_that_does_not_suffice_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MachineError, match="memory"):
-        of_file(tmp_path, noise(), request(memory_bytes=1000))
+        of_file(tmp_path, noise(), {"memory": 1e-6})
 
 
-def test_the_command_needs_a_sensor_and_no_option_of_a_network(tmp_path: Path) -> None:
+def test_the_command_needs_a_sensor_and_refuses_options_of_a_network(tmp_path: Path) -> None:
     image = tmp_path / "in.tif"
     out = tmp_path / "out.tif"
     tifffile.imwrite(image, noise())
@@ -162,17 +158,13 @@ def test_the_command_needs_a_sensor_and_no_option_of_a_network(tmp_path: Path) -
     chain = [*start, "--method", "traditional"]
     with_sensor = [*chain, "--sensor", "pleiades-degraded"]
     for arguments, words in (
-        (chain, "--sensor: expected the sensor that acquired IN"),
+        (chain, "--method traditional needs --sensor, the sensor that acquired the image"),
         ([*chain, "--sensor", "hubble"], "hubble"),
-        ([*with_sensor, "--tile", "64"], "--tile: expected none with --method traditional"),
-        ([*with_sensor, "--resume"], "--resume: expected none"),
-        ([*with_sensor, "--scheduler", "host:8786"], "--scheduler: expected none"),
-        (
-            [*with_sensor, "--no-consistency"],
-            "--no-consistency: expected none with --method traditional",
-        ),
-        ([*with_sensor, "--no-exposure"], "--no-exposure: expected none"),
-        ([*with_sensor, "--exposure"], "--exposure: expected none"),
+        ([*with_sensor, "--tile", "64"], "--tile has no effect with --method traditional"),
+        ([*with_sensor, "--resume"], "--resume has no effect"),
+        ([*with_sensor, "--scheduler", "host:8786"], "--scheduler has no effect"),
+        ([*with_sensor, "--no-consistency"], "consistency has no effect with --method"),
+        ([*with_sensor, "--no-exposure"], "exposure has no effect with --method"),
     ):
         assert words in refused(*arguments)
         assert not out.exists()

@@ -1,11 +1,10 @@
-"""Masks and alpha are missing pixels and stay what they are; what is no plain light is refused in a
-sentence.
-"""
+"""Masks and alpha mark missing pixels and are copied; other pixels than plain light are refused."""
 
+import logging
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import onnx
@@ -20,10 +19,8 @@ from rasterio.enums import MaskFlags
 
 from beers_deploy.model.raster.compression import Compression
 from beers_deploy.model.raster.reader import open_raster
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError, OptionError
-from beers_deploy.restoration.options import Options
-from beers_deploy.restoration.run import restore_file
+from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import noise
 from tests.model.raster import formats
 
@@ -35,8 +32,8 @@ HIDDEN[50, 3] = True
 
 
 def restored(path: Path, model: Path, **options: Any) -> tuple[np.ndarray, np.ndarray | None]:
-    """The pixels of a restored file, and its mask."""
-    restore_file(path, path.with_name("out.tif"), Options(model, tile_px=23, **options))
+    """Restore a file, and return the pixels and the mask of the result."""
+    restore(path, path.with_name("out.tif"), network=model, tile=23, overwrite=True, **options)
     with warnings.catch_warnings(action="ignore"), rasterio.open(path.with_name("out.tif")) as file:
         pixels = file.read()
         has_mask = MaskFlags.per_dataset in file.mask_flag_enums[0]
@@ -45,7 +42,7 @@ def restored(path: Path, model: Path, **options: Any) -> tuple[np.ndarray, np.nd
 
 
 def by_nodata(folder: Path, pixels: np.ndarray, model: Path) -> np.ndarray:
-    """The same image restored, its hidden pixels told by a nodata value that no other has."""
+    """Return the same image restored, whose hidden pixels have a nodata value that no other has."""
     marked = np.where(HIDDEN, NODATA, np.where(pixels == NODATA, NODATA + 1, pixels)).astype(
         pixels.dtype
     )
@@ -61,8 +58,8 @@ def pixels_of_test() -> np.ndarray:
 
 
 @pytest.mark.parametrize("beside", [False, True])
-@pytest.mark.parametrize("compression", Compression)
-def test_a_mask_is_missing_pixels_and_is_kept(
+@pytest.mark.parametrize("compression", get_args(Compression))
+def test_a_mask_marks_missing_pixels_and_is_copied(
     beside: bool, compression: Compression, model: Path, tmp_path: Path
 ) -> None:
     pixels = pixels_of_test()
@@ -86,7 +83,7 @@ def test_a_mask_is_missing_pixels_and_is_kept(
     np.testing.assert_array_equal(result_mask == 0, HIDDEN)
 
 
-def test_what_gdal_keeps_beside_an_image_counts(model: Path, tmp_path: Path) -> None:
+def test_sidecar_files_of_gdal_count(model: Path, tmp_path: Path) -> None:
     image = tmp_path / "in.tif"
     beside = tmp_path / "in.tif.aux.xml"
     pixels = np.where(HIDDEN, NODATA, pixels_of_test()).astype(np.uint16)
@@ -105,19 +102,21 @@ def test_what_gdal_keeps_beside_an_image_counts(model: Path, tmp_path: Path) -> 
             restored(image, model)
     beside.unlink()
     tifffile.imwrite(tmp_path / "in.tif.msk", HIDDEN)
-    with pytest.raises(ImageError, match="one mask that GDAL reads"):
+    with pytest.raises(ImageError, match="so that GDAL does not read it"):
         restored(image, model)
     (tmp_path / "in.tif.msk").unlink()
     for sidecar in ("out.tif.msk", "out.tif.aux.xml"):
         (tmp_path / sidecar).touch()
-        with pytest.raises(OptionError, match=f"got {sidecar}"):
+        with pytest.raises(OptionError, match=f"{sidecar} exists already"):
             restored(image, model)
         (tmp_path / sidecar).unlink()
 
 
 @pytest.mark.parametrize("planes", ["contig", "separate"])
 @pytest.mark.parametrize("bands", [1, 3])
-def test_alpha_goes_through_untouched(planes: Any, bands: int, model: Path, tmp_path: Path) -> None:
+def test_alpha_is_copied(
+    planes: Any, bands: int, model: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     pixels = pixels_of_test()
     alpha = np.where(HIDDEN, 0, noise(61, 83, seed=3)).astype(np.uint16)
     planes_and_alpha = np.stack([pixels] * bands + [alpha], axis=0 if planes == "separate" else 2)
@@ -130,11 +129,9 @@ def test_alpha_goes_through_untouched(planes: Any, bands: int, model: Path, tmp_
         extrasamples=["unassalpha"],
         metadata=None,
     )
-    messages = list[str]()
-    restore_file(
-        tmp_path / "in.tif", tmp_path / "out.tif", Options(model, tile_px=23), messages.append
-    )
-    assert any(f"band {bands + 1} is alpha" in message for message in messages)
+    with caplog.at_level(logging.INFO, "beers_deploy"):
+        restore(tmp_path / "in.tif", tmp_path / "out.tif", network=model, tile=23)
+    assert any(f"band {bands + 1} is alpha" in message for message in caplog.messages)
     with tifffile.TiffFile(tmp_path / "out.tif") as file:
         page = file.pages.first
         result = page.asarray()
@@ -216,9 +213,7 @@ REFUSED: dict[str, tuple[Callable[[Path, np.ndarray], object], str]] = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_is_no_plain_light_is_refused_with_a_remedy(
-    case: str, model: Path, tmp_path: Path
-) -> None:
+def test_other_pixels_than_plain_light_are_refused(case: str, model: Path, tmp_path: Path) -> None:
     write, word = REFUSED[case]
     write(tmp_path / "in.tif", noise(61, 83))
     with pytest.raises(ImageError, match=word):
@@ -226,7 +221,7 @@ def test_what_is_no_plain_light_is_refused_with_a_remedy(
     assert [path.name for path in tmp_path.iterdir()] == ["in.tif"]
 
 
-def test_an_image_is_restored_once_unless_asked_again(model: Path, tmp_path: Path) -> None:
+def test_an_image_is_restored_once_unless_forced(model: Path, tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", noise(61, 83))
     first, _ = restored(tmp_path / "in.tif", model)
     (tmp_path / "out.tif").rename(tmp_path / "once.tif")
@@ -275,32 +270,30 @@ def test_a_result_that_no_restoration_has_is_refused(
 
 @pytest.mark.parametrize("how", [(255.0, 0.0), (0.0, 0.3), (-1.0, 0.0)])
 def test_the_consistency_step_does_not_hide_a_network_that_does_not_fit(
-    scaled: Callable[[float, float], Path], tmp_path: Path, how: tuple[float, float]
+    scaled: Callable[[float, float], Path],
+    tmp_path: Path,
+    how: tuple[float, float],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     rows, columns = np.mgrid[:61, :83]
     tifffile.imwrite(tmp_path / "in.tif", (900 + 10 * rows + 5 * columns).astype(np.uint16))
-    sensors = {"": load_sensor("pleiades-degraded")}
+    sensor = "pleiades-degraded"
     with pytest.raises(ImageError, match=r"before the consistency step.*force"):
-        restored(tmp_path / "in.tif", scaled(*how), sensors=sensors)
-    messages: list[str] = []
-    row = restore_file(
-        tmp_path / "in.tif",
-        tmp_path / "out.tif",
-        Options(scaled(*how), force=True, sensors=sensors),
-        messages.append,
-    )
-    assert any("before the consistency step" in message for message in messages)
+        restored(tmp_path / "in.tif", scaled(*how), sensor=sensor)
+    out = tmp_path / "out.tif"
+    (row,) = restore(tmp_path / "in.tif", out, network=scaled(*how), force=True, sensor=sensor)
+    assert any("before the consistency step" in message for message in caplog.messages)
     assert abs(row.figures["mean moved"].value or 0.0) < 1
 
 
-def test_a_small_departure_is_told(scaled: Callable[[float, float], Path], tmp_path: Path) -> None:
-    messages: list[str] = []
+def test_a_small_departure_is_reported(
+    scaled: Callable[[float, float], Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.full((61, 83), 1500, np.uint16) + (noise(61, 83) >> 6))
     shifts = []
     for offset in (0.0, 0.05):
-        row = restore_file(
-            tmp_path / "in.tif", tmp_path / "out.tif", Options(scaled(1.0, offset)), messages.append
-        )
+        out = tmp_path / f"{offset}.tif"
+        (row,) = restore(tmp_path / "in.tif", out, network=scaled(1.0, offset))
         shifts.append(row.figures["mean moved"].value or 0.0)
     assert shifts[1] - shifts[0] == pytest.approx(5, abs=0.1)
-    assert any("the mean went from" in message for message in messages)
+    assert any("the mean went from" in message for message in caplog.messages)

@@ -9,7 +9,6 @@ from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.target import board_names
 from beers_deploy.profiles.toml import HERE
 from beers_deploy.quant.onnx_file import metadata
-from beers_deploy.studies import demo
 from beers_deploy.studies.demo import load_sensors, read_input
 from tests.deploy.command_line import done
 from tests.deploy.documents import figures_of, valid
@@ -19,8 +18,8 @@ from tests.deploy.documents import figures_of, valid
 def test_the_demo_takes_a_raw_image_through_the_whole_chain(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On few patches: .ci/run's first stage has all."""
-    monkeypatch.setattr(demo, "GATE_PATCHES", 2)
+    """It uses few patches: .ci/run's first stage has all."""
+    monkeypatch.setattr("beers_deploy.verbs.demo.GATE_PATCHES", 2)
     raw = tmp_path / "raw.tif"
     tifffile.imwrite(
         raw, np.random.default_rng(0).integers(300, 1500, (120, 150)).astype(np.uint16)
@@ -30,7 +29,8 @@ def test_the_demo_takes_a_raw_image_through_the_whole_chain(
     mine.write_text(text.replace("10.2375", "10.0"))
     out = tmp_path / "out"
     figures = tmp_path / "figures.json"
-    done("demo", "--image", raw, "--out", out, "--json", figures, "--sensor", mine)
+    output = done("demo", "--image", raw, "--out", out, "--json", figures, "--sensor", mine)
+    assert f"report: {out / 'report.html'}" in " ".join(output.split())
     names = {path.name for path in out.iterdir()}
     assert names == {
         "report.html",
@@ -70,5 +70,5 @@ def test_the_reference_has_the_gain_of_the_sensor_named(tmp_path: Path) -> None:
     assert pair is not None
     assert abs(float(pair.degraded.mean() / pair.reference.mean()) - 1) < 0.01
     (tmp_path / "wide.toml").write_text(text.replace("bits = { value = 12", "bits = { value = 14"))
-    with pytest.raises(OptionError, match="sensor: expected a sensor of 12 bits, got 14 bits"):
+    with pytest.raises(OptionError, match=r"`sensor` must have 12 bits, .* 14 bits"):
         load_sensors(str(tmp_path / "wide.toml"))

@@ -1,5 +1,5 @@
-"""`train --recipe`: stages, INT8 file and card, the same bytes where a run was stopped, and what it
-refuses.
+"""`train --recipe`: stages, INT8 file and model card, the same bytes after an interruption, and
+what is refused.
 """
 
 from pathlib import Path
@@ -87,7 +87,7 @@ def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes
         (out / name).unlink()
     for path in (out / "2-rounded").iterdir():
         path.unlink()
-    assert "add --resume" in refused(*command)
+    assert "Add --resume" in refused(*command)
     done(*command, "--resume")
     assert [(out / name).read_bytes() for name in names] == first
 
@@ -96,13 +96,14 @@ def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes
     ("options", "words"),
     [
         (
-            ["--variant", "convbeers-s"],
-            "--variant: expected no --recipe beside it, which states it",
+            ["--variant", "convbeers-xs"],
+            "--variant has no effect with --recipe, which states it",
         ),
-        (["--steps", "5"], "--steps: expected no --recipe beside it"),
-        (["--conditioned"], "--conditioned: expected no --recipe"),
+        (["--steps", "5"], "--steps has no effect with --recipe"),
+        (["--sensor", "dior-high"], "--sensor has no effect with --recipe"),
+        (["--conditioned"], "--conditioned has no effect with --recipe"),
         (["--images", "nowhere"], "no such folder"),
-        ([], "--images beside it"),
+        ([], "--recipe needs --images"),
     ],
 )
 def test_what_a_recipe_states_or_needs_is_said(
@@ -126,4 +127,4 @@ def test_a_held_out_site_that_no_folder_shows_is_refused(
         "--out",
         tmp_path / "run",
     )
-    assert "held out: expected images of town, got none" in message
+    assert "'town' is to be held out" in message

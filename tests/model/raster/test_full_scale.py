@@ -30,14 +30,14 @@ def test_floats_beyond_any_share_are_digital_numbers(kind: str) -> None:
     assert settled(kind, 4095) == MAX_DN
     for brightest in (1e-6, 0.5, 1.0, UNIT_MAX):
         with pytest.raises(
-            ImageError, match=r"x\.tif: .*more than 8 bits, got floats of at most .*full_scale"
+            ImageError, match=r"x\.tif has floats of at most .*shares of full scale.*`full_scale`"
         ):
             settled(kind, 0.0, brightest)
 
 
 @pytest.mark.parametrize("kind", ["uint8", "int8"])
 def test_8_bit_pixels_leave_it_open(kind: str) -> None:
-    with pytest.raises(ImageError, match=r"got 8-bit pixels; .*`full_scale` \(255 for"):
+    with pytest.raises(ImageError, match=r"x\.tif has 8-bit pixels.*`full_scale` \(255 for"):
         settled(kind, 200)
 
 
@@ -57,7 +57,7 @@ IMPOSSIBLE = (0, -1, float("nan"), float("inf"))
 
 @pytest.mark.parametrize(
     ("kind", "words", "requested"),
-    [("uint16", "whole number", (*IMPOSSIBLE, 0.5)), ("float32", "above 0", IMPOSSIBLE)],
+    [("uint16", "integer", (*IMPOSSIBLE, 0.5)), ("float32", "above 0", IMPOSSIBLE)],
 )
 def test_no_image_has_such_a_full_scale(
     kind: str, words: str, requested: tuple[float, ...]
@@ -97,5 +97,5 @@ def test_floats_that_may_be_radiances_leave_it_open() -> None:
 
 
 def test_who_has_no_such_option_says_what_else_to_do() -> None:
-    with pytest.raises(ImageError, match=r"; rescale it\.$"):
-        settled_scale("x", np.dtype("uint8"), (), remedy="rescale it")
+    with pytest.raises(ImageError, match=r"\. Rescale it\.$"):
+        settled_scale("x", np.dtype("uint8"), (), remedy="Rescale it.")

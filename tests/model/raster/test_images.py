@@ -10,8 +10,8 @@ from PIL import Image
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.raster.images import image_size_px, list_images, read_pixels, site_of
 from beers_deploy.model.simulator.sampling import read_scene
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.sensor_file import load_sensor
 
 SENSOR = load_sensor("pleiades-reference").nominal()
 CAMERAS = {"dji", "img", "image", "dsc", "dscn", "dscf", "fhd", "mos", "gopr", "frame"}
@@ -133,7 +133,7 @@ def test_a_missing_file_and_a_folder_are_refused(name: str, tmp_path: Path) -> N
         read_pixels(tmp_path / name)
     with pytest.raises(ImageError, match="no such folder"):
         list_images(tmp_path / name)
-    with pytest.raises(ImageError, match="got a folder"):
+    with pytest.raises(ImageError, match="it is a folder"):
         read_pixels(tmp_path)
 
 

@@ -49,12 +49,12 @@ def test_what_an_index_names_is_found_once_each(tmp_path: Path) -> None:
 
 BOMB = '<!DOCTYPE a [<!ENTITY a "aa"><!ENTITY b "&a;&a;">]>'
 REFUSED = {
-    "missing": (vrt(naming("no.tif")), "the tile no.tif, got no such file"),
-    "no name": (vrt(naming("")), "no such file"),
-    "a name too long": (vrt(naming("9" * 5000)), "expected names of tiles, got no path, 999"),
-    "above": (vrt(naming("../outside.tif")), "in its own folder"),
+    "missing": (vrt(naming("no.tif")), "the tile no.tif, but there is no such file"),
+    "no name": (vrt(naming("")), "a tile without a name"),
+    "a name too long": (vrt(naming("9" * 5000)), "not a path: 999"),
+    "above": (vrt(naming("../outside.tif")), "outside its own folder"),
     "absolute": (vrt(naming("/etc/passwd")), "/etc/passwd"),
-    "from where it runs": (vrt(naming("outside.tif", relative=0)), "in its own folder"),
+    "from where it runs": (vrt(naming("outside.tif", relative=0)), "outside its own folder"),
     "URL": (vrt(naming("http://localhost/a.tif")), "http://localhost/a.tif"),
     "network path": (vrt(naming("/vsicurl/http://localhost/a.tif")), "vsicurl"),
     "part of a file": (vrt(naming("GTIFF_DIR:1:tile.tif")), "GTIFF_DIR"),
@@ -63,15 +63,15 @@ REFUSED = {
         vrt('<SimpleSource SourceFilename="/vsicurl/http://a"/>'),
         "/vsicurl/http://a",
     ),
-    "no image": (vrt(naming("notes.txt")), "another file, notes.txt"),
-    "a service": (vrt(naming("service.xml")), "another file, service.xml"),
+    "no image": (vrt(naming("notes.txt")), "notes.txt, which is not a TIFF"),
+    "a service": (vrt(naming("service.xml")), "service.xml, which is not a TIFF"),
     "bomb": (BOMB + vrt("<Description>&b;</Description>"), "a document type"),
     "no XML": ("<VRTDataset", "plain XML"),
     "unknown letters": (
         '<?xml version="1.0" encoding="UTFZ8"?>' + vrt(""),
         "unknown encoding: UTFZ8",
     ),
-    "another root": ("<vrtdataset/>", "is no VRTDataset"),
+    "another root": ("<vrtdataset/>", "vrtdataset instead of VRTDataset"),
 }
 
 
@@ -96,7 +96,7 @@ def test_a_link_out_of_the_folder_is_refused(tmp_path: Path) -> None:
     except OSError:
         pytest.skip("this account cannot make links")
     (folder / "a.vrt").write_text(vrt(naming("link.tif")))
-    with pytest.raises(ImageError, match="in its own folder"):
+    with pytest.raises(ImageError, match="outside its own folder"):
         index_files(folder / "a.vrt")
 
 
@@ -142,14 +142,14 @@ def test_code_in_an_index_is_never_run(trusted: bool, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("before", "after", "words"),
     [
-        ('href="IMG_R2C1.TIF"', 'href="../outside.tif"', "in its own folder"),
+        ('href="IMG_R2C1.TIF"', 'href="../outside.tif"', "outside its own folder"),
         (
             '<DATA_FILE_PATH href="IMG_R2C1.TIF"/>',
             "<data_file_path><HREF>/vsicurl/x</HREF></data_file_path>",
             "vsicurl",
         ),
         ('href="IMG_R2C1.TIF"', 'href="gone.TIF"', "no such file"),
-        ('href="RPC.XML"', 'href="/etc/RPC.XML"', "in its own folder"),
+        ('href="RPC.XML"', 'href="/etc/RPC.XML"', "outside its own folder"),
         ("<Dimap_Document>", BOMB + "<Dimap_Document>", "document type"),
     ],
 )

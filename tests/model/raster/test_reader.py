@@ -82,7 +82,7 @@ def test_pictures_are_read_by_rows(tmp_path: Path) -> None:
 
 def test_one_page_of_several_has_to_be_named(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "pages.tif", pixels_of("uint16", 3), photometric="minisblack")
-    refused(tmp_path / "pages.tif", ImageError, "got 3; save the one.*GTIFF_DIR:1:")
+    refused(tmp_path / "pages.tif", ImageError, "one image, got 3.*GTIFF_DIR:1:")
 
 
 @settings(max_examples=30)
@@ -202,7 +202,7 @@ def test_a_sidecar_that_leads_out_of_the_folder_is_refused(tmp_path: Path) -> No
         (folder / "a.tfw").symlink_to(tmp_path / "world")
     except OSError:
         pytest.skip("this account cannot make links")
-    refused(folder / "a.tif", ImageError, "files in its own folder")
+    refused(folder / "a.tif", ImageError, r"outside its own folder: .*a\.tfw\.")
 
 
 @pytest.mark.parametrize("name", formats.FORMATS)

@@ -2,6 +2,7 @@
 
 import warnings
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ class Masked(ArrayPixels):
 
 @settings(max_examples=25)
 @given(
-    st.sampled_from(Compression),
+    st.sampled_from(get_args(Compression)),
     st.sampled_from(["uint8", "int16", "uint16", "float32"]),
     st.integers(1, 3),
     st.integers(1, 300),
@@ -57,7 +58,7 @@ def test_every_type_and_compression_is_what_was_written(
     assert not missing[:, 3:].any()
 
 
-@pytest.mark.parametrize("compression", [Compression.none, Compression.zlib])
+@pytest.mark.parametrize("compression", ["none", "zlib"])
 def test_a_file_that_differs_from_what_was_written_is_an_error(
     compression: Compression, tmp_path: Path
 ) -> None:
@@ -82,7 +83,7 @@ def test_a_mask_that_differs_from_what_was_written_is_an_error(
     pixels = np.random.default_rng(0).integers(0, 4096, (1, 300, 280)).astype(np.uint16)
     raster = Raster(1, 300, 280, pixels.dtype, mask_kind=mask_kind)
     path = tmp_path / "a.tif"
-    write_raster(path, raster, Masked(pixels), Compression.zlib)
+    write_raster(path, raster, Masked(pixels), "zlib")
     with pytest.raises(OSError, match="other pixels"):
         require_equal(path, raster, ArrayPixels(pixels))
 

@@ -10,9 +10,9 @@ from beers_deploy.model.simulator.acquire import MARGIN_PX, acquire, acquire_pad
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import read_scene, scene_spectrum
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.sensor_file import load_sensor
 from tests.model.simulator.stages import pixel_means
 
 DEGRADED, REFERENCE = (

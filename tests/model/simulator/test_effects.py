@@ -126,7 +126,7 @@ def test_defects_come_at_their_rate_and_at_the_ends_of_the_range() -> None:
 
 def test_an_infeasible_budget_is_refused_with_its_numbers() -> None:
     with pytest.raises(
-        OptionError, match=r"up to 0\.1854 behind an anti-alias filter that keeps 0\.291"
+        OptionError, match=r"up to 0\.1854 \(with an anti-alias filter of gain 0\.291\)"
     ):
         gamma_from_mtf(0.25, 0.5)
 

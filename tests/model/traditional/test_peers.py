@@ -6,7 +6,7 @@ from torch import Tensor
 
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.model.traditional.pipeline import Chain
-from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.sensor_file import load_sensor
 from tests.model.traditional.test_pipeline import Seen, psnr_db, restored_db, seen_by
 
 CHAIN = Chain(

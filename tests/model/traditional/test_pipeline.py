@@ -24,10 +24,10 @@ from beers_deploy.model.traditional.pipeline import (
     restore_traditional,
 )
 from beers_deploy.model.traditional.rows import mirrored
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.response import PointSpread
 from beers_deploy.profiles.sensor import Instrument, noise_from_snr
+from beers_deploy.profiles.sensor_file import load_sensor
 from tests.model.simulator.stages import formula_point, point_spread, with_response
 from tests.model.traditional.whole import compensate
 

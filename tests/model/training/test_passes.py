@@ -24,9 +24,9 @@ from beers_deploy.model.training.passes import (
     noiseless,
     prepare,
 )
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.effects import AntiAlias, Offset, Smear
 from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.sensor_file import load_sensor
 from tests.model.simulator.stages import lopsided_point, with_response
 
 NOMINAL = load_sensor("pleiades-degraded").nominal()

@@ -72,7 +72,7 @@ def test_a_conditioned_run_moves_every_part_and_what_it_makes_of_a_sensor(tmp_pa
 def test_plain_and_conditioned_checkpoints_are_not_taken_for_one_another(tmp_path: Path) -> None:
     for conditioned in (False, True):
         train(tmp_path, conditioned=conditioned)
-        with pytest.raises(ModelError, match="checkpoint of this network"):
+        with pytest.raises(ModelError, match="not a checkpoint of this network"):
             Trainer(VARIANT, RECIPE, conditioned=not conditioned).resume(
                 tmp_path / "checkpoint.safetensors"
             )

@@ -7,7 +7,7 @@ from beers_deploy.model.convbeers import ConvBEERS
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.training.run import Validation, split_by_site
 from beers_deploy.model.variants import Variant
-from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.sensor_file import load_sensor
 
 NAMES = (
     [f"village_{k:03d}.jpg" for k in range(30)]

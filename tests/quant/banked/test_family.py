@@ -248,7 +248,7 @@ def test_a_damaged_delta_is_one_sentence(
     file = host_model(core_of(pair[1], SENSORS[1]), {FAMILY: pair[1].to_words()})
     with pytest.raises(
         ModelError,
-        match=r"^delta: expected a delta of this network, got (damaged|another).*--delta",
+        match=r"^The delta (is damaged|belongs to another network).*--delta",
     ):
         with_delta(required_family(file).core, change(delta_of_file(file)))
 
@@ -264,7 +264,7 @@ def test_words_of_another_network_are_refused(pair: tuple[BankedConvBEERS, Famil
     core = core_of(pair[1], SENSORS[0])
     assert family_of(host_model(core, {})) is None
     for words in ("[]", '{"head": [[0, 0, 0, 0, 0]]}', '{"other": []}', "{"):
-        with pytest.raises(ModelError, match="INT8 model"):
+        with pytest.raises(ModelError, match="the INT8 network"):
             family_of(host_model(core, {FAMILY: words}))
 
 

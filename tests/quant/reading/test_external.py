@@ -73,7 +73,7 @@ def test_the_same_network_apart_and_whole_computes_the_same(saved: Path) -> None
 def refused(path: Path) -> str:
     with pytest.raises(ModelError) as caught:
         load_onnx(path)
-    assert str(caught.value).startswith(str(path))
+    assert str(path) in str(caught.value)
     return str(caught.value)
 
 
@@ -108,19 +108,19 @@ def test_no_link_is_followed(saved: Path) -> None:
 def test_no_pipe_is_waited_for(saved: Path) -> None:
     (saved.parent / "weights.bin").unlink()
     os.mkfifo(saved.parent / "weights.bin")
-    assert "no regular file" in refused(saved)
+    assert "regular file" in refused(saved)
 
 
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (stating("offset", "99999999"), "not the"),
-        (stating("offset", "-4"), "not the"),
-        (stating("offset", "9" * 4000), "not the"),
-        (stating("length", "12"), "not the"),
+        (stating("offset", "99999999"), "does not hold the"),
+        (stating("offset", "-4"), "does not hold the"),
+        (stating("offset", "9" * 4000), "does not hold the"),
+        (stating("length", "12"), "does not hold the"),
         (stating("location", "missing.bin"), "no such file"),
         (lambda m: m.graph.initializer[1].dims.append(2**22), "values"),
-        (lambda m: m.graph.initializer[1].dims.append(1000), "not the"),
+        (lambda m: m.graph.initializer[1].dims.append(1000), "does not hold the"),
         (lambda m: m.graph.initializer[1].dims.append(-1), "plain numbers"),
         (
             lambda m: setattr(m.graph.initializer[1], "data_type", TensorProto.STRING),

@@ -11,7 +11,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 
-from beers_deploy.export import to_onnx
+from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError
@@ -144,7 +144,7 @@ def test_files_that_need_nothing_stay_as_they_are(tmp_path: Path) -> None:
 
 def test_a_network_that_the_runtime_does_not_read_is_one_sentence() -> None:
     model = made([conv(weight="b"), normal()])
-    with pytest.raises(ModelError, match=r"^a\.onnx: expected a model that onnxruntime runs"):
+    with pytest.raises(ModelError, match=r"onnxruntime cannot run a\.onnx"):
         simplest(model, "a.onnx")
 
 
@@ -155,7 +155,7 @@ def test_sizes_that_contradict_the_nodes_are_one_sentence_or_read() -> None:
     try:
         assert "Conv" in kinds(simplest(model, "a.onnx"))
     except ModelError as error:
-        assert str(error).startswith("a.onnx: expected")  # noqa: PT017 - either will do
+        assert "a.onnx" in str(error)  # noqa: PT017 - either will do
 
 
 def test_a_file_that_is_only_looked_at_is_folded_where_a_runtime_may_get_it(tmp_path: Path) -> None:

@@ -150,38 +150,38 @@ def test_tiled_is_whole_and_no_smaller_halo_does(name: str) -> None:
 
 HEAD = helper.make_node("GlobalAveragePool", ["image"], ["restored"], name="head/pool")
 ELSEWHERE = {
-    "got GlobalAveragePool head/pool, which looks at the whole image": graph([HEAD]),
-    "InstanceNormalization restored, which looks at the whole image": one(
+    "but GlobalAveragePool head/pool reads the whole image": graph([HEAD]),
+    "InstanceNormalization restored reads the whole image": one(
         "InstanceNormalization", constant("scale", 1), constant("bias", 1)
     ),
-    "ReduceMean restored, which looks at the whole image": one("ReduceMean", axes=[2, 3]),
-    "DynamicQuantizeLinear q, which looks at the whole image": graph(
+    "ReduceMean restored reads the whole image": one("ReduceMean", axes=[2, 3]),
+    "DynamicQuantizeLinear q reads the whole image": graph(
         [
             helper.make_node("DynamicQuantizeLinear", ["image"], ["q", "s", "z"]),
             helper.make_node("DequantizeLinear", ["q", "s", "z"], ["restored"]),
         ]
     ),
-    "Flatten restored, fully connected": one("Flatten"),
-    "Softmax restored, along other sides than the channels": one("Softmax", axis=3),
-    "Concat restored, along other sides": one("Concat", "image", axis=2),
-    "Concat restored, of tensors of unequal sizes": Row()
+    "Flatten restored is fully connected": one("Flatten"),
+    "Softmax restored does not work along the channels": one("Softmax", axis=3),
+    "Concat restored does not work along the channels": one("Concat", "image", axis=2),
+    "Concat restored combines tensors of different sizes": Row()
     .add("MaxPool", kernel_shape=[2, 2], strides=[2, 2])
     .add("Concat", "image", axis=1)
     .model((1, 2)),
-    "Resize restored, by 1 x 1 x 1.5 x 1.5": resized("nearest", "asymmetric", 1.5),
-    "Resize restored, by 3, of weights that depend on the place": resized(
+    "Resize restored resizes by 1 x 1 x 1.5 x 1.5": resized("nearest", "asymmetric", 1.5),
+    "Resize restored resizes by 3 with weights whose rounding depends on the position": resized(
         "linear", "half_pixel", 3
     ),
-    "Resize restored, of coordinates align_corners, which depend on the size": resized(
+    "Resize restored uses the coordinates align_corners, which depend on the size": resized(
         "linear", "align_corners", 2
     ),
-    "Resize restored, to a size that is fixed": one("Resize", "", "", whole("sizes", 1, 1, 40, 40)),
-    "Slice restored, which cuts at a place that is fixed": one("Slice", *cut((0, 0), 40)),
-    "Add restored, with a constant that differs from pixel to pixel": one(
+    "Resize restored resizes to a fixed size": one("Resize", "", "", whole("sizes", 1, 1, 40, 40)),
+    "Slice restored cuts at a fixed position": one("Slice", *cut((0, 0), 40)),
+    "Add restored has a constant that differs from pixel to pixel": one(
         "Add", constant("map", 1, 1, 40, 40)
     ),
-    "Mul restored, with a constant that differs": one("Mul", constant("ramp", 40)),
-    "MaxPool max, which tells places": graph(
+    "Mul restored has a constant that differs": one("Mul", constant("ramp", 40)),
+    "MaxPool max returns positions as well": graph(
         [
             helper.make_node(
                 "MaxPool", ["image"], ["max", "places"], kernel_shape=[3, 3], pads=[1] * 4
@@ -189,12 +189,14 @@ ELSEWHERE = {
             helper.make_node("Cast", ["places"], ["restored"], to=TensorProto.FLOAT),
         ]
     ),
-    "MaxPool restored, of no stride": one("MaxPool", kernel_shape=[2, 2], strides=[-2, -2]),
-    "got -2 pixels a side": conv(),
-    "as many pixels of output along both sides, got 1/2 and 1": one(
+    "MaxPool restored has no positive stride": one(
+        "MaxPool", kernel_shape=[2, 2], strides=[-2, -2]
+    ),
+    "but it has -2 pixels a side": conv(),
+    "scale rows and columns by one factor, but the factors are 1/2 and 1": one(
         "MaxPool", kernel_shape=[2, 1], strides=[2, 1]
     ),
-    "got a period of 4096": Row()
+    "its period is 4096 pixels": Row()
     .add("MaxPool", kernel_shape=[2, 2], strides=[64, 64])
     .add("MaxPool", kernel_shape=[2, 2], strides=[64, 64])
     .model(),

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from beers_deploy.model.io.pictures import Stretch
-from beers_deploy.profiles import load_sensor
+from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.studies.detection.scenes import CLASSES
 from beers_deploy.studies.detection.study import synthetic_labelled
 

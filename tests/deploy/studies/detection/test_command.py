@@ -1,15 +1,19 @@
-"""`beers-deploy detect` from options to a page: on drawn scenes, on a labelled folder, and on what
-is refused.
+"""`evaluate --detector` from options to a page: on a labelled folder, and on what is refused; and
+the demonstration of the small detector on drawn scenes.
 """
 
 from pathlib import Path
 
 import pytest
 
+from beers_deploy.model.shipped import DETECTOR
+from beers_deploy.profiles.errors import OptionError
 from beers_deploy.studies.detection.tables import PAPER_TABLE, paper_rows
+from beers_deploy.verbs.evaluate import evaluate
+from benchmarks.detector import demonstration
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
-from tests.deploy.studies.detection.folders import Object, dior, labelled
+from tests.deploy.studies.detection.folders import Object, dior, labelled, voc
 
 pytestmark = pytest.mark.slow
 
@@ -26,18 +30,27 @@ def document(path: Path) -> dict[str, dict[str, dict[str, float]]]:
     return tables
 
 
+DETECT = ("evaluate", "--detector", DETECTOR)
 SMALL = ("--sensor", "dior-medium", "--methods", "degraded")
 MAP = ("--classes", "Motor-Car=vehicle,Storage tank=tank")
 
 
-def test_synthetic_scenes_and_the_same_as_pictures_score_alike(tmp_path: Path) -> None:
-    """Reading, class names, labels and sites lead to what the scenes lead to, but for 8 bits and
-    the clip.
+def test_synthetic_scenes_and_the_same_as_pictures_score_alike(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reading, class names, labels and sites lead to the scores of the scenes themselves, apart
+    from 8 bits and clipping.
     """
-    done("detect", *SMALL, "--drawn", 2, "--out", tmp_path / "a", "--json", tmp_path / "a.json")
+    outputs = ("--out", tmp_path / "a", "--json", tmp_path / "a.json")
+    words = ["demonstration", *SMALL, "--drawn", 2, *outputs]
+    monkeypatch.setattr("sys.argv", list(map(str, words)))
+    demonstration.main()
     folder = labelled(tmp_path / "pictures", 2)
     outputs = ("--out", tmp_path / "b", "--json", tmp_path / "b.json")
-    done("detect", *SMALL, "--images", folder, *MAP, *outputs)
+    output = done(*DETECT, *SMALL, "--images", folder, *MAP, *outputs)
+    assert "dior-medium: mAP50 is" in output
+    assert f"wrote {tmp_path / 'b' / 'report.html'}" in output
+    assert "mAP50 by size" not in output, "it is for the document and the page"
     tables, picture_tables = (document(tmp_path / name) for name in ("a.json", "b.json"))
     scene_rows, picture_rows = (
         document_tables["detection, dior-medium"] for document_tables in (tables, picture_tables)
@@ -47,7 +60,7 @@ def test_synthetic_scenes_and_the_same_as_pictures_score_alike(tmp_path: Path) -
         assert picture_rows[row]["mAP50"] == pytest.approx(scene_rows[row]["mAP50"], abs=6)
     assert scene_rows["degraded"]["loss to reference"] > 10
     assert list(tables[PAPER_TABLE]) == [row.name for row in paper_rows()]
-    assert {"mAP50 by class, dior-medium", "mAP50 by size, dior-medium"} <= set(tables)
+    assert {"mAP50 by class, dior-medium", "mAP50 by size, dior-medium"} <= set(picture_tables)
     page = (tmp_path / "a" / "report.html").read_text()
     assert "No interval over sites is shown: of 2" in page
     assert page.count("data:image/png") == 2
@@ -59,35 +72,69 @@ def test_dior_s_tree_is_read_and_nothing_in_it_is_written_over(tmp_path: Path) -
         tmp_path / "dior", {"test": {"00001": boxes, "00002": boxes[:1]}, "val": {"00003": boxes}}
     )
     names = ("--classes", "storagetank=tank")
-    command = [*SMALL, "--images", folder, *names, "--out", tmp_path / "out"]
-    done("detect", *command, "--json", tmp_path / "found.json")
+    command = [*DETECT, *SMALL, "--images", folder, *names, "--out", tmp_path / "out"]
+    done(*command, "--json", tmp_path / "found.json")
     inputs = [entry["name"] for entry in valid(tmp_path / "found.json")["inputs"]]
     assert inputs == ["detector.onnx", "00001.jpg", "00002.jpg"]
     label = folder / "Annotations" / "Horizontal Bounding Boxes" / "00001.xml"
     before = label.read_text()
-    refused("detect", *command, "--json", label)
+    assert "is an input of this run" in refused(*command, "--json", label)
     assert label.read_text() == before
 
 
 @pytest.mark.parametrize(
-    ("arguments", "word"),
+    ("arguments", "words"),
     [
-        (["--methods", "nothing"], "--methods"),
+        (["--methods", "nothing"], "'nothing' in --methods is not a method"),
         (["--sensor", "nowhere"], "nowhere"),
         (["--sensor", ","], "profile"),
-        (["--methods", ","], "--methods"),
+        (["--methods", ","], "'' in --methods is not a method"),
         (["--detector", "none.onnx"], "none.onnx"),
-        (["--classes", "car"], "--classes"),
-        (["--classes", "lorry=vehicle"], "lorry"),
+        (["--classes", "car"], "--classes must be LABELLED=DETECTOR"),
+        (["--classes", "lorry=vehicle"], "'lorry' in --classes"),
         (["--images", "none"], "none"),
-        (["--side", "128"], "--side"),
+        (["--labels", "none"], "none does not exist"),
+        (["--split", "val"], "no images of the split 'val'"),
+        (["--side", "128"], "--side must be 256 px"),
+        (["--sweep"], "--sweep has no effect with --detector"),
+        (["--brightness", "0.5"], "--brightness has no effect with --detector"),
+        (["--pairs", "pairs"], "--pairs has no effect with --detector"),
+        (["--strict"], "--strict has no effect with --detector"),
     ],
 )
 def test_what_cannot_be_is_one_sentence(
-    arguments: list[str], word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    arguments: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    message = refused("detect", *arguments, *([] if "--images" in arguments else ["--drawn", 2]))
+    voc(tmp_path / "ships")
+    given = ["evaluate", "--detector", str(DETECTOR), "--images", "ships", "--out", "detection"]
+    for name, value in zip(arguments[::2], [*arguments[1::2], None], strict=False):
+        if name in given:
+            given[given.index(name) + 1] = str(value)
+        else:
+            given += [name] if value is None else [name, value]
+    message = refused(*given)
     assert message.count("beers-deploy: ") == 1
-    assert word in message.split("beers-deploy: ")[1]
+    assert words in message.split("beers-deploy: ")[1]
     assert not (tmp_path / "detection" / "report.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--detector", DETECTOR], "--detector needs --images"),
+        (["--labels", "labels"], "--labels has no effect without --detector"),
+        (["--split", "test"], "--split has no effect without --detector"),
+        (["--side", "128"], "--side has no effect without --detector"),
+        (["--classes", "car=vehicle"], "--classes has no effect without --detector"),
+    ],
+)
+def test_a_detector_needs_images_and_its_options_need_a_detector(
+    arguments: list[object], words: str
+) -> None:
+    assert words in refused("evaluate", *arguments)
+
+
+def test_functions_are_no_methods_of_a_detector(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="`methods` must be names with `detector`"):
+        evaluate(detector=DETECTOR, images=voc(tmp_path), methods={"mine": lambda image: image})

@@ -90,14 +90,14 @@ def test_dior_is_read_by_split_and_its_classes_by_their_letters(tmp_path: Path) 
 
 def test_a_split_that_is_not_there_is_named_with_those_that_are(tmp_path: Path) -> None:
     folder = dior(tmp_path, {"test": OBJECTS})
-    with pytest.raises(OptionError, match=r"one of its splits \(test\), got 'trainval'"):
+    with pytest.raises(OptionError, match=r"one of the splits .* \(test\), but it is 'trainval'"):
         read_labelled(folder, split="trainval")
     with pytest.raises(OptionError, match="images of the split 'test'"):
         read_labelled(voc(tmp_path / "plain"), split="test")
     text(folder / "ImageSets" / "Main" / "test.txt", "00001\n00777\n")
-    refused(folder, "1 of 2 missing, the first '00777'")
+    refused(folder, "1 of 2 are missing, the first '00777'")
     with pytest.raises(
-        OptionError, match=r"numbers as xmin, ymin, xmax, ymax of a .* got 'none none none none'"
+        OptionError, match=r"numbers as xmin, ymin, xmax, ymax of a .* has 'none none none none'"
     ):
         read_labelled(
             folder / "JPEGImages-test", folder / "Annotations" / "Oriented Bounding Boxes"
@@ -128,7 +128,7 @@ def test_without_labels_a_yolo_image_shows_nothing_and_a_voc_image_is_refused(
     image(voc(tmp_path / "voc") / "00003.png")
     refused(
         tmp_path / "voc",
-        r"a file of labels for every image, got 1 of 3 missing, the first 00003\.xml",
+        r"a file of labels for every image, but 1 of 3 are missing, the first 00003\.xml",
     )
 
 
@@ -147,25 +147,28 @@ def test_boxes_outside_or_without_area_are_left_out_and_told(tmp_path: Path) -> 
 
 def test_labels_of_an_image_of_another_size_are_refused(tmp_path: Path) -> None:
     image(voc(tmp_path) / "00002.png", (80, 120))
-    refused(tmp_path, "labels of an image of 80 x 120 px, got 40 x 60 px")
+    refused(tmp_path, r"00002\.xml labels an image of 40 x 60 px, but the image has 80 x 120 px")
 
 
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
-        (lambda folder: image(folder / "a.png"), "labels as VOC .* got none beside the images"),
+        (
+            lambda folder: image(folder / "a.png"),
+            "no labels for the images in .* VOC .* as `labels`",
+        ),
         (
             lambda folder: text(image(folder / "a.png").with_name("b.xml"), xml([])),
-            "got none named as one of",
+            "no VOC .* labels named as one of the 1 images",
         ),
         (
             lambda folder: text(image(folder / "a.png").with_name("a.xml"), xml([])),
-            "got none on 1 images",
+            "none on 1 images",
         ),
-        (lambda folder: folder, "a folder of images, got no image in it"),
+        (lambda folder: folder, "there is no image in it"),
         (
             lambda folder: text(text(coco(folder) / "b.json", "{}"), "{}"),
-            "one file of labels, got 2; name it as `labels`",
+            "has 2 JSON files, .* as `labels`",
         ),
     ],
 )
@@ -180,8 +183,8 @@ def test_a_folder_without_labelled_images_is_refused(
 def test_a_missing_folder_or_file_of_labels_is_refused(tmp_path: Path) -> None:
     folder = voc(tmp_path)
     for labels, sentence in (
-        (tmp_path / "none", "got no such folder"),
-        (folder / "00001.xml", "got another file"),
+        (tmp_path / "none", "none does not exist"),
+        (folder / "00001.xml", "00001.xml is another file"),
     ):
         with pytest.raises(OptionError, match=sentence):
             read_labelled(folder, labels)
@@ -191,13 +194,13 @@ def test_a_missing_folder_or_file_of_labels_is_refused(tmp_path: Path) -> None:
     ("content", "sentence"),
     [
         ('<!DOCTYPE a [<!ENTITY b "c">]>' + SHIP, "a document type"),
-        (SHIP.replace("<xmin>3</xmin>", ""), "xmin, .* of a 'ship', got 'none 4 12 9'"),
-        (SHIP.replace("<xmax>12", "<xmax>nan"), "of a 'ship', got '3 4 nan 9'"),
-        (SHIP.replace("<name>ship</name>", "<name> </name>"), "a name for every object"),
+        (SHIP.replace("<xmin>3</xmin>", ""), "xmin, .* of a 'ship', but it has 'none 4 12 9'"),
+        (SHIP.replace("<xmax>12", "<xmax>nan"), "of a 'ship', but it has '3 4 nan 9'"),
+        (SHIP.replace("<name>ship</name>", "<name> </name>"), "an object without a name"),
         (SHIP.replace("<width>60", "<width>six"), "numbers as size"),
-        (SHIP[:-20], "expected plain XML"),
-        ("<kml></kml>", "Pascal VOC, an 'annotation', got <kml>"),
-        ('<?xml version="1.0" encoding="klingon"?>' + SHIP, "expected plain XML"),
+        (SHIP[:-20], "is not plain XML"),
+        ("<kml></kml>", "Pascal VOC, an 'annotation', but it is <kml>"),
+        ('<?xml version="1.0" encoding="klingon"?>' + SHIP, "is not plain XML: .*klingon"),
     ],
 )
 def test_a_faulty_voc_file_is_refused_by_a_sentence(
@@ -218,20 +221,28 @@ def test_a_huge_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
     ("name", "content", "sentence"),
     [
         ("labels/val/00001.txt", "0 0.5 0.5 0.1", "YOLO's 'class cx cy w h'"),
-        ("labels/val/00001.txt", "0 30 20 10 10", "coordinates as shares of the image, 0 to 1"),
+        ("labels/val/00001.txt", "0 30 20 10 10", "coordinates as fractions of the image, 0 to 1"),
         (
             "labels/val/00001.txt",
             "2 0.5 0.5 0.1 0.1",
-            "a class from 0 to 1, of which there is a name, got 2",
+            "has the class 2, but only classes from 0 to 1 have a name",
         ),
-        ("labels/val/00001.txt", "0.5 0.5 0.5 0.1 0.1", "a class from 0 to 1"),
+        ("labels/val/00001.txt", "0.5 0.5 0.5 0.1 0.1", "has the class 0.5, .* 0 to 1"),
         ("labels/val/00001.txt", "ship 0.5 0.5 0.1 0.1", "numbers as class and coordinates"),
-        ("data.yaml", "names: {0: ship, 2: tank}", "names: a list, or a table by number from 0"),
-        ("data.yaml", "names: [ship", "expected YAML"),
-        ("data.yaml", "names: !!python/object/apply:os.system [true]", "expected YAML"),
-        ("data.yaml", "a: &a [x, x]\nb: &b [*a, *a]\nnames: [*b, *b]", "names: a list, or a table"),
+        (
+            "data.yaml",
+            "names: {0: ship, 2: tank}",
+            "names in .* must be a list, or a table by number from 0",
+        ),
+        ("data.yaml", "names: [ship", "is not YAML"),
+        ("data.yaml", "names: !!python/object/apply:os.system [true]", "is not YAML"),
+        (
+            "data.yaml",
+            "a: &a [x, x]\nb: &b [*a, *a]\nnames: [*b, *b]",
+            "names in .* must be a list, or a table",
+        ),
         ("data.yaml", "path: here", "data.yaml or classes.txt with the names"),
-        ("data.yaml", "[" * 5000, "expected YAML"),
+        ("data.yaml", "[" * 5000, "is not YAML"),
         ("data.yaml", "names: [" + "ab, " * 20000 + "]", "more than 65536 bytes"),
     ],
 )
@@ -267,22 +278,25 @@ def test_without_pyyaml_it_is_said_how_to_do_without(
 @pytest.mark.parametrize(
     ("damage", "sentence"),
     [
-        ({"images": None}, "got TypeError: 'NoneType'"),
-        ({"annotations": [5]}, "got TypeError: 'int'"),
+        ({"images": None}, "TypeError: 'NoneType'"),
+        ({"annotations": [5]}, "TypeError: 'int'"),
         (
             {"annotations": [{"image_id": 9, "category_id": 7, "bbox": [0, 0, 1, 1]}]},
-            "got KeyError: 9",
+            "KeyError: 9",
         ),
         (
             {"annotations": [{"image_id": [], "category_id": 7, "bbox": [0, 0, 1, 1]}]},
-            "got TypeError: ",
+            "TypeError: ",
         ),
-        ({"categories": [{"id": 7, "name": 5}]}, "got TypeError: "),
+        ({"categories": [{"id": 7, "name": 5}]}, "TypeError: "),
         (
             {"images": [{"id": 0, "file_name": "../../etc/passwd"}]},
-            "its images in .* got none of 1",
+            "None of the 1 images that .*labels.json lists",
         ),
-        ({"images": [{"id": 0, "file_name": "/etc/passwd"}]}, "its images in .* got none of 1"),
+        (
+            {"images": [{"id": 0, "file_name": "/etc/passwd"}]},
+            "None of the 1 images that .*labels.json lists",
+        ),
     ],
 )
 def test_a_faulty_coco_file_is_refused_by_a_sentence(

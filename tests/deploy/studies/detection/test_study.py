@@ -9,10 +9,9 @@ import pytest
 
 from beers_deploy.model.io.pictures import stretch_of
 from beers_deploy.model.simulator.detector import Draw
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.sensor_file import reference_for
+from beers_deploy.profiles.sensor_file import load_sensor, reference_for
 from beers_deploy.studies.detection.average_precision import find_hits, score_rows, site_weights
 from beers_deploy.studies.detection.boxes import Boxes, iou
 from beers_deploy.studies.detection.detector import Detector

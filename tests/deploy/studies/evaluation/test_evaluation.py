@@ -15,11 +15,10 @@ from beers_deploy.model.simulator.acquire import simulate_pair
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.network import Network
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Row, by_table, measured
-from beers_deploy.results import missing
+from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.studies.evaluation import targets as targets_module
 from beers_deploy.studies.evaluation.methods import (
     BLIND,
@@ -39,7 +38,6 @@ from beers_deploy.studies.evaluation.pairs import (
 from beers_deploy.studies.evaluation.run import (
     Evaluation,
     chosen_pairs,
-    evaluate,
     evaluation_report,
     strip_of,
 )
@@ -58,6 +56,8 @@ from beers_deploy.studies.evaluation.scores import (
     score,
     site_rows,
 )
+from beers_deploy.tables.columns import missing
+from beers_deploy.verbs.evaluate import evaluate
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import figures_of, valid
 
@@ -131,7 +131,7 @@ def test_a_pair_without_a_partner_or_of_two_sizes_is_refused(tmp_path: Path) -> 
     with pytest.raises(ImageError, match=r"45 x 37 and 9 x 9"):
         read_pairs(tmp_path)
     (tmp_path / "reference" / "b.tif").unlink()
-    with pytest.raises(ImageError, match=r"'b' in one of them"):
+    with pytest.raises(ImageError, match=r"'b' in only one"):
         read_pairs(tmp_path)
     with pytest.raises(ImageError, match="no such folder"):
         read_pairs(tmp_path / "degraded")
@@ -173,7 +173,7 @@ def test_another_oversampling_than_the_profiles_is_said(
 
 @pytest.mark.parametrize("name", ["magic", "traditional-superb", "convbeers-huge", ""])
 def test_an_unknown_method_is_refused(name: str) -> None:
-    with pytest.raises(OptionError, match=r"methods|variant"):
+    with pytest.raises(OptionError, match=r"`methods`|variant"):
         method_named(name, DEGRADED, REFERENCE)
 
 
@@ -248,11 +248,7 @@ def test_the_degraded_input_gains_nothing_and_missing_figures_have_a_reason() ->
     assert mean.figures["PSNR gain"].value == 0
     assert len(images) == 5
     assert mean.figures["LPIPS-squeeze"].reason == "no weights"
-    reasons = [
-        f"- {NOISE_FREE}: {READ}",
-        f"- {INNER_NOISE_FREE}: {READ}",
-        "- LPIPS-squeeze: no weights",
-    ]
+    reasons = [f"{NOISE_FREE}, {INNER_NOISE_FREE}: {READ}", "LPIPS-squeeze: no weights"]
     assert missing([mean, *images]) == reasons
     interval = mean.figures["PSNR"].interval
     assert interval is not None
@@ -416,7 +412,7 @@ def test_tables_of_a_sweep_keep_their_words_on_the_page() -> None:
         for name in ("targets", "sweep, PSNR")
     ]
     about: dict[str, Any] = {"sensors": (DEGRADED, REFERENCE), "methods": [], "pairs": []}
-    report = evaluation_report(Evaluation("evaluate", {}, (), (mean, dim, *rest), **about), [])
+    report = evaluation_report(Evaluation(rows=(mean, dim, *rest), **about), [])
     titles = ["Means over all pairs", "Mean, radiance x 0.05", "Targets", "Sweep, PSNR"]
     assert [table.title for table in report.tables] == titles
     assert len({table.caption for table in report.tables}) == len(titles)
@@ -429,6 +425,7 @@ def test_the_command_on_a_folder_of_pairs(tmp_path: Path, monkeypatch: pytest.Mo
     done("evaluate", "--pairs", folder, "--methods", "traditional-fast", *files)
     document = valid(tmp_path / "e.json")
     assert [entry["name"] for entry in document["inputs"]] == ["a_1.tif", "b_1.tif"] * 2
+    assert document["arguments"]["methods"] == "degraded,traditional-fast"
     names = [row["name"] for row in document["rows"] if row["table"] == "mean"]
     assert names == ["degraded", "traditional-fast", "paper: traditional", "paper: ConvBEERS"]
     of_paper = [row for row in document["rows"] if row["name"].startswith("paper")]
@@ -459,20 +456,23 @@ def test_brightness_scales_the_scenes_before_they_are_acquired() -> None:
 
 @pytest.mark.parametrize("brightness", [(0.0,), (1.5,), (-0.25,), (float("nan"),), (float("inf"),)])
 def test_a_brightness_out_of_range_is_refused(brightness: tuple[float, ...]) -> None:
-    with pytest.raises(OptionError, match="factors of radiance above 0 and up to 1"):
-        evaluate(["degraded"], brightness=brightness)
+    with pytest.raises(OptionError, match=r"`brightness` .* above 0 and at most 1"):
+        evaluate(methods=["degraded"], brightness=brightness)
 
 
-def test_pairs_are_as_bright_as_they_are() -> None:
-    with pytest.raises(OptionError, match="no brightness with pairs"):
-        evaluate(["degraded"], [], brightness=(1.0, 0.25))
+@pytest.mark.parametrize(
+    "options", [{"brightness": (1.0, 0.25)}, {"sweep": True}, {"images": "scenes"}]
+)
+def test_what_simulates_pairs_has_no_effect_with_given_ones(options: dict[str, Any]) -> None:
+    with pytest.raises(OptionError, match=f"`{next(iter(options))}` has no effect with `pairs`"):
+        evaluate(methods=["degraded"], pairs=[], **options)
 
 
 @pytest.mark.parametrize("text", [",", "a quarter", "0.25,,0.05"])
 def test_a_brightness_that_is_no_number_is_one_sentence(text: str, tmp_path: Path) -> None:
     write_tiff(tmp_path / "scene.tif", np.ones((400, 400), np.uint16))
     message = refused("evaluate", "--images", tmp_path, "--brightness", text)
-    assert message.startswith("beers-deploy: --brightness: expected numbers separated by commas")
+    assert message.startswith("beers-deploy: --brightness must be numbers separated by commas")
 
 
 def test_the_command_at_two_brightnesses_on_photographs(

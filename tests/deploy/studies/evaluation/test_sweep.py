@@ -11,9 +11,9 @@ import pytest
 import tifffile
 
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.profiles import Sensor, load_sensor
 from beers_deploy.profiles.figures import Row, by_table, unavailable
-from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.sensor import Instrument, Sensor
+from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.restoration.method import Restore
 from beers_deploy.studies.evaluation import sweep as module
 from beers_deploy.studies.evaluation import targets as targets_module

@@ -10,9 +10,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from beers_deploy.model.metrics.refusal import Refusal
-from beers_deploy.profiles import load_sensor
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.studies.evaluation import targets as module
 from beers_deploy.studies.evaluation.methods import BLIND, Method, method_named
 from beers_deploy.studies.evaluation.targets import (

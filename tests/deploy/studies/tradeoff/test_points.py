@@ -3,6 +3,7 @@ times on this machine.
 """
 
 import json
+import logging
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,14 +12,15 @@ import numpy as np
 import onnx
 import pytest
 
-from beers_deploy.bench.swath import Swath
-from beers_deploy.export import to_onnx
+from beers_deploy.dpu.board import boards_of
+from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.variants import Variant as Shape
 from beers_deploy.network import Network
-from beers_deploy.profiles import load_sensor, load_target
+from beers_deploy.performance.swath import Swath
 from beers_deploy.profiles.constant import Constant
-from beers_deploy.profiles.errors import ModelError, OptionError
-from beers_deploy.profiles.target import TILE_PX, board_names
+from beers_deploy.profiles.errors import ModelError, OptionError, ProfileError
+from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.target import TILE_PX, board_names, load_target
 from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.studies.tradeoff.measure import (
     ROUNDS,
@@ -40,7 +42,6 @@ from beers_deploy.studies.tradeoff.points import (
     fastest_tile_px,
     network_points,
     network_variants,
-    parse_targets,
     radius_px,
 )
 from tests.deploy.dpu.graphs import integer_convbeers
@@ -59,7 +60,7 @@ def variant(tmp_path_factory: pytest.TempPathFactory) -> Variant:
 
 
 def refused(_: Network) -> Network:
-    raise ModelError("net", expected="convolutions", got="a sigmoid", remedy="leave it out")
+    raise ModelError("net has a sigmoid. Leave it out.")
 
 
 def float_file(path: Path) -> Path:
@@ -67,44 +68,48 @@ def float_file(path: Path) -> Path:
     return path
 
 
-def test_all_boards_are_the_shipped_ones_the_default_first() -> None:
-    assert parse_targets("all")[0] == "vck190"
-    assert sorted(parse_targets("all")) == sorted(board_names())
-    assert parse_targets("zcu102, vck190") == ("zcu102", "vck190")
-    for text in ("", "vck190,", "vck190,vck190"):
-        with pytest.raises(OptionError, match="boards, each once"):
-            parse_targets(text)
+def test_boards_are_named_with_commas_and_all_are_the_shipped_ones() -> None:
+    assert [board.name for board in boards_of("all")] == board_names()
+    assert [board.name for board in boards_of("zcu102, vck190")] == ["zcu102", "vck190"]
+    for text in ("", "vck190,"):
+        with pytest.raises(ProfileError):
+            boards_of(text)
 
 
 def test_shipped_networks_come_in_both_precisions_with_the_sensors_profile() -> None:
-    variants = network_variants(["convbeers-xs", "convbeers-xs"], SENSOR, refused, lambda _: None)
+    variants = network_variants(["convbeers-xs", "convbeers-xs"], SENSOR, refused)
     assert [variant.name for variant in variants] == ["convbeers-xs float32", "convbeers-xs INT8"]
     precisions = [variant.network and variant.network.precision for variant in variants]
     assert precisions == ["float32", "int8"]
 
 
-def test_an_own_network_is_quantised_and_one_that_cannot_be_stays_float(tmp_path: Path) -> None:
+def test_an_own_network_is_quantised_and_one_that_cannot_be_stays_float(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     path = float_file(tmp_path / "net.onnx")
-    messages = list[str]()
-    variants = network_variants([str(path)], SENSOR, lambda file: file, messages.append)
-    assert [variant.precision for variant in variants] == [FLOAT, INT8]
-    variants = network_variants([str(path)], SENSOR, refused, messages.append)
+    with caplog.at_level(logging.INFO, "beers_deploy"):
+        variants = network_variants([str(path)], SENSOR, lambda file: file)
+        assert [variant.precision for variant in variants] == [FLOAT, INT8]
+        assert not caplog.records
+        variants = network_variants([str(path)], SENSOR, refused)
     assert [variant.precision for variant in variants] == [FLOAT]
-    assert "compared in float32 alone: net: expected convolutions, got a sigmoid" in messages[0]
+    (record,) = caplog.records
+    assert record.levelno == logging.WARNING
+    assert "compared in float32 alone: net has a sigmoid" in record.getMessage()
 
 
 def test_an_int8_file_is_taken_as_it_is(variant: Variant) -> None:
-    variants = network_variants([variant.network or ""], SENSOR, refused, lambda _: None)
+    variants = network_variants([variant.network or ""], SENSOR, refused)
     assert [item.precision for item in variants] == [INT8]
 
 
 def test_other_names_and_two_files_of_one_name_are_refused(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="a shipped network"):
-        network_variants(["convbeers-xl"], SENSOR, refused, lambda _: None)
+        network_variants(["convbeers-xl"], SENSOR, refused)
     (tmp_path / "other").mkdir()
     paths = [str(float_file(folder / "net.onnx")) for folder in (tmp_path, tmp_path / "other")]
-    with pytest.raises(OptionError, match="names that differ"):
-        network_variants(paths, SENSOR, lambda file: file, lambda _: None)
+    with pytest.raises(OptionError, match="must differ, but two are named 'net float32'"):
+        network_variants(paths, SENSOR, lambda file: file)
 
 
 def test_a_network_of_one_tile_size_is_refused(tmp_path: Path) -> None:
@@ -113,7 +118,7 @@ def test_a_network_of_one_tile_size_is_refused(tmp_path: Path) -> None:
         model.graph.input[0].type.tensor_type.shape.dim[side].dim_value = 64
     onnx.save(model, tmp_path / "fixed.onnx")
     with pytest.raises(OptionError, match="fixed to one tile size"):
-        network_variants([str(tmp_path / "fixed.onnx")], SENSOR, refused, lambda _: None)
+        network_variants([str(tmp_path / "fixed.onnx")], SENSOR, refused)
 
 
 def test_the_fastest_tile_is_a_multiple_of_the_step_and_no_other_is_faster(

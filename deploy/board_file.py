@@ -1,0 +1,38 @@
+"""The core of an INT8 network as a file in a board's encoding: QDQ ONNX, or VINT8 of an NPU."""
+
+import logging
+from collections.abc import Iterable
+from pathlib import Path
+
+from beers_deploy.model.io.files import require_writable
+from beers_deploy.network import Network
+from beers_deploy.profiles.target import TargetProfile
+from beers_deploy.quant.encodings import CONFIG, required_tile, save_config
+
+logger = logging.getLogger(__name__)
+
+
+def require_core_file(
+    target: TargetProfile, path: Path | None, tile: int | None, inputs: Iterable[Path | None]
+) -> None:
+    """Raise an error if a core cannot be written: of an NPU it needs a tile, and room for what its
+    compiler reads.
+
+    Args:
+        target: whose encoding the core has.
+        path: of the core; None if none is written.
+        tile: side that it is fixed to, or None.
+        inputs: files that are read, and may not be replaced.
+    """
+    if path is not None and target.npu:
+        required_tile(tile)
+        require_writable(path.with_name(CONFIG), inputs=inputs)
+
+
+def save_core(core: Network, path: Path, target: TargetProfile) -> None:
+    """Write a core for a board, and next to it what the compiler of an NPU reads."""
+    core.save(path)
+    logger.info("wrote %s: the same numbers in the board's encoding", path)
+    if target.npu:
+        config = save_config(path, *target.npu["device"].value)
+        logger.info("wrote %s: the configuration of AMD's compiler", config)

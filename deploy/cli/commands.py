@@ -1,0 +1,173 @@
+"""Which verbs are commands, and the entry of the program."""
+
+import sys
+from collections.abc import Iterator
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+from beers_deploy import __version__
+from beers_deploy.cli.generate import Command, generated
+from beers_deploy.cli.run import run
+from beers_deploy.cli.streams import lasting_streams
+from beers_deploy.profiles.errors import CRASHED
+from beers_deploy.verbs.bench import bench
+from beers_deploy.verbs.characterize import characterize
+from beers_deploy.verbs.check import check
+from beers_deploy.verbs.demo import demo
+from beers_deploy.verbs.evaluate import evaluate
+from beers_deploy.verbs.export import export
+from beers_deploy.verbs.gate import gate
+from beers_deploy.verbs.golden import golden
+from beers_deploy.verbs.profiles import profiles
+from beers_deploy.verbs.quantize import quantize
+from beers_deploy.verbs.restore import restore
+from beers_deploy.verbs.simulate import simulate
+from beers_deploy.verbs.stress import stress
+from beers_deploy.verbs.tradeoff import tradeoff
+from beers_deploy.verbs.train import train
+
+RESTORE = "Restore"
+INT8 = "Quantise and judge"
+BOARDS = "Boards"
+STUDY = "Study"
+TRAIN = "Sensors and training"
+"""Panels of the help."""
+
+COMMANDS = {
+    command.name: command
+    for command in (
+        Command("restore", restore, "raw.tif restored.tif", RESTORE),
+        Command("demo", demo, "--out demo", RESTORE),
+        Command("export", export, "--network convbeers-s --out float.onnx", INT8),
+        Command(
+            "quantize",
+            quantize,
+            "float.onnx --target zcu104 --sensor pleiades-degraded --out int8.onnx",
+            INT8,
+        ),
+        Command("gate", gate, "float.onnx int8.onnx --max-mae 0.0007", INT8),
+        Command("check", check, "network.onnx --target zcu102 --dpu B4096", BOARDS),
+        Command("golden", golden, "int8.onnx --tile 64 --out golden", BOARDS),
+        Command("bench", bench, "--target vck190-model --size 13600x9016 --dpu C32B3", BOARDS),
+        Command(
+            "evaluate",
+            evaluate,
+            "--images aerial/ --methods degraded,traditional,convbeers-s --out report/",
+            STUDY,
+        ),
+        Command(
+            "tradeoff", tradeoff, "--images aerial/ --out study/ --budget 'latency<=20s'", STUDY
+        ),
+        Command("stress", stress, "float.onnx int8.onnx --out stability.md", STUDY),
+        Command("profiles", profiles, "pleiades-degraded", TRAIN),
+        Command(
+            "characterize", characterize, "raw1.tif raw2.tif --bits 12 --out my-sensor.toml", TRAIN
+        ),
+        Command(
+            "simulate",
+            simulate,
+            "--images aerial/ --sensor pleiades-degraded --out pairs",
+            TRAIN,
+        ),
+        Command(
+            "train",
+            train,
+            "--variant convbeers-s --images aerial/ --out runs/s --steps 20000",
+            TRAIN,
+        ),
+    )
+}
+"""The commands by name, in the order of the help."""
+
+SPELLINGS = {"characterise": "characterize"}
+"""Other spellings of commands, which the help does not list."""
+
+
+class Group(TyperGroup):
+    """Keeps standard output for the results document where it is asked for there."""
+
+    results_on_stdout = False
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Note whether the results go to standard output."""
+        # Once parsed, Click keeps the words in an attribute that has another name in each of its
+        # versions.
+        self.results_on_stdout = ("--json", "-") in pairwise(args) or "--json=-" in args
+        return super().parse_args(ctx, args)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the chosen command; output that was lost ends it with 70 when all is done."""
+        closed = sys.stdout is None
+        with lasting_streams(self.results_on_stdout) as out:
+            result = super().invoke(ctx)
+        if out.lost or (closed and self.results_on_stdout):
+            reason = out.lost or "closed"
+            typer.echo(f"beers-deploy: standard output: {reason}; all else is done", err=True)
+            ctx.exit(CRASHED)
+        return result
+
+
+app = typer.Typer(
+    cls=Group,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Satellite image restoration from training to board: simulate, train, quantise, check, "
+    "predict, restore.",
+)
+
+
+@app.callback(invoke_without_command=True)
+def main(
+    context: typer.Context,
+    version: bool = typer.Option(False, "--version", help="Print the version."),
+    verbose: bool = typer.Option(
+        False, "-v", "--verbose", help="With --version: the system and the libraries too."
+    ),
+) -> None:
+    """Print the version or the help where no command is given."""
+    if version or context.invoked_subcommand is None:
+        typer.echo(f"beers-deploy {__version__}" if version else context.get_help())
+        for line in _installation() if version and verbose else ():
+            typer.echo(line)
+        raise typer.Exit
+
+
+def _installation() -> Iterator[str]:
+    """Yield a line for each fact about the system, the libraries and their kernels."""
+    from importlib.metadata import PackageNotFoundError
+    from importlib.metadata import version as version_of
+
+    from beers_deploy.model.processor import int8_adds_exactly
+    from beers_deploy.results import host
+
+    int8_adds_exactly()
+    for key, value in host().items():
+        values = value if isinstance(value, dict) else {key: value}
+        yield from (f"{name.replace('_', ' ')}: {text}" for name, text in values.items())
+    for package in ("onnxruntime", "onnx", "torch", "numpy", "openvino"):
+        try:
+            yield f"{package}: {version_of(package)}"
+        except PackageNotFoundError:
+            yield f"{package}: not installed"
+
+
+def _add(name: str, command: Command, *, hidden: bool = False) -> None:
+    """Add a command under a name."""
+    app.command(
+        name,
+        epilog=f"Example:  [bold]beers-deploy {command.name} {command.example}[/bold]",
+        rich_help_panel=command.panel,
+        hidden=hidden,
+    )(generated(command, partial(run, command)))
+
+
+for each in COMMANDS.values():
+    _add(each.name, each)
+for spelling, name in SPELLINGS.items():
+    _add(spelling, COMMANDS[name], hidden=True)

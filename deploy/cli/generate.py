@@ -1,0 +1,227 @@
+"""A command of Typer from a verb's signature and docstring.
+
+- A positional parameter is an argument, a keyword-only one an option.
+- The text of an argument or option is that of the docstring's `Args`.
+- The type is that of the annotation; a type that only Python has is read as text.
+"""
+
+import inspect
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+import typer
+from docstring_parser import Docstring, DocstringStyle, parse
+
+from beers_deploy.verbs.parameters import Completed, Interval, PythonOnly, Written
+from beers_deploy.verbs.verb import marker, parts_of
+
+Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Print errors alone.")]
+Verbose = Annotated[
+    bool,
+    typer.Option("-v", "--verbose", help="Print details too, and where an error arose."),
+]
+Json = Annotated[
+    Path | None, typer.Option(help="Write the results here as JSON; - is standard output.")
+]
+
+
+@dataclass(frozen=True)
+class Command:
+    """A verb as a command.
+
+    Attributes:
+        name: on the command line.
+        verb: the function.
+        example: words of a command line.
+        panel: of the help.
+    """
+
+    name: str
+    verb: Callable[..., Any]
+    example: str
+    panel: str
+
+    @cached_property
+    def doc(self) -> Docstring:
+        """The docstring, parsed."""
+        return parse(inspect.cleandoc(self.verb.__doc__ or ""), DocstringStyle.GOOGLE)
+
+    @property
+    def parameters(self) -> list[inspect.Parameter]:
+        """The parameters of the verb that the command has."""
+        every = parameters_of(self.verb).values()
+        return [parameter for parameter in every if marker(parameter, PythonOnly) is None]
+
+    @property
+    def has_table(self) -> bool:
+        """True if the command writes results documents: all do but those that return a path."""
+        return inspect.signature(self.verb).return_annotation is not Path
+
+    @property
+    def help(self) -> str:
+        """The text above the options: what the verb does."""
+        doc = self.doc
+        return "\n\n".join(filter(None, (doc.short_description, doc.long_description)))
+
+
+@lru_cache
+def parameters_of(verb: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
+    """Return the parameters of a verb by name."""
+    return inspect.signature(verb).parameters
+
+
+def generated(command: Command, run: Callable[..., None]) -> Callable[..., None]:
+    """Return a function that Typer makes a command of.
+
+    Args:
+        command: the verb, and how it is listed.
+        run: is called with the options by name, and with quiet, verbose and json.
+    """
+
+    def called(**options: Any) -> None:
+        run(**options)
+
+    texts = {entry.arg_name: entry.description or "" for entry in command.doc.params}
+    parameters = [
+        _for_typer(parameter, text_for_command(texts[parameter.name], command.verb))
+        for parameter in command.parameters
+    ]
+    extra: dict[str, Any] = {"json": Json} if command.has_table else {}
+    extra |= {"quiet": Quiet, "verbose": Verbose}
+    for name, hint in extra.items():
+        default = None if name == "json" else False
+        parameters.append(_keyword(name, hint, default))
+    called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    called.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    called.__doc__ = in_options(command.help, command.verb)
+    return called
+
+
+def _keyword(name: str, hint: Any, default: Any) -> inspect.Parameter:
+    kind = inspect.Parameter.KEYWORD_ONLY
+    return inspect.Parameter(name, kind, default=default, annotation=hint)
+
+
+def _for_typer(parameter: inspect.Parameter, text: str) -> inspect.Parameter:
+    """Return a parameter with the annotation and the default that Typer reads."""
+    about: dict[str, Any] = {"help": text}
+    interval = marker(parameter, Interval)
+    if interval is not None:
+        about |= {"min": interval.ge, "max": interval.le}
+    completed = marker(parameter, Completed)
+    if completed is not None:
+        about["autocompletion"] = _completion(completed)
+        if completed.listed:
+            about["help"] += f" Names: {', '.join(completed.names())}."
+    hint, repeated = read_as(parameter.annotation)
+    default = _default(parameter, hint, repeated)
+    if repeated:
+        hint = list[hint]  # type: ignore[valid-type]
+    if default is None:
+        hint = hint | None
+    if parameter.kind is parameter.POSITIONAL_OR_KEYWORD:
+        info = typer.Argument(metavar=metavar_of(parameter), **about)
+    else:
+        info = typer.Option(*spellings_of(parameter), **about)
+    return _keyword(parameter.name, Annotated[hint, info], default)
+
+
+def _default(parameter: inspect.Parameter, hint: Any, repeated: bool) -> Any:
+    """Return the default on the command line; empty of what must be given."""
+    written = marker(parameter, Written)
+    if written is not None and written.required:
+        return inspect.Parameter.empty
+    if parameter.default is parameter.empty or parameter.default is None:
+        return parameter.default
+    if repeated:
+        return None
+    return str(parameter.default) if hint is str else parameter.default
+
+
+def read_as(annotation: Any) -> tuple[Any, bool]:
+    """Return the type that the command line reads a parameter as, and whether it may be repeated.
+
+    A type that only Python has, such as a mapping of limits, is a path or a text, whichever its
+    annotation names first.
+    """
+    parts = list(parts_of(annotation))
+    repeated = next((part for part in parts if get_origin(part) is SEQUENCE), None)
+    if repeated is not None:
+        return read_as(get_args(repeated)[0])[0], True
+    for part in parts:
+        if get_origin(part) is Literal or part in (bool, int, float, str, Path):
+            return part, False
+    raise TypeError(f"the command line cannot read {annotation}")
+
+
+SEQUENCE = get_origin(Sequence[str])
+
+
+def spellings_of(parameter: inspect.Parameter) -> list[str]:
+    """Return the spellings of an option: a switch that is on by default is turned off by --no-."""
+    name = option_of(parameter.name)
+    if parameter.default is True:
+        return [f"{name}/--no-{name[2:]}"]
+    if parameter.name == "out":
+        return ["-o", name]
+    return [name]
+
+
+def option_of(name: str) -> str:
+    """Return the option of a parameter's name; `with_` stands for --with."""
+    return f"--{name.rstrip('_').replace('_', '-')}"
+
+
+def metavar_of(parameter: inspect.Parameter) -> str:
+    """Return the name of an argument on the command line: capitals."""
+    return parameter.name.upper()
+
+
+def _completion(completed: Completed) -> Callable[[str], list[str]]:
+    """Return what completes names, and paths where no name fits."""
+
+    def complete(incomplete: str) -> list[str]:
+        # Several names are separated by commas.
+        before, comma, last = incomplete.rpartition(",")
+        names = [name for name in completed.names() if name.startswith(last)]
+        folder = Path(last).parent
+        if not names and folder.is_dir():
+            paths = [str(path) for path in folder.iterdir()]
+            names = [path for path in paths if path.startswith(last)]
+        return [f"{before}{comma}{name}" for name in names]
+
+    return complete
+
+
+PYTHON_SENTENCE = re.compile(r"\s*(?:\bIn Python\b[^.]*\.|; in Python\b[^.;]*)")
+"""A sentence, or a part behind a semicolon, that says what Python accepts too."""
+
+
+def text_for_command(text: str, verb: Callable[..., Any]) -> str:
+    """Return the text of a parameter on one line, without what Python alone accepts."""
+    words = in_options(PYTHON_SENTENCE.sub("", " ".join(text.split())).strip(), verb)
+    return words[:1].upper() + words[1:]
+
+
+def in_options(text: str, verb: Callable[..., Any]) -> str:
+    """Return text with the parameters of a verb as the command line names them.
+
+    Args:
+        text: has parameters in backquotes.
+        verb: whose parameters they are.
+    """
+    parameters = parameters_of(verb)
+
+    def named(match: re.Match[str]) -> str:
+        parameter = parameters.get(match[1])
+        if parameter is None:
+            return match[1]
+        if parameter.kind is parameter.POSITIONAL_OR_KEYWORD:
+            return metavar_of(parameter)
+        return option_of(parameter.name)
+
+    return re.sub(r"`(\w+)`", named, text)

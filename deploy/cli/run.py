@@ -1,0 +1,173 @@
+"""A verb run as a command: what it returns is printed, and what ends it gets an exit code."""
+
+import logging
+import sys
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from beers_deploy.cli.generate import Command, in_options
+from beers_deploy.cli.streams import STDOUT, delete_results, save_results
+from beers_deploy.model.progress import live_console, reporting
+from beers_deploy.profiles.errors import (
+    CRASHED,
+    BeersError,
+    OptionError,
+    missing_extra,
+    one_line,
+    visible,
+)
+from beers_deploy.verbs.parameters import RequiredUnless
+from beers_deploy.verbs.verb import delete_older, marker, paths_of, require_apart
+
+INTERRUPTED = 130
+"""Exit code of Ctrl-C."""
+
+
+def run(
+    command: Command,
+    *,
+    quiet: bool = False,
+    verbose: bool = False,
+    json: Path | None = None,
+    **options: Any,
+) -> None:
+    """Run a verb, print its result, and exit with 1 if a check failed.
+
+    What a user can correct ends it with 2, anything else with 70.
+    """
+    try:
+        with reporting(False if quiet else None), logged(quiet, verbose):
+            result = _result(command, options, json)
+            _show(result, quiet, verbose)
+            table = table_of(result)
+            if table is not None:
+                save_results(table, json)
+    except (typer.Exit, typer.Abort):
+        raise
+    except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - no fault must look like a failed gate
+        message, code = ending(error, command)
+        if verbose or code == CRASHED:
+            traceback.print_exc()
+        typer.echo(f"beers-deploy: {visible(message)}", err=True)
+        raise typer.Exit(code) from None
+    if table is not None and not table:
+        if quiet:
+            typer.echo(f"beers-deploy: {one_line(table.verdict)}", err=True)
+        raise typer.Exit(1)
+
+
+def _result(command: Command, options: dict[str, Any], json: Path | None) -> Any:
+    """Call the verb with the options that are given."""
+    given = {name: value for name, value in options.items() if value not in (None, [])}
+    for parameter in command.parameters:
+        needed = marker(parameter, RequiredUnless)
+        if needed and parameter.name not in given and not given.get(needed.other):
+            raise OptionError(f"`{parameter.name}` is missing. Give it, or add `{needed.other}`.")
+    if json is not None and json != STDOUT:
+        delete_older(command.verb, given)
+        delete_results(json, paths_of(command.verb, given).inputs)
+        require_apart(command.verb, given, json)
+    return command.verb(**given)
+
+
+def table_of(result: Any) -> Any:
+    """Return the table of a result: itself, or what a network or a sensor found on the way."""
+    from beers_deploy.results import Table
+
+    return result if isinstance(result, Table) else getattr(result, "table", None)
+
+
+def _show(result: Any, quiet: bool, verbose: bool) -> None:
+    """Print a result on standard output."""
+    if quiet:
+        return
+    table = table_of(result)
+    if table is not None:
+        table.print(details=verbose)
+    elif isinstance(result, str):
+        # A terminal must obey nothing in the text of a file.
+        for line in result.removesuffix("\n").split("\n"):
+            typer.echo(one_line(line))
+
+
+@contextmanager
+def logged(quiet: bool, verbose: bool) -> Iterator[None]:
+    """Print what the package logs on standard error while a command runs."""
+    logger = logging.getLogger("beers_deploy")
+    handler = Lines()
+    before = logger.level, logger.propagate
+    level = logging.INFO
+    if quiet:
+        level = logging.ERROR
+    elif verbose:
+        level = logging.DEBUG
+    handler.setLevel(level)
+    logger.setLevel(min(level, logging.INFO))
+    logger.propagate = False
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before[0])
+        logger.propagate = before[1]
+
+
+class Lines(logging.Handler):
+    """Prints each record as one line on standard error, above a bar of progress."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._warned: set[str] = set()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a record; a warning says that it is one, and is printed once."""
+        text = one_line(record.getMessage())
+        if record.levelno >= logging.WARNING:
+            # Several networks of one sensor warn of the same.
+            if text in self._warned:
+                return
+            self._warned.add(text)
+            text = f"warning: {text}"
+        console = live_console()
+        if console is None:
+            sys.stderr.write(f"{text}\n")
+        else:
+            console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def ending(error: BaseException, command: Command) -> tuple[str, int]:
+    """Return what is printed of an error that ends a command, and the exit code."""
+    if isinstance(error, ImportError) and not isinstance(error, BeersError):
+        error = missing_extra(error, command.name)
+    if isinstance(error, BeersError):
+        return in_options(str(error), command.verb), 2
+    if isinstance(error, MemoryError):
+        return "There is not enough memory for this input. Give a smaller image or tile.", 2
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted", INTERRUPTED
+    at_fault = " or of ".join(["this program", *_library_of(error)])
+    return f"This is a fault of {at_fault}. Please report it: {error!r}", CRASHED
+
+
+def _library_of(error: BaseException) -> list[str]:
+    """Return name and version of the library in which an error arose; nothing if it arose in this
+    program.
+    """
+    from importlib.metadata import packages_distributions, version
+
+    distributions = packages_distributions()
+    for frame, _ in reversed(list(traceback.walk_tb(error.__traceback__))):
+        package = str(frame.f_globals.get("__name__")).partition(".")[0]
+        if package == __package__.partition(".")[0]:
+            return []
+        # The standard library belongs to no distribution.
+        if package in distributions:
+            name = distributions[package][0]
+            return [f"{name} {version(name)}"]
+    return []

@@ -1,0 +1,121 @@
+"""Standard output and error of a command: a stream that breaks ends no run."""
+
+import io
+import os
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, redirect_stdout, suppress
+from contextvars import ContextVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO, cast
+
+from beers_deploy.profiles.errors import OptionError
+
+if TYPE_CHECKING:
+    from beers_deploy.results import Table
+
+SCHEMA_NAME = "beers-deploy/results"
+"""The same as in `deploy.results`, which is imported late."""
+
+HEAD_BYTES = 200
+"""Of a results document: it begins with the name of its schema."""
+
+STDOUT = Path("-")
+"""What --json takes for standard output; tables and notes then go to standard error."""
+
+_results: ContextVar[TextIO | None] = ContextVar("results", default=None)
+
+
+class Stream:
+    """Standard output or error that ends no run: what cannot be written is left out, and `lost`
+    says why.
+
+    A stream that was closed at the start takes everything and loses nothing, as nobody asked for
+    it.
+    """
+
+    def __init__(self, stream: Any) -> None:
+        self.stream = stream or open(os.devnull, "w")  # noqa: PTH123, SIM115 - as long as the process
+        self.lost = ""
+        if isinstance(self.stream, io.TextIOWrapper):
+            # A name that a terminal cannot show must end no run either.
+            self.stream.reconfigure(errors="backslashreplace")
+
+    def write(self, text: str) -> int:
+        """Write and flush, or leave it out."""
+        if not self.lost:
+            try:
+                self.stream.write(text)
+                self.stream.flush()
+            except OSError as error:
+                self.lost = error.strerror or str(error)
+                # Buffered text must not be tried once more when Python ends.
+                with suppress(OSError, ValueError):
+                    os.dup2(os.open(os.devnull, os.O_WRONLY), self.stream.fileno())
+        return len(text)
+
+    def flush(self) -> None:
+        """Do nothing: each write flushes."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+
+@contextmanager
+def lasting_streams(results_on_stdout: bool) -> Iterator[Stream]:
+    """Replace the standard streams by lasting ones while a command runs, and return the output.
+
+    Args:
+        results_on_stdout: whether standard output is for the results document alone: then all else
+            that is printed goes to standard error.
+    """
+    out = Stream(sys.stdout)
+    sys.stdout = cast(TextIO, out)
+    sys.stderr = cast(TextIO, Stream(sys.stderr))
+    if not results_on_stdout:
+        yield out
+        return
+    token = _results.set(sys.stdout)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield out
+    finally:
+        _results.reset(token)
+
+
+def delete_results(path: Path, inputs: Iterable[Path]) -> None:
+    """Delete an older results document: it must not pass for the result of a run that is refused.
+
+    Args:
+        path: of the document that will be written.
+        inputs: what the run reads.
+
+    Raises:
+        OptionError: another file stands there, which a run may read without naming it, such as a
+            tile of an index.
+    """
+    from beers_deploy.model.io.files import require_writable
+
+    require_writable(path, inputs=inputs)
+    if not path.exists():
+        return
+    with path.open("rb") as stream:
+        head = stream.read(HEAD_BYTES)
+    if SCHEMA_NAME.encode() not in head:
+        raise OptionError(
+            f"{path} exists and is not a results document, so it is not replaced. Choose another "
+            "path for `json`."
+        )
+    path.unlink()
+
+
+def save_results(table: "Table", path: Path | None) -> None:
+    """Write a table where --json asks for it: to a file, to standard output for `-`, or nowhere."""
+    if path == STDOUT:
+        (_results.get() or sys.stdout).write(table.to_json())
+    elif path is not None:
+        if path.exists():
+            raise OptionError(
+                f"{path} is another output of this run. Choose another path for `json`."
+            )
+        table.save(path)

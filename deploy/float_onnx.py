@@ -1,0 +1,184 @@
+"""ConvBEERS as ONNX: `image` (N, 1, H, W) in [0, 1] to `restored`, written node by node under
+readable names.
+
+Also how any float network is had as ONNX: from an ONNX file or from weights, which may need to be
+told a sensor.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import onnx
+
+from beers_deploy import __version__
+from beers_deploy.model.bank import FILTERS, in_places, network_bank
+from beers_deploy.model.family import sensor_vector
+from beers_deploy.model.io.tensors import Weights, read_conditioned, read_plain
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.sensor import Instrument, Sensor
+from beers_deploy.quant.onnx_file import GraphWriter, image_info, load_onnx, make_model
+
+if TYPE_CHECKING:
+    from beers_deploy.model.convbeers import ConvBEERS
+
+
+def float_for(path: Path, name: str, sensor: Sensor, tile_px: int | None = None) -> onnx.ModelProto:
+    """A network that is told its sensor as an ONNX model for the middle of a profile.
+
+    Args:
+        path: of its weights.
+        name: that it is listed under.
+        sensor: whose images it is to restore.
+        tile_px: as in `to_onnx`.
+    """
+    weights = read_conditioned(path)
+    return banked_to_onnx(
+        weights, sensor.nominal(), about(name, weights.recipe, sensor.name), tile_px
+    )
+
+
+def to_onnx(
+    network: "Weights | ConvBEERS", about: dict[str, str], tile_px: int | None = None
+) -> onnx.ModelProto:
+    """A plain network as an ONNX model; `tile_px` fixes one square image, None leaves number and
+    size free.
+    """
+    scale = network.variant.scale
+    require_tile(tile_px, scale)
+    writer = GraphWriter()
+    arrays = network.tensors if isinstance(network, Weights) else network.state_dict()
+    for name, value in arrays.items():
+        writer.constant(name, np.asarray(value))
+    unshuffled = _moved(writer, "SpaceToDepth", "unshuffled", "image", scale)
+    deep = _deep(writer, network.variant.blocks, unshuffled)
+    return _ended(writer, _conv(writer, "tail", deep), scale, about, tile_px)
+
+
+def banked_to_onnx(
+    weights: Weights, sensor: Instrument, about: dict[str, str], tile_px: int | None = None
+) -> onnx.ModelProto:
+    """A network behind the bank of a sensor as an ONNX model: its filters are the first
+    convolution.
+
+    That convolution gives the image, the planes and the analytic restoration; the last one reads
+    what the body gives and, at one tap, the analytic restoration, which another convolution picks.
+    The image's borders are mirrored in front.
+
+    Args:
+        weights: of a `BankedConvBEERS`.
+        sensor: whose images are restored.
+        about: metadata.
+        tile_px: side of a fixed square image, or None for any number and size.
+    """
+    variant = weights.variant
+    bank = network_bank(sensor, weights.kernels)
+    scale = variant.scale
+    pixels = variant.pixels
+    require_tile(tile_px, scale)
+    vector = np.array(sensor_vector(sensor).values, np.float32)
+    tensors = dict(weights.tensors)
+    # The head does not read the analytic restoration, hence weights of 0 for its planes.
+    unread = np.zeros((variant.features, pixels, 3, 3), np.float32)
+    tensors["head.weight"] = np.concatenate([tensors["head.weight"], unread], 1)
+    tensors["head.bias"] = tensors["head.bias"] + tensors.pop("bias.weight") @ vector
+    # The last convolution adds the analytic restoration at its middle tap alone.
+    added = np.zeros((pixels, pixels, 3, 3), np.float32)
+    added[range(pixels), range(pixels), 1, 1] = 1
+    tensors["tail.weight"] = np.concatenate([tensors["tail.weight"], added], 1) * np.float32(
+        bank.unit
+    )
+    tensors["analytic.weight"] = np.zeros((pixels, (2 + FILTERS) * pixels, 1, 1), np.float32)
+    tensors["analytic.weight"][range(pixels), range(-pixels, 0)] = 1
+    tensors["tail.bias"] = tensors["tail.bias"] * np.float32(bank.unit)
+    tensors["bank.weight"] = in_places(bank.kernels, scale).astype(np.float32)
+    # The body reads the image less 0.5, as it did in training.
+    tensors["bank.bias"] = np.repeat(np.array([-0.5, *[0] * (1 + FILTERS)], np.float32), pixels)
+    writer = GraphWriter()
+    for name, value in tensors.items():
+        writer.constant(name, value)
+    side = tensors["bank.weight"].shape[-1]
+    around = writer.constant("around", np.array([0, 0, *[side // 2 * scale] * 2] * 2))
+    widened = writer.node("Pad", "widened", ["image", around], mode="reflect")
+    unshuffled = _moved(writer, "SpaceToDepth", "unshuffled", widened, scale)
+    bank_output = writer.node(
+        "Conv",
+        "bank",
+        [unshuffled, "bank.weight", "bank.bias"],
+        pads=[0] * 4,
+        kernel_shape=[side, side],
+    )
+    reach, wide_reach = bank.reach(weights.kernels)
+    planes = _held(writer, "planes", bank_output, reach)
+    picked = writer.node("Conv", "picked", [bank_output, "analytic.weight"], kernel_shape=[1, 1])
+    analytic = _held(writer, "analytic", picked, wide_reach)
+    deep = writer.node("Concat", "deep", [_deep(writer, variant.blocks, planes), analytic], axis=1)
+    return _ended(writer, _conv(writer, "tail", deep), scale, about, tile_px)
+
+
+def _held(writer: GraphWriter, name: str, source: str, most: float) -> str:
+    """Write what holds a tensor within so many units."""
+    ends = [(f"{name}.low", -most), (f"{name}.high", most)]
+    limits = [writer.constant(end, np.array(value, np.float32)) for end, value in ends]
+    return writer.node("Clip", name, [source, *limits])
+
+
+def _deep(writer: GraphWriter, blocks: int, source: str) -> str:
+    """Head, blocks and the end of the body."""
+    stream = head = _conv(writer, "head", source)
+    for k in range(blocks):
+        inner = writer.node("Relu", f"body.{k}.relu", [_conv(writer, f"body.{k}.first", stream)])
+        stream = writer.node(
+            "Add", f"body.{k}.add", [stream, _conv(writer, f"body.{k}.second", inner)]
+        )
+    return writer.node("Add", "body_end.add", [head, _conv(writer, "body_end", stream)])
+
+
+def _ended(
+    writer: GraphWriter, correction: str, scale: int, about: dict[str, str], tile_px: int | None
+) -> onnx.ModelProto:
+    """The model that adds a correction to the image."""
+    shuffled = _moved(writer, "DepthToSpace", "shuffled", correction, scale)
+    writer.node("Add", "restored", ["image", shuffled])
+    graph = writer.graph(
+        "convbeers", [image_info("image", 1, tile_px)], [image_info("restored", 1, tile_px)]
+    )
+    return make_model(graph, {"beers_deploy_version": __version__, "precision": "float32", **about})
+
+
+def require_tile(tile_px: int | None, scale: int) -> None:
+    """Raise OptionError if a network at 1 / `scale` of the resolution cannot rearrange a tile."""
+    if tile_px is not None and tile_px % scale:
+        raise OptionError(
+            f"`tile` must be a multiple of {scale} px, but it is {tile_px} px. Choose another "
+            "`tile`, or leave it out."
+        )
+
+
+def _conv(writer: GraphWriter, name: str, source: str) -> str:
+    feeds = [source, f"{name}.weight", f"{name}.bias"]
+    return writer.node("Conv", name, feeds, pads=[1] * 4, kernel_shape=[3, 3])
+
+
+def _moved(writer: GraphWriter, operator: str, name: str, source: str, scale: int) -> str:
+    """Pixels into channels or back, in an order in which ONNX and torch agree: the image has one
+    channel.
+    """
+    return writer.node(operator, name, [source], blocksize=scale) if scale > 1 else source
+
+
+def float_model(path: Path) -> onnx.ModelProto:
+    """A float network as ONNX: from an .onnx file, or from the .safetensors file of a plain one."""
+    if path.suffix != ".safetensors":
+        return load_onnx(path)
+    weights = read_plain(path)
+    return to_onnx(weights, about(path.stem, weights.recipe))
+
+
+def about(variant: str, recipe: dict[str, object], sensor: str | None = None) -> dict[str, str]:
+    """What an exported file says of itself; `sensor` is the name of the one that it was told."""
+    return {
+        "variant": variant,
+        "sensor": sensor if sensor is not None else str(recipe.get("degraded", "")),
+        "reference": str(recipe.get("reference", "")),
+    }

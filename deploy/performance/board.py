@@ -1,0 +1,307 @@
+"""A swath on boards, predicted, next to the traditional pipeline on the board's processor and the
+paper's figures.
+
+One configuration and one tile size are predicted layer by layer; several are swept. Networks that
+cannot be tiled are predicted by the frame.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beers_deploy.dpu.board import ALL, BoardLike, Dpu, boards_of, dpu_of
+from beers_deploy.dpu.cost.latency import Prediction
+from beers_deploy.dpu.cost.model import Task
+from beers_deploy.dpu.cost.own_runs import read_own_runs
+from beers_deploy.dpu.reading import own_tile_px
+from beers_deploy.model.exposure import factors_for
+from beers_deploy.network import Network
+from beers_deploy.performance.swath import PAPER_SIZE, Swath, parse_size, predict_network
+from beers_deploy.performance.tables import (
+    LAYERS,
+    PAPER_TARGET,
+    TABLE,
+    frame_row,
+    host_words,
+    layer_rows,
+    predicted_rows,
+    processor_row,
+    published_rows,
+    quoted_rows,
+    sweep_rows,
+    within_words,
+)
+from beers_deploy.profiles.errors import ModelError, OptionError, printable
+from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.sensor import MAX_DN, Sensor
+from beers_deploy.profiles.target import TILE_PX, TargetProfile
+from beers_deploy.restoration.plan import make_plan, parse_halo
+from beers_deploy.restoration.steps import keeps_pixels, offset_of
+from beers_deploy.restoration.tiles.exposures import tiles_by_factor
+from beers_deploy.results import Table
+
+Tables = list[tuple[str, list[Row]]]
+"""Rows by the title of their table."""
+
+
+def _predictions(
+    network: Network,
+    boards: Sequence[Dpu],
+    tile_px: int,
+    task: Task | None,
+    step_px: float = 0.0,
+) -> tuple[list[Prediction], list[str]]:
+    """A network on each board, of its own size where it is fixed to one; and what to say of its
+    host.
+    """
+    # A network that is fixed to one size runs at that size alone.
+    size_px = None if own_tile_px(network.model) else tile_px
+    predictions = [predict_network(network, dpu, size_px, task, step_px) for dpu in boards]
+    # Boards of one kind say the same of their hosts: each sentence is kept once.
+    sentences = dict.fromkeys(chain.from_iterable(map(host_words, predictions)))
+    return predictions, list(sentences)
+
+
+TRAFFIC = (
+    "LdFM, StFM: feature maps loaded and stored, an image; LdWB: weights and biases loaded, a batch"
+)
+PREDICTED = (
+    "No board was used: the DPU's figures come from a cost model, its power from an assumption."
+)
+DETAILS = frozenset(
+    {
+        "CPU load",
+        "batch",
+        "bound",
+        "consistency step",
+        "energy",
+        "fitted range",
+        "host beside the DPU",
+        "host's task",
+        "layers",
+        "layers on chip",
+        "maps through memory",
+        "network runs",
+        "one-thread latency",
+        "power of products and traffic",
+        "threads",
+        "tiles",
+        "time",
+        "work",
+        "work factor",
+    }
+)
+"""Figures and tables for a closer look."""
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
+class Bench(Table):
+    """A network's speed, power and energy, next to the traditional pipeline.
+
+    Attributes:
+        swath: the image that the rows are about; None of a network that is not tiled, or of a host.
+        dn: the image's digital numbers, (H, W); None for a drawn one.
+    """
+
+    swath: Swath | None = None
+    dn: np.ndarray | None = None
+
+    @property
+    def layers(self) -> list[Row]:
+        """Where the time goes, layer by layer, of one configuration; empty of several."""
+        return [row for row in self.rows if row.table == LAYERS]
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked of the cost model.
+
+    Attributes:
+        boards: configurations of the DPU.
+        corrections: tables that say how the user's own runs correct the cost model.
+        size: (width, height) of the swath in pixels; None for the paper's, or that of the image.
+        tiles_px: tile sides.
+        halo: "exact" or a number of pixels.
+        within_s: time that the swath may take; None does not ask.
+        task: of the host; None for what the file tells.
+        consistency: whether the host takes the consistency step.
+    """
+
+    boards: Sequence[Dpu]
+    corrections: Tables
+    size: tuple[int, int] | None
+    tiles_px: Sequence[int]
+    halo: str
+    within_s: float | None
+    task: Task | None
+    consistency: bool
+
+
+def bench_board(
+    network: Network, asked: Question, dn: np.ndarray | None = None, sensor: Sensor | None = None
+) -> Bench:
+    """Predict a network's swath on boards; nothing is measured.
+
+    A network that cannot be tiled is predicted by the frame, without a swath.
+
+    Args:
+        network: float or INT8.
+        asked: boards, tiles and swath.
+        dn: digital numbers (H, W) of the image that is the swath; None for a drawn one.
+        sensor: that a shipped network is conditioned on: the exposures of the image are counted;
+            None counts none.
+
+    Raises:
+        ModelError: a network that does not run on the DPU, or that cannot be tiled where a size,
+            an image or a time is asked for.
+    """
+    try:
+        tiling = network.tiling
+    except ModelError as error:
+        if dn is not None or asked.size or asked.within_s is not None:
+            raise
+        return _frames(network, asked, error)
+    width_px, height_px = asked.size or parse_size(PAPER_SIZE)
+    if dn is not None:
+        height_px, width_px = dn.shape
+    halo_px = parse_halo(asked.halo, tiling.halo_px)
+    takes_step = asked.consistency and keeps_pixels(tiling)
+    tile_px = asked.tiles_px[0]
+    swath = Swath(width_px, height_px, tile_px, halo_px, consistency=takes_step)
+    counts = dict[int, int]()
+    if dn is not None and sensor is not None:
+        plan = make_plan((1, height_px, width_px), tile_px, halo_px, tiling)
+        # `dn` is in 0..MAX_DN whatever the bits of the sensor.
+        counts = tiles_by_factor(
+            dn, plan, factors_for(sensor.nominal()), MAX_DN, offset_of(sensor, MAX_DN)
+        )
+        # A tile with bright and dark pixels runs once for each exposure that its pixels ask for.
+        swath = replace(swath, runs=sum(counts.values()) / plan.tiles)
+    targets = list({dpu.target.name: dpu.target for dpu in asked.boards}.values())
+    # The paper measured the VCK190 alone: its rows belong next to no other board.
+    papers = published_rows() if any(profile.name == PAPER_TARGET for profile in targets) else []
+    comparison = [*(processor_row(swath, profile) for profile in targets), *papers]
+    title = f"{width_px} x {height_px} pixels"
+    notes = exposure_words(counts)
+    if len(asked.boards) == len(asked.tiles_px) == 1 and asked.within_s is None:
+        prediction = predict_network(network, asked.boards[0], tile_px, asked.task, swath.step_px)
+        rows = [*predicted_rows(network.name, prediction, swath), *comparison]
+        tables = [(f"{title} in tiles of {tile_px}", rows), *asked.corrections]
+        tables.append(_layers(network, prediction))
+        notes = [*host_words(prediction), *notes]
+    else:
+        rows = sweep_rows(network, swath, asked.boards, asked.tiles_px, asked.task)
+        sweep = f"{network.input.name}, {title} in whole tiles, halo {halo_px} px"
+        tables = [(sweep, rows), (f"{title}, for comparison", comparison), *asked.corrections]
+    if asked.within_s is not None:
+        notes.append(within_words(rows, asked.boards, asked.within_s))
+    return _table(network, tables, [*fitted_words(rows), *notes], swath=swath, dn=dn)
+
+
+def _table(network: Network, tables: Tables, notes: Sequence[str], **more: Any) -> Bench:
+    """Return tables with titles as one table."""
+    rows = list(chain.from_iterable(part for _, part in tables))
+    headings = {part[0].table: title for title, part in tables if part}
+    return Bench(
+        inputs=(network.input,),
+        rows=tuple(rows),
+        notes=(*notes, PREDICTED),
+        headings=headings,
+        details=DETAILS,
+        **more,
+    )
+
+
+def fitted_words(rows: Sequence[Row]) -> list[str]:
+    """Return a sentence for each prediction outside the range that the cost model was fitted on."""
+    ranges: dict[str, list[str]] = {}
+    for row in rows:
+        words = row.text.get("fitted range", "inside")
+        if words != "inside":
+            ranges.setdefault(words, []).append(row.name)
+    return [f"fitted range of {'; '.join(names)}: {words}" for words, names in ranges.items()]
+
+
+def exposure_words(counts: Mapping[int, int]) -> list[str]:
+    """Say which share of an image's tiles asks for each exposure; nothing without counts."""
+    if len(counts) < 2:
+        return []
+    total = sum(counts.values())
+    shares = ", ".join(f"x{factor} {count / total:.0%}" for factor, count in counts.items())
+    return [
+        (
+            f"runs of the network by exposure (measured on the image's pixels): {shares}; one tile "
+            "may need several"
+        )
+    ]
+
+
+def _layers(network: Network, prediction: Prediction) -> tuple[str, list[Row]]:
+    dpu = prediction.dpu
+    title = f"{network.input.name}, one batch on {dpu.target.name} {dpu.name}; {TRAFFIC}"
+    return title, layer_rows(prediction)
+
+
+def _frames(network: Network, asked: Question, why: ModelError) -> Bench:
+    """Return the network on whole images; of one configuration each layer too."""
+    predictions, notes = _predictions(network, asked.boards, TILE_PX, asked.task)
+    rows = list(map(frame_row, predictions))
+    sides = network.model.graph.input[0].type.tensor_type.shape.dim[2:]
+    size = " x ".join(str(side.dim_value or TILE_PX) for side in sides)
+    tables = [(f"{network.input.name}, frames of {size}", rows), *asked.corrections]
+    if len(asked.boards) == 1:
+        tables.append(_layers(network, predictions[0]))
+    reason = f"The network runs on whole images. {why}"
+    return _table(network, tables, [*fitted_words(rows), reason, *notes])
+
+
+def quoted(network: Network, target: TargetProfile) -> Bench:
+    """Return what the maker of a board publishes, where nothing is predicted."""
+    title = (
+        f"{network.input.name} on {target.name}: nothing is predicted; other networks are published"
+    )
+    return Bench(
+        inputs=(network.input,),
+        rows=tuple(quoted_rows(network.name, target)),
+        headings={TABLE: title},
+    )
+
+
+def boards_for(
+    target: BoardLike | Sequence[BoardLike], config: str | None, measured: Path | None
+) -> tuple[list[Dpu], Tables]:
+    """Return the configurations of boards, and tables of the runs that correct them.
+
+    Args:
+        target: one board or several, or "all".
+        config: a configuration, "all" of each board, or None for the default.
+        measured: the user's own runs on the board, as JSON.
+
+    Raises:
+        OptionError: one configuration for all boards, or runs for several.
+        ProfileError: no such board or configuration.
+    """
+    targets = boards_of(target)
+    if len(targets) > 1 and config not in (None, ALL):
+        raise OptionError(
+            f"`dpu` {printable(repr(config))} cannot be combined with several boards. Name one "
+            "board, or give 'all'."
+        )
+    if len(targets) > 1 and measured is not None:
+        raise OptionError(
+            "`measured` cannot be combined with several boards. Name the board of the runs with "
+            "`target`."
+        )
+    boards = []
+    for profile in targets:
+        names = profile.configurations if config == ALL else [config]
+        boards += [dpu_of(profile, name) for name in names]
+    if measured is None:
+        return boards, []
+    own_runs = read_own_runs(measured, boards[0])
+    tables = [(own_runs.source, own_runs.factor_rows()), ("your runs", own_runs.run_rows())]
+    return [own_runs.applied(dpu) for dpu in boards], tables

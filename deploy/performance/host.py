@@ -1,0 +1,151 @@
+"""What networks take on this machine for a tile.
+
+Networks are timed interleaved, so that whatever else runs here meets them alike; load, clock
+and memory stand beside what was measured.
+"""
+
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+import onnx
+import psutil
+
+from beers_deploy.dpu.reading import inputs_of
+from beers_deploy.host_state import cpu_load, resident_bytes
+from beers_deploy.model.consistency import Consistency, Placed
+from beers_deploy.model.processor import require_cores
+from beers_deploy.network import Network, NetworkLike, other_precision
+from beers_deploy.performance.timing import interleaved
+from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.target import TargetProfile
+from beers_deploy.quant.onnx_file import is_quantised
+from beers_deploy.quant.session import open_session, require_finite
+
+
+@dataclass
+class Timed:
+    """A network, and what its runs took."""
+
+    name: str
+    model: onnx.ModelProto
+    times_s: list[float] = field(default_factory=list)
+    powers: list[Figure] = field(default_factory=list)
+    held_bytes: int = 0
+
+
+def time_networks(
+    runs: Sequence[Timed], tile_px: int, threads: int, min_time_s: float, min_runs: int
+) -> None:
+    """Time each for a grey tile, interleaved, until all have run for `min_time_s` and `min_runs`
+    times.
+    """
+    calls = []
+    for run in runs:
+        shapes = inputs_of(run.model, tile_px, run.name)
+        feed = {name: np.full((1, *shape), 0.25, np.float32) for name, shape in shapes.items()}
+        before_bytes = resident_bytes()
+        session = open_session(run.model, threads)
+        require_finite(session.run(None, feed), run.name)  # warm-up, not counted
+        run.held_bytes = resident_bytes() - before_bytes
+        calls.append(partial(session.run, None, feed))
+
+    for run, samples in zip(runs, interleaved(calls, min_runs, min_time_s), strict=True):
+        run.times_s += [time_s for time_s, _ in samples]
+        run.powers += [power for _, power in samples]
+
+
+def _row(run: Timed, tile_px: int, conditions: Mapping[str, Figure]) -> Row:
+    times_ms = 1e3 * np.array(run.times_s)
+    total_s = sum(run.times_s)
+    source = f"{len(run.times_s)} runs in {total_s:.1f} s after one for warm-up, loading left out"
+    memory = "rise of resident memory once the file was opened and had run once"
+    figures = {
+        "p50": measured(float(np.percentile(times_ms, 50)), "ms/tile", source),
+        "p90": measured(float(np.percentile(times_ms, 90)), "ms/tile", source),
+        "throughput": measured(len(run.times_s) / total_s, "frame/s", source),
+        "power": _mean_power(run),
+        "memory": measured(run.held_bytes / 1e6, "MB", memory),
+    }
+    return Row("host", f"{run.name}, {tile_px} x {tile_px}", {**figures, **conditions})
+
+
+def _ratio_row(runs: Sequence[Timed]) -> Row:
+    # False sorts before True: the INT8 network comes first.
+    int8, float32 = sorted(runs, key=lambda run: not is_quantised(run.model))
+    ratio = statistics.median(float32.times_s) / statistics.median(int8.times_s)
+    source = f"medians of {len(int8.times_s)} runs each, interleaved"
+    return Row("host", "float32 time / INT8 time, here", {"ratio": measured(ratio, "x", source)})
+
+
+def _mean_power(run: Timed) -> Figure:
+    """Mean over the network's own runs, or why there is none."""
+    no_power = next((power for power in run.powers if power.value is None), None)
+    if no_power is not None:
+        return unavailable("W", no_power.reason)
+    # Runs differ in length: the mean power is energy over time, not the mean of the powers.
+    energy_j = sum(
+        (power.value or 0.0) * time_s for power, time_s in zip(run.powers, run.times_s, strict=True)
+    )
+    return measured(energy_j / sum(run.times_s), "W", run.powers[0].source)
+
+
+def host_rows(
+    network: NetworkLike,
+    target: TargetProfile,
+    tile_px: int,
+    threads: int = 0,
+    sensor: Sensor | None = None,
+) -> list[Row]:
+    """A network's time for one tile through onnxruntime, float32 and INT8 interleaved, and how much
+    faster INT8 is.
+
+    With a `sensor` the time of the consistency step is a row too.
+
+    Each runs for the target's minimum time and count, one run for warm-up left out. Its pair in the
+    other precision is the shipped network of the same variant; without one it runs alone.
+    """
+    require_cores("threads", threads)
+    source = Network.load(network)
+    other = other_precision(source)
+    runs = [Timed(source.name, source.model)]
+    if other is not None:
+        precision = "INT8" if other.precision == "int8" else "float32"
+        runs.append(Timed(f"{precision} of the same shape", other.model))
+    min_time_s = target.value("measurement", "min_time_s")
+    min_runs = int(target.value("measurement", "min_runs"))
+    # The load is measured from one call to the next: this one opens the window of the timed runs.
+    cpu_load()
+    time_networks(runs, tile_px, threads, min_time_s, min_runs)
+    conditions = conditions_of(threads or psutil.cpu_count(logical=False) or 1)
+    rows = [_row(run, tile_px, conditions) for run in runs]
+    if sensor is not None:
+        rows.append(step_row(sensor, tile_px, min_time_s, min_runs))
+    return rows if other is None else [*rows, _ratio_row(runs)]
+
+
+def step_row(sensor: Sensor, tile_px: int, min_time_s: float, min_runs: int) -> Row:
+    """Time the consistency step on one thread here, on a tile of noise."""
+    instrument = sensor.nominal()
+    step = Consistency.of(instrument, sensor.reference.nominal())
+    generator = np.random.default_rng(0)
+    noise = generator.uniform(0, instrument.max_dn / 2, (tile_px, tile_px))
+    raw = noise.astype(np.float32)
+    side = Placed(tile_px, 0, 0, tile_px)
+    call = partial(step.correction, raw, raw, side, side, (0, 0))
+    call()
+    samples = interleaved([call], min_runs, min_time_s)[0]
+    times_ms = np.array([1e3 * time_s for time_s, _ in samples])
+    source = f"{len(times_ms)} runs on one thread after one for warm-up"
+    figures = {
+        f"p{p}": measured(float(np.percentile(times_ms, p)), "ms/tile", source) for p in (50, 90)
+    }
+    return Row("host", f"consistency step, {tile_px} x {tile_px}", figures)
+
+
+def conditions_of(threads: int) -> dict[str, Figure]:
+    """Under what conditions something was measured since the last call of `cpu_load`."""
+    return {"threads": measured(threads, "thread", "of the runtime"), "CPU load": cpu_load()}

@@ -1,0 +1,237 @@
+"""The image that a benchmark is about, the tiles that it is cut into, and the figures that are
+predicted of it.
+"""
+
+import math
+from dataclasses import dataclass
+
+from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.cost.latency import Prediction, dpu_power, predict
+from beers_deploy.dpu.cost.model import Interval, Task, between
+from beers_deploy.dpu.reading import network_of
+from beers_deploy.model.raster.facts import SIDE_PX
+from beers_deploy.network import Network, NetworkLike
+from beers_deploy.profiles.errors import OptionError, printable
+from beers_deploy.profiles.figures import Figure, predicted, unavailable
+from beers_deploy.profiles.target import TILE_PX
+from beers_deploy.restoration.plan import plan_side
+
+COST_SOURCE = "cost model fitted on published networks, docs/explanation/cost-model.md"
+HELD = 0.9
+"""Share of families left out of the fit that an interval is meant to hold."""
+ARITHMETIC = "arithmetic of the tile grid"
+PAPER_SIZE = "13600x9016"
+
+
+@dataclass(frozen=True)
+class Swath:
+    """The image that all rows are about, and the tiles it is cut into.
+
+    Attributes:
+        width_px: of the image.
+        height_px: of the image.
+        tile_px: side of a tile.
+        halo_px: context around what is kept of a tile.
+        runs: how often the network runs on a tile, once for each exposure that its pixels ask for;
+            a mean.
+        consistency: whether the host takes the consistency step.
+    """
+
+    width_px: int
+    height_px: int
+    tile_px: int = TILE_PX
+    halo_px: int = 0
+    runs: float = 1.0
+    consistency: bool = False
+
+    @property
+    def pixels(self) -> int:
+        """Pixels of the image."""
+        return self.width_px * self.height_px
+
+    @property
+    def frames(self) -> float:
+        """Tiles as the paper counts: pixels of the image over pixels of a tile, a fraction, without
+        halo.
+
+        13600 x 9016 at 640 is 299.4; at the published 7.2 frames a second that is the published 42
+        s.
+        """
+        return self.pixels / self.tile_px**2
+
+    @property
+    def tiles(self) -> int:
+        """Whole tiles of the grid, the last row and column moved inward: 384 of the paper's swath,
+        halo 35.
+        """
+        rows, columns = (
+            plan_side(side, self.tile_px, self.halo_px) for side in (self.height_px, self.width_px)
+        )
+        return len(rows) * len(columns)
+
+    @property
+    def step_px(self) -> float:
+        """Pixels of the image for which the host takes the consistency step, for each run of the
+        network.
+        """
+        return self.pixels / (self.tiles * self.runs) if self.consistency else 0.0
+
+
+def predict_network(
+    network: NetworkLike,
+    dpu: Dpu,
+    tile_px: int | None = TILE_PX,
+    task: Task | None = None,
+    step_px: float = 0.0,
+) -> Prediction:
+    """Predict a network for tiles of one side or, with None, for the size it is fixed to.
+
+    The `task` of the host is what the network tells, if none is given; `step_px` as of `predict`.
+    """
+    source = Network.load(network, to_run=False)
+    sized = network_of(source.model, tile_px, source.label)
+    return predict(place(sized, dpu), dpu, task, step_px)
+
+
+def swath_figures(
+    prediction: Prediction, swath: Swath, frames: float, batches: float
+) -> dict[str, Figure]:
+    """Return the figures of a swath that takes `frames` tiles in `batches` batches."""
+    power = dpu_power(prediction.dpu)
+    latency = swath_latency(prediction, batches)
+    step = {"consistency step": step_time(prediction, swath)} if swath.consistency else {}
+    return {
+        "tiles": exact(frames, "tile", ARITHMETIC),
+        "network runs": exact(
+            swath.runs, "run/tile", "exposures that the image's tiles ask for; 1 without an image"
+        ),
+        "work factor": exact(frames * swath.tile_px**2 / swath.pixels, "px/px", ARITHMETIC),
+        "latency": latency,
+        "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
+        "power": power,
+        "energy": energy(latency, power),
+        "efficiency": efficiency(swath.pixels, latency, power),
+        **step,
+    }
+
+
+def step_time(prediction: Prediction, swath: Swath) -> Figure:
+    """Time of the consistency step for the swath on the host's cores, in s; it runs while the DPU
+    works.
+    """
+    runs = swath.tiles * swath.runs
+    low_s, high_s = (end_s * runs for end_s in prediction.step_s)
+    source = (
+        "counted work of the step at the rates of the board's processor, from the best "
+        "published to plain code"
+    )
+    return predicted(between((low_s, high_s)), "s", (low_s, high_s), source)
+
+
+def host_time(prediction: Prediction, unit: str) -> Figure:
+    """What the host's cores together take for an image, in ms."""
+    low_s, high_s = prediction.host_interval_s
+    return predicted(1e3 * prediction.host_s, unit, (1e3 * low_s, 1e3 * high_s), COST_SOURCE)
+
+
+def one_thread_latency(prediction: Prediction) -> Figure:
+    """From image to result where one thread runs one core's batch and does the host's work itself,
+    in ms.
+    """
+    low_s, high_s = prediction.latency_interval_s
+    handlers = prediction.dpu.handlers
+    images = f"a batch of {handlers}" if handlers > 1 else "one image"
+    source = (
+        f"{COST_SOURCE}, its fit to rates with one thread: {images} through one core, then the host"
+    )
+    return predicted(1e3 * prediction.latency_s, "ms/batch", (1e3 * low_s, 1e3 * high_s), source)
+
+
+def swath_latency(prediction: Prediction, batches: float) -> Figure:
+    """Time of so many batches, in seconds."""
+    images = batches * prediction.batch
+    # The lower end of the rate is the upper end of the time.
+    slow_s, fast_s = (images / fps for fps in prediction.fps_interval)
+    return predicted(images / prediction.fps, "s", (fast_s, slow_s), COST_SOURCE)
+
+
+def fitted_range(prediction: Prediction) -> str:
+    """Whether the fitted networks speak for this one, and how often the board's intervals held, if
+    too rarely.
+    """
+    words = f"outside: {'; '.join(prediction.outside)}" if prediction.outside else "inside"
+    share = prediction.dpu.value("cost", "families_held")
+    if share >= HELD:
+        return words
+    return f"{words}; intervals held {100 * share:.0f} % of families left out"
+
+
+def energy(latency: Figure, power: Figure) -> Figure:
+    """Energy of the swath, in J: time and power, and their ends."""
+    if power.value is None or latency.value is None:
+        return unavailable("J", power.reason or latency.reason)
+    fast_s, slow_s = interval_ends(latency)
+    low_w, high_w = interval_ends(power)
+    ends = fast_s * low_w, slow_s * high_w
+    return predicted(latency.value * power.value, "J", ends, f"{latency.source}; {power.source}")
+
+
+def efficiency(pixels: int, latency: Figure, power: Figure) -> Figure:
+    """Pixels a second and watt; its interval pairs the slowest run with the highest power and the
+    reverse.
+    """
+    unit = "px/s/W"
+    if power.value is None or latency.value is None:
+        return unavailable(unit, power.reason or latency.reason)
+    value = pixels / latency.value / power.value
+    if "predicted" not in (latency.mode, power.mode):
+        # Only predictions have intervals, so that a quotient without one among its parts has none.
+        return Figure(value, unit, latency.mode, f"{latency.source}; {power.source}")
+    fast_s, slow_s = interval_ends(latency)
+    low_w, high_w = interval_ends(power)
+    # The slowest run at the highest power is the least efficient, and the reverse.
+    interval = (pixels / slow_s / high_w, pixels / fast_s / low_w)
+    return predicted(value, unit, interval, f"{latency.source}; {power.source}")
+
+
+def interval_ends(figure: Figure) -> Interval:
+    """The interval, or the value twice where it has none."""
+    return figure.interval or (figure.value or 0.0, figure.value or 0.0)
+
+
+def chain_rate(swath: Swath, latency: Figure) -> Figure:
+    """Tiles a second, as the paper counts them, of a predicted latency of the swath."""
+    low, high = (swath.frames / end_s for end_s in reversed(interval_ends(latency)))
+    return predicted(
+        swath.frames / (latency.value or math.inf), "frame/s", (low, high), latency.source
+    )
+
+
+def exact(
+    value: float, unit: str, source: str = "arithmetic of the graph's shapes, one image"
+) -> Figure:
+    """A number that follows from shapes alone."""
+    return predicted(value, unit, (value, value), source)
+
+
+def scaled(value: float, unit: str, prediction: Prediction) -> Figure:
+    """A part of the prediction, with the relative error of the whole."""
+    return predicted(
+        value, unit, (value / prediction.spread, value * prediction.spread), COST_SOURCE
+    )
+
+
+def parse_size(size: str | tuple[int, int]) -> tuple[int, int]:
+    """Return (width, height) in pixels, of both or of WIDTHxHEIGHT."""
+    text = size if isinstance(size, str) else "x".join(map(str, size))
+    parts = text.lower().split("x")
+    # Python raises an error of its own for very long numbers, so these are refused by their length.
+    if len(parts) != 2 or not all(
+        part.isdecimal() and len(part) <= 9 and 0 < int(part) <= SIDE_PX for part in parts
+    ):
+        raise OptionError(
+            f"`size` must be WIDTHxHEIGHT of 1 to {SIDE_PX} pixels each, got "
+            f"{printable(repr(size))}. Write it as {PAPER_SIZE}."
+        )
+    return int(parts[0]), int(parts[1])

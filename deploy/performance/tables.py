@@ -1,0 +1,311 @@
+"""The rows of the bench that need no measurement here.
+
+These are a network on the DPU and the traditional pipeline on the board's own processor, both
+predicted, and the paper's figures.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import product
+
+from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.cost.latency import (
+    LayerCost,
+    Prediction,
+    counted_power,
+    dpu_power,
+    energy_source,
+    layer_energy_j,
+)
+from beers_deploy.dpu.cost.model import Task, between
+from beers_deploy.network import NetworkLike
+from beers_deploy.performance.swath import (
+    COST_SOURCE,
+    Swath,
+    chain_rate,
+    efficiency,
+    energy,
+    exact,
+    fitted_range,
+    host_time,
+    interval_ends,
+    one_thread_latency,
+    predict_network,
+    scaled,
+    swath_figures,
+    swath_latency,
+)
+from beers_deploy.profiles.errors import OptionError, printable
+from beers_deploy.profiles.figures import Figure, Row, number, predicted, published, unavailable
+from beers_deploy.profiles.target import TargetProfile
+
+TABLE = "bench"
+LAYERS = "layers"
+CHAIN = "chain_s_per_mpx"
+"""In a target's [cpu]: time of the traditional pipeline for 10^6 pixels on all cores."""
+PAPER = "ConvBEERS paper, table of the VCK190 benchmark, 13600 x 9016"
+PAPER_TARGET = "vck190"
+"""The board that the paper measured: its rows stand beside that one alone."""
+
+
+def predicted_rows(name: str, prediction: Prediction, swath: Swath) -> list[Row]:
+    """A network on the DPU, twice: as the paper counts, and with whole tiles."""
+    batches = math.ceil(swath.tiles * swath.runs / prediction.batch)
+    counts = {
+        "as the paper counts": (swath.frames, swath.frames * swath.runs / prediction.batch),
+        f"whole tiles, halo {swath.halo_px} px": (float(swath.tiles), float(batches)),
+    }
+    besides = {
+        "one-thread latency": one_thread_latency(prediction),
+        "host beside the DPU": host_time(prediction, "ms/tile"),
+        "power of products and traffic": counted_power(prediction),
+    }
+    words = {"fitted range": fitted_range(prediction)}
+    name = f"{name}, INT8 on the DPU ({prediction.dpu.name})"
+    return [
+        Row(TABLE, f"{name}, {how}", swath_figures(prediction, swath, *count) | besides, words)
+        for how, count in counts.items()
+    ]
+
+
+QUOTED = {"latency": "ms", "throughput": "fps"}
+"""Of the tables [published_latency_ms] and [published_throughput_fps]: the
+figure's name and unit.
+"""
+
+
+def quoted_rows(network: str, target: TargetProfile) -> list[Row]:
+    """A network on a board without a cost model, unavailable; and what the board's maker prints of
+    other networks.
+    """
+    reason = f"too few rates of {target.name} are published to fit a cost model"
+    figures = {key: unavailable(unit, reason) for key, unit in QUOTED.items()}
+    figures["power"] = unavailable("W", f"no power of {target.name} is published")
+    rows = [Row(TABLE, f"{network} on {target.name}", figures)]
+    for key, unit in QUOTED.items():
+        for name, constant in target.tables.get(f"published_{key}_{unit}", {}).items():
+            figure = published(constant.low, unit, constant.source)
+            rows.append(Row(TABLE, f"quoted: {name}", {key: figure}))
+    return rows
+
+
+def published_rows() -> list[Row]:
+    """The paper's two runs on the VCK190, as printed; its DPU configuration is not named."""
+    runs = {
+        "paper, 13600 x 9016: traditional on the VCK190's CPU": (1724, 0.2, 22.5, 3161),
+        "paper, 13600 x 9016: ConvBEERS, INT8 on the DPU": (42, 7.2, 29.6, 98965),
+    }
+    units = {"latency": "s", "throughput": "frame/s", "power": "W", "efficiency": "px/s/W"}
+    return [
+        Row(
+            TABLE,
+            name,
+            {k: published(v, units[k], PAPER) for k, v in zip(units, values, strict=True)},
+        )
+        for name, values in runs.items()
+    ]
+
+
+def processor_row(swath: Swath, board: TargetProfile) -> Row:
+    """The traditional pipeline on the board's own processor, from the time of 10^6 pixels that its
+    file states.
+    """
+    cpu = board.tables.get("cpu", {})
+    mpx = swath.pixels / 1e6
+    watts = board.tables.get("power", {}).get("cpu_run_w")
+    power = unavailable("W", "no power of a run on this board's processor is published")
+    if watts is not None:
+        power = published(watts.low, "W", watts.source)
+    constant = cpu.get(CHAIN)
+    cores = f", {cpu['cores']} cores" if "cores" in cpu else ""
+    name = f"traditional pipeline on the processor of {board.name}{cores}"
+    if constant is None:
+        reason = f"the target states no [cpu] {CHAIN}"
+        return Row(TABLE, name, {"latency": unavailable("s", reason), "power": power})
+    low_s = mpx * constant.low
+    high_s = mpx * constant.high
+    # The two ends are factors apart: their geometric mean stands for the value.
+    latency = predicted(between((low_s, high_s)), "s", (low_s, high_s), constant.source)
+    figures = {
+        "latency": latency,
+        "throughput": chain_rate(swath, latency),
+        "power": power,
+        "efficiency": efficiency(swath.pixels, latency, power),
+    }
+    return Row(TABLE, name, figures)
+
+
+def layer_rows(prediction: Prediction) -> list[Row]:
+    """One row a layer; their times add up to that of a batch, the last row.
+
+    The columns are those of AMD's vaitrace, with what bounds the layer; bytes and energy are those
+    of one image.
+    """
+    rows = [_layer_row(layer, prediction) for layer in prediction.layers]
+    total = f"sum: one batch of {prediction.batch}"
+    time = scaled(1e3 * prediction.batch_time_s, "ms/batch", prediction)
+    return [*rows, Row(LAYERS, total, {"time": time})]
+
+
+def _layer_row(layer: LayerCost, prediction: Prediction) -> Row:
+    work = layer.work
+    batch = prediction.batch
+    dpu = prediction.dpu
+    low_j, high_j = layer_energy_j(layer, dpu)
+    moved_bytes = batch * work.map_bytes + work.weight_bytes
+    # A concat takes no time of its own: over an infinite time its rates are 0.
+    seconds = layer.time_s or math.inf
+    figures = {
+        "work": exact(work.operations / 1e9, "GOP"),
+        "time": scaled(1e3 * layer.time_s, "ms/batch", prediction),
+        "rate": scaled(batch * work.operations / seconds / 1e9, "GOP/s", prediction),
+        "LdFM": exact(
+            work.load_map_bytes / 1e6,
+            "MB",
+            "feature maps that an image loads, by the graph's shapes",
+        ),
+        "LdWB": exact(
+            work.weight_bytes / 1e6,
+            "MB",
+            "weights and biases that a batch loads, by the graph's shapes",
+        ),
+        "StFM": exact(
+            work.store_map_bytes / 1e6,
+            "MB",
+            "feature maps that an image stores, by the graph's shapes",
+        ),
+        "bandwidth": scaled(moved_bytes / seconds / 1e9, "GB/s", prediction),
+        "array use": exact(100 * work.array_use, "%"),
+        "energy": predicted(
+            500 * (low_j + high_j), "mJ", (1e3 * low_j, 1e3 * high_j), energy_source(dpu)
+        ),
+    }
+    return Row(LAYERS, work.name, figures, {"bound": layer.bound})
+
+
+MOST_TILE_PX = 8192
+"""One layer's result of 64 channels has 17 GB there; no board has a tenth of it."""
+
+
+def sweep_rows(
+    network: NetworkLike,
+    swath: Swath,
+    boards: Sequence[Dpu],
+    tiles_px: Sequence[int],
+    task: Task | None = None,
+) -> list[Row]:
+    """A row a configuration and tile size, for whole tiles with the swath's halo."""
+    rows = []
+    for dpu, tile_px in product(boards, tiles_px):
+        tiled = replace(swath, tile_px=tile_px)
+        prediction = predict_network(network, dpu, tile_px, task, tiled.step_px)
+        rows.append(swath_row(prediction, tiled))
+    return rows
+
+
+def swath_row(prediction: Prediction, swath: Swath) -> Row:
+    """A swath in whole tiles on one configuration."""
+    batches = math.ceil(swath.tiles * swath.runs / prediction.batch)
+    on_chip = [not layer.work.map_bytes for layer in prediction.layers]
+    figures = swath_figures(prediction, swath, swath.tiles, batches) | {
+        "maps through memory": exact(prediction.streamed_bytes / 1e6, "MB/tile"),
+        "layers on chip": exact(100 * sum(on_chip) / len(on_chip), "%"),
+    }
+    bound = Counter[str]()
+    for layer in prediction.layers:
+        # A Counter is typed to hold integers: the times are added up in picoseconds.
+        bound[layer.bound] += round(1e12 * layer.time_s)
+    words = {"bound": bound.most_common(1)[0][0], "fitted range": fitted_range(prediction)}
+    return Row("sweep", f"{_named(prediction)}, tiles of {swath.tile_px}", figures, words)
+
+
+def _named(prediction: Prediction) -> str:
+    return f"{prediction.dpu.target.name} {prediction.dpu.name}"
+
+
+def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) -> str:
+    """Which DPU, the one of the lowest peak, meets a time for the swath: surely, probably, or only
+    at best.
+
+    One that does so surely is not named again for what is less. Peaks stand for prices, which no
+    file states.
+
+    Args:
+        rows: those of `sweep_rows`, the boards' one behind the other, as many of each.
+        boards: as given there.
+        within_s: what the swath may take.
+    """
+    rows_per_board = len(rows) // len(boards)
+    names = dict[str, str]()
+    # The rows of a board stand next to each other, the same number for each board.
+    placed = [(boards[k // rows_per_board].peak_ops_per_s, row) for k, row in enumerate(rows)]
+    ends: dict[str, Callable[[Figure], float | None]] = {
+        "by the whole interval": lambda latency: interval_ends(latency)[1],
+        "by the prediction": lambda latency: latency.value,
+        "at best": lambda latency: interval_ends(latency)[0],
+    }
+    for how, end in ends.items():
+        fits = [
+            (peak, row)
+            for peak, row in placed
+            if (end(row.figures["latency"]) or math.inf) <= within_s
+        ]
+        if fits:
+            peak, row = min(fits, key=lambda fit: fit[0])
+            # A DPU that meets the time surely is not named again for less.
+            names.setdefault(f"{row.name} ({peak / 1e12:.3g} TOPS)", how)
+    words = "; ".join(f"{how} {name}" for name, how in names.items()) or "none of these"
+    return f"the smallest DPU that takes {within_s:g} s or less: {words}"
+
+
+def frame_row(prediction: Prediction) -> Row:
+    """A network that is run on whole images, on one configuration: frames instead of a swath."""
+    power = dpu_power(prediction.dpu)
+    frame_s = swath_latency(prediction, 1 / prediction.batch)
+    figures = {
+        "work": exact(prediction.operations / 1e9, "GOP"),
+        "batch": exact(prediction.batch, "frame", "images in flight"),
+        "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
+        "one-thread latency": one_thread_latency(prediction),
+        "host beside the DPU": host_time(prediction, "ms/frame"),
+        "power": power,
+        "energy": energy(frame_s, power),
+    }
+    words = {"host's task": prediction.task, "fitted range": fitted_range(prediction)}
+    return Row("frames", f"{_named(prediction)}, whole images", figures, words)
+
+
+def host_words(prediction: Prediction) -> list[str]:
+    """What was assumed of the file, and what the processor runs because the DPU refuses it; a
+    sentence each.
+    """
+    sentences = [prediction.note] if prediction.note else []
+    if prediction.refused:
+        low_ms, high_ms = (1e3 * end_s for end_s in prediction.refused_s)
+        sentences.append(
+            f"the processor of {prediction.dpu.target.name} runs what its DPU refuses "
+            "('beers-deploy check' says "
+            f"why): {', '.join(prediction.refused)}; {number(low_ms, 2)} to "
+            f"{number(high_ms, 2)} ms an image, from "
+            "the best that is published of its cores to plain code"
+        )
+    return sentences
+
+
+def parse_tiles(tile: int | str | Sequence[int]) -> list[int]:
+    """Return tile sides in pixels, of one side, several, or text with commas between them."""
+    parts: Sequence[int | str] = [tile] if isinstance(tile, int) else tile
+    if isinstance(tile, str):
+        parts = tile.split(",")
+    sides = [str(part).strip() for part in parts]
+    # Python raises an error of its own for very long numbers, so these are refused by their length.
+    if not sides or not all(
+        side.isdecimal() and len(side) < 6 and 16 <= int(side) <= MOST_TILE_PX for side in sides
+    ):
+        raise OptionError(
+            f"`tile` must be sides of 16 to {MOST_TILE_PX} pixels, got {printable(repr(tile))}. "
+            "Write one side, or several as 640,256,128."
+        )
+    return [int(side) for side in sides]

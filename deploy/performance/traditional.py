@@ -1,0 +1,105 @@
+"""The traditional pipeline on this processor: measured on crops of an image, extrapolated by the
+pixel.
+"""
+
+import statistics
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from beers_deploy.host_state import cpu_load
+from beers_deploy.model.simulator.acquire import MARGIN_PX, simulate_pair
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.traditional.pipeline import Chain, restore_traditional
+from beers_deploy.performance.host import conditions_of
+from beers_deploy.performance.swath import Swath, chain_rate, efficiency
+from beers_deploy.performance.tables import TABLE
+from beers_deploy.performance.timing import timed
+from beers_deploy.profiles.figures import Figure, Row, measured, predicted
+from beers_deploy.profiles.sensor import Sensor
+
+CROP_PX = 256
+CROPS = 3
+
+
+@dataclass(frozen=True)
+class ChainTime:
+    """What the pipeline takes here for 10^6 pixels, crop by crop.
+
+    Attributes:
+        s_per_mpx: of each crop.
+        power: of this processor meanwhile.
+        conditions: threads, load and clock.
+        crop: the crops' size, for the source of the figures.
+    """
+
+    s_per_mpx: list[float]
+    power: Figure
+    conditions: dict[str, Figure]
+    crop: str
+
+    def row(self, swath: Swath) -> Row:
+        """The swath by proportion; the interval is that of the fastest and the slowest crop."""
+        median = statistics.median(self.s_per_mpx)
+        mpx = swath.pixels / 1e6
+        here = f"{len(self.s_per_mpx)} crops of {self.crop} on this processor, the default quality"
+        ends = mpx * min(self.s_per_mpx), mpx * max(self.s_per_mpx)
+        latency = predicted(mpx * median, "s", ends, f"by the pixel from {here}")
+        figures = {
+            "time": measured(median, "s/Mpx", f"median of {here}"),
+            "latency": latency,
+            "throughput": chain_rate(swath, latency),
+            "power": self.power,
+            "efficiency": efficiency(swath.pixels, latency, self.power),
+            **self.conditions,
+        }
+        return Row(TABLE, "traditional pipeline on this CPU", figures)
+
+
+def measure_chain(dn: np.ndarray, degraded: Sensor, reference: Sensor) -> ChainTime:
+    """Time the pipeline on crops of (H, W) digital numbers, after one small run for warm-up."""
+    chain = Chain(degraded.nominal(), reference.nominal())
+    crops = [torch.from_numpy(np.ascontiguousarray(crop, dtype=np.float32)) for crop in _crops(dn)]
+    restore_traditional(crops[0][:32, :32], chain)
+    # The load is measured from one call to the next: this one opens the window of the timed run.
+    cpu_load()
+    times_s, _, power = timed(lambda: [_time_s(crop, chain) for crop in crops])
+    per_mpx = [1e6 * time_s / crop.numel() for time_s, crop in zip(times_s, crops, strict=True)]
+    height, width = crops[0].shape
+    return ChainTime(
+        per_mpx, power, conditions_of(torch.get_num_threads()), f"{width} x {height} pixels"
+    )
+
+
+def _time_s(dn: torch.Tensor, chain: Chain) -> float:
+    start_s = time.perf_counter()
+    restore_traditional(dn, chain)
+    return time.perf_counter() - start_s
+
+
+def drawn_acquisition(
+    swath: Swath, degraded: Sensor, reference: Sensor, seed: int = 0
+) -> np.ndarray:
+    """Digital numbers of a drawn scene, as large as the swath but no larger than the crops need."""
+    ratio = int(degraded.oversampling.low)
+    sides = min(swath.height_px, CROP_PX), min(swath.width_px, CROPS * CROP_PX)
+    # The simulator cuts a margin off each side, which keeps the wrap of its Fourier transform out.
+    height, width = ((side + 2 * MARGIN_PX) * ratio for side in sides)
+    scene = procedural_scene(height, width, np.random.default_rng(seed))
+    pair = simulate_pair(scene.radiance, degraded.nominal(), reference.nominal(), ratio, Draw(seed))
+    return pair.degraded
+
+
+def _crops(dn: np.ndarray) -> Iterator[np.ndarray]:
+    """Square crops along the image's diagonal, or the image where it is no larger."""
+    height, width = (min(CROP_PX, side) for side in dn.shape)
+    for k in range(CROPS):
+        top, left = (
+            (side - crop) * k // (CROPS - 1)
+            for side, crop in zip(dn.shape, (height, width), strict=True)
+        )
+        yield dn[top : top + height, left : left + width]

@@ -1,0 +1,112 @@
+"""Sensors, scenes and boards as tables: every constant with its status and its source."""
+
+from collections.abc import Mapping
+
+from beers_deploy.profiles.constant import Constant, Words
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.response import MtfTable
+from beers_deploy.profiles.scene_call import load_scene_call, scene_names
+from beers_deploy.profiles.sensor import TABLES, Sensor, constant_keys
+from beers_deploy.profiles.sensor_file import load_sensor, sensor_names
+from beers_deploy.profiles.target import load_target, target_names
+from beers_deploy.profiles.toml import profile_path, read_toml
+from beers_deploy.results import Table
+
+
+def list_of_profiles() -> Table:
+    """Return all shipped profiles by kind."""
+    kinds = {
+        "sensors": {name: load_sensor(name).description for name in sensor_names()},
+        "scenes": {name: load_scene_call(name).description for name in scene_names()},
+        "boards": {name: load_target(name).description for name in target_names()},
+    }
+    rows = []
+    for kind, descriptions in kinds.items():
+        rows += [Row(kind, name, {}, {"what it is": text}) for name, text in descriptions.items()]
+    return Table(rows=tuple(rows))
+
+
+def text_of_profile(name: str) -> str:
+    """Return the TOML of a profile that can be read as one."""
+    kind, _ = _profile(name)
+    return profile_path(kind, name).read_text(encoding="utf-8")
+
+
+def table_of_profile(name: str) -> Table:
+    """Return every constant of a sensor, a scene or a board."""
+    _, table = _profile(name)
+    return table
+
+
+def _profile(name: str) -> tuple[str, Table]:
+    """Return the folder of a profile, and its table; tried as sensor, scene and target in turn."""
+    if _is(name, "sensors", sensor_names(), "mtf"):
+        sensor = load_sensor(name)
+        return "sensors", _table(sensor.name, sensor.description, _sensor_rows(sensor))
+    if _is(name, "scenes", scene_names(), "radiance_scale"):
+        scene = load_scene_call(name)
+        rows = [_row("radiance_scale", scene.radiance_scale), *_table_rows(scene.effects)]
+        return "scenes", _table(scene.name, scene.description, rows)
+    if name in target_names() or name.endswith(".toml"):
+        target = load_target(name)
+        groups: dict[str, Mapping[str, Constant | Words]] = {
+            **target.tables,
+            **{f"configurations.{k}": v for k, v in target.configurations.items()},
+        }
+        groups |= {"activations": target.activations, "npu": target.npu}
+        return "targets", _table(target.name, target.description, _table_rows(groups))
+    names = ", ".join([*sensor_names(), *scene_names(), *target_names()])
+    raise OptionError(
+        f"`name` must be one of {names}, or a .toml file, but it is {name!r}. Choose one."
+    )
+
+
+def _is(name: str, kind: str, shipped: list[str], key: str) -> bool:
+    """Return True if a profile is of a kind: by its name, or by a key that its file has."""
+    return name in shipped or (name.endswith(".toml") and key in read_toml(kind, name)[1])
+
+
+def _table(name: str, description: str, rows: list[Row]) -> Table:
+    return Table(title=f"{name}: {description}", rows=tuple(rows), headings={"constants": ""})
+
+
+def _sensor_rows(sensor: Sensor) -> list[Row]:
+    rows: list[Row] = []
+    for table in TABLES:
+        constants = [(f"{table}.{key}", getattr(sensor, key)) for key in constant_keys(table)]
+        rows += [_row(key, constant) for key, constant in constants if constant is not None]
+        rows += _response(sensor) if table == "mtf" else []
+    return rows + _table_rows(sensor.effects)
+
+
+def _response(sensor: Sensor) -> list[Row]:
+    """Return a table's numbers, or what a point-spread function is made of."""
+    response = sensor.response
+    words = {"status": sensor.mtf_nyquist.status, "source": sensor.mtf_nyquist.source}
+    if response is None:
+        return []
+    if not isinstance(response, MtfTable):
+        return [Row("constants", "mtf.psf", {}, {"value": str(response), **words})]
+    columns = {"frequency": response.frequency, "across": response.across, "along": response.along}
+    return [
+        Row(
+            "constants",
+            f"mtf.{key}",
+            {},
+            {"value": ", ".join(f"{v:g}" for v in values), **words},
+        )
+        for key, values in columns.items()
+    ]
+
+
+def _table_rows(tables: Mapping[str, Mapping[str, Constant | Words]]) -> list[Row]:
+    rows = list[Row]()
+    for name, table in tables.items():
+        rows += [_row(f"{name}.{key}", value) for key, value in table.items()]
+    return rows
+
+
+def _row(key: str, constant: Constant | Words) -> Row:
+    words = {"value": str(constant), "status": constant.status, "source": constant.source}
+    return Row("constants", key, {}, words)

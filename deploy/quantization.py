@@ -1,0 +1,306 @@
+"""The steps of `quantize`: calibration, alone or over a family of sensors, and where INT8 errs."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+import onnx
+
+from beers_deploy.baseline import data_inputs
+from beers_deploy.model.bank import bank_of_vector
+from beers_deploy.model.family import RANGES
+from beers_deploy.model.io.files import sha256
+from beers_deploy.model.io.tensors import read_conditioned
+from beers_deploy.model.progress import progress, step
+from beers_deploy.network import Network, NetworkLike
+from beers_deploy.network_files import Conditioned, conditioned, told_int8
+from beers_deploy.profiles.errors import ModelError, OptionError, optional, printable
+from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
+from beers_deploy.profiles.target import TargetProfile, board_names, npu_names
+from beers_deploy.quant.banked.family import FAMILY, WEIGHTS, required_family
+from beers_deploy.quant.core import SHIFTS, Shifts, target_shifts
+from beers_deploy.quant.encodings import host_model, read_core
+from beers_deploy.quant.gate import compare, gate_row
+from beers_deploy.quant.integer.reference import integer_rows
+from beers_deploy.quant.onnx_file import faults_named, load_onnx, metadata, require_quantised
+from beers_deploy.quant.passes.selection import Passes
+from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.samples import OwnSamples, samples_of
+from beers_deploy.quant.sensitivity import (
+    WORST,
+    headline,
+    layer_error_rows,
+    losses,
+    sizes_row,
+    spread_of,
+    worst_row,
+)
+from beers_deploy.quant.session import open_any_size
+from beers_deploy.quant.untrusted import contradictions
+from beers_deploy.report.page import Report
+from beers_deploy.report.sensitivity_page import sensitivity_page
+from beers_deploy.results import Input
+
+if TYPE_CHECKING:
+    from beers_deploy.model.convbeers import Rounding
+    from beers_deploy.quant.calibration import Calibration
+
+Source: TypeAlias = "Calibration | OwnSamples"
+"""Where patches come from: simulated ones, or a user's own."""
+
+
+def steps_of(finetune: int | str) -> int | None:
+    """Return the steps of fine-tuning, or None for "auto"."""
+    if finetune == "auto":
+        return None
+    if not str(finetune).isdecimal():
+        raise OptionError(
+            "`finetune` must be 'auto' or a whole number of steps from 0, but it is "
+            f"{printable(repr(finetune))}. Choose 'auto'."
+        )
+    return int(finetune)
+
+
+@dataclass(frozen=True)
+class Data:
+    """What a network is calibrated on.
+
+    Attributes:
+        sensor: of the simulated patches.
+        samples: the user's own, in place of patches; None for none.
+        images: folder of scenes for the patches; None for drawn ones.
+        patches: number of patches.
+        patch_px: their side.
+        seed: of the patches.
+    """
+
+    sensor: Sensor
+    samples: object = None
+    images: Path | None = None
+    patches: int = 64
+    patch_px: int = 128
+    seed: int = 0
+
+    @property
+    def simulated(self) -> "Calibration":
+        """The source of simulated patches."""
+        # This loads SciPy, which samples of one's own do without.
+        from beers_deploy.quant.calibration import Calibration
+
+        return Calibration(self.sensor, self.images, self.patches, self.patch_px, self.seed)
+
+    def source_for(self, model: onnx.ModelProto) -> Source:
+        """Return the samples for a network, or else simulated patches."""
+        return samples_of(model, self.samples) or self.simulated
+
+    @property
+    def inputs(self) -> list[Input]:
+        """The images and samples in files."""
+        named = isinstance(self.samples, str | os.PathLike)
+        return data_inputs(self.images, Path(str(self.samples)) if named else None)
+
+
+def quantised(
+    network: NetworkLike, data: Data, target: TargetProfile, finetune: int | str
+) -> Network:
+    """Quantise a float network; the INT8 one knows its `origin`.
+
+    Args:
+        network: float network, a shipped name, or weights that are conditioned on a sensor.
+        data: what it is calibrated on.
+        target: whose rules count.
+        finetune: steps that train the integers, or "auto".
+
+    Raises:
+        ModelError: an operation that the DPU does not compute.
+        OptionError: samples or fine-tuning of a network that is conditioned on its sensor.
+        ImageError: samples that the network does not accept.
+    """
+    banked = conditioned(Path(network)) if isinstance(network, str | os.PathLike) else None
+    steps = steps_of(finetune)
+    if banked and (steps != 0 or data.samples is not None):
+        unfit = "`finetune`" if data.samples is None else "`samples`"
+        raise OptionError(
+            f"{unfit} cannot be combined with {banked.name}, because a network conditioned on a "
+            f"sensor is calibrated over the whole family of sensors at once. Leave {unfit} out."
+        )
+    origin = Network.load(network, sensor=data.sensor)
+    require_quantised(origin.model, origin.label, wanted=False)
+    with faults_named(origin.label):
+        if banked:
+            return quantise_conditioned(banked, origin, data.simulated, data.sensor, target)
+        return quantise_alone(origin, data.source_for(origin.model), target, steps)
+
+
+def quantise_alone(
+    origin: Network, calibration: Source, target: TargetProfile, steps: int | None
+) -> Network:
+    """Quantise a network that is calibrated by itself.
+
+    Args:
+        origin: the float network.
+        calibration: patches or samples.
+        target: whose rules count.
+        steps: of fine-tuning; None while it helps, 0 for none.
+    """
+    shifts = _shifts_of(target)
+    tuning = None
+    if steps != 0:
+        optional("torch", "finetune")
+        from beers_deploy.quant.passes.tune import Tuning
+
+        tuning = Tuning(calibration.for_tuning.pairs, steps)
+    with progress("calibrating"):
+        about = {**calibration.about, "target": target.name}
+        result = quantise_model(origin.model, calibration.drawn, about, shifts, tuning)
+        step("statistics of each layer")
+        layers = integer_rows(origin.model, result.core, result.host, calibration.drawn.degraded)
+    return Network(
+        result.host, f"{origin.name}-int8", origin=origin, layers=layers, quantised=result
+    )
+
+
+def quantise_conditioned(
+    network: Conditioned,
+    origin: Network,
+    calibration: "Calibration",
+    sensor: Sensor,
+    target: TargetProfile,
+) -> Network:
+    """Quantise a network that is conditioned on its sensor, over the whole family of sensors.
+
+    Args:
+        network: its weights.
+        origin: the float network for `sensor`.
+        calibration: patches on which the integer layers are described.
+        sensor: that the result is conditioned on.
+        target: whose rules count.
+    """
+    images = [] if calibration.images is None else [calibration.images]
+    family = family_model(network, images, calibration.seed, _shifts_of(target))
+    host = told_int8(family, sensor, {"target": target.name})
+    layers = integer_rows(origin.model, read_core(host), host, calibration.drawn.degraded)
+    return Network(host, f"{network.name}-int8", origin=origin, layers=layers)
+
+
+def _shifts_of(target: TargetProfile) -> Shifts:
+    if not (target.configurations or target.npu):
+        raise OptionError(
+            f"`target` must have a DPU or NPU, but {target.name!r} has none. Choose one of "
+            f"{', '.join(board_names() + npu_names())}."
+        )
+    return target_shifts(target)
+
+
+def losses_of(network: Network, data: Data) -> str:
+    """Return what INT8 loses on samples that calibration did not see, in one sentence."""
+    assert network.origin is not None and network.quantised is not None  # noqa: S101, PT018
+    model = network.origin.model
+    result = network.quantised
+    held_out = data.source_for(model).unseen
+    differences = compare(
+        open_any_size(model), open_any_size(result.host), held_out.pairs, data.samples is None
+    )
+    return losses(result, differences, held_out)
+
+
+def sensitivity_report(
+    network: Network, data: Data, more: Sequence[Row] = ()
+) -> tuple[list[Row], Report]:
+    """Return where INT8 errs on samples that calibration did not see: rows, and a page.
+
+    Args:
+        network: that was quantised here.
+        data: that it was calibrated on.
+        more: rows that the page shows behind.
+    """
+    assert network.origin is not None and network.quantised is not None  # noqa: S101, PT018
+    model = network.origin.model
+    result = network.quantised
+    held_out = data.source_for(model).unseen
+    sessions = open_any_size(model), open_any_size(result.host)
+    differences = compare(*sessions, held_out.pairs, data.samples is None)
+    spread = spread_of(*sessions, held_out.degraded)
+    worst = spread.worst(WORST)
+    layers = layer_error_rows(result, held_out)
+    rows = [
+        gate_row(differences),
+        *layers,
+        *(worst_row(k, held_out, spread) for k in worst),
+        sizes_row(spread),
+    ]
+    return rows, sensitivity_page(
+        headline(differences, layers), [*rows, *more], spread, held_out, sessions, worst
+    )
+
+
+def rounding_of(int8: Path, weights: Path) -> "Rounding":
+    """How the INT8 file of a network behind a bank rounds its maps; refused where it is of other
+    weights.
+    """
+    import torch
+
+    from beers_deploy.model.convbeers import Rounding
+    from beers_deploy.quant.banked.calibrate import map_steps
+
+    model = load_onnx(int8)
+    tensors = read_conditioned(weights)
+    if metadata(model).get(WEIGHTS) != sha256(weights):
+        raise ModelError(
+            f"{int8} is the INT8 file of another network than {weights}. Make it with "
+            "'beers-deploy quantize'."
+        )
+    with contradictions(str(int8)):
+        step_sizes = map_steps(required_family(model), tensors)
+    stream, *inner = (torch.from_numpy(np.float32(steps))[:, None, None] for steps in step_sizes)
+    return Rounding(stream, tuple(inner))
+
+
+def family_model(
+    network: Conditioned,
+    images: Sequence[Path] = (),
+    seed: int = 0,
+    shifts: Shifts = SHIFTS,
+    passes: Passes | None = None,
+) -> onnx.ModelProto:
+    """The INT8 file of a network behind a bank, for the middle of the family; any sensor can be
+    told to it.
+
+    Args:
+        network: of weights that 'train --conditioned' wrote.
+        images: folders of photographs, beside which about as many drawn scenes are seen; none takes
+            these alone.
+        seed: of the patches.
+        shifts: the windows of the target.
+        passes: that reduce the error; None for those that pay behind a bank.
+    """
+    # This loads SciPy, which samples of one's own do without.
+    from beers_deploy.model.simulator.procedural import load_scenes
+    from beers_deploy.quant.banked.calibrate import PASSES, family_images, quantise_family
+
+    weights = read_conditioned(network.weights)
+    aim = load_sensor(REFERENCE).nominal()
+    scale = weights.variant.scale
+    scenes = load_scenes(None, aim, seed)
+    # Drawn scenes have stronger edges, photographs finer ground, so both are calibrated on.
+    if images:
+        photographs = list(chain.from_iterable(load_scenes(folder, aim, seed) for folder in images))
+        scenes = photographs + scenes * max(len(photographs) // len(scenes), 1)
+    with progress(f"calibrating {network.name} over the family of sensors"):
+        family_patches = family_images(scenes, scale, seed, weights.kernels)
+        middle = bank_of_vector((0.0,) * len(RANGES), weights.kernels)
+        family = quantise_family(weights, middle, family_patches, shifts, passes or PASSES)
+    description = {
+        "variant": network.name,
+        "reference": REFERENCE,
+        "precision": "int8 legal",
+        "calibration_seed": str(seed),
+    }
+    description |= {FAMILY: family.to_words(), WEIGHTS: sha256(network.weights)}
+    return host_model(family.core, description)

@@ -1,0 +1,202 @@
+"""Arrays of NumPy, torch, Dask and xarray restored in memory.
+
+The pixels are those that `restore` writes of the same image in a file.
+"""
+
+from dataclasses import dataclass, replace
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from beers_deploy.model.raster.facts import (
+    MaskKind,
+    Raster,
+    is_restored,
+    require_numbers,
+    require_raw,
+    usable_nodata,
+)
+from beers_deploy.model.raster.source import ArraySource
+from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.restoration.prepare import NetworkPipeline, Pipeline
+from beers_deploy.restoration.reading import Reading
+from beers_deploy.restoration.tiles.engine import NAME
+from beers_deploy.restoration.tiles.lazy import restore_lazily
+from beers_deploy.restoration.tiles.rows import gathered
+
+
+@dataclass(frozen=True)
+class Job:
+    """How an array is restored.
+
+    Attributes:
+        pipeline: what restores it.
+        reading: how its pixels are understood.
+        nodata: the value of its missing pixels, besides NaN.
+    """
+
+    pipeline: Pipeline
+    reading: Reading
+    nodata: float | None
+
+
+def restore_array(image: Any, job: Job) -> Any:
+    """Restore an array of any kind, and return the same kind.
+
+    Args:
+        image: (H, W) or (bands, H, W); of NumPy (masked or not) and torch it is restored at once;
+            of Dask the result is lazy. An xarray.DataArray keeps coordinates and attributes.
+        job: how.
+    """
+    # Arrays of xarray and torch are recognised by their attributes, so that neither is imported.
+    if hasattr(image, "coords") and hasattr(image, "dims"):
+        return _restore_labelled(image, job)
+    if hasattr(image, "detach"):
+        restored = _restore(image.detach().cpu().numpy(), job)
+        return import_module("torch").from_numpy(restored).to(image.device)
+    if np.ma.isMaskedArray(image):
+        return _restore_masked(image, job)
+    return _restore(image, job)
+
+
+def _restore_labelled(image: Any, job: Job) -> Any:
+    """An xarray.DataArray; bands may stand behind the rows and columns where their dimension says
+    so.
+    """
+    if hasattr(image, "data_vars"):
+        names = ", ".join(map(str, image.data_vars)) or "none"
+        raise ImageError(
+            f"`image` is an xarray.Dataset of {names}. Choose one of its variables, which is a "
+            "DataArray."
+        )
+    own = image.attrs
+    reading = job.reading
+    require_raw(NAME, is_restored(str(own.get("TIFFTAG_SOFTWARE", "")), own), reading.force)
+    full_scale = own.get("full_scale") if reading.full_scale is None else reading.full_scale
+    nodata = own.get("_FillValue") if job.nodata is None else job.nodata
+    dims = image.dims
+    bands = next((dim for dim in image.dims if dim in BAND_DIMS), None)
+    ordered = image if bands is None or image.ndim != 3 else image.transpose(bands, ...)
+    if image.ndim == 3 and bands is None and ordered.shape[-1] <= FEW < min(ordered.shape[:-1]):
+        raise _bands_last(ordered.shape, "name the dimension of the bands 'band'.")
+    scaled = replace(reading, full_scale=full_scale)
+    pixels = _restore(ordered.data, replace(job, reading=scaled, nodata=nodata))
+    restored = _labelled(ordered, pixels)
+    return restored if restored.ndim != len(dims) else restored.transpose(*dims)
+
+
+def _restore_masked(image: Any, job: Job) -> Any:
+    """A masked array, whose masked pixels are missing and stay masked, enlarged with the image."""
+    restored = _restore(image, job)
+    mask = np.ma.getmaskarray(image)
+    scale = restored.shape[-1] // mask.shape[-1]
+    mask = mask.repeat(scale, axis=-2).repeat(scale, axis=-1)
+    # A network that makes other bands makes each of them of all bands of the image.
+    if mask.shape != restored.shape:
+        mask = np.broadcast_to(mask if mask.ndim == 2 else mask.any(axis=0), restored.shape)
+    return np.ma.array(restored, mask=mask)
+
+
+def _restore(image: Any, job: Job) -> Any:
+    bands = _bands_first(image)
+    raster = _raster(bands, job.nodata)
+    restored = _restored(image, bands, raster, job)
+    return restored[0] if image.ndim == 2 and len(restored) == 1 else restored
+
+
+def _restored(image: Any, bands: Any, raster: Raster, job: Job) -> Any:
+    """Restore (bands, H, W), lazily if the image is an array of Dask."""
+    if not hasattr(image, "__dask_graph__"):
+        return _restore_now(bands, raster, job)
+    if np.ma.isMaskedArray(getattr(image, "_meta", None)):
+        raise ImageError(
+            "`image` is a masked Dask array, which is not supported. Fill it with "
+            "dask.array.ma.filled(image, 0) and give that value as `nodata`, or compute it first."
+        )
+    if not isinstance(job.pipeline, NetworkPipeline):
+        raise OptionError(
+            "`method` must be 'network' for a Dask array. Compute the array first, or use a "
+            "network."
+        )
+    return restore_lazily(bands, raster, job.pipeline, job.reading)
+
+
+def _labelled(image: Any, pixels: Any) -> Any:
+    """Restored pixels with an xarray.DataArray's labels; where they are more than it had, those of
+    their places.
+    """
+    if pixels.shape == image.shape:
+        return image.copy(data=pixels)
+    dims = image.dims if pixels.ndim == image.ndim else ("band", *image.dims)
+    sizes = dict(zip(dims, pixels.shape, strict=True))
+    changed = {dim for dim in image.dims if sizes[dim] != image.sizes[dim]}
+    coordinates = {
+        name: coordinate.copy()
+        for name, coordinate in image.coords.items()
+        if not changed.intersection(coordinate.dims)
+    }
+    for coordinate in coordinates.values():
+        # This transform is that of the original pixels; the coordinates have the new places.
+        coordinate.attrs.pop("GeoTransform", None)
+    for dim in changed.intersection(image.dims[-2:], image.coords):
+        places = _between(image.coords[dim].values, sizes[dim])
+        coordinates |= {dim: (dim, places, image.coords[dim].attrs)} if places is not None else {}
+    return type(image)(pixels, coordinates, dims, image.name, image.attrs)
+
+
+def _between(places: np.ndarray, count: int) -> np.ndarray | None:
+    """The middles of `count` pixels over those at `places`, evenly between; None where these are no
+    two numbers.
+    """
+    if len(places) < 2 or places.dtype.kind not in "iuf":
+        return None
+    # Pixels of both sizes share the image's borders, not their middles.
+    at = (np.arange(count) + 0.5) * (len(places) / count) - 0.5
+    left = np.clip(np.floor(at).astype(int), 0, len(places) - 2)
+    return np.asarray(places[left] + (at - left) * (places[left + 1] - places[left]))
+
+
+def _restore_now(bands: np.ndarray, raster: Raster, job: Job) -> np.ndarray:
+    work = job.pipeline.prepare(ArraySource(bands, raster), job.reading, NAME)
+    pixels, tally = gathered(work.rows(0, lambda _: None), work.out_shape, raster.out_dtype)
+    if not job.reading.force:
+        tally.require(name=NAME)
+    return pixels
+
+
+BAND_DIMS = ("band", "bands", "channel", "wavelength")
+FEW = 4
+"""Bands of a photograph: a last axis of no more, behind two longer ones, holds bands and no
+columns.
+"""
+
+
+def _bands_first(image: Any) -> Any:
+    """Return an image as (bands, H, W)."""
+    shape: tuple[int, ...] = getattr(image, "shape", ())
+    if len(shape) not in (2, 3) or 0 in shape or any(side != side for side in shape):
+        kind = type(image).__name__
+        raise ImageError(
+            f"`image` must be an array (H, W) or (bands, H, W) of known size, but it is "
+            f"{kind} of shape {shape}. Give pixels as an array, missing ones as NaN or as "
+            "`nodata`."
+        )
+    if len(shape) == 3 and shape[2] <= FEW < min(shape[:2]):
+        raise _bands_last(shape, "numpy.moveaxis(image, -1, 0) puts them first.")
+    return image if len(shape) == 3 else image[None]
+
+
+def _bands_last(shape: tuple[int, ...], remedy: str) -> ImageError:
+    return ImageError(
+        f"`image` must be (bands, H, W), but its shape {tuple(shape)} ends in bands: {remedy}"
+    )
+
+
+def _raster(bands: Any, nodata: float | None) -> Raster:
+    count, height_px, width_px = bands.shape
+    dtype = require_numbers(NAME, bands.dtype)
+    value = None if nodata is None else float(nodata)
+    mask_kind: MaskKind = "mask" if np.ma.isMaskedArray(bands) else ""
+    nodata = usable_nodata(value, dtype)
+    return Raster(count, height_px, width_px, dtype, nodata, mask_kind=mask_kind)

@@ -1,0 +1,153 @@
+"""A sensor profile from raw frames of the sensor's own: what `characterise` does between options
+and TOML.
+
+- `frames`: which frames, what one digital number is, where the dark lies
+- `instrument`: noise and MTF, with intervals
+- `profile`: the TOML file
+
+Gain, ground sampling distance, black level, and bits unless pixels are clipped at full scale, are
+asked for or assumed. Where no edge gives an MTF, the user's word or an assumption stands in its
+place, marked so.
+"""
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from beers_deploy.model.raster.writer import write_tiff
+from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.results import Table, input_of
+from beers_deploy.studies.characterize.frames import cut_box, open_frames
+from beers_deploy.studies.characterize.instrument import Mtf, measure_mtf, measure_noise, snr_at
+from beers_deploy.studies.characterize.profile import PARTS, Characterised, profile_toml
+
+__all__ = [
+    "Characterised",
+    "MeasuredSensor",
+    "Stated",
+    "characterise",
+    "measured_sensor",
+    "profile_toml",
+]
+
+FULL_SCALE_RADIANCE = 400.0
+"""W/m2/sr/um, where no gain is given."""
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What the user says of a camera; None of what pixels are to tell, or what is assumed.
+
+    Attributes:
+        bits: of a digital number.
+        gain: DN per W/m2/sr/um.
+        gsd_m: ground sampling distance.
+        black_level: value of the dark in the files.
+        mtf: contrast at Nyquist across and along the track, instead of a measurement.
+    """
+
+    bits: int | None = None
+    gain: float | None = None
+    gsd_m: float | None = None
+    black_level: float | None = None
+    mtf: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        for option, value in (("gain", self.gain), ("gsd", self.gsd_m)):
+            if value is not None and not 0 < value < math.inf:
+                raise OptionError(
+                    f"`{option}` must be a finite number above 0, but it is {value:g}."
+                )
+
+
+def characterise(
+    images: Sequence[Path], edges: Sequence[str] = (), stated: Stated | None = None
+) -> Characterised:
+    """Measure a sensor on its own frames.
+
+    Args:
+        images: raw ones of one sensor at one setting: files, and folders of them.
+        edges: boxes with one straight edge as FILE:X,Y,WIDTH,HEIGHT; none searches for edges.
+        stated: what the user says.
+    """
+    stated = stated or Stated()
+    frames = open_frames(images, stated.bits, stated.black_level)
+    regions = {words: cut_box(words, frames) for words in edges}
+    noise = measure_noise(frames)
+    mtf = Mtf({}, {})
+    if stated.mtf is None:
+        mtf = measure_mtf(frames, regions, noise.model)
+    gain = stated.gain or frames.full_scale_dn / FULL_SCALE_RADIANCE
+    low, high = (snr_at(noise.model, frames.full_scale_dn / part, gain) for part in PARTS)
+    return Characterised(
+        frames, noise, mtf, (low, high), gain, stated.gain is not None, stated.gsd_m, stated.mtf
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredSensor(Sensor):
+    """A sensor measured on its own images.
+
+    Attributes:
+        table: the figures with their intervals.
+    """
+
+    table: Table | None = None
+
+
+def measured_sensor(
+    images: Any, edges: Sequence[str], stated: Stated
+) -> tuple[MeasuredSensor, str]:
+    """Measure a sensor, and return it with the text of its profile.
+
+    Args:
+        images: one or several, each a path or an array (H, W) of integers.
+        edges: boxes with one straight edge as FILE:X,Y,WIDTH,HEIGHT.
+        stated: what the user states.
+    """
+    with TemporaryDirectory(prefix="beers-deploy-") as folder:
+        paths = [
+            _as_file(image, Path(folder) / f"image{number}.tif")
+            for number, image in enumerate(_several(images))
+        ]
+        measurement = characterise(paths, edges, stated)
+        toml = profile_toml(measurement)
+        profile = Path(folder) / "measured.toml"
+        profile.write_text(toml, encoding="utf-8")
+        count = len(measurement.frames.paths)
+        table = Table(
+            title=f"sensor of {count} image{'' if count == 1 else 's'}",
+            # The files of arrays are gone after this block: they are digested here.
+            inputs=tuple(map(input_of, measurement.frames.paths)),
+            rows=tuple(measurement.rows()),
+            notes=tuple(measurement.notes()),
+        )
+        return MeasuredSensor(**vars(load_sensor(str(profile))), table=table), toml
+
+
+def _several(images: Any) -> list[Any]:
+    return list(images) if isinstance(images, list | tuple) else [images]
+
+
+def _as_file(image: Any, path: Path) -> Path:
+    if isinstance(image, str | os.PathLike):
+        return Path(image)
+    pixels = np.asarray(getattr(image, "values", image))
+    # Arrays of xarray and rasterio have a first axis for the bands.
+    if pixels.ndim == 3 and len(pixels) == 1:
+        pixels = pixels[0]
+    if pixels.ndim != 2 or pixels.dtype.kind not in "ui":
+        raise ImageError(
+            "`images` must be integer digital numbers of shape (H, W), but one is "
+            f"{pixels.dtype} of shape {pixels.shape}. Give raw pixels of one band."
+        )
+    write_tiff(path, pixels.astype(np.uint16))
+    return path

@@ -1,0 +1,233 @@
+"""The raw frames of one camera: which files they are, what one digital number is, and where the
+dark lies.
+"""
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from beers_deploy.model.metrics.uneven_edge import HALF_PX
+from beers_deploy.model.raster.images import list_images
+from beers_deploy.model.raster.reader import open_raster
+from beers_deploy.profiles.errors import ImageError, OptionError, printable
+
+TILE_PX = 1024
+BOX_PX = 2 * int(HALF_PX) + 1
+"""Shortest side of a box with an edge."""
+MAX_DN = 65535
+CLIPPED_PIXELS = 10
+PILE = 4
+"""Pixels at one value, 2^n - 1, and how many times as many as just below: what shows that it is
+full scale.
+"""
+DARKEST_PERCENT = 0.01
+DARK_SHARE = 0.02
+"""Where the darkest pixels of all frames lie above this share of full scale, a black level is
+probable.
+"""
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Raw frames of one camera at one setting.
+
+    Attributes:
+        paths: of the images, sorted as given.
+        step: stored values are multiples of it; one digital number.
+        bits: of a digital number.
+        bits_stated: whether the user said so.
+        black_dn: the digital number of the dark, subtracted from all that is measured.
+        darkest_dn: what the darkest pixels have, the black level included.
+    """
+
+    paths: tuple[Path, ...]
+    step: int
+    bits: int
+    bits_stated: bool
+    black_dn: float
+    darkest_dn: float
+
+    @property
+    def full_scale_dn(self) -> int:
+        """The largest digital number."""
+        return int(2**self.bits) - 1
+
+    @property
+    def stored_full_scale(self) -> int:
+        """The value that stands for it in the files."""
+        return self.full_scale_dn * self.step
+
+    @property
+    def name(self) -> str:
+        """The frames in a few words."""
+        more = f" and {len(self.paths) - 1} more" if len(self.paths) > 1 else ""
+        return f"{self.paths[0].name}{more}"
+
+    @property
+    def hides_black(self) -> bool:
+        """Whether no black level is stated, though nothing in the frames is near 0."""
+        return not self.black_dn and self.darkest_dn > DARK_SHARE * self.full_scale_dn
+
+    def read(self, path: Path) -> np.ndarray:
+        """Digital numbers (H, W) of one frame, float64; 0 where they are missing."""
+        return read_raw(path).astype(np.float64) / self.step
+
+    def tiles(self, path: Path) -> Iterator[np.ndarray]:
+        """The frame in pieces (h, w) of 1024 pixels a side at most."""
+        pixels = self.read(path)
+        for top in range(0, pixels.shape[0], TILE_PX):
+            for left in range(0, pixels.shape[1], TILE_PX):
+                yield pixels[top : top + TILE_PX, left : left + TILE_PX]
+
+
+def open_frames(images: Sequence[Path], bits: int | None, black_level: float | None) -> Frames:
+    """Look at raw frames: steps, bits and the dark.
+
+    Args:
+        images: files, and folders whose images are taken in the order of their names.
+        bits: of a digital number, or of a stored value; None where clipped pixels must tell.
+        black_level: the stored value of the dark; None counts 0 as dark.
+    """
+    paths: tuple[Path, ...] = ()
+    for image in images:
+        paths += tuple(list_images(image)) if image.is_dir() else (image,)
+    if not paths:
+        raise ImageError("There are no `images`. Give one or several raw images of one sensor.")
+    if len({path.resolve() for path in paths}) < len(paths):
+        raise OptionError(
+            "One of the `images` is given twice, but the same pixels add no information. Give "
+            "each image once."
+        )
+    looks = [_look(path) for path in paths]
+    step = int(np.gcd.reduce([look.step for look in looks]))
+    largest = max(look.largest for look in looks)
+    bit_count = _settled_bits(bits, largest, step, any(look.piled for look in looks))
+    black_dn = (black_level or 0.0) / step
+    darkest_dn = min(look.darkest for look in looks) / step
+    middle_dn = float(np.median([look.middle for look in looks])) / step
+    if not 0 <= black_dn < max(middle_dn, 1.0):
+        raise OptionError(
+            "`black_level` must be at least 0 and below the median of the images, "
+            f"{middle_dn * step:g}, but it is {black_level:g}. Give the value of dark frames."
+        )
+    return Frames(paths, step, bit_count, bits is not None, black_dn, darkest_dn)
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What the stored values of one frame show.
+
+    Attributes:
+        step: largest number that divides all values.
+        largest: of the values.
+        piled: whether pixels pile up there as at a full scale alone.
+        darkest: value of the darkest pixels.
+        middle: median.
+    """
+
+    step: int
+    largest: int
+    piled: bool
+    darkest: float
+    middle: float
+
+
+def _look(path: Path) -> _Look:
+    pixels = read_raw(path)
+    values = pixels.astype(np.int64, copy=False).ravel()
+    largest = int(values.max())
+    step = int(np.gcd.reduce(values))
+    apart = int(np.gcd.reduce(values - values.min()))
+    # All differences are multiples of `apart` and the values are not: they are no digital numbers.
+    if apart > 1 and step % apart:
+        raise ImageError(
+            f"{path} has values in steps of {apart}: {apart - 1} of {apart} values never occur, "
+            f"so they are no digital numbers, which have steps of 1. Divide them by {apart}."
+        )
+    # Of a constant image nothing can be said.
+    step = step if apart else 1
+    count = int((values == largest).sum())
+    below = int((values == largest - step).sum())
+    # Values stored in 8 bits do not tell the bits of the digitiser, clipped or not.
+    piled = count >= max(CLIPPED_PIXELS, PILE * below) and pixels.dtype.itemsize > 1
+    # 0 stands for a missing pixel too, so that it tells nothing of the dark.
+    present = values[values > 0]
+    darkest, middle = np.percentile(present, [DARKEST_PERCENT, 50]) if present.size else (0.0, 0.0)
+    return _Look(step, largest, piled, float(darkest), float(middle))
+
+
+def _settled_bits(stated: int | None, largest: int, step: int, piled: bool) -> int:
+    """The bits that were given, or those that pixels clipped at full scale show."""
+    largest_dn = largest // step
+    if stated is None:
+        if not piled or largest_dn != 2 ** largest_dn.bit_length() - 1:
+            raise OptionError(
+                f"`bits` is missing. The values up to {largest} do not show it, because the "
+                "images are not clipped at full scale, or are stored in 8 bits. Give the bits of "
+                "the digitiser, such as 12."
+            )
+        return largest_dn.bit_length()
+    # 16 bits of values in steps of 64 are 10 bits of digital numbers.
+    shift = step.bit_length() - 1
+    bits = stated - shift if step == 2**shift and largest <= 2**stated - 1 else stated
+    if largest_dn > 2**bits - 1:
+        raise OptionError(
+            f"`bits` allows digital numbers up to {2**bits - 1}, but the images have {largest_dn}. "
+            "Give the bits of the raw image."
+        )
+    return bits
+
+
+def read_raw(path: Path) -> np.ndarray:
+    """Stored values (H, W) of one band, integers of any width; 0 where they are missing."""
+    with open_raster(path) as source:
+        raster = source.raster
+        rows = source.read(0, raster.height_px)
+    if raster.bands != 1:
+        raise ImageError(
+            f"{path} must have one band, because each band has its own sensor, but it has "
+            f"{raster.bands} bands. Extract one band."
+        )
+    pixels: np.ndarray = np.ma.getdata(rows)[0]
+    if raster.may_miss:
+        pixels = np.where(raster.missing(rows)[0], 0, pixels)
+    if (
+        (pixels.dtype.kind == "f" and (pixels != np.rint(pixels)).any())
+        or pixels.min() < 0
+        or pixels.max() > MAX_DN
+    ):
+        found = f"{pixels.dtype} from {float(pixels.min()):.4g} to {float(pixels.max()):.4g}"
+        raise ImageError(
+            f"{path} must have whole digital numbers from 0 to {MAX_DN}, but it has {found}. Give "
+            "the raw image, because resampling, calibration and scaling change the noise."
+        )
+    return pixels
+
+
+def cut_box(words: str, frames: Frames) -> np.ndarray:
+    """The digital numbers (h, w) that FILE:X,Y,WIDTH,HEIGHT names, FILE being one of the frames."""
+    parts = re.fullmatch(r"(.*):(\d{1,8}),(\d{1,8}),(\d{1,8}),(\d{1,8})", words, re.ASCII)
+    if parts is None:
+        raise OptionError(
+            "`edge` must be FILE:X,Y,WIDTH,HEIGHT in whole pixels, such as "
+            f"raw.tif:1200,340,60,60, but it is {printable(repr(words))}."
+        )
+    path = Path(parts[1])
+    left, top, width, height = map(int, parts.groups()[1:])
+    if path not in frames.paths:
+        raise OptionError(
+            f"`edge` names {printable(repr(parts[1]))}, which is not one of the `images`. Write "
+            "the file's name as it is in `images`."
+        )
+    pixels = frames.read(path)
+    region = pixels[top : top + height, left : left + width]
+    if region.shape != (height, width) or min(region.shape) < BOX_PX:
+        raise OptionError(
+            f"`edge` must be a box of {BOX_PX} x {BOX_PX} pixels or more inside the image of "
+            f"{pixels.shape[1]} x {pixels.shape[0]} pixels, but it is {printable(words)}. X,Y is "
+            "the upper left pixel, counted from 0."
+        )
+    return region

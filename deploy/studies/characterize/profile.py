@@ -1,0 +1,266 @@
+"""What was measured of a camera as figures, as sentences for its user, and as a profile: a TOML
+file.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+from beers_deploy.model.metrics.edge_curve import FREQUENCIES, MtfCurve
+from beers_deploy.model.metrics.noise_line import SPECTRUM
+from beers_deploy.profiles.constant import Status
+from beers_deploy.profiles.errors import printable
+from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
+from beers_deploy.profiles.sensor import snr_0_bounds
+from beers_deploy.profiles.sensor_file import BLIND, load_sensor, sensor_toml
+from beers_deploy.studies.characterize.frames import Frames
+from beers_deploy.studies.characterize.instrument import AXES, Mtf, Noise, Snr
+
+PARTS = (16, 4)
+"""Of full scale: the radiances at which SNRs are stated, as those that a network is told of."""
+GSD_M = 0.5
+OVERSAMPLING = 4
+SHOWN_CPX = {"at 0.1 cycles per pixel": 0.1, "at 0.25 cycles per pixel": 0.25, "at Nyquist": 0.5}
+MARGIN = 1e-5
+"""Of an SNR, by which it stays off the bounds of physics: decimals are rounded."""
+
+
+@dataclass(frozen=True)
+class Characterised:
+    """What was found of a camera.
+
+    Attributes:
+        frames: that were looked at.
+        noise: the line that the SNRs lie on.
+        mtf: curves that edges show; none where the user states the MTF.
+        snrs: at two radiances.
+        gain: DN per W/m2/sr/um, stated or assumed.
+        gain_stated: whether the user said so.
+        gsd_m: what the user says; None assumes one.
+        stated_mtf: contrast at Nyquist across and along the track, as the user says; None measures.
+    """
+
+    frames: Frames
+    noise: Noise
+    mtf: Mtf
+    snrs: tuple[Snr, Snr]
+    gain: float
+    gain_stated: bool
+    gsd_m: float | None
+    stated_mtf: tuple[float, float] | None
+
+    def rows(self) -> list[Row]:
+        """The figures, as commands report them."""
+        figures: dict[str, Figure] = {}
+        for axis in AXES:
+            curve = self.mtf.curves.get(axis)
+            if curve is None:
+                reason = self.mtf.reasons.get(axis, "the user states it")
+                figures[f"MTF {axis} at Nyquist"] = unavailable("%", reason)
+                continue
+            for words, frequency in SHOWN_CPX.items():
+                value, (low, high) = curve.at(frequency)
+                figure = measured(100 * value, "%", _edges(curve), (100 * low, 100 * high))
+                figures[f"MTF {axis} {words}"] = figure
+        for snr in self.snrs:
+            source = _blocks(self.noise) + (", extrapolated" if snr.extrapolated else "")
+            figures[f"SNR at {snr.radiance:g} W/m2/sr/um"] = measured(
+                snr.value, "ratio", source, snr.interval
+            )
+        for (low, high), value in zip(pairwise(SPECTRUM), self.noise.model.spectrum, strict=True):
+            name = f"noise from {low:g} to {high:.2g} cycles per pixel"
+            figures[name] = measured(
+                value, "ratio", "variance over that beyond 0.55 cycles per pixel"
+            )
+        return [Row("sensor", "measured sensor", figures)]
+
+    def notes(self) -> Iterator[str]:
+        """What a user should know before the profile is used, a sentence each."""
+        frames = self.frames
+        model = self.noise.model
+        if frames.step > 1:
+            yield (
+                f"the values are multiples of {frames.step}: they count as {frames.bits}-bit "
+                "numbers; "
+                f"restore these frames with --full-scale {frames.stored_full_scale}"
+            )
+        if frames.hides_black:
+            yield (
+                "0 counts as dark, but the darkest pixels have "
+                f"{frames.darkest_dn * frames.step:g}: if the camera "
+                "adds a black level, state it as --black-level, or the SNR in the dark is too high"
+            )
+        if not model.white:
+            yield (
+                f"the noise is not white: at middle frequencies it is {model.colour:.2f} times "
+                "as strong as at the "
+                f"finest. {_colour_consequence(model.colour)}"
+            )
+        if model.one_level:
+            yield (
+                f"the frames show one level of light, near {model.measured_dn[1]:.4g} DN above "
+                "the dark: all noise "
+                "there is taken for that of photons; give frames of other brightness as well"
+            )
+        yield from self._notes_on_edges()
+
+    def _notes_on_edges(self) -> Iterator[str]:
+        for axis, reason in self.mtf.reasons.items():
+            yield f"no MTF {axis} the track: {reason}"
+        for curve in self.mtf.curves.values():
+            if curve.contradicting:
+                yield f"these edges differ from the others: {', '.join(curve.contradicting)}"
+        if self.stated_mtf is None and not self.mtf.curves:
+            yield (
+                "the profile's MTF is an assumption: state what you know as --mtf, or point at "
+                "straight edges as "
+                "--edge FILE:X,Y,WIDTH,HEIGHT"
+            )
+
+
+def _colour_consequence(colour: float) -> str:
+    """What noise that is not white means for a restoration, which takes it for white."""
+    if colour > 1:
+        return (
+            "The profile states the stronger part. Filtering or compression after the detector "
+            "causes this: a "
+            "restoration leaves grain of some pixels' size"
+        )
+    return (
+        "The profile states the stronger part. Unequal readout channels or interference cause "
+        "this: equalise the "
+        "frames first, or a restoration smooths more than it need"
+    )
+
+
+def _blocks(noise: Noise) -> str:
+    """How many blocks of what."""
+    still = f" of {noise.pairs} pairs of one scene each" if noise.pairs else ""
+    return f"{noise.model.blocks} blocks of 16 x 16{still}"
+
+
+def profile_toml(found: Characterised) -> str:
+    """The profile as its TOML file; the source of what was measured has its interval, and any
+    doubt.
+    """
+    frames = found.frames
+    images = printable(frames.name)
+    bits_source = (
+        "given"
+        if frames.bits_stated
+        else f"pixels clipped at {frames.stored_full_scale} in {images}"
+    )
+    if frames.step > 1:
+        bits_source += f"; stored in steps of {frames.step}"
+    gain_source = (
+        f"full scale {frames.full_scale_dn} DN counts as 400 W/m2/sr/um; pixels do not tell the "
+        "gain, and to a "
+        "network only noise over full scale matters"
+    )
+    tables: dict[str, dict[str, object]] = {
+        "grid": {
+            "gsd_m": _given(found.gsd_m, GSD_M, "no pixel depends on it; state it"),
+            "oversampling": _constant(
+                OVERSAMPLING, "assumed", "for simulations alone: scene pixels a pixel"
+            ),
+        },
+        "mtf": _mtf_table(found, images),
+        "noise": _noise_table(found, images),
+        "digitiser": {
+            "bits": _constant(
+                frames.bits, "stated" if frames.bits_stated else "measured", bits_source
+            ),
+            "gain_dn_per_radiance": _given(
+                found.gain if found.gain_stated else None, found.gain, gain_source
+            ),
+        },
+    }
+    if frames.black_dn:
+        tables["offset"] = {
+            "offset_dn": _constant(frames.black_dn, "stated", "given on the command line")
+        }
+    return sensor_toml(f"Measured on {images}.", tables)
+
+
+def _mtf_table(sensor: Characterised, images: str) -> dict[str, object]:
+    """Measured curves, what the user states, or an assumption; an axis without a curve has the
+    other's.
+    """
+    if sensor.stated_mtf is not None:
+        across, along = (
+            _constant(value, "stated", "given on the command line") for value in sensor.stated_mtf
+        )
+        return {"mtf_nyquist": across, "mtf_nyquist_along": along}
+    if not sensor.mtf.curves:
+        middle = load_sensor(BLIND).nominal().mtf_nyquist
+        why = "no edge shows it; the middle of the range that networks are trained for"
+        return {"mtf_nyquist": _constant(float(f"{middle:.4g}"), "assumed", why)}
+    table: dict[str, object] = {"frequency": [float(f) for f in FREQUENCIES]}
+    # An axis without edges has the curve of the other one, and its source says so.
+    other = next(iter(sensor.mtf.curves))
+    for axis in AXES:
+        source_axis = axis if axis in sensor.mtf.curves else other
+        curve = sensor.mtf.curves[source_axis]
+        source = f"{_edges(curve)} {source_axis} the track in {images}"
+        source += f", 90 % interval {_intervals(curve)}"
+        if source_axis != axis:
+            source += f"; no curve {axis} the track"
+        contrast = [float(f"{value:.4g}") for value in curve.contrast]
+        table[axis] = {"value": contrast, "status": "measured", "source": source}
+    return table
+
+
+def _edges(curve: MtfCurve) -> str:
+    return f"{curve.edges} edge{'' if curve.edges == 1 else 's'}"
+
+
+def _intervals(curve: MtfCurve) -> str:
+    """The interval of each contrast, in the order of the table."""
+    return ", ".join(
+        f"{low:.3g} to {high:.3g}" for low, high in zip(curve.low, curve.high, strict=True)
+    )
+
+
+def _noise_table(sensor: Characterised, images: str) -> dict[str, object]:
+    """The SNRs are linear ratios without the rounding to whole DN; the darker one is kept within
+    physics.
+    """
+    model = sensor.noise.model
+    dark, bright = (dn / sensor.gain for dn in model.measured_dn)
+    low, high = sensor.snrs
+    bounds = snr_0_bounds(low.radiance, high.radiance, high.value)
+    # Outside these bounds alpha or beta would be negative, and no sensor has such noise.
+    inside = min(max(low.value, bounds[0] * (1 + MARGIN)), bounds[1] * (1 - MARGIN))
+    table = dict[str, object]()
+    for number, (snr, value, part) in enumerate(
+        zip(sensor.snrs, (inside, high.value), PARTS, strict=True)
+    ):
+        source = (
+            f"{_blocks(sensor.noise)} in {images}, 95 % interval {snr.interval[0]:.3g} to "
+            f"{snr.interval[1]:.3g}"
+        )
+        # No block has this radiance: the interval is wider, and the source says so.
+        if snr.extrapolated:
+            source += f"; extrapolated from {dark:.3g} to {bright:.3g} W/m2/sr/um"
+        if not model.white:
+            source += (
+                f"; not white, {model.colour:.2f} times as strong at middle frequencies "
+                "as at the finest"
+            )
+        if model.one_level:
+            source += "; seen at one level of light, and how the noise grows with light is assumed"
+        table[f"radiance_{number}"] = _constant(
+            float(f"{snr.radiance:.10g}"), "inferred", f"1/{part} of full scale"
+        )
+        table[f"snr_{number}"] = _constant(float(f"{value:.8g}"), "measured", source)
+    return table
+
+
+def _given(value: float | None, otherwise: float, why: str) -> dict[str, object]:
+    if value is None:
+        return _constant(float(f"{otherwise:.10g}"), "assumed", why)
+    return _constant(value, "stated", "given on the command line")
+
+
+def _constant(value: float, status: Status, source: str) -> dict[str, object]:
+    return {"value": value, "status": status, "source": source}

@@ -1,0 +1,100 @@
+"""Rows of figures as a pandas DataFrame, and as bars of matplotlib."""
+
+from collections.abc import Sequence
+from itertools import chain
+from typing import TYPE_CHECKING, Any
+
+from beers_deploy.profiles.errors import OptionError, optional, printable
+from beers_deploy.profiles.figures import Row
+from beers_deploy.tables.columns import figures_of, words_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+
+COLOURS = {"measured": "tab:green", "predicted": "tab:orange", "published": "tab:blue"}
+
+
+def _units(rows: Sequence[Row]) -> dict[str, str]:
+    """Return the unit of each figure; where rows differ, that of the last one."""
+    figures = chain.from_iterable(row.figures.items() for row in rows)
+    return {key: figure.unit for key, figure in figures}
+
+
+def _index(rows: Sequence[Row]) -> Any:
+    pandas = optional("pandas", "to_pandas")
+    if len({row.table for row in rows}) > 1:
+        return pandas.MultiIndex.from_tuples(
+            [(row.table, row.name) for row in rows], names=["table", "name"]
+        )
+    return pandas.Index([row.name for row in rows], name=rows[0].table if rows else "name")
+
+
+def wide_frame(rows: Sequence[Row]) -> "pd.DataFrame":
+    """One line a row, a column a figure and a column for each word beside them; units in
+    `attrs["units"]`.
+    """
+    pandas = optional("pandas", "to_pandas")
+    columns: dict[str, list[object]] = {}
+    for key in figures_of(rows):
+        columns[key] = [row.figures[key].value if key in row.figures else None for row in rows]
+    # As floats, figures that are missing are NaN.
+    frame: pd.DataFrame = pandas.DataFrame(columns, index=_index(rows), dtype=float)
+    for word in words_of(rows):
+        # A word of a figure's name would replace the figure.
+        if word not in columns:
+            frame[word] = [row.text.get(word, "") for row in rows]
+    frame.attrs["units"] = _units(rows)
+    return frame
+
+
+def tidy_frame(rows: Sequence[Row]) -> "pd.DataFrame":
+    """One line a figure: its table, row and name, value, unit, mode, interval and source (or why
+    there is none).
+    """
+    pandas = optional("pandas", "to_pandas")
+    lines = []
+    for row in rows:
+        for key, figure in row.figures.items():
+            low, high = figure.interval or (None, None)
+            line = {
+                "table": row.table,
+                "name": row.name,
+                "figure": key,
+                "value": figure.value,
+                "unit": figure.unit,
+                "mode": figure.mode,
+                "low": low,
+                "high": high,
+                "source": figure.source or figure.reason,
+            }
+            lines.append(line)
+    frame: pd.DataFrame = pandas.DataFrame(lines)
+    return frame
+
+
+def bars(rows: Sequence[Row], figure: str | None, ax: "Axes | None") -> "Axes":
+    """Bars of one figure, its interval on each; see `results.Table.plot`."""
+    names = figures_of(rows)
+    if not names:
+        raise OptionError("The table has no figures, so there is nothing to plot.")
+    if figure not in (None, *names):
+        raise OptionError(
+            f"`figure` must be one of {', '.join(names)}, but it is {printable(repr(figure))}."
+        )
+    key = figure or names[0]
+    entries = [
+        (row.name, row.figures[key])
+        for row in rows
+        if key in row.figures and row.figures[key].value is not None
+    ]
+    axes: Any = ax if ax is not None else optional("matplotlib.pyplot", "plot").subplots()[1]
+    for place, (_, entry) in enumerate(entries):
+        axes.barh(place, entry.value, color=COLOURS[entry.mode])
+        if entry.interval:
+            axes.plot(entry.interval, [place, place], color="black", lw=1, marker="|")
+    axes.set_yticks(range(len(entries)), [name for name, _ in entries])
+    axes.invert_yaxis()
+    axes.set_xlabel(f"{key} ({entries[0][1].unit})" if entries else key)
+    result: Axes = axes
+    return result

@@ -1,0 +1,51 @@
+"""A table as HTML, as a notebook shows it."""
+
+from collections.abc import Sequence
+from html import escape
+
+from beers_deploy.profiles.errors import visible
+from beers_deploy.profiles.figures import Figure, Row
+from beers_deploy.tables.columns import figures_of, unit_of, words_of
+
+STYLE = "border-bottom: 1px solid; padding: 2px 8px; text-align: left"
+
+
+def html_table(title: str, rows: Sequence[Row]) -> str:
+    """Return one table with a line for each row.
+
+    The mode follows each figure. Its source, or why it is missing, is its tooltip.
+    """
+    keys = figures_of(rows)
+    words = words_of(rows)
+    head = [_cell("th", title)]
+    for key in keys:
+        unit = unit_of(key, rows)
+        head.append(_cell("th", f"{key} ({unit})" if unit else key))
+    head += [_cell("th", word) for word in words]
+    lines = []
+    for row in rows:
+        cells = [_cell("th", row.name)]
+        cells += [_figure(row.figures.get(key), unit_of(key, rows)) for key in keys]
+        cells += [_cell("td", row.text.get(word, "")) for word in words]
+        lines.append(f"<tr>{''.join(cells)}</tr>")
+    header = f"<thead><tr>{''.join(head)}</tr></thead>"
+    return f"<table>{header}<tbody>{''.join(lines)}</tbody></table>"
+
+
+def html_text(text: str) -> str:
+    """Return text as HTML that shows it and obeys nothing in it."""
+    return escape(visible(text))
+
+
+def _cell(tag: str, text: str, tooltip: str = "") -> str:
+    about = f' title="{html_text(tooltip)}"' if tooltip else ""
+    return f'<{tag} style="{STYLE}"{about}>{html_text(text)}</{tag}>'
+
+
+def _figure(figure: Figure | None, unit: str) -> str:
+    if figure is None:
+        return _cell("td", "")
+    if figure.value is None:
+        return _cell("td", "unavailable", figure.reason)
+    own_unit = "" if unit else f" {figure.unit}"
+    return _cell("td", f"{figure}{own_unit} {figure.mode}", figure.source)

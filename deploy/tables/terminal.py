@@ -1,0 +1,190 @@
+"""Tables on a terminal of any width: no number is cut or broken.
+
+Several layouts are tried, and the first that fits is printed:
+
+1. a line for each row, or for each figure where there are more figures than rows
+2. the same with each interval below its value
+3. and 4. the other way round
+5. a block for each row, which fits any width
+"""
+
+import textwrap
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
+
+from rich import box
+from rich.cells import cell_len
+from rich.console import Console
+from rich.measure import Measurement
+from rich.table import Table
+from rich.text import Text
+
+from beers_deploy.profiles.errors import one_line
+from beers_deploy.profiles.figures import Figure, Row
+from beers_deploy.tables.columns import (
+    common_mode,
+    figures_of,
+    heading_of,
+    missing,
+    unit_of,
+    words_of,
+)
+
+COLOURS = {"measured": "green", "predicted": "yellow", "published": "blue"}
+PIPE_WIDTH = 160
+"""Columns when the output is no terminal."""
+
+NAME_WIDTH = 18
+"""Columns that a name or a word has at least, if it is as long."""
+
+HEADING_WIDTH = 16
+"""Columns at which the name of a row is wrapped where it heads a column."""
+
+
+def default_console() -> Console:
+    """Return standard output, wide enough for whole tables when it is a file or a pipe."""
+    console = Console()
+    return console if console.is_terminal else Console(width=PIPE_WIDTH)
+
+
+def plain(text: str) -> Text:
+    """Return words on one line, as they are: without markup, and without characters of control."""
+    return Text(one_line(text))
+
+
+def print_rows(title: str, rows: Iterable[Row], console: Console | None = None) -> None:
+    """Print the rows of one table, and below it why figures are missing.
+
+    Args:
+        title: of the table.
+        rows: of the table.
+        console: to print on; standard output if None.
+    """
+    table_rows = list(rows)
+    console = console or default_console()
+    console.print(plain(title), style="bold", highlight=False)
+    for layout in _layouts(table_rows):
+        if _fits(layout, console):
+            console.print(layout)
+            break
+    else:
+        _print_blocks(table_rows, console)
+    for reason in missing(table_rows):
+        console.print(plain(f"- {reason}"), style="dim", highlight=False)
+    console.print()
+
+
+def _layouts(rows: Sequence[Row]) -> Iterator[Table]:
+    """Yield a table in every layout, the best first."""
+    down = len(figures_of(rows)) > len(rows)
+    for by_figure in (down, not down):
+        for stacked in (False, True):
+            yield _by_figure(rows, stacked) if by_figure else _by_row(rows, stacked)
+
+
+def _fits(table: Table, console: Console) -> bool:
+    # On its own console, the least width of a table never exceeds the console's.
+    wide = console.options.update(width=10 * PIPE_WIDTH)
+    return Measurement.get(console, wide, table).minimum <= console.width
+
+
+def _empty() -> Table:
+    return Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False)
+
+
+def _by_row(rows: Sequence[Row], stacked: bool) -> Table:
+    """Return a table with a line for each row; the headings state units and modes."""
+    table = _empty()
+    columns = [[plain(row.name) for row in rows]]
+    _add_words(table, "", columns[0])
+    for key in figures_of(rows):
+        about = heading_of(key, rows)
+        heading = [*_wrapped(key), *_wrapped(f"({about})" if about else "")]
+        mode = common_mode(key, rows)
+        cells = [_cell(row.figures.get(key), mode, stacked) for row in rows]
+        _add_figures(table, heading, cells)
+        columns.append(cells)
+    for word in words_of(rows):
+        cells = [plain(row.text.get(word, "")) for row in rows]
+        _add_words(table, word, cells)
+        columns.append(cells)
+    for line in zip(*columns, strict=True):
+        table.add_row(*line)
+    return table
+
+
+def _by_figure(rows: Sequence[Row], stacked: bool) -> Table:
+    """Return a table with a line for each figure; its unit and its mode stand in columns."""
+    table = _empty()
+    keys = figures_of(rows)
+    words = words_of(rows)
+    modes = [common_mode(key, rows) for key in keys]
+    none = [plain("")] * len(words)
+    columns = [
+        [plain(name) for name in (*keys, *words)],
+        [*(plain(unit_of(key, rows)) for key in keys), *none],
+        [*map(plain, modes), *none],
+    ]
+    for heading, cells in zip(("", "unit", "mode"), columns, strict=True):
+        _add_words(table, heading, cells)
+    for row in rows:
+        figures = [
+            _cell(row.figures.get(key), mode, stacked)
+            for key, mode in zip(keys, modes, strict=True)
+        ]
+        _add_figures(table, _wrapped(row.name), figures)
+        columns.append([*figures, *(plain(row.text.get(word, "")) for word in words)])
+    for line in zip(*columns, strict=True):
+        table.add_row(*line)
+    return table
+
+
+def _add_figures(table: Table, heading: Sequence[str], cells: Sequence[Text]) -> None:
+    """Add a column in which no number is broken; words in it are wrapped."""
+    lines = [*heading, *chain.from_iterable(cell.plain.split("\n") for cell in cells)]
+    least = max(map(cell_len, lines), default=0)
+    text = Text("\n").join(map(plain, heading))
+    table.add_column(text, justify="right", overflow="fold", min_width=least)
+
+
+def _add_words(table: Table, heading: str, cells: Sequence[Text]) -> None:
+    """Add a column whose text is wrapped where it is longer than the terminal has room for."""
+    longest = max(map(cell_len, (heading, *(cell.plain for cell in cells))), default=0)
+    table.add_column(plain(heading), overflow="fold", min_width=min(longest, NAME_WIDTH))
+
+
+def _wrapped(name: str) -> list[str]:
+    """Return a heading in lines of at most `HEADING_WIDTH` columns."""
+    return textwrap.wrap(one_line(name), HEADING_WIDTH) or [""]
+
+
+def _cell(figure: Figure | None, mode: str, stacked: bool) -> Text:
+    """Return a figure in the colour of its mode, which follows unless the table states it."""
+    if figure is None or figure.value is None:
+        return Text("" if figure is None else "-")
+    text = str(figure)
+    if stacked:
+        text = text.replace(" [", "\n[")
+    shown = Text(text, COLOURS[figure.mode])
+    if not mode:
+        shown.append("\n" if stacked else " ").append(figure.mode)
+    return shown
+
+
+def _print_blocks(rows: Sequence[Row], console: Console) -> None:
+    """Print a block for each row: its name, then a line for each figure and each word."""
+    for row in rows:
+        console.print(plain(row.name), highlight=False)
+        block = Table(box=None, show_header=False, padding=(0, 1), pad_edge=False)
+        block.add_column(min_width=1)
+        for _ in range(2):
+            block.add_column(overflow="fold")
+        for key, figure in row.figures.items():
+            value = _cell(figure, "", stacked=False)
+            # The unit stands in front of the mode, as a person reads it.
+            if figure.value is not None:
+                value = Text(f"{figure} {figure.unit} ", COLOURS[figure.mode]).append(figure.mode)
+            block.add_row("", plain(key), value)
+        for word, words in row.text.items():
+            block.add_row("", plain(word), plain(words))
+        console.print(block)

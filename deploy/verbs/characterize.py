@@ -1,0 +1,92 @@
+"""`characterize`: a sensor profile from raw images of the sensor."""
+
+import logging
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.verbs.parameters import Edges, Images, Interval, Mtf, Progress, RequiredFile
+from beers_deploy.verbs.verb import verb
+
+if TYPE_CHECKING:
+    from beers_deploy.studies.characterize import MeasuredSensor
+
+logger = logging.getLogger(__name__)
+
+
+@verb
+def characterize(
+    images: Images,
+    *,
+    out: RequiredFile | None = None,
+    edge: Edges = (),
+    mtf: Mtf | None = None,
+    black_level: float | None = None,
+    bits: Annotated[int, Interval(ge=1, le=16)] | None = None,
+    gain: float | None = None,
+    gsd: float | None = None,
+    progress: Progress = None,
+) -> "MeasuredSensor":
+    """Measure the MTF and the noise of a sensor on its raw images, and write its profile.
+
+    The MTF needs straight edges: a target, roofs, kerbs, shadows. Without edges `mtf` or an
+    assumption takes its place. The noise needs raw pixels: images that were denoised, sharpened or
+    resampled are refused.
+
+    Args:
+        images: raw images of one sensor at one setting, or folders of them: integers, one band. In
+            Python also arrays (H, W).
+        out: sensor profile to write, a .toml file.
+        edge: box with one straight edge, FILE:X,Y,WIDTH,HEIGHT; edges are searched for if none.
+        mtf: contrast at Nyquist across the track, or across and along it, if you know it: 0.07 is
+            7 %; measured if none.
+        black_level: value of the dark in the images; 0 is assumed to be dark if none.
+        bits: bits of a pixel; found from clipped pixels if none.
+        gain: DN per W/m2/sr/um; full scale is assumed to be 400 W/m2/sr/um if none.
+        gsd: ground sampling distance in m; no pixel depends on it.
+        progress: a function that is called at each step, False for silence, None for a bar or lines
+            on standard error.
+
+    Returns:
+        The sensor. Its `table` has the figures with their intervals.
+
+    Raises:
+        ImageError: images that are not raw, or that lack what is needed.
+        OptionError: an option that contradicts the pixels.
+
+    Examples:
+        >>> raw = bd.simulate(size=256, seed=1).degraded
+        >>> sensor = bd.characterize(raw, bits=12, gain=10.2375)
+        >>> 0.05 < sensor.mtf_nyquist.low < 0.09  # the truth is 0.07
+        True
+    """
+    from beers_deploy.model.io.files import write_text
+    from beers_deploy.studies.characterize import Stated, measured_sensor
+
+    file = None if out is None else Path(out)
+    edges = [edge] if isinstance(edge, str) else list(edge)
+    stated = Stated(bits, gain, gsd, black_level, None if mtf is None else contrasts(mtf))
+    sensor, toml = measured_sensor(images, edges, stated)
+    if file is not None:
+        write_text(file, toml)
+        logger.info("wrote %s: beers-deploy profiles %s", file, file)
+    return sensor
+
+
+def contrasts(mtf: str | tuple[float, float]) -> tuple[float, float]:
+    """Return the contrast at Nyquist across and along the track; one number stands for both."""
+    from beers_deploy.profiles.sensor import MTF_NYQUIST_MAX
+
+    parts = mtf.split(",") if isinstance(mtf, str) else list(mtf)
+    try:
+        across, along = (float(part) for part in (parts * 2)[:2])
+    except ValueError:
+        # NaN lies within no limits, so the message below covers words as well.
+        across = along = math.nan
+    if len(parts) > 2 or not (0 < across <= MTF_NYQUIST_MAX and 0 < along <= MTF_NYQUIST_MAX):
+        raise OptionError(
+            f"`mtf` must be one or two ratios above 0 and up to {MTF_NYQUIST_MAX:.4f}, got "
+            f"{mtf!r}. Write 0.07 for 7 %, or 0.09,0.05."
+        )
+    return across, along

@@ -1,0 +1,260 @@
+"""`evaluate`: several restorations on the same pairs, measured by the same instruments."""
+
+import logging
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.verbs.parameters import (
+    Factors,
+    Holds,
+    InputPath,
+    Interval,
+    LabelledFolder,
+    Methods,
+    OutputFolder,
+    Pairs,
+    Progress,
+    Seed,
+    SensorLike,
+)
+from beers_deploy.verbs.verb import refuse_with, refuse_without, verb
+
+if TYPE_CHECKING:
+    from beers_deploy.pairs import Pair
+    from beers_deploy.profiles.sensor import Sensor
+    from beers_deploy.results import Table
+
+logger = logging.getLogger(__name__)
+
+METHODS = "degraded,traditional,deconvolve-first,convbeers-s,convbeers-s-int8"
+PAGE = "report.html"
+
+
+@verb
+def evaluate(
+    *,
+    methods: Methods = METHODS,
+    images: LabelledFolder | None = None,
+    pairs: Pairs | None = None,
+    sensor: SensorLike | None = None,
+    reference: SensorLike | None = None,
+    lpips: InputPath | None = None,
+    out: Annotated[OutputFolder, Holds(PAGE, folders=("",))] | None = None,
+    sweep: bool = False,
+    brightness: Factors = "1",
+    consistency: bool = True,
+    exposure: bool = True,
+    strict: bool = False,
+    detector: InputPath | None = None,
+    labels: LabelledFolder | None = None,
+    split: str | None = None,
+    side: Annotated[int, Interval(ge=32, le=4096)] | None = None,
+    classes: str | None = None,
+    seed: Seed = 0,
+    progress: Progress = None,
+) -> "Table":
+    """Compare restorations with the reference, in the mean and by site.
+
+    PSNR leaves out clipped pixels; of simulated pairs it is also measured against the reference
+    without its noise. Inner PSNR leaves out a border of 57 pixels. MTF and SNR are measured on
+    restored slanted edges and flat fields. The table of targets has the flux of points and the
+    contrast of faint bars and zone plates. With a detector the table has what it finds in scenes as
+    the reference sees them, degraded and restored: average precision, precision and recall with
+    intervals over sites, and the share of the loss that restoration regains.
+
+    Args:
+        methods: names, separated by commas: degraded is always a row. A shipped network and the
+            traditional methods use the sensor; NAME@blind is given no sensor, NAME@SENSOR another
+            one. In Python also a mapping of names to networks or functions of an image (H, W).
+        images: folder of scenes to simulate from; drawn scenes if none.
+        pairs: folder with degraded/ and reference/, as 'simulate' writes it; in Python also pairs.
+        sensor: sensor of the degraded images, a name or a .toml file; of pairs the one that made
+            them, else pleiades-degraded if none. With a detector several, separated by commas.
+        reference: sensor of the reference images; pleiades-reference if none.
+        lpips: weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.
+        out: folder for report.html and pictures.
+        sweep: also compare under 16 sensors that are known exactly, and 7 that are known wrongly.
+        brightness: also compare with the radiance of the scenes times these factors, separated by
+            commas, such as 0.25,0.05.
+        consistency: networks that are given the sensor agree with the image at low frequencies.
+        exposure: shipped networks restore dark parts at a higher exposure.
+        strict: refuse pairs whose pixels contradict the sensor, instead of a warning.
+        detector: ONNX detector as Ultralytics exports it, to be shown the labelled images.
+        labels: folder of labels (VOC, YOLO) or COCO's .json of the images; next to them if none.
+        split: use only the pictures that a list in the folder names, such as test.
+        side: side of the detector's input in pixels, if its file leaves it open.
+        classes: labelled classes by the detector's names: car=vehicle,minibus=vehicle.
+        seed: seed of every random draw.
+        progress: a function that is called at each step, False for silence, None for a bar or lines
+            on standard error.
+
+    Returns:
+        A table of means, sites and images; or of what the detector found.
+
+    Raises:
+        OptionError: no such method, or options that do not go together.
+        ImageError: images, pairs or labels that cannot be read.
+        ProfileError: no such sensor.
+
+    Examples:
+        >>> pair = bd.simulate(size=96)
+        >>> methods = {"mine": lambda image: image, "convbeers-xs": "convbeers-xs"}
+        >>> table = bd.evaluate(methods=methods, pairs=[pair])
+        >>> [row.name for row in table.rows][:3]
+        ['degraded', 'mine', 'convbeers-xs']
+    """
+    from beers_deploy.model.raster.images import list_images
+
+    folder = None if out is None else Path(out)
+    if detector is not None:
+        unused = {
+            "pairs": pairs is not None,
+            "lpips": lpips is not None,
+            "sweep": sweep,
+            "brightness": brightness != "1",
+            "consistency": not consistency,
+            "exposure": not exposure,
+            "strict": strict,
+        }
+        refuse_with("`detector`", **unused)
+        return _detection(
+            methods,
+            images,
+            sensor,
+            reference,
+            Path(detector),
+            labels,
+            split,
+            side,
+            classes,
+            seed,
+            folder,
+        )
+    refuse_without(
+        "`detector`",
+        labels=labels is not None,
+        split=split is not None,
+        side=side is not None,
+        classes=classes is not None,
+    )
+    if pairs is not None:
+        refuse_with("`pairs`", images=images is not None, sweep=sweep, brightness=brightness != "1")
+    if images is not None:
+        # An empty folder is refused before torch is loaded.
+        list_images(Path(images))
+    from beers_deploy.restoration.steps import Around
+    from beers_deploy.studies.evaluation.pairs import check_brightness
+    from beers_deploy.studies.evaluation.run import Plan, run_evaluation
+
+    stored, in_memory = _stored_or_given(pairs)
+    plan = Plan(
+        methods=named_methods(methods),
+        sensors=_sensors(sensor, reference, stored, in_memory),
+        scenes=None if images is None else Path(images),
+        folder=stored,
+        given=in_memory,
+        lpips=None if lpips is None else Path(lpips),
+        factors=check_brightness(factors_of(brightness)),
+        sweep=sweep,
+        strict=strict,
+        around=Around(consistency, exposure),
+        seed=seed,
+    )
+    table = run_evaluation(plan)
+    if folder is not None:
+        logger.info("wrote %s", table.report(folder))
+    return table
+
+
+def named_methods(methods: Methods) -> dict[str, Any]:
+    """Return what restores by the name of its row, the degraded input first."""
+    if isinstance(methods, Mapping):
+        return {"degraded": "degraded", **methods}
+    names = methods.split(",") if isinstance(methods, str) else methods
+    # A method that is named twice is measured once, in the order that is given.
+    return {name.strip(): name.strip() for name in ("degraded", *names)}
+
+
+def factors_of(brightness: Factors) -> tuple[float, ...]:
+    """Return factors of radiance, of text with commas or of numbers."""
+    parts = brightness.split(",") if isinstance(brightness, str) else brightness
+    try:
+        return tuple(float(factor) for factor in parts)
+    except ValueError as error:
+        raise OptionError(
+            f"`brightness` must be numbers separated by commas, such as 0.25,0.05, got "
+            f"{brightness!r}."
+        ) from error
+
+
+def _stored_or_given(pairs: "Pairs | None") -> "tuple[Path | None, Sequence[Pair] | None]":
+    """Return the folder of stored pairs, and pairs in memory: one of them is None, or both."""
+    if pairs is None:
+        return None, None
+    if isinstance(pairs, str | os.PathLike):
+        return Path(pairs), None
+    return None, list(pairs)
+
+
+def _sensors(
+    sensor: SensorLike | None,
+    reference: SensorLike | None,
+    stored: Path | None,
+    given: "Sequence[Pair] | None",
+) -> "tuple[Sensor, Sensor]":
+    """Return the sensors of the degraded and of the reference images."""
+    from beers_deploy.model.dataset import profiles_for, read_pairs_recipe
+
+    if given and sensor is None:
+        # Simulated pairs know the sensors that made them.
+        sensor, reference = given[0].profiles
+    return profiles_for(sensor, reference, read_pairs_recipe(stored) if stored else None)
+
+
+def _detection(
+    methods: Methods,
+    images: InputPath | None,
+    sensor: SensorLike | None,
+    reference: SensorLike | None,
+    detector: Path,
+    labels: InputPath | None,
+    split: str | None,
+    side_px: int | None,
+    classes: str | None,
+    seed: int,
+    out: Path | None,
+) -> "Table":
+    """Return what a detector finds in labelled images, degraded and restored."""
+    from beers_deploy.profiles.sensor import Sensor
+    from beers_deploy.studies.detection.detector import open_detector, parse_classes
+    from beers_deploy.studies.detection.study import labelled_scenes, run_study
+    from beers_deploy.studies.detection.table import detection_table
+
+    if images is None:
+        raise OptionError("`detector` needs `images`. Give the folder of labelled images.")
+    if isinstance(methods, Mapping):
+        raise OptionError("`methods` must be names with `detector`, but it is a mapping.")
+    named = [sensor or SENSOR]
+    if isinstance(sensor, str):
+        named = [name.strip() for name in sensor.split(",")]
+    network = open_detector(detector, size_px=side_px)
+    scenes, notes = labelled_scenes(
+        network.names,
+        {} if classes is None else parse_classes(classes),
+        Path(images),
+        None if labels is None else Path(labels),
+        split,
+    )
+    compared = run_study(
+        network,
+        scenes,
+        [Sensor.load(each) for each in dict.fromkeys(named)],
+        list(named_methods(methods)),
+        reference=reference,
+        seed=seed,
+    )
+    return detection_table(compared, detector, network, scenes, notes, out)

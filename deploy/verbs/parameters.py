@@ -1,0 +1,210 @@
+"""Types of the verbs' parameters.
+
+A type checker sees all that Python accepts. At run time each is what the command line reads: text
+or a path, with the names that it completes. So `--help` needs no network, array or sensor loaded.
+"""
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+
+from annotated_types import Interval
+
+from beers_deploy.model.processor import SEEDS
+
+
+@dataclass(frozen=True)
+class Completed:
+    """Names that a shell completes.
+
+    Attributes:
+        names: returns them.
+        listed: whether the help lists them.
+    """
+
+    names: Callable[[], Sequence[str]]
+    listed: bool = False
+
+
+@dataclass(frozen=True)
+class Written:
+    """Marks a parameter that names an output.
+
+    Attributes:
+        folder: whether it is a folder.
+        required: whether the command line must have it, where Python may do without a file.
+        verdict: whether an older file is deleted first: it must not pass for the verdict of a run
+            that is refused.
+    """
+
+    folder: bool = False
+    required: bool = False
+    verdict: bool = False
+
+
+class Holds:
+    """Marks an output folder with what a verb writes into it.
+
+    Attributes:
+        files: names of files.
+        folders: names of folders that are filled with images, "" for the folder itself.
+    """
+
+    def __init__(self, *files: str, folders: Sequence[str] = ()) -> None:
+        self.files = files
+        self.folders = folders
+
+
+@dataclass(frozen=True)
+class RequiredUnless:
+    """Marks a parameter that the command line must have, unless it has another one.
+
+    Attributes:
+        other: the name of that one.
+    """
+
+    other: str
+
+
+class Labelled:
+    """Marks a folder that is read with the labels in it, at any depth."""
+
+
+class PythonOnly:
+    """Marks a parameter that no command has."""
+
+
+def network_names() -> list[str]:
+    """Return the names of the shipped networks, in float32 and in INT8."""
+    from beers_deploy.model.shipped import INT8, shipped_names
+
+    names: list[str] = []
+    for name in shipped_names():
+        names += [name, f"{name}{INT8}"]
+    return names
+
+
+def sensor_names() -> list[str]:
+    """Return the names of the shipped sensors."""
+    from beers_deploy.profiles.sensor_file import sensor_names as shipped
+
+    return list(shipped())
+
+
+@lru_cache(maxsize=1)
+def target_names() -> list[str]:
+    """Return the names of the boards and NPUs."""
+    from beers_deploy.profiles.target import board_names, npu_names
+
+    return [*board_names(), *npu_names()]
+
+
+def profile_names() -> list[str]:
+    """Return the names of all shipped profiles."""
+    from beers_deploy.profiles.scene_call import scene_names
+
+    return [*sensor_names(), *scene_names(), *target_names()]
+
+
+Seed = Annotated[int, Interval(ge=0, le=SEEDS)]
+
+if TYPE_CHECKING:
+    from beers_deploy.dpu.board import BoardLike
+    from beers_deploy.model.progress import Progress
+    from beers_deploy.network import NetworkLike, SensorLike
+    from beers_deploy.pairs import Pair
+    from beers_deploy.profiles.sensor import Sensor
+    from beers_deploy.quant.limits import Limits
+    from beers_deploy.restoration.method import Restore
+
+    InputPath: TypeAlias = str | os.PathLike[str]
+    InputPaths: TypeAlias = InputPath | Sequence[InputPath]
+    LabelledFolder: TypeAlias = str | os.PathLike[str]
+    OutputFile: TypeAlias = str | os.PathLike[str]
+    OutputFolder: TypeAlias = str | os.PathLike[str]
+    RequiredFile: TypeAlias = str | os.PathLike[str]
+    VerdictFile: TypeAlias = str | os.PathLike[str]
+    VerdictFolder: TypeAlias = str | os.PathLike[str]
+    ShippedOrFile: TypeAlias = str | os.PathLike[str]
+    LimitsLike: TypeAlias = Limits | Mapping[str, float] | str | os.PathLike[str]
+    ProfileName: TypeAlias = str
+    TargetLike: TypeAlias = BoardLike
+    Targets: TypeAlias = BoardLike | Sequence[BoardLike]
+    Networks: TypeAlias = NetworkLike | Sequence[NetworkLike]
+    BandSensors: TypeAlias = SensorLike | Mapping[str, Sensor]
+    Samples: TypeAlias = Any
+    Image: TypeAlias = Any
+    Images: TypeAlias = Any
+    Pairs: TypeAlias = Sequence[Pair] | str | os.PathLike[str]
+    Methods: TypeAlias = str | Sequence[str] | Mapping[str, NetworkLike | Restore]
+    Halo: TypeAlias = int | str
+    Tiles: TypeAlias = int | str | Sequence[int]
+    Size: TypeAlias = str | tuple[int, int]
+    Steps: TypeAlias = int | str
+    Names: TypeAlias = str | Sequence[str]
+    Edges: TypeAlias = str | Sequence[str]
+    Effects: TypeAlias = Sequence[str]
+    Factors: TypeAlias = str | Sequence[float]
+    Mtf: TypeAlias = str | tuple[float, float]
+else:
+    InputPath = LimitsLike = Samples = Image = Pairs = Path
+    OutputFile = Annotated[Path, Written()]
+    InputPaths = Images = Sequence[Path]
+    LabelledFolder = Annotated[Path, Labelled()]
+    Edges = Effects = Sequence[str]
+    RequiredFile = Annotated[Path, Written(required=True)]
+    OutputFolder = Annotated[Path, Written(folder=True)]
+    VerdictFile = Annotated[Path, Written(verdict=True)]
+    VerdictFolder = Annotated[Path, Written(folder=True, verdict=True)]
+    NetworkLike = Networks = ShippedOrFile = Annotated[str, Completed(network_names)]
+    SensorLike = BandSensors = Annotated[str, Completed(sensor_names)]
+    ProfileName = Annotated[str, Completed(profile_names)]
+    TargetLike = Targets = Annotated[str, Completed(target_names, listed=True)]
+    Progress = Annotated[object, PythonOnly()]
+    Halo = Tiles = Size = Steps = Names = Factors = Methods = Mtf = str
+
+__all__ = [
+    "BandSensors",
+    "Completed",
+    "Edges",
+    "Effects",
+    "Factors",
+    "Halo",
+    "Holds",
+    "Image",
+    "Images",
+    "InputPath",
+    "InputPaths",
+    "Interval",
+    "Labelled",
+    "LabelledFolder",
+    "LimitsLike",
+    "Methods",
+    "Mtf",
+    "Names",
+    "NetworkLike",
+    "Networks",
+    "OutputFile",
+    "OutputFolder",
+    "Pairs",
+    "ProfileName",
+    "Progress",
+    "PythonOnly",
+    "RequiredFile",
+    "RequiredUnless",
+    "Samples",
+    "Seed",
+    "SensorLike",
+    "ShippedOrFile",
+    "Size",
+    "Steps",
+    "TargetLike",
+    "Targets",
+    "Tiles",
+    "VerdictFile",
+    "VerdictFolder",
+    "Written",
+]

@@ -1,0 +1,34 @@
+"""`profiles`: the shipped sensors, scenes and boards."""
+
+from typing import TYPE_CHECKING
+
+from beers_deploy.verbs.parameters import ProfileName
+from beers_deploy.verbs.verb import refuse_without, verb
+
+if TYPE_CHECKING:
+    from beers_deploy.results import Table
+
+
+@verb
+def profiles(name: ProfileName | None = None, *, toml: bool = False) -> "Table | str":
+    """List sensors, scenes and boards, or show one: every constant, its status and its source.
+
+    The keys of a sensor's file, with units and ranges: docs/reference/sensor-profile.md.
+
+    Args:
+        name: a shipped profile, or a .toml file; all are listed if none.
+        toml: print the file itself, to start your own from.
+
+    Returns:
+        A table; with `toml` the text of the file.
+
+    Raises:
+        OptionError: no such profile.
+        ProfileError: a file that is no profile.
+    """
+    from beers_deploy.profile_tables import list_of_profiles, table_of_profile, text_of_profile
+
+    if name is None:
+        refuse_without("`name`", toml=toml)
+        return list_of_profiles()
+    return text_of_profile(name) if toml else table_of_profile(name)

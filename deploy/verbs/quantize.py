@@ -1,0 +1,228 @@
+"""`quantize`: a float network to static INT8 under the rules of a DPU."""
+
+import logging
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.profiles.errors import OptionError, optional, printable
+from beers_deploy.profiles.target import DEFAULT_TARGET
+from beers_deploy.verbs.parameters import (
+    Holds,
+    InputPath,
+    Interval,
+    NetworkLike,
+    OutputFile,
+    OutputFolder,
+    Progress,
+    RequiredFile,
+    Samples,
+    Seed,
+    SensorLike,
+    Steps,
+    TargetLike,
+)
+from beers_deploy.verbs.verb import refuse_with, refuse_without, verb
+
+if TYPE_CHECKING:
+    from beers_deploy.network import Network
+    from beers_deploy.profiles.figures import Row
+    from beers_deploy.quantization import Data
+    from beers_deploy.results import Table
+
+logger = logging.getLogger(__name__)
+
+PAGES = ("report.html", "report.json")
+"""What --report writes into its folder."""
+
+PATCHES = 64
+PATCH_PX = 128
+
+
+@verb
+def quantize(
+    network: NetworkLike,
+    *,
+    out: RequiredFile | None = None,
+    target: TargetLike = DEFAULT_TARGET,
+    sensor: SensorLike = SENSOR,
+    samples: Samples | None = None,
+    images: InputPath | None = None,
+    patches: Annotated[int, Interval(ge=1, le=100_000)] = PATCHES,
+    patch: Annotated[int, Interval(ge=32, le=2048)] = PATCH_PX,
+    finetune: Steps = 0,
+    seed: Seed = 0,
+    board_file: OutputFile | None = None,
+    tile: Annotated[int, Interval(ge=16, le=8192)] | None = None,
+    report: Annotated[OutputFolder, Holds(*PAGES)] | None = None,
+    progress: Progress = None,
+) -> "Network":
+    """Quantise a network to int8 with power-of-two scales.
+
+    The DPU computes the correction, and the host adds it to the image. Any network that a DPU
+    computes is accepted: see docs/reference/any-network.md, or ask 'check'. The table has each
+    integer layer: bits of its accumulator, measured and proven, and the share of saturated results.
+
+    Args:
+        network: float ONNX or weights, or a shipped name. Weights of 'train --conditioned' are
+            calibrated over the whole family of sensors.
+        out: INT8 ONNX file to write, for any onnxruntime.
+        target: board or NPU whose rules count: a name, or a .toml file.
+        sensor: sensor of the simulated patches, and of a network that is conditioned on one.
+        samples: your own samples in place of simulated patches: .npy or .npz (N, C, H, W), or a
+            folder; in Python also arrays (N, C, H, W) in [0, 1], two of them (images, references),
+            or an iterable of these such as a DataLoader.
+        images: folder of scenes for the simulated patches; drawn scenes if none.
+        patches: number of simulated patches.
+        patch: side of a simulated patch in pixels.
+        finetune: number of steps that train the integers on the patches; 'auto' trains for minutes,
+            while it helps.
+        seed: seed of the patches.
+        board_file: also write the core in the board's encoding: QDQ ONNX, of an NPU VINT8.
+        tile: side of the tile in pixels that `board_file` is fixed to; an NPU needs one.
+        report: folder for report.html and report.json: which layers and patches err most.
+        progress: a function that is called at each step, False for silence, None for a bar or lines
+            on standard error.
+
+    Returns:
+        The INT8 network. Its `origin` is the float one, its `table` has the integer layers.
+
+    Raises:
+        ModelError: an operation that the DPU does not compute, or weights of no sensible size.
+        OptionError: options that do not go together, a target without DPU or NPU, or samples that
+            the network needs.
+        ImageError: samples that the network does not accept.
+        ProfileError: no such board or sensor.
+
+    Examples:
+        >>> import torch
+        >>> network = torch.nn.Conv2d(1, 1, 3, padding=1)
+        >>> samples = np.random.default_rng(0).random((8, 1, 32, 32), np.float32)
+        >>> network = bd.Network.load(network, example=(1, 1, 32, 32))
+        >>> bd.quantize(network, samples=samples, target="zcu102").precision
+        'int8'
+    """
+    from beers_deploy.board_file import require_core_file, save_core
+    from beers_deploy.profiles.sensor import Sensor
+    from beers_deploy.profiles.target import TargetProfile
+    from beers_deploy.quant.encodings import read_core
+    from beers_deploy.quant.onnx_file import require_onnx_name
+    from beers_deploy.quantization import Data, quantised
+
+    if board_file is None:
+        refuse_without("`board_file`", tile=tile is not None)
+    if samples is not None:
+        refuse_with(
+            "`samples`",
+            images=images is not None,
+            patches=patches != PATCHES,
+            patch=patch != PATCH_PX,
+            seed=seed != 0,
+        )
+    board = TargetProfile.load(target)
+    files = [None if path is None else Path(path) for path in (out, board_file)]
+    inputs = [Path(each) for each in (network, samples) if isinstance(each, str | os.PathLike)]
+    pages = _report_files(report, network)
+    require_onnx_name(*files)
+    require_core_file(board, files[1], tile, inputs)
+    data = Data(
+        Sensor.load(sensor), samples, None if images is None else Path(images), patches, patch, seed
+    )
+    result = quantised(network, data, board, finetune)
+    # Both are made before the first is written: a core that is refused leaves no file.
+    core = result.core(board, tile) if files[1] else None
+    if files[0] is not None:
+        result.save(files[0])
+        count = len(read_core(result.model).ops)
+        logger.info("wrote %s: %d integer operations", files[0], count)
+    if core is not None and files[1] is not None:
+        save_core(core, files[1], board)
+    rows = list(result.layers)
+    if pages:
+        rows = [*_write_report(result, data, pages[0]), *rows]
+    table = _table(result, data, rows, files[0])
+    if pages:
+        table.save(pages[1])
+    return replace(result, table=table)
+
+
+def _table(network: "Network", data: "Data", rows: "list[Row]", out: Path | None) -> "Table":
+    """Return what is reported of a quantised network."""
+    from beers_deploy.quant.onnx_file import metadata
+    from beers_deploy.quant.sample_range import recorded_range
+    from beers_deploy.quantization import losses_of
+    from beers_deploy.results import Table
+
+    covered = recorded_range(metadata(network.model))
+    notes = [] if covered is None else [f"calibration: {covered}"]
+    if network.quantised:
+        notes.append(losses_of(network, data))
+    origin = [network.origin.input] if network.origin else []
+    return Table(
+        command="quantize",
+        arguments={
+            "network": network.origin.name if network.origin else "",
+            "sensor": data.sensor.name,
+            "images": data.images,
+            "patches": data.patches,
+            "patch": data.patch_px,
+            "seed": data.seed,
+        },
+        title=f"{network.name}: each integer layer",
+        inputs=(*origin, *([] if out is None else [out]), *data.inputs),
+        rows=tuple(rows),
+        notes=tuple(notes),
+        headings=HEADINGS,
+        details=DETAILS,
+    )
+
+
+HEADINGS = {
+    "integer layers": "integer layers",
+    "rounding": "tie rounding",
+    "gate": "float against INT8, on patches that calibration did not see",
+}
+DETAILS = frozenset(
+    {
+        "as onnxruntime",
+        "at most by",
+        "error sizes",
+        "layers",
+        "moved by half up",
+        "rounding",
+        "ties",
+        "worst patches",
+        "worst samples",
+    }
+)
+"""Tables and figures for a closer look."""
+
+
+def _write_report(network: "Network", data: "Data", page: Path) -> "list[Row]":
+    """Write the page of --report, and return its rows."""
+    from beers_deploy.quantization import sensitivity_report
+    from beers_deploy.report.page import write_report
+
+    rows, report = sensitivity_report(network, data, network.layers)
+    write_report(report, page)
+    logger.info("wrote %s: %s", page, report.headline)
+    return rows
+
+
+def _report_files(folder: OutputFolder | None, network: Any) -> list[Path]:
+    """Return the page and the figures of --report, which matplotlib draws."""
+    from beers_deploy.network_files import conditioned
+
+    if folder is None:
+        return []
+    named = isinstance(network, str | os.PathLike)
+    if named and conditioned(Path(network)):
+        raise OptionError(
+            f"`report` cannot be combined with {printable(str(network))}, because the network is "
+            "calibrated over a family of sensors. Leave `report` out."
+        )
+    # A missing package is refused before the network is calibrated.
+    optional("matplotlib", "report")
+    return [Path(folder) / name for name in PAGES]

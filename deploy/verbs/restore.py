@@ -1,0 +1,274 @@
+"""`restore`: a raw image in, the restored one out, of any size."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from beers_deploy.model.raster.compression import Compression
+from beers_deploy.profiles.errors import OptionError, optional
+from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX
+from beers_deploy.verbs.parameters import (
+    BandSensors,
+    Halo,
+    Image,
+    Interval,
+    NetworkLike,
+    OutputFile,
+    Progress,
+    PythonOnly,
+)
+from beers_deploy.verbs.verb import refuse_with, refuse_without, verb
+
+if TYPE_CHECKING:
+    from beers_deploy.restoration.output import Output
+    from beers_deploy.restoration.prepare import Pipeline
+    from beers_deploy.restoration.reading import Reading
+    from beers_deploy.results import Table
+
+
+@verb
+def restore(
+    image: Image,
+    out: OutputFile | None = None,
+    *,
+    network: NetworkLike | None = None,
+    method: Literal["network", "traditional"] = "network",
+    quality: Literal["fast", "standard", "best"] = "standard",
+    sensor: BandSensors = "blind",
+    tile: Annotated[int, Interval(ge=16)] = TILE_PX,
+    halo: Halo = "exact",
+    full_scale: float | None = None,
+    nodata: Annotated[float, PythonOnly()] | None = None,
+    runtime: Literal["onnxruntime", "openvino"] = "onnxruntime",
+    threads: Annotated[int, Interval(ge=0)] = 0,
+    compression: Compression = "zlib",
+    memory: Annotated[float, Interval(ge=0)] | None = None,
+    scheduler: str | None = None,
+    cog: bool = False,
+    stac: OutputFile | None = None,
+    strict: bool = False,
+    consistency: bool = True,
+    exposure: bool = True,
+    fix_detectors: str | None = None,
+    force: bool = False,
+    overwrite: bool = False,
+    resume: bool = False,
+    dry_run: bool = False,
+    progress: Progress = None,
+) -> Any:
+    """Restore an image of raw digital numbers tile by tile, as if it were restored whole.
+
+    A file is read and written by rows, so memory does not grow with its height. OUT has the pixel
+    type and the scale of IMAGE, and keeps its georeference, RPCs, missing pixels and alpha. Bands
+    are restored one by one. Noise, edges and detectors of the image are checked, and a warning says
+    what contradicts the sensor.
+
+    Args:
+        image: image file of any size: TIFF, or what GDAL reads. In Python also an array (H, W) or
+            (bands, H, W) of NumPy, torch, Dask or xarray, or a dataset of rasterio.
+        out: TIFF to write.
+        network: ONNX network, or a shipped name, in float32 (NAME) or INT8 (NAME-int8);
+            convbeers-s-int8 if none.
+        method: a network, or the traditional pipeline, which takes about a minute for a megapixel
+            and cannot be resumed.
+        quality: quality of the traditional pipeline.
+        sensor: sensor that acquired the image, a name or a .toml file: shipped networks and the
+            consistency step use it. B0=a.toml,B1=b.toml names one for each band; blind for an
+            unknown sensor.
+        tile: longest side of a tile in pixels.
+        halo: context around each tile in pixels, or 'exact' (no seams).
+        full_scale: pixel value that is full scale; else what the image states, the bits of the
+            sensor, or 12 bits. 8-bit and 0..1 pixels need it.
+        nodata: value of missing pixels of an array; a file states its own.
+        runtime: library that runs the network; openvino is 1.0 to 1.9 times as fast.
+        threads: threads of the runtime; 0 uses all cores, or one for each thread of a scheduler's
+            workers.
+        compression: lossless compression of the output.
+        memory: budget of this process in GB; what is free if none.
+        scheduler: address of a Dask scheduler whose workers run the network, such as
+            tcp://host:8786.
+        cog: write a Cloud-Optimised GeoTIFF: tiles, overviews and what was done.
+        stac: STAC item of the output to write; needs `cog`.
+        strict: refuse an image whose pixels contradict the sensor, instead of a warning.
+        consistency: make the result agree with the image at low spatial frequencies, if the sensor
+            is named.
+        exposure: restore dark parts at a higher exposure (shipped networks).
+        fix_detectors: interpolate faulty pixels before the restoration: 'found' searches for them
+            and writes the list next to the output; or a list, lines of column,row with * as the
+            row for a whole column.
+        force: accept an image that was restored before, follow an index out of its folder, and
+            write any result.
+        overwrite: replace the output if it exists.
+        resume: continue a run that was stopped or killed.
+        dry_run: print facts of the image, the plan of tiles and the time it would take, and write
+            no image.
+        progress: a function that is called at each step, False for silence, None for a bar or lines
+            on standard error.
+
+    Returns:
+        Of an array the restored one, of the same kind, type and scale. Of a file a table of the
+        run, with the `path` and the `time_s`.
+
+    Raises:
+        ImageError: no such image, an unknown full scale, or pixels outside 0 to full scale.
+        ModelError: a network that cannot be tiled or run.
+        OptionError: options that do not go together, or an output that exists.
+        ProfileError: no such sensor.
+        MachineError: a missing package, memory, or a disk that cannot be written.
+
+    Examples:
+        >>> pair = bd.simulate(size=96)
+        >>> restored = bd.restore(pair.degraded, network="convbeers-xs", sensor=pair.profiles[0])
+        >>> bool(pair.psnr(restored) > pair.psnr(pair.degraded))
+        True
+    """
+    from beers_deploy.model.raster.reader import require_image_file
+    from beers_deploy.restoration.arrays import Job, restore_array
+    from beers_deploy.restoration.bands import is_unknown, networks_of, sensors_of
+    from beers_deploy.restoration.plan import Tiles
+    from beers_deploy.restoration.prepare import NetworkPipeline
+    from beers_deploy.restoration.reading import Reading
+    from beers_deploy.restoration.run import restore_file
+    from beers_deploy.restoration.runtime import Engine
+    from beers_deploy.restoration.stac import write_item
+    from beers_deploy.restoration.steps import Around
+
+    if method == "traditional":
+        refuse_with(
+            "`method` traditional",
+            network=network is not None,
+            tile=tile != TILE_PX,
+            halo=halo != "exact",
+            resume=resume,
+            runtime=runtime != "onnxruntime",
+            threads=threads != 0,
+            scheduler=scheduler is not None,
+            consistency=not consistency,
+            exposure=not exposure,
+            dry_run=dry_run,
+        )
+    else:
+        refuse_without("`method` traditional", quality=quality != "standard")
+    path = _file_of(image)
+    if path is None:
+        refuse_with(
+            "an array",
+            out=out is not None,
+            compression=compression != "zlib",
+            cog=cog,
+            stac=stac is not None,
+            resume=resume,
+            overwrite=overwrite,
+            dry_run=dry_run,
+            fix_detectors=fix_detectors is not None,
+            scheduler=scheduler is not None,
+        )
+    else:
+        refuse_with("an image file, which states its own", nodata=nodata is not None)
+        refuse_without("`cog`", stac=stac is not None and not cog)
+        require_image_file(path)
+    output = None
+    if path is not None and not dry_run:
+        how = {"compression": compression, "cog": cog, "resume": resume}
+        output = _output(out, stac, overwrite or resume, fix_detectors or "", **how)
+    sensors = sensors_of(sensor)
+    unknown = is_unknown(sensors)
+    reading = Reading(
+        sensors={} if unknown else sensors,
+        full_scale=full_scale,
+        strict=strict,
+        force=force,
+        # A budget of 0 bytes would count as none.
+        memory_bytes=None if memory is None else max(int(memory * 1e9), 1),
+        fix_detectors=fix_detectors or "",
+    )
+    pipeline: Pipeline
+    if method == "traditional":
+        pipeline = _traditional(quality, unknown)
+    else:
+        pipeline = NetworkPipeline(
+            networks_of(network, sensors, full_scale),
+            Tiles(tile, str(halo)),
+            Engine(runtime, threads, scheduler),
+            Around(consistency, exposure),
+        )
+    if path is None:
+        return restore_array(image, Job(pipeline, reading, nodata))
+    if output is None:
+        return _preview(path, pipeline, reading)
+    run = restore_file(path, output, pipeline, reading)
+    if stac is not None:
+        write_item(output.path, Path(stac))
+    return run
+
+
+def _file_of(image: Any) -> Path | None:
+    """Return the path of an image, or None of an array."""
+    if isinstance(image, str | os.PathLike):
+        return Path(image)
+    # A dataset of rasterio has a coordinate system and the name of its file. A DataArray may have
+    # the attribute `crs` too, but it has no method `read`.
+    return Path(image.name) if hasattr(image, "crs") and hasattr(image, "read") else None
+
+
+def _require_sensor(unknown: bool) -> None:
+    if unknown:
+        raise OptionError(
+            "`method` traditional needs `sensor`, the sensor that acquired the image. Name a "
+            "profile ('beers-deploy profiles' lists them), or give your .toml file."
+        )
+
+
+def _traditional(quality: str, unknown: bool) -> "Pipeline":
+    """Return the traditional pipeline; raise OptionError if the sensor is unknown."""
+    if unknown:
+        raise OptionError(
+            "`method` traditional needs `sensor`, the sensor that acquired the image. Name a "
+            "profile ('beers-deploy profiles' lists them), or give your .toml file."
+        )
+    # It loads torch, which is optional.
+    from beers_deploy.restoration.traditional import TraditionalPipeline
+
+    return TraditionalPipeline(quality)
+
+
+def _output(
+    out: OutputFile | None,
+    stac: OutputFile | None,
+    may_exist: bool,
+    fix_detectors: str,
+    **how: Any,
+) -> "Output":
+    """Return what is written; raise OptionError if it is not named, or if it exists."""
+    from beers_deploy.restoration.detectors.fault_list import list_beside
+    from beers_deploy.restoration.output import Output
+
+    if out is None:
+        raise OptionError(
+            "`out` is missing. Name the TIFF to write, or add `dry_run` to see the plan only."
+        )
+    path = Path(out)
+    if path.exists() and not may_exist:
+        raise OptionError(
+            f"{path} exists already. Add `overwrite` to replace it, or choose another name."
+        )
+    if stac is not None:
+        optional("pystac", "stac")
+    # The list of faults is an output of its own where they are searched for.
+    listed = list_beside(path, fix_detectors)
+    return Output(path, others=(None if stac is None else Path(stac), listed), **how)
+
+
+def _preview(image: Path, pipeline: "Pipeline", reading: "Reading") -> "Table":
+    """Return what an image is, how it would be cut and how long that would take."""
+    from beers_deploy.dry_run import preview_row
+    from beers_deploy.profiles.target import load_target
+    from beers_deploy.restoration.prepare import NetworkPipeline
+    from beers_deploy.results import Table
+
+    # The traditional pipeline has no plan of tiles, and is refused before.
+    assert isinstance(pipeline, NetworkPipeline)  # noqa: S101
+    row = preview_row(image, pipeline, reading, load_target(DEFAULT_TARGET))
+    # The image has no digest here, because the whole file would be read for it.
+    networks = tuple(network.input for network in pipeline.networks.values())
+    return Table(title=str(image), inputs=networks, rows=(row,), headings={"restore": ""})

@@ -1,0 +1,163 @@
+"""`stress`: hard cases and bit flips against a network."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.profiles.target import DEFAULT_TARGET
+from beers_deploy.verbs.parameters import (
+    InputPath,
+    Interval,
+    Names,
+    NetworkLike,
+    OutputFile,
+    Progress,
+    Seed,
+    SensorLike,
+    TargetLike,
+)
+from beers_deploy.verbs.verb import refuse_with, refuse_without, verb
+
+if TYPE_CHECKING:
+    from beers_deploy.results import Table
+    from beers_deploy.studies.stress.networks import Subject
+
+DRAWS = 6
+
+
+@verb
+def stress(
+    float_network: NetworkLike | None = None,
+    int8_network: NetworkLike | None = None,
+    *,
+    cases: Names | None = None,
+    stages: Names | None = None,
+    side: Annotated[int, Interval(ge=16, le=4096)] = 96,
+    bit_flips: bool = False,
+    draws: Annotated[int, Interval(ge=1, le=10_000)] = DRAWS,
+    sensor: SensorLike = SENSOR,
+    images: InputPath | None = None,
+    target: TargetLike = DEFAULT_TARGET,
+    seed: Seed = 0,
+    out: OutputFile | None = None,
+    progress: Progress = None,
+) -> "Table":
+    """Run hard cases through a network in float32, in INT8, in integers alone and in tiles.
+
+    The tables show what holds, the worst measurements, the known limitations that were met, and
+    which sums are proven not to overflow. The command exits with 1 if something fails. `bit_flips`
+    shows what flipped bits in weights, shifts, feature maps and the image cost, and what guards
+    gain and cost on the board.
+
+    Args:
+        float_network: float ONNX or weights. The name of a shipped pair stands for both.
+        int8_network: its INT8 ONNX; that of the shipped pair if none.
+        cases: only these cases, separated by commas, such as night,snow.
+        stages: only these stages, separated by commas, such as float32,INT8.
+        side: side of the images in pixels, if a case has none of its own.
+        bit_flips: inject bit flips into the INT8 network instead of running hard cases.
+        draws: number of injections into each memory at each rate.
+        sensor: sensor of a shipped network, and of the patches for bit flips: a name, or a .toml
+            file.
+        images: folder of aerial images for the patches for bit flips; drawn scenes if none.
+        target: board whose cost model predicts the cost of the guards: a name, or a .toml file.
+        seed: seed of every random draw.
+        out: tables as Markdown; with `bit_flips` the curves are written next to it as SVG.
+        progress: a function that is called at each step, False for silence, None for a bar or lines
+            on standard error.
+
+    Returns:
+        A table of the cases. It is true if nothing failed.
+
+    Raises:
+        ModelError: a network that cannot be tiled, or a float and an INT8 network that are swapped.
+        OptionError: no such case or stage, or options that do not go together.
+    """
+    if bit_flips:
+        refuse_with("`bit_flips`", cases=cases is not None, stages=stages is not None)
+    else:
+        refuse_without(
+            "`bit_flips`",
+            draws=draws != DRAWS,
+            images=images is not None,
+            target=target != DEFAULT_TARGET,
+        )
+    # These load torch.
+    from beers_deploy.model.io.files import require_writable, write_text
+    from beers_deploy.studies.stress.battery import chosen, markdown
+    from beers_deploy.studies.stress.cases import CASES
+    from beers_deploy.studies.stress.networks import STAGES, open_subject
+
+    file = None if out is None else Path(out)
+    picture = file.with_name(f"{file.stem}.svg") if file and bit_flips else None
+    # The curves are an output whose name is derived from that of the tables.
+    given = [float_network, int8_network, images]
+    inputs = [Path(each) for each in given if isinstance(each, str | os.PathLike)]
+    require_writable(file, picture, inputs=inputs)
+    names = chosen(cases, [case.name for case in CASES], "cases")
+    stage_names = chosen(stages, STAGES, "stages")
+    subject = open_subject(float_network, int8_network, sensor)
+    if bit_flips:
+        scenes = None if images is None else Path(images)
+        table = _bit_flips(subject, sensor, scenes, draws, side, seed, target, picture)
+    else:
+        table = _battery(subject, names, stage_names, side, seed)
+    if file is not None:
+        shown = [row for row in table.rows if row.table not in table.details]
+        write_text(file, markdown(shown))
+    return table
+
+
+def _battery(
+    subject: "Subject", names: list[str], stages: list[str], side_px: int, seed: int
+) -> "Table":
+    """Run hard cases."""
+    from beers_deploy.results import Table
+    from beers_deploy.studies.stress.battery import (
+        TITLES,
+        battery_checks,
+        finding_rows,
+        run_battery,
+        shown_rows,
+        skipped,
+    )
+    from beers_deploy.studies.stress.cases import CASES
+
+    cases = [case for case in CASES if case.name in names]
+    results = run_battery(subject, cases, stages, seed, side_px)
+    return Table(
+        inputs=tuple(network.input for network in subject.opened),
+        rows=(*shown_rows(subject, results), *finding_rows(results)),
+        checks=tuple(battery_checks(subject, results)),
+        notes=tuple(skipped(results)),
+        headings=TITLES,
+        details=frozenset({"findings"}),
+    )
+
+
+def _bit_flips(
+    subject: "Subject",
+    sensor: SensorLike,
+    images: Path | None,
+    draws: int,
+    side_px: int,
+    seed: int,
+    target: TargetLike,
+    picture: Path | None,
+) -> "Table":
+    """Inject bit flips, and draw the curves."""
+    from beers_deploy.model.io.files import write_text
+    from beers_deploy.profiles.sensor import Sensor
+    from beers_deploy.profiles.target import TargetProfile
+    from beers_deploy.quant.calibration import Calibration
+    from beers_deploy.results import Table
+    from beers_deploy.studies.stress.battery import TITLES
+    from beers_deploy.studies.stress.bit_flips import flip_curves_svg, flip_rows
+
+    patches = Calibration(Sensor.load(sensor), images, draws, side_px, seed)
+    rows = flip_rows(subject, patches, TargetProfile.load(target))
+    if picture is not None:
+        write_text(picture, flip_curves_svg({subject.opened[-1].name: rows}))
+    inputs = tuple(network.input for network in subject.opened)
+    return Table(inputs=inputs, rows=tuple(rows), headings=TITLES)

@@ -1,0 +1,152 @@
+"""`tradeoff`: what accuracy costs in time, over many operating points."""
+
+import logging
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated
+
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.target import DEFAULT_TARGET
+from beers_deploy.verbs.parameters import (
+    Holds,
+    InputPath,
+    Networks,
+    OutputFolder,
+    Progress,
+    Seed,
+    SensorLike,
+    Size,
+    Targets,
+)
+from beers_deploy.verbs.verb import refuse_with, verb
+
+if TYPE_CHECKING:
+    from beers_deploy.network import NetworkLike
+    from beers_deploy.results import Table
+    from beers_deploy.studies.tradeoff.run import Study
+
+logger = logging.getLogger(__name__)
+
+PAPER_SIZE = "13600x9016"
+FIGURES = "tradeoff.json"
+
+
+STUDY = Holds(FIGURES, "tradeoff.html", "tradeoff.svg", "measurements.json", folders=("int8",))
+
+
+@verb
+def tradeoff(
+    *,
+    out: Annotated[OutputFolder, STUDY] | None = None,
+    images: InputPath | None = None,
+    sensor: SensorLike = SENSOR,
+    reference: SensorLike | None = None,
+    network: Networks = "all",
+    budget: str | None = None,
+    need: str | None = None,
+    lpips: InputPath | None = None,
+    calibration: InputPath | None = None,
+    target: Targets = DEFAULT_TARGET,
+    size: Size = PAPER_SIZE,
+    dry_run: bool = False,
+    seed: Seed = 0,
+    progress: Progress = None,
+) -> "Table":
+    """Find what accuracy costs in time, over networks and boards, and recommend a point.
+
+    Networks and pipelines are measured on the same images, and their runs on boards are predicted.
+    All boards are compared, whatever their order; a line says for each one that is not recommended
+    why. Measurements are stored: a second run, or one that was stopped, measures only what is
+    missing. The command exits with 1 if no point keeps the budget and the need; the page is written
+    all the same.
+
+    Args:
+        out: folder of the page, the figures and the measurements.
+        images: folder of held-out scenes to simulate from; drawn scenes if none.
+        sensor: sensor of the degraded images: a name, or a .toml file.
+        reference: sensor of the reference images; pleiades-reference if none.
+        network: shipped names, float ONNX or safetensors files, which are quantised on the way, or
+            INT8 files, separated by commas; all stands for the shipped ones.
+        budget: what you can afford: latency<=20s, or latency<=9s,power<=20W. The best PSNR wins.
+        need: what you must reach: psnr>=44. Without a budget the least latency wins.
+        lpips: weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.
+        calibration: folder of scenes to quantise your networks on; drawn scenes if none.
+        target: board whose model predicts: a name, or a .toml file; several with commas, or all.
+        size: width x height of the swath in pixels.
+        dry_run: print how much is measured and about how long that takes, and write nothing.
+        seed: seed of every random draw.
+        progress: a function that is called at each step, False for silence, None for a bar or lines
+            on standard error.
+
+    Returns:
+        A table of the points and the front. It is true if a point keeps the limits; `best` is the
+        recommended one.
+
+    Raises:
+        OptionError: no such network, or limits that cannot be read.
+        ImageError: images that cannot be read.
+        ProfileError: no such sensor or board.
+        ModelError: a network that cannot be tiled.
+
+    Examples:
+        >>> table = bd.tradeoff(network="convbeers-xs", budget="latency<=20s")
+        >>> table.best.network.precision
+        'int8'
+    """
+    from beers_deploy.dpu.board import boards_of
+    from beers_deploy.performance.swath import parse_size
+    from beers_deploy.profiles.sensor import Sensor
+    from beers_deploy.profiles.sensor_file import reference_beside
+    from beers_deploy.studies.tradeoff.advice import parse_constraints
+
+    if dry_run:
+        refuse_with("`dry_run`", out=out is not None)
+    networks = _networks(network)
+    # Limits are read before torch is loaded.
+    limits = parse_constraints("budget", budget), parse_constraints("need", need)
+    folder = None if out is None else Path(out)
+    from beers_deploy.studies.tradeoff.run import Study, preview
+
+    degraded = Sensor.load(sensor)
+    study = Study(
+        networks=networks,
+        boards=boards_of(target),
+        sensors=(degraded, reference_beside(degraded, reference)),
+        scenes=None if images is None else Path(images),
+        lpips=None if lpips is None else Path(lpips),
+        calibration=None if calibration is None else Path(calibration),
+        size=parse_size(size),
+        budget=limits[0],
+        need=limits[1],
+        seed=seed,
+    )
+    return preview(study) if dry_run else _run(study, folder)
+
+
+def _networks(network: Networks) -> "list[NetworkLike]":
+    """Return networks of one, several, or text with commas; "all" stands for the shipped ones."""
+    from beers_deploy.model.shipped import shipped_names
+
+    given: list[NetworkLike] = []
+    several = list(network) if isinstance(network, list | tuple) else [network]
+    for each in several:
+        names = each.split(",") if isinstance(each, str) else [each]
+        for name in names:
+            given += shipped_names() if name == "all" else [name]
+    if not given:
+        raise OptionError("`network` names no network. Give a name, a file, or all.")
+    return given
+
+
+def _run(study: "Study", folder: Path | None) -> "Table":
+    """Run a study, and write its page and figures into a folder."""
+    from beers_deploy.studies.tradeoff.run import run_tradeoff
+
+    if folder is None:
+        with TemporaryDirectory(prefix="beers-deploy-") as temporary:
+            return run_tradeoff(study, Path(temporary))
+    table = run_tradeoff(study, folder)
+    logger.info("wrote %s", table.report(folder))
+    table.save(folder / FIGURES)
+    return table

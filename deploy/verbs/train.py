@@ -1,0 +1,256 @@
+"""`train`: a network's weights from images and two sensor profiles."""
+
+import logging
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.verbs.parameters import (
+    Holds,
+    InputPath,
+    InputPaths,
+    Interval,
+    OutputFolder,
+    Progress,
+    Seed,
+    SensorLike,
+)
+from beers_deploy.verbs.verb import refuse_with, refuse_without, verb
+
+logger = logging.getLogger(__name__)
+
+RANGE = "pleiades-variable"
+"""The sensors of a network that is for no single one."""
+
+FILES = ("checkpoint.safetensors", "log.csv", "validation.csv", "validation.png")
+"""What a run leaves in its folder besides the weights."""
+
+DEFAULTS: dict[str, Any] = {
+    "variant": "convbeers-s",
+    "drawn": 0,
+    "steps": 20_000,
+    "batch": 8,
+    "patch": 96,
+    "learning_rate": 1e-3,
+    "l1_weight": 1.0,
+    "lpips_weight": 0.5,
+    "fft_weight": 0.1,
+    "psnr_weight": 0.0,
+    "validate_every": 1000,
+    "seed": 0,
+    "precision": "float32",
+}
+"""What a recipe states in place of these options."""
+
+
+@verb
+def train(
+    *,
+    out: Annotated[OutputFolder, Holds(*FILES)],
+    recipe: str | None = None,
+    images: InputPaths = (),
+    pairs: InputPath | None = None,
+    variant: str = DEFAULTS["variant"],
+    sensor: SensorLike | None = None,
+    conditioned: bool = False,
+    reference: SensorLike | None = None,
+    drawn: Annotated[int, Interval(ge=0, le=1000)] = DEFAULTS["drawn"],
+    steps: Annotated[int, Interval(ge=1)] = DEFAULTS["steps"],
+    batch: Annotated[int, Interval(ge=1, le=4096)] = DEFAULTS["batch"],
+    patch: Annotated[int, Interval(ge=17, le=2048)] = DEFAULTS["patch"],
+    learning_rate: Annotated[float, Interval(ge=0)] = DEFAULTS["learning_rate"],
+    l1_weight: Annotated[float, Interval(ge=0)] = DEFAULTS["l1_weight"],
+    lpips_weight: Annotated[float, Interval(ge=0)] = DEFAULTS["lpips_weight"],
+    fft_weight: Annotated[float, Interval(ge=0)] = DEFAULTS["fft_weight"],
+    psnr_weight: Annotated[float, Interval(ge=0)] = DEFAULTS["psnr_weight"],
+    lpips: InputPath | None = None,
+    start: InputPath | None = None,
+    rounding: InputPath | None = None,
+    validate_every: Annotated[int, Interval(ge=0)] = DEFAULTS["validate_every"],
+    seed: Seed = DEFAULTS["seed"],
+    device: str = "cpu",
+    precision: Literal["float32", "bfloat16"] = DEFAULTS["precision"],
+    resume: bool = False,
+    progress: Progress = None,
+) -> Path:
+    """Train a network on simulated or stored pairs; the same seed makes the same weights.
+
+    The loss is the paper's: 1.0 L1 + 0.5 LPIPS + 0.1 L1 of spectra. Without weights for LPIPS that
+    term is left out, which is logged and recorded. A twentieth of the images, whole sites, is held
+    out for validation. For several GPUs start it with torchrun.
+
+    Args:
+        out: folder of checkpoint, logs, pictures and weights.
+        recipe: make a shipped network by its name, or a network of your own recipe (.toml), which
+            states everything else.
+        images: folder of sharp aerial images (8-bit RGB, or 16-bit mono) to simulate from; several
+            if repeated.
+        pairs: folder of pairs that 'simulate' wrote, in place of images.
+        variant: size of the network.
+        sensor: sensor of the degraded images: a name, or a .toml file; of pairs the one that made
+            them, else pleiades-variable if none.
+        conditioned: draw sensors of a wide range with that gain, and condition the network on each:
+            it becomes the network of any sensor in range.
+        reference: sensor of the reference images; pleiades-reference if none.
+        drawn: number of drawn scenes to add to the images.
+        steps: number of gradient steps.
+        batch: number of patches for each step and worker.
+        patch: side of a patch in pixels.
+        learning_rate: highest learning rate.
+        l1_weight: weight of L1 in the loss.
+        lpips_weight: weight of LPIPS in the loss.
+        fft_weight: weight of the L1 of spectra in the loss.
+        psnr_weight: weight of the mean PSNR of the patches in the loss, such as 0.01 without L1.
+        lpips: weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.
+        start: weights to start from; those of a smaller network are widened.
+        rounding: INT8 file of the `start` weights: trains with feature maps rounded as there, so
+            that a new quantisation loses less.
+        validate_every: number of steps between validations; 0 for none.
+        seed: seed of every random draw.
+        device: cpu, or cuda.
+        precision: number format of the convolutions; bfloat16 is faster where the device has units
+            for it.
+        resume: continue the run from its checkpoint.
+        progress: a function that is called at each step, False for silence, None for a bar or lines
+            on standard error.
+
+    Returns:
+        The path of the weights.
+
+    Raises:
+        OptionError: options that do not go together, or a folder that holds a run.
+        ImageError: images or pairs that cannot be read.
+        ModelError: weights to start from that do not fit.
+        ProfileError: no such sensor.
+        MissingExtraError: torch is not installed.
+    """
+    given = {
+        "variant": variant,
+        "drawn": drawn,
+        "steps": steps,
+        "batch": batch,
+        "patch": patch,
+        "learning_rate": learning_rate,
+        "l1_weight": l1_weight,
+        "lpips_weight": lpips_weight,
+        "fft_weight": fft_weight,
+        "psnr_weight": psnr_weight,
+        "validate_every": validate_every,
+        "seed": seed,
+        "precision": precision,
+    }
+    folders = _folders(images)
+    if recipe is not None:
+        changed = {name: value != DEFAULTS[name] for name, value in given.items()}
+        changed |= {
+            "pairs": pairs is not None,
+            "sensor": sensor is not None,
+            "conditioned": conditioned,
+            "reference": reference is not None,
+            "lpips": lpips is not None,
+            "start": start is not None,
+            "rounding": rounding is not None,
+        }
+        refuse_with("`recipe`, which states it", **changed)
+        return _make(recipe, folders, Path(out), resume, device)
+    if pairs is not None:
+        refuse_with("`pairs`", images=bool(folders), drawn=drawn > 0, conditioned=conditioned)
+    if rounding is not None and not (conditioned and start):
+        raise OptionError(
+            "`rounding` has no effect without `conditioned` and `start`. Add both, or leave "
+            "`rounding` out."
+        )
+    if not folders:
+        refuse_without(
+            "`images`",
+            validate_every=validate_every != DEFAULTS["validate_every"],
+        )
+    if not lpips_weight:
+        refuse_with("`lpips_weight` 0", lpips=lpips is not None)
+    # These load torch.
+    from beers_deploy.model.dataset import profiles_for, read_pairs_recipe
+    from beers_deploy.model.family import SensorFamily
+    from beers_deploy.model.io.files import require_writable, sha256
+    from beers_deploy.model.training.checkpoint import TrainingRecipe
+    from beers_deploy.model.training.losses import LossWeights
+    from beers_deploy.model.training.patches import PatchRecipe
+    from beers_deploy.model.training.run import Run
+    from beers_deploy.model.training.run import train as run_training
+    from beers_deploy.model.training.trainer import joined
+    from beers_deploy.network_files import weights_file
+    from beers_deploy.quantization import rounding_of
+
+    stored = None if pairs is None else Path(pairs)
+    start_file = None if start is None else weights_file(Path(start))
+    rounding_file = None if rounding is None else weights_file(Path(rounding))
+    lpips_file = None if lpips is None else Path(lpips)
+    sources = [*folders] if stored is None else [stored, stored / "degraded", stored / "reference"]
+    profiles = [Path(each) for each in (sensor, reference) if isinstance(each, str | os.PathLike)]
+    inputs = (*sources, lpips_file, start_file, rounding_file, *profiles)
+    folder = Path(out)
+    require_writable(folder / f"{variant}.safetensors", inputs=inputs)
+    # The INT8 file must be of the start weights, or its rounding is another network's.
+    rounded = rounding_of(rounding_file, start_file) if rounding_file and start_file else None
+    numbers = TrainingRecipe(
+        steps=steps,
+        batch=batch,
+        learning_rate=learning_rate,
+        loss=LossWeights(l1_weight, lpips_weight, fft_weight, psnr_weight),
+        seed=seed,
+        rounding=sha256(rounding_file) if rounding_file else "",
+    )
+    pairs_recipe = read_pairs_recipe(stored) if stored else None
+    degraded, aim = profiles_for(
+        sensor or (None if pairs_recipe else RANGE), reference, pairs_recipe
+    )
+    family = SensorFamily(degraded.nominal()) if conditioned else None
+    run = Run(
+        variant,
+        numbers,
+        PatchRecipe(degraded, aim, patch_px=patch, family=family),
+        folders,
+        stored,
+        folder,
+        drawn=drawn,
+        lpips=lpips_file,
+        start=start_file,
+        validate_steps=validate_every,
+        device=device,
+        precision=precision,
+        rounding=rounded,
+    )
+    # Under torchrun every worker runs this, and the first one alone reports.
+    with joined(device) as worker:
+        run_training(run, resume, worker)
+        if worker.first:
+            logger.info("wrote %s", run.weights)
+    return run.weights
+
+
+def _folders(images: InputPaths) -> tuple[Path, ...]:
+    """Return one folder, or several."""
+    if isinstance(images, str | os.PathLike):
+        return (Path(images),)
+    return tuple(map(Path, images))
+
+
+def _make(name: str, images: Sequence[Path], out: Path, resume: bool, device: str) -> Path:
+    """Make a network from its recipe, and return its weights."""
+    from beers_deploy.model.io.files import require_writable
+    from beers_deploy.model.shipped import INT8
+    from beers_deploy.model.training.recipe import load_recipe, recipe_file
+    from beers_deploy.studies.recipes import make_network
+
+    recipe = load_recipe(name)
+    if not images:
+        raise OptionError(
+            "`recipe` needs `images`. Give the folders of the photographs that the model card "
+            "names."
+        )
+    outputs = [out / f"{recipe.variant}{end}" for end in (".safetensors", f"{INT8}.onnx", ".md")]
+    require_writable(*outputs, inputs=images)
+    toml = recipe_file(name).read_text(encoding="utf-8")
+    make_network(recipe, toml, images, out, resume, device)
+    return outputs[0]

@@ -1,0 +1,262 @@
+"""What makes a function a verb: its parameters are checked, and its table records the call."""
+
+import math
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import wraps
+from inspect import Parameter, signature
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal, ParamSpec, TypeVar, cast, get_args, get_origin
+
+from annotated_types import Interval
+
+from beers_deploy.profiles.errors import BeersError, OptionError, missing_extra
+from beers_deploy.verbs.parameters import Holds, Labelled, Written
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+NOT_RECORDED = ("progress", "json", "junit")
+"""Parameters that decide no figure."""
+
+
+def verb(function: Callable[P, R]) -> Callable[P, R]:
+    """Check the parameters of a function before it runs, and record them in its result.
+
+    1. An older verdict is deleted, so that it does not pass for that of a run that is refused.
+    2. A value outside the interval or the choices of its annotation is refused, and so is an empty
+       text, such as that of an unset variable.
+    3. An output that is an input or another output is refused.
+    4. The parameter `progress` decides how the work inside is reported.
+    5. If an optional package is missing, the error names the extra that installs it.
+    6. A table that is returned names the verb and its arguments.
+    """
+    parameters = signature(function).parameters
+
+    @wraps(function)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        from beers_deploy.model.progress import reporting
+        from beers_deploy.results import Table
+
+        bound = signature(function).bind(*args, **kwargs)
+        bound.apply_defaults()
+        delete_older(function, bound.arguments)
+        for name, value in bound.arguments.items():
+            require_allowed(parameters[name], value)
+        require_apart(function, bound.arguments)
+        try:
+            with reporting(bound.arguments.get("progress")):
+                result = function(*args, **kwargs)
+        except ImportError as error:
+            if isinstance(error, BeersError):
+                raise
+            raise missing_extra(error, function.__name__) from error
+        given = {k: v for k, v in bound.arguments.items() if k not in NOT_RECORDED}
+
+        def named(table: Table) -> Table:
+            arguments = {**recorded(given), **table.arguments}
+            return replace(table, command=function.__name__, arguments=arguments)
+
+        if isinstance(result, Table):
+            return cast(R, named(result))
+        # A network or a sensor that a verb returns may have a table of how it was made.
+        table = getattr(result, "table", None)
+        if isinstance(table, Table):
+            return cast(R, replace(cast(Any, result), table=named(table)))
+        return result
+
+    return checked
+
+
+def require_allowed(parameter: Parameter, value: object) -> None:
+    """Raise OptionError if the annotation of a parameter does not allow its value.
+
+    Args:
+        parameter: annotated with an `Interval` or a `Literal`, or with neither.
+        value: what was given; None and the default are always allowed.
+    """
+    name = parameter.name
+    if isinstance(value, str) and value == "":
+        raise OptionError(f"`{name}` is empty. Give a value, or leave it out.")
+    if value is None or value is parameter.default:
+        return
+    for part in parts_of(parameter.annotation):
+        if isinstance(part, Interval) and isinstance(value, int | float):
+            _require_inside(name, value, part)
+        if get_origin(part) is Literal and value not in get_args(part):
+            names = ", ".join(map(repr, get_args(part)))
+            raise OptionError(f"`{name}` must be one of {names}, got {value!r}.")
+
+
+def _require_inside(name: str, value: float, interval: Interval) -> None:
+    low = -math.inf if interval.ge is None else float(str(interval.ge))
+    high = math.inf if interval.le is None else float(str(interval.le))
+    # NaN lies in no interval.
+    if low <= value <= high:
+        return
+    if math.isinf(high):
+        raise OptionError(f"`{name}` must be at least {low:g}, got {value:g}.")
+    raise OptionError(f"`{name}` must be from {low:g} to {high:g}, got {value:g}.")
+
+
+@dataclass(frozen=True)
+class Paths:
+    """The paths among the arguments of a verb.
+
+    Attributes:
+        outputs: files that are written.
+        folders: folders that are filled with images.
+        verdicts: outputs of which an older file is deleted first.
+        inputs: files and folders that are read.
+    """
+
+    outputs: list[Path]
+    folders: list[Path]
+    verdicts: list[Path]
+    inputs: list[Path]
+
+
+def paths_of(function: Callable[..., Any], arguments: Mapping[str, Any]) -> Paths:
+    """Return the paths among the arguments of a verb."""
+    parameters = signature(function).parameters
+    paths = Paths([], [], [], [])
+    for name, value in arguments.items():
+        written = marker(parameters[name], Written)
+        if written is None:
+            paths.inputs.extend(_paths_in(value))
+            if value is not None and marker(parameters[name], Labelled):
+                paths.inputs.extend(_labels_in(Path(value)))
+        elif value is not None:
+            holds = marker(parameters[name], Holds)
+            files = [Path(value)] if holds is None else [Path(value) / f for f in holds.files]
+            paths.outputs.extend(files)
+            paths.verdicts.extend(files if written.verdict else [])
+            paths.folders.extend([] if holds is None else [Path(value) / f for f in holds.folders])
+    return paths
+
+
+def delete_older(function: Callable[..., Any], arguments: Mapping[str, Any]) -> None:
+    """Delete older verdicts of a verb."""
+    from beers_deploy.model.io.files import require_writable
+
+    paths = paths_of(function, arguments)
+    for path in paths.verdicts:
+        # What may not be written is refused afterwards, when all verdicts are deleted.
+        with suppress(BeersError):
+            require_writable(path, inputs=paths.inputs)
+            path.unlink(missing_ok=True)
+
+
+def require_apart(
+    function: Callable[..., Any], arguments: Mapping[str, Any], *more: Path | None
+) -> None:
+    """Raise an error if an output of a verb cannot be written, or is an input or another output.
+
+    Args:
+        function: the verb.
+        arguments: its parameters by name.
+        more: further outputs.
+    """
+    from beers_deploy.model.io.files import require_writable
+
+    paths = paths_of(function, arguments)
+    outputs = [*paths.outputs, *more]
+    if outputs:
+        require_writable(*outputs, inputs=paths.inputs, folders=paths.folders)
+
+
+def _paths_in(value: Any) -> list[Path]:
+    """Return the paths of an argument; a shipped name is a path that does not exist.
+
+    Text may hold several with commas, and BAND=PATH. A folder of pairs has its images in two
+    folders.
+    """
+    several = value if isinstance(value, list | tuple) else [value]
+    names: list[str | os.PathLike[str]] = []
+    for each in several:
+        if isinstance(each, str):
+            names += [each, *re.split("[,=]", each)]
+        elif isinstance(each, os.PathLike):
+            names.append(each)
+    paths = [Path(name) for name in names if name != ""]
+    roles = (path / role for path, role in product(paths, ("degraded", "reference")))
+    return [*paths, *filter(Path.is_dir, roles)]
+
+
+LABELS = {".xml", ".txt"}
+"""Suffixes of labels, which lie anywhere below the folder of images."""
+
+
+def _labels_in(folder: Path) -> list[Path]:
+    """Return the labels below a folder: no output may replace one."""
+    return [path for path in folder.rglob("*") if path.suffix.lower() in LABELS]
+
+
+Marker = TypeVar("Marker")
+
+
+def marker(parameter: Parameter, kind: type[Marker]) -> Marker | None:
+    """Return what the annotation of a parameter says of a kind: an `Interval` or a `Written`."""
+    parts = parts_of(parameter.annotation)
+    return next((part for part in parts if isinstance(part, kind)), None)
+
+
+def parts_of(annotation: Any) -> Iterator[Any]:
+    """Yield an annotation, and all that its unions and `Annotated` are made of."""
+    yield annotation
+    if get_origin(annotation) is not Literal:
+        for part in get_args(annotation):
+            yield from parts_of(part)
+
+
+def refuse_with(other: str, **given: bool) -> None:
+    """Raise OptionError for the first option that is given although it has no effect with another.
+
+    Args:
+        other: the other option, in backquotes, with its value where that matters.
+        given: whether each option is given, by its name.
+    """
+    for name, is_given in given.items():
+        if is_given:
+            raise OptionError(f"`{name}` has no effect with {other}. Leave one of the two out.")
+
+
+def refuse_without(other: str, **given: bool) -> None:
+    """Raise OptionError for the first option that is given although it needs another.
+
+    Args:
+        other: the other option, in backquotes.
+        given: whether each option is given, by its name.
+    """
+    for name, is_given in given.items():
+        if is_given:
+            raise OptionError(
+                f"`{name}` has no effect without {other}. Add {other}, or leave `{name}` out."
+            )
+
+
+def recorded(arguments: Mapping[str, object]) -> dict[str, object]:
+    """Return arguments as a results document has them: numbers, text, or the names of values."""
+    return {name: _recorded(value) for name, value in arguments.items()}
+
+
+def _recorded(value: object) -> object:
+    if isinstance(value, str | int | float | bool | type(None)):
+        return value
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, Mapping):
+        return ", ".join(map(str, value))
+    if isinstance(value, list | tuple):
+        return ", ".join(str(_recorded(each)) for each in value)
+    # A network, a sensor or a board has a name; arrays have none.
+    name = getattr(value, "name", None)
+    return name if isinstance(name, str) else IN_MEMORY
+
+
+IN_MEMORY = "in memory"
+"""How a document names arrays and other values without a name."""

@@ -1,0 +1,89 @@
+"""Measured on this machine: networks interleaved, their nodes, load and memory."""
+
+from dataclasses import replace
+from mmap import mmap
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+
+from beers_deploy.host_state import cpu_load, resident_bytes
+from beers_deploy.network import Network, other_precision
+from beers_deploy.performance.host import Timed, host_rows, time_networks
+from beers_deploy.profiles.constant import Constant
+from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.target import load_target
+from tests.deploy.dpu.graphs import float_convbeers, integer_convbeers
+from tests.shipped import shipped_pair
+
+SHORT = {"min_time_s": Constant(0.05, "stated", "test"), "min_runs": Constant(3, "stated", "test")}
+QUICK = replace(load_target("host-cpu"), tables={"measurement": SHORT})
+
+
+def value(row: Row, key: str) -> float:
+    number = row.figures[key].value
+    assert number is not None
+    return number
+
+
+def test_float_and_int8_are_interleaved() -> None:
+    rows = host_rows(shipped_pair()[1], QUICK, 48, threads=1)
+    assert rows[0].name == "convbeers-s-int8, 48 x 48"
+    assert rows[1].name == "float32 of the same shape, 48 x 48"
+    for row in rows[:2]:
+        assert value(row, "p50") <= value(row, "p90")
+        assert 0 <= value(row, "CPU load") <= 100
+        assert value(row, "threads") == 1
+    assert value(rows[2], "ratio") == pytest.approx(value(rows[1], "p50") / value(rows[0], "p50"))
+    for row in rows:
+        modes = {figure.mode for key, figure in row.figures.items() if key != "power"}
+        assert modes <= {"measured", "unavailable"}
+
+
+def test_turns_last_for_the_minimum_time_and_count(tmp_path: Path) -> None:
+    model = onnx.load_model(integer_convbeers(tmp_path / "i.onnx", 1, 8))
+    runs = [Timed("one", model), Timed("other", model)]
+    time_networks(runs, 24, 1, min_time_s=0.05, min_runs=7)
+    assert len(runs[0].times_s) == len(runs[1].times_s) >= 7
+    assert min(sum(run.times_s) for run in runs) >= 0.05
+
+
+def test_the_other_precision_is_a_shipped_network_of_the_same_variant() -> None:
+    floating, integer = map(Network.load, shipped_pair())
+    float32 = other_precision(integer)
+    assert float32 is not None
+    back = other_precision(float32)
+    assert back is not None
+    assert (float32.precision, back.precision) == ("float32", "int8")
+    shapes = [
+        sorted(
+            tuple(tensor.dims)
+            for tensor in network.model.graph.initializer
+            if len(tensor.dims) == 4
+        )
+        for network in (floating, float32)
+    ]
+    assert shapes[0] == shapes[1]
+
+
+def test_a_network_of_another_make_runs_alone(tmp_path: Path) -> None:
+    path = float_convbeers(tmp_path / "f.onnx", 1, 8)
+    assert other_precision(Network.load(path)) is None
+    assert [row.name for row in host_rows(path, QUICK, 32, 1) if row.table == "host"] == [
+        "f, 32 x 32"
+    ]
+
+
+def test_memory_that_is_taken_is_seen() -> None:
+    before = resident_bytes()
+    # The block comes from the system: an allocator may still hold what earlier tests freed.
+    block = mmap(-1, 40_000_000)
+    np.frombuffer(block, np.uint8).fill(1)
+    assert 30e6 < resident_bytes() - before < 200e6
+
+
+def test_the_load_is_that_of_the_work_since_the_last_call() -> None:
+    cpu_load()
+    sum(range(3_000_000))
+    assert 0 < (cpu_load().value or 0) <= 100

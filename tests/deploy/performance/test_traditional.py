@@ -1,0 +1,64 @@
+"""The traditional pipeline: measured here on crops, stored for a board's processor."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beers_deploy.performance.swath import PAPER_SIZE, Swath, parse_size
+from beers_deploy.performance.tables import processor_row
+from beers_deploy.performance.traditional import CROP_PX, drawn_acquisition, measure_chain
+from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.target import load_target
+from tests.deploy.dpu.graphs import integer_convbeers
+
+SENSORS = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+SWATH = Swath(*parse_size(PAPER_SIZE))
+
+
+def test_crops_are_measured_and_the_swath_is_their_proportion() -> None:
+    row = measure_chain(np.full((70, 90), 1000, np.float32), *SENSORS).row(SWATH)
+    time = row.figures["time"]
+    latency = row.figures["latency"]
+    assert (time.mode, time.unit, latency.mode) == ("measured", "s/Mpx", "predicted")
+    assert latency.value == pytest.approx((time.value or 0) * SWATH.pixels / 1e6)
+    assert "3 crops of 90 x 70" in latency.source
+    low, high = latency.interval or (0, 0)
+    assert low <= (latency.value or 0) <= high
+    assert {"throughput", "power", "threads", "CPU load"} <= set(row.figures)
+
+
+def test_a_drawn_acquisition_is_no_larger_than_the_crops_need() -> None:
+    assert drawn_acquisition(Swath(61, 47), *SENSORS).shape == (47, 61)
+    assert max(drawn_acquisition(Swath(9000, 40), *SENSORS).shape) == 3 * CROP_PX
+
+
+def test_the_boards_processor_holds_the_papers_run_and_lacks_what_its_file_lacks() -> None:
+    board = load_target("vck190")
+    figures = processor_row(SWATH, board).figures
+    # The paper publishes 1724 s and 22.5 W for this pipeline on the VCK190's processor.
+    low, high = figures["latency"].interval or (0, 0)
+    assert low < 1724 < high
+    assert figures["power"].mode == "published"
+    assert figures["efficiency"].interval == pytest.approx(
+        (SWATH.pixels / high / 22.5, SWATH.pixels / low / 22.5)
+    )
+    row = processor_row(SWATH, replace(board, tables={}))
+    assert "chain_s_per_mpx" in row.figures["latency"].reason
+
+
+@pytest.mark.slow
+def test_a_prediction_does_not_wait_for_torch(tmp_path: Path) -> None:
+    model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
+    code = (
+        "import sys\nfrom beers_deploy.cli.commands import app\n"
+        f"app(['bench', {str(model)!r}, '--no-traditional'], standalone_mode=False)\n"
+        "sys.exit('torch' in sys.modules)"
+    )
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    assert (process.returncode, "throughput" in process.stdout) == (0, True), process.stderr

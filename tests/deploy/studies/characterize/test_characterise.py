@@ -1,0 +1,322 @@
+import math
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from beers_deploy.model.metrics.slanted_edge import slanted_edge
+from beers_deploy.model.simulator.acquire import acquire
+from beers_deploy.model.simulator.detector import Draw, to_uint16
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.model.simulator.sampling import scene_spectrum
+from beers_deploy.profiles.errors import BeersError, OptionError
+from beers_deploy.profiles.sensor import Instrument, noise_from_snr
+from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.studies.characterize import Stated, characterise, profile_toml
+from beers_deploy.studies.characterize.frames import Frames, cut_box
+from tests.deploy.command_line import done, refused
+from tests.deploy.documents import valid
+
+RATIO = 4
+SIDE = 1280
+GAIN = 10.2375
+BOARD_PX = 100
+SNRS = (50.0, 110.0)
+SENSOR = Instrument(0.09, *noise_from_snr(25, SNRS[0], 100, SNRS[1]), GAIN, 12, {}, 0.05)
+
+
+def landscape(seed: int, board: bool) -> np.ndarray:
+    """A drawn scene without its own calibration site; a leaning checkerboard of 100 x 100 pixels in
+    it or none.
+    """
+    radiance = procedural_scene(SIDE, SIDE, np.random.default_rng(seed)).radiance.copy()
+    radiance[:420] = radiance[420:840]
+    if board:
+        upright = slanted_edge(BOARD_PX, RATIO, 7, (-1, 1))
+        start = (SIDE - upright.shape[0]) // 2
+        part = slice(start, start + upright.shape[0])
+        radiance[part, part] = 95 + 65 * upright * slanted_edge(BOARD_PX, RATIO, -7, (-1, 1)).T
+    return radiance
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two raw images of one sensor, the checkerboard in the first."""
+    folder = tmp_path_factory.mktemp("raw")
+    paths = folder / "board.tif", folder / "plain.tif"
+    for seed, path in enumerate(paths):
+        spectrum = scene_spectrum(landscape(seed, board=seed == 0))
+        signal = acquire(spectrum, SIDE, SENSOR, RATIO, Draw(seed), "degraded")
+        tifffile.imwrite(path, to_uint16(signal))
+    return paths
+
+
+FREQUENCIES = np.array([0.1, 0.25, 0.5])
+
+
+def test_the_profile_is_that_of_the_sensor(raw: tuple[Path, Path], tmp_path: Path) -> None:
+    out = tmp_path / "mine.toml"
+    figures = tmp_path / "mine.json"
+    options = "--bits", 12, "--gain", GAIN, "--gsd", 0.7
+    done("characterize", *raw, *options, "--out", out, "--json", figures)
+    profile = load_sensor(str(out))
+    sensor = profile.nominal()
+    assert sensor.response is not None
+    none = np.zeros((1, 1))
+    for table, truth in (
+        (sensor.response.at(FREQUENCIES[None], none)[0], transfer(FREQUENCIES, SENSOR.mtf_axes[0])),
+        (
+            sensor.response.at(none, FREQUENCIES[:, None])[:, 0],
+            transfer(FREQUENCIES, SENSOR.mtf_axes[1]),
+        ),
+    ):
+        assert table == pytest.approx(truth, rel=0.12)
+    for radiance, snr in zip((25, 100), SNRS, strict=True):
+        assert radiance / sensor.noise_sigma(radiance) == pytest.approx(snr, rel=0.1)
+    assert (sensor.bits, sensor.gain_dn_per_radiance, profile.gsd_m.low) == (12, GAIN, 0.7)
+    assert {profile.mtf_nyquist.status, profile.snr_pair[0].status} == {"measured"}
+    assert {profile.gain_dn_per_radiance.status, profile.bits.status, profile.gsd_m.status} == {
+        "stated"
+    }
+    done("characterize", *raw, *options, "--out", tmp_path / "again.toml")
+    assert (tmp_path / "again.toml").read_bytes() == out.read_bytes()
+    by_name = valid(figures)["rows"][0]["figures"]
+    contrasts = np.concatenate([transfer(FREQUENCIES, mtf) for mtf in SENSOR.mtf_axes])
+    truths = [*(100 * contrasts), *SNRS]
+    assert {figure["mode"] for figure in by_name.values()} == {"measured"}
+    intervals = [figure["interval"] for figure in by_name.values()][: len(truths)]
+    hits = [low <= truth <= high for (low, high), truth in zip(intervals, truths, strict=True)]
+    # A 95 % interval may miss its truth, so not all eight need to hold it.
+    assert sum(hits) >= 6
+    assert f"95 % interval {intervals[6][0]:.3g} to {intervals[6][1]:.3g}" in out.read_text(
+        encoding="utf-8"
+    )
+
+
+def transfer(frequencies: np.ndarray, mtf_nyquist: float) -> np.ndarray:
+    """The profile's formula, exp(-gamma f) sinc(f)."""
+    return np.asarray((mtf_nyquist * math.pi / 2) ** (2 * frequencies) * np.sinc(frequencies))
+
+
+def test_without_a_gain_the_noise_over_full_scale_stands(raw: tuple[Path, Path]) -> None:
+    """To a network only that matters: any gain leaves it."""
+    with_gain = characterise(raw, stated=Stated(bits=12, gain=3.0))
+    without_gain = characterise(raw, stated=Stated(bits=12))
+    assert without_gain.gain == pytest.approx(4095 / 400)
+    for one, other in zip(with_gain.snrs, without_gain.snrs, strict=True):
+        assert one.value == pytest.approx(other.value)
+        assert one.radiance * 3.0 == pytest.approx(other.radiance * without_gain.gain)
+    profile = tomllib.loads(profile_toml(without_gain))
+    assert profile["digitiser"]["gain_dn_per_radiance"]["status"] == "assumed"
+    assert profile["noise"]["radiance_1"]["value"] == pytest.approx(100)
+
+
+def test_a_box_gives_one_axis_for_both(raw: tuple[Path, Path]) -> None:
+    # The box holds the upper half of the board's upright edge. The simulator cuts 32 pixels off
+    # each side of an image.
+    middle = SIDE // RATIO // 2 - 32
+    box = f"{raw[0]}:{middle - 11},{middle - 38},30,28"
+    result = characterise(raw, (box,), Stated(bits=12))
+    assert list(result.mtf.curves) == ["across"]
+    value, (low, high) = result.mtf.curves["across"].at(0.5)
+    assert low <= 0.09 <= high < 2 * low
+    assert low <= value <= high
+    table = tomllib.loads(profile_toml(result))["mtf"]
+    assert table["across"]["value"] == table["along"]["value"]
+    assert "no curve along the track" in table["along"]["source"]
+    assert result.rows()[0].figures["MTF along at Nyquist"].mode == "unavailable"
+
+
+def test_without_an_edge_the_mtf_is_assumed_and_said_so(tmp_path: Path) -> None:
+    out = tmp_path / "mine.toml"
+    ramp = np.linspace(200, 3000, 320)[:, None] + np.random.default_rng(1).normal(0, 20, (320, 320))
+    output = done(
+        "characterize", tiff(tmp_path, ramp.astype(np.uint16)), "--bits", 12, "--out", out
+    )
+    assert "the profile's MTF is an assumption" in output
+    profile = load_sensor(str(out))
+    assert profile.mtf_nyquist.status == "assumed"
+    assert profile.snr_pair[1].status == "measured"
+
+
+def test_the_mtf_may_be_stated(raw: tuple[Path, Path], tmp_path: Path) -> None:
+    out = tmp_path / "mine.toml"
+    output = done("characterize", raw[1], "--bits", 12, "--mtf", "0.08,0.04", "--out", out)
+    profile = load_sensor(str(out))
+    assert profile.nominal().mtf_axes == (0.08, 0.04)
+    assert profile.mtf_nyquist.status == "stated"
+    assert "assumption" not in output
+
+
+def test_steps_and_a_black_level_change_nothing_but_the_units(
+    raw: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """Ten bits stored in sixteen, above a pedestal: the noise above the dark is the same."""
+    plain = characterise(raw, stated=Stated(bits=12, mtf=(0.1, 0.1)))
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for path in raw:
+        tifffile.imwrite(folder / path.name, ((tifffile.imread(path) + 200) * 8).astype(np.uint16))
+    result = characterise([folder], stated=Stated(bits=15, black_level=1600, mtf=(0.1, 0.1)))
+    assert (result.frames.step, result.frames.bits, result.frames.stored_full_scale) == (
+        8,
+        12,
+        32760,
+    )
+    for one, other in zip(result.snrs, plain.snrs, strict=True):
+        assert one.value == pytest.approx(other.value, rel=0.02)
+    assert tomllib.loads(profile_toml(result))["offset"]["offset_dn"]["value"] == 200
+    assert any("--full-scale 32760" in note for note in result.notes())
+    assert not any("black level" in note for note in result.notes())
+    hidden = characterise([folder], stated=Stated(bits=15, mtf=(0.1, 0.1)))
+    assert any("black level" in note for note in hidden.notes())
+
+
+def test_pairs_of_one_scene_give_the_noise_alone(tmp_path: Path) -> None:
+    """Texture as fine as the noise cancels; without the pair it counts as noise."""
+    generator = np.random.default_rng(4)
+    scene = np.linspace(300, 3000, 320)[:, None] + generator.normal(0, 40, (320, 320))
+    for number in range(2):
+        noisy = scene + generator.normal(size=scene.shape) * np.sqrt(0.5 * scene)
+        tifffile.imwrite(
+            tmp_path / f"{number}.tif", np.clip(noisy.round(), 1, 4094).astype(np.uint16)
+        )
+    result = characterise([tmp_path], stated=Stated(bits=12, mtf=(0.1, 0.1)))
+    assert result.noise.pairs == 1
+    assert result.noise.model.at(1000).value == pytest.approx(500, rel=0.05)
+    alone = characterise([tmp_path / "0.tif"], stated=Stated(bits=12, mtf=(0.1, 0.1)))
+    assert alone.noise.model.at(1000).value > 1500
+
+
+@pytest.mark.parametrize(
+    ("box", "words"),
+    [
+        ("board.tif", "FILE:X,Y,WIDTH,HEIGHT"),
+        ("board.tif:1,2,3", "FILE:X,Y,WIDTH,HEIGHT"),
+        ("board.tif:1,2,-3,4", "FILE:X,Y,WIDTH,HEIGHT"),
+        ("other.tif:1,2,30,40", "'other.tif', which is not one of the `images`"),
+    ],
+)
+def test_a_box_written_wrongly_is_refused(box: str, words: str) -> None:
+    with pytest.raises(OptionError, match=words):
+        cut_box(box, Frames((Path("board.tif"),), 1, 12, True, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("box", "words"),
+    [
+        ("0,0,9999,20", "or more inside"),
+        ("9,9,0,0", "or more inside"),
+        ("2,2,30,40", "one straight edge"),
+    ],
+)
+def test_a_box_that_holds_no_edge_is_refused(
+    raw: tuple[Path, Path], tmp_path: Path, box: str, words: str
+) -> None:
+    edge = "--edge", f"{raw[0]}:{box}"
+    assert words in refused(
+        "characterize", *raw, "--bits", 12, *edge, "--out", tmp_path / "mine.toml"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def tiff(folder: Path, pixels: np.ndarray) -> Path:
+    tifffile.imwrite(
+        folder / "raw.tif", pixels, photometric="rgb" if pixels.ndim == 3 else "minisblack"
+    )
+    return folder / "raw.tif"
+
+
+FLAT = np.random.default_rng(0).normal(1000, 20, (200, 200))
+WRONG: dict[str, tuple[np.ndarray, tuple[str, ...], str]] = {
+    "8-bit": (np.clip(FLAT / 8, 0, 255).astype(np.uint8), (), "or are stored in 8 bits"),
+    "bands": (np.full((64, 64, 3), 7, np.uint16), ("--bits", "12"), "one band"),
+    "fractions": (FLAT.astype(np.float32), ("--bits", "12"), "whole digital numbers"),
+    "negative": (FLAT.astype(np.int16) - 2000, ("--bits", "12"), "from 0 to 65535"),
+    "wide": (FLAT.astype(np.uint32) * 70, ("--bits", "16"), "from 0 to 65535"),
+    "all missing": (np.full((200, 200), np.nan, np.float32), ("--bits", "12"), "unclipped"),
+    "steps": (FLAT.astype(np.uint16) * 16 + 3, ("--bits", "16"), "Divide them by 16"),
+    "black": (
+        FLAT.astype(np.uint16),
+        ("--bits", "12", "--black-level", "1500"),
+        "--black-level must be at least 0 and below the median",
+    ),
+    "mtf": (FLAT.astype(np.uint16), ("--bits", "12", "--mtf", "7"), "Write 0.07 for 7 %"),
+    "three contrasts": (
+        FLAT.astype(np.uint16),
+        ("--bits", "12", "--mtf", "0.1,0.1,0.1"),
+        "one or two ratios",
+    ),
+    "open bits": (FLAT.astype(np.uint16), (), "--bits is missing"),
+    "wrong bits": (FLAT.astype(np.uint16), ("--bits", "8"), "up to 255"),
+    "gain": (FLAT.astype(np.uint16), ("--bits", "12", "--gain", "0"), "above 0"),
+    "no noise": (np.full((200, 200), 1000, np.uint16), ("--bits", "12"), "noise"),
+    "nodata": (np.zeros((200, 200), np.uint16), ("--bits", "12"), "unclipped"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_input_is_one_sentence(case: str, tmp_path: Path) -> None:
+    pixels, options, words = WRONG[case]
+    image = tiff(tmp_path, pixels)
+    outputs = "--out", tmp_path / "mine.toml", "--json", tmp_path / "mine.json"
+    message = refused("characterize", image, *options, *outputs)
+    assert [p.name for p in tmp_path.iterdir()] == ["raw.tif"]
+    assert words in message
+    assert message.startswith("beers-deploy: ")
+
+
+def test_one_image_twice_is_refused(raw: tuple[Path, Path], tmp_path: Path) -> None:
+    """Its blocks would count twice, and the intervals would shrink for nothing."""
+    assert "twice" in refused(
+        "characterize", raw[0], raw[0], "--bits", 12, "--out", tmp_path / "mine.toml"
+    )
+
+
+def test_images_of_two_gains_are_refused(raw: tuple[Path, Path], tmp_path: Path) -> None:
+    half = tmp_path / "half.tif"
+    tifffile.imwrite(half, tifffile.imread(raw[0]) // 2)
+    message = refused("characterize", raw[0], half, "--bits", 12, "--out", tmp_path / "mine.toml")
+    assert "differ in gain" in message
+    assert f"DN^2 in {half.name}" in message
+
+
+def test_pixels_clipped_at_full_scale_tell_the_bits(raw: tuple[Path, Path], tmp_path: Path) -> None:
+    pixels = tifffile.imread(raw[0]).copy()
+    pixels[:4, :4] = 4095
+    image = tiff(tmp_path, pixels)
+    result = characterise((image, raw[1]))
+    assert result.frames.bits == 12
+    assert tomllib.loads(profile_toml(result))["digitiser"]["bits"]["status"] == "measured"
+    with pytest.raises(BeersError, match="clipped pixels"):
+        characterise((image, raw[1]), (f"{image}:0,0,30,30",))
+    pixels[:4, :4] = 4000
+    with pytest.raises(BeersError, match="bits"):
+        characterise((tiff(tmp_path, pixels), raw[1]))
+
+
+def test_names_cannot_break_the_profile(raw: tuple[Path, Path], tmp_path: Path) -> None:
+    odd = tmp_path / 'a "quoted" \x7f\u202e name.tif'
+    odd.write_bytes(raw[0].read_bytes())
+    text = profile_toml(characterise((odd, raw[1]), stated=Stated(bits=12)))
+    assert "\x7f" not in text
+    assert "quoted" in tomllib.loads(text)["description"]
+
+
+def test_the_noise_of_a_bound_is_a_profile_that_loads(
+    raw: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """All noise in beta, or in alpha: decimals must not put the SNR beyond what physics allows."""
+    result = characterise(raw, stated=Stated(bits=12))
+    full_scale = 4095 / result.gain
+    for dark in (math.sqrt(1 / 4), 1 / 4):
+        bright = replace(result.snrs[1], radiance=full_scale / 4, value=100 / 3)
+        low = replace(result.snrs[0], radiance=full_scale / 16, value=dark * 100 / 3)
+        (tmp_path / "mine.toml").write_text(
+            profile_toml(replace(result, snrs=(low, bright))), encoding="utf-8"
+        )
+        sensor = load_sensor(str(tmp_path / "mine.toml")).nominal()
+        assert min(sensor.alpha, sensor.beta) >= 0
