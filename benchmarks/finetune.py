@@ -109,7 +109,7 @@ def main() -> None:
         f"of {turns} steps"
     )
     for name, make in NETWORKS.items():
-        core = read_core(quantize(make(), patches=2, patch_px=64, progress=False).model)
+        core = read_core(quantize(make(), patches=2, patch=64, progress=False).model)
         layouts = torch.contiguous_format, torch.channels_last
         steps = [tuning_step(core), *(float_step(make(), layout) for layout in layouts)]
         times_s = [[_seconds(step) for step in steps] for _ in range(turns)]

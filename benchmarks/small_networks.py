@@ -260,7 +260,7 @@ def fine_tune(path: Path, tuning: Drawn, out: Path) -> float:
     """
     begun = time.process_time()
     samples = (tuning.images, tuning.wanted) if tuning.wanted.ndim > 1 else tuning.images
-    save_onnx(quantize(path, samples, finetune="auto", progress=False).model, out)
+    save_onnx(quantize(path, samples=samples, finetune="auto", progress=False).model, out)
     return time.process_time() - begun
 
 

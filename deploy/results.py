@@ -151,9 +151,10 @@ class Table:
             console.print(LEGEND, style="dim", highlight=False, markup=False)
         for check in self.checks:
             word = "ok    " if check.passed else "FAILED"
-            console.print(plain(f"{word} {check}"), highlight=False)
+            console.print(plain(f"{word} {check}"), highlight=False, soft_wrap=True)
         for sentence in filter(None, (*self.notes, self.verdict)):
-            console.print(plain(sentence), highlight=False)
+            # Whoever searches a log finds a sentence on one line.
+            console.print(plain(sentence), highlight=False, soft_wrap=True)
 
     def to_dict(self) -> dict[str, object]:
         """Return the table as the schema of results documents wants it."""

@@ -1,6 +1,6 @@
 """What restoration gains for the small detector, on synthetic scenes: docs/results/detection.md.
 
-    python -m benchmarks.detector.demonstration [--out detection/] [--json detection.json]
+    python benchmarks/detector/demonstration.py [--out detection/] [--json detection.json]
 
 Prints the tables, and writes their page into the folder: three minutes on two cores.
 """

@@ -2,23 +2,27 @@
 
 `model.raster` reads an image by rows. It passes, in this order:
 
-    options      what a user can choose
+    reading      how its pixels are understood, and what is demanded of them
     bands        a sensor, and so a network, for each band
     plan         how it is cut into tiles, and the memory that takes
-    radiometry   which pixel value is full scale, and who says so
+    radiometry   which pixel value is full scale, and who states it
+    detectors    faults of detectors; a list of them, whose pixels are replaced
+    sensor_check the comparison with its sensor, and whether it is raw at all
     runtime      the network, on onnxruntime or OpenVINO, here or by the workers of a Dask scheduler
     steps        the steps around the network: its exposures, and the consistency step
+    prepare      all of these made ready: `NetworkPipeline`
+    traditional  the same for the traditional pipeline: `TraditionalPipeline`
     tiles        the one tile loop, for files, arrays and Dask
-    method       a network as a method that studies compare
-    sensor_check what the image shows of its sensor, and whether it is raw at all
-    detectors    what it shows of faulty detectors; a list of them, whose pixels are replaced
+    outcome      a comparison of the result with the image
+    figures      the figures of a run
     journal      which rows are finished, and their digests
-    checkpoint   the finished rows on the disk, which a later run can go on with
+    checkpoint   the finished rows on the disk, from which a later run can continue
     output       from the finished rows to the TIFF, plain or cloud-optimised
     stac         the STAC item of a cloud-optimised output
     run          all of this for one file: `restore_file`
-    traditional  a file by the traditional pipeline: `restore_file_traditionally`
+    arrays       all of this for an array in memory: `restore_array`
+    method       a network as a method that studies compare
 
-`deploy.library.restore` is the same for notebooks. Nothing is imported here, so that `--help` stays
-quick; none of these but `traditional` loads torch.
+`verbs.restore` calls `run` and `arrays`. Nothing is imported here, so that `--help` stays quick;
+none of these but `traditional` loads torch.
 """

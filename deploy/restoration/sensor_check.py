@@ -54,7 +54,7 @@ STEP_PX = 4
 CELL_PX = (8, 4)
 FEW_WINDOWS = 4
 """Every so many rows are searched for edges, by such cells; an image of few windows may have few:
-it is searched as thoroughly as by `characterise`.
+it is searched as thoroughly as by `characterize`.
 """
 CANDIDATES = 6000
 CANDIDATES_OF_WINDOW = 400
@@ -154,7 +154,7 @@ class SensorCheck:
         if self.doubts and strict:
             raise ImageError(
                 f"{name} contradicts the sensor {sensor}: {printable('; '.join(self.doubts))}. "
-                "Name the image's own sensor, measure it with 'characterise', or leave `strict` "
+                "Name the image's own sensor, measure it with 'characterize', or leave `strict` "
                 "out."
             )
         for doubt in self.doubts:

@@ -70,7 +70,7 @@ def print_rows(title: str, rows: Iterable[Row], console: Console | None = None) 
     else:
         _print_blocks(table_rows, console)
     for reason in missing(table_rows):
-        console.print(plain(f"- {reason}"), style="dim", highlight=False)
+        console.print(plain(f"- {reason}"), style="dim", highlight=False, soft_wrap=True)
     console.print()
 
 

@@ -3,7 +3,7 @@
 import logging
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
@@ -129,7 +129,9 @@ def _networks(network: Networks) -> "list[NetworkLike]":
     from beers_deploy.model.shipped import shipped_names
 
     given: list[NetworkLike] = []
-    several = list(network) if isinstance(network, list | tuple) else [network]
+    several = [cast("NetworkLike", network)]
+    if isinstance(network, list | tuple):
+        several = list(network)
     for each in several:
         names = each.split(",") if isinstance(each, str) else [each]
         for name in names:

@@ -128,7 +128,8 @@ def paths_of(function: Callable[..., Any], arguments: Mapping[str, Any]) -> Path
         written = marker(parameters[name], Written)
         if written is None:
             paths.inputs.extend(_paths_in(value))
-            if value is not None and marker(parameters[name], Labelled):
+            labelled = marker(parameters[name], Labelled)
+            if labelled is not None and value is not None:
                 paths.inputs.extend(_labels_in(Path(value)))
         elif value is not None:
             holds = marker(parameters[name], Holds)

@@ -33,6 +33,7 @@ from beers_deploy.profiles.scene_call import (
     typical_effects,
 )
 from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.results import Table
 from beers_deploy.verbs.simulate import simulate
 from tests.deploy.command_line import done, refused
 from tests.deploy.two_workers import local_cluster
@@ -375,6 +376,7 @@ def test_a_folder_of_scenes_becomes_a_dataset_and_the_table_counts_its_pairs(
 ) -> None:
     out = tmp_path / "d"
     table = simulate(images=scene.parent, out=out, oversampling=2, patch=64, workers=1)
+    assert isinstance(table, Table)
     (row,) = table.rows
     count = len((out / "manifest.jsonl").read_text().splitlines())
     assert row.figures["pairs"].value == count > 0
@@ -386,8 +388,15 @@ def test_the_explanation_has_each_effect_with_its_origin_and_writes_nothing(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    asked: dict[str, Any] = {"with_": ["prnu"], "without": ["veil"], "scene": "haze-over-sea"}
-    table = simulate(images=scene, oversampling=2, explain=True, **asked)
+    table = simulate(
+        images=scene,
+        oversampling=2,
+        scene="haze-over-sea",
+        with_=["prnu"],
+        without=["veil"],
+        explain=True,
+    )
+    assert isinstance(table, Table)
     words = {row.name: row.text for row in table.rows}
     assert words["prnu"]["from"] == "--with"
     assert words["striping"]["from"] == "scene haze-over-sea"

@@ -25,6 +25,7 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.banked.family import FAMILY, WEIGHTS
 from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
 from beers_deploy.quant.samples import CALIBRATED_ON
+from beers_deploy.results import Table
 from beers_deploy.verbs.gate import gate
 from tests.deploy.command_line import done, refused
 from tests.quant.quick import change
@@ -69,9 +70,9 @@ def test_an_output_that_is_an_input_is_refused_and_stays(
     pair: tuple[Path, Path], tmp_path: Path
 ) -> None:
     baseline = tmp_path / "gate.json"
-    baseline.write_text("{}")
+    before = Table("gate").save(baseline).read_text()
     refused("gate", *pair, "--baseline", baseline, "--json", baseline)
-    assert baseline.read_text() == "{}"
+    assert baseline.read_text() == before
 
 
 def test_notes_stand_in_the_document(tmp_path: Path) -> None:
@@ -195,14 +196,14 @@ def test_a_refusal_deletes_an_older_verdict_and_the_junit_file_gives_the_reason(
     file.touch()
     outputs = ["--json", document, "--junit", junit]
     for words in (["--max-mae", "nan"], ["--samples", file, "--patches", 2]):
-        document.write_text('"passed"')
+        Table("gate").save(document)
         message = refused("gate", *SMALL[:1], *outputs, *words)
         assert not document.exists()
         error = ET.fromstring(junit.read_text()).find("testcase/error")  # noqa: S314 - our own text
         assert error is not None
         assert in_options(error.text or "", gate) in message
     for words in ([*outputs, "--record", file], ["--json", document, "--junit", tmp_path]):
-        document.write_text('"passed"')
+        Table("gate").save(document)
         junit.write_text("<testsuite/>")
         refused("gate", *SMALL, *words)
         assert not document.exists()

@@ -226,13 +226,13 @@ def test_check_and_stress_accept_the_name(command: list[str]) -> None:
 
 
 def test_one_name_stands_for_a_shipped_pair() -> None:
-    for names in (
+    for floating, int8 in (
         ("convbeers-xs", None),
         ("convbeers-xs-int8", None),
         ("convbeers-xs", "convbeers-xs"),
         ("convbeers-xs", "convbeers-xs-int8"),
     ):
-        pair = pair_of(*names, KNOWN)
+        pair = pair_of(floating, int8, KNOWN)
         assert [each.name for each in pair] == ["convbeers-xs", "convbeers-xs-int8"]
         assert [each.precision for each in pair] == ["float32", "int8"]
         assert {each.sensor for each in pair} == {SENSOR}

@@ -34,7 +34,7 @@ REFUSED = {
     "simulate": [
         Refused(("workers",), f"--out data {SCHEDULER}"),
         Refused(("explain",), "--out data"),
-        Refused(("workers", "scheduler", "resume", "preset", "patch"), without="--out"),
+        Refused(("workers", "scheduler", "resume"), "--explain", without="--out"),
     ],
     "train": [
         Refused(

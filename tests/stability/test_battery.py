@@ -179,11 +179,10 @@ def test_the_command_writes_its_figures_and_fails_by_exit_code(
     assert "## Integer layers" in (tmp_path / "s.md").read_text()
     corrupted = changed(onnx.load(pair[0]), "tail.weight", lambda weight: 3000 * weight)
     save_onnx(corrupted, tmp_path / "broken.onnx")
-    # A long sentence is wrapped.
-    words = " ".join(done("stress", tmp_path / "broken.onnx", *few, code=1).split())
-    assert "FAILED failures 1 result (night, float32: gain" in words
-    assert "not checked: The INT8 network is missing" in words
-    assert "stress FAILED, 1 of 2" in words
+    output = done("stress", tmp_path / "broken.onnx", *few, code=1)
+    assert "FAILED failures 1 result (night, float32: gain" in output
+    assert "not checked: The INT8 network is missing" in output
+    assert "stress FAILED, 1 of 2" in output
 
 
 @pytest.mark.parametrize(

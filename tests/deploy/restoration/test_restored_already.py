@@ -69,10 +69,14 @@ def test_a_raw_image_of_any_sensor_in_range_is_not_reported(
     assert look(raw(seed, light, snr)) == ""
 
 
+def restored() -> np.ndarray:
+    pair = bd.simulate(sensor=SENSOR, size=320)
+    assert isinstance(pair, bd.Pair)
+    return np.asarray(bd.restore(pair.degraded, network=NETWORK))
+
+
 PROCESSED: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "restored": lambda _: np.asarray(
-        bd.restore(bd.simulate(sensor=SENSOR, size=320).degraded, network=NETWORK)
-    ),
+    "restored": lambda _: restored(),
     "smoothed": lambda image: np.rint(gaussian_filter(image.astype(np.float64), 1.0)).astype(
         np.uint16
     ),

@@ -23,7 +23,9 @@ SENSOR = Sensor.load(NAME)
 @pytest.fixture(scope="module")
 def raw() -> np.ndarray:
     """A raw image (320, 320), of drawn fields and houses."""
-    return bd.simulate(sensor=SENSOR, size=320, seed=3).degraded
+    pair = bd.simulate(sensor=SENSOR, size=320, seed=3)
+    assert isinstance(pair, bd.Pair)
+    return pair.degraded
 
 
 def check(
@@ -139,7 +141,8 @@ def test_the_library_logs_a_warning_and_strict_refuses(
 
 def test_pairs_are_compared_with_the_sensor_before_an_evaluation(tmp_path: Path) -> None:
     profile = SENSOR.replace(snr_0=25, snr_1=55).save(tmp_path / "wrong.toml")
-    pairs = bd.simulate(sensor=SENSOR, size=320, seed=3).save(tmp_path / "pairs")
+    pair = bd.simulate(sensor=SENSOR, size=320, seed=3)
+    pairs = pair.save(tmp_path / "pairs")
     (pairs / "recipe.json").unlink()
     words = ("evaluate", "--pairs", pairs, "--methods", "degraded")
     assert "look at the sensor: noise at" in done(*words, "--sensor", profile)
