@@ -192,10 +192,10 @@ def test_an_unknown_full_scale_is_refused(da: Any, model: Path) -> None:
     shares = (noise(60, 50) / 4095).astype(np.float32)
     eight = (noise(60, 50) // 16).astype(np.uint8)
     for image in (shares, eight, da.from_array(eight, chunks=20)):
-        with pytest.raises(ImageError, match=r"^image has .*`full_scale`"):
+        with pytest.raises(ImageError, match=r"^The image has .*`full_scale`"):
             restore(image, network=model, tile=23)
     lazy = restore(da.from_array(shares, chunks=20), network=model, tile=23)
-    with pytest.raises(ImageError, match=r"^image has .*`full_scale`"):
+    with pytest.raises(ImageError, match=r"^The image has .*`full_scale`"):
         lazy.compute()
     for image, full_scale in ((shares, 1), (eight, 255)):
         expected = restore(image, network=model, tile=23, full_scale=full_scale)
@@ -217,7 +217,7 @@ def test_an_unknown_full_scale_is_refused(da: Any, model: Path) -> None:
     ],
 )
 def test_other_arrays_than_images_are_refused(image: Any, model: Path) -> None:
-    with pytest.raises(ImageError, match=r"^(`image`|image) must"):
+    with pytest.raises(ImageError, match=r"^(`image`|The image) must"):
         restore(image, network=model)
 
 

@@ -18,7 +18,7 @@ import pytest
 import tifffile
 from typer.testing import CliRunner
 
-from beers_deploy.cli import app
+from beers_deploy.cli.commands import app
 from beers_deploy.model.convbeers import save_network
 from beers_deploy.model.variants import Variant
 from tests.deploy.sealed import SOCKET_CALL

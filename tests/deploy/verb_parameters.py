@@ -97,7 +97,7 @@ class Option:
         if get_origin(hint) is Literal:
             return next(each for each in get_args(hint) if each != self.parameter.default)
         interval = marker(self.parameter, Interval)
-        least = 1 if interval is None else max(interval.ge or 0, 1)
+        least = 1 if interval is None else max(int(str(interval.ge)), 1)
         number = least + 1 if least == self.parameter.default else least
         return str(number) if hint in (int, float) else "a"
 
