@@ -165,7 +165,8 @@ def train(
     if not folders:
         refuse_without(
             "`images`",
-            validate_every=validate_every != DEFAULTS["validate_every"],
+            # 0 asks for no validation, which a run without images has none of.
+            validate_every=validate_every not in (0, DEFAULTS["validate_every"]),
         )
     if not lpips_weight:
         refuse_with("`lpips_weight` 0", lpips=lpips is not None)
