@@ -222,6 +222,7 @@ def in_options(text: str, verb: Callable[..., Any]) -> str:
             return match[1]
         if parameter.kind is parameter.POSITIONAL_OR_KEYWORD:
             return metavar_of(parameter)
-        return option_of(parameter.name)
+        # A switch that is on by default is written only to turn it off.
+        return spellings_of(parameter)[-1].rpartition("/")[2]
 
     return re.sub(r"`(\w+)`", named, text)

@@ -55,7 +55,11 @@ class Option:
 
     @property
     def label(self) -> str:
-        return metavar_of(self.parameter) if self.is_argument else option_of(self.name)
+        """As it is typed; a switch that is on by default is typed only to turn it off."""
+        if self.is_argument:
+            return metavar_of(self.parameter)
+        option = option_of(self.name)
+        return f"--no-{option[2:]}" if self.parameter.default is True else option
 
     @property
     def written(self) -> Written | None:
@@ -85,7 +89,7 @@ class Option:
         """The parameter with a value that is not its default, as words of a command line."""
         hint, _ = read_as(self.parameter.annotation)
         if hint is bool:
-            return [f"--no-{self.label[2:]}" if self.parameter.default is True else self.label]
+            return [self.label]
         return self.words(self.value(hint))
 
     def value(self, hint: Any) -> object:

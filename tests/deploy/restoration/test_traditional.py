@@ -163,8 +163,8 @@ def test_the_command_needs_a_sensor_and_refuses_options_of_a_network(tmp_path: P
         ([*with_sensor, "--tile", "64"], "--tile has no effect with --method traditional"),
         ([*with_sensor, "--resume"], "--resume has no effect"),
         ([*with_sensor, "--scheduler", "host:8786"], "--scheduler has no effect"),
-        ([*with_sensor, "--no-consistency"], "consistency has no effect with --method"),
-        ([*with_sensor, "--no-exposure"], "exposure has no effect with --method"),
+        ([*with_sensor, "--no-consistency"], "--no-consistency has no effect with --method"),
+        ([*with_sensor, "--no-exposure"], "--no-exposure has no effect with --method"),
     ):
         assert words in refused(*arguments)
         assert not out.exists()
