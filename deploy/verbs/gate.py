@@ -57,8 +57,9 @@ def gate(
     optimisations change no bit. The command exits with 1 if a check fails.
 
     Args:
-        float_network: float ONNX or weights. The name of a shipped pair stands for both. In Python
-            so does an INT8 network that was quantised in this process.
+        float_network: float ONNX or weights. The name of a shipped pair stands for both;
+            convbeers-s if none. In Python an INT8 network that was quantised in this process
+            stands for both too.
         int8_network: its INT8 ONNX; that of the shipped pair if none.
         max_mae: largest mean absolute difference, as a share of full scale; 0.0007 if none.
         limits: TOML file of limits by name; others have their defaults. In Python also a mapping.

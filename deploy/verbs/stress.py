@@ -51,7 +51,8 @@ def stress(
     gain and cost on the board.
 
     Args:
-        float_network: float ONNX or weights. The name of a shipped pair stands for both.
+        float_network: float ONNX or weights. The name of a shipped pair stands for both;
+            convbeers-s if none.
         int8_network: its INT8 ONNX; that of the shipped pair if none.
         cases: only these cases, separated by commas, such as night,snow.
         stages: only these stages, separated by commas, such as float32,INT8.
