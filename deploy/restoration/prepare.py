@@ -127,7 +127,10 @@ class Restoration(ABC):
         return 0
 
     def memory_bytes(self) -> int:
-        """Return the peak memory of the process, once it grows no more by itself."""
+        """Return the peak memory of the process, once it grows no more by itself.
+
+        Called only where `steady_ticks` is not 0: what sets one defines the other.
+        """
         raise NotImplementedError
 
     @abstractmethod
