@@ -159,9 +159,7 @@ def test_this_machine_accepts_one_tile_size_and_no_option_of_a_board(tmp_path: P
         *command, "--tile", "64,32"
     )
     for option in ("--no-traditional", "--no-consistency", "--dpu=C32B3", "--within=3"):
-        assert f"{option.partition('=')[0].replace('--no-', '--')} has no effect" in refused(
-            *command, option
-        )
+        assert f"{option.partition('=')[0]} has no effect" in refused(*command, option)
     assert "--threads has no effect without --target host" in refused(*command[:2], "--threads", 1)
 
 
