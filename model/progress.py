@@ -16,11 +16,15 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from types import FrameType
-
-from rich import progress as rich_progress
-from rich.console import Console
+from typing import TYPE_CHECKING
 
 from beers_deploy.profiles.errors import one_line
+
+if TYPE_CHECKING:
+    # Each command loads this module, also where it only prints its help.
+    from rich.console import Console
+    from rich.progress import Progress as Bar
+    from rich.progress import TaskID
 
 logger = logging.getLogger(__name__)
 
@@ -63,16 +67,16 @@ def reporting(wanted: Progress) -> Iterator[None]:
 class Display:
     """The one bar that is drawn, on which all work that runs has a line."""
 
-    bar: rich_progress.Progress | None = None
+    bar: "Bar | None" = None
 
 
-def live_console() -> Console | None:
+def live_console() -> "Console | None":
     """Return the console of the bar that is drawn now, or None: other lines go through it."""
     return Display.bar.console if Display.bar is not None else None
 
 
 @contextmanager
-def _task(label: str, total: int | None) -> Iterator[rich_progress.TaskID | None]:
+def _task(label: str, total: int | None) -> "Iterator[TaskID | None]":
     """Add a line to the bar while a block runs; None where no bar is drawn."""
     if _sink.get() not in (None, True) or not _shows_bars():
         yield None
@@ -96,13 +100,18 @@ def _task(label: str, total: int | None) -> Iterator[rich_progress.TaskID | None
 
 def _shows_bars() -> bool:
     """Return True if there is a terminal or a notebook to draw on."""
+    from rich.console import Console
+
     console = Console(stderr=True)
     return console.is_terminal or console.is_jupyter
 
 
-def _new_bar() -> rich_progress.Progress:
-    # Without markup a name in brackets is shown as it is.
+def _new_bar() -> "Bar":
+    from rich import progress as rich_progress
+    from rich.console import Console
+
     columns = (
+        # Without markup a name in brackets is shown as it is.
         rich_progress.TextColumn("{task.description}", markup=False),
         rich_progress.BarColumn(),
         rich_progress.MofNCompleteColumn(),
@@ -115,9 +124,7 @@ def _new_bar() -> rich_progress.Progress:
 class Steps:
     """Counts steps of one piece of work."""
 
-    def __init__(
-        self, label: str, total: int, task: rich_progress.TaskID | None, nested: bool
-    ) -> None:
+    def __init__(self, label: str, total: int, task: "TaskID | None", nested: bool) -> None:
         self.label = label
         self.total = total
         self.done = 0
@@ -162,7 +169,7 @@ class Work:
     """Work whose steps are named one after the other."""
 
     label: str
-    task: rich_progress.TaskID | None
+    task: "TaskID | None"
     done: int = 0
 
 

@@ -34,16 +34,17 @@ class Command:
     """A verb as a command.
 
     Attributes:
-        name: on the command line.
         verb: the function.
         example: words of a command line.
-        panel: of the help.
     """
 
-    name: str
     verb: Callable[..., Any]
     example: str
-    panel: str
+
+    @property
+    def name(self) -> str:
+        """The name on the command line."""
+        return self.verb.__name__
 
     @cached_property
     def doc(self) -> Docstring:

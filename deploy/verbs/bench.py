@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError, missing_extra
-from beers_deploy.profiles.target import DEFAULT_TARGET, MODEL_SUFFIX
+from beers_deploy.profiles.target import DEFAULT_TARGET, MODEL_SUFFIX, TILE_PX
 from beers_deploy.verbs.parameters import (
     Halo,
     InputPath,
@@ -37,7 +37,7 @@ def bench(
     image: InputPath | None = None,
     full_scale: float | None = None,
     size: Size | None = None,
-    tile: Tiles = 640,
+    tile: Tiles = TILE_PX,
     halo: Halo = "exact",
     dpu: str | None = None,
     host_task: Literal["copy", "argmax", "softmax", "sort", "image"] | None = None,

@@ -211,14 +211,6 @@ def _file_of(image: Any) -> Path | None:
     return Path(image.name) if hasattr(image, "crs") and hasattr(image, "read") else None
 
 
-def _require_sensor(unknown: bool) -> None:
-    if unknown:
-        raise OptionError(
-            "`method` traditional needs `sensor`, the sensor that acquired the image. Name a "
-            "profile ('beers-deploy profiles' lists them), or give your .toml file."
-        )
-
-
 def _traditional(quality: str, unknown: bool) -> "Pipeline":
     """Return the traditional pipeline; raise OptionError if the sensor is unknown."""
     if unknown:
