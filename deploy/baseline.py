@@ -14,7 +14,7 @@ from jsonschema import Draft202012Validator
 
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.raster.images import list_images
-from beers_deploy.profiles.errors import OptionError, encodable, printable
+from beers_deploy.profiles.errors import OptionError, encodable, printable, reason_of
 from beers_deploy.profiles.figures import Check
 from beers_deploy.profiles.sensor import Sensor, numbers_of
 from beers_deploy.profiles.toml import read_json
@@ -43,7 +43,7 @@ def read_document(path: Path) -> dict[str, object]:
     except FileNotFoundError:
         fault = "there is no such file"
     except (OSError, ValueError) as error:
-        fault = " ".join(str(error).split())
+        fault = reason_of(error)
     if fault:
         raise OptionError(
             f"{path} is not a results document: {fault[:100].removesuffix('.')}. Give what a "

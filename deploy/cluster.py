@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from importlib.metadata import version
 from typing import Any, TypeVar
 
-from beers_deploy.profiles.errors import MachineError, optional, printable
+from beers_deploy.profiles.errors import MachineError, optional, printable, reason_of
 
 ANSWER_S = 10
 JOIN_S = 30
@@ -104,7 +104,7 @@ def _connect(distributed: Any, address: str) -> Any:
     try:
         client = distributed.Client(address, timeout=ANSWER_S, set_as_default=False)
     except (OSError, ValueError) as error:
-        reason = " ".join(str(error).split())[:120]
+        reason = reason_of(error)
         raise MachineError(
             f"The scheduler {printable(address)} does not answer: {reason}. Give its address, such "
             "as tcp://host:8786."

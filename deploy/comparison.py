@@ -39,7 +39,6 @@ class Comparison(Table):
         shares: of each layer's results the share at the ends of 8 bits.
         floating: the float network.
         int8: the INT8 network.
-        sensor: of the simulated patches, and of shipped networks.
         rests_on: what the figures rest on besides the networks.
     """
 
@@ -47,7 +46,6 @@ class Comparison(Table):
     shares: Mapping[str, float]
     floating: Network
     int8: Network
-    sensor: Sensor
     rests_on: tuple[Input, ...]
 
 
@@ -74,7 +72,7 @@ def compare(
         images: folder of scenes for the patches; drawn ones if None.
         patches: number of simulated patches, 128 x 128 pixels each.
         seed: of the patches.
-        metric: psnr, ssim, mae, top1 or iou: also compare the results with the references.
+        metric: psnr, ssim or mae: also compare the results with the references.
         progress: a function that is called at each step, False for silence, None for a bar or lines
             on standard error.
 
@@ -135,7 +133,6 @@ def compare(
         shares=shares,
         floating=floating,
         int8=int8,
-        sensor=profile,
         rests_on=tuple(rests_on),
     )
 

@@ -23,7 +23,7 @@ from beers_deploy.network_files import (
     require_known,
     warn_outside,
 )
-from beers_deploy.profiles.errors import ModelError, optional
+from beers_deploy.profiles.errors import ModelError, optional, reason_of
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import BLIND
@@ -286,7 +286,7 @@ def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
             )
         # The code of a module may raise anything.
         except Exception as error:
-            reason = " ".join(str(error).split())[:160]
+            reason = reason_of(error)
             raise ModelError(
                 f"torch cannot export the module {type(module).__name__}: {reason}. Check that it "
                 f"accepts an image of {times(example)}, or give example=(N, C, H, W)."

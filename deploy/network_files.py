@@ -20,7 +20,6 @@ from beers_deploy.model.io.tensors import is_conditioned, read_conditioned
 from beers_deploy.model.shipped import (
     INT8,
     SHIPPED,
-    VARIANT,
     shipped_names,
     shipped_weights,
 )
@@ -38,7 +37,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Conditioned:
-    """Weights of a network that is told its sensor, and the name that it is listed under."""
+    """Weights of a network that is conditioned on its sensor, and the name it is listed under."""
 
     name: str
     weights: Path
@@ -49,7 +48,7 @@ class Conditioned:
         return read_conditioned(self.weights).kernels
 
     def model(self, sensor: Sensor, int8: bool) -> onnx.ModelProto:
-        """The network told a sensor, in float32 or in INT8."""
+        """Return the network for a sensor, in float32 or in INT8."""
         if not int8:
             return float_for(self.weights, self.name, sensor)
         shipped = SHIPPED / f"{self.name}{INT8}.onnx"
@@ -59,15 +58,11 @@ class Conditioned:
                 f"every sensor with 'beers-deploy quantize {self.weights} --out "
                 f"{self.name}{INT8}.onnx'."
             )
-        return told_int8(load_onnx(shipped), sensor)
+        return int8_for_sensor(load_onnx(shipped), sensor)
 
 
-def conditioned(given: Path | None) -> Conditioned | None:
-    """The network to be told its sensor that is meant, None meaning the default one; None for any
-    other file.
-    """
-    if given is None:
-        return Conditioned(VARIANT, shipped_weights(VARIANT))
+def conditioned(given: Path) -> Conditioned | None:
+    """Return the conditioned network that a name or a file stands for; None for any other file."""
     if _is_shipped(given):
         name = given.name.removesuffix(INT8)
         return Conditioned(name, shipped_weights(name))
@@ -79,7 +74,7 @@ def conditioned(given: Path | None) -> Conditioned | None:
 
 
 def weights_file(given: Path) -> Path:
-    """The file given, or the shipped one of that name where no such file lies; nothing is read."""
+    """Return the path of a file, or of the shipped network of that name; nothing is read."""
     if not _is_shipped(given):
         return given
     return (
@@ -88,7 +83,7 @@ def weights_file(given: Path) -> Path:
 
 
 def _is_shipped(path: Path) -> bool:
-    """Whether a shipped network is meant by its name, with INT8 behind it or without."""
+    """Return True if a path is the name of a shipped network, with INT8 behind it or without."""
     # A file of that name goes before the shipped network.
     is_name = path == Path(path.name) and path.name.removesuffix(INT8) in shipped_names()
     return is_name and not path.exists()
@@ -118,8 +113,8 @@ def warn_outside(sensor: Sensor, kernels: Kernels) -> None:
 
 
 def other_sensor(model: onnx.ModelProto, sensor: Sensor) -> str:
-    """Return a warning if a network was made for another sensor than the one
-    named; else nothing.
+    """Return a warning if a network was made for another sensor than the named one; else
+    nothing.
     """
     own = metadata(model).get("sensor", "")
     if own in ("", BLIND, BLIND_PROFILE, sensor.name):
@@ -127,14 +122,15 @@ def other_sensor(model: onnx.ModelProto, sensor: Sensor) -> str:
     return f"look at the sensor: the network was made for {own}, not for {sensor.name}"
 
 
-def told_int8(
+def int8_for_sensor(
     model: onnx.ModelProto, sensor: Sensor, more: Mapping[str, str] | None = None
 ) -> onnx.ModelProto:
-    """An INT8 network behind a bank told another sensor: its filters, unit and biases written anew.
+    """Return a conditioned INT8 network for another sensor: filters, unit and biases are written
+    anew.
 
     Args:
-        model: of whatever sensor.
-        sensor: of which the middle is taken.
+        model: for any sensor.
+        sensor: of which the middle of each range is taken.
         more: metadata to add.
     """
     family = required_family(model)
@@ -147,9 +143,9 @@ def told_int8(
     )
 
 
-def told_by_delta(model: onnx.ModelProto, delta: Path) -> onnx.ModelProto:
-    """An INT8 network behind a bank told the sensor of a delta, a file that
-    `export --delta` wrote.
+def int8_for_delta(model: onnx.ModelProto, delta: Path) -> onnx.ModelProto:
+    """Return a conditioned INT8 network for the sensor of a delta, a file that `export --delta`
+    wrote.
     """
     try:
         packed = delta.read_bytes()

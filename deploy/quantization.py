@@ -17,7 +17,7 @@ from beers_deploy.model.io.files import sha256
 from beers_deploy.model.io.tensors import read_conditioned
 from beers_deploy.model.progress import progress, step
 from beers_deploy.network import Network, NetworkLike
-from beers_deploy.network_files import Conditioned, conditioned, told_int8
+from beers_deploy.network_files import Conditioned, conditioned, int8_for_sensor
 from beers_deploy.profiles.errors import ModelError, OptionError, optional, printable
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
@@ -26,17 +26,16 @@ from beers_deploy.profiles.target import TargetProfile, board_names, npu_names
 from beers_deploy.quant.banked.family import FAMILY, WEIGHTS, required_family
 from beers_deploy.quant.core import SHIFTS, Shifts, target_shifts
 from beers_deploy.quant.encodings import host_model, read_core
-from beers_deploy.quant.gate import compare, gate_row
+from beers_deploy.quant.gate import GateResult, compare, gate_row
 from beers_deploy.quant.integer.reference import integer_rows
 from beers_deploy.quant.onnx_file import faults_named, load_onnx, metadata, require_quantised
-from beers_deploy.quant.passes.selection import Passes
+from beers_deploy.quant.passes.selection import ALL, Passes
 from beers_deploy.quant.quantise import quantise_model
 from beers_deploy.quant.samples import OwnSamples, samples_of
 from beers_deploy.quant.sensitivity import (
     WORST,
     headline,
     layer_error_rows,
-    losses,
     sizes_row,
     spread_of,
     worst_row,
@@ -50,21 +49,26 @@ from beers_deploy.results import Input
 if TYPE_CHECKING:
     from beers_deploy.model.convbeers import Rounding
     from beers_deploy.quant.calibration import Calibration
+    from beers_deploy.quant.samples import Patches
 
 Source: TypeAlias = "Calibration | OwnSamples"
 """Where patches come from: simulated ones, or a user's own."""
+
+MOST_DIGITS = 9
 
 
 def steps_of(finetune: int | str) -> int | None:
     """Return the steps of fine-tuning, or None for "auto"."""
     if finetune == "auto":
         return None
-    if not str(finetune).isdecimal():
+    text = str(finetune)
+    # Python refuses to read numbers of thousands of digits.
+    if not text.isdecimal() or len(text) > MOST_DIGITS:
         raise OptionError(
             "`finetune` must be 'auto' or a whole number of steps from 0, but it is "
             f"{printable(repr(finetune))}. Choose 'auto'."
         )
-    return int(finetune)
+    return int(text)
 
 
 @dataclass(frozen=True)
@@ -108,8 +112,11 @@ class Data:
 
 def quantised(
     network: NetworkLike, data: Data, target: TargetProfile, finetune: int | str
-) -> Network:
+) -> tuple[Network, "Patches | None"]:
     """Quantise a float network; the INT8 one knows its `origin`.
+
+    Also returned are the samples that calibration did not see; None of a network that is calibrated
+    over the family of sensors.
 
     Args:
         network: float network, a shipped name, or weights that are conditioned on a sensor.
@@ -134,8 +141,11 @@ def quantised(
     require_quantised(origin.model, origin.label, wanted=False)
     with faults_named(origin.label):
         if banked:
-            return quantise_conditioned(banked, origin, data.simulated, data.sensor, target)
-        return quantise_alone(origin, data.source_for(origin.model), target, steps)
+            int8 = quantise_conditioned(banked, origin, data.simulated, data.sensor, target)
+            return int8, None
+        # Samples in memory may be given one after the other, so they are read only here.
+        source = data.source_for(origin.model)
+        return quantise_alone(origin, source, target, steps), source.unseen
 
 
 def quantise_alone(
@@ -184,7 +194,7 @@ def quantise_conditioned(
     """
     images = [] if calibration.images is None else [calibration.images]
     family = family_model(network, images, calibration.seed, _shifts_of(target))
-    host = told_int8(family, sensor, {"target": target.name})
+    host = int8_for_sensor(family, sensor, {"target": target.name})
     layers = integer_rows(origin.model, read_core(host), host, calibration.drawn.degraded)
     return Network(host, f"{network.name}-int8", origin=origin, layers=layers)
 
@@ -198,37 +208,35 @@ def _shifts_of(target: TargetProfile) -> Shifts:
     return target_shifts(target)
 
 
-def losses_of(network: Network, data: Data) -> str:
-    """Return what INT8 loses on samples that calibration did not see, in one sentence."""
-    assert network.origin is not None and network.quantised is not None  # noqa: S101, PT018
-    model = network.origin.model
-    result = network.quantised
-    held_out = data.source_for(model).unseen
-    differences = compare(
-        open_any_size(model), open_any_size(result.host), held_out.pairs, data.samples is None
-    )
-    return losses(result, differences, held_out)
+def differences_of(network: Network, held_out: "Patches", simulated: bool) -> GateResult:
+    """Return what INT8 changes in a network that was quantised here.
+
+    Args:
+        network: the INT8 one.
+        held_out: samples that calibration did not see.
+        simulated: whether they are simulated patches.
+    """
+    assert network.origin is not None  # noqa: S101
+    sessions = open_any_size(network.origin.model), open_any_size(network.model)
+    return compare(*sessions, held_out.pairs, simulated)
 
 
 def sensitivity_report(
-    network: Network, data: Data, more: Sequence[Row] = ()
+    network: Network, held_out: "Patches", differences: GateResult, more: Sequence[Row] = ()
 ) -> tuple[list[Row], Report]:
     """Return where INT8 errs on samples that calibration did not see: rows, and a page.
 
     Args:
         network: that was quantised here.
-        data: that it was calibrated on.
+        held_out: the samples.
+        differences: that were measured on them.
         more: rows that the page shows behind.
     """
     assert network.origin is not None and network.quantised is not None  # noqa: S101, PT018
-    model = network.origin.model
-    result = network.quantised
-    held_out = data.source_for(model).unseen
-    sessions = open_any_size(model), open_any_size(result.host)
-    differences = compare(*sessions, held_out.pairs, data.samples is None)
+    sessions = open_any_size(network.origin.model), open_any_size(network.model)
     spread = spread_of(*sessions, held_out.degraded)
     worst = spread.worst(WORST)
-    layers = layer_error_rows(result, held_out)
+    layers = layer_error_rows(network.quantised, held_out)
     rows = [
         gate_row(differences),
         *layers,
@@ -241,8 +249,10 @@ def sensitivity_report(
 
 
 def rounding_of(int8: Path, weights: Path) -> "Rounding":
-    """How the INT8 file of a network behind a bank rounds its maps; refused where it is of other
-    weights.
+    """Return how the INT8 file of a conditioned network rounds its maps.
+
+    Raises:
+        ModelError: it was made of other weights.
     """
     import torch
 
@@ -267,22 +277,22 @@ def family_model(
     images: Sequence[Path] = (),
     seed: int = 0,
     shifts: Shifts = SHIFTS,
-    passes: Passes | None = None,
+    passes: Passes = ALL,
 ) -> onnx.ModelProto:
-    """The INT8 file of a network behind a bank, for the middle of the family; any sensor can be
-    told to it.
+    """Quantise a conditioned network over the family of sensors, and return its INT8 file for the
+    middle of the family.
 
     Args:
         network: of weights that 'train --conditioned' wrote.
-        images: folders of photographs, beside which about as many drawn scenes are seen; none takes
-            these alone.
+        images: folders of photographs; about as many drawn scenes are added. Drawn scenes alone if
+            empty.
         seed: of the patches.
         shifts: the windows of the target.
-        passes: that reduce the error; None for those that pay behind a bank.
+        passes: that reduce the error.
     """
     # This loads SciPy, which samples of one's own do without.
     from beers_deploy.model.simulator.procedural import load_scenes
-    from beers_deploy.quant.banked.calibrate import PASSES, family_images, quantise_family
+    from beers_deploy.quant.banked.calibrate import family_images, quantise_family
 
     weights = read_conditioned(network.weights)
     aim = load_sensor(REFERENCE).nominal()
@@ -295,7 +305,7 @@ def family_model(
     with progress(f"calibrating {network.name} over the family of sensors"):
         family_patches = family_images(scenes, scale, seed, weights.kernels)
         middle = bank_of_vector((0.0,) * len(RANGES), weights.kernels)
-        family = quantise_family(weights, middle, family_patches, shifts, passes or PASSES)
+        family = quantise_family(weights, middle, family_patches, shifts, passes)
     description = {
         "variant": network.name,
         "reference": REFERENCE,

@@ -111,8 +111,9 @@ class Table:
             return ""
         if self.failed:
             reasons = "; ".join(map(str, self.failed))
-            return f"{self.command} FAILED, {len(self.failed)} of {len(self.checks)}: {reasons}"
-        return f"{self.command} passed, {len(self.checks)} of {len(self.checks)}"
+            failed = f"{len(self.failed)} of {len(self.checks)} checks"
+            return f"{self.command} FAILED, {failed}: {reasons}"
+        return f"{self.command} passed, all {len(self.checks)} checks"
 
     def shown(self, details: bool = False) -> dict[str, list[Row]]:
         """Return the rows of each table that is shown, by its heading.
@@ -122,11 +123,13 @@ class Table:
         """
         tables: dict[str, list[Row]] = {}
         for name, rows in by_table(self.rows).items():
+            # Two tables of one heading are shown as one.
+            shown = tables.setdefault(self.headings.get(name, name), [])
             if details:
-                tables[self.headings.get(name, name)] = rows
+                shown += rows
             elif name not in self.details:
-                tables[self.headings.get(name, name)] = [self._short(row) for row in rows]
-        return tables
+                shown += [self._short(row) for row in rows]
+        return {heading: rows for heading, rows in tables.items() if rows}
 
     def _short(self, row: Row) -> Row:
         """Return a row without its details."""
@@ -149,12 +152,15 @@ class Table:
             print_rows(heading if heading != self.title else "", rows, console)
         if any(row.figures for rows in tables.values() for row in rows):
             console.print(LEGEND, style="dim", highlight=False, markup=False)
-        for check in self.checks:
-            word = "ok    " if check.passed else "FAILED"
-            console.print(plain(f"{word} {check}"), highlight=False, soft_wrap=True)
-        for sentence in filter(None, (*self.notes, self.verdict)):
+        for sentence in self.sentences:
             # Whoever searches a log finds a sentence on one line.
             console.print(plain(sentence), highlight=False, soft_wrap=True)
+
+    @property
+    def sentences(self) -> list[str]:
+        """What stands below the tables: each check with its outcome, the notes, the verdict."""
+        checks = [f"{'ok    ' if check.passed else 'FAILED'} {check}" for check in self.checks]
+        return [*checks, *self.notes, *filter(None, (self.verdict,))]
 
     def to_dict(self) -> dict[str, object]:
         """Return the table as the schema of results documents wants it."""
@@ -194,12 +200,11 @@ class Table:
         return Path(path)
 
     def to_markdown(self) -> str:
-        """Return the tables, checks and notes as Markdown."""
-        lines: list[str] = []
+        """Return the title, the tables, checks, notes and the verdict as Markdown."""
+        lines = [f"# {markdown_text(self.title)}", ""] if self.title else []
         for heading, rows in self.shown().items():
             lines += [f"## {markdown_text(heading)}", "", *markdown_table(rows), ""]
-        sentences = [*map(str, self.checks), *self.notes]
-        lines += [f"- {markdown_text(sentence)}" for sentence in sentences]
+        lines += [f"- {markdown_text(sentence)}" for sentence in self.sentences]
         return "\n".join(lines).rstrip() + "\n"
 
     def to_pandas(self, tidy: bool = False) -> "pd.DataFrame":
@@ -252,10 +257,8 @@ class Table:
     def _repr_html_(self) -> str:
         """Return what a notebook shows: each table, checks and notes."""
         tables = [html_table(heading, rows) for heading, rows in self.shown().items()]
-        sentences = [*map(str, self.checks), *self.notes, self.verdict]
-        return "".join(tables) + "".join(
-            f"<p>{html_text(one_line(sentence))}</p>" for sentence in sentences if sentence
-        )
+        sentences = [f"<p>{html_text(one_line(sentence))}</p>" for sentence in self.sentences]
+        return "".join(tables) + "".join(sentences)
 
 
 def host() -> dict[str, object]:

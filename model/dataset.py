@@ -33,7 +33,7 @@ from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.plan import TOLERANCE_DN, make_plan
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene, read_scene, resample
-from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.errors import ImageError, OptionError, reason_of
 from beers_deploy.profiles.sensor import Instrument, Sensor, require_same_units, same_instrument
 from beers_deploy.profiles.sensor_file import reference_beside, sensor_from_json
 from beers_deploy.profiles.toml import parse_json, read_json
@@ -355,7 +355,7 @@ def _read_summary(path: Path) -> dict[str, float]:
         )
         return {"patches": len(lines), "rejected_share": rejected / (rejected + 2 * len(lines))}
     except (ArithmeticError, LookupError, OSError, TypeError, ValueError) as error:
-        reason = " ".join(str(error).split())[:120]
+        reason = reason_of(error)
         raise OptionError(
             f"{path} is not the manifest of a dataset: {reason}. Choose another folder."
         ) from error

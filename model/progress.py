@@ -192,10 +192,10 @@ def progress(label: str) -> Iterator[None]:
 
 def step(name: str) -> None:
     """Name the step that begins now, for whoever shows the progress of this work."""
-    logger.debug(name)
     work = _work.get()
     sink = _sink.get()
     if work is None or sink is False:
+        logger.debug(name)
         return
     text = f"{work.label}: {name}"
     if callable(sink):

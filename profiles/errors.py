@@ -52,6 +52,13 @@ def printable(text: str, longest: int = LONGEST) -> str:
     return one_line(text[:longest]) + ("..." if len(text) > longest else "")
 
 
+def reason_of(error: BaseException) -> str:
+    """Return the message of a library's error for a sentence of ours: on one line, cut where it is
+    long, and without a full stop.
+    """
+    return printable(" ".join(str(error).split())).rstrip(".")
+
+
 def one_line(text: str) -> str:
     """Return the whole text on one line, with its escape for each character that is not printable.
 

@@ -104,9 +104,9 @@ def origins(
     leaves it out.
     """
     # What is stated wins over what is added.
-    sources = dict.fromkeys(add, "--with")
+    sources = dict.fromkeys(add, "`with_`")
     sources |= dict.fromkeys(("mtf", "noise", *profile.effects), f"sensor {profile.name}")
     if scene:
         sources |= dict.fromkeys(scene.effects, f"scene {scene.name}")
         sources |= dict.fromkeys(scene.without, f"left out by scene {scene.name}")
-    return sources | dict.fromkeys(forbid, "left out by --without")
+    return sources | dict.fromkeys(forbid, "left out by `without`")

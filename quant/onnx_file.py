@@ -5,6 +5,7 @@ Also what a network's file says of itself: its metadata, and the tile that it is
 image may be cut into tiles for it is `quant.tiling`'s matter.
 """
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
@@ -24,6 +25,7 @@ from beers_deploy.profiles.errors import (
     OptionError,
     one_line,
     printable,
+    reason_of,
 )
 from beers_deploy.profiles.toml import read_whole, unreadable
 from beers_deploy.quant.domains import functions_of, operator_name
@@ -56,7 +58,7 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
     try:
         content = read_whole(path, FILE_BYTES)
     except (OSError, ValueError) as error:
-        reason = unreadable(path) or printable(" ".join(str(error).split()))
+        reason = unreadable(path) or reason_of(error)
         raise ModelError(
             f"The network {printable(str(path))} cannot be read: {reason}. {REMEDY}"
         ) from error
@@ -103,7 +105,7 @@ def parse_onnx(
     except BeersError:
         raise
     except (DecodeError, onnx.checker.ValidationError, ValueError) as error:
-        reason = printable(" ".join(str(error).split()) or "other bytes")
+        reason = reason_of(error) or "other bytes"
         raise ModelError(f"{where} is not an ONNX file: {reason}. {REMEDY}") from error
     opset = opset_of(model)
     newest = onnx.defs.onnx_opset_version()
@@ -278,7 +280,8 @@ def faults_named(label: str) -> Iterator[None]:
     try:
         yield
     except ModelError as error:
-        if one_line(label) in str(error):
+        # As a word of its own: a network may be called "image" or "a".
+        if re.search(rf"(?<![\w.-]){re.escape(one_line(label))}(?![\w-])", str(error)):
             raise
         raise ModelError(f"{label}: {error}") from error
 

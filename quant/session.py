@@ -13,7 +13,7 @@ import onnx
 import onnxruntime as ort
 
 from beers_deploy.model.processor import int8_adds_exactly
-from beers_deploy.profiles.errors import CODE_FAULTS, ModelError, printable
+from beers_deploy.profiles.errors import CODE_FAULTS, ModelError, printable, reason_of
 from beers_deploy.quant.ends import ONE_CHANNEL, Ends
 from beers_deploy.quant.graph import (
     PLANES,
@@ -79,7 +79,7 @@ def open_session(
     except CODE_FAULTS:
         raise
     except Exception as error:  # onnxruntime raises a class of its own for each status code
-        reason = printable(" ".join(str(error).split())).rstrip(".")
+        reason = reason_of(error)
         raise ModelError(
             f"onnxruntime cannot run {name}: {reason}. Give a file written by "
             "'beers-deploy export' or 'beers-deploy quantize'."
@@ -118,7 +118,7 @@ def tensors_of(
     except CODE_FAULTS:
         raise
     except Exception as error:  # as above
-        raise _unfit(" ".join(str(error).split()).rstrip(".")) from error
+        raise _unfit(reason_of(error)) from error
 
 
 def require_finite(values: Iterable[np.ndarray], name: str) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import onnx
 from onnx import AttributeProto, NodeProto, TensorProto, helper, numpy_helper
 
-from beers_deploy.profiles.errors import BeersError, ModelError, printable
+from beers_deploy.profiles.errors import BeersError, ModelError, printable, reason_of
 from beers_deploy.quant.domains import INLINE, MICROSOFT, STANDARD, foreign_remedy
 
 DAMAGE = (
@@ -76,7 +76,7 @@ def contradictions(where: str) -> Iterator[None]:
         if isinstance(getattr(error, "obj", None), ModuleType):
             # The installed library lacks what this program calls, whatever the file holds.
             raise
-        reason = printable(" ".join(str(error).split()))
+        reason = reason_of(error)
         raise ModelError(
             f"Nodes of {where} contradict their definition in ONNX ({reason}). Check the file with "
             "onnx.checker, and export it again."

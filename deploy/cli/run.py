@@ -5,6 +5,8 @@ import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,9 +43,9 @@ def run(
     What a user can correct ends it with 2, anything else with 70.
     """
     try:
-        with reporting(False if quiet else None), logged(quiet, verbose):
+        with reporting(False if quiet else None), logged(command, quiet, verbose):
             result = _result(command, options, json)
-            _show(result, quiet, verbose)
+            _show(result, command, quiet, verbose)
             table = table_of(result)
             if table is not None:
                 save_results(table, json)
@@ -82,24 +84,32 @@ def table_of(result: Any) -> Any:
     return result if isinstance(result, Table) else getattr(result, "table", None)
 
 
-def _show(result: Any, quiet: bool, verbose: bool) -> None:
+def _show(result: Any, command: Command, quiet: bool, verbose: bool) -> None:
     """Print a result on standard output."""
     if quiet:
         return
     table = table_of(result)
     if table is not None:
-        table.print(details=verbose)
+        notes = tuple(in_options(note, command.verb) for note in table.notes)
+        rows = tuple(_in_options(row, command) for row in table.rows)
+        replace(table, notes=notes, rows=rows).print(details=verbose)
     elif isinstance(result, str):
         # A terminal must obey nothing in the text of a file.
         for line in result.removesuffix("\n").split("\n"):
             typer.echo(one_line(line))
 
 
+def _in_options(row: Any, command: Command) -> Any:
+    """Return a row whose words name parameters as the command line does."""
+    words = {key: in_options(text, command.verb) for key, text in row.text.items()}
+    return replace(row, text=words)
+
+
 @contextmanager
-def logged(quiet: bool, verbose: bool) -> Iterator[None]:
+def logged(command: Command, quiet: bool, verbose: bool) -> Iterator[None]:
     """Print what the package logs on standard error while a command runs."""
     logger = logging.getLogger("beers_deploy")
-    handler = Lines()
+    handler = Lines(command)
     before = logger.level, logger.propagate
     level = logging.INFO
     if quiet:
@@ -121,13 +131,17 @@ def logged(quiet: bool, verbose: bool) -> Iterator[None]:
 class Lines(logging.Handler):
     """Prints each record as one line on standard error, above a bar of progress."""
 
-    def __init__(self) -> None:
+    def __init__(self, command: Command) -> None:
         super().__init__()
+        self._command = command
         self._warned: set[str] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print a record; a warning says that it is one, and is printed once."""
-        text = one_line(record.getMessage())
+        # The names of files that are inserted into a message stay as they are.
+        message = copy(record)
+        message.msg = in_options(str(record.msg), self._command.verb)
+        text = one_line(message.getMessage())
         if record.levelno >= logging.WARNING:
             # Several networks of one sensor warn of the same.
             if text in self._warned:

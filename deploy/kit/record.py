@@ -11,12 +11,13 @@ from uuid import NAMESPACE_URL, uuid5
 
 from beers_deploy import __version__
 from beers_deploy.float_onnx import float_for
+from beers_deploy.kit import RECORD
 from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.io.tensors import read_conditioned
 from beers_deploy.model.shipped import INT8, SHIPPED, shipped_names, shipped_weights
 from beers_deploy.network import Network
-from beers_deploy.network_files import told_int8 as for_sensor
+from beers_deploy.network_files import int8_for_sensor
 from beers_deploy.profiles.errors import ModelError, one_line, optional, printable
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
@@ -28,7 +29,6 @@ from beers_deploy.results import Table
 
 SCHEMA = "beers-deploy/record"
 SCHEMA_VERSION = 1
-NAMES = "record.json", "record.html", "record.cdx.json"
 LIMITATIONS = (
     (
         "Nothing here has run on a board: figures of a board are predicted by a cost model, or "
@@ -46,7 +46,7 @@ BULKY = {KEY, FAMILY}
 
 def recorded(folder: Path) -> list[Path]:
     """Return the files of a record."""
-    return [folder / name for name in NAMES]
+    return [folder / name for name in RECORD]
 
 
 def require_library() -> None:
@@ -119,7 +119,7 @@ def _has_family(network: Network) -> bool:
 
 
 def code_sha256() -> str:
-    """Of the sources of this package, whose names and bytes in their order are one text."""
+    """Return the SHA-256 of all sources of this package, names and bytes in their order."""
     root = Path(__file__).parents[1]
     digest = hashlib.sha256()
     # In this order and with these slashes the digest is the same on every system.
@@ -141,7 +141,7 @@ def _verified_weights(network: Network, sensor: Sensor, floating: Network | None
     path = shipped_weights(name)
     if floating is not None and floating.model.graph == float_for(path, name, sensor).graph:
         return path
-    shipped = for_sensor(load_onnx(SHIPPED / f"{name}{INT8}.onnx"), sensor)
+    shipped = int8_for_sensor(load_onnx(SHIPPED / f"{name}{INT8}.onnx"), sensor)
     return path if network.model.graph == shipped.graph else None
 
 

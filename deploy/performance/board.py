@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from beers_deploy.dpu.board import ALL, BoardLike, Dpu, boards_of, dpu_of
+from beers_deploy.dpu.board import ALL, Dpu, dpu_of
 from beers_deploy.dpu.cost.latency import Prediction
 from beers_deploy.dpu.cost.model import Task
 from beers_deploy.dpu.cost.own_runs import read_own_runs
@@ -48,24 +48,6 @@ Tables = list[tuple[str, list[Row]]]
 """Rows by the title of their table."""
 
 
-def _predictions(
-    network: Network,
-    boards: Sequence[Dpu],
-    tile_px: int,
-    task: Task | None,
-    step_px: float = 0.0,
-) -> tuple[list[Prediction], list[str]]:
-    """A network on each board, of its own size where it is fixed to one; and what to say of its
-    host.
-    """
-    # A network that is fixed to one size runs at that size alone.
-    size_px = None if own_tile_px(network.model) else tile_px
-    predictions = [predict_network(network, dpu, size_px, task, step_px) for dpu in boards]
-    # Boards of one kind say the same of their hosts: each sentence is kept once.
-    sentences = dict.fromkeys(chain.from_iterable(map(host_words, predictions)))
-    return predictions, list(sentences)
-
-
 TRAFFIC = (
     "LdFM, StFM: feature maps loaded and stored, an image; LdWB: weights and biases loaded, a batch"
 )
@@ -80,7 +62,7 @@ DETAILS = frozenset(
         "consistency step",
         "energy",
         "fitted range",
-        "host beside the DPU",
+        "host next to the DPU",
         "host's task",
         "layers",
         "layers on chip",
@@ -248,7 +230,11 @@ def _layers(network: Network, prediction: Prediction) -> tuple[str, list[Row]]:
 
 def _frames(network: Network, asked: Question, why: ModelError) -> Bench:
     """Return the network on whole images; of one configuration each layer too."""
-    predictions, notes = _predictions(network, asked.boards, TILE_PX, asked.task)
+    # A network that is fixed to one size runs at that size alone.
+    size_px = None if own_tile_px(network.model) else TILE_PX
+    predictions = [predict_network(network, dpu, size_px, asked.task) for dpu in asked.boards]
+    # Boards of one kind say the same of their hosts: each sentence is printed once.
+    notes = dict.fromkeys(chain.from_iterable(map(host_words, predictions)))
     rows = list(map(frame_row, predictions))
     sides = network.model.graph.input[0].type.tensor_type.shape.dim[2:]
     size = " x ".join(str(side.dim_value or TILE_PX) for side in sides)
@@ -272,12 +258,12 @@ def quoted(network: Network, target: TargetProfile) -> Bench:
 
 
 def boards_for(
-    target: BoardLike | Sequence[BoardLike], config: str | None, measured: Path | None
+    targets: Sequence[TargetProfile], config: str | None, measured: Path | None
 ) -> tuple[list[Dpu], Tables]:
     """Return the configurations of boards, and tables of the runs that correct them.
 
     Args:
-        target: one board or several, or "all".
+        targets: the boards.
         config: a configuration, "all" of each board, or None for the default.
         measured: the user's own runs on the board, as JSON.
 
@@ -285,7 +271,6 @@ def boards_for(
         OptionError: one configuration for all boards, or runs for several.
         ProfileError: no such board or configuration.
     """
-    targets = boards_of(target)
     if len(targets) > 1 and config not in (None, ALL):
         raise OptionError(
             f"`dpu` {printable(repr(config))} cannot be combined with several boards. Name one "

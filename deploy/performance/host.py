@@ -1,7 +1,7 @@
 """What networks take on this machine for a tile.
 
-Networks are timed interleaved, so that whatever else runs here meets them alike; load, clock
-and memory stand beside what was measured.
+Networks are timed interleaved, so that whatever else runs here meets them alike; load and memory
+are reported with each time.
 """
 
 import statistics

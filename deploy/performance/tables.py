@@ -59,7 +59,7 @@ def predicted_rows(name: str, prediction: Prediction, swath: Swath) -> list[Row]
     }
     besides = {
         "one-thread latency": one_thread_latency(prediction),
-        "host beside the DPU": host_time(prediction, "ms/tile"),
+        "host next to the DPU": host_time(prediction, "ms/tile"),
         "power of products and traffic": counted_power(prediction),
     }
     words = {"fitted range": fitted_range(prediction)}
@@ -269,7 +269,7 @@ def frame_row(prediction: Prediction) -> Row:
         "batch": exact(prediction.batch, "frame", "images in flight"),
         "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
         "one-thread latency": one_thread_latency(prediction),
-        "host beside the DPU": host_time(prediction, "ms/frame"),
+        "host next to the DPU": host_time(prediction, "ms/frame"),
         "power": power,
         "energy": energy(frame_s, power),
     }

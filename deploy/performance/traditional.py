@@ -33,7 +33,7 @@ class ChainTime:
     Attributes:
         s_per_mpx: of each crop.
         power: of this processor meanwhile.
-        conditions: threads, load and clock.
+        conditions: threads and CPU load.
         crop: the crops' size, for the source of the figures.
     """
 

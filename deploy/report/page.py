@@ -5,7 +5,6 @@ network for nothing.
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 
 import jinja2
@@ -15,7 +14,7 @@ from beers_deploy import __version__
 from beers_deploy.model.io.files import write_text
 from beers_deploy.profiles.errors import visible
 from beers_deploy.profiles.figures import Figure, Row
-from beers_deploy.tables.columns import missing, unit_of
+from beers_deploy.tables.columns import figures_of, missing, unit_of, words_of
 
 INTERVAL = re.compile(r"\[[^\[\]]*\]")
 
@@ -101,8 +100,8 @@ def _grid(table: Section, *, upright: bool) -> dict[str, object]:
     that fits better.
     """
     rows = list(table.rows)
-    figures = list(dict.fromkeys(chain.from_iterable(row.figures for row in rows)))
-    words = list(dict.fromkeys(chain.from_iterable(row.text for row in rows)))
+    figures = figures_of(rows)
+    words = words_of(rows)
     columns = [_head(key, unit_of(key, rows)) for key in figures]
     columns += [_head(word, word=True) for word in words]
     cells = []

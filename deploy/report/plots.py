@@ -20,6 +20,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from markupsafe import Markup
 
+from beers_deploy.profiles.errors import visible
 from beers_deploy.profiles.figures import number
 from beers_deploy.profiles.sensor import MAX_DN
 
@@ -170,7 +171,7 @@ def svg_of(figure: "Figure", name: str, titles: Mapping[str, str] | None = None)
         )
     ET.register_namespace("", SVG)
     ET.register_namespace("xlink", XLINK)
-    text = re.sub(r' transform="rotate\(-0 [^"]*"', "", printable(stream.getvalue().decode()))
+    text = re.sub(r' transform="rotate\(-0 [^"]*"', "", visible(stream.getvalue().decode()))
     for key, colour in LIGHT.items():
         text = text.replace(colour, f"var(--{key})")
     root = ET.fromstring(text)  # noqa: S314 - our own
@@ -179,7 +180,7 @@ def svg_of(figure: "Figure", name: str, titles: Mapping[str, str] | None = None)
         "width": width,
         "height": height,
         "role": "group",
-        "aria-label": printable(name),
+        "aria-label": visible(name),
     }
     style = ET.Element(f"{{{SVG}}}style")
     style.text = plot_style()
@@ -196,19 +197,8 @@ def _name(group: ET.Element, titles: Mapping[str, str]) -> None:
         group.set("class", "dot" if kind in titles else kind)
     if kind in titles:
         words = ET.Element(f"{{{SVG}}}title")
-        words.text = printable(titles[kind])
+        words.text = visible(titles[kind])
         group.insert(0, words)
-
-
-def printable(text: str) -> str:
-    """Return a text with a mark in the place of each control character and each letter that XML
-    forbids.
-
-    Names come from files: some characters would also turn the direction of the words behind them.
-    """
-    return "".join(
-        letter if letter.isprintable() or letter in "\t\n" else "\ufffd" for letter in text
-    )
 
 
 def plot_style() -> str:

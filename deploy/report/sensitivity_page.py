@@ -75,7 +75,7 @@ def worst_picture(
 HISTOGRAM_CAPTION = (
     "Share of the pixels by the difference of INT8 from float, on a logarithmic scale. The line "
     "is a Gaussian of the "
-    "same standard deviation: rounding follows it, clipping leaves bars beside it."
+    "same standard deviation: rounding follows it, clipping leaves bars outside it."
 )
 CAPTIONS = {
     "layers": "Each layer in int8 by itself, all others in float. Alone: its own result, given "
@@ -88,7 +88,7 @@ CAPTIONS = {
     "integer layers": "Accumulators as seen and as proven for any input, and what is left of 24 "
     "bits; results at "
     "int8's ends; sums whose rounding depends on the rule for ties; the integer reference "
-    "beside onnxruntime, with "
+    "compared with onnxruntime, with "
     "onnxruntime's rule and with the DPU's.",
 }
 NOTES = (

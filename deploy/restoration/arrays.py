@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from beers_deploy.model.progress import steps
 from beers_deploy.model.raster.facts import (
     MaskKind,
     Raster,
@@ -159,7 +160,8 @@ def _between(places: np.ndarray, count: int) -> np.ndarray | None:
 
 def _restore_now(bands: np.ndarray, raster: Raster, job: Job) -> np.ndarray:
     work = job.pipeline.prepare(ArraySource(bands, raster), job.reading, NAME)
-    pixels, tally = gathered(work.rows(0, lambda _: None), work.out_shape, raster.out_dtype)
+    with steps("restoring", work.ticks(0)) as bar:
+        pixels, tally = gathered(work.rows(0, bar.advance), work.out_shape, raster.out_dtype)
     if not job.reading.force:
         tally.require(name=NAME)
     return pixels

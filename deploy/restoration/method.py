@@ -14,7 +14,7 @@ from beers_deploy.model.consistency import Consistency
 from beers_deploy.profiles.sensor import Instrument
 from beers_deploy.profiles.target import TILE_PX
 from beers_deploy.quant.tiling.walk import tiling_of
-from beers_deploy.restoration.plan import make_plan
+from beers_deploy.restoration.plan import Plan, make_plan
 from beers_deploy.restoration.runtime import AtFirstCall, open_runtime
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 from beers_deploy.restoration.tiles.rows import restore_dn
@@ -29,10 +29,9 @@ def network_method(
     brighter: Mapping[int, onnx.ModelProto] | None = None,
     sensor: Instrument | None = None,
     reference: Instrument | None = None,
+    plan_of: Callable[[tuple[int, ...]], Plan] | None = None,
 ) -> Restore:
     """Build a method: digital numbers of 0 to `max_dn` become whole ones, as `restore` writes them.
-
-    Tiles are the default ones, or those the network is fixed to.
 
     Args:
         model: the network.
@@ -41,6 +40,8 @@ def network_method(
             exposure out.
         sensor: that acquired the images; None leaves the consistency step out.
         reference: that the restoration aims at; needed with `sensor`.
+        plan_of: returns the tiles of an image (H, W); the default ones, or those that the network
+            is fixed to, if None.
     """
     infer, _ = open_runtime("onnxruntime", model, threads=0)
     tiling = tiling_of(model)
@@ -54,8 +55,11 @@ def network_method(
     network = ExposedNetwork({1: infer, **at_first_call}, tiling.halo_px, offset)
     consistency = (Consistency.of(sensor, reference, max_dn),) if sensor and reference else ()
 
+    def default_plan(shape: tuple[int, ...]) -> Plan:
+        return make_plan((1, *shape), tiling.fixed_px or TILE_PX, tiling.halo_px, tiling)
+
     def restore(dn: np.ndarray) -> np.ndarray:
-        plan = make_plan((1, *dn.shape), tiling.fixed_px or TILE_PX, tiling.halo_px, tiling)
+        plan = (plan_of or default_plan)(dn.shape)
         return restore_dn(dn, network, plan, max_dn, consistency)
 
     return restore

@@ -284,9 +284,9 @@ class Tally:
             impossible or self.clipped > MANY_AT_ENDS * max(self.compared, 1)
         ):
             raise ImageError(
-                f"The network does not restore {name}: {printable('; '.join(self.doubts))}. Check "
-                "the scale of the network with 'gate' and the `full_scale` of the image, or write "
-                "the result all the same with `force`."
+                f"{name} is not restored plausibly: {printable('; '.join(self.doubts))}. Check "
+                "`full_scale` and, with 'gate', the network, or write the result all the same with "
+                "`force`."
             )
 
 

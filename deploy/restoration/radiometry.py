@@ -49,7 +49,7 @@ def full_scale_of(
     Args:
         name: of the image, for messages.
         raster: what its file states.
-        extents: as for `model.io.images.settled_scale`, drawn for floats only.
+        extents: as for `model.raster.full_scale.settled_scale`, drawn for floats only.
         asked: by the user.
         bits: of the sensor, where the user names its profile.
     """

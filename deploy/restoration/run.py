@@ -252,7 +252,7 @@ def _kept_for_resuming(checkpoint: Checkpoint, resumable: bool) -> Iterator[None
     except KeyboardInterrupt:
         if resumable:
             logger.warning(
-                "stopped at row %d of %d; the same command with --resume goes on",
+                "stopped at row %d of %d; run it again with `resume` to go on",
                 checkpoint.rows,
                 checkpoint.shape[1],
             )

@@ -17,7 +17,7 @@ from onnx import helper, numpy_helper
 
 from beers_deploy.cluster import Cluster
 from beers_deploy.model.processor import asked, require_cores
-from beers_deploy.profiles.errors import ModelError, optional
+from beers_deploy.profiles.errors import ModelError, optional, reason_of
 from beers_deploy.quant.kernels import made_exact
 from beers_deploy.quant.onnx_file import is_quantised, parse_onnx
 from beers_deploy.quant.session import open_session, tensors_of
@@ -73,7 +73,7 @@ def open_openvino(model: onnx.ModelProto, threads: int, at_once: int = 1) -> tup
             network.reshape(list(shape))
             return core.compile_model(network, "CPU", options)
         except RuntimeError as error:
-            reason = " ".join(str(error).split())[:160]
+            reason = reason_of(error)
             raise ModelError(
                 f"OpenVINO does not run the network: {reason}. Use `runtime` onnxruntime."
             ) from error

@@ -40,6 +40,7 @@ from beers_deploy.profiles.errors import ImageError, printable
 from beers_deploy.profiles.figures import Figure, measured, unavailable
 from beers_deploy.profiles.response import NYQUIST
 from beers_deploy.profiles.sensor import Instrument, Sensor
+from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.restoration.bands import in_order
 
@@ -173,12 +174,12 @@ def checked_sensor(
 
     Args:
         source: the image.
-        sensors: by band, under no name where one is for all; empty where none was named.
+        sensors: by band, under no name where one is for all; empty or blind where none is known.
         full_scale: the pixel value that is the sensors' largest digital number.
         name: of the image, for messages.
         strict: whether a contradiction is an error instead of a warning.
     """
-    if not sensors:
+    if all(sensor.name == BLIND for sensor in sensors.values()):
         return SensorCheck()
     ordered = in_order(sensors, source.raster)
     names = " and ".join(dict.fromkeys(sensor.name for sensor in ordered))

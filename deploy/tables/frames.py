@@ -1,24 +1,17 @@
 """Rows of figures as a pandas DataFrame, and as bars of matplotlib."""
 
 from collections.abc import Sequence
-from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 from beers_deploy.profiles.errors import OptionError, optional, printable
 from beers_deploy.profiles.figures import Row
-from beers_deploy.tables.columns import figures_of, words_of
+from beers_deploy.tables.columns import figures_of, unit_of, words_of
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
 COLOURS = {"measured": "tab:green", "predicted": "tab:orange", "published": "tab:blue"}
-
-
-def _units(rows: Sequence[Row]) -> dict[str, str]:
-    """Return the unit of each figure; where rows differ, that of the last one."""
-    figures = chain.from_iterable(row.figures.items() for row in rows)
-    return {key: figure.unit for key, figure in figures}
 
 
 def _index(rows: Sequence[Row]) -> Any:
@@ -31,8 +24,8 @@ def _index(rows: Sequence[Row]) -> Any:
 
 
 def wide_frame(rows: Sequence[Row]) -> "pd.DataFrame":
-    """One line a row, a column a figure and a column for each word beside them; units in
-    `attrs["units"]`.
+    """Return a line for each row, with a column for each figure and for each word; `attrs["units"]`
+    has the units.
     """
     pandas = optional("pandas", "to_pandas")
     columns: dict[str, list[object]] = {}
@@ -44,13 +37,13 @@ def wide_frame(rows: Sequence[Row]) -> "pd.DataFrame":
         # A word of a figure's name would replace the figure.
         if word not in columns:
             frame[word] = [row.text.get(word, "") for row in rows]
-    frame.attrs["units"] = _units(rows)
+    frame.attrs["units"] = {key: unit_of(key, rows) for key in figures_of(rows)}
     return frame
 
 
 def tidy_frame(rows: Sequence[Row]) -> "pd.DataFrame":
-    """One line a figure: its table, row and name, value, unit, mode, interval and source (or why
-    there is none).
+    """Return a line for each figure: its table, row and name, value, unit, mode, interval and
+    source (or why there is none).
     """
     pandas = optional("pandas", "to_pandas")
     lines = []
@@ -74,7 +67,7 @@ def tidy_frame(rows: Sequence[Row]) -> "pd.DataFrame":
 
 
 def bars(rows: Sequence[Row], figure: str | None, ax: "Axes | None") -> "Axes":
-    """Bars of one figure, its interval on each; see `results.Table.plot`."""
+    """Draw bars of one figure, each with its interval; see `results.Table.plot`."""
     names = figures_of(rows)
     if not names:
         raise OptionError("The table has no figures, so there is nothing to plot.")

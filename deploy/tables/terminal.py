@@ -52,16 +52,15 @@ def plain(text: str) -> Text:
     return Text(one_line(text))
 
 
-def print_rows(title: str, rows: Iterable[Row], console: Console | None = None) -> None:
+def print_rows(title: str, rows: Iterable[Row], console: Console) -> None:
     """Print the rows of one table, and below it why figures are missing.
 
     Args:
         title: of the table.
         rows: of the table.
-        console: to print on; standard output if None.
+        console: to print on.
     """
     table_rows = list(rows)
-    console = console or default_console()
     console.print(plain(title), style="bold", highlight=False)
     for layout in _layouts(table_rows):
         if _fits(layout, console):
@@ -100,8 +99,8 @@ def _by_row(rows: Sequence[Row], stacked: bool) -> Table:
     for key in figures_of(rows):
         about = heading_of(key, rows)
         heading = [*_wrapped(key), *_wrapped(f"({about})" if about else "")]
-        mode = common_mode(key, rows)
-        cells = [_cell(row.figures.get(key), mode, stacked) for row in rows]
+        states = bool(unit_of(key, rows)), bool(common_mode(key, rows))
+        cells = [_cell(row.figures.get(key), *states, stacked) for row in rows]
         _add_figures(table, heading, cells)
         columns.append(cells)
     for word in words_of(rows):
@@ -118,19 +117,20 @@ def _by_figure(rows: Sequence[Row], stacked: bool) -> Table:
     table = _empty()
     keys = figures_of(rows)
     words = words_of(rows)
+    units = [unit_of(key, rows) for key in keys]
     modes = [common_mode(key, rows) for key in keys]
     none = [plain("")] * len(words)
     columns = [
         [plain(name) for name in (*keys, *words)],
-        [*(plain(unit_of(key, rows)) for key in keys), *none],
+        [*map(plain, units), *none],
         [*map(plain, modes), *none],
     ]
     for heading, cells in zip(("", "unit", "mode"), columns, strict=True):
         _add_words(table, heading, cells)
     for row in rows:
         figures = [
-            _cell(row.figures.get(key), mode, stacked)
-            for key, mode in zip(keys, modes, strict=True)
+            _cell(row.figures.get(key), bool(unit), bool(mode), stacked)
+            for key, unit, mode in zip(keys, units, modes, strict=True)
         ]
         _add_figures(table, _wrapped(row.name), figures)
         columns.append([*figures, *(plain(row.text.get(word, "")) for word in words)])
@@ -158,15 +158,19 @@ def _wrapped(name: str) -> list[str]:
     return textwrap.wrap(one_line(name), HEADING_WIDTH) or [""]
 
 
-def _cell(figure: Figure | None, mode: str, stacked: bool) -> Text:
-    """Return a figure in the colour of its mode, which follows unless the table states it."""
+def _cell(figure: Figure | None, states_unit: bool, states_mode: bool, stacked: bool) -> Text:
+    """Return a figure in the colour of its mode; unit and mode follow unless a heading states
+    them.
+    """
     if figure is None or figure.value is None:
         return Text("" if figure is None else "-")
     text = str(figure)
     if stacked:
         text = text.replace(" [", "\n[")
+    if not states_unit and figure.unit:
+        text = f"{text} {figure.unit}"
     shown = Text(text, COLOURS[figure.mode])
-    if not mode:
+    if not states_mode:
         shown.append("\n" if stacked else " ").append(figure.mode)
     return shown
 
@@ -180,11 +184,7 @@ def _print_blocks(rows: Sequence[Row], console: Console) -> None:
         for _ in range(2):
             block.add_column(overflow="fold")
         for key, figure in row.figures.items():
-            value = _cell(figure, "", stacked=False)
-            # The unit stands in front of the mode, as a person reads it.
-            if figure.value is not None:
-                value = Text(f"{figure} {figure.unit} ", COLOURS[figure.mode]).append(figure.mode)
-            block.add_row("", plain(key), value)
+            block.add_row("", plain(key), _cell(figure, False, False, stacked=False))
         for word, words in row.text.items():
             block.add_row("", plain(word), plain(words))
         console.print(block)

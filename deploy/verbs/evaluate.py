@@ -84,7 +84,7 @@ def evaluate(
         exposure: shipped networks restore dark parts at a higher exposure.
         strict: refuse pairs whose pixels contradict the sensor, instead of a warning.
         detector: ONNX detector as Ultralytics exports it, to be shown the labelled images.
-        labels: folder of labels (VOC, YOLO) or COCO's .json of the images; next to them if none.
+        labels: folder of VOC labels, or COCO's .json, of the images; next to them if none.
         split: use only the pictures that a list in the folder names, such as test.
         side: side of the detector's input in pixels, if its file leaves it open.
         classes: labelled classes by the detector's names: car=vehicle,minibus=vehicle.
@@ -211,7 +211,8 @@ def _sensors(
 
     if given and sensor is None:
         # Simulated pairs know the sensors that made them.
-        sensor, reference = given[0].profiles
+        sensor, own = given[0].profiles
+        reference = own if reference is None else reference
     return profiles_for(sensor, reference, read_pairs_recipe(stored) if stored else None)
 
 
@@ -240,7 +241,8 @@ def _detection(
         raise OptionError("`methods` must be names with `detector`, but it is a mapping.")
     named = [sensor or SENSOR]
     if isinstance(sensor, str):
-        named = [name.strip() for name in sensor.split(",")]
+        # A sensor that is named twice is compared once.
+        named = list(dict.fromkeys(name.strip() for name in sensor.split(",")))
     network = open_detector(detector, size_px=side_px)
     scenes, notes = labelled_scenes(
         network.names,
@@ -252,7 +254,7 @@ def _detection(
     compared = run_study(
         network,
         scenes,
-        [Sensor.load(each) for each in dict.fromkeys(named)],
+        [Sensor.load(each) for each in named],
         list(named_methods(methods)),
         reference=reference,
         seed=seed,

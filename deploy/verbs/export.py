@@ -150,17 +150,17 @@ def _export_float(path: Path, out: Path, sensor: SensorLike | None, tile: int | 
 
 def _conditioned(path: Path, sensor: SensorLike | None, delta: Path | None) -> "onnx.ModelProto":
     """Return an INT8 network that is conditioned on a sensor, or on that of a delta."""
-    from beers_deploy.network_files import told_by_delta, told_int8, warn_outside
+    from beers_deploy.network_files import int8_for_delta, int8_for_sensor, warn_outside
     from beers_deploy.profiles.sensor import Sensor
     from beers_deploy.quant.banked.family import required_family
     from beers_deploy.quant.onnx_file import load_onnx
 
     model = load_onnx(path)
     if delta is not None:
-        return told_by_delta(model, delta)
+        return int8_for_delta(model, delta)
     profile = Sensor.load(sensor or SENSOR)
     warn_outside(profile, required_family(model).kernels)
-    return told_int8(model, profile)
+    return int8_for_sensor(model, profile)
 
 
 def _export_int8(
@@ -205,12 +205,12 @@ def _save_delta(model: "onnx.ModelProto", sensor: SensorLike, factor: int, delta
     """Write the delta of an INT8 network that is conditioned on a sensor, at one exposure."""
     from beers_deploy.model.exposure import brightened
     from beers_deploy.model.io.files import whole_file
-    from beers_deploy.network_files import told_int8
+    from beers_deploy.network_files import int8_for_sensor
     from beers_deploy.profiles.sensor import Sensor
     from beers_deploy.quant.banked.family import delta_of_file
 
     profile = Sensor.load(sensor)
-    exposed = model if factor == 1 else told_int8(model, brightened(profile, factor))
+    exposed = model if factor == 1 else int8_for_sensor(model, brightened(profile, factor))
     packed = delta_of_file(exposed)
     with whole_file(delta) as temporary:
         temporary.write_bytes(packed)

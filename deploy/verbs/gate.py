@@ -1,9 +1,11 @@
 """`gate`: whether an INT8 network stays close enough to its float network."""
 
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from beers_deploy.kit import RECORD
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import BeersError, OptionError
 from beers_deploy.profiles.target import DEFAULT_TARGET
@@ -21,14 +23,10 @@ from beers_deploy.verbs.parameters import (
     VerdictFile,
     VerdictFolder,
 )
-from beers_deploy.verbs.verb import refuse_with, verb
+from beers_deploy.verbs.verb import recorded, refuse_with, verb
 
 if TYPE_CHECKING:
     from beers_deploy.verdict import Verdict
-
-
-RECORD = ("record.json", "record.html", "record.cdx.json")
-"""The files of a record of evidence."""
 
 
 @verb
@@ -44,7 +42,7 @@ def gate(
     images: InputPath | None = None,
     samples: Samples | None = None,
     patches: Annotated[int, Interval(ge=1, le=100_000)] = 32,
-    metric: Literal["psnr", "ssim", "mae", "top1", "iou"] | None = None,
+    metric: Literal["psnr", "ssim", "mae"] | None = None,
     seed: Seed = 0,
     junit: VerdictFile | None = None,
     record: Annotated[VerdictFolder, Holds(*RECORD)] | None = None,
@@ -136,6 +134,8 @@ def gate(
             metric=metric,
         )
         verdict = judged(comparison, allowed, earlier, board, own)
+        asked = recorded({"limits": limits, "baseline": baseline, "metric": metric})
+        verdict = replace(verdict, arguments={**verdict.arguments, **asked})
         # The record comes first: its library may fail, and then no other file may have a verdict.
         if folder is not None:
             from beers_deploy.kit.record import write_record

@@ -24,13 +24,12 @@ from beers_deploy.verbs.parameters import (
     Steps,
     TargetLike,
 )
-from beers_deploy.verbs.verb import refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import recorded, refuse_with, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.network import Network
     from beers_deploy.profiles.figures import Row
-    from beers_deploy.quantization import Data
-    from beers_deploy.results import Table
+    from beers_deploy.quant.samples import Patches
 
 logger = logging.getLogger(__name__)
 
@@ -108,8 +107,10 @@ def quantize(
     from beers_deploy.profiles.sensor import Sensor
     from beers_deploy.profiles.target import TargetProfile
     from beers_deploy.quant.encodings import read_core
-    from beers_deploy.quant.onnx_file import require_onnx_name
+    from beers_deploy.quant.onnx_file import metadata, require_onnx_name
+    from beers_deploy.quant.sample_range import recorded_range
     from beers_deploy.quantization import Data, quantised
+    from beers_deploy.results import Table
 
     if board_file is None:
         refuse_without("`board_file`", tile=tile is not None)
@@ -130,7 +131,7 @@ def quantize(
     data = Data(
         Sensor.load(sensor), samples, None if images is None else Path(images), patches, patch, seed
     )
-    result = quantised(network, data, board, finetune)
+    result, held_out = quantised(network, data, board, finetune)
     # Both are made before the first is written: a core that is refused leaves no file.
     core = result.core(board, tile) if files[1] else None
     if files[0] is not None:
@@ -139,48 +140,44 @@ def quantize(
         logger.info("wrote %s: %d integer operations", files[0], count)
     if core is not None and files[1] is not None:
         save_core(core, files[1], board)
-    rows = list(result.layers)
-    if pages:
-        rows = [*_write_report(result, data, pages[0]), *rows]
-    table = _table(result, data, rows, files[0])
-    if pages:
-        table.save(pages[1])
-    return replace(result, table=table)
-
-
-def _table(network: "Network", data: "Data", rows: "list[Row]", out: Path | None) -> "Table":
-    """Return what is reported of a quantised network."""
-    from beers_deploy.quant.onnx_file import metadata
-    from beers_deploy.quant.sample_range import recorded_range
-    from beers_deploy.quantization import losses_of
-    from beers_deploy.results import Table
-
-    covered = recorded_range(metadata(network.model))
+    covered = recorded_range(metadata(result.model))
     notes = [] if covered is None else [f"calibration: {covered}"]
-    if network.quantised:
-        notes.append(losses_of(network, data))
-    origin = [network.origin.input] if network.origin else []
-    return Table(
+    rows = list(result.layers)
+    if held_out is not None:
+        page = pages[0] if pages else None
+        more, sentence = _judged(result, held_out, samples is None, page)
+        rows = [*more, *rows]
+        notes.append(sentence)
+    assert result.origin is not None  # noqa: S101
+    table = Table(
         command="quantize",
-        arguments={
-            "network": network.origin.name if network.origin else "",
-            "sensor": data.sensor.name,
-            "images": data.images,
-            "patches": data.patches,
-            "patch": data.patch_px,
-            "seed": data.seed,
-        },
-        title=f"{network.name}: each integer layer",
-        inputs=(*origin, *([] if out is None else [out]), *data.inputs),
+        arguments=recorded(
+            {
+                "network": result.origin,
+                "target": board,
+                "sensor": data.sensor,
+                "samples": samples,
+                "images": images,
+                "patches": patches,
+                "patch": patch,
+                "finetune": finetune,
+                "seed": seed,
+                "tile": tile,
+            }
+        ),
+        title=f"{result.name}: each integer layer",
+        inputs=(result.origin.input, *data.inputs),
         rows=tuple(rows),
         notes=tuple(notes),
         headings=HEADINGS,
         details=DETAILS,
     )
+    if pages:
+        table.save(pages[1])
+    return replace(result, table=table)
 
 
 HEADINGS = {
-    "integer layers": "integer layers",
     "rounding": "tie rounding",
     "gate": "float against INT8, on patches that calibration did not see",
 }
@@ -200,15 +197,25 @@ DETAILS = frozenset(
 """Tables and figures for a closer look."""
 
 
-def _write_report(network: "Network", data: "Data", page: Path) -> "list[Row]":
-    """Write the page of --report, and return its rows."""
-    from beers_deploy.quantization import sensitivity_report
+def _judged(
+    network: "Network", held_out: "Patches", simulated: bool, page: Path | None
+) -> "tuple[list[Row], str]":
+    """Return what INT8 changes on samples that calibration did not see: rows and a sentence.
+
+    With a page there are rows of layers and of the worst samples, and the page is written.
+    """
+    from beers_deploy.quant.sensitivity import losses
+    from beers_deploy.quantization import differences_of, sensitivity_report
     from beers_deploy.report.page import write_report
 
-    rows, report = sensitivity_report(network, data, network.layers)
-    write_report(report, page)
-    logger.info("wrote %s: %s", page, report.headline)
-    return rows
+    assert network.quantised is not None  # noqa: S101 - it was quantised here
+    differences = differences_of(network, held_out, simulated)
+    rows: list[Row] = []
+    if page is not None:
+        rows, report = sensitivity_report(network, held_out, differences, network.layers)
+        write_report(report, page)
+        logger.info("wrote %s: %s", page, report.headline)
+    return rows, losses(network.quantised, differences, held_out)
 
 
 def _report_files(folder: OutputFolder | None, network: Any) -> list[Path]:

@@ -19,7 +19,7 @@ from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.formats import HEAD_BYTES, SAFETENSORS, OtherFormat, other_format
 from beers_deploy.model.variants import Kernels, Variant
-from beers_deploy.profiles.errors import ModelError, printable
+from beers_deploy.profiles.errors import ModelError, printable, reason_of
 from beers_deploy.profiles.toml import parse_json, unreadable
 
 BANKED = "behind the bank of its sensor"
@@ -93,7 +93,7 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
                 f"{name} must hold safetensors weights, but it is {other.name}. {TRAINED}, or an "
                 f"ONNX file of your own network: {other.remedy}."
             ) from error
-        reason = unreadable(path) or " ".join(str(error).split())[:120]
+        reason = unreadable(path) or reason_of(error)
         raise ModelError(f"{name} holds no safetensors weights: {reason}. {TRAINED}.") from error
 
 
@@ -130,7 +130,7 @@ def read_weights(path: Path) -> Weights:
             raise ValueError(f"it has {len(tensors)} tensors for {variant}")
         _check_like(tensors, variant.banked_shapes if conditioned else variant.shapes)
     except FAULTS as error:
-        reason = " ".join(str(error).split())[:120]
+        reason = reason_of(error)
         if isinstance(error, KeyError):
             reason = f"it has no {reason}"
         raise ModelError(

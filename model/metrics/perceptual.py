@@ -22,7 +22,7 @@ from safetensors import safe_open
 from torch import Tensor, nn
 from torch.nn import functional
 
-from beers_deploy.profiles.errors import ImageError, ModelError, printable
+from beers_deploy.profiles.errors import ImageError, ModelError, reason_of
 from beers_deploy.profiles.toml import unreadable
 
 
@@ -201,7 +201,7 @@ def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
                 raise TypeError(f"an array of {tensor.dtype}")
     # The bytes of a damaged archive may lead to anything.
     except Exception as error:
-        reason = printable(" ".join(str(error).split()))
+        reason = reason_of(error)
         raise ModelError(
             f"{path} must contain arrays of floating-point numbers, none pickled, but reading it "
             f"failed: {reason}. {CONVERT}"

@@ -37,7 +37,7 @@ import onnxruntime as ort
 from onnx import TensorProto, numpy_helper, version_converter
 from onnx.shape_inference import InferenceError
 
-from beers_deploy.profiles.errors import ModelError, printable
+from beers_deploy.profiles.errors import ModelError, reason_of
 from beers_deploy.quant.reading.equivalents import rewrite
 from beers_deploy.quant.reading.nodes import fresh
 from beers_deploy.quant.untrusted import contradictions, held_tensors, opset_of
@@ -150,7 +150,7 @@ def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
             )
         # onnxruntime raises a class of its own for each status code.
         except Exception as error:
-            reason = printable(" ".join(str(error).split())).rstrip(".")
+            reason = reason_of(error)
             raise ModelError(
                 f"onnxruntime cannot run {where}: {reason}. Check the file with onnx.checker, and "
                 "export it again."

@@ -301,9 +301,9 @@ def test_each_effect_says_who_asks_for_it() -> None:
     base = {"mtf": "sensor pleiades-degraded", "noise": "sensor pleiades-degraded"}
     assert origins(profile, None) == base
     assert origins(profile, haze, ["prnu", "striping"], ["veil"]) == base | {
-        "veil": "left out by --without",
+        "veil": "left out by `without`",
         "striping": "scene haze-over-sea",
-        "prnu": "--with",
+        "prnu": "`with_`",
     }
     striped = replace(profile, effects=typical_effects())
     assert (
@@ -398,7 +398,7 @@ def test_the_explanation_has_each_effect_with_its_origin_and_writes_nothing(
     )
     assert isinstance(table, Table)
     words = {row.name: row.text for row in table.rows}
-    assert words["prnu"]["from"] == "--with"
+    assert words["prnu"]["from"] == "`with_`"
     assert words["striping"]["from"] == "scene haze-over-sea"
     assert words["mtf"]["from"] == "sensor pleiades-degraded"
     assert all(text["decision"] and text["why"] for text in words.values())

@@ -35,7 +35,8 @@ from beers_deploy.quant.onnx_file import (
 from beers_deploy.quant.samples import CALIBRATED_ON, Patches, digest_of
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.structure import Relus, count_relus, rounded_tensors, saturated_shares
-from beers_deploy.verdict import file_checks, junit_text, sentence
+from beers_deploy.results import Table
+from beers_deploy.verdict import file_checks, junit_text
 from tests.deploy.command_line import done, refused
 from tests.quant.quick import Calibration, change, changed, drawn
 from tests.shipped import shipped_pair
@@ -269,12 +270,12 @@ def test_the_action_s_summary_is_a_table_whatever_a_stranger_s_name_holds(
 
 
 def test_the_last_line_names_what_failed_and_nothing_else() -> None:
-    assert sentence(CHECKS[:1], "MAE 0.0006") == "passed, all 1 checks: MAE 0.0006"
-    text = sentence(CHECKS, "MAE 0.0006")
+    assert Table(command="gate", checks=tuple(CHECKS[:1])).verdict == "gate passed, all 1 checks"
+    text = Table(command="gate", checks=tuple(CHECKS)).verdict
     # A node's name may hold what a terminal or a CI's log would obey.
     assert text.isprintable()
     assert text.startswith(
-        "FAILED, 2 of 4 checks: PSNR drop 0.31 dB, allowed at most 0.25; nodes <all> 1 (tail"
+        "gate FAILED, 2 of 4 checks: PSNR drop 0.31 dB, allowed at most 0.25; nodes <all> 1 (tail"
     )
     assert "MAE" not in text
     assert "float-INT8" not in text
@@ -310,7 +311,8 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_the_judged_file_does_not_choose_its_judges(model: Path) -> None:
     """Whatever samples it claims to be calibrated on, all are judged, and the claim is a note."""
     samples = np.random.default_rng(0).random((12, 1, 32, 40), np.float32)
-    int8 = bd.quantize(model, samples=samples[:8])
+    # Given one after the other, they can be read only once.
+    int8 = bd.quantize(model, samples=iter(samples[:8]))
     mixed = np.concatenate([samples[10:], samples[2:7]])
     comparison = bd.compare(int8, samples=mixed)
     assert comparison.result.patches == 7

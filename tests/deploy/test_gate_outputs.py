@@ -128,7 +128,7 @@ def test_a_note_says_if_the_default_limit_does_not_suit(model: Path) -> None:
     samples = np.random.default_rng(0).random((6, 1, 32, 40), np.float32)
     verdict = bd.gate(bd.quantize(model, samples=samples), samples=samples)
     (mae,) = (check for check in verdict.checks if check.name == "MAE")
-    notes = [note for note in verdict.notes if "--max-mae" in note]
+    notes = [note for note in verdict.notes if "`max_mae`" in note]
     assert len(notes) == (not mae.passed)
     # The samples are noise, which this network changes most.
     assert not mae.passed

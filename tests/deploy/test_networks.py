@@ -24,7 +24,7 @@ from beers_deploy.model.shipped import (
     shipped_weights,
 )
 from beers_deploy.network import Network
-from beers_deploy.network_files import told_int8, weights_file
+from beers_deploy.network_files import int8_for_sensor, weights_file
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import numbers_of
 from beers_deploy.profiles.sensor_file import BLIND, BLIND_PROFILE, load_sensor
@@ -78,7 +78,7 @@ def test_int8_is_calibrated_once_and_then_conditioned_on_any_sensor(
         SENSOR,
         load_sensor(str(sensor)).name,
     )
-    again = told_int8(other, KNOWN)
+    again = int8_for_sensor(other, KNOWN)
     assert again.SerializeToString(deterministic=True) == base.SerializeToString(deterministic=True)
 
 

@@ -67,7 +67,7 @@ def test_what_is_lost_is_told_and_of_much_also_where(
     layers, _ = layer_errors(spoilt.graph, spoilt.core, few_crops(patches.degraded, spoilt.host))
     worst = max(layers, key=lambda layer: layer.network.squared)
     assert f": most of it in {worst.name} (" in much
-    assert much.endswith("; try --finetune auto")
+    assert much.endswith("; try `finetune` auto")
 
 
 def test_a_spoilt_layer_is_found(spoilt: Quantised, crops: list[np.ndarray]) -> None:

@@ -142,7 +142,7 @@ def run_main_commands(python: Path, folder: Path) -> None:
         "--sensor",
         "pleiades-degraded",
     )
-    done("simulate", "scene.tif", "--sensor", "pleiades-degraded", "--out", "pairs")
+    done("simulate", "--images", "scene.tif", "--sensor", "pleiades-degraded", "--out", "pairs")
     done("quantize", "float.onnx", "--samples", "samples.npy", "--out", "int8.onnx")
     done("gate", "float.onnx", "int8.onnx", "--samples", "samples.npy", "--json", "gate.json")
     done("check", "int8.onnx", "--tile", "64")

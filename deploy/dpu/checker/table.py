@@ -78,12 +78,15 @@ def check_network(
     """
     source = Network.load(network, sensor=SENSOR, int8=True, to_run=False)
     build = ruled(target, dpu)
-    tile_px = own_tile_px(source.model) or TILE_PX if tile is None else require_side(tile)
+    tile_px = own_tile_px(source.model) or TILE_PX
+    if tile is not None:
+        tile_px = require_side(tile)
     placement = place(network_of(source.model, tile_px, source.label), build)
     npu = bool(target.npu)
     checks = [legality(placement, npu=npu), *(_file_checks(source.model, build) if npu else [])]
     return Checked(
         title=f"{source.input.name} on {target.name} {build.name}, tile {tile_px}",
+        command="check",
         arguments={"target": target.name, "dpu": build.name, "tile": tile_px},
         inputs=(source.input,),
         rows=tuple(_rows(placement, build, tile_px)),

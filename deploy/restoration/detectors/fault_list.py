@@ -16,7 +16,6 @@ from beers_deploy.model.io.files import write_text
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.profiles.errors import OptionError, printable
 
-OPTION = "--fix-detectors"
 LINES = "Write lines 'column,row', counted from 0, with '*' as the row for a whole column."
 FOUND = "found"
 HEADER = ("column", "row", "band")

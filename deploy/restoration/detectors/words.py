@@ -8,14 +8,14 @@ from beers_deploy.model.metrics.detector_lines import Stripes
 from beers_deploy.model.metrics.detector_phases import COLOUR, Pattern
 from beers_deploy.model.raster.source import Source
 from beers_deploy.profiles.figures import Figure, measured, unavailable
-from beers_deploy.restoration.detectors.fault_list import FOUND, OPTION
+from beers_deploy.restoration.detectors.fault_list import FOUND
 from beers_deploy.restoration.detectors.look import BandFaults, look_at_detectors
 
 logger = logging.getLogger(__name__)
 
 SHARPENS = "restoration about doubles it"
 EQUALISE = "equalise the image first"
-FIX = f"'{OPTION} {FOUND}' replaces"
+FIX = f"`fix_detectors` {FOUND} replaces"
 EFFECTS = {"columns": "or train with the effects prnu and dsnu in the sensor's profile", "rows": ""}
 """By the lines' name: the effects that describe them."""
 ERRORS = 2.0
@@ -55,8 +55,8 @@ def _of_band(band: BandFaults) -> Iterator[str]:
     if len(band.pixels):
         places = [f"column {column}, row {row}" for row, column in band.pixels[:NAMED].tolist()]
         yield (
-            f"{_count(len(band.pixels), 'pixel')} of {band.looked_px}, alone as no light is: "
-            "hot, dead or "
+            f"{_count(len(band.pixels), 'pixel')} of {band.looked_px}, isolated as no light can "
+            "be: hot, dead or "
             f"hit by a particle ({_some(places, len(band.pixels))}); restoration sharpens that; "
             f"{FIX} such pixels"
         )
@@ -85,7 +85,7 @@ def _of_lines(name: str, lines: Stripes) -> Iterator[str]:
         yield (
             f"{_count(len(lines.off), one)} {verb} off in gain or offset "
             f"({_some(places, len(lines.off))}); "
-            f"{SHARPENS}: {EQUALISE}, or list them for {OPTION}"
+            f"{SHARPENS}: {EQUALISE}, or list them for `fix_detectors`"
         )
 
 

@@ -2,7 +2,7 @@
 
 `Restorer.read` takes a strip of rows from a `Source`, `Restorer.tile` runs the network on one tile
 of it, at each exposure that its pixels ask for, and `Restorer.finish` makes the restored pixels
-agree with the raw ones and stores them. `deploy.restoration.tiles.rows` calls these for all tiles
+agree with the raw ones and stores them. `restoration.tiles.rows` calls these for all tiles
 of an image.
 """
 

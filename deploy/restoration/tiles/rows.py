@@ -5,7 +5,7 @@ A `Source` gives a strip of rows, `Restorer.tile` runs the network on one tile o
 `Restorer.finish` takes the consistency step once the tiles around are there. `restore_rows` yields
 finished rows of tiles in order: the next strip is read ahead, and several tiles are in work at a
 time. `gathered`, `restore_floats` and `restore_dn` gather the rows of an image in memory;
-`deploy.restoration.run` writes those of a file.
+`restoration.run` writes those of a file.
 """
 
 from collections import deque

@@ -82,13 +82,13 @@ class Characterised:
             yield (
                 f"the values are multiples of {frames.step}: they count as {frames.bits}-bit "
                 "numbers; "
-                f"restore these frames with --full-scale {frames.stored_full_scale}"
+                f"restore these frames with full scale {frames.stored_full_scale}"
             )
         if frames.hides_black:
             yield (
                 "0 counts as dark, but the darkest pixels have "
                 f"{frames.darkest_dn * frames.step:g}: if the camera "
-                "adds a black level, state it as --black-level, or the SNR in the dark is too high"
+                "adds a black level, state it as `black_level`, or the SNR in the dark is too high"
             )
         if not model.white:
             yield (
@@ -112,9 +112,9 @@ class Characterised:
                 yield f"these edges differ from the others: {', '.join(curve.contradicting)}"
         if self.stated_mtf is None and not self.mtf.curves:
             yield (
-                "the profile's MTF is an assumption: state what you know as --mtf, or point at "
+                "the profile's MTF is an assumption: state what you know as `mtf`, or point at "
                 "straight edges as "
-                "--edge FILE:X,Y,WIDTH,HEIGHT"
+                "`edge` FILE:X,Y,WIDTH,HEIGHT"
             )
 
 

@@ -4,7 +4,7 @@ They are the input itself, the traditional pipeline in both orders and three qua
 libraries' ways, and networks.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -26,7 +26,7 @@ from beers_deploy.profiles.sensor_file import BLIND as NOT_KNOWN
 from beers_deploy.profiles.sensor_file import BLIND_PROFILE, load_sensor
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.restoration.method import Restore, network_method
-from beers_deploy.restoration.steps import BOTH, Around
+from beers_deploy.restoration.steps import BOTH, Around, exposures_of
 
 Specialise = Callable[[Instrument], Restore]
 """A sensor to the restoration of images that it acquired."""
@@ -166,25 +166,14 @@ def network_restore(
     network: Network, sensor: Sensor, reference: Instrument, around: Around
 ) -> Restore:
     """Return a network with the steps around it; dark parts are restored at a higher exposure."""
-    exposures = network.exposures if around.exposure else {}
+    exposures = exposures_of(network, around)
     brighter = {factor: other.model for factor, other in exposures.items()}
-    return with_steps(network.model, brighter, sensor, reference, around)
-
-
-def with_steps(
-    model: onnx.ModelProto,
-    brighter: Mapping[int, onnx.ModelProto],
-    sensor: Sensor,
-    reference: Instrument,
-    around: Around,
-) -> Restore:
-    """A network with the steps around it; the consistency step only where a sensor is known."""
     instrument = sensor.nominal()
     # The consistency step blurs the result as the sensor does: it needs one that is known.
     aim = None
     if around.consistency and sensor.name != NOT_KNOWN:
         aim = reference.in_units_of(instrument)
-    return network_method(model, instrument.max_dn, brighter, instrument, aim)
+    return network_method(network.model, instrument.max_dn, brighter, instrument, aim)
 
 
 def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:

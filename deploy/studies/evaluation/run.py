@@ -38,9 +38,8 @@ from beers_deploy.results import Table
 from beers_deploy.studies.evaluation import scores, targets
 from beers_deploy.studies.evaluation.methods import (
     Method,
-    knowledge_of,
     method_named,
-    with_steps,
+    method_of,
 )
 from beers_deploy.studies.evaluation.pairs import (
     NamedPair,
@@ -249,10 +248,7 @@ def _method(
     if callable(source) and not isinstance(source, Network) and not hasattr(source, "state_dict"):
         return Method(name, source, "what the function knows")
     network = Network.load(cast("NetworkLike", source), sensor=sensors[0])
-    knowledge = knowledge_of(network.model, sensors[0].name)
-    return Method(
-        name, with_steps(network.model, {}, sensors[0], sensors[1].nominal(), around), knowledge
-    )
+    return method_of(name, network, *sensors, around)
 
 
 SITES = 4

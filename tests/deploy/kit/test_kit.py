@@ -18,9 +18,9 @@ from cyclonedx.schema import SchemaVersion
 from cyclonedx.validation.json import JsonStrictValidator
 
 import beers_deploy as bd
+from beers_deploy.kit import RECORD
 from beers_deploy.kit.golden import read_golden
 from beers_deploy.kit.host_facts import host_facts
-from beers_deploy.kit.record import NAMES
 from beers_deploy.model.bank import bank_of_vector
 from beers_deploy.model.consistency import REACH_PX, Consistency, Placed
 from beers_deploy.model.convbeers import arrays
@@ -238,20 +238,21 @@ def test_a_network_for_another_sensor_is_a_warning(
 def test_a_record_says_what_a_network_is_and_what_was_checked(tmp_path: Path) -> None:
     pair = "convbeers-xs", "convbeers-xs-int8"
     done("gate", *pair, "--patches", 2, "--record", tmp_path / "gate")
-    record = json.loads((tmp_path / "gate" / NAMES[0]).read_text(encoding="utf-8"))
+    record = json.loads((tmp_path / "gate" / RECORD[0]).read_text(encoding="utf-8"))
     assert record["passed"]
     assert record["licence"] == "Apache-2.0"
     assert len(record["training"]["images"]) >= 50
     assert record["network"]["sha256"] in {entry["sha256"] for entry in record["results"]["inputs"]}
     assert len(record["tool"]["code_sha256"]) == 64
-    text = (tmp_path / "gate" / NAMES[2]).read_text(encoding="utf-8")
+    text = (tmp_path / "gate" / RECORD[2]).read_text(encoding="utf-8")
     assert JsonStrictValidator(SchemaVersion.V1_6).validate_str(text) is None
-    assert "All checks passed" in (tmp_path / "gate" / NAMES[1]).read_text(encoding="utf-8")
+    assert "All checks passed" in (tmp_path / "gate" / RECORD[1]).read_text(encoding="utf-8")
 
 
 def test_of_a_users_network_nothing_is_made_up(tmp_path: Path) -> None:
     folder = bd.Board.load("zcu102").kit(network("unet"), tmp_path / "kit", tile=32, record=True)
-    record = json.loads((folder / "record" / NAMES[0]).read_text(encoding="utf-8"))
+    record = json.loads((folder / "record" / RECORD[0]).read_text(encoding="utf-8"))
+    assert record["results"]["command"] == "check"
     assert (
         record["training"],
         record["licence"],

@@ -11,10 +11,10 @@ import numpy as np
 import onnx
 import pytest
 import tifffile
-import torch
+from torch import nn
 
 import beers_deploy as bd
-from beers_deploy.dpu.board import load_dpu
+from beers_deploy.dpu.board import boards_of, load_dpu
 from beers_deploy.dpu.cost.model import TASKS
 from beers_deploy.model.raster.images import read_acquisition
 from beers_deploy.network import Network
@@ -26,7 +26,6 @@ from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.profiles.target import board_names, npu_names
 from beers_deploy.verbs.verb import parts_of
-from examples.networks import build, to_onnx
 from tests.deploy.dpu.graphs import integer_convbeers
 
 
@@ -43,8 +42,21 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def classifier(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten classes of images of 32 x 32 pixels."""
     path = tmp_path_factory.mktemp("net") / "classifier.onnx"
-    onnx.save(to_onnx("classifier", build("classifier", torch.Generator().manual_seed(0))), path)
+    features = nn.Sequential(
+        nn.Conv2d(1, 16, 3, stride=2, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(16, 16, 3, stride=2, padding=1, groups=16),
+        nn.ReLU6(),
+        nn.Conv2d(16, 64, 1),
+        nn.ReLU6(),
+    )
+    network = nn.Sequential(features, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(64, 10))
+    model = bd.Network.load(network, example=(1, 1, 32, 32)).model
+    for side in model.graph.input[0].type.tensor_type.shape.dim[2:]:
+        side.dim_value = 32
+    onnx.save(model, path)
     return path
 
 
@@ -172,7 +184,7 @@ def test_the_exposures_of_an_image_are_counted_whatever_the_bits_of_the_sensor(
     # These pixels are dark enough for x8, also far from bright ground.
     pixels[:, :128] = 200
     tifffile.imwrite(tmp_path / "image.tif", pixels)
-    boards, _ = boards_for("vck190", None, None)
+    boards, _ = boards_for(boards_of("vck190"), None, None)
     asked = Question(boards, [], None, [128], "exact", None, None, consistency=True)
     dn = read_acquisition(tmp_path / "image.tif", 4095, None)
     result = bench_board(Network.load(network), asked, dn, sensor)

@@ -169,7 +169,7 @@ def test_steps_and_a_black_level_change_nothing_but_the_units(
     for one, other in zip(result.snrs, plain.snrs, strict=True):
         assert one.value == pytest.approx(other.value, rel=0.02)
     assert tomllib.loads(profile_toml(result))["offset"]["offset_dn"]["value"] == 200
-    assert any("--full-scale 32760" in note for note in result.notes())
+    assert any("full scale 32760" in note for note in result.notes())
     assert not any("black level" in note for note in result.notes())
     hidden = characterise([folder], stated=Stated(bits=15, mtf=(0.1, 0.1)))
     assert any("black level" in note for note in hidden.notes())
