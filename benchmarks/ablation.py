@@ -3,7 +3,7 @@ larger it is when one is left out.
 
     python -m benchmarks.ablation --images aerial-train/ --held-out aerial-test/ --keep networks/
 
-The twelve small networks are those of `benchmarks.small_networks`, trained briefly. Shipped
+The small networks are those of `benchmarks.small_networks`, trained briefly. Shipped
 networks are quantised over their range of sensors and judged on `pleiades-degraded`. Prints a
 Markdown table; samples that judge were seen by neither training nor calibration.
 """
@@ -19,9 +19,8 @@ from tempfile import TemporaryDirectory
 import onnx
 
 from beers_deploy.model.shipped import SENSOR, shipped_names, shipped_weights
-from beers_deploy.network_files import Conditioned, told_int8
+from beers_deploy.network_files import Conditioned, int8_for_sensor
 from beers_deploy.profiles.sensor_file import load_sensor
-from beers_deploy.quant.banked.calibrate import PASSES as BANKED
 from beers_deploy.quant.calibration import unseen_patches
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.onnx_file import load_onnx
@@ -33,34 +32,32 @@ from beers_deploy.quantization import family_model
 from benchmarks.small_networks import NETWORKS, SIDE_PX, Drawn, losses, save, slug, trained
 
 Loss = Callable[[Passes], float]
-"""Quantises a network with these passes; the mean loss of PSNR in dB (points, of a classifier)."""
+"""Quantises a network with these passes; the mean loss of PSNR in dB."""
 UNSEEN = 64
 """Patches that judge a shipped network."""
-NOT_BEHIND_A_BANK = {"dual_range", "copies"}
-"""Passes without effect there: the result has two ranges of its own, and no channel is dead."""
+NOT_BEHIND_A_BANK = {"dual_range"}
+"""Passes without effect there: the result has two ranges of its own."""
 SAME_DB = 5e-4
 """A smaller change is none: it is printed as 0.000."""
 
 
-def ablations(base: Passes) -> Iterator[tuple[str, Passes]]:
-    """Return the passes with each single one switched, by its name."""
+def ablations() -> Iterator[tuple[str, Passes]]:
+    """Return the passes with each single one left out, by its name."""
     for field in fields(Passes):
-        yield field.name, replace(base, **{field.name: not getattr(base, field.name)})
+        yield field.name, replace(ALL, **{field.name: False})
 
 
-def row(loss_of: Loss, base: Passes) -> list[str]:
-    """Return the loss with the passes of `base`, and what each one buys: the loss without it, less
-    the loss with it.
+def row(loss_of: Loss, behind_bank: bool = False) -> list[str]:
+    """Return the loss with all passes, and what each one buys: the loss without it, less the loss
+    with it.
     """
-    loss = loss_of(base)
+    loss = loss_of(ALL)
     cells = [f"{loss:.3f}"]
-    for name, passes in ablations(base):
-        if base is BANKED and name in NOT_BEHIND_A_BANK:
+    for name, passes in ablations():
+        if behind_bank and name in NOT_BEHIND_A_BANK:
             cells.append("-")
             continue
         gain = loss_of(passes) - loss
-        # A pass that is off by default is switched on here.
-        gain = gain if getattr(base, name) else -gain
         cells.append("0" if abs(gain) < SAME_DB else f"{gain:+.3f}")
     return cells
 
@@ -96,8 +93,9 @@ def shipped(name: str, arguments: argparse.Namespace) -> Loss:
     folders = [arguments.images] if arguments.images else []
 
     def loss_of(passes: Passes) -> float:
-        int8: onnx.ModelProto = told_int8(family_model(network, folders, passes=passes), sensor)
-        return float(compare(float_session, open_any_size(int8), pairs).drop_db)
+        family: onnx.ModelProto = family_model(network, folders, passes=passes)
+        int8 = open_any_size(int8_for_sensor(family, sensor))
+        return float(compare(float_session, int8, pairs).drop_db)
 
     return loss_of
 
@@ -124,9 +122,9 @@ def main() -> None:
             if not re.search(arguments.only, name):
                 continue
             if name in NETWORKS:
-                cells = row(small(name, arguments, folder), ALL)
+                cells = row(small(name, arguments, folder))
             else:
-                cells = row(shipped(name, arguments), BANKED)
+                cells = row(shipped(name, arguments), behind_bank=True)
             print(f"| {name} | {' | '.join(cells)} |", flush=True)
 
 

@@ -5,7 +5,6 @@ A tensor with n fractional bits holds whole multiples of 2^-n, its scale, in [-1
 (UG1414 3.5, vai_q). `frac_bits` is n everywhere; a finer scale has more of them.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -161,7 +160,7 @@ class IntCore:
 def dequantised(op: Conv, whole: IntConv) -> Conv:
     """The same convolution in float, with the values that its int8 weights and bias stand for."""
     weight = (whole.weight * 2.0**-whole.weight_frac_bits).astype(np.float32)
-    return replace(op, weight=weight, bias=(whole.float_bias + op.offset).astype(np.float32))
+    return replace(op, weight=weight, bias=whole.float_bias.astype(np.float32))
 
 
 def rounded_to(values: np.ndarray, frac_bits: int) -> np.ndarray:
@@ -183,11 +182,7 @@ def build_core(
         shifts: the windows of the target.
         ends: what the host does around; by default an image of one channel and a correction of it.
     """
-    lowered = {op.output: op.offset for op in graph if isinstance(op, Conv) and op.offset}
-    # An offset is 128 units of its tensor, so it states the scale.
-    legal = dict(frac_bits) | {
-        name: round(math.log2(-INT8_MIN / offset)) for name, offset in lowered.items()
-    }
+    legal = dict(frac_bits)
     # Each round starts from the scales that the one before has moved.
     for _ in range(ROUNDS):
         core = _in_one_round(graph, legal, shifts, ends or Ends())
@@ -208,24 +203,7 @@ def _with_biases_left(core: IntCore, graph: Graph) -> IntCore:
     rounded = core.ops[-1]
     if not (core.ends.offsets and isinstance(last, Conv) and isinstance(rounded, IntConv)):
         return core
-    bias = nearest_bias(last, rounded.weight, rounded.weight_frac_bits, graph)
-    return replace(core, ends=core.ends.moved(bias - rounded.float_bias))
-
-
-def nearest_bias(op: Conv, weight: np.ndarray, weight_frac_bits: int, graph: Graph) -> np.ndarray:
-    """(O,) the bias to be rounded, beside weights (O, I, kh, kw) that each are rounded to the
-    nearest whole number.
-
-    Where what it reads is stored less an offset, those weights give back another amount than the
-    float ones.
-    """
-    writers = (conv for conv in graph if isinstance(conv, Conv) and conv.output == op.input)
-    offset = next((conv.offset for conv in writers), 0.0)
-    if not offset:
-        return op.stored_bias
-    # The float bias has the offset times the float weights in it.
-    errors = weight * 2.0**-weight_frac_bits - op.weight
-    return np.asarray(op.stored_bias + offset * errors.sum((1, 2, 3)))
+    return replace(core, ends=core.ends.moved(last.bias - rounded.float_bias))
 
 
 def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts, ends: Ends) -> IntCore:
@@ -233,7 +211,7 @@ def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts, ends:
     ops: list[IntConv | Op] = []
     for op in graph:
         if isinstance(op, Conv):
-            ops.append(_quantise_conv(op, frac_bits, shifts, graph))
+            ops.append(_quantise_conv(op, frac_bits, shifts))
             continue
         if isinstance(op, Add):
             _move_add(op, frac_bits, shifts)
@@ -247,21 +225,20 @@ def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts, ends:
     return IntCore(tuple(ops), dict(frac_bits), ends)
 
 
-def _quantise_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts, graph: Graph) -> IntConv:
+def _quantise_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts) -> IntConv:
     # With finer weights the shift would be beyond its window, and the result's scale would have to
     # become finer too, so that it clips.
     finest = shifts.cut[1] + frac_bits[op.output] - frac_bits[op.input]
     weight_frac_bits = min(best_frac_bits(op.weight), finest)
     # Here the end of int8 is the activation's own clip, so the result must keep its scale: the
     # weights are made fine enough for a shift of 0.
-    if op.ceiling is not None or op.offset:
+    if op.ceiling is not None:
         weight_frac_bits = max(weight_frac_bits, frac_bits[op.output] - frac_bits[op.input])
     product = weight_frac_bits + frac_bits[op.input]
     cut = clamp(product - frac_bits[op.output], shifts.cut)
     frac_bits[op.output] = product - cut
     weight = quantise(op.weight, weight_frac_bits)
-    exact_bias = nearest_bias(op, weight, weight_frac_bits, graph)
-    bias, bias_frac_bits = quantise_bias(exact_bias, product, shifts)
+    bias, bias_frac_bits = quantise_bias(op.bias, product, shifts)
     kind = (_activation(op, frac_bits[op.output]), op.window, op.groups, op.transposed)
     return IntConv(
         op.name, op.input, op.output, weight, weight_frac_bits, bias, bias_frac_bits, *kind
@@ -272,9 +249,6 @@ def _activation(op: Conv, frac_bits: int) -> Activation:
     """Of whole numbers: ReLU6 is ReLU where int8 ends no later than the six, as it does once
     `equalise` scaled.
     """
-    # Stored less 128 units, zero is -128, below which int8 saturates by itself.
-    if op.offset:
-        return Activation.saturated_relu
     ends_first = op.ceiling is not None or INT8_MAX * 2.0**-frac_bits <= SIX
     return Activation.relu if op.activation is Activation.relu6 and ends_first else op.activation
 

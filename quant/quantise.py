@@ -34,12 +34,10 @@ from beers_deploy.quant.graph import (
     graph_to_onnx,
     read_network,
     read_planes,
-    relu_count,
     tensors,
     tied,
 )
 from beers_deploy.quant.onnx_file import fixed_tile_px, metadata
-from beers_deploy.quant.passes.copies import Copies, ranges_apart, with_copies
 from beers_deploy.quant.passes.equalise import (
     FULL,
     LEVELLING,
@@ -49,18 +47,14 @@ from beers_deploy.quant.passes.equalise import (
     equalise,
     first_guess,
     search,
-    with_room,
 )
-from beers_deploy.quant.passes.fit_weights import fit_weights
 from beers_deploy.quant.passes.level import Chain, chain_ranges, largest_values, level
-from beers_deploy.quant.passes.lower import lower
 from beers_deploy.quant.passes.selection import ALL, Passes
 from beers_deploy.quant.passes.stream import (
     MAX_CHANNELS,
     STREAM_FRAC_BITS,
     Stream,
     exceeds_six,
-    half_lsb_pair,
     lone_tensors,
     streams,
     takes_gains,
@@ -94,18 +88,11 @@ LEAST_CHANGE = 1e-4
 decide alone.
 """
 
-STREAM_STEP = 2.0**-STREAM_FRAC_BITS
-"""The value of one unit of the streams' tensors."""
-
 FINER = GAIN.bit_length() - 1
 """Fractional bits by which a window is finer than the result's own scale."""
 
 
-PASSES = (
-    "fine_planes, least_squares, shared_residual_scale, equalise, half_lsb_pair, "
-    "fit_weights, dual_gain"
-)
-LOWERED = "full_range_relu"
+PASSES = "fine_planes, least_squares, shared_residual_scale, equalise, dual_gain"
 """What a file says was done beyond rounding each tensor: see `quant.passes`, `quant.graph` and
 `quant.core`.
 """
@@ -119,7 +106,6 @@ class Quantised:
 
     host: onnx.ModelProto
     core: IntCore
-    relus: int
     graph: Graph
 
 
@@ -127,9 +113,7 @@ class Quantised:
 class Plan:
     """What is to be quantised: the graph that reads the planes; the host's part; streams.
 
-    `chain` is what is levelled besides the streams, or where there are none. What is calibrated and
-    searched is the map in front of the network's `tail`, which is put behind it in the end: values
-    of boxes that no object has would outweigh all others.
+    `chain` is what is levelled besides the streams, or where there are none.
     """
 
     graph: Graph
@@ -171,12 +155,6 @@ class Plan:
             return self
         return replace(self, streams=within, chain=_chain(self.graph, self.ends, within))
 
-    def paired(self, graph: Graph) -> Graph:
-        """The graph with the half-LSB pair where that is wanted and possible; else itself."""
-        if self.passes.half_lsb_pair and self.streams:
-            return half_lsb_pair(graph, STREAM_STEP)
-        return graph
-
     def ended(self, graph: Graph) -> Graph:
         """The graph with windows or two gains where the result has them."""
         if self.ends.offsets:
@@ -184,12 +162,9 @@ class Plan:
         return two_gains(graph) if self.ends.gains == 2 else graph
 
     def core(self, final: Graph, frac_bits: Mapping[str, int]) -> IntCore:
-        """The integer core of a graph, paired and ended, whose tensors have these least-squares
-        scales.
-        """
-        # The pair has added tensors, so the streams are looked up anew.
-        shared = list(chain.from_iterable(streams(final))) if self.streams else []
-        scales = {**frac_bits, **dict.fromkeys([*shared, *self.chain.tensors], STREAM_FRAC_BITS)}
+        """The integer core of a graph, ended, whose tensors have these least-squares scales."""
+        shared = [*chain.from_iterable(self.streams), *self.chain.tensors]
+        scales = {**frac_bits, **dict.fromkeys(shared, STREAM_FRAC_BITS)}
         # A coarse copy holds what a finer scale clips.
         if self.ends.offsets:
             scales[CORRECTION] += FINER
@@ -242,15 +217,12 @@ def quantise_model(
     ends = ends_of(network, 2 if finer else 1)
     equalised = streams(graph)
     plan = Plan(graph, ends, equalised, _chain(graph, ends, equalised), shifts, passes)
-    core, final, last_sum = rounded(plan, patches.degraded)
-    # Only now: values of boxes that no object has would outweigh all others in the search.
-    core = replace(core, ends=replace(core.ends, tail=network.tail))
+    core, final = rounded(plan, patches.degraded)
     if tuning:
         # Imported here because it needs torch, which no other step does.
         from beers_deploy.quant.passes.tune import tune
 
-        # Patches that hold few roofs would train the last sum's room away.
-        core, steps = tune(core, graph, tuning, still=last_sum)
+        core, steps = tune(core, graph, tuning)
     about = {
         **metadata(model),
         "precision": "int8 legal",
@@ -258,11 +230,10 @@ def quantise_model(
         CALIBRATION_RANGE: range_of(patches.degraded).to_words(),
         **about,
     }
-    lowered = any(getattr(op, "offset", 0.0) for op in final)
-    about["passes"] = f"{PASSES}, {LOWERED}" if lowered else PASSES
+    about["passes"] = PASSES
     if tuning:
         about["finetune"] = f"{steps} steps on {len(tuning.pairs)} patches"
-    return Quantised(host_model(core, about, fixed_tile_px(model)), core, relu_count(graph), final)
+    return Quantised(host_model(core, about, fixed_tile_px(model)), core, final)
 
 
 def choose_frac_bits(
@@ -310,80 +281,39 @@ def _errors(tensor: np.ndarray, first: int) -> np.ndarray:
     return np.asarray(np.sum([squared_errors(part, first) for part in parts], axis=0))
 
 
-def rounded(plan: Plan, images: Remade[np.ndarray]) -> tuple[IntCore, Graph, frozenset[str]]:
-    """A plan's graph in whole numbers, the float graph that was rounded, and the tensors of its
-    last sum.
-    """
+def rounded(plan: Plan, images: Remade[np.ndarray]) -> tuple[IntCore, Graph]:
+    """A plan's graph in whole numbers, and the float graph that was rounded."""
     step("scale of each tensor")
     frac_bits = choose_frac_bits(plan.graph, images, plan.ends, plan.passes.least_squares)
     plan = plan.without_large_sums(frac_bits).with_windows(frac_bits[CORRECTION], images)
-    graph = _balanced(plan, frac_bits, images)
-    paired = plan.paired(graph)
-    last_sum = frozenset[str]()
-    if paired is not graph:
-        # No block reads the last sum, so a finer step there does not make up for clipped roofs.
-        paired = with_room(paired, STREAM_STEP, images, plan.ends)
-        last_sum = frozenset(paired[-2].inputs)
-    final = plan.ended(paired)
-    step("rounding of the weights")
-    return _fitted(plan, final, plan.core(final, frac_bits), images), final, last_sum
-
-
-def _fitted(plan: Plan, graph: Graph, core: IntCore, images: Remade[np.ndarray]) -> IntCore:
-    """The core with its weights fitted, where the plan says so."""
-    return fit_weights(graph, core, images, plan.shifts) if plan.passes.fitted_weights else core
+    final = plan.ended(_balanced(plan, frac_bits, images))
+    return plan.core(final, frac_bits), final
 
 
 def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray]) -> Graph:
-    """The plan's graph, its streams equalised, its chain levelled, and what gains by it stored from
-    -128 on.
-
-    Where the image itself passes through, also with copies in its dead channels, if that costs
-    less.
-    """
+    """The plan's graph, its streams equalised and its chain levelled."""
     if not (plan.streams or plan.chain.tensors):
         return plan.graph
     targets = search_targets(plan.graph, plan.ends, images)
 
-    def built(candidate: Graph) -> tuple[Graph, IntCore]:
-        final = plan.ended(plan.paired(candidate))
-        return final, plan.core(final, frac_bits)
-
     def trial(candidate: Graph) -> Costs:
-        return crop_costs(host_model(built(candidate)[1], {}), targets)
-
-    def fitted(candidate: Graph) -> Costs:
-        core = _fitted(plan, *built(candidate), images)
+        core = plan.core(plan.ended(candidate), frac_bits)
         return crop_costs(host_model(core, {}), targets)
 
-    def searched(graph: Graph, copies: Copies) -> Graph:
-        graph = plan.chain.scaled(graph, plan.chain.unscaled(frac_bits))
-        graph = _equalised(graph, plan, trial, images) if plan.streams else graph
-        graph = _levelled(graph, plan, trial, images, copies) if plan.chain.tensors else graph
-        shared = frac_bits | dict.fromkeys(plan.chain.tensors, STREAM_FRAC_BITS)
-        # There are few of these trials, so each is judged with its weights fitted as in the end.
-        return lower(graph, shared, fitted) if plan.passes.full_range_relu else graph
-
-    graph = searched(plan.graph, {})
-    if plan.ends.offsets and plan.passes.copies:
-        other, copies = with_copies(plan.graph, plan.chain.tensors, images, plan.ends)
-        if copies:
-            graph = min(
-                (graph, searched(other, copies)),
-                key=lambda candidate: float(fitted(candidate)(None).sum()),
-            )
+    graph = plan.chain.scaled(plan.graph, plan.chain.unscaled(frac_bits))
+    if plan.streams:
+        graph = _equalised(graph, plan, trial, images)
+    if plan.chain.tensors:
+        graph = _levelled(graph, plan, trial, images)
     return graph
 
 
-def _levelled(
-    graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray], copies: Copies
-) -> Graph:
+def _levelled(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray]) -> Graph:
     """The graph, its chain levelled; what the image itself passes through clips nothing that
     calibration sees.
     """
     step(f"equalising the channels of {len(plan.chain.tensors)} tensors")
     ranges = chain_ranges(graph, plan.chain, images, plan.ends)
-    ranges = ranges_apart(ranges, plan.chain.parts, copies)
     factors = level(graph, plan.chain, ranges, np.ones(len(ranges)), trial)
     graph = plan.chain.scaled(graph, factors)
     if not plan.ends.offsets:

@@ -21,7 +21,7 @@ from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import encoding_faults, read_core
 from beers_deploy.quant.ends import ZERO, Ends
 from beers_deploy.quant.float_parts import float_layers_check
-from beers_deploy.quant.graph import CORRECTION, Activation
+from beers_deploy.quant.graph import CORRECTION
 from beers_deploy.quant.graph.nodes import Node, OnnxGraph
 from beers_deploy.quant.graph.quantised import Scale, stated
 from beers_deploy.quant.onnx_file import any_size, with_outputs
@@ -106,12 +106,6 @@ def _own_core(model: onnx.ModelProto) -> IntCore | None:
         return None
 
 
-def _saturated_relus(core: IntCore | None) -> set[str]:
-    """The tensors whose ReLU is int8's lower end."""
-    convolutions = core.convolutions if core else ()
-    return {op.output for op in convolutions if op.activation is Activation.saturated_relu}
-
-
 def _rounded(graph: OnnxGraph, core: IntCore | None) -> list[Rounded]:
     coarse = _coarse(core.ends) if core else slice(None)
     read_as = {
@@ -119,7 +113,7 @@ def _rounded(graph: OnnxGraph, core: IntCore | None) -> list[Rounded]:
         for node in graph.nodes
         if node.op_type == "DequantizeLinear"
     }
-    relus = _saturated_relus(core)
+    relus = set[str]()
     for node in graph.nodes:
         if node.op_type in RELUS:
             relus.update(node.inputs)
@@ -184,7 +178,7 @@ def count_relus(model: onnx.ModelProto) -> Relus:
         convolved = set(chain.from_iterable(node.outputs for node in convolutions))
         explicit = sum(_is_relu(node, graph, tensors) for node in graph.nodes)
         n_folded = sum(_begins_at_zero(node, tensors, convolved) for node in graph.nodes)
-        return Relus(explicit, n_folded + len(_saturated_relus(core)))
+        return Relus(explicit, n_folded)
 
 
 def _is_relu(node: Node, graph: OnnxGraph, tensors: dict[str, Rounded]) -> bool:

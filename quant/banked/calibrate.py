@@ -55,8 +55,6 @@ LIKE = "pleiades-degraded"
 """The profile that gives gain and bits; what is computed is over full scale."""
 
 ANALYTIC = "analytic"
-PASSES = replace(ALL, half_lsb_pair=False)
-"""A pair in the last sum costs 10 to 18 % of the time, and bought 0.007 dB at most."""
 BODY = "body.correction"
 """The results that lie side by side: the analytic restoration, and the body's correction of it."""
 
@@ -197,7 +195,7 @@ def quantise_family(
     bank: Bank,
     images: Remade[np.ndarray],
     shifts: Shifts = SHIFTS,
-    passes: Passes = PASSES,
+    passes: Passes = ALL,
 ) -> Family:
     """A network behind a bank in whole numbers, for the middle of the family.
 
@@ -208,7 +206,7 @@ def quantise_family(
         shifts: the windows of the target.
         passes: that reduce the error.
     """
-    body, *_ = rounded(_plan(weights, shifts, passes), images)
+    body, _ = rounded(_plan(weights, shifts, passes), images)
     biases = {op.name: _biases(op) for op in body.convolutions}
     # A sensor's values are constant, so their planes become part of the biases.
     ops = tuple(

@@ -60,9 +60,6 @@ place. Behind fitted kernels the last one of the analytic restoration is coarse 
 the others clip.
 """
 
-COARSE = 2 + FILTERS
-"""The kernel of that one: behind the image's, the planes' and the analytic restoration's."""
-
 GRID_BITS = 16
 """Fractional bits of what weights are fitted with: weights below 2^8, a covariance of at most 1, 49
 products.

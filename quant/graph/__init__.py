@@ -5,7 +5,6 @@
 - `operations`: what there is, convolutions to pixel shuffles, which tensors must share a scale, and
   how 12 bits enter int8;
 - `reader`: from float ONNX to a `network`, cut where the host's part ends;
-- `tail`: what the host computes behind the last map, kept as ONNX nodes;
 - `writer`: back to float ONNX.
 """
 
@@ -33,7 +32,6 @@ from beers_deploy.quant.graph.operations import (
     Shuffle,
     Window,
     read_planes,
-    relu_count,
     same,
     split,
     tensors,
@@ -81,7 +79,6 @@ __all__ = [
     "read_network",
     "read_planes",
     "refusal",
-    "relu_count",
     "same",
     "split",
     "tensors",

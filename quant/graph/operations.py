@@ -35,17 +35,10 @@ class Activation(StrEnum):
     leaky_relu = "LeakyRelu"
     hard_sigmoid = "HardSigmoid"
     hard_swish = "HardSwish"
-    saturated_relu = "SaturatedRelu"
-    """ReLU by int8's lower end, of whole numbers alone: the result is stored less 128 units."""
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """Of values of any shape, as the DPU computes it, in their own type."""
         return _FUNCTIONS[self](values)
-
-    @property
-    def written(self) -> "Activation":
-        """What a file has an operator for: none where rounding to int8 does it."""
-        return Activation.none if self is Activation.saturated_relu else self
 
     @property
     def homogeneous(self) -> bool:
@@ -68,7 +61,6 @@ _FUNCTIONS: Mapping[Activation, Callable[[np.ndarray], np.ndarray]] = {
     ),
     Activation.hard_sigmoid: _hard_sigmoid,
     Activation.hard_swish: lambda values: values * _hard_sigmoid(values),
-    Activation.saturated_relu: lambda values: values,
 }
 
 
@@ -155,18 +147,11 @@ class Conv(OneInput):
     transposed: bool = False
     # (O,) where ReLU6 clips each channel once they are scaled; None at 6.
     ceiling: np.ndarray | None = None
-    # Taken off the result behind its ReLU: 128 units of int8, or nothing.
-    offset: float = 0.0
 
     @property
     def ceilings(self) -> np.ndarray:
         """(O,) where ReLU6 clips each channel."""
         return np.full(len(self.bias), float(SIX)) if self.ceiling is None else self.ceiling
-
-    @property
-    def stored_bias(self) -> np.ndarray:
-        """(O,) the bias of the result as it is stored, its offset taken off."""
-        return np.asarray(self.bias - np.float32(self.offset)) if self.offset else self.bias
 
 
 @dataclass(frozen=True)
@@ -302,11 +287,6 @@ def tied(graph: Graph) -> dict[str, str]:
 def tensors(graph: Graph) -> list[str]:
     """The names of all results, in order."""
     return [op.output for op in graph]
-
-
-def relu_count(graph: Graph) -> int:
-    """How many operations carry a ReLU: quantisers have been seen to drop them without a word."""
-    return sum(getattr(op, "activation", None) is Activation.relu for op in graph)
 
 
 PLANES = "planes"

@@ -46,17 +46,6 @@ def graph_to_onnx(graph: Graph, outputs: list[str], channels: int = 3) -> onnx.M
     return make_model(writer.graph("core", [image_info(PLANES, channels, None)], results), {})
 
 
-def operation_to_onnx(op: Op) -> onnx.ModelProto:
-    """One operation by itself, from the tensors that it reads to the one that it writes."""
-    model = graph_to_onnx((op,), [op.output])
-    del model.graph.input[:]
-    sides = ["N", "C", None, None]
-    model.graph.input.extend(
-        helper.make_tensor_value_info(n, TensorProto.FLOAT, sides) for n in dict.fromkeys(op.inputs)
-    )
-    return model
-
-
 def onnx_weight(weight: np.ndarray, transposed: bool) -> np.ndarray:
     """Weights (O, I, kh, kw) as ONNX wants them: (I, O, kh, kw) of a transposed convolution."""
     return np.ascontiguousarray(weight.swapaxes(0, 1)) if transposed else weight
@@ -74,11 +63,7 @@ def write_float(w: GraphWriter, op: Op, feeds: Sequence[str], output: str) -> No
     # The operator of a Pointwise is its activation, so that none follows.
     activation = Activation.none
     if not isinstance(op, Pointwise):
-        activation = getattr(op, "activation", Activation.none).written
-    offset = getattr(op, "offset", 0.0)
-    end = output
-    if offset:
-        output = f"{end}.whole"
+        activation = getattr(op, "activation", Activation.none)
     result = output if activation is Activation.none else f"{op.output}.linear"
     _WRITERS[type(op)](w, op, list(feeds), result)
     if isinstance(op, Conv) and op.ceiling is not None:
@@ -89,9 +74,6 @@ def write_float(w: GraphWriter, op: Op, feeds: Sequence[str], output: str) -> No
         w.node("Min", output, [f"{output}.above_0", ceiling], f"{op.name}.{activation.name}")
     elif activation is not Activation.none:
         _activation(w, activation, result, output, f"{op.name}.{activation.name}")
-    if offset:
-        lowered_by = w.constant(f"{op.name}.offset", np.array(offset, np.float32))
-        w.node("Sub", end, [output, lowered_by], f"{op.name}.lowered")
 
 
 def _conv(w: GraphWriter, op: Conv, feeds: list[str], output: str) -> None:

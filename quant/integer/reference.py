@@ -23,7 +23,6 @@ from beers_deploy.quant.ends import ZERO
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
-    Activation,
     Add,
     AveragePool,
     Concat,
@@ -109,9 +108,7 @@ def run_core(
         quotients, ties = rounded(sums, shift, half_even)
         result = saturated(quotients)
         tensors[op.output] = faults.touch(op.output, result)
-        # The lower end of int8 is this activation's zero, so nothing is lost there.
-        relu = getattr(op, "activation", None) is Activation.saturated_relu
-        ends = (result == INT8_MAX) | ((result == INT8_MIN) & (not relu))
+        ends = (result == INT8_MAX) | (result == INT8_MIN)
         largest = max(int(np.abs(sums).max()), 1)
         # The bits that an activation appends come behind the accumulator, which never holds them.
         peak = max(float(np.log2(largest)) - finer, 0.0)

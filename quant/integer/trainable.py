@@ -11,7 +11,7 @@ A result in windows or two gains is trained as one copy of it, which is not roun
 what the host computes by up to half a unit. `TrainableCore.core` makes the other copies.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -68,18 +68,13 @@ class TrainableCore(torch.nn.Module):
     count.
     """
 
-    def __init__(self, core: IntCore, still: Collection[str] = ()) -> None:
-        """Parameters that begin at the core's whole numbers; convolutions that write what is
-        `still` stay so.
-        """
+    def __init__(self, core: IntCore) -> None:
+        """Parameters that begin at the core's whole numbers."""
         super().__init__()
         self._core = core
         self._convs = [_one_copy(op, core.ends) for op in core.convolutions]
         self.weights = torch.nn.ParameterList(torch.tensor(op.weight).float() for op in self._convs)
         self.biases = torch.nn.ParameterList(torch.tensor(op.bias).float() for op in self._convs)
-        for op, *parameters in zip(self._convs, self.weights, self.biases, strict=True):
-            for parameter in parameters:
-                parameter.requires_grad_(op.output not in still)
         if core.ends.offsets:
             # The host adds a window's offset in float, so this bias need not be an integer.
             self.biases[-1].data.copy_(torch.from_numpy(_window_bias(self._convs[-1], core.ends)))

@@ -40,11 +40,6 @@ FULL = INT8_MAX * 2.0**-STREAM_FRAC_BITS
 STEPS = (1.5, 1.2)
 """Factors by which each channel is tried larger and smaller, a sweep each."""
 
-ROOM = 0.8
-"""The share that must fit into int8 of the largest values that calibration sees in the stream's
-last sum.
-"""
-
 MOST_CHANNELS = 256
 """More are not tried one by one: each costs four runs of all crops at most, hours in a wide
 network.
@@ -150,29 +145,6 @@ def largest_sizes(
         np.max(sizes, axis=0)
         for sizes in zip(*channel_sizes(graph, names, images, ends, quantile), strict=True)
     ]
-
-
-def with_room(
-    graph: Graph, step: float, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL
-) -> Graph:
-    """The same network with room in its last sum, which no block reads, for the brightest roofs.
-
-    The search that equalises clips what is rare on the patches that it looks at. In the stream that
-    is right, for a finer step serves every block; in the last sum of a half-LSB pair it cost a site
-    0.46 of 0.56 dB.
-
-    Args:
-        graph: that ends with the sum of a half-LSB pair and a convolution.
-        step: the value of one unit of the sum.
-        images: (1, C', H, W) that tell how large its values are.
-        ends: what the host does to the images.
-    """
-    add = graph[-2]
-    last = dict.fromkeys((*add.inputs, add.output), slice(None))
-    limit = INT8_MAX * step
-    largest = np.max(largest_sizes(graph, list(last), images, ends), axis=0)
-    # No factor is above 1: a channel that has the room already keeps its step.
-    return equalise(graph, last, limit / np.maximum(ROOM * largest, limit))
 
 
 def above_dead(ranges: np.ndarray) -> np.ndarray:

@@ -1,9 +1,8 @@
 """What is done to the residual stream and to its last tensor, so that rounding them costs little.
 
-One scale for the whole stream makes its adds exact. Two copies of the last stream tensor, rounded
-half a step apart, together hold nine bits. Two gains for the correction: a fine one for nearly all
-pixels, a coarse one for the strongest edges. Windows for a result that nothing is added to: fine
-ones side by side over all that it can be, and a coarse one for what lies outside.
+One scale for the whole stream makes its adds exact. Two gains for the correction: a fine one for
+nearly all pixels, a coarse one for the strongest edges. Windows for a result that nothing is added
+to: fine ones side by side over all that it can be, and a coarse one for what lies outside.
 """
 
 from collections.abc import Mapping, Sequence
@@ -139,54 +138,6 @@ def _passes_factors(graph: Graph, stream: Stream) -> bool:
     )
 
 
-OFFSETS = np.array([-0.25, 0.25])
-"""What the two copies of a half-LSB pair add before they are rounded, in units of their step; the
-mean is 0.
-"""
-
-
-def half_lsb_pair(graph: Graph, step: float) -> Graph:
-    """The graph with two copies of what its last convolution reads, where that is the sum of two
-    convolutions.
-
-    `step` is the value of one unit of the tensors that the add reads and writes.
-    """
-    *before, add, tail = graph if len(graph) > 1 else (None, None)
-    if not (isinstance(add, Add) and isinstance(tail, Conv)):
-        return graph
-    writers = {op.output: op for op in graph if isinstance(op, Conv) and _plain(op)}
-    two = (
-        add.activation is Activation.none
-        and len(set(add.inputs)) == 2
-        and set(add.inputs) <= set(writers)
-    )
-    # The offsets are in units of `step`, which only a stream's tensors have.
-    shared = any(add.output in stream for stream in streams(graph))
-    if not (shared and two and tail.groups == 1 and tail.input == add.output):
-        return graph
-    left, right = (_twice(writers[name], step) for name in add.inputs)
-    inputs = set(chain.from_iterable(op.inputs for op in before))
-    # A convolution that only this add read is replaced by its pair.
-    others = [op for op in before if op.output in inputs or op.output not in add.inputs]
-    pair = replace(add, inputs=(left.output, right.output))
-    # Rounded half a unit apart, the two copies have a mean on a grid twice as fine.
-    halved = replace(tail, weight=np.concatenate([tail.weight / 2] * len(OFFSETS), axis=1))
-    return (*others, left, right, pair, halved)
-
-
-def _plain(op: Conv) -> bool:
-    return op.activation is Activation.none and op.groups == 1
-
-
-def _twice(op: Conv, step: float) -> Conv:
-    """Its output channels down, then up."""
-    bias = np.concatenate([op.bias + np.float32(offset * step) for offset in OFFSETS])
-    weight = np.concatenate([op.weight] * len(OFFSETS))
-    return replace(
-        op, name=f"{op.name}.twice", output=f"{op.output}.twice", weight=weight, bias=bias
-    )
-
-
 def two_gains(graph: Graph) -> Graph:
     """The graph whose last convolution writes its channels twice: fine, and coarse by GAIN.
 
@@ -234,4 +185,5 @@ def window_offsets(low: np.ndarray, high: np.ndarray, unit: float) -> np.ndarray
 
 def takes_gains(graph: Graph) -> bool:
     """Whether the last operation is a convolution that can write its channels twice."""
-    return isinstance(graph[-1], Conv) and _plain(graph[-1])
+    last = graph[-1]
+    return isinstance(last, Conv) and last.activation is Activation.none and last.groups == 1

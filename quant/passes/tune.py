@@ -9,7 +9,7 @@ was.
 """
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -104,9 +104,7 @@ class Judge:
     def loss(self, core: IntCore) -> float:
         """What a core loses."""
         # Samples are corrections, so the host must stop once it has merged gains or windows.
-        ends = replace(
-            core.ends, back=(), adds_image=False, last=(), flat=False, softmax=False, tail=None
-        )
+        ends = replace(core.ends, back=(), adds_image=False, last=())
         session = open_session(host_model(replace(core, ends=ends), {}))
         results = (torch.from_numpy(result_of(session, sample.image)) for sample in self._held)
         errors = [
@@ -162,9 +160,7 @@ class Descent:
             yield steps - taken - 1
 
 
-def tune(
-    core: IntCore, full: Graph, tuning: Tuning, still: Collection[str] = ()
-) -> tuple[IntCore, int]:
+def tune(core: IntCore, full: Graph, tuning: Tuning) -> tuple[IntCore, int]:
     """The core with the numbers that erred least on pairs that they were not trained on, and the
     steps taken.
 
@@ -172,13 +168,12 @@ def tune(
         core: to start from; it comes back as it is where training finds nothing better.
         full: the float network that reads all planes.
         tuning: on what, how long, how fast.
-        still: the tensors whose convolutions are not trained.
     """
     samples = list(_samples(core.ends, full, tuning.pairs))
     # Too few samples to hold one out are trained on and judged by.
     validation = (samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or samples)[:MOST_HELD_OUT]
     training = [sample for k, sample in enumerate(samples) if (k + 1) % HELD_OUT_EVERY] or samples
-    trainable = TrainableCore(core, still)
+    trainable = TrainableCore(core)
     judge = Judge(core, validation)
     descent = Descent(trainable, training, tuning)
     rounds = (tuning.steps,) if tuning.steps else ROUNDS
@@ -206,7 +201,7 @@ def _samples(ends: Ends, full: Graph, pairs: Remade[Pair]) -> Iterator[Sample]:
             memory_format=torch.channels_last
         )
         result = torch.from_numpy(floats)
-        if not (reference.size and ends.is_image):
+        if not reference.size:
             yield Sample(image, planes, result, None, 1.0)
             continue
         size = times(reference.shape)

@@ -1,7 +1,7 @@
 """The passes: each leaves the float network as it was, and does to the integer one what it says."""
 
 from dataclasses import replace
-from itertools import chain, product
+from itertools import product
 
 import numpy as np
 import onnx
@@ -26,21 +26,17 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.passes.equalise import (
     FIRST_CROPS,
-    ROOM,
     Costs,
     channel_ranges,
-    channel_sizes,
     equalise,
     first_guess,
     search,
-    with_room,
 )
 from beers_deploy.quant.passes.selection import Passes
 from beers_deploy.quant.passes.stream import (
     STREAM_FRAC_BITS,
     Stream,
     exceeds_six,
-    half_lsb_pair,
     streams,
     two_gains,
 )
@@ -163,38 +159,6 @@ def test_sums_beyond_a_relu6_are_told_by_their_scale(bits: int, beyond: bool) ->
     assert not exceeds_six(plain, stream_of(plain), frac_bits)
 
 
-def largest(graph: Graph, images: list[np.ndarray]) -> np.ndarray:
-    """(C,) of the last sum."""
-    sizes = channel_sizes(graph, [graph[-2].output], images, quantile=1.0)
-    return np.asarray(np.max([size for (size,) in sizes], axis=0))
-
-
-@pytest.mark.parametrize("loud", [0.1, 3.0, 40.0])
-def test_the_last_sum_has_room_for_the_largest_values(
-    graph: Graph, patches: Patches, loud: float
-) -> None:
-    images = [image for image, _ in patches.pairs]
-    step = 2.0**-STREAM_FRAC_BITS
-    ranges = channel_ranges(graph, stream_of(graph), images)
-    paired = half_lsb_pair(equalise(graph, stream_of(graph), first_guess(ranges, 0.5, loud)), step)
-    roomy = with_room(paired, step, images)
-    np.testing.assert_allclose(correction(roomy), correction(paired), atol=1e-5)
-    before = largest(paired, images)
-    after = largest(roomy, images)
-    assert (after * ROOM <= 127 * step * (1 + 1e-5)).all()
-    assert (after <= before * (1 + 1e-5)).all()
-    inputs = chain.from_iterable(op.inputs for op in roomy)
-    # The blocks keep their step.
-    for name in sorted(stream_of(graph).keys() & set(inputs)):
-        first, second = ([op for op in variant if op.output == name] for variant in (paired, roomy))
-        assert all(
-            a is b or np.array_equal(a.weight, b.weight)  # type: ignore[attr-defined]
-            for a, b in zip(first, second, strict=True)
-        )
-    if loud < 1:
-        np.testing.assert_allclose(after, before, rtol=1e-5)
-
-
 CROPS = 5
 RANGES = np.geomspace(1, 0.05, 8)
 
@@ -293,12 +257,12 @@ def test_all_passes_lose_far_less_than_none(
     def mae(int8: Quantised) -> float:
         return compare(open_session(float_onnx), open_session(int8.host), patches.pairs).mae
 
-    few = Passes(half_lsb_pair=False, dual_range=False, equalising=False, fitted_weights=False)
+    few = Passes(dual_range=False, least_squares=False, equalising=False)
     rounded = quantise_model(float_onnx, patches, {}, passes=few)
     last = rounded.core.ops[-1]
     assert isinstance(last, IntConv)
     assert len(last.weight) == 1
-    assert mae(quantised) < 0.5 * mae(rounded)
+    assert mae(quantised) < 0.6 * mae(rounded)
 
 
 def test_each_step_is_named(float_onnx: onnx.ModelProto, patches: Patches) -> None:
@@ -306,4 +270,4 @@ def test_each_step_is_named(float_onnx: onnx.ModelProto, patches: Patches) -> No
     with reporting(reported.append), progress("calibrating"):
         quickly(float_onnx, patches)
     names = [step.what.removeprefix("calibrating: ") for step in reported]
-    assert [name.split(" ")[0] for name in names] == ["scale", "equalising", "rounding"]
+    assert [name.split(" ")[0] for name in names] == ["scale", "equalising"]

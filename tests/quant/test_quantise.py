@@ -49,9 +49,8 @@ def test_unreachable_positions_are_moved_to_legal_ones(
 
 def test_every_convolution_is_an_integer_kernel(quantised: Quantised) -> None:
     kinds = [node.op_type for node in quantised.host.graph.node]
-    # These are the head, two in each of two blocks, head and end for the half-LSB pair, and the
-    # tail.
-    assert kinds.count("QLinearConv") == 8
+    # These are the head, two in each of two blocks, the end and the tail.
+    assert kinds.count("QLinearConv") == 7
     assert "Conv" not in kinds
 
 

@@ -11,7 +11,6 @@ from beers_deploy.model.bank import FILTERS, SIDE_PX, UNIT_STEPS, WIDE, Bank, ba
 from beers_deploy.model.variants import Kernels
 from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.quant.banked.filters import (
-    COARSE,
     COPIES,
     IMAGE_STEP_DN,
     MIDDLE_DN,
@@ -26,6 +25,9 @@ from beers_deploy.quant.graph import Window
 from beers_deploy.quant.integer.arithmetic import convolve
 
 VECTOR = st.tuples(*[st.floats(-1, 1)] * 4)
+
+COARSE = 2 + FILTERS
+"""The kernel of the coarse copy: behind the image's, the planes' and the analytic restoration's."""
 
 
 def sums(image: np.ndarray, own: Bank) -> np.ndarray:
