@@ -34,7 +34,6 @@ from beers_deploy.quant.graph import (
     channels_of,
     split,
 )
-from beers_deploy.quant.graph.tail import Tail
 from beers_deploy.quant.graph.writer import write_shuffle
 from beers_deploy.quant.onnx_file import GraphWriter
 
@@ -76,12 +75,9 @@ class Ends:
     back: tuple[Shuffle, ...] = ()
     adds_image: bool = True
     last: tuple[Shuffle, ...] = ()
-    flat: bool = False
-    softmax: bool = False
     gains: int = 1
     outputs: int = 1
     offsets: tuple[tuple[float, ...], ...] = ()
-    tail: Tail | None = None
     banked: bool = False
     unit: float = 1.0
     direct: bool = False
@@ -195,23 +191,10 @@ class Ends:
         """As `restored`, of a correction that is one already."""
         for shuffle in self.back:
             result = shuffle(result)
-        if self.softmax:
-            # Without the largest the powers would overflow; it cancels in the quotient.
-            powers = np.exp(result - result.max(axis=1, keepdims=True))
-            result = powers / powers.sum(axis=1, keepdims=True)
-        if self.flat:
-            result = result.reshape(len(result), -1)
         result = self.clipped(image + result) if self.adds_image else result
         for shuffle in self.last:
             result = shuffle(result)
-        return self.tail(result) if self.tail else result
-
-    @property
-    def is_image(self) -> bool:
-        """Whether the result is an image, and nothing but moved values and a sum away from the
-        core's.
-        """
-        return not (self.softmax or self.flat or self.tail)
+        return result
 
     def correction_of(self, image: np.ndarray, result: np.ndarray) -> np.ndarray:
         """The correction from which `finished` makes that result (N, C, H, W), in [0, 1] where the
@@ -238,14 +221,7 @@ ONE_CHANNEL = Ends()
 
 def ends_of(network: Network, gains: int = 1) -> Ends:
     """The ends of a network whose correction comes in so many gains."""
-    steps = (
-        network.front,
-        network.back,
-        network.adds_image,
-        network.last,
-        network.flat,
-        network.softmax,
-    )
+    steps = network.front, network.back, network.adds_image, network.last
     outputs = channels_of(network.graph, {IMAGE: network.core_channels})[CORRECTION]
     return Ends(network.core_channels, COUNT, *steps, gains, outputs)
 
@@ -332,8 +308,6 @@ def write_back(w: HostWriter, ends: Ends, feeds: list[str], scale: float) -> Non
         result = f"host_back.shuffled_{k}"
     if ends.unit != 1:
         result = w.node("Mul", "host_back.in_units", [result, w.scalar("unit", ends.unit)])
-    if ends.softmax:
-        result = w.node("Softmax", "host_back.probabilities", [result], axis=1)
     if ends.adds_image:
         w.node("Add", "host_back.add", [IMAGE, result])
         limits = [w.scalar("zero", 0), w.scalar("one", 1)]
@@ -343,12 +317,9 @@ def write_back(w: HostWriter, ends: Ends, feeds: list[str], scale: float) -> Non
             result = name
             name = "restored" if k + 1 == len(ends.last) else f"host_back.last_{k}"
             write_shuffle(w, shuffle, result, name)
-    elif ends.tail:
-        ends.tail.write(w, result)
     else:
         # The file's output is named `restored`, whatever the node in front of it.
-        kind = "Flatten" if ends.flat else "Identity"
-        w.node(kind, "restored", [result], name="host_back.result")
+        w.node("Identity", "restored", [result], name="host_back.result")
 
 
 def _write_one(w: HostWriter, ends: Ends, feeds: list[str], scale: float) -> str:

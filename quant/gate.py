@@ -22,12 +22,6 @@ if TYPE_CHECKING:
     from beers_deploy.quant.samples import Pair
 
 
-Parts = tuple[np.ndarray, np.ndarray]
-"""Numerators and denominators of one sample, for each class or for one: both are added up over the
-samples.
-"""
-
-
 @dataclass(frozen=True)
 class Metric:
     """What a user measures results by.
@@ -35,77 +29,38 @@ class Metric:
     Attributes:
         unit: of the figure.
         larger_is_better: whether it is.
-        of_classes: whether references are numbers of classes, for every result or for every pixel.
-        parts: of a result and its reference.
+        value: of a result (1, C, H, W) and its reference of the same shape.
     """
 
     unit: str
     larger_is_better: bool
-    of_classes: bool
-    parts: Callable[[np.ndarray, np.ndarray], Parts]
+    value: Callable[[np.ndarray, np.ndarray], float]
 
 
-def _alone(value: float) -> Parts:
-    return np.array([value]), np.ones(1)
-
-
-def _similarity(result: np.ndarray, reference: np.ndarray) -> Parts:
+def _similarity(result: np.ndarray, reference: np.ndarray) -> float:
     # SSIM is that of one band, so it is the mean over the bands.
-    values = [ssim(*pair, 1.0) for pair in zip(result[0], reference[0], strict=True)]
-    return _alone(float(np.mean(values)))
-
-
-def _hits(result: np.ndarray, reference: np.ndarray) -> Parts:
-    right = result.argmax(1).ravel() == reference.ravel()
-    return np.array([right.sum()]), np.array([right.size])
-
-
-def _overlap(result: np.ndarray, reference: np.ndarray) -> Parts:
-    """Of every class, the pixels that both say and those that one of them says."""
-    classes = np.arange(result.shape[1])[:, None]
-    predicted = classes == result.argmax(1).ravel()
-    actual = classes == reference.ravel()
-    return (predicted & actual).sum(1), (predicted | actual).sum(1)
+    return float(np.mean([ssim(*pair, 1.0) for pair in zip(result[0], reference[0], strict=True)]))
 
 
 METRICS: Mapping[str, Metric] = {
-    "psnr": Metric(
-        "dB", True, False, lambda result, reference: _alone(psnr_db(result, reference, 1.0))
-    ),
-    "ssim": Metric("ratio", True, False, _similarity),
+    "psnr": Metric("dB", True, lambda result, reference: psnr_db(result, reference, 1.0)),
+    "ssim": Metric("ratio", True, _similarity),
     "mae": Metric(
         "of full scale",
         False,
-        False,
-        lambda result, reference: _alone(np.abs(result - reference).mean()),
+        lambda result, reference: float(np.abs(result - reference).mean()),
     ),
-    "top1": Metric("ratio", True, True, _hits),
-    "iou": Metric("ratio", True, True, _overlap),
 }
-"""By name. iou is the mean over the classes of intersection over union."""
 
 
-def parts_of(name: str, result: np.ndarray, reference: np.ndarray) -> Parts:
-    """What one result (1, C, ...) adds to a metric, by its name."""
-    metric = METRICS[name]
-    shape = (len(result), *result.shape[2:]) if metric.of_classes else result.shape
-    # Of one channel the largest is always the same, so it tells no classes.
-    if reference.size != math.prod(shape) or (metric.of_classes and result.shape[1] < 2):
-        kind = "numbers of classes as references" if metric.of_classes else "references"
+def metric_value(name: str, result: np.ndarray, reference: np.ndarray) -> float:
+    """Return the value of a metric, by its name, for one result (1, C, H, W)."""
+    if reference.size != result.size:
         raise OptionError(
-            f"The `metric` {name!r} needs {kind} of {times(shape)} for results of "
-            f"{times(result.shape)}, got {times(reference.shape)}. Give these, or another metric."
+            f"The `metric` {name!r} needs references of {times(result.shape)} for results of that "
+            f"size, got {times(reference.shape)}. Give these, or leave the metric out."
         )
-    return metric.parts(result, reference)
-
-
-def value_of(parts: Sequence[Parts]) -> float:
-    """The metric over all samples of one network; NaN of none."""
-    if not parts:
-        return math.nan
-    above, below = (np.sum(column, 0) for column in zip(*parts, strict=True))
-    # A class that neither result nor reference has in any sample has no ratio.
-    return float((above[below > 0] / below[below > 0]).mean())
+    return METRICS[name].value(result, reference)
 
 
 @dataclass(frozen=True)
@@ -113,8 +68,7 @@ class GateResult:
     """Differences in [0, 1] of full scale over all pixels; PSNRs over full scale, in dB, NaN
     without references.
 
-    `same_class` is the share of results whose largest channel is the same: of networks that tell
-    classes, else NaN. `metric` is what the user measures results by, `metric_float` and
+    `metric` is what the user measures results by, `metric_float` and
     `metric_int8` what was found of the two. `worst_drop_db` is what the patch loses that loses
     most. `input_change` is the mean absolute difference of the float results from their inputs, NaN
     where these have another shape. `contrast` is the mean absolute deviation of the float results
@@ -130,7 +84,6 @@ class GateResult:
     psnr_float_db: float
     psnr_int8_db: float
     patches: int
-    same_class: float = math.nan
     simulated: bool = True
     worst_drop_db: float = math.nan
     metric: str = ""
@@ -200,7 +153,7 @@ def compare(
         int8_session: the INT8 network's.
         pairs: what both are run on.
         simulated: whether these are simulated patches.
-        metric: one of `METRICS`, by which results are held against the references too.
+        metric: one of `METRICS`, by which results are compared with the references too.
         names: of the samples, for messages.
 
     Raises:
@@ -211,11 +164,10 @@ def compare(
     """
     differences = []
     errors = []
-    agreements = []
     changes = []
     contrasts = []
     counts = RangeCounts()
-    metric_parts = list[list[Parts]]()
+    metric_values = list[list[float]]()
     unfit_shapes = dict[str, tuple[int, ...]]()
     for number, (degraded, reference) in enumerate(pairs):
         counts.add(degraded)
@@ -226,17 +178,15 @@ def compare(
                 f"The results of the INT8 network are {int8_size}, but those of the float network "
                 f"are {float_size}. Give the INT8 file that was made from this float network."
             )
-        classes = [result.argmax(1) for result in results]
-        # More channels than the image has are taken for classes.
-        tells_classes = results[0].shape[1] > degraded.shape[1]
-        agreements.append((classes[0] == classes[1]).mean() if tells_classes else math.nan)
+        if results[0].ndim != 4:
+            raise ModelError(
+                f"The results of the networks must be images (N, C, H, W), but they are "
+                f"{times(results[0].shape)}. The gate is for networks that make an image of an "
+                "image; 'check' and 'bench' read any network."
+            )
         # The float result alone decides, so that both are clipped or neither is.
         inside = ((results[0] >= 0) & (results[0] <= 1)).mean()
-        is_image = (
-            results[0].ndim == 4
-            and results[0].shape[1] == degraded.shape[1]
-            and bool(inside >= MOST)
-        )
+        is_image = results[0].shape[1] == degraded.shape[1] and bool(inside >= MOST)
         in_float, in_int8 = (_as_in_a_file(result, is_image) for result in results)
         differences.append((in_int8 - in_float).ravel())
         same_shape = in_float.shape == degraded.shape
@@ -245,12 +195,12 @@ def compare(
         name = names[number] if names else f"sample {number}"
         if reference.shape != in_float.shape:
             unfit_shapes[name] = reference.shape
-        elif metric is None or not METRICS[metric].of_classes:
+        else:
             _require_full_scale(name, reference)
         errors.append([_psnr_db(image, reference) for image in (degraded, in_float, in_int8)])
         if metric is not None:
-            metric_parts.append(
-                [parts_of(metric, result, reference) for result in (in_float, in_int8)]
+            metric_values.append(
+                [metric_value(metric, result, reference) for result in (in_float, in_int8)]
             )
     some_fit = not np.isnan([in_float for _, in_float, _ in errors]).all()
     if unfit_shapes and some_fit:
@@ -259,6 +209,9 @@ def compare(
         raise unfit_reference(name, shape, "the PSNRs, because other samples have one")
     difference = np.concatenate(differences).astype(np.float64)
     degraded_db, float_db, int8_db = np.mean(errors, axis=0)
+    metric_float = metric_int8 = math.nan
+    if metric is not None:
+        metric_float, metric_int8 = np.mean(metric_values, axis=0).tolist()
     return GateResult(
         mae=float(np.abs(difference).mean()),
         std=float(difference.std()),
@@ -269,11 +222,10 @@ def compare(
         psnr_float_db=float(float_db),
         psnr_int8_db=float(int8_db),
         patches=len(errors),
-        same_class=float(np.mean(agreements)),
         simulated=simulated,
         metric=metric or "",
-        metric_float=value_of([parts for parts, _ in metric_parts]),
-        metric_int8=value_of([parts for _, parts in metric_parts]),
+        metric_float=metric_float,
+        metric_int8=metric_int8,
         worst_drop_db=float(np.max([in_float - in_int8 for _, in_float, in_int8 in errors])),
         input_change=float(np.mean(changes)),
         contrast=float(np.mean(contrasts)),
@@ -377,8 +329,6 @@ def gate_row(result: GateResult) -> Row:
         "PSNR INT8": (result.psnr_int8_db, "dB"),
     }
     figures = {name: _figure(value, unit, result) for name, (value, unit) in entries.items()}
-    if not math.isnan(result.same_class):
-        figures["same class"] = _figure(100 * result.same_class, "%", result)
     if result.metric:
         values = {
             "float": result.metric_float,

@@ -149,7 +149,7 @@ def samples_in(given: object) -> list[Pair]:
         and len(given) == 2
         and all(hasattr(array, "ndim") for array in given)
     ):
-        # A reference may be a class, or a class for each pixel, so it has any number of axes.
+        # A reference may have another size than its image.
         images = _batch(given[0])
         references = _plain(given[1])
         references = references[None] if np.ndim(given[0]) == 3 else references
@@ -370,7 +370,7 @@ def _cut(
             f"{name} has a reference, so its sides must be multiples of {multiple_px} pixels, got "
             f"{times((height, width))}. Cut both."
         )
-    # A reference may be of another size, such as an enlarged image or a class: it cannot be cut.
+    # A reference may be of another size, such as an enlarged image: it cannot be cut.
     if reference.size:
         yield image[None], reference[None]
         return

@@ -311,7 +311,6 @@ def sizes_row(spread: Spread) -> Row:
 
 
 MUCH_DB = 0.2
-SAME_CLASS = 0.99
 """From here on, or below, a network has lost so much that it is worth asking where."""
 
 
@@ -326,9 +325,6 @@ def losses(result: Quantised, gate: GateResult, patches: Patches) -> str:
         )
         message = f"INT8 loses {worst}"
         much = gate.drop_db > MUCH_DB
-    elif not math.isnan(gate.same_class):
-        message = f"INT8 tells {100 * gate.same_class:.2f} % of the classes as float"
-        much = gate.same_class < SAME_CLASS
     else:
         message = f"INT8 differs from float by {gate.mae:.2g} of full scale on average"
         much = False
@@ -339,7 +335,7 @@ def losses(result: Quantised, gate: GateResult, patches: Patches) -> str:
     add = ""
     if not result.core.ends.adds_image:
         add = ", or a network that ends with a global add, of which INT8 errs less"
-    return f"{message} ({gate.source}): most of it in {names}; try --finetune auto{add}"
+    return f"{message} ({gate.source}): most of it in {names}; try `finetune` auto{add}"
 
 
 MOST = 3

@@ -1,17 +1,14 @@
-"""Golden vectors: what every layer of an INT8 network must write on a board, and what is wrong
-where one does not.
+"""Golden vectors: what every layer of an INT8 network must write on a board.
 
 A folder holds the network (int8.onnx), golden.json and, for each case, its image and the int8
 tensors of all layers as .npy files (N, C, H, W), numbered in the order in which they are computed.
-What a board wrote are files of the same names in folders of the same names, as many of them as it
-can hand out.
 """
 
 import hashlib
 import json
 import os
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,13 +21,12 @@ from beers_deploy.model.io.files import whole_file, write_text
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.arrays import ALONE, load_arrays
 from beers_deploy.profiles.errors import ImageError, OptionError, printable
-from beers_deploy.profiles.figures import Check, Row, measured
+from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 from beers_deploy.profiles.toml import read_json, unreadable
-from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import read_core
-from beers_deploy.quant.graph import PLANES, Op
-from beers_deploy.quant.integer.diagnosis import Seen, explain, where
+from beers_deploy.quant.graph import PLANES
 from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px
 from beers_deploy.quant.untrusted import times
@@ -38,7 +34,7 @@ from beers_deploy.results import Input, Table
 
 SCHEMA = "beers-deploy/golden"
 SCHEMA_VERSION = 1
-TILE_PX = 64
+GOLDEN_TILE_PX = 64
 INDEX = "golden.json"
 NETWORK = "int8.onnx"
 PICTURE = "image.npy"
@@ -153,7 +149,7 @@ def _images(
     """The images (1, C, H, W) of the cases."""
     fixed_px = fixed_tile_px(network.model)
     lattice_px = fixed_px or network.tiling.lattice_px
-    side = fixed_px or tile or -(-TILE_PX // lattice_px) * lattice_px
+    side = fixed_px or tile or -(-GOLDEN_TILE_PX // lattice_px) * lattice_px
     if (tile or side) != side or side < 1 or side % lattice_px:
         rule = (
             f"{fixed_px} px, to which the network is fixed"
@@ -281,7 +277,7 @@ def _index(path: Path) -> tuple[dict[str, dict[str, str]], bool]:
 
 def _planes(path: Path, core: IntCore) -> np.ndarray:
     """Read the planes that a core reads, (N, C, H, W) int8."""
-    planes = _array(path)
+    planes = read_array(path)
     channels = core.ends.planes * core.ends.channels
     if (
         planes.dtype != np.int8
@@ -296,7 +292,8 @@ def _planes(path: Path, core: IntCore) -> np.ndarray:
     return planes
 
 
-def _array(path: Path) -> np.ndarray:
+def read_array(path: Path) -> np.ndarray:
+    """Read one array of a .npy file."""
     try:
         arrays = load_arrays(path)
         if list(arrays) != [ALONE]:
@@ -306,147 +303,3 @@ def _array(path: Path) -> np.ndarray:
             f"{path} is not an array (.npy): {printable(str(error))}. Write it with numpy.save."
         ) from error
     return arrays[ALONE]
-
-
-def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[str]) -> Table:
-    """Hold what a board wrote against golden vectors; false where a layer differs.
-
-    Args:
-        folder: of the golden vectors.
-        results: folders of the cases' names with files of the layers' names, any of them: int8,
-            uint8 around 128, or float multiples of the tensor's scale; channels first, or last.
-    """
-    golden = read_golden(Path(folder))
-    results_folder = Path(results)
-    outputs = _results(golden, results_folder)
-    wrong = [name for name, cases in outputs.items() if _differing(name, cases)]
-    verdict = _verdict(golden.core, outputs, wrong[0], golden.half_even) if wrong else ""
-    first = {wrong[0]: {"first": verdict}} if wrong else {}
-    rows = tuple(
-        _row(golden.core, name, cases, first.get(name, {})) for name, cases in outputs.items()
-    )
-    checks = (Check("layers that differ", len(wrong), 0, "layer", detail=verdict),)
-    return Table(
-        title=f"{results_folder.name} against {Path(folder).name}",
-        command="golden",
-        inputs=(golden.network, Path(folder) / INDEX),
-        rows=rows,
-        checks=checks,
-        notes=() if wrong else (f"no layer differs: {len(rows)} compared",),
-        headings={"golden": "layers"},
-    )
-
-
-Results = Mapping[str, list[Seen]]
-"""Of each tensor that a board handed out, in the order in which they are computed, what it wrote in
-each case.
-"""
-
-
-def _results(golden: Golden, folder: Path) -> Results:
-    files = files_of(golden.core)
-    paths = [path for path in folder.glob("*/*.npy") if path.name != PICTURE]
-    unknown = [
-        path
-        for path in paths
-        if path.parent.name not in golden.cases or path.name not in files.values()
-    ]
-    if unknown or not paths:
-        found = f"{unknown[0].parent.name}/{unknown[0].name}" if unknown else "none"
-        raise OptionError(
-            f"The results in {folder} must be named CASE/LAYER.npy as in {INDEX}, got {found}. "
-            "Rename them."
-        )
-    outputs: dict[str, list[Seen]] = {}
-    for name, file in files.items():
-        for path in sorted(path for path in paths if path.name == file):
-            sound = golden.cases[path.parent.name]
-            values = _integers(path, sound[name].shape, golden.core.frac_bits[name])
-            outputs.setdefault(name, []).append(Seen(sound, values))
-    return outputs
-
-
-def _differing(name: str, cases: list[Seen]) -> list[Seen]:
-    return [case for case in cases if not np.array_equal(case.tensors[name], case.seen)]
-
-
-def _integers(path: Path, shape: tuple[int, ...], frac_bits: int) -> np.ndarray:
-    """What a board wrote of a tensor as int16 (N, C, H, W)."""
-    values = _array(path)
-    if (
-        values.shape != shape
-        and values.ndim == len(shape)
-        and np.moveaxis(values, -1, 1).shape == shape
-    ):
-        values = np.moveaxis(values, -1, 1)
-    if values.shape != shape:
-        raise ImageError(
-            f"{path} must have the shape {shape}, got {values.shape}. Write the whole tensor, for "
-            "the tile of the golden vectors."
-        )
-    if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
-        raise ImageError(
-            f"{path} must hold finite real numbers, but it holds {values.dtype} values or some "
-            "that are not finite. Write int8."
-        )
-    numbers = values.astype(np.float64)
-    if values.dtype == np.uint8:
-        numbers -= 128
-    elif values.dtype.kind == "f":
-        numbers *= 2.0**frac_bits
-    if (
-        not (np.abs(numbers - np.rint(numbers)) < 1e-3).all()
-        or np.abs(numbers).max(initial=0) > 128
-    ):
-        raise ImageError(
-            f"{path} holds {values.dtype} numbers that are not those of an int8 tensor. Write "
-            f"int8, or its values as integer multiples of 2^{-frac_bits}."
-        )
-    return np.rint(numbers).astype(np.int16)
-
-
-def _verdict(core: IntCore, outputs: Results, name: str, half_even: bool) -> str:
-    """The first layer that differs, and the fault that gives just that."""
-    between = _unseen_before(core, name, outputs)
-    fault = explain(core, between, _differing(name, outputs[name]), half_even)
-    unseen = (
-        f" ({len(between) - 1} layers before it were not handed out)" if len(between) > 1 else ""
-    )
-    why = f"as if {fault}" if fault else "by no fault that is known"
-    return f"the first to differ is {_layer(core, name)}{unseen}, {why}"
-
-
-def _layer(core: IntCore, name: str) -> str:
-    return next((op.name for op in core.ops if op.output == name), PLANES)
-
-
-def _unseen_before(core: IntCore, name: str, outputs: Collection[str]) -> list[IntConv | Op]:
-    """The operations between tensors that a board handed out and the one of that name, which is the
-    last.
-    """
-    needed = {name}
-    operations = list[IntConv | Op]()
-    # From the last operation back, until every path ends at a tensor that was handed out.
-    for op in reversed(core.ops):
-        if op.output in needed and (op.output == name or op.output not in outputs):
-            operations.insert(0, op)
-            needed |= set(op.inputs)
-    return operations
-
-
-def _row(core: IntCore, name: str, cases: list[Seen], first: dict[str, str]) -> Row:
-    errors = [np.abs(case.seen - case.tensors[name]) for case in cases]
-    values = sum(error.size for error in errors)
-    source = f"{len(errors)} cases, {values} values, against the integer reference"
-    figures = {
-        "differing": measured(
-            100 * sum(int((error > 0).sum()) for error in errors) / values, "%", source
-        ),
-        "at most by": measured(max(int(error.max()) for error in errors), "LSB", source),
-    }
-    wrong = _differing(name, cases)
-    alike = [
-        (case.seen, case.tensors[name]) for case in wrong if case.seen.shape == wrong[0].seen.shape
-    ]
-    text = {"where": where(*map(np.concatenate, zip(*alike, strict=True)))} if wrong else {}
-    return Row("golden", _layer(core, name), figures, text | first)

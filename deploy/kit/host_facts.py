@@ -65,7 +65,7 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
     ends = core.ends
     outputs = {"back": (ends.back, ends.outputs), "last": (ends.last, ends.outputs)}
     shuffles = {"front": (ends.front, ends.channels), **outputs}
-    if not ends.is_image or ends.direct:
+    if ends.direct:
         return None
     for moves, channels in shuffles.values():
         # Of one band ONNX's order of the channels is that of torch, which host.py takes.

@@ -52,7 +52,8 @@ def golden(
         OptionError: neither or both of `out` and `compare`, or a folder that holds no vectors.
         ImageError: results of other shapes or types.
     """
-    from beers_deploy.kit.golden import compare_golden, vectors_table, write_golden
+    from beers_deploy.kit.golden import vectors_table, write_golden
+    from beers_deploy.kit.golden_results import compare_golden
 
     if compare is not None:
         refuse_with(

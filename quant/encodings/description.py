@@ -29,7 +29,6 @@ from beers_deploy.quant.graph import (
     Shuffle,
     Window,
 )
-from beers_deploy.quant.graph.tail import Tail
 from beers_deploy.quant.untrusted import DAMAGE
 
 KEY = "core"
@@ -43,6 +42,8 @@ said.
 """
 LARGEST = 1 << 16
 """Channels, windows, strides and factors of whatever a DPU runs are smaller still."""
+FLAGS = ("adds_image", "banked", "unit", "direct", "wide")
+"""What a description may state of the host's part besides counts, shuffles and offsets."""
 KINDS: dict[str, type] = {
     kind.__name__: kind
     for kind in (IntConv, Add, Mul, Concat, MaxPool, AveragePool, Resize, Shuffle, Pointwise)
@@ -92,10 +93,9 @@ def _described(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
     }
     offsets = tuple(tuple(float(offset) for offset in window) for window in ends["offsets"])
     counts = {key: int(ends[key]) for key in ("channels", "planes", "gains", "outputs")}
-    tail = Tail(**ends["tail"]) if ends["tail"] else None
-    return IntCore(
-        ops, frac_bits, Ends(**{**ends, **counts, **shuffles, "offsets": offsets, "tail": tail})
-    )
+    others = {key: ends[key] for key in FLAGS if key in ends}
+    host = Ends(**{**counts, **shuffles, **others, "offsets": offsets})
+    return IntCore(ops, frac_bits, host)
 
 
 def _require_small(value: object) -> None:

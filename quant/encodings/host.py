@@ -75,12 +75,6 @@ def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None)
 
 def _result(core: IntCore, tile_px: int | None) -> onnx.ValueInfoProto:
     ends = core.ends
-    if ends.tail:
-        return ends.tail.result
-    if ends.flat:
-        return onnx.helper.make_tensor_value_info(
-            "restored", TensorProto.FLOAT, ["N", ends.outputs]
-        )
     if ends.adds_image and not ends.last:
         return image_info("restored", ends.image_channels, tile_px)
     shuffled = int(np.prod([shuffle.block**2 for shuffle in (*ends.back, *ends.last)], initial=1))
@@ -132,12 +126,12 @@ def _attributes(op: IntConv) -> dict[str, Any]:
 
 def _unclamped(op: IntConv | Add) -> str:
     """The name of a result in front of its activation."""
-    return op.output if op.activation.written is Activation.none else f"{op.output}.linear"
+    return op.output if op.activation is Activation.none else f"{op.output}.linear"
 
 
 def _clamp(w: HostWriter, core: IntCore, op: IntConv | Add) -> None:
     """ReLU and ReLU6 of what is rounded already: they only clip."""
-    if op.activation.written is Activation.none:
+    if op.activation is Activation.none:
         return
     relu = op.output if op.activation is Activation.relu else f"{op.output}.above_0"
     w.node("Max", relu, [_unclamped(op), w.zero_point()], name=f"{op.name}.relu")

@@ -25,7 +25,6 @@ from beers_deploy.quant.graph.operations import (
     Resize,
     Shuffle,
 )
-from beers_deploy.quant.graph.tail import Tail
 
 REMEDY = (
     "See docs/reference/any-network.md for the operators that 'quantize' accepts; 'check' names "
@@ -46,9 +45,6 @@ class Network:
             numbers.
         last: what it does to the sum: pixel shuffle. An image of one channel is added to each of
             the sum's.
-        flat: whether the result is (N, K) rather than an image.
-        softmax: whether the host makes probabilities of the result, along its channels.
-        tail: what else it does to the result, as the nodes that it is.
     """
 
     graph: Graph = field(compare=False)
@@ -57,9 +53,6 @@ class Network:
     back: tuple[Shuffle, ...] = ()
     adds_image: bool = True
     last: tuple[Shuffle, ...] = ()
-    flat: bool = False
-    softmax: bool = False
-    tail: Tail | None = None
 
     @property
     def core_channels(self) -> int:
@@ -77,7 +70,7 @@ def unsupported(fault: str, remedy: str = REMEDY) -> ModelError:
     return ModelError(f"{printable(fault, 4 * LONGEST)} {remedy}")
 
 
-def cut(graph: Graph, channels: int, flat: bool, softmax: bool) -> Network:
+def cut(graph: Graph, channels: int) -> Network:
     """The network of operations from `IMAGE` to `CORRECTION`: what the host does at both ends is
     taken off.
 
@@ -98,7 +91,7 @@ def cut(graph: Graph, channels: int, flat: bool, softmax: bool) -> Network:
     while isinstance(first := _only_reader(graph), Shuffle) and not first.up:
         front.append(first)
         graph = tuple(renamed(op, {first.output: IMAGE}) for op in graph if op is not first)
-    network = Network(graph, channels, tuple(front), back, adds_image, last, flat, softmax)
+    network = Network(graph, channels, tuple(front), back, adds_image, last)
     return replace(network, graph=_image_for_convolutions(graph, network.core_channels))
 
 
@@ -165,7 +158,7 @@ def named_apart(ops: Sequence[Op], ends: Mapping[str, str]) -> Graph:
 def _is_ours(name: str) -> bool:
     """Whether the files that we write have a tensor of that name themselves."""
     ours = IMAGE, CORRECTION, PLANES, "restored"
-    return name in ours or name.startswith(("host_front.", "host_back.", "host_tail.", f"{IMAGE}."))
+    return name in ours or name.startswith(("host_front.", "host_back.", f"{IMAGE}."))
 
 
 def check_network(network: Network) -> None:
@@ -174,11 +167,6 @@ def check_network(network: Network) -> None:
     if not graph or graph[-1].output != CORRECTION:
         last = f"is {graph[-1].name}" if graph else "does not exist"
         raise unsupported(f"The last operation must write the network's result, but it {last}.")
-    if network.tail and (network.adds_image or network.flat or network.softmax):
-        raise unsupported(
-            "The network may have nothing behind the global add, or behind a Flatten or a Softmax "
-            f"at its end, but {network.tail.graph.node[0].name} follows."
-        )
     widths = channels_of(graph, {IMAGE: network.core_channels})
     for op in graph:
         # ONNX's SpaceToDepth has the other order of channels, so several need a Gather, which the

@@ -18,7 +18,6 @@ from beers_deploy.quant.graph.network import (
     check_network,
     cut,
     named_apart,
-    renamed,
     sized,
     unsupported,
 )
@@ -42,7 +41,6 @@ from beers_deploy.quant.graph.operations import (
     Window,
     same,
 )
-from beers_deploy.quant.graph.tail import without_tail
 from beers_deploy.quant.reading.equivalents import per_channel
 from beers_deploy.quant.untrusted import check_runnable, contradictions, times
 
@@ -50,11 +48,8 @@ from beers_deploy.quant.untrusted import check_runnable, contradictions, times
 def read_network(model: onnx.ModelProto) -> Network:
     """The operations of a float network that has been simplified (`quant.reading`)."""
     with contradictions("the float network"):
-        body, tail = without_tail(model, {*READERS, *ACTIVATIONS})
-        reader = _Reader(body)
-        network = replace(
-            cut(reader.graph(), reader.channels(), reader.flat, reader.softmax), tail=tail
-        )
+        reader = _Reader(model)
+        network = cut(reader.graph(), reader.channels())
         check_network(network)
     return network
 
@@ -124,8 +119,6 @@ class _Reader:
         self._places: dict[str, int] = {}  # where the operation that writes a tensor stands
         self._widths: dict[str, int] = {}  # channels of what the first operations write
         self._measured = 0  # so many operations
-        self.flat = False
-        self.softmax = False
 
     def channels(self) -> int:
         """Of the image."""
@@ -167,6 +160,11 @@ class _Reader:
             return
         if node.op_type not in READERS:
             remedy = "Replace it by one that the DPU computes, or cut the network in front of it."
+            if node.op_type in OF_NO_IMAGE:
+                remedy = (
+                    "'quantize' accepts networks that make an image of an image: cut the network "
+                    "in front of it. 'check' and 'bench' read any network."
+                )
             if node.op_type == "Pad":
                 remedy = (
                     "Pad in the convolution; a network behind a bank is quantised from its "
@@ -275,40 +273,6 @@ class _Reader:
             has_pads, node, f"must state its pads instead of auto_pad {auto} with strides"
         )
         return window.kernel, Window(window.stride, window.pads, window.dilation)
-
-    def _flatten(self, node: Node) -> None:
-        """At the end, where what is flat is (N, K): inside it stays (N, K, 1, 1)."""
-        at_end = (
-            node.outputs[0] == self.result
-            and bool(self.ops)
-            and node.attributes.get("axis", 1) == 1
-        )
-        self._require(
-            at_end and self.ops[-1].output == node.inputs[0],
-            node,
-            "is supported at the end of the network only",
-        )
-        self._replace(len(self.ops) - 1, renamed(self.ops[-1], {node.inputs[0]: node.outputs[0]}))
-        self.flat = True
-
-    def _softmax(self, node: Node) -> None:
-        """Along the channels, at the end, where the host does it."""
-        readers = self.source.readers.get(node.outputs[0], ())
-        rest = [reader.op_type for reader in readers]
-        at_end = node.outputs[0] == self.result or rest == ["Flatten"]
-        of_channels = node.attributes.get("axis", -1) in (1, -3)
-        last = (
-            bool(self.ops)
-            and self.ops[-1].output == node.inputs[0]
-            and self.source.reads(node.inputs[0]) == 1
-        )
-        self._require(
-            at_end and of_channels and last,
-            node,
-            "is supported along the channels at the end of the network only",
-        )
-        self._replace(len(self.ops) - 1, renamed(self.ops[-1], {node.inputs[0]: node.outputs[0]}))
-        self.softmax = True
 
     def _add_or_mul(self, node: Node) -> Op:
         kind = Add if node.op_type == "Add" else Mul
@@ -483,18 +447,19 @@ READERS: dict[str, Callable[[_Reader, Node], Op | None]] = {
     "Conv": _Reader._conv,
     "ConvTranspose": _Reader._convtranspose,
     "DepthToSpace": _Reader._shuffle,
-    "Flatten": _Reader._flatten,
     "GlobalAveragePool": lambda _, node: AveragePool(
         node.name, node.inputs[0], node.outputs[0], None
     ),
     "MaxPool": _Reader._maxpool,
     "Mul": _Reader._add_or_mul,
     "Resize": _Reader._resize,
-    "Softmax": _Reader._softmax,
     "SpaceToDepth": _Reader._shuffle,
     "Sub": _Reader._sub,
     **dict.fromkeys(MOVES, _Reader._shuffle),
 }
+
+OF_NO_IMAGE = {"Flatten", "Gemm", "MatMul", "NonMaxSuppression", "Sigmoid", "Softmax"}
+"""Operators with which classifiers and detectors end."""
 
 ACTIVATIONS = {
     "Relu": Activation.relu,

@@ -1,0 +1,184 @@
+"""What a board wrote, compared with golden vectors: the first layer that differs, how much, where.
+
+The results are files of the golden vectors' names in folders of their cases' names, as many of them
+as the board can hand out. What a pattern usually means: docs/how-to/board.md.
+"""
+
+import os
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from beers_deploy.kit.golden import INDEX, PICTURE, Golden, files_of, read_array, read_golden
+from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.figures import Check, Row, measured
+from beers_deploy.quant.core import IntCore
+from beers_deploy.quant.graph import PLANES
+from beers_deploy.results import Table
+
+
+@dataclass(frozen=True)
+class Written:
+    """One tensor in one case, (N, C, H, W) int16: what is sound, and what a board wrote."""
+
+    sound: np.ndarray
+    board: np.ndarray
+
+    @property
+    def differs(self) -> np.ndarray:
+        """Which values differ, (N, C, H, W)."""
+        return np.asarray(self.sound != self.board)
+
+
+Results = Mapping[str, list[Written]]
+"""What a board wrote of each tensor that it handed out, in the order in which they are computed: an
+entry for each case.
+"""
+
+
+def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[str]) -> Table:
+    """Compare what a board wrote with golden vectors. The table is false if a layer differs.
+
+    Args:
+        folder: of the golden vectors.
+        results: folders of the cases' names with files of the layers' names, any of them: int8,
+            uint8 around 128, or float multiples of the tensor's scale; channels first, or last.
+    """
+    golden = read_golden(Path(folder))
+    results_folder = Path(results)
+    outputs = _results(golden, results_folder)
+    rows = tuple(_row(golden.core, name, cases) for name, cases in outputs.items())
+    wrong = [name for name, cases in outputs.items() if any(case.differs.any() for case in cases)]
+    detail = _first_layer(golden.core, outputs, wrong[0]) if wrong else ""
+    return Table(
+        title=f"{results_folder.name} against {Path(folder).name}",
+        inputs=(golden.network, Path(folder) / INDEX),
+        rows=rows,
+        checks=(Check("layers that differ", len(wrong), 0, "layer", detail=detail),),
+        notes=() if wrong else (f"no layer differs: {len(rows)} compared",),
+        headings={"golden": "layers"},
+    )
+
+
+def _results(golden: Golden, folder: Path) -> Results:
+    """Read what a board wrote; raise OptionError for a file that is no result."""
+    files = files_of(golden.core)
+    paths = [path for path in folder.glob("*/*.npy") if path.name != PICTURE]
+    unknown = [
+        path
+        for path in paths
+        if path.parent.name not in golden.cases or path.name not in files.values()
+    ]
+    if unknown or not paths:
+        found = f"{unknown[0].parent.name}/{unknown[0].name}" if unknown else "none"
+        raise OptionError(
+            f"The results in {folder} must be named CASE/LAYER.npy as in {INDEX}, got {found}. "
+            "Rename them."
+        )
+    outputs: dict[str, list[Written]] = {}
+    for name, file in files.items():
+        for path in sorted(path for path in paths if path.name == file):
+            sound = golden.cases[path.parent.name][name]
+            values = _integers(path, sound.shape, golden.core.frac_bits[name])
+            outputs.setdefault(name, []).append(Written(sound, values))
+    return outputs
+
+
+def _integers(path: Path, shape: tuple[int, ...], frac_bits: int) -> np.ndarray:
+    """Read what a board wrote of a tensor, as int16 (N, C, H, W)."""
+    values = read_array(path)
+    if (
+        values.shape != shape
+        and values.ndim == len(shape)
+        and np.moveaxis(values, -1, 1).shape == shape
+    ):
+        values = np.moveaxis(values, -1, 1)
+    if values.shape != shape:
+        raise ImageError(
+            f"{path} must have the shape {shape}, got {values.shape}. Write the whole tensor, for "
+            "the tile of the golden vectors."
+        )
+    if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+        raise ImageError(
+            f"{path} must hold finite real numbers, but it holds {values.dtype} values or some "
+            "that are not finite. Write int8."
+        )
+    numbers = values.astype(np.float64)
+    if values.dtype == np.uint8:
+        numbers -= 128
+    elif values.dtype.kind == "f":
+        numbers *= 2.0**frac_bits
+    if (
+        not (np.abs(numbers - np.rint(numbers)) < 1e-3).all()
+        or np.abs(numbers).max(initial=0) > 128
+    ):
+        raise ImageError(
+            f"{path} holds {values.dtype} numbers that are not those of an int8 tensor. Write "
+            f"int8, or its values as integer multiples of 2^{-frac_bits}."
+        )
+    return np.rint(numbers).astype(np.int16)
+
+
+def _first_layer(core: IntCore, outputs: Results, name: str) -> str:
+    """Return in words which layer differs first, and how many before it nobody saw."""
+    unseen = _unseen_before(core, name, outputs)
+    words = f"the first to differ is {_layer(core, name)}"
+    return f"{words}, {unseen} layers before it were not handed out" if unseen else words
+
+
+def _layer(core: IntCore, name: str) -> str:
+    """Return the name of the operation that writes a tensor."""
+    return next((op.name for op in core.ops if op.output == name), PLANES)
+
+
+def _unseen_before(core: IntCore, name: str, outputs: Collection[str]) -> int:
+    """Return how many operations lie between a tensor and those that a board handed out."""
+    needed = {name}
+    count = 0
+    # From the last operation back, until every path ends at a tensor that was handed out.
+    for op in reversed(core.ops):
+        if op.output in needed and (op.output == name or op.output not in outputs):
+            needed |= set(op.inputs)
+            count += op.output != name
+    return count
+
+
+def _row(core: IntCore, name: str, cases: list[Written]) -> Row:
+    """Return share and size of the differences of a layer, and where they lie."""
+    # Differences of uint8 or int8 would wrap around, so the tensors are int16.
+    errors = [np.abs(case.board - case.sound) for case in cases]
+    values = sum(error.size for error in errors)
+    source = f"{len(errors)} cases, {values} values, against the integer reference"
+    differing = sum(int(case.differs.sum()) for case in cases)
+    figures = {
+        "differing": measured(100 * differing / values, "%", source),
+        "at most by": measured(max(int(error.max()) for error in errors), "LSB", source),
+    }
+    worst = max(cases, key=lambda case: int(case.differs.sum()))
+    return Row("golden", _layer(core, name), figures, {"where": where(worst.differs)})
+
+
+def where(differs: np.ndarray) -> str:
+    """Return where in tiles (N, C, H, W) values differ: nowhere (""), in one channel, along the
+    border, in some rows or columns, or everywhere.
+    """
+    if not differs.any():
+        return ""
+    height, width = differs.shape[2:]
+    channels = np.flatnonzero(differs.any((0, 2, 3)))
+    rows = np.flatnonzero(differs.any((0, 1, 3)))
+    columns = np.flatnonzero(differs.any((0, 1, 2)))
+    within = f"{len(channels)} of {differs.shape[1]} channels"
+    if len(channels) == 1:
+        within = f"channel {channels[0]}"
+    places = np.argwhere(differs.any((0, 1)))
+    # The distance of the innermost difference from the nearest border.
+    reach_px = int(np.minimum(places, np.array([height - 1, width - 1]) - places).min(1).max()) + 1
+    if reach_px < min(height, width) // 4:
+        return f"within {reach_px} px of the border, in {within}"
+    for name, lines, size in (("rows", rows, height), ("columns", columns, width)):
+        if len(lines) <= size // 4:
+            return f"in {name} {lines[0]} to {lines[-1]}, in {within}"
+    return f"everywhere, in {within}"
