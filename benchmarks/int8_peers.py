@@ -114,18 +114,17 @@ def scores(in_float: Restore, in_int8: Restore, pairs: list[Pair]) -> list[str]:
     for image, reference in pairs:
         both = [_as_in_a_file(run(image), image) for run in (in_float, in_int8)]
         differences.append((both[1] - both[0]).ravel())
-        rows.append([*_against(reference, both), *_alike(image, both)])
+        rows.append(_against(reference, both))
     difference = np.concatenate(differences).astype(np.float64)
     mae = float(np.abs(difference).mean())
     std = float(difference.std())
-    db_float, db_int8, similarity, same = np.mean(rows, axis=0)
+    db_float, db_int8, similarity = np.mean(rows, axis=0)
     sizes = [f"{mae:.6f}", f"{std:.6f}", f"{np.abs(difference).max():.4f}", f"{std / mae:.2f}"]
     cells = (
         f"{db_float:.2f}",
         f"{db_int8:.2f}",
         f"{db_float - db_int8:.3f}",
         f"{similarity:.4f}",
-        f"{100 * same:.2f}",
     )
     return [*sizes, *(cell.replace("nan", "") for cell in cells)]
 
@@ -142,13 +141,6 @@ def _against(reference: np.ndarray, both: list[np.ndarray]) -> list[float]:
         ssim(one, other, 1.0) for one, other in zip(both[1][0], reference[0], strict=True)
     ]
     return [*(psnr_db(result, reference, 1.0) for result in both), float(np.mean(similarity))]
-
-
-def _alike(image: np.ndarray, both: list[np.ndarray]) -> list[float]:
-    """The share of pixels or images that are told the same class, of networks that tell classes."""
-    if both[0].shape[1] <= image.shape[1]:
-        return [math.nan]
-    return [float((both[0].argmax(1) == both[1].argmax(1)).mean())]
 
 
 def quantise(
@@ -229,7 +221,7 @@ COLUMNS = (
         "drop dB",
         "SSIM",
     ),
-    *("same class %", "s", "peak MB"),
+    *("s", "peak MB"),
 )
 
 

@@ -1,13 +1,13 @@
-"""What INT8 costs twelve small networks that are trained briefly, with AMD Quark beside it.
+"""What INT8 costs eleven small networks that are trained briefly, next to AMD Quark.
 
     python -m benchmarks.small_networks --images aerial-train/ --held-out aerial-test/ \
         --quark-python quark/bin/python
 
-Prints a Markdown table: what is lost on samples that neither training nor calibration saw, of PSNR
-on average and on the worst sample, of the classifier in points of the share of right answers. With
---tuned, also once our whole numbers are fine-tuned on more samples, and Quark's weights are rounded
-by AdaRound. The samples are those of `examples.samples`, the environment of Quark that of
-`int8_peers.py`. Trained networks stay in the folder of --keep, where a later run finds them.
+Prints a Markdown table: what PSNR is lost on samples that neither training nor calibration saw, in
+the mean and on the worst sample. With --tuned, also once our integers are fine-tuned on more
+samples, and Quark's weights are rounded by AdaRound. The samples are those of `examples.samples`,
+the environment of Quark that of `int8_peers.py`. Trained networks stay in the folder of --keep,
+where a later run finds them.
 """
 
 import argparse
@@ -32,10 +32,10 @@ from beers_deploy.quant.ends import ends_of
 from beers_deploy.quant.graph import read_network
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from benchmarks.int8_peers import OURS, QUARK, Peered, Restore, Way, print_lines, quantise
-from examples.networks import ESPCN, Classifier, DnCNN
+from examples.networks import ESPCN, DnCNN
 from examples.samples import batches_of
 
-SIDE_PX = {"dncnn": 64, "espcn": 64, "classifier": 32}
+SIDE_PX = {"dncnn": 64, "espcn": 64}
 SEPARABLE = 32
 DENSE = 16
 """Features of networks with depthwise convolutions, and of those without."""
@@ -153,14 +153,13 @@ NETWORKS: dict[str, tuple[str, Callable[[], nn.Module]]] = {
     "residual": ("dncnn", residual),
     "DnCNN": ("dncnn", lambda: DnCNN(6)),
     "ESPCN": ("espcn", ESPCN),
-    "classifier": ("classifier", Classifier),
 }
 """By name, what each learns from (`examples.samples`) and how it is made."""
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """Samples: images (K, C, H, W) in [0, 1], and their references or classes."""
+    """Samples: images (K, C, H, W) in [0, 1], and their references."""
 
     images: np.ndarray
     wanted: np.ndarray
@@ -177,7 +176,7 @@ class Drawn:
 def drawn(network: nn.Module, generator: torch.Generator) -> nn.Module:
     """The network with weights and biases drawn as torch draws them, from a generator."""
     for module in network.modules():
-        if isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
+        if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
             bound = module.weight[0].numel() ** -0.5
             for numbers in module.parameters():
                 numbers.uniform_(-bound, bound, generator=generator)
@@ -188,14 +187,13 @@ def trained(name: str, folder: Path | None, count: int) -> nn.Module:
     """The network of that name after so many steps of Adam."""
     kind, make = NETWORKS[name]
     network = drawn(make(), torch.Generator().manual_seed([*NETWORKS].index(name))).train()
-    error = functional.cross_entropy if kind == "classifier" else functional.l1_loss
     optimiser = torch.optim.Adam(
         network.parameters(), lr=FAST if name.startswith(("depthwise", "plain")) else RATE
     )
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, count)
     for image, reference in islice(batches_of(kind, folder, 0), count):
         optimiser.zero_grad()
-        error(network(image[:BATCH]), reference[:BATCH]).backward()  # type: ignore[no-untyped-call]
+        functional.l1_loss(network(image[:BATCH]), reference[:BATCH]).backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimiser.step()
         schedule.step()
@@ -214,16 +212,11 @@ def save(network: nn.Module, side_px: int, path: Path) -> None:
 
 
 def losses(in_float: Restore, in_int8: Restore, held_out: Drawn) -> np.ndarray:
-    """(K,) what each sample loses: dB of PSNR, or of one that was classified rightly all, 100
-    points.
-    """
+    """Return what each sample loses, (K,): dB of PSNR."""
     values = []
     for image, reference in zip(held_out.images, held_out.wanted, strict=True):
         results = [run(image[None]) for run in (in_float, in_int8)]
-        if reference.ndim:
-            scores = [psnr_db(np.clip(result, 0, 1), reference[None], 1.0) for result in results]
-        else:
-            scores = [100.0 * (result.argmax() == reference) for result in results]
+        scores = [psnr_db(np.clip(result, 0, 1), reference[None], 1.0) for result in results]
         values.append(scores[0] - scores[1])
     return np.array(values)
 
@@ -231,7 +224,7 @@ def losses(in_float: Restore, in_int8: Restore, held_out: Drawn) -> np.ndarray:
 def cells(
     name: str, way: Way, python: str, folder: Path, samples: dict[bool, Drawn], held_out: Drawn
 ) -> str:
-    """What a way loses: the mean, and the worst sample's of images.
+    """What a way loses: the mean, and the worst sample's.
 
     `samples[True]` is what it tunes on.
     """
@@ -247,19 +240,13 @@ def cells(
         seconds, _ = quantise(way, {False: (path, patches)}, out, python)
     sample_losses = losses(network.runner(path), network.runner(out), held_out)
     print(name, way.name, f"{seconds:.0f} s", file=sys.stderr)
-    return (
-        f"{sample_losses.mean():.2f}, {sample_losses.max():.2f}"
-        if held_out.wanted.ndim > 1
-        else f"{sample_losses.mean():.1f} points"
-    )
+    return f"{sample_losses.mean():.2f}, {sample_losses.max():.2f}"
 
 
 def fine_tune(path: Path, tuning: Drawn, out: Path) -> float:
-    """Quantise and fine-tune a network, with references where they are images; the processor time
-    in seconds.
-    """
+    """Quantise and fine-tune a network; return the processor time in seconds."""
     begun = time.process_time()
-    samples = (tuning.images, tuning.wanted) if tuning.wanted.ndim > 1 else tuning.images
+    samples = tuning.images, tuning.wanted
     save_onnx(quantize(path, samples=samples, finetune="auto", progress=False).model, out)
     return time.process_time() - begun
 

@@ -222,21 +222,6 @@ class Segment(nn.Module):
         return functional.interpolate(self.classes(merged), scale_factor=2.0, mode="nearest")
 
 
-class Classifier(nn.Sequential):
-    """Ten classes of whole images: strided and depthwise convolutions, global average pooling,
-    fully connected.
-
-    Images (N, 1, 32, 32) to logits (N, 10).
-    """
-
-    def __init__(self) -> None:
-        stages: list[nn.Module] = [_batch_normed(1, 16, nn.ReLU(), stride=2)]
-        for inputs, outputs in ((16, 32), (32, 64)):
-            stages.append(_batch_normed(inputs, inputs, nn.ReLU6(), stride=2, groups=inputs))
-            stages.append(_batch_normed(inputs, outputs, nn.ReLU6(), kernel=1))
-        super().__init__(*stages, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(64, 10))
-
-
 def _activated(
     inputs: int, outputs: int, activation: nn.Module, stride: int = 1, dilation: int = 1
 ) -> nn.Sequential:
@@ -277,7 +262,6 @@ class Example:
         scale: output pixels a side for each input pixel.
         multiple_px: sides of an input are multiples of it.
         restores: whether the output is the input image, restored or enlarged.
-        side_px: the only side that an input may have; None where any will do.
     """
 
     module: Callable[[], nn.Module]
@@ -286,7 +270,6 @@ class Example:
     scale: int = 1
     multiple_px: int = 1
     restores: bool = True
-    side_px: int | None = None
 
 
 NETWORKS = {
@@ -298,7 +281,6 @@ NETWORKS = {
     "edsr4": Example(EDSR, inputs=4, outputs=4),
     "mobile": Example(Mobile),
     "segment": Example(Segment, outputs=2, multiple_px=4, restores=False),
-    "classifier": Example(Classifier, outputs=10, restores=False, side_px=32),
 }
 
 
@@ -309,7 +291,7 @@ def build(name: str, generator: torch.Generator) -> nn.Module:
         for path, module in network.named_modules():
             if isinstance(module, nn.BatchNorm2d):
                 _draw_statistics(module, generator)
-            elif isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
+            elif isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu", generator=generator)
                 module.weight.mul_(0.1 if path.endswith(CORRECTIONS) else 1.0)
                 if module.bias is not None:
@@ -334,11 +316,10 @@ def to_onnx(name: str, network: nn.Module, fold: bool = True, opset: int = 17) -
     the convolution before it. Without, it stays as the nodes that it is.
     """
     example = NETWORKS[name]
-    axes = {0: "batch"} if example.side_px else {0: "batch", 2: "height", 3: "width"}
-    outer = axes if example.side_px else {0: "batch", 2: "output_height", 3: "output_width"}
+    axes = {0: "batch", 2: "height", 3: "width"}
+    outer = {0: "batch", 2: "output_height", 3: "output_width"}
     mode = torch.onnx.TrainingMode.EVAL if fold else torch.onnx.TrainingMode.PRESERVE
-    side_px = example.side_px or 32
-    image = torch.zeros(1, example.inputs, side_px, side_px)
+    image = torch.zeros(1, example.inputs, 32, 32)
     file = io.BytesIO()
     axis_options = {
         "input_names": ["input"],

@@ -4,9 +4,9 @@ become of them.
     python -m examples.samples unet --count 64 --out samples.npz
 
 Those that restore get pairs of `pleiades-degraded` and its reference, of drawn scenes or of the
-photographs of a folder. The segmentation network finds what is bright in them, the classifier tells
-ten gratings apart. Writes a .npz file as `beers-deploy quantize --samples` reads it: `image` (N, C,
-H, W) in [0, 1] and, for networks that restore, `reference`.
+photographs of a folder. The segmentation network finds what is bright in them. Writes a .npz file
+as `beers-deploy quantize --samples` reads it: `image` (N, C, H, W) in [0, 1] and, for networks that
+restore, `reference`.
 """
 
 import argparse
@@ -46,14 +46,6 @@ of full scale.
 """
 AROUND_PX = 9
 """Side of that square."""
-CYCLES = (4.0, 8.0)
-"""Cycles of an image in the ten gratings."""
-ANGLES = 5
-"""Directions of the gratings with the same number of cycles."""
-TURN_RAD = 0.1
-"""How far a grating's direction strays."""
-NOISE = 0.1
-"""Noise on the gratings."""
 MIXED = 4
 """Passes over scenes whose patches of four bands are mixed."""
 MOST = 64
@@ -61,18 +53,13 @@ MOST = 64
 
 Batch = tuple[Tensor, Tensor]
 """What a network gets, (N, C, H, W) in [0, 1], and what it should give: as much, or classes of
-pixels or images.
+pixels.
 """
 
 
 def batches(name: str, scenes: Sequence[Scene], seed: int) -> Iterator[Batch]:
-    """Endless batches for the network of that name; the same for the same seed.
-
-    The classifier needs no scenes.
-    """
+    """Endless batches for the network of that name; the same for the same seed."""
     example = NETWORKS[name]
-    if name == "classifier":
-        return gratings(torch.Generator().manual_seed(seed), example.side_px or PATCH_PX)
     if example.inputs == len(GAINS):
         return banded(scenes, np.random.default_rng(seed))
     pairs = (batch[:2] for batch in PatchSource(list(scenes), RECIPE, BATCH, seed).batches())
@@ -93,26 +80,6 @@ def bright(reference: Tensor) -> Tensor:
         reference, AROUND_PX, stride=1, padding=AROUND_PX // 2, count_include_pad=False
     )
     return (mean[:, 0] > BRIGHT).long()
-
-
-def gratings(generator: torch.Generator, side_px: int) -> Iterator[Batch]:
-    """Endless batches of gratings of ten kinds under noise, (N, 1, side_px, side_px), and their
-    classes (N,).
-    """
-
-    def uniform(low: float, high: float) -> Tensor:
-        return low + (high - low) * torch.rand(BATCH, 1, 1, 1, generator=generator)
-
-    rows, columns = torch.meshgrid(*[torch.arange(side_px) / side_px] * 2, indexing="ij")
-    while True:
-        kind = torch.randint(len(CYCLES) * ANGLES, (BATCH,), generator=generator)
-        angle = (kind % ANGLES).view(-1, 1, 1, 1) * math.pi / ANGLES + uniform(-TURN_RAD, TURN_RAD)
-        cycles = torch.tensor(CYCLES)[kind // ANGLES].view(-1, 1, 1, 1)
-        phase = math.tau * (
-            cycles * (columns * angle.cos() + rows * angle.sin()) + uniform(0.0, 1.0)
-        )
-        noise = NOISE * torch.randn(BATCH, 1, side_px, side_px, generator=generator)
-        yield (uniform(0.3, 0.7) + uniform(0.1, 0.3) * phase.sin() + noise).clamp(0.0, 1.0), kind
 
 
 def banded(scenes: Sequence[Scene], generator: np.random.Generator) -> Iterator[Batch]:
@@ -165,8 +132,7 @@ def _acquire_bands(scene: Visited, ratio: int, generator: np.random.Generator) -
 
 def batches_of(name: str, folder: Path | None, seed: int) -> Iterator[Batch]:
     """As `batches`, of the photographs of a folder, or of drawn scenes."""
-    scenes = [] if name == "classifier" else load_scenes(folder, RECIPE.degraded.nominal(), seed)
-    return batches(name, scenes, seed)
+    return batches(name, load_scenes(folder, RECIPE.degraded.nominal(), seed), seed)
 
 
 def positive(text: str) -> int:

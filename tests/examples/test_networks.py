@@ -21,13 +21,8 @@ def made(name: str, seed: int = 0) -> nn.Module:
 
 
 def shapes(name: str) -> list[tuple[int, int, int, int]]:
-    """Odd and even sizes in steps of the network's own, or batches of its only size."""
+    """Odd and even sizes in steps of the network's own."""
     example = NETWORKS[name]
-    if example.side_px:
-        return [
-            (1, example.inputs, example.side_px, example.side_px),
-            (3, example.inputs, example.side_px, example.side_px),
-        ]
     step = example.multiple_px
     return [(1, example.inputs, 9 * step, 10 * step), (2, example.inputs, 12 * step, 7 * step)]
 
@@ -60,7 +55,7 @@ def test_sizes_and_channels_are_those_that_the_example_states(name: str) -> None
     for size in shapes(name):
         with torch.inference_mode():
             output = network(torch.rand(size, generator=torch.Generator().manual_seed(0)))
-        sides = (*(side * example.scale for side in size[2:]),) if not example.side_px else ()
+        sides = (*(side * example.scale for side in size[2:]),)
         assert output.shape == (size[0], example.outputs, *sides)
 
 
@@ -73,7 +68,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_gives_others(name: str) 
     assert first != other
 
 
-@pytest.mark.parametrize("name", ["dncnn", "mobile", "classifier"])
+@pytest.mark.parametrize("name", ["dncnn", "mobile"])
 def test_batch_normalisation_may_stay_unfolded_and_is_not_the_identity(name: str) -> None:
     network = made(name)
     model = to_onnx(name, network, fold=False)

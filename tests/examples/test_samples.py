@@ -18,7 +18,7 @@ from examples.train_network import criterion
 
 
 # There is one network for each kind of batch. The other networks read what the first one reads.
-@pytest.mark.parametrize("name", ["dncnn", "espcn", "edsr4", "segment", "classifier"])
+@pytest.mark.parametrize("name", ["dncnn", "espcn", "edsr4", "segment"])
 def test_batches_fit_the_network_and_come_again_with_the_seed(
     name: str, scenes: list[Scene]
 ) -> None:
@@ -61,14 +61,14 @@ def test_bright_is_what_is_bright_around_a_pixel_and_not_the_pixel_alone() -> No
     assert classes[0, 20:, 20:].all()
 
 
-@pytest.mark.parametrize("name", ["espcn", "classifier"])
+@pytest.mark.parametrize("name", ["espcn", "segment"])
 def test_a_file_of_samples_is_read_as_data(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "samples.npz"
     assert main([name, "--count", "5", "--out", str(out)]) == 0
     assert "wrote" in capsys.readouterr().out
-    pairs = list(read_samples(out, NETWORKS[name].inputs, NETWORKS[name].side_px).pairs)
+    pairs = list(read_samples(out, NETWORKS[name].inputs, None).pairs)
     assert len(pairs) == 5
     assert (pairs[0][1].size > 0) == NETWORKS[name].restores
 
@@ -76,8 +76,8 @@ def test_a_file_of_samples_is_read_as_data(
 def test_other_names_and_counts_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["classifier", "--out", str(tmp_path / "samples.npy")]) == 2
+    assert main(["segment", "--out", str(tmp_path / "samples.npy")]) == 2
     assert "ends in .npz" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
-        main(["classifier", "--count", "0", "--out", str(tmp_path / "samples.npz")])
+        main(["segment", "--count", "0", "--out", str(tmp_path / "samples.npz")])
     assert not list(tmp_path.iterdir())

@@ -26,19 +26,19 @@ def test_a_few_steps_help_on_other_patches(name: str, scenes: list[Scene]) -> No
 def test_both_files_hold_the_trained_network(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "classifier.onnx"
-    assert main(["classifier", "--steps", "3", "--out", str(out)]) == 0
+    out = tmp_path / "segment.onnx"
+    assert main(["segment", "--steps", "3", "--out", str(out)]) == 0
     assert "(measured)" in capsys.readouterr().out
     tensors, header = read_tensors(out.with_suffix(".safetensors"))
-    assert header == {"network": "classifier", "steps": 3, "seed": 0}
-    network = build("classifier", torch.Generator().manual_seed(1))
+    assert header == {"network": "segment", "steps": 3, "seed": 0}
+    network = build("segment", torch.Generator().manual_seed(1))
     network.load_state_dict({name: torch.from_numpy(value) for name, value in tensors.items()})
-    assert to_onnx("classifier", network) == onnx.load(out)
+    assert to_onnx("segment", network) == onnx.load(out)
 
 
 def test_another_suffix_is_refused_before_any_work(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["classifier", "--steps", "3", "--out", str(tmp_path / "classifier.pt")]) == 2
+    assert main(["segment", "--steps", "3", "--out", str(tmp_path / "segment.pt")]) == 2
     assert "ends in .onnx" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""The twelve small networks of `benchmarks/small_networks.py`, and the integers that they become.
+"""The small networks of `benchmarks/small_networks.py`, and the integers that they become.
 
     PYTHONPATH=. python tests/golden/small_networks.py
 
@@ -20,7 +20,7 @@ WEIGHTS = Path(__file__).with_suffix(".safetensors")
 STEPS = 30
 SIDE_PX = 32
 SAMPLES = 2
-"""That each network is calibrated on: few and small, so that all twelve take half a minute."""
+"""That each network is calibrated on: few and small, so that all take half a minute."""
 
 
 def save_weights() -> None:

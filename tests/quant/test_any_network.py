@@ -40,7 +40,7 @@ def images(name: str, count: int = 3, side_px: int = SIDE_PX) -> list[np.ndarray
     """Smooth patches with an edge, of the network's channels and size: (1, C, h, w) float32 in [0,
     1].
     """
-    side = NETWORKS[name].side_px or side_px
+    side = side_px
     generator = np.random.default_rng(7)
     rows, columns = np.mgrid[:side, :side] / side
     patches = []
@@ -159,13 +159,10 @@ def test_a_description_of_something_else_is_one_sentence(
 def test_the_core_is_legal_on_the_dpu(name: str) -> None:
     dpu = load_dpu("vck190", None)
     for file in (quantised(name).host, board_model(quantised(name).core, {})):
-        assert legality(place(network_of(file, NETWORKS[name].side_px or 64), dpu)).passed
+        assert legality(place(network_of(file, 64), dpu)).passed
 
 
-TILED = [name for name in NETWORKS if name != "classifier"]
-
-
-@pytest.mark.parametrize("name", TILED)
+@pytest.mark.parametrize("name", NETWORKS)
 def test_tiles_of_int8_are_the_whole(name: str) -> None:
     model = quantised(name).host
     lattice_px = tiling_of(model).lattice_px
@@ -200,8 +197,9 @@ def test_windows_make_a_result_finer_than_8_bits(
             monkeypatch.setattr("beers_deploy.quant.quantise.takes_gains", lambda _: False)
         int8 = quantise_model(model, patches, {})
         expected = result_of(open_session(model), image_list[0])
-        errors.append(
-            float(np.abs(result_of(open_session(int8.host), image_list[0]) - expected).mean())
-        )
+        actual = result_of(open_session(int8.host), image_list[0])
+        # The rounding of the one weight and bias is the same in both, and is left out.
+        line = np.polynomial.Polynomial.fit(expected.ravel(), actual.ravel(), 1)
+        errors.append(float((actual - line(expected)).std()))
         assert encoding_faults(int8.host) == []
     assert errors[0] < 0.4 * errors[1]
