@@ -1,8 +1,8 @@
 """`tradeoff`: what accuracy costs in time, over many operating points."""
 
 import logging
+import os
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, cast
 
 from beers_deploy.model.shipped import SENSOR
@@ -23,6 +23,7 @@ from beers_deploy.verbs.verb import refuse_with, verb
 
 if TYPE_CHECKING:
     from beers_deploy.network import NetworkLike
+    from beers_deploy.profiles.sensor import Sensor
     from beers_deploy.results import Table
     from beers_deploy.studies.tradeoff.run import Study
 
@@ -32,7 +33,7 @@ PAPER_SIZE = "13600x9016"
 FIGURES = "tradeoff.json"
 
 
-STUDY = Holds(FIGURES, "tradeoff.html", "tradeoff.svg", "measurements.json", folders=("int8",))
+STUDY = Holds(FIGURES, "tradeoff.html", "tradeoff.svg")
 
 
 @verb
@@ -57,12 +58,11 @@ def tradeoff(
 
     Networks and pipelines are measured on the same images, and their runs on boards are predicted.
     All boards are compared, whatever their order; a line says for each one that is not recommended
-    why. Measurements are stored: a second run, or one that was stopped, measures only what is
-    missing. The command exits with 1 if no point keeps the budget and the need; the page is written
-    all the same.
+    why. The command exits with 1 if no point keeps the budget and the need; the page is written all
+    the same.
 
     Args:
-        out: folder of the page, the figures and the measurements.
+        out: folder of the page and the figures.
         images: folder of held-out scenes to simulate from; drawn scenes if none.
         sensor: sensor of the degraded images: a name, or a .toml file.
         reference: sensor of the reference images; pleiades-reference if none.
@@ -110,7 +110,7 @@ def tradeoff(
 
     degraded = Sensor.load(sensor)
     study = Study(
-        networks=networks,
+        networks=[_loaded(each, degraded) for each in networks],
         boards=boards_of(target),
         sensors=(degraded, reference_beside(degraded, reference)),
         scenes=None if images is None else Path(images),
@@ -133,22 +133,32 @@ def _networks(network: Networks) -> "list[NetworkLike]":
     if isinstance(network, list | tuple):
         several = list(network)
     for each in several:
-        names = each.split(",") if isinstance(each, str) else [each]
-        for name in names:
-            given += shipped_names() if name == "all" else [name]
+        if not isinstance(each, str):
+            given.append(each)
+            continue
+        for name in each.split(","):
+            given += shipped_names() if name.strip() == "all" else [name.strip()]
     if not given:
         raise OptionError("`network` names no network. Give a name, a file, or all.")
-    return given
+    # A name that is given twice is compared once.
+    return [each for k, each in enumerate(given) if each not in given[:k]]
+
+
+def _loaded(network: "NetworkLike", sensor: "Sensor") -> "NetworkLike":
+    """Return a network in memory as a `Network`, and a name or a file as it is."""
+    from beers_deploy.network import Network
+
+    if isinstance(network, str | os.PathLike):
+        return network
+    return Network.load(network, sensor=sensor)
 
 
 def _run(study: "Study", folder: Path | None) -> "Table":
     """Run a study, and write its page and figures into a folder."""
     from beers_deploy.studies.tradeoff.run import run_tradeoff
 
-    if folder is None:
-        with TemporaryDirectory(prefix="beers-deploy-") as temporary:
-            return run_tradeoff(study, Path(temporary))
-    table = run_tradeoff(study, folder)
-    logger.info("wrote %s", table.report(folder))
-    table.save(folder / FIGURES)
+    table = run_tradeoff(study)
+    if folder is not None:
+        logger.info("wrote %s", table.report(folder))
+        table.save(folder / FIGURES)
     return table

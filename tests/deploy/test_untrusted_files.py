@@ -34,7 +34,6 @@ from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.journal import FinishedRow, journal_text
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.results import Table
-from beers_deploy.studies.tradeoff.measure import Measurements
 from tests.deploy.command_line import refused
 from tests.fuzz.networks import checkpoint_seeds, go_on
 from tests.fuzz.parsers import JOB, SHAPE
@@ -205,16 +204,6 @@ def test_a_manifest_that_is_none_is_refused(line: str, tmp_path: Path) -> None:
     (tmp_path / "manifest.jsonl").write_text(line + "\n")
     with pytest.raises(OptionError, match="manifest"):
         _read_summary(tmp_path / "manifest.jsonl")
-
-
-@pytest.mark.parametrize(
-    "text", ["", "[]", "3", "{}", "[" * 100_000, '{"measurements": 3}', '{"measurements": NaN}']
-)
-def test_measurements_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
-    path = tmp_path / "measurements.json"
-    path.write_text(text)
-    with pytest.raises(OptionError, match="Remove the file"):
-        Measurements.open(path)
 
 
 def test_a_log_with_strange_lines_is_gone_on_with(tmp_path: Path) -> None:

@@ -103,7 +103,7 @@ def test_gate_in_ci(tmp_path: Path) -> None:
 def test_accuracy_and_time(tmp_path: Path) -> None:
     with small_studies():
         walked("accuracy-and-time", tmp_path)
-    files = {"tradeoff.html", "tradeoff.svg", "tradeoff.json", "measurements.json"}
+    files = {"tradeoff.html", "tradeoff.svg", "tradeoff.json"}
     assert {path.name for path in (tmp_path / "study").iterdir()} == files
     limits = "board latency &lt;= 20 s and board power &lt;= 20 W"
     assert f"Recommended for {limits}: convbeers-half INT8, zcu104" in (

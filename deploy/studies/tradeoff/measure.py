@@ -5,40 +5,25 @@ A measurement is kept under the SHA-256 of what it depends on: the inputs and th
 tool.
 """
 
-import hashlib
-import json
-import platform
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import psutil
 
-from beers_deploy import __version__
-from beers_deploy.model.consistency import Consistency
-from beers_deploy.model.io.files import sha256, write_text
-from beers_deploy.model.metrics.perceptual import find_backbone
-from beers_deploy.model.processor import processor_name
-from beers_deploy.model.raster.images import list_images
 from beers_deploy.network import Network
 from beers_deploy.performance.swath import Swath
 from beers_deploy.performance.timing import interleaved
 from beers_deploy.performance.traditional import drawn_acquisition
-from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Figure, measured
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import load_sensor, sensor_names
 from beers_deploy.quant.calibration import Calibration
-from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.quant.quantise import quantise_model
-from beers_deploy.restoration.method import Restore
+from beers_deploy.restoration.method import Restore, network_method
 from beers_deploy.restoration.plan import Plan, make_plan
-from beers_deploy.restoration.runtime import AtFirstCall, open_runtime
-from beers_deploy.restoration.tiles.exposures import ExposedNetwork, tiles_by_factor
-from beers_deploy.restoration.tiles.rows import restore_dn
+from beers_deploy.restoration.tiles.exposures import tiles_by_factor
 from beers_deploy.studies.evaluation.methods import Method
 from beers_deploy.studies.evaluation.pairs import NamedPair
 from beers_deploy.studies.evaluation.scores import DETAILS, Instruments, perceptual_distances
@@ -49,62 +34,13 @@ from beers_deploy.studies.tradeoff.points import (
     network_of_variant,
 )
 
-Scores = Mapping[str, float | None]
+Scores = dict[str, float | None]
 """Figures of one image by name; None where an instrument is not there."""
 
 LPIPS = "LPIPS-squeeze"
 SEAM_ERROR = "seam error"
 NOT_SHOWN = (*DETAILS, SEAM_ERROR)
 """Of the scores of an image, in the means of a point."""
-
-
-def key_of(**about: object) -> str:
-    """SHA-256 of what a measurement depends on, this tool's version among it."""
-    # Keys are sorted, so that the order of arguments does not change the digest.
-    text = json.dumps({"version": __version__, **about}, sort_keys=True, default=_as_text)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _as_text(value: object) -> str:
-    if isinstance(value, np.ndarray):
-        return f"{value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}"
-    return str(value)
-
-
-@dataclass
-class Measurements:
-    """Measurements of a study in one file, written anew after each: a run that was stopped goes on.
-
-    Attributes:
-        path: of the file.
-        kept: by key.
-    """
-
-    path: Path
-    kept: dict[str, Any] = field(default_factory=dict)
-
-    @classmethod
-    def open(cls, path: Path) -> "Measurements":
-        """Those of a file, or none yet."""
-        if not path.exists():
-            return cls(path)
-        try:
-            return cls(path, dict(json.loads(path.read_text(encoding="utf-8"))["measurements"]))
-        except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
-            raise OptionError(
-                f"{path} does not hold measurements that this command stored. Remove the file, "
-                "and they are measured again."
-            ) from error
-
-    def make(self, key: str, measure: Callable[[], Any]) -> Any:
-        """What was measured under a key; measured now, and written, where there is nothing."""
-        if key not in self.kept:
-            # Written after each measurement, so that a run that was stopped goes on.
-            self.kept[key] = measure()
-            write_text(
-                self.path, json.dumps({"version": __version__, "measurements": self.kept}) + "\n"
-            )
-        return self.kept[key]
 
 
 @dataclass(frozen=True)
@@ -132,42 +68,26 @@ class Benchmark:
             {LPIPS: perceptual_distances(self.lpips)[LPIPS]}, self.degraded.nominal().max_dn
         )
 
-    @cached_property
-    def digest(self) -> str:
-        """Of everything that scores depend on besides the method."""
-        pairs = [(pair.name, pair.site, pair.degraded, pair.reference) for pair in self.pairs]
-        weights = find_backbone("squeeze", self.lpips)
-        return key_of(pairs=pairs, weights=weights and sha256(weights))
-
     @property
     def sites(self) -> list[str]:
         """The site of each pair."""
         return [pair.site for pair in self.pairs]
 
-    def depends(self, variant: Variant) -> str:
-        """Digest of what a variant's pictures depend on."""
-        if variant.network is not None:
-            sensors = self.degraded, self.reference
-            networks = (variant.network, *variant.network.exposures.values())
-            return key_of(files=[network.sha256 for network in networks], sensors=sensors)
-        return key_of(method=variant.method, sensors=[self.degraded, self.reference])
-
-    def scores(
-        self, point: Point, exact: Restore, kept: Measurements
-    ) -> list[dict[str, float | None]]:
-        """Scores of each image: those of the variant, or with seams where the halo is too small for
-        exact ones.
+    def cuts(self, point: Point) -> tuple[int, ...]:
+        """Return the sides of the tiles that a point with seams cuts the images into; none of exact
+        ones. Points that differ in nothing else have the same scores.
         """
-        about: dict[str, object] = {"scores": self.depends(point.variant), "images": self.digest}
         if point.halo_px is None:
-            return list(kept.make(key_of(**about), lambda: self.score(exact)))
-        # The images may be smaller than the tile. Then points with other tiles, as of another
-        # board, share a score.
-        cuts = sorted({tiles_of_point(point, pair.degraded.shape).tile_px for pair in self.pairs})
-        about |= {"tile_px": cuts, "halo_px": point.halo_px}
-        return list(kept.make(key_of(**about), lambda: self._with_seams(point, exact)))
+            return ()
+        shapes = [pair.degraded.shape for pair in self.pairs]
+        return tuple(sorted({tiles_of_point(point, shape).tile_px for shape in shapes}))
 
-    def _with_seams(self, point: Point, exact: Restore) -> list[dict[str, float | None]]:
+    def scores(self, point: Point, exact: Restore) -> list[Scores]:
+        """Return the scores of each image: those of the exact restoration, or with seams where the
+        halo is too small for that.
+        """
+        if point.halo_px is None:
+            return self.score(exact)
         return self.score(restore_in_tiles(point, self.degraded, self.reference), exact)
 
     def runs(self, point: Point) -> float:
@@ -189,9 +109,7 @@ class Benchmark:
             runs += sum(counts.values())
         return runs / tiles
 
-    def score(
-        self, restore: Restore, exact: Restore | None = None
-    ) -> list[dict[str, float | None]]:
+    def score(self, restore: Restore, exact: Restore | None = None) -> list[Scores]:
         """Scores of every pair; and how far, in DN, a restoration with seams is from the exact one
         given.
         """
@@ -221,18 +139,10 @@ def restore_in_tiles(point: Point, degraded: Sensor, reference: Sensor) -> Resto
     """A network in a point's tiles, with the steps around it that `restore` takes."""
     source = network_of_variant(point.variant)
     sensor = degraded.nominal()
-    infer, _ = open_runtime("onnxruntime", source.model, threads=0)
-    others = {
-        factor: AtFirstCall(partial(open_runtime, "onnxruntime", other.model, 0))
-        for factor, other in source.exposures.items()
-    }
-    network = ExposedNetwork({1: infer, **others}, source.tiling.halo_px, sensor.offset_dn)
-    steps = (Consistency.of(sensor, reference.nominal().in_units_of(sensor), sensor.max_dn),)
-
-    def restore(dn: np.ndarray) -> np.ndarray:
-        return restore_dn(dn, network, tiles_of_point(point, dn.shape), sensor.max_dn, steps)
-
-    return restore
+    brighter = {factor: other.model for factor, other in source.exposures.items()}
+    aim = reference.nominal().in_units_of(sensor)
+    tiles = partial(tiles_of_point, point)
+    return network_method(source.model, sensor.max_dn, brighter, sensor, aim, tiles)
 
 
 def tiles_of_point(point: Point, shape: tuple[int, ...]) -> Plan:
@@ -251,23 +161,15 @@ ROUNDS = 9
 
 
 def measure_host(
-    methods: Mapping[Variant, Method], benchmark: Benchmark, kept: Measurements
+    methods: Mapping[Variant, Method], benchmark: Benchmark
 ) -> dict[Variant, dict[str, Figure]]:
-    """What each variant takes on this machine, all timed together on a drawn scene as the sensor
-    sees it.
+    """Measure what each variant takes on this machine, all timed together on a drawn scene as the
+    sensor sees it.
     """
     tile = drawn_acquisition(
         Swath(TILE_PX, TILE_PX), benchmark.degraded, benchmark.reference, benchmark.seed
     )
-    names = [benchmark.depends(variant) for variant in methods]
-    machine = (
-        f"{platform.machine()} {processor_name() or platform.processor()} x {psutil.cpu_count()}"
-    )
-    # Times are kept for this machine alone: on another one they are measured again.
-    key = key_of(times=names, tile=tile, machine=machine)
-    times = kept.make(
-        key, lambda: host_times([method.restore for method in methods.values()], tile)
-    )
+    times = host_times([method.restore for method in methods.values()], tile)
     return {
         variant: host_figures(times_s, tile.size)
         for variant, times_s in zip(methods, times, strict=True)
@@ -303,30 +205,17 @@ takes.
 """
 
 
-def make_int8(
-    network: Network, folder: Path, scenes: Path | None, sensor: Sensor, seed: int
-) -> Network:
-    """Quantise a float network on simulated patches as `quantize` does, and keep the file.
+def make_int8(network: Network, scenes: Path | None, sensor: Sensor, seed: int) -> Network:
+    """Quantise a float network on simulated patches as `quantize` does.
 
     Args:
         network: in float32.
-        folder: where the INT8 file is kept.
         scenes: folder of images to calibrate on; drawn ones if None.
         sensor: of the patches, where the network names none that is known.
         seed: of every random draw.
     """
     named = network.sensor
     calibration_sensor = load_sensor(named) if named in sensor_names() else sensor
-    scene_digests = [sha256(path) for path in list_images(scenes)] if scenes else []
-    key = key_of(
-        network=network.sha256,
-        scenes=scene_digests,
-        sensor=calibration_sensor,
-        seed=seed,
-        size=[PATCHES, PATCH_PX],
-    )
-    path = folder / f"{network.name}-int8-{key[:16]}.onnx"
-    if not path.is_file():
-        patches = Calibration(calibration_sensor, scenes, PATCHES, PATCH_PX, seed)
-        save_onnx(quantise_model(network.model, patches.drawn, patches.about).host, path)
-    return Network.load(path)
+    patches = Calibration(calibration_sensor, scenes, PATCHES, PATCH_PX, seed)
+    result = quantise_model(network.model, patches.drawn, patches.about)
+    return Network(result.host, f"{network.name}-int8")

@@ -113,7 +113,7 @@ def network_variants(
         make_int8: quantises a float network.
     """
     variants: list[Variant] = []
-    for network in dict.fromkeys(each.strip() if isinstance(each, str) else each for each in given):
+    for network in given:
         variants += _variants(network, sensor, make_int8)
     variant_names = [variant.name for variant in variants]
     if len(set(variant_names)) < len(variant_names):

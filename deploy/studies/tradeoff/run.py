@@ -3,13 +3,13 @@ recommendation.
 """
 
 import logging
+import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
+from typing import cast
 
 from beers_deploy.dpu.board import dpu_of
 from beers_deploy.dpu.cost.model import Constants
@@ -21,7 +21,7 @@ from beers_deploy.network import Network, NetworkLike
 from beers_deploy.performance.swath import PAPER_SIZE, Swath, parse_size
 from beers_deploy.performance.tables import PAPER_TARGET, published_rows
 from beers_deploy.performance.timing import interleaved
-from beers_deploy.profiles.errors import MachineError, OptionError
+from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Check, Row, predicted
 from beers_deploy.profiles.figures import measured as measured_figure
 from beers_deploy.profiles.sensor import Sensor
@@ -33,7 +33,7 @@ from beers_deploy.studies.tradeoff import advice
 from beers_deploy.studies.tradeoff.boards import Question, board_rows, lines
 from beers_deploy.studies.tradeoff.measure import (
     Benchmark,
-    Measurements,
+    Scores,
     make_int8,
     measure_host,
 )
@@ -88,7 +88,8 @@ class Study:
     def names(self) -> list[str]:
         """The networks as they are given: names and paths."""
         return [
-            each if isinstance(each, str) else Network.load(each).label for each in self.networks
+            each.label if isinstance(each, Network) else os.fspath(cast(str, each))
+            for each in self.networks
         ]
 
     @property
@@ -113,11 +114,10 @@ def benchmark_of(study: Study) -> tuple[Benchmark, list[str]]:
     return Benchmark(pairs, *study.sensors, study.lpips, study.seed), remarks
 
 
-def points_for(study: Study, folder: Path) -> list[Point]:
-    """Return the points of a study; float networks are quantised into a folder."""
+def points_for(study: Study) -> list[Point]:
+    """Return the points of a study; float networks are quantised."""
     quantise = partial(
         make_int8,
-        folder=folder / "int8",
         scenes=study.calibration,
         sensor=study.sensors[0],
         seed=study.seed,
@@ -126,17 +126,13 @@ def points_for(study: Study, folder: Path) -> list[Point]:
     return points_of(variants, study.boards, Swath(*study.size))
 
 
-def run_tradeoff(study: Study, folder: Path) -> Tradeoff:
-    """Measure every point of a study, and recommend one.
-
-    Args:
-        study: what is compared.
-        folder: of measurements that a later run goes on with.
-    """
-    measurements = Measurements.open(folder / "measurements.json")
-    points = points_for(study, folder)
+def run_tradeoff(study: Study) -> Tradeoff:
+    """Measure every point of a study, and recommend one."""
+    # The digests are those of the files that are measured.
+    inputs = study.inputs
+    points = points_for(study)
     benchmark, remarks = benchmark_of(study)
-    results = _measured(points, benchmark, measurements, Swath(*study.size))
+    results = _measured(points, benchmark, Swath(*study.size))
     if PAPER_TARGET in study.board_names and study.size == parse_size(PAPER_SIZE):
         # The rows stand as printed: the paper's images are others.
         for row in published_rows():
@@ -156,8 +152,8 @@ def run_tradeoff(study: Study, folder: Path) -> Tradeoff:
         "seed": study.seed,
     }
     notes = (*_notes(benchmark, study.board_names), *remarks)
-    about = {"arguments": arguments, "inputs": study.inputs, "notes": notes}
-    return weigh(results, study.board_names, question, **about)
+    table = weigh(results, study.board_names, question, notes)
+    return replace(table, arguments=arguments, inputs=inputs)
 
 
 PREVIEW_PX = 256
@@ -167,8 +163,7 @@ PREVIEW_RUNS = 3
 def preview(study: Study) -> Table:
     """Return what a study would measure and about how long that takes, from a crop timed here."""
     benchmark, _ = benchmark_of(study)
-    with TemporaryDirectory(prefix="beers-deploy-") as folder:
-        points = points_for(study, Path(folder))
+    points = points_for(study)
     methods = _methods([point.variant for point in points], benchmark)
     first = benchmark.pairs[0]
     side = slice(0, PREVIEW_PX)
@@ -217,7 +212,10 @@ def _require_different(boards: Sequence[TargetProfile]) -> None:
 
 
 def weigh(
-    points: Sequence[advice.Measured], boards: Sequence[str], asked: Question, **about: Any
+    points: Sequence[advice.Measured],
+    boards: Sequence[str],
+    asked: Question,
+    remarks: Sequence[str] = (),
 ) -> Tradeoff:
     """Find the front, the recommendation, and what each board offers.
 
@@ -225,7 +223,7 @@ def weigh(
         points: of all boards, and published runs.
         boards: their names.
         asked: budget and need.
-        **about: the arguments, inputs and notes of the study.
+        remarks: on the study.
     """
     cost = advice.chosen_cost(points, asked.budget)
     best, line = advice.recommend(points, asked.budget, asked.need, asked.compare)
@@ -236,10 +234,8 @@ def weigh(
     figures = best.figures if best else {}
     every = (Row("points", point.name, point.figures, point.text) for point in points)
     rows = (Row("recommended", name, figures, {"line": line}), *by_board, *numbered, *every)
-    remarks = tuple(about.pop("notes", ()))
     fits = Check("points within budget and need", int(best is not None), 1, "point", "at least")
     return Tradeoff(
-        command="tradeoff",
         title="what accuracy costs in time",
         rows=rows,
         checks=(fits,),
@@ -254,35 +250,37 @@ def weigh(
         boards=tuple(boards),
         board_rows=by_board,
         constraints=asked.constraints,
-        remarks=remarks,
-        **about,
+        remarks=tuple(remarks),
     )
 
 
 def _measured(
     points: Sequence[Point],
     benchmark: Benchmark,
-    measurements: Measurements,
     swath: Swath,
 ) -> list[advice.Measured]:
-    """Every point with its figures; a method whose library is not installed is left out."""
+    """Return every point with its figures."""
     methods = _methods([point.variant for point in points], benchmark)
-    runnable = [point for point in points if point.variant in methods]
     results = list[advice.Measured]()
-    with steps("tradeoff", len(runnable) + 1) as bar:
-        for point in runnable:
+    # Points of several boards may cut the images alike.
+    scores_of: dict[tuple[Variant, int | None, tuple[int, ...]], list[Scores]] = {}
+    with steps("tradeoff", len(points) + 1) as bar:
+        for point in points:
             bar.advance(0, f"measuring {point.name}")
             method = methods[point.variant]
-            scores = benchmark.scores(point, method.restore, measurements)
+            key = point.variant, point.halo_px, benchmark.cuts(point)
+            if key not in scores_of:
+                scores_of[key] = benchmark.scores(point, method.restore)
+            scores = scores_of[key]
             figures = benchmark.means(scores)
             results.append(
                 advice.Measured(point.name, figures, _text(point, method), point, scores)
             )
             bar.advance(1, point.name)
-        host = measure_host(methods, benchmark, measurements)
+        host = measure_host(methods, benchmark)
         bar.advance(1, "timed on this machine")
     medians_s = {variant: times["host p50"].value or 1.0 for variant, times in host.items()}
-    for point, result in zip(runnable, results, strict=True):
+    for point, result in zip(points, results, strict=True):
         here_s = medians_s[point.variant]
         # Where the chain itself was not timed, the board's stated time stands as it is.
         slower = here_s / medians_s.get(Variant(CHAIN), here_s)
@@ -297,14 +295,7 @@ def _measured(
 
 
 def _methods(variants: Sequence[Variant], benchmark: Benchmark) -> dict[Variant, Method]:
-    methods: dict[Variant, Method] = {}
-    for variant in dict.fromkeys(variants):
-        try:
-            methods[variant] = _method(variant, benchmark)
-        except MachineError as error:
-            # The library of this method is not installed: the study goes on without it.
-            logger.warning("%s is left out: %s", variant.name, error)
-    return methods
+    return {variant: _method(variant, benchmark) for variant in dict.fromkeys(variants)}
 
 
 def _method(variant: Variant, benchmark: Benchmark) -> Method:

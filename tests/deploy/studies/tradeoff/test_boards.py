@@ -30,7 +30,7 @@ def weighed(
     question = Question(
         parse_constraints("budget", budget), parse_constraints("need", need), COMPARE
     )
-    return weigh(points, boards, question, arguments={}, inputs=(), notes=())
+    return weigh(points, boards, question)
 
 
 def on_boards(costs: dict[str, float], psnr_db: dict[str, float]) -> list[Measured]:

@@ -29,9 +29,7 @@ def study(
 ) -> Tradeoff:
     candidates = list(family()) if points is None else points
     question = Question(parse_constraints("budget", budget), [], COMPARE)
-    return weigh(
-        candidates, boards, question, arguments={}, inputs=(), notes=("No board was used.",)
-    )
+    return weigh(candidates, boards, question, ("No board was used.",))
 
 
 def words_of(result: Tradeoff) -> list[str]:

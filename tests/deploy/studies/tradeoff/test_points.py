@@ -2,7 +2,6 @@
 times on this machine.
 """
 
-import json
 import logging
 from dataclasses import replace
 from functools import partial
@@ -24,10 +23,8 @@ from beers_deploy.profiles.target import TILE_PX, board_names, load_target
 from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.studies.tradeoff.measure import (
     ROUNDS,
-    Measurements,
     host_figures,
     host_times,
-    key_of,
 )
 from beers_deploy.studies.tradeoff.points import (
     FLOAT,
@@ -77,7 +74,7 @@ def test_boards_are_named_with_commas_and_all_are_the_shipped_ones() -> None:
 
 
 def test_shipped_networks_come_in_both_precisions_with_the_sensors_profile() -> None:
-    variants = network_variants(["convbeers-xs", "convbeers-xs"], SENSOR, refused)
+    variants = network_variants(["convbeers-xs"], SENSOR, refused)
     assert [variant.name for variant in variants] == ["convbeers-xs float32", "convbeers-xs INT8"]
     precisions = [variant.network and variant.network.precision for variant in variants]
     assert precisions == ["float32", "int8"]
@@ -198,21 +195,6 @@ def test_a_chain_on_a_boards_processor_takes_the_stated_time_by_the_measured_rat
         board_figures(Point(chain, untimed), swath, slower=3.0)["board latency"].mode
         == "unavailable"
     )
-
-
-def test_what_was_measured_is_kept_by_what_it_depends_on(tmp_path: Path) -> None:
-    path = tmp_path / "measurements.json"
-    calls = list[int]()
-
-    def measure() -> list[int]:
-        calls.append(1)
-        return [len(calls)]
-
-    store = Measurements.open(path)
-    assert store.make(key_of(model="a"), measure) == [1]
-    assert Measurements.open(path).make(key_of(model="a"), measure) == [1]
-    assert Measurements.open(path).make(key_of(model="b"), measure) == [2]
-    assert len(json.loads(path.read_text())["measurements"]) == 2
 
 
 def test_methods_are_timed_in_turns_after_a_run_for_warm_up() -> None:
