@@ -8,12 +8,6 @@ SHIPPED = Path(__file__).parent / "weights"
 
 VARIANT = "convbeers-s"
 
-DETECTOR = SHIPPED / "detector.onnx"
-DETECTOR_INT8 = SHIPPED / "detector-int8.onnx"
-"""What finds vehicles, ships, aircraft and tanks of drawn scenes: in float32, and under the DPU's
-rules.
-"""
-
 INT8 = "-int8"
 """Behind a network's name: that network in INT8."""
 

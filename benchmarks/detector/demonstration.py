@@ -1,6 +1,6 @@
 """What restoration gains for the small detector, on synthetic scenes: docs/results/detection.md.
 
-    python benchmarks/detector/demonstration.py [--out detection/] [--json detection.json]
+    python -m benchmarks.detector.demonstration [--out detection/] [--json detection.json]
 
 Prints the tables, and writes their page into the folder: three minutes on two cores.
 """
@@ -9,12 +9,13 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from beers_deploy.model.shipped import DETECTOR
 from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.studies.detection.detector import open_detector
-from beers_deploy.studies.detection.study import run_study, synthetic_scenes
+from beers_deploy.studies.detection.study import run_study
 from beers_deploy.studies.detection.table import detection_table
 from beers_deploy.studies.evaluation.methods import DEGRADED
+from benchmarks.detector.labelled import synthetic_scenes
+from benchmarks.detector.network import DETECTOR
 
 
 def main() -> None:

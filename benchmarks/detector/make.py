@@ -1,11 +1,10 @@
-"""Makes the shipped detector anew: synthetic pictures, training, the file, the same in INT8, and
-what both find.
+"""Make the small detector: synthetic pictures, training, its file, and what it finds.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.detector.make [FOLDER]
+    OMP_NUM_THREADS=1 python -m benchmarks.detector.make [FILE]
 
-The files go to model/weights, or to FOLDER; the same bytes on the same machine. The training is
-most of it: see model/weights/detector.md for how long it took. --steps, --pictures and --held-out
-make it shorter, to try it.
+The file is detector.onnx in this folder, or FILE; the same bytes on the same machine. The training
+is most of it: see detector.md for how long it took. --steps, --pictures and --held-out make it
+shorter, to try it.
 """
 
 import argparse
@@ -17,10 +16,7 @@ import numpy as np
 import torch
 
 from beers_deploy.model.progress import steps
-from beers_deploy.model.shipped import DETECTOR, DETECTOR_INT8
-from beers_deploy.quant.onnx_file import load_onnx, save_onnx
-from beers_deploy.quant.quantise import quantise_model
-from beers_deploy.quant.samples import Patches, Remade
+from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.studies.detection.average_precision import (
     find_hits,
     interval,
@@ -29,28 +25,25 @@ from beers_deploy.studies.detection.average_precision import (
 )
 from beers_deploy.studies.detection.boxes import Boxes
 from beers_deploy.studies.detection.detector import open_detector
-from beers_deploy.studies.detection.scenes import CLASSES
-from benchmarks.detector.network import detector_to_onnx
+from benchmarks.detector.network import DETECTOR, detector_to_onnx
+from benchmarks.detector.scenes import CLASSES
 from benchmarks.detector.training import DetectorRecipe, Picture, drawn_picture, train_detector
 
 SIDE_PX = 256
-SEEN = 64
-"""Pictures of the training that INT8 is calibrated on."""
 RECIPE = DetectorRecipe(precision="bfloat16")
 
 
 def main() -> None:
-    """Draw, train, quantise, judge."""
+    """Draw, train, judge."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("folder", nargs="?", type=Path, default=DETECTOR.parent)
+    parser.add_argument("file", nargs="?", type=Path, default=DETECTOR)
     parser.add_argument("--pictures", type=int, default=400, help="drawn for training")
     parser.add_argument(
-        "--held-out", type=int, default=60, help="of another seed, that both files are judged on"
+        "--held-out", type=int, default=60, help="of another seed, that it is judged on"
     )
     parser.add_argument("--steps", type=int, default=RECIPE.steps)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    files = [arguments.folder / path.name for path in (DETECTOR, DETECTOR_INT8)]
     recipe = replace(RECIPE, steps=arguments.steps)
     pictures = drawn(0, arguments.pictures)
     with steps("training", recipe.steps) as bar:
@@ -61,11 +54,9 @@ def main() -> None:
         "description": "vehicles, ships, aircraft and tanks of drawn scenes",
         "license": "Apache-2.0",
     }
-    save_onnx(
-        detector_to_onnx(network, CLASSES, SIDE_PX, {**about, "recipe": str(recipe)}), files[0]
-    )
-    quantise(pictures[:SEEN], *files)
-    judge(drawn(1, arguments.held_out), files)
+    about["recipe"] = str(recipe)
+    save_onnx(detector_to_onnx(network, CLASSES, SIDE_PX, about), arguments.file)
+    judge(drawn(1, arguments.held_out), arguments.file)
 
 
 def drawn(seed: int, count: int) -> list[Picture]:
@@ -78,39 +69,20 @@ def drawn(seed: int, count: int) -> list[Picture]:
     return pictures
 
 
-def quantise(pictures: Sequence[Picture], file: Path, int8: Path) -> None:
-    """The file in INT8 under the DPU's rules, for the host."""
-    images = [picture.image[None].astype(np.float32) / 255 for picture in pictures]
-    patches = Patches(
-        [],
-        Remade(lambda k: (images[k], images[k]), len(images)),
-        Remade(lambda k: images[k], len(images)),
-    )
-    save_onnx(quantise_model(load_onnx(file), patches, {}).host, int8)
-
-
-def judge(pictures: Sequence[Picture], files: Sequence[Path]) -> None:
+def judge(pictures: Sequence[Picture], file: Path) -> None:
     """Print average precisions with intervals, over pictures that nothing was trained on."""
     truths = [Boxes.of(picture.corners, picture.classes) for picture in pictures]
-    hits = {}
-    for file in files:
-        detector = open_detector(file, 1)
-        detections = [
-            detector.detect((picture.image.astype(np.float32) / 255).transpose(1, 2, 0))
-            for picture in pictures
-        ]
-        hits[file.stem] = find_hits(truths, detections, len(CLASSES))
-    rows, _ = score_rows(
-        hits, CLASSES, site_weights([str(number) for number in range(len(pictures))], 0)
-    )
-    float32, int8 = rows.values()
+    detector = open_detector(file, 1)
+    detections = [
+        detector.detect((picture.image.astype(np.float32) / 255).transpose(1, 2, 0))
+        for picture in pictures
+    ]
+    hits = {file.stem: find_hits(truths, detections, len(CLASSES))}
+    sites = [str(number) for number in range(len(pictures))]
+    rows, _ = score_rows(hits, CLASSES, site_weights(sites, 0))
+    (values,) = rows.values()
     for key in ("mAP50", "mAP50-95", *(f"mAP50 of {name}" for name in CLASSES)):
-        for name, values in (
-            ("float32", float32[key]),
-            ("INT8", int8[key]),
-            ("INT8 less", int8[key] - float32[key]),
-        ):
-            print(name, key, f"{values[0]:.4f}", interval(values, len(pictures)))
+        print(key, f"{values[key][0]:.4f}", interval(values[key], len(pictures)))
 
 
 if __name__ == "__main__":

@@ -13,11 +13,15 @@ import io
 import math
 import warnings
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import onnx
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+DETECTOR = Path(__file__).with_name("detector.onnx")
+"""The small detector, trained: it finds vehicles, ships, aircraft and tanks of synthetic scenes."""
 
 STRIDE_PX = 4
 """Input pixels a side of a cell."""

@@ -24,19 +24,18 @@ from beers_deploy.results import Table
 from beers_deploy.studies.detection.average_precision import find_hits, score
 from beers_deploy.studies.detection.boxes import Letterbox
 from beers_deploy.studies.detection.detector import open_detector
-from beers_deploy.studies.detection.scenes import CLASSES
 from beers_deploy.studies.detection.study import (
     REFERENCE,
     AcquiredScene,
     LabelledScene,
     SensorPair,
     acquired,
-    synthetic_labelled,
-    synthetic_scenes,
 )
 from beers_deploy.studies.detection.tables import GAIN, PERCENT, POINTS, REGAINED
 from beers_deploy.studies.evaluation.methods import DEGRADED, Method, method_named
+from benchmarks.detector.labelled import synthetic_labelled, synthetic_scenes
 from benchmarks.detector.network import detector_to_onnx
+from benchmarks.detector.scenes import CLASSES
 from benchmarks.detector.training import DetectorRecipe, Picture, picture_of, train_detector
 
 TABLE = "detector retrained for each row"

@@ -20,8 +20,8 @@ from beers_deploy.model.simulator.acquire import acquire_padded
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
-from beers_deploy.studies.detection.scenes import synthetic_scene
 from benchmarks.detector.network import STRIDE_PX, DetectorNetwork, decoded, initialise
+from benchmarks.detector.scenes import synthetic_scene
 
 OVERSAMPLING = 3
 """Scene pixels a pixel of a drawn picture."""

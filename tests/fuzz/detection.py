@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from beers_deploy.studies.detection.detector import open_detector
-from beers_deploy.studies.detection.labels import read_labelled, yolo_names
+from beers_deploy.studies.detection.labels import read_labelled
 from tests.deploy.studies.detection.folders import OBJECTS, SIZE_PX
 from tests.deploy.studies.detection.networks import detector, final, raw
 
@@ -24,11 +24,6 @@ def label_seeds(folder: Path, make: Callable[[Path], Path], suffix: str) -> list
     return [path.read_bytes() for path in labels]
 
 
-def names_seeds(_: Path) -> list[bytes]:
-    """Names of classes, as a list and as a table."""
-    return [b"names: [ship, tank]\nnc: 2\n", b"path: a\nnames:\n  0: ship\n  1: tank\n"]
-
-
 def read_beside(path: Path) -> None:
     """Labels, beside the images that they are of: one file of all, or a copy for each."""
     with TemporaryDirectory() as folder:
@@ -37,15 +32,7 @@ def read_beside(path: Path) -> None:
             shutil.copy(
                 path, Path(folder) / f"{'labels' if path.suffix == '.json' else stem}{path.suffix}"
             )
-        (Path(folder) / "classes.txt").write_text(
-            "Expressway-Service-area\nship\n", encoding="utf-8"
-        )
         read_labelled(Path(folder))
-
-
-def read_names(path: Path) -> None:
-    with TemporaryDirectory() as folder:
-        yolo_names([Path(shutil.copy(path, folder)).parent])
 
 
 def detector_seeds(folder: Path) -> list[bytes]:

@@ -35,16 +35,13 @@ from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.journal import FinishedRow, journal_text
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.results import Table
-from beers_deploy.studies.tradeoff.measure import Measurements
 from tests.deploy.dpu.graphs import integer_convbeers
-from tests.deploy.studies.detection.folders import coco, voc, yolo
+from tests.deploy.studies.detection.folders import coco, voc
 from tests.fuzz.detection import (
     detect,
     detector_seeds,
     label_seeds,
-    names_seeds,
     read_beside,
-    read_names,
 )
 from tests.fuzz.mutation import Mutate, of_json, of_onnx, of_png, of_safetensors, of_tiff, of_xml
 from tests.fuzz.networks import (
@@ -169,12 +166,6 @@ def read_results(path: Path) -> None:
     read_document(path)
 
 
-def measurement_seeds(folder: Path) -> list[bytes]:
-    store = Measurements(folder / "measurements.json")
-    store.make("a", lambda: [{"PSNR": 30.0, "LPIPS": None}])
-    return [store.path.read_bytes()]
-
-
 def journal_seeds(_: Path) -> list[bytes]:
     row = FinishedRow(4, 64, "0" * 64, Tally())
     return [journal_text(JOB, [row]).encode(), journal_text(JOB, []).encode()]
@@ -274,7 +265,6 @@ PARSERS: tuple[Parser, ...] = (
         of_json,
         0.3,
     ),
-    Parser("kept measurements", ".json", measurement_seeds, Measurements.open, of_json),
     Parser("journal of a run", ".json", journal_seeds, resume, of_json, 0.5),
     Parser("dataset manifest", ".jsonl", manifest_seeds, _read_summary, of_json),
     Parser(
@@ -303,7 +293,5 @@ PARSERS: tuple[Parser, ...] = (
         read_beside,
         of_json,
     ),
-    Parser("labels of YOLO", ".txt", partial(label_seeds, make=yolo, suffix=".txt"), read_beside),
-    Parser("names of classes", ".yaml", names_seeds, read_names),
     Parser("detector", ".onnx", detector_seeds, detect, of_onnx, 0.5),
 )

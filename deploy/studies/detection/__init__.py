@@ -1,9 +1,9 @@
 """What restoration gains an object detector: labelled scenes, a detector, and average precision
 with intervals.
 
-- `labels`: labelled images of any known layout; `scenes`: synthetic scenes with known objects;
+- `labels`: labelled images of VOC, DIOR and COCO;
 - `boxes`: boxes and the square input of a detector; `detector`: detectors as Ultralytics exports
   them to ONNX;
 - `average_precision`: average precision, precision and recall, with a bootstrap over sites;
-- `study`: the comparison; `tables`: its rows of figures; `page`: its pictures and page.
+- `study`: the comparison; `tables`: its rows of figures; `table`: the whole; `page`: its page.
 """

@@ -19,7 +19,14 @@ import numpy as np
 import onnx
 from onnxruntime import InferenceSession
 
-from beers_deploy.profiles.errors import CODE_FAULTS, LONGEST, ModelError, OptionError, printable
+from beers_deploy.profiles.errors import (
+    CODE_FAULTS,
+    LONGEST,
+    ModelError,
+    OptionError,
+    printable,
+    reason_of,
+)
 from beers_deploy.quant.onnx_file import constants, fixed_tile_px, load_onnx, metadata
 from beers_deploy.quant.session import open_session
 from beers_deploy.studies.detection.boxes import MOST, Boxes, Letterbox, suppress
@@ -122,7 +129,7 @@ def _answer(session: InferenceSession, path: Path, image: np.ndarray) -> np.ndar
         raise
     except Exception as error:
         # onnxruntime raises a class of its own for each status code.
-        reason = " ".join(str(error).split())[:160]
+        reason = reason_of(error)
         raise ModelError(
             f"The detector {path} does not run: {reason}. Export it again, for one size of image."
         ) from error

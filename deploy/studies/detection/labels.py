@@ -1,4 +1,4 @@
-"""Labelled images: Pascal VOC (DIOR's folders among it), COCO and YOLO.
+"""Labelled images: Pascal VOC (DIOR's folders among it), and COCO.
 
 Boxes are in continuous pixels of the image, pixel i covering [i, i + 1):
 
@@ -6,41 +6,27 @@ Boxes are in continuous pixels of the image, pixel i covering [i, i + 1):
   1909.00133): corners count pixels from 1 and belong to the box.
 - COCO, one JSON file (Lin et al., arXiv 1405.0312; cocodataset.org/#format-data): left, top, width,
   height in px.
-- YOLO, a text file an image (docs.ultralytics.com/datasets/detect): `class cx cy w h`, or `class x
-  y x y x y ...` of an outline, which an upright box encloses, as shares of the image; names in
-  data.yaml or classes.txt; an image without a file shows no object.
 """
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from beers_deploy.model.io.files import IMAGE_SUFFIXES
 from beers_deploy.model.raster.images import image_size_px, list_images
 from beers_deploy.model.raster.index import parse_xml
-from beers_deploy.profiles.errors import MissingExtraError, OptionError, printable
+from beers_deploy.profiles.errors import OptionError, printable, reason_of
 from beers_deploy.profiles.toml import read_json, read_whole
 from beers_deploy.studies.detection.boxes import Boxes, areas
-from beers_deploy.studies.detection.detector import class_names, letters
+from beers_deploy.studies.detection.detector import letters
 
-SPLITS = ("test", "val", "valid", "train")
-"""Where no split is asked for, the first that is there: what a detector was
-trained on comes last.
-"""
-LAYOUTS = "VOC (.xml), COCO (.json) or YOLO (.txt) labels"
+LAYOUTS = "VOC (.xml) or COCO (.json) labels"
 CORRECT = "Correct the labels."
 LABEL_BYTES = 1 << 23
-NAMES_BYTES = 1 << 16
-"""Limits of a file of labels (25 000 boxes of XML), and of data.yaml, of which PyYAML reads so much
-in 0.4 s.
-"""
-SPAN = 1e-3
-"""By how much a share of YOLO's may pass 0 or 1: tools write six digits or fewer."""
+"""Limit of a file of labels: 25 000 boxes of XML."""
 HORIZONTAL = "Horizontal Bounding Boxes"
 CORNERS = ("xmin", "ymin", "xmax", "ymax")
 
@@ -72,91 +58,59 @@ class _File(NamedTuple):
 def read_labelled(
     images: Path, labels: Path | None = None, split: str | None = None
 ) -> LabelledSet:
-    """Labelled images of a folder.
+    """Read the labelled images of a folder.
 
     Args:
-        images: the folder of the images, or the top of a tree as VOC, DIOR or YOLO have it.
-        labels: a folder of label files, one an image, or COCO's JSON; None looks where each layout
-            keeps them.
+        images: the folder of the images, or the top of a tree as VOC and DIOR have it.
+        labels: a folder of label files, one for each image, or COCO's JSON; None looks next to the
+            images.
         split: which part of a tree; None takes `test` if there is one.
     """
-    if labels is None and (images / "Annotations").is_dir() and any(images.glob("JPEGImages*")):
+    is_tree = (images / "Annotations").is_dir() and any(images.glob("JPEGImages*"))
+    if labels is None and is_tree:
         return _labelled_set(_read_voc_tree(images, split))
-    folder = _image_folder(images, split)
-    where = labels or _labels_near(images, folder)
+    if split is not None:
+        raise OptionError(
+            f"`split` needs folders as VOC and DIOR have them, but {images} has none. Leave it out."
+        )
+    where = labels or _labels_near(images)
     if where.suffix.lower() == ".json":
-        return _labelled_set(*_read_coco(where, folder))
-    return _labelled_set(
-        _read_each(list_images(folder), where, (where, where.parent, folder, images))
-    )
+        return _labelled_set(*_read_coco(where, images))
+    return _labelled_set(_read_each(list_images(images), where))
 
 
-def _image_folder(top: Path, split: str | None) -> Path:
-    """Where the images of a split lie: TOP/images/SPLIT, TOP/SPLIT/images or TOP/SPLIT, else TOP or
-    TOP/images.
-    """
-    if split is None and _holds(top, IMAGE_SUFFIXES):
-        return top
-    for name in (split,) if split else SPLITS:
-        for path in (top / "images" / name, top / name / "images", top / name):
-            if _holds(path, IMAGE_SUFFIXES):
-                return path
-    if split:
-        raise OptionError(f"{top} has no images of the split {split!r}. Name a split that it has.")
-    return top / "images" if (top / "images").is_dir() else top
-
-
-def _labels_near(top: Path, folder: Path) -> Path:
-    """Where the labels of a folder's images lie: in the place of `images`, beside them, or in a
-    file of JSON.
-    """
-    parts = folder.relative_to(top).parts
-    swapped = top.joinpath(*("labels" if part == "images" else part for part in parts))
-    for path in (swapped, folder, top / "labels", top / "Annotations", top):
-        if _holds(path, (".xml", ".txt"), but="classes.txt"):
-            return path
-        json_files = sorted(path.glob("*.json"))
-        if len(json_files) > 1:
-            raise OptionError(
-                f"{path} has {len(json_files)} JSON files, but one file of labels is needed. Name "
-                "it as `labels`."
-            )
-        if json_files:
-            return json_files[0]
-    # This call says so where there is no image either.
+def _labels_near(folder: Path) -> Path:
+    """Return where the labels of a folder's images lie: next to them, or in a file of JSON."""
+    # This call refuses a folder without images.
     list_images(folder)
-    raise OptionError(
-        f"There are no labels for the images in {folder}. Give {LAYOUTS} as `labels`."
-    )
+    if any(path.suffix.lower() == ".xml" for path in folder.iterdir()):
+        return folder
+    json_files = sorted(folder.glob("*.json"))
+    if len(json_files) > 1:
+        raise OptionError(
+            f"{folder} has {len(json_files)} JSON files, but one file of labels is needed. Name it "
+            "as `labels`."
+        )
+    if not json_files:
+        raise OptionError(
+            f"There are no labels for the images in {folder}. Give {LAYOUTS} as `labels`."
+        )
+    return json_files[0]
 
 
-def _holds(folder: Path, suffixes: Iterable[str], but: str = "") -> bool:
-    return folder.is_dir() and any(
-        p.suffix.lower() in suffixes and p.name != but for p in folder.iterdir()
-    )
-
-
-def _read_each(images: Sequence[Path], where: Path, named_in: Sequence[Path]) -> list[_File]:
+def _read_each(images: Sequence[Path], where: Path) -> list[_File]:
     if not where.is_dir():
         fault = "is another file" if where.exists() else "does not exist"
         raise OptionError(f"{where} {fault}. Give a folder of {LAYOUTS}.")
     names_there = {path.name for path in where.iterdir()}
     absent = [f"{image.stem}.xml" for image in images if f"{image.stem}.xml" not in names_there]
-    if not absent:
-        return [_read_voc(image, where / f"{image.stem}.xml") for image in images]
-    if len(absent) < len(images):
+    if absent:
         raise OptionError(
             f"{where} must have a file of labels for every image, but {len(absent)} of "
             f"{len(images)} are missing, the first {absent[0]}. Leave those images out, or give "
             "them files without objects."
         )
-    if not any(f"{image.stem}.txt" in names_there for image in images):
-        raise OptionError(
-            f"{where} has no {LAYOUTS} named as one of the {len(images)} images. Name each file "
-            "as its image."
-        )
-    names = yolo_names(named_in)
-    return [_read_yolo(image, where / f"{image.stem}.txt", names) for image in images]
+    return [_read_voc(image, where / f"{image.stem}.xml") for image in images]
 
 
 def _labelled_set(files: Sequence[_File], notes: Sequence[str] = ()) -> LabelledSet:
@@ -261,7 +215,7 @@ def _read_voc(image: Path, labels: Path) -> _File:
         root = parse_xml(text)
     except (ValueError, LookupError, RecursionError) as error:
         # A LookupError is that of an unknown encoding.
-        reason = " ".join(str(error).split())[:100]
+        reason = reason_of(error)
         raise OptionError(f"{labels} is not plain XML: {reason}. {CORRECT}") from error
     if root.tag != "annotation":
         raise OptionError(
@@ -345,88 +299,14 @@ def _inside(folder: Path, name: str) -> Path | None:
     )
 
 
-def _read_yolo(image: Path, labels: Path, names: Sequence[str]) -> _File:
-    # In YOLO an image without a file shows no object.
-    lines = _lines(labels) if labels.exists() else []
-    size_px = image_size_px(image)
-    return _File(image, labels, [_yolo_box(line, labels, names, size_px) for line in lines])
-
-
-def _yolo_box(line: str, path: Path, names: Sequence[str], size_px: tuple[int, int]) -> Box:
-    words = line.split()
-    if len(words) != 5 and (len(words) < 7 or len(words) % 2 == 0):
-        raise OptionError(
-            f"A line of {path} must be YOLO's 'class cx cy w h', but it is {line[:80]!r}. {CORRECT}"
-        )
-    number, *shares = _numbers(words, path, "class and coordinates")
-    if number not in range(len(names)):
-        raise OptionError(
-            f"{path} has the class {words[0][:20]}, but only classes from 0 to {len(names) - 1} "
-            "have a name. Name it in data.yaml or classes.txt."
-        )
-    if min(shares) < -SPAN or max(shares) > 1 + SPAN:
-        raise OptionError(
-            f"{path} must have coordinates as fractions of the image, 0 to 1, but it has "
-            f"{line[:80]!r}. Divide pixels by the image's width and height."
-        )
-    # The size is height and width, and the points are x and y.
-    points = np.reshape(shares, (-1, 2)) * size_px[::-1]
-    if len(shares) == 4:
-        middle, size = points
-        points = np.array([middle - size / 2, middle + size / 2])
-    return names[int(number)], (*points.min(axis=0), *points.max(axis=0)), False
-
-
-def yolo_names(folders: Sequence[Path]) -> tuple[str, ...]:
-    """Names of the classes, in their order, from the first data.yaml or classes.txt in some
-    folders.
-    """
-    for folder in folders:
-        for path in (*sorted(folder.glob("*.yaml")), *sorted(folder.glob("*.yml"))):
-            if names := _yaml_names(path):
-                return names
-        if (folder / "classes.txt").is_file():
-            return tuple(line.strip() for line in _lines(folder / "classes.txt"))
-    places = ", ".join(map(str, folders))
-    raise OptionError(
-        "YOLO labels need data.yaml or classes.txt with the names of the classes, but neither is "
-        f"in {places}. Add one."
-    )
-
-
-def _yaml_names(path: Path) -> tuple[str, ...]:
-    """The list or table `names` of a YAML file; nothing where it has none."""
-    try:
-        import yaml  # type: ignore[import-untyped]  # its stubs are one more package, for one function
-    except ImportError as error:
-        raise MissingExtraError(
-            f"{path} cannot be read, because the package PyYAML is not installed. Run pip install "
-            "'beers-deploy[detect]', or write classes.txt."
-        ) from error
-    text = _read_bytes(path, NAMES_BYTES)
-    try:
-        content: Any = yaml.safe_load(text)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        reason = " ".join(str(error).split())[:100]
-        raise OptionError(f"{path} is not YAML: {reason}. {CORRECT}") from error
-    if not isinstance(content, dict) or "names" not in content:
-        return ()
-    names = class_names(content["names"])
-    if not names:
-        raise OptionError(
-            f"The names in {path} must be a list, or a table by number from 0. {CORRECT}"
-        )
-    return names
-
-
 def _lines(path: Path) -> list[str]:
     text = _read_bytes(path).decode("utf-8-sig", "replace")
     return [line for line in text.splitlines() if line.strip()]
 
 
-def _read_bytes(path: Path, limit_bytes: int = LABEL_BYTES) -> bytes:
+def _read_bytes(path: Path) -> bytes:
     try:
-        return read_whole(path, limit_bytes)
+        return read_whole(path, LABEL_BYTES)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise OptionError(f"{path} is not a file of labels: {reason}. {CORRECT}") from error

@@ -31,16 +31,10 @@ from beers_deploy.studies.detection.average_precision import (
 from beers_deploy.studies.detection.boxes import Boxes
 from beers_deploy.studies.detection.detector import Detector, class_numbers
 from beers_deploy.studies.detection.labels import read_labelled
-from beers_deploy.studies.detection.scenes import CLASSES, synthetic_scene
 from beers_deploy.studies.evaluation.methods import DEGRADED, Method, method_named
 
 REFERENCE = "reference"
 """The row of the scenes as the reference sensor sees them."""
-
-SIDE_PX = 768
-"""Of a synthetic scene: 256 pixels a side of a sensor that makes one of three, the input of the
-embedded detector.
-"""
 
 
 @dataclass(frozen=True)
@@ -48,10 +42,10 @@ class LabelledScene:
     """A scene, and the objects in it that the detector knows.
 
     Attributes:
-        name: of the file, or of the synthetic scene.
+        name: of the file.
         site: where it lies; scenes of one site are alike.
         truth: labelled boxes in scene pixels, of the detector's classes.
-        path: of the file; None of a synthetic scene.
+        path: of the file; None of a scene in memory.
         radiance: the scene (H, W) in W/m2/sr/um; a picture's white stands for the full scale of the
             sensor given.
     """
@@ -214,40 +208,6 @@ def acquired(
         range(len(scenes)),
         scenes,
     )
-
-
-def synthetic_scenes(
-    count: int, seed: int, names: Sequence[str], given: Mapping[str, str]
-) -> tuple[list[LabelledScene], list[str]]:
-    """The first synthetic scenes of a seed, each a site of its own, and sentences on what they are.
-
-    Args:
-        count: how many; the same scenes however many there are.
-        seed: other for other scenes.
-        names: of the classes that the detector knows.
-        given: of them by synthetic ones, where letters do not match.
-    """
-    numbers = class_numbers(CLASSES, names, given)
-    scenes = []
-    with steps("drawing scenes", count) as bar:
-        for number in range(count):
-            scenes.append(synthetic_labelled(number, seed, numbers))
-            bar.advance()
-    note = f"The {count} scenes are synthetic, each a site of its own: no photographs."
-    return scenes, [note, *left_out(CLASSES, numbers)]
-
-
-def synthetic_labelled(number: int, seed: int, classes: np.ndarray) -> LabelledScene:
-    """The synthetic scene of a number; no two numbers or seeds share a generator.
-
-    Args:
-        number: of the scene.
-        seed: other for other scenes of the same numbers.
-        classes: the synthetic classes as the detector's, as `class_numbers` gives them.
-    """
-    radiance, truth = synthetic_scene(np.random.default_rng([seed, number]), SIDE_PX, SIDE_PX)
-    name = f"synthetic {number}"
-    return LabelledScene(name, name, truth.renamed(classes), None, lambda _: radiance)
 
 
 def labelled_scenes(

@@ -10,8 +10,8 @@ from PIL import Image
 
 from beers_deploy.model.io.pictures import Stretch
 from beers_deploy.profiles.sensor_file import load_sensor
-from beers_deploy.studies.detection.scenes import CLASSES
-from beers_deploy.studies.detection.study import synthetic_labelled
+from benchmarks.detector.labelled import synthetic_labelled
+from benchmarks.detector.scenes import CLASSES
 
 Object = tuple[str, float, float, float, float]
 """A name, then left, top, right and bottom in continuous px."""
@@ -101,22 +101,6 @@ def coco(folder: Path) -> Path:
                 row | {"category_id": 7 + names.index(name), "iscrowd": 0}
             )
     text(folder / "labels.json", json.dumps(content))
-    return folder
-
-
-def yolo(folder: Path) -> Path:
-    """Ultralytics' folders and data.yaml."""
-    names = ["Expressway-Service-area", "ship"]
-    height, width = SIZE_PX
-    for stem, objects in OBJECTS.items():
-        image(folder / "images" / "val" / f"{stem}.png")
-        lines = [
-            f"{names.index(name)} {(x1 + x2) / 2 / width} {(y1 + y2) / 2 / height} "
-            f"{(x2 - x1) / width} {(y2 - y1) / height}"
-            for name, x1, y1, x2, y2 in objects
-        ]
-        text(folder / "labels" / "val" / f"{stem}.txt", "\n".join(lines) + "\n")
-    text(folder / "data.yaml", "val: images/val\nnames:\n  0: Expressway-Service-area\n  1: ship\n")
     return folder
 
 

@@ -3,16 +3,15 @@ sentence.
 """
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from beers_deploy.profiles.errors import ImageError, MachineError, OptionError
+from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.studies.detection.detector import class_numbers
-from beers_deploy.studies.detection.labels import LabelledSet, read_labelled, yolo_names
+from beers_deploy.studies.detection.labels import LabelledSet, read_labelled
 from tests.deploy.studies.detection.folders import (
     OBJECTS,
     Object,
@@ -22,10 +21,9 @@ from tests.deploy.studies.detection.folders import (
     text,
     voc,
     xml,
-    yolo,
 )
 
-LAYOUTS: dict[str, Callable[[Path], Path]] = {"voc": voc, "coco": coco, "yolo": yolo}
+LAYOUTS: dict[str, Callable[[Path], Path]] = {"voc": voc, "coco": coco}
 LAYOUTS["dior"] = lambda folder: dior(folder, {"test": OBJECTS})
 
 SHIP = xml([("ship", 2, 3, 12, 9)])
@@ -57,18 +55,15 @@ def test_every_layout_says_the_same_of_the_same_boxes(layout: str, tmp_path: Pat
     assert labelled.notes == []
 
 
-@pytest.mark.parametrize("layout", ["voc", "yolo", "coco"])
+@pytest.mark.parametrize("layout", ["voc", "coco"])
 def test_labels_may_lie_elsewhere(layout: str, tmp_path: Path) -> None:
     folder = LAYOUTS[layout](tmp_path / "made")
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
-    for path in folder.rglob({"voc": "*.xml", "yolo": "*.txt", "coco": "*.json"}[layout]):
+    for path in folder.rglob({"voc": "*.xml", "coco": "*.json"}[layout]):
         path.rename(elsewhere / path.name)
-    images = folder / "images" / "val" if layout == "yolo" else folder
-    if layout == "yolo":
-        text(elsewhere / "classes.txt", "Expressway-Service-area\nship\n")
     labels = elsewhere / "labels.json" if layout == "coco" else elsewhere
-    assert boxes_of(read_labelled(images, labels)) == OBJECTS
+    assert boxes_of(read_labelled(folder, labels)) == OBJECTS
 
 
 def test_dior_is_read_by_split_and_its_classes_by_their_letters(tmp_path: Path) -> None:
@@ -92,7 +87,7 @@ def test_a_split_that_is_not_there_is_named_with_those_that_are(tmp_path: Path) 
     folder = dior(tmp_path, {"test": OBJECTS})
     with pytest.raises(OptionError, match=r"one of the splits .* \(test\), but it is 'trainval'"):
         read_labelled(folder, split="trainval")
-    with pytest.raises(OptionError, match="images of the split 'test'"):
+    with pytest.raises(OptionError, match="`split` needs folders as VOC and DIOR have them"):
         read_labelled(voc(tmp_path / "plain"), split="test")
     text(folder / "ImageSets" / "Main" / "test.txt", "00001\n00777\n")
     refused(folder, "1 of 2 are missing, the first '00777'")
@@ -117,17 +112,10 @@ def test_the_four_photographs_are_read_with_their_boxes(shared_data: Path) -> No
     assert labelled.notes == []
 
 
-def test_without_labels_a_yolo_image_shows_nothing_and_a_voc_image_is_refused(
-    tmp_path: Path,
-) -> None:
-    folder = yolo(tmp_path / "yolo")
-    image(folder / "images" / "val" / "00003.png")
-    labelled = read_labelled(folder)
-    assert boxes_of(labelled)["00003"] == []
-    assert labelled.notes == ["Images without a labelled object, all found there is false: 1 of 3."]
-    image(voc(tmp_path / "voc") / "00003.png")
+def test_an_image_without_its_file_is_refused(tmp_path: Path) -> None:
+    image(voc(tmp_path) / "00003.png")
     refused(
-        tmp_path / "voc",
+        tmp_path,
         r"a file of labels for every image, but 1 of 3 are missing, the first 00003\.xml",
     )
 
@@ -159,7 +147,7 @@ def test_labels_of_an_image_of_another_size_are_refused(tmp_path: Path) -> None:
         ),
         (
             lambda folder: text(image(folder / "a.png").with_name("b.xml"), xml([])),
-            "no VOC .* labels named as one of the 1 images",
+            "1 of 1 are missing, the first a.xml",
         ),
         (
             lambda folder: text(image(folder / "a.png").with_name("a.xml"), xml([])),
@@ -215,64 +203,6 @@ def test_a_huge_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
     with (tmp_path / "a.xml").open("wb") as stream:
         stream.truncate(1 << 40)
     refused(tmp_path, "more than 8388608 bytes")
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "sentence"),
-    [
-        ("labels/val/00001.txt", "0 0.5 0.5 0.1", "YOLO's 'class cx cy w h'"),
-        ("labels/val/00001.txt", "0 30 20 10 10", "coordinates as fractions of the image, 0 to 1"),
-        (
-            "labels/val/00001.txt",
-            "2 0.5 0.5 0.1 0.1",
-            "has the class 2, but only classes from 0 to 1 have a name",
-        ),
-        ("labels/val/00001.txt", "0.5 0.5 0.5 0.1 0.1", "has the class 0.5, .* 0 to 1"),
-        ("labels/val/00001.txt", "ship 0.5 0.5 0.1 0.1", "numbers as class and coordinates"),
-        (
-            "data.yaml",
-            "names: {0: ship, 2: tank}",
-            "names in .* must be a list, or a table by number from 0",
-        ),
-        ("data.yaml", "names: [ship", "is not YAML"),
-        ("data.yaml", "names: !!python/object/apply:os.system [true]", "is not YAML"),
-        (
-            "data.yaml",
-            "a: &a [x, x]\nb: &b [*a, *a]\nnames: [*b, *b]",
-            "names in .* must be a list, or a table",
-        ),
-        ("data.yaml", "path: here", "data.yaml or classes.txt with the names"),
-        ("data.yaml", "[" * 5000, "is not YAML"),
-        ("data.yaml", "names: [" + "ab, " * 20000 + "]", "more than 65536 bytes"),
-    ],
-)
-def test_a_faulty_text_is_refused_by_a_sentence(
-    name: str, content: str, sentence: str, tmp_path: Path
-) -> None:
-    text(yolo(tmp_path) / name, content)
-    refused(tmp_path, sentence)
-
-
-def test_an_outline_of_yolo_is_enclosed(tmp_path: Path) -> None:
-    folder = yolo(tmp_path)
-    text(folder / "labels" / "val" / "00001.txt", "1 0.5 0 0.75 0.5 0.5 1 0.25 0.5\n")
-    assert read_labelled(folder).images[0][1].corners.tolist() == [[15, 0, 45, 40]]
-
-
-def test_names_stand_in_a_list_a_table_or_lines(tmp_path: Path) -> None:
-    text(tmp_path / "a" / "data.yaml", "names: [ship, tank]")
-    text(tmp_path / "b" / "data.yml", "names: {1: tank, 0: ship}")
-    text(tmp_path / "c" / "classes.txt", "ship\ntank\n")
-    assert {yolo_names([tmp_path / name]) for name in "abc"} == {("ship", "tank")}
-    assert yolo_names([tmp_path / "none", tmp_path / "c"]) == ("ship", "tank")
-
-
-def test_without_pyyaml_it_is_said_how_to_do_without(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "yaml", None)
-    with pytest.raises(MachineError, match=r"beers-deploy\[detect\]', or write classes.txt"):
-        read_labelled(yolo(tmp_path))
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from beers_deploy.model.simulator.procedural import turn
 from beers_deploy.studies.detection.boxes import Boxes
-from beers_deploy.studies.detection.scenes import (
+from benchmarks.detector.scenes import (
     CLASSES,
     SCENE_GSD_M,
     Canvas,
