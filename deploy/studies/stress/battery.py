@@ -246,8 +246,8 @@ TITLES = {  # of the sections that are shown, by the names of their tables in th
 }
 NOTES = {
     "battery": "`ok`: every check holds; `limit`: only what a known limitation explains does "
-    "not; `-`: not looked "
-    "at, for whole numbers know no missing pixels and the others are refused before.",
+    "not; `-`: not checked, because integers cannot represent missing pixels, and other invalid "
+    "pixels are refused earlier.",
     "bit flips": "PSNR, mean and range over patches and injections; one kind of memory at a "
     "time. `clamped`: ReLU6 "
     "and the limit of the correction. `all guards`: scrubbing and triple modular redundancy "
@@ -256,7 +256,7 @@ NOTES = {
     "guards": "ReLU6 only where calibration stays below 96 units. Three rows are the host's "
     "time; the DPU is busy "
     "meanwhile, so nothing is lost while the host has time left.",
-    "integer layers": "Intervals of whole numbers through the file's weights: true of every image.",
+    "integer layers": "Intervals of integers through the file's weights: true of every image.",
 }
 
 
