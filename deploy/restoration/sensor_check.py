@@ -139,7 +139,7 @@ class SensorCheck:
         """For a row of results: whether the image contradicts its sensor, and how."""
         is_measured = any(figure.value is not None for figure in self.figures.values())
         words = "; ".join(self.doubts) or ("agrees" if is_measured else "cannot be seen")
-        return {"sensor told": words} if self.figures else {}
+        return {"sensor check": words} if self.figures else {}
 
     def settled(self, name: str, sensor: str, strict: bool) -> "SensorCheck":
         """Return this check, and log a warning for each contradiction.

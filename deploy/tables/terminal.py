@@ -144,7 +144,8 @@ def _add_figures(table: Table, heading: Sequence[str], cells: Sequence[Text]) ->
     lines = [*heading, *chain.from_iterable(cell.plain.split("\n") for cell in cells)]
     least = max(map(cell_len, lines), default=0)
     text = Text("\n").join(map(plain, heading))
-    table.add_column(text, justify="right", overflow="fold", min_width=least)
+    # With a width of its own the column is not narrowed where the table is too wide.
+    table.add_column(text, justify="right", overflow="fold", width=least)
 
 
 def _add_words(table: Table, heading: str, cells: Sequence[Text]) -> None:

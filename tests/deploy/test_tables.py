@@ -90,6 +90,19 @@ def test_no_number_of_many_rows_is_cut_or_broken(width: int, count: int) -> None
     assert all(text.count(f"C32B{k}") == 1 for k in range(count))
 
 
+@given(st.integers(40, 200))
+def test_long_names_give_way_before_a_figure_is_cut(width: int) -> None:
+    """Names are wrapped, and the figures next to them are wide: each has its interval and mode."""
+    figures = {f"figure {k}": predicted(913_456, "px", (503_456, 1_660_123), "m") for k in range(4)}
+    stated = {key: published(77_777, "px", "paper") for key in figures}
+    name = "convbeers-s, INT8 on the DPU (C32B3), whole tiles, halo 22 px"
+    rows = [Row("t", f"{name}, {k}", figures if k else stated) for k in range(6)]
+    text = shown(rows, width)
+    assert text.count("1,660,000]") == 5 * 4
+    assert text.count("77,777") == 4
+    assert text.count("predicted") - text.count("predicted by") == 5 * 4
+
+
 def test_a_missing_figure_is_a_dash_with_its_reason_once() -> None:
     rows = [Row("t", "one", {"power": unavailable("W", "no counter")})] * 2
     text = shown(rows, 80)

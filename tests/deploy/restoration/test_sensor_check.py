@@ -43,7 +43,7 @@ def check(
 def test_the_true_sensor_is_found_again(raw: np.ndarray) -> None:
     result = check(raw)
     assert result.doubts == ()
-    assert result.text == {"sensor told": "agrees"}
+    assert result.text == {"sensor check": "agrees"}
     low, high = result.figures["SNR seen"].interval or (0, 0)
     assert 0 < high - low < 0.5 * high
     # Left-justified, and with missing pixels of any value: the same image of the same sensor.
@@ -103,7 +103,7 @@ def test_what_cannot_be_seen_is_no_contradiction() -> None:
         generator.integers(400, 500, (19, 23)).astype(np.uint16),
     ):
         result = check(image)
-        assert result.text["sensor told"] in ("cannot be seen", *result.doubts)
+        assert result.text["sensor check"] in ("cannot be seen", *result.doubts)
         assert all(
             figure.mode == "unavailable" and figure.reason for figure in result.figures.values()
         )
@@ -149,7 +149,7 @@ def test_pairs_are_compared_with_the_sensor_before_an_evaluation(tmp_path: Path)
     assert "contradicts the sensor wrong" in refused(*words, "--sensor", profile, "--strict")
     result = bd.evaluate(methods=["degraded"], pairs=pairs, sensor=SENSOR, strict=True)
     assert next(row for row in result.rows if "sensor" in row.table).text == {
-        "sensor told": "agrees"
+        "sensor check": "agrees"
     }
 
 
