@@ -82,9 +82,15 @@ def _layouts(rows: Sequence[Row]) -> Iterator[Table]:
 
 
 def _fits(table: Table, console: Console) -> bool:
+    """Return True if a table fits with each figure whole; names then give way before figures."""
     # On its own console, the least width of a table never exceeds the console's.
     wide = console.options.update(width=10 * PIPE_WIDTH)
-    return Measurement.get(console, wide, table).minimum <= console.width
+    needed = Measurement.get(console, wide, table)
+    if needed.maximum > console.width:
+        # rich narrows the widest columns, whatever their least width, unless it is fixed.
+        for column in table.columns:
+            column.width = column.min_width if column.justify == "right" else None
+    return needed.minimum <= console.width
 
 
 def _empty() -> Table:
@@ -144,8 +150,7 @@ def _add_figures(table: Table, heading: Sequence[str], cells: Sequence[Text]) ->
     lines = [*heading, *chain.from_iterable(cell.plain.split("\n") for cell in cells)]
     least = max(map(cell_len, lines), default=0)
     text = Text("\n").join(map(plain, heading))
-    # With a width of its own the column is not narrowed where the table is too wide.
-    table.add_column(text, justify="right", overflow="fold", width=least)
+    table.add_column(text, justify="right", overflow="fold", min_width=least)
 
 
 def _add_words(table: Table, heading: str, cells: Sequence[Text]) -> None:

@@ -65,7 +65,7 @@ def test_quantize_reports_layers(tmp_path: Path) -> None:
     done("quantize", tmp_path / "f.onnx", *outputs, "--report", tmp_path / "r", *patches)
     document = valid(tmp_path / "q.json")
     tables = [row["table"] for row in document["rows"]]
-    assert tables.count("integer layers") == 8
+    assert tables.count("integer layers") == 7
     for row in document["rows"]:
         if row["table"] == "integer layers":
             figures = row["figures"]

@@ -154,7 +154,7 @@ def test_without_references_it_comes_back_towards_the_float_network(
     quantised: Quantised, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
 ) -> None:
     bad = spoilt(quantised.core)
-    tuned = trained(bad, float_onnx, Tuning(alone(patches), 40, rate=0.3))
+    tuned = trained(bad, float_onnx, Tuning(alone(patches), 40, rate=0.1))
     assert difference(tuned, quantised.core, unseen) < 0.7 * difference(bad, quantised.core, unseen)
     assert shift_faults(tuned) == []
     assert tuned.frac_bits == quantised.core.frac_bits
@@ -209,17 +209,6 @@ def test_the_same_seed_gives_the_same_numbers(
         return bytes(model.host.SerializeToString())
 
     assert made(1) == made(1)
-
-
-@pytest.mark.slow
-def test_the_last_sum_keeps_the_room_it_was_given(
-    float_onnx: onnx.ModelProto, patches: Patches
-) -> None:
-    plain = quantise_model(float_onnx, patches, {})
-    tuned = quantise_model(float_onnx, patches, {}, tuning=Tuning(patches.pairs, 3, rate=0.3))
-    both = list(zip(plain.core.convolutions, tuned.core.convolutions, strict=True))
-    same = {one.output for one, other in both if np.array_equal(one.weight, other.weight)}
-    assert same == set(plain.core.ops[-2].inputs)
 
 
 @pytest.mark.parametrize(("side", "looked_at"), [(4 * BORDER_PX, False), (4 * BORDER_PX - 1, True)])

@@ -236,6 +236,7 @@ def weigh(
     rows = (Row("recommended", name, figures, {"line": line}), *by_board, *numbered, *every)
     fits = Check("points within budget and need", int(best is not None), 1, "point", "at least")
     return Tradeoff(
+        command="tradeoff",
         title="what accuracy costs in time",
         rows=rows,
         checks=(fits,),

@@ -94,7 +94,7 @@ def test_dior_s_tree_is_read_and_nothing_in_it_is_written_over(tmp_path: Path) -
         (["--classes", "lorry=vehicle"], "'lorry' in --classes"),
         (["--images", "none"], "none"),
         (["--labels", "none"], "none does not exist"),
-        (["--split", "val"], "no images of the split 'val'"),
+        (["--split", "val"], "--split needs folders as VOC and DIOR have them"),
         (["--side", "128"], "--side must be 256 px"),
         (["--sweep"], "--sweep has no effect with --detector"),
         (["--brightness", "0.5"], "--brightness has no effect with --detector"),
