@@ -25,7 +25,7 @@ from beers_deploy.quant.calibration import unseen_patches
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.passes.selection import ALL, Passes
-from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.samples import samples_of
 from beers_deploy.quant.session import open_any_size, open_session, result_of
 from beers_deploy.quantization import family_model
@@ -77,7 +77,7 @@ def small(name: str, arguments: argparse.Namespace, folder: Path) -> Loss:
     in_float = partial(result_of, open_session(model))
 
     def loss_of(passes: Passes) -> float:
-        host = quantise_model(model, patches, {}, passes=passes).host
+        host = quantize_model(model, patches, {}, passes=passes).host
         in_int8 = partial(result_of, open_session(host))
         return float(losses(in_float, in_int8, held).mean())
 

@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 
 COMMAND = [sys.executable, "-c", "from beers_deploy.cli.commands import app; app()"]
-IMPORTS = [sys.executable, "-c", "import beers_deploy.quant.quantise"]
+IMPORTS = [sys.executable, "-c", "import beers_deploy.quant.quantize"]
 CASES = ((64, 128), (1024, 128), (16, 640))
 """Number of patches, and their side in pixels."""
 

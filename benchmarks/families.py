@@ -48,7 +48,7 @@ from beers_deploy.model.training.source import PatchSource
 from beers_deploy.network import Network
 from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.quant.calibration import Calibration, draw_patches
-from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.tiling.walk import tiling_of
 
@@ -286,7 +286,7 @@ def main() -> None:
         weights_file = arguments.out / f"{name}.safetensors"
         network = trained(name, source, arguments.steps, weights_file, arguments.device)
         model = Network.load(network).model
-        int8 = quantise_model(model, patches, {}).host
+        int8 = quantize_model(model, patches, {}).host
         scores = [psnr_cell(network, judging) for network in (model, int8)]
         weights = sum(parameter.numel() for parameter in network.parameters()) / 1e3
         cells = [name, f"{weights:.0f}", str(tiling_of(int8).halo_px), *scores, swath_cell(int8)]

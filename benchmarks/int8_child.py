@@ -39,7 +39,7 @@ def main() -> None:
 
 def ours(network: Path, images: np.ndarray, out: Path) -> None:
     """The host file of `quantize`, of these images (K, 1, H, W) in [0, 1]."""
-    from beers_deploy.quant.quantise import quantise_model
+    from beers_deploy.quant.quantize import quantize_model
     from beers_deploy.quant.samples import Patches, Remade
 
     def image(number: int) -> np.ndarray:
@@ -48,7 +48,7 @@ def ours(network: Path, images: np.ndarray, out: Path) -> None:
     count = len(images)
     patches = Patches([], Remade(lambda k: (image(k), image(k)), count), Remade(image, count))
     model = onnx.load(network)
-    onnx.save(quantise_model(model, patches, {}).host, out)
+    onnx.save(quantize_model(model, patches, {}).host, out)
 
 
 def onnxruntimes(way: str, network: Path, inputs: np.ndarray, out: Path) -> None:

@@ -143,7 +143,7 @@ def _against(reference: np.ndarray, both: list[np.ndarray]) -> list[float]:
     return [*(psnr_db(result, reference, 1.0) for result in both), float(np.mean(similarity))]
 
 
-def quantise(
+def quantize_in_child(
     way: Way, files: dict[bool, tuple[Path, Path]], out: Path, python: str
 ) -> tuple[float, float]:
     """Run one way; seconds and peak MB.
@@ -283,7 +283,7 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
             continue
         out = folder / f"{number:02d}-{way.name.replace(' ', '-')}-{graph}.onnx"
         try:
-            seconds, peak_mb = quantise(way, files, out, python)
+            seconds, peak_mb = quantize_in_child(way, files, out, python)
         except RuntimeError as error:
             yield f"| {way.name} | {graph} | unavailable: {error} |{' |' * (len(COLUMNS) - 3)}"
             continue

@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from characterise import LEAST_SIDE_PX, LIKE, RATIO, draw
+from characterize import LEAST_SIDE_PX, LIKE, RATIO, draw
 from scipy.ndimage import gaussian_filter, shift
 
 from beers_deploy.model.raster.facts import Raster

@@ -27,7 +27,7 @@ from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import Variant
 from beers_deploy.performance.swath import PAPER_SIZE, Swath, parse_size, swath_latency
-from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.samples import Patches, Remade
 from beers_deploy.quant.tiling.walk import tiling_of
 
@@ -82,7 +82,7 @@ def int8(variant: Variant) -> onnx.ModelProto:
     patches = Patches([], Remade(lambda _: (image, image), 1), Remade(lambda _: image, 1))
     # The search does not try channels one by one.
     with patch("beers_deploy.quant.passes.equalise.MOST_CHANNELS", 0):
-        return quantise_model(to_onnx(network.eval(), {}), patches, {}).host
+        return quantize_model(to_onnx(network.eval(), {}), patches, {}).host
 
 
 def on_a_swath(

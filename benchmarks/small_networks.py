@@ -31,7 +31,7 @@ from beers_deploy.model.metrics.fidelity import psnr_db
 from beers_deploy.quant.ends import ends_of
 from beers_deploy.quant.graph import read_network
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
-from benchmarks.int8_peers import OURS, QUARK, Peered, Restore, Way, print_lines, quantise
+from benchmarks.int8_peers import OURS, QUARK, Peered, Restore, Way, print_lines, quantize_in_child
 from examples.networks import ESPCN, DnCNN
 from examples.samples import batches_of
 
@@ -237,7 +237,7 @@ def cells(
         seconds = fine_tune(path, samples[True], out)
     else:
         np.save(patches, samples[False].images)
-        seconds, _ = quantise(way, {False: (path, patches)}, out, python)
+        seconds, _ = quantize_in_child(way, {False: (path, patches)}, out, python)
     sample_losses = losses(network.runner(path), network.runner(out), held_out)
     print(name, way.name, f"{seconds:.0f} s", file=sys.stderr)
     return f"{sample_losses.mean():.2f}, {sample_losses.max():.2f}"

@@ -15,7 +15,7 @@ from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.gate import METRICS, GateResult, verdict_row
 from beers_deploy.quant.gate import compare as differences_of
-from beers_deploy.quant.onnx_file import faults_named, metadata, require_quantised
+from beers_deploy.quant.onnx_file import faults_named, metadata, require_quantized
 from beers_deploy.quant.sample_range import range_row, recorded_range, uncovered
 from beers_deploy.quant.samples import CALIBRATED_ON, digest_of, samples_of
 from beers_deploy.quant.session import open_any_size
@@ -176,8 +176,8 @@ def pair_of(
         VARIANT if float_network is None else float_network, sensor=sensor, int8=False
     )
     int8 = Network.load(int8_network, sensor=sensor, int8=True)
-    require_quantised(floating.model, floating.label, wanted=False)
-    require_quantised(int8.model, int8.label, wanted=True)
+    require_quantized(floating.model, floating.label, wanted=False)
+    require_quantized(int8.model, int8.label, wanted=True)
     return floating, int8
 
 

@@ -31,7 +31,7 @@ from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 from beers_deploy.quant.encodings import board_model, read_core, vint8_model
 from beers_deploy.quant.onnx_file import (
     fixed_tile_px,
-    is_quantised,
+    is_quantized,
     load_onnx,
     metadata,
     read_onnx,
@@ -47,7 +47,7 @@ from beers_deploy.results import Input, Table
 if TYPE_CHECKING:
     import torch
 
-    from beers_deploy.quant.quantise import Quantised
+    from beers_deploy.quant.quantize import Quantised
 
 NetworkLike = Union["Network", onnx.ModelProto, "torch.nn.Module", str, os.PathLike[str]]
 SensorLike = Sensor | str | os.PathLike[str]
@@ -82,7 +82,7 @@ class Network:
     path: Path | None = None
     origin: "Network | None" = None
     layers: tuple[Row, ...] = ()
-    quantised: "Quantised | None" = None
+    quantized: "Quantised | None" = None
     file_sha256: str = ""
     weights: Conditioned | None = None
     profile: Sensor | None = None
@@ -205,7 +205,7 @@ class Network:
     @property
     def precision(self) -> str:
         """float32 or int8."""
-        return "int8" if is_quantised(self.model) else "float32"
+        return "int8" if is_quantized(self.model) else "float32"
 
     @cached_property
     def tiling(self) -> Tiling:

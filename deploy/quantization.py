@@ -28,9 +28,9 @@ from beers_deploy.quant.core import SHIFTS, Shifts, target_shifts
 from beers_deploy.quant.encodings import host_model, read_core
 from beers_deploy.quant.gate import GateResult, compare, gate_row
 from beers_deploy.quant.integer.reference import integer_rows
-from beers_deploy.quant.onnx_file import faults_named, load_onnx, metadata, require_quantised
+from beers_deploy.quant.onnx_file import faults_named, load_onnx, metadata, require_quantized
 from beers_deploy.quant.passes.selection import ALL, Passes
-from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.samples import OwnSamples, samples_of
 from beers_deploy.quant.sensitivity import (
     WORST,
@@ -110,7 +110,7 @@ class Data:
         return data_inputs(self.images, Path(str(self.samples)) if named else None)
 
 
-def quantised(
+def quantized(
     network: NetworkLike, data: Data, target: TargetProfile, finetune: int | str
 ) -> tuple[Network, "Patches | None"]:
     """Quantise a float network; the INT8 one knows its `origin`.
@@ -138,17 +138,17 @@ def quantised(
             f"sensor is calibrated over the whole family of sensors at once. Leave {unfit} out."
         )
     origin = Network.load(network, sensor=data.sensor)
-    require_quantised(origin.model, origin.label, wanted=False)
+    require_quantized(origin.model, origin.label, wanted=False)
     with faults_named(origin.label):
         if banked:
-            int8 = quantise_conditioned(banked, origin, data.simulated, data.sensor, target)
+            int8 = quantize_conditioned(banked, origin, data.simulated, data.sensor, target)
             return int8, None
         # Samples in memory may be given one after the other, so they are read only here.
         source = data.source_for(origin.model)
-        return quantise_alone(origin, source, target, steps), source.unseen
+        return quantize_alone(origin, source, target, steps), source.unseen
 
 
-def quantise_alone(
+def quantize_alone(
     origin: Network, calibration: Source, target: TargetProfile, steps: int | None
 ) -> Network:
     """Quantise a network that is calibrated by itself.
@@ -168,15 +168,15 @@ def quantise_alone(
         tuning = Tuning(calibration.for_tuning.pairs, steps)
     with progress("calibrating"):
         about = {**calibration.about, "target": target.name}
-        result = quantise_model(origin.model, calibration.drawn, about, shifts, tuning)
+        result = quantize_model(origin.model, calibration.drawn, about, shifts, tuning)
         step("statistics of each layer")
         layers = integer_rows(origin.model, result.core, result.host, calibration.drawn.degraded)
     return Network(
-        result.host, f"{origin.name}-int8", origin=origin, layers=layers, quantised=result
+        result.host, f"{origin.name}-int8", origin=origin, layers=layers, quantized=result
     )
 
 
-def quantise_conditioned(
+def quantize_conditioned(
     network: Conditioned,
     origin: Network,
     calibration: "Calibration",
@@ -232,11 +232,11 @@ def sensitivity_report(
         differences: that were measured on them.
         more: rows that the page shows behind.
     """
-    assert network.origin is not None and network.quantised is not None  # noqa: S101, PT018
+    assert network.origin is not None and network.quantized is not None  # noqa: S101, PT018
     sessions = open_any_size(network.origin.model), open_any_size(network.model)
     spread = spread_of(*sessions, held_out.degraded)
     worst = spread.worst(WORST)
-    layers = layer_error_rows(network.quantised, held_out)
+    layers = layer_error_rows(network.quantized, held_out)
     rows = [
         gate_row(differences),
         *layers,
@@ -292,7 +292,7 @@ def family_model(
     """
     # This loads SciPy, which samples of one's own do without.
     from beers_deploy.model.simulator.procedural import load_scenes
-    from beers_deploy.quant.banked.calibrate import family_images, quantise_family
+    from beers_deploy.quant.banked.calibrate import family_images, quantize_family
 
     weights = read_conditioned(network.weights)
     aim = load_sensor(REFERENCE).nominal()
@@ -305,7 +305,7 @@ def family_model(
     with progress(f"calibrating {network.name} over the family of sensors"):
         family_patches = family_images(scenes, scale, seed, weights.kernels)
         middle = bank_of_vector((0.0,) * len(RANGES), weights.kernels)
-        family = quantise_family(weights, middle, family_patches, shifts, passes)
+        family = quantize_family(weights, middle, family_patches, shifts, passes)
     description = {
         "variant": network.name,
         "reference": REFERENCE,

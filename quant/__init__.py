@@ -3,7 +3,7 @@
 float ONNX (`onnx_file`) -> `graph` -> `calibration` -> `passes` -> integer `core` -> two
 `encodings`: the host's file for onnxruntime, the board's for its own flow
 
-- `quantise` does it in one call;
+- `quantize` does it in one call;
 - `session` runs networks on onnxruntime, `kernels` in ways that add exactly on this processor;
 - `integer` is the core's arithmetic in whole numbers, `bounds` proves what holds for any input;
 - `gate` and `structure` judge an INT8 file, `sensitivity` says which layers err;

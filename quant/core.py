@@ -32,7 +32,7 @@ CANDIDATES = 6
 """Scales tried: the one that clips nothing, and the finer ones after it."""
 
 
-def quantise(values: np.ndarray, frac_bits: int) -> np.ndarray:
+def quantize(values: np.ndarray, frac_bits: int) -> np.ndarray:
     """Whole numbers in [-128, 127], rounded half away from zero as the DPU does for weights and
     bias.
     """
@@ -157,7 +157,7 @@ class IntCore:
         return [op for op in self.ops if isinstance(op, IntConv)]
 
 
-def dequantised(op: Conv, whole: IntConv) -> Conv:
+def dequantized(op: Conv, whole: IntConv) -> Conv:
     """The same convolution in float, with the values that its int8 weights and bias stand for."""
     weight = (whole.weight * 2.0**-whole.weight_frac_bits).astype(np.float32)
     return replace(op, weight=weight, bias=whole.float_bias.astype(np.float32))
@@ -211,7 +211,7 @@ def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts, ends:
     ops: list[IntConv | Op] = []
     for op in graph:
         if isinstance(op, Conv):
-            ops.append(_quantise_conv(op, frac_bits, shifts))
+            ops.append(_quantize_conv(op, frac_bits, shifts))
             continue
         if isinstance(op, Add):
             _move_add(op, frac_bits, shifts)
@@ -225,7 +225,7 @@ def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts, ends:
     return IntCore(tuple(ops), dict(frac_bits), ends)
 
 
-def _quantise_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts) -> IntConv:
+def _quantize_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts) -> IntConv:
     # With finer weights the shift would be beyond its window, and the result's scale would have to
     # become finer too, so that it clips.
     finest = shifts.cut[1] + frac_bits[op.output] - frac_bits[op.input]
@@ -237,8 +237,8 @@ def _quantise_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts) -> IntCo
     product = weight_frac_bits + frac_bits[op.input]
     cut = clamp(product - frac_bits[op.output], shifts.cut)
     frac_bits[op.output] = product - cut
-    weight = quantise(op.weight, weight_frac_bits)
-    bias, bias_frac_bits = quantise_bias(op.bias, product, shifts)
+    weight = quantize(op.weight, weight_frac_bits)
+    bias, bias_frac_bits = quantize_bias(op.bias, product, shifts)
     kind = (_activation(op, frac_bits[op.output]), op.window, op.groups, op.transposed)
     return IntConv(
         op.name, op.input, op.output, weight, weight_frac_bits, bias, bias_frac_bits, *kind
@@ -253,7 +253,7 @@ def _activation(op: Conv, frac_bits: int) -> Activation:
     return Activation.relu if op.activation is Activation.relu6 and ends_first else op.activation
 
 
-def quantise_bias(
+def quantize_bias(
     bias: np.ndarray, product: int, shifts: Shifts = SHIFTS
 ) -> tuple[np.ndarray, int]:
     """An int8 bias (O,) and its scale, within reach of the accumulator's
@@ -262,7 +262,7 @@ def quantise_bias(
     # Any scale holds zeros; the accumulator's own needs no shift.
     best = best_frac_bits(bias) if bias.any() else product
     frac_bits = product - clamp(product - best, shifts.bias)
-    return quantise(bias, frac_bits), frac_bits
+    return quantize(bias, frac_bits), frac_bits
 
 
 def _move_add(op: Add, frac_bits: dict[str, int], shifts: Shifts) -> None:

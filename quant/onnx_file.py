@@ -74,7 +74,7 @@ def _simplest(model: onnx.ModelProto, where: str, to_run: bool) -> onnx.ModelPro
     try:
         # First, because folding removes the Dropout and BatchNormalization that show the mode.
         require_inference(model, where)
-        if is_quantised(model):
+        if is_quantized(model):
             return model
         check_runnable(model, where)
         return simplest(model, where)
@@ -264,7 +264,7 @@ def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
     return copy
 
 
-def is_quantised(model: onnx.ModelProto) -> bool:
+def is_quantized(model: onnx.ModelProto) -> bool:
     """Whether any node computes on, makes or reads quantised numbers."""
     kinds = {node.op_type.lower() for node in model.graph.node}
     marks = ("qlinear", "quantizelinear", "integer")
@@ -286,9 +286,9 @@ def faults_named(label: str) -> Iterator[None]:
         raise ModelError(f"{label}: {error}") from error
 
 
-def require_quantised(model: onnx.ModelProto, name: str, wanted: bool) -> None:
+def require_quantized(model: onnx.ModelProto, name: str, wanted: bool) -> None:
     """Raise ModelError if the float and the INT8 network are swapped."""
-    if is_quantised(model) != wanted:
+    if is_quantized(model) != wanted:
         kinds = ("a float network", "an INT8 network")
         raise ModelError(
             f"{name} must be {kinds[wanted]}, but it is {kinds[not wanted]}. Give the float model "

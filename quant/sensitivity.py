@@ -16,7 +16,7 @@ from onnx import TensorProto, helper
 
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.profiles.sensor import MAX_DN, Instrument
-from beers_deploy.quant.core import IntConv, IntCore, dequantised, rounded_to
+from beers_deploy.quant.core import IntConv, IntCore, dequantized, rounded_to
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.gate import GateResult
 from beers_deploy.quant.graph import (
@@ -32,7 +32,7 @@ from beers_deploy.quant.graph import (
     tensors,
     ties_scales,
 )
-from beers_deploy.quant.quantise import Quantised
+from beers_deploy.quant.quantize import Quantised
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import (
     few_crops,
@@ -124,7 +124,7 @@ def layer_errors(
     # The same convolutions, by their side, with the values that their int8 weights and biases stand
     # for.
     twins = tuple(
-        replace(dequantised(op, int_op), name=op.name + IN_INT8, output=op.output + IN_INT8)
+        replace(dequantized(op, int_op), name=op.name + IN_INT8, output=op.output + IN_INT8)
         for op, int_op in zip(graph, core.ops, strict=True)
         if isinstance(op, Conv) and isinstance(int_op, IntConv)
     )

@@ -29,7 +29,7 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.graph.writer import graph_to_onnx
 from beers_deploy.quant.kernels import filled, made_exact
-from beers_deploy.quant.onnx_file import any_size, fixed_tile_px, is_quantised, load_onnx
+from beers_deploy.quant.onnx_file import any_size, fixed_tile_px, is_quantized, load_onnx
 from beers_deploy.quant.untrusted import contradictions, times
 
 
@@ -67,10 +67,10 @@ def open_session(
     # Outside `contradictions`: the processor is asked with a network of its own, whose faults are
     # not this file's.
     if exact is None:
-        exact = is_quantised(network) and not int8_adds_exactly()
+        exact = is_quantized(network) and not int8_adds_exactly()
     with contradictions(name):
         network = filled(network) if optimise else network
-        if exact and is_quantised(network):
+        if exact and is_quantized(network):
             network, _ = made_exact(network)
     try:
         return ort.InferenceSession(

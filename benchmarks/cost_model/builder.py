@@ -199,7 +199,7 @@ class Builder:
             self.out(last)
         names = tuple(self._read_bytes)
         net = Network(
-            tuple(self._operations), {self.image.name: self.image.shape}, names, quantised=False
+            tuple(self._operations), {self.image.name: self.image.shape}, names, quantized=False
         )
         return Written(net, self._read_bytes)
 

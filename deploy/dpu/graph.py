@@ -9,7 +9,7 @@ import numpy as np
 
 from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.graph.nodes import Kind, Shape, Window
-from beers_deploy.quant.graph.quantised import Scale
+from beers_deploy.quant.graph.quantized import Scale
 
 __all__ = ["CONVOLUTIONS", "Kind", "Network", "Operation", "Scale", "Shape", "Window"]
 
@@ -75,7 +75,7 @@ class Network:
     operations: tuple[Operation, ...]
     inputs: Mapping[str, Shape]
     outputs: tuple[str, ...]
-    quantised: bool
+    quantized: bool
 
 
 def _pixels(name: str, shape: Shape | None) -> int:

@@ -20,7 +20,7 @@ from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.encodings import BORDER_PX, PLACE_PX, as_on_board
 from beers_deploy.quant.graph.moves import with_shuffles
 from beers_deploy.quant.graph.nodes import Kind, Node, OnnxGraph, kind_of, out_shape
-from beers_deploy.quant.graph.quantised import Integers
+from beers_deploy.quant.graph.quantized import Integers
 from beers_deploy.quant.onnx_file import load_onnx, metadata
 from beers_deploy.quant.untrusted import contradictions
 

@@ -22,7 +22,7 @@ from beers_deploy.performance.timing import interleaved
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.quant.onnx_file import is_quantised
+from beers_deploy.quant.onnx_file import is_quantized
 from beers_deploy.quant.session import open_session, require_finite
 
 
@@ -75,7 +75,7 @@ def _row(run: Timed, tile_px: int, conditions: Mapping[str, Figure]) -> Row:
 
 def _ratio_row(runs: Sequence[Timed]) -> Row:
     # False sorts before True: the INT8 network comes first.
-    int8, float32 = sorted(runs, key=lambda run: not is_quantised(run.model))
+    int8, float32 = sorted(runs, key=lambda run: not is_quantized(run.model))
     ratio = statistics.median(float32.times_s) / statistics.median(int8.times_s)
     source = f"medians of {len(int8.times_s)} runs each, interleaved"
     return Row("host", "float32 time / INT8 time, here", {"ratio": measured(ratio, "x", source)})

@@ -19,7 +19,7 @@ from beers_deploy.cluster import Cluster
 from beers_deploy.model.processor import asked, require_cores
 from beers_deploy.profiles.errors import ModelError, optional, reason_of
 from beers_deploy.quant.kernels import made_exact
-from beers_deploy.quant.onnx_file import is_quantised, parse_onnx
+from beers_deploy.quant.onnx_file import is_quantized, parse_onnx
 from beers_deploy.quant.session import open_session, tensors_of
 
 Runtime = Literal["onnxruntime", "openvino"]
@@ -63,7 +63,7 @@ def open_openvino(model: onnx.ModelProto, threads: int, at_once: int = 1) -> tup
         "ENABLE_CPU_PINNING": False,
     }
     options |= {"INFERENCE_NUM_THREADS": str(threads)} if threads else {}
-    exact = model if not is_quantised(model) or _adds_exactly(core) else made_exact(model)[0]
+    exact = model if not is_quantized(model) or _adds_exactly(core) else made_exact(model)[0]
     content = saturating_adds(exact).SerializeToString()
 
     @lru_cache(maxsize=2)

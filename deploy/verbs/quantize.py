@@ -109,7 +109,7 @@ def quantize(
     from beers_deploy.quant.encodings import read_core
     from beers_deploy.quant.onnx_file import metadata, require_onnx_name
     from beers_deploy.quant.sample_range import recorded_range
-    from beers_deploy.quantization import Data, quantised
+    from beers_deploy.quantization import Data, quantized
     from beers_deploy.results import Table
 
     if board_file is None:
@@ -131,7 +131,7 @@ def quantize(
     data = Data(
         Sensor.load(sensor), samples, None if images is None else Path(images), patches, patch, seed
     )
-    result, held_out = quantised(network, data, board, finetune)
+    result, held_out = quantized(network, data, board, finetune)
     # Both are made before the first is written: a core that is refused leaves no file.
     core = result.core(board, tile) if files[1] else None
     if files[0] is not None:
@@ -208,14 +208,14 @@ def _judged(
     from beers_deploy.quantization import differences_of, sensitivity_report
     from beers_deploy.report.page import write_report
 
-    assert network.quantised is not None  # noqa: S101 - it was quantised here
+    assert network.quantized is not None  # noqa: S101 - it was quantised here
     differences = differences_of(network, held_out, simulated)
     rows: list[Row] = []
     if page is not None:
         rows, report = sensitivity_report(network, held_out, differences, network.layers)
         write_report(report, page)
         logger.info("wrote %s: %s", page, report.headline)
-    return rows, losses(network.quantised, differences, held_out)
+    return rows, losses(network.quantized, differences, held_out)
 
 
 def _report_files(folder: OutputFolder | None, network: Any) -> list[Path]:

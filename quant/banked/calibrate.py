@@ -28,7 +28,7 @@ from beers_deploy.quant.banked.filters import (
     whole_bank,
 )
 from beers_deploy.quant.calibration import draw_patches
-from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, Shifts, quantise_bias
+from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, Shifts, quantize_bias
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import (
     CORRECTION,
@@ -48,7 +48,7 @@ from beers_deploy.quant.integer.arithmetic import convolve
 from beers_deploy.quant.passes.level import Chain
 from beers_deploy.quant.passes.selection import ALL, Passes
 from beers_deploy.quant.passes.stream import lone_tensors, streams
-from beers_deploy.quant.quantise import Plan, rounded
+from beers_deploy.quant.quantize import Plan, rounded
 from beers_deploy.quant.samples import PATCH_PX, Remade
 
 LIKE = "pleiades-degraded"
@@ -98,7 +98,7 @@ def _analytic(scale: int, result: int, shifts: Shifts, kernels: Kernels) -> IntC
     weight[fine:, rows, inputs - 1, rows] = 2**shift if coarse else 0
     # Rounded at other places of a step each time, the copies hold together what one cannot.
     offsets = np.repeat(np.array(spread_over_a_step(fine) + [0.0] * coarse), pixels)
-    bias = quantise_bias(offsets * 2.0**-result, shift + result, shifts)
+    bias = quantize_bias(offsets * 2.0**-result, shift + result, shifts)
     flat = weight.reshape(ANALYTIC_COPIES * pixels, -1, 1, 1)
     # These bits make the shift to int8 `shift`, whatever scale the result is said to have.
     return IntConv("analytic", BANK, ANALYTIC, flat, shift + result - BITS, *bias)
@@ -190,7 +190,7 @@ def bank_results(
     return np.concatenate([results / 2.0**BITS, vector_planes], 1).astype(np.float32)
 
 
-def quantise_family(
+def quantize_family(
     weights: Weights,
     bank: Bank,
     images: Remade[np.ndarray],
@@ -229,14 +229,14 @@ def map_steps(family: Family, weights: Weights) -> list[np.ndarray]:
     Returns:
         (F,) of the maps between head and tail, then of the one within each block.
     """
-    quantised = {op.name: op.weight * 2.0**-op.weight_frac_bits for op in family.core.convolutions}
+    quantized = {op.name: op.weight * 2.0**-op.weight_frac_bits for op in family.core.convolutions}
     floats = {op.name: op.weight for op in body_graph(weights) if isinstance(op, Conv)}
 
     def steps(name: str, inputs: np.ndarray | float, output: str) -> np.ndarray:
-        weight = floats[name][:, : quantised[name].shape[1]] * inputs
+        weight = floats[name][:, : quantized[name].shape[1]] * inputs
         square = np.square(weight).sum((1, 2, 3))
         # Least squares over a channel's weights, each of which is rounded.
-        products = (weight * quantised[name]).sum((1, 2, 3))
+        products = (weight * quantized[name]).sum((1, 2, 3))
         factors = np.where(square > 0, products / np.maximum(square, 1e-30), 1.0)
         return np.asarray(2.0 ** -family.core.frac_bits[output] / factors)
 

@@ -24,7 +24,7 @@ from beers_deploy.model.bank import Bank
 from beers_deploy.model.variants import SENSOR_VALUES, Kernels
 from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.banked.filters import BITS, whole_bank
-from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, Shifts, quantise_bias
+from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, Shifts, quantize_bias
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import PLANES, Op
 from beers_deploy.quant.onnx_file import metadata
@@ -78,7 +78,7 @@ class Family:
         terms = self.biases[op.name]
         product = op.weight_frac_bits + self.core.frac_bits[op.input]
         # Only the convolution behind the bank has a term for each of the sensor's values.
-        bias, bits = quantise_bias(terms @ values[: terms.shape[1]], product, self.shifts)
+        bias, bits = quantize_bias(terms @ values[: terms.shape[1]], product, self.shifts)
         return replace(op, bias=bias, bias_frac_bits=bits)
 
     def to_words(self) -> str:
@@ -124,7 +124,7 @@ def bank_layer(bank: Bank, scale: int, shifts: Shifts, kernels: Kernels) -> IntC
     """The first convolution of a network of that scale, for one sensor."""
     integers = whole_bank(bank, scale, bank.gain, kernels)
     # The offsets put each copy of a result at another place of a rounding step.
-    bias = quantise_bias(integers.offsets * 2.0**-BITS, integers.frac_bits + BITS, shifts)
+    bias = quantize_bias(integers.offsets * 2.0**-BITS, integers.frac_bits + BITS, shifts)
     return IntConv("bank", PLANES, BANK, integers.weight, integers.frac_bits, *bias)
 
 

@@ -46,12 +46,12 @@ def board_model(
     `quant.ends.Ends.merge` makes one.
     """
     writer = BoardWriter()
-    writer.quantised("planes.dequantised", PLANES, core.frac_bits[PLANES])
+    writer.quantized("planes.dequantised", PLANES, core.frac_bits[PLANES])
     for op in core.ops:
         feeds = ["planes.dequantised" if i == PLANES else i for i in op.inputs]
         output = f"{op.output}.float"
         writer.operation(op, feeds, output)
-        writer.quantised(op.output, output, core.frac_bits[op.output])
+        writer.quantized(op.output, output, core.frac_bits[op.output])
     return _core_file(writer, core.ends, about, tile_px)
 
 
@@ -95,7 +95,7 @@ class BoardWriter(GraphWriter):
         """Scale and zero point of a tensor."""
         return [self.unit(frac_bits), self.constant("zero_point", np.array(0, np.int8))]
 
-    def quantised(self, output: str, source: str, frac_bits: int) -> None:
+    def quantized(self, output: str, source: str, frac_bits: int) -> None:
         """Quantise and dequantise an activation."""
         middle = self.node(
             "QuantizeLinear", f"{source}.int8", [source, *self.scale(source, frac_bits)]

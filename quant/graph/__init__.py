@@ -1,7 +1,7 @@
 """A network as the short list of operations that a DPU computes: what quantisation works on.
 
 - `nodes`: the one reading of an ONNX file, for `check` and tiling too, with `moves` of pixels in
-  one spelling and how numbers are `quantised`;
+  one spelling and how numbers are `quantized`;
 - `operations`: what there is, convolutions to pixel shuffles, which tensors must share a scale, and
   how 12 bits enter int8;
 - `reader`: from float ONNX to a `network`, cut where the host's part ends;

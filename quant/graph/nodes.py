@@ -38,8 +38,8 @@ Kind = Literal[
     "resize",
     "pixel shuffle",
     "argmax",
-    "quantise",
-    "dequantise",
+    "quantize",
+    "dequantize",
     "other",
 ]
 POOLS = ("AveragePool", "GlobalAveragePool")
@@ -53,8 +53,8 @@ OPERATORS: dict[Kind, tuple[str, ...]] = {
     "resize": ("Resize", "Upsample"),
     "pixel shuffle": ("DepthToSpace", "SpaceToDepth"),
     "argmax": ("ArgMax",),
-    "quantise": ("QuantizeLinear",),
-    "dequantise": ("DequantizeLinear",),
+    "quantize": ("QuantizeLinear",),
+    "dequantize": ("DequantizeLinear",),
     "activation": ("Relu", "LeakyRelu", "QLinearLeakyRelu", "PRelu", "HardSigmoid", "HardSwish"),
     "pool": ("MaxPool", *POOLS, *(f"QLinear{pool}" for pool in POOLS), "GlobalMaxPool"),
 }
@@ -281,7 +281,7 @@ def out_shape(
         return (max(s[0] for s in inputs), max(s[1] for s in inputs), max(s[2] for s in inputs))
     return (
         first
-        if kind in ("activation", "quantise", "dequantise")
+        if kind in ("activation", "quantize", "dequantize")
         else _inferred(node, inputs, constants)
     )
 

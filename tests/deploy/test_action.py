@@ -121,7 +121,7 @@ def test_a_missing_float_network_is_red_in_one_sentence(
     assert not (runner.folder / "gate.json").exists()
 
 
-def test_without_an_int8_network_it_quantises_for_the_same_sensor(
+def test_without_an_int8_network_it_quantizes_for_the_same_sensor(
     runner: Runner, networks: Path
 ) -> None:
     take(runner, networks / "plain", "float.onnx")

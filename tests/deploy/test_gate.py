@@ -414,7 +414,7 @@ def test_results_that_are_never_below_zero_need_no_relu() -> None:
     assert [relus.off_by(count) for count in range(6)] == [1, 0, 0, 0, 1, 2]
 
 
-def test_a_file_of_another_quantiser_is_judged_without_the_rules_of_a_dpu(
+def test_a_file_of_another_quantizer_is_judged_without_the_rules_of_a_dpu(
     model: Path, tmp_path: Path
 ) -> None:
     path = tmp_path / "free.onnx"

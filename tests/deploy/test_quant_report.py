@@ -46,7 +46,7 @@ def test_steps_of_fine_tuning_are_whole_or_auto(text: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_network_fixed_to_one_tile_is_quantised_reported_and_gated(tmp_path: Path) -> None:
+def test_a_network_fixed_to_one_tile_is_quantized_reported_and_gated(tmp_path: Path) -> None:
     paths = tmp_path / "f.onnx", tmp_path / "i.onnx"
     save_onnx(to_onnx(plain(Variant(1, 4)), {}, tile_px=80), paths[0])
     options = ["--out", paths[1], "--patches", "2", "--patch", "64", "--report", tmp_path / "r"]

@@ -19,7 +19,7 @@ from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.toml import HERE as PROFILES
-from tests.deploy.studies.characterize.test_characterise import RATIO, SENSOR, SIDE, landscape
+from tests.deploy.studies.characterize.test_characterize import RATIO, SENSOR, SIDE, landscape
 from tests.deploy.studies.detection.folders import Object, dior
 from tests.deploy.studies.detection.networks import detector, raw
 from tests.docs.walk import ROOT, Walk
@@ -28,7 +28,7 @@ from tests.model.networks import plain
 HOW_TO = ROOT / "docs" / "how-to"
 SITES = 6
 SCENE_PX = 820
-"""As `benchmarks/characterise.py` needs them."""
+"""As `benchmarks/characterize.py` needs them."""
 FEW = 2
 FEW_PX = 480
 MADE = """

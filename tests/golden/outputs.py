@@ -34,7 +34,7 @@ from benchmarks.small_networks import NETWORKS
 from examples.networks import build
 from examples.networks import to_onnx as example_to_onnx
 from tests.golden.layouts import CREATION, restored
-from tests.golden.small_networks import quantised
+from tests.golden.small_networks import quantized
 from tests.golden.wrong_calls import CALLS, answer, inputs
 
 STORED = Path(__file__).resolve().parent / "outputs"
@@ -87,7 +87,7 @@ def outputs(folder: Path) -> Outputs:
     for name, files in networks.items():
         made.add_network(name, files, folder)
     for name in NETWORKS:
-        made.add_integers(name, quantised(name, folder))
+        made.add_integers(name, quantized(name, folder))
     for name in shipped_names():
         file = folder / f"{name}-int8.onnx"
         _run("export", "--network", f"{name}-int8", "--out", file)

@@ -33,7 +33,7 @@ def save_weights() -> None:
     save_file(tensors, WEIGHTS)
 
 
-def quantised(name: str, folder: Path) -> Path:
+def quantized(name: str, folder: Path) -> Path:
     """Quantise the network of that name; the INT8 file."""
     kind, make = NETWORKS[name]
     prefix = f"{slug(name)}."

@@ -8,7 +8,7 @@ from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.graph import Graph, correction_graph, read_planes
-from beers_deploy.quant.quantise import Quantised, quantise_model
+from beers_deploy.quant.quantize import Quantised, quantize_model
 from beers_deploy.quant.samples import Patches
 from tests.model.networks import plain
 from tests.quant.quick import drawn
@@ -46,5 +46,5 @@ def unseen() -> Patches:
 
 
 @pytest.fixture(scope="session")
-def quantised(float_onnx: onnx.ModelProto, patches: Patches) -> Quantised:
-    return quantise_model(float_onnx, patches, {"seed": "5"})
+def quantized(float_onnx: onnx.ModelProto, patches: Patches) -> Quantised:
+    return quantize_model(float_onnx, patches, {"seed": "5"})

@@ -27,7 +27,7 @@ from beers_deploy.quant.graph import (
     same,
 )
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
-from beers_deploy.quant.quantise import Quantised, quantise_model
+from beers_deploy.quant.quantize import Quantised, quantize_model
 from beers_deploy.quant.samples import Patches, Remade
 from beers_deploy.quant.session import open_session, planes_of
 
@@ -126,7 +126,7 @@ def one_guess() -> Iterator[None]:
 
 def quickly(model: onnx.ModelProto, patches: Patches, **more: Any) -> Quantised:
     with one_guess():
-        return quantise_model(model, patches, {}, **more)
+        return quantize_model(model, patches, {}, **more)
 
 
 class Calibration(CalibrationDataReader):  # type: ignore[misc]  # onnxruntime has no types

@@ -22,7 +22,7 @@ from beers_deploy.quant.graph import (
     correction_graph,
     read_planes,
 )
-from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_session
 from tests.quant.quick import changed, one_guess, quickly
@@ -67,7 +67,7 @@ def twice(values: np.ndarray) -> np.ndarray:
         ),
     ],
 )
-def test_what_cannot_be_quantised_is_refused(
+def test_what_cannot_be_quantized_is_refused(
     spoil: Callable[[Graph], Graph], message: str, graph: Graph
 ) -> None:
     check_network(Network(graph))
@@ -84,7 +84,7 @@ def test_a_layer_that_never_fires_costs_nothing(
 
     def mae(model: onnx.ModelProto) -> float:
         with one_guess():
-            int8 = quantise_model(model, patches, {}).host
+            int8 = quantize_model(model, patches, {}).host
         return compare(open_session(model), open_session(int8), unseen.pairs).mae
 
     assert mae(dead) < 1.5 * mae(float_onnx)

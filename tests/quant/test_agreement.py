@@ -12,15 +12,15 @@ from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import split
 from beers_deploy.quant.integer.reference import agreement, merged_correction, run_core
 from beers_deploy.quant.onnx_file import load_onnx
-from beers_deploy.quant.quantise import Quantised
+from beers_deploy.quant.quantize import Quantised
 from tests.quant.quick import changed
 
 IMAGE = np.random.default_rng(4).random((2, 1, 35, 41), dtype=np.float32)
 
 
-def test_every_layer_of_a_new_file_is_equal(quantised: Quantised) -> None:
-    layers = agreement(quantised.core, quantised.host, IMAGE).layers
-    assert [layer.report.name for layer in layers] == [op.name for op in quantised.core.ops]
+def test_every_layer_of_a_new_file_is_equal(quantized: Quantised) -> None:
+    layers = agreement(quantized.core, quantized.host, IMAGE).layers
+    assert [layer.report.name for layer in layers] == [op.name for op in quantized.core.ops]
     assert {layer.unequal for layer in layers} == {0.0}
 
 
@@ -34,22 +34,22 @@ def test_every_layer_of_a_shipped_file_is_equal(path: Path) -> None:
     assert (layers.up != layers.even).any()
 
 
-def test_a_layer_that_computes_something_else_is_found(quantised: Quantised) -> None:
-    corrupted = changed(quantised.host, "body.0.second.bias", lambda bias: bias * 2 + 900)
-    layers = agreement(quantised.core, corrupted, IMAGE).layers
+def test_a_layer_that_computes_something_else_is_found(quantized: Quantised) -> None:
+    corrupted = changed(quantized.host, "body.0.second.bias", lambda bias: bias * 2 + 900)
+    layers = agreement(quantized.core, corrupted, IMAGE).layers
     unequal = {layer.report.name: layer.unequal > 0 for layer in layers}
     assert not unequal["body.0.first"]
     assert unequal["body.0.second"]
     assert unequal["tail"]
 
 
-def test_what_the_rule_moves_is_counted(quantised: Quantised) -> None:
-    layers = agreement(quantised.core, quantised.host, IMAGE)
-    up, even = (run_core(quantised.core, split(IMAGE), half_even=rule)[0] for rule in (False, True))
-    for layer, op in zip(layers.layers, quantised.core.ops, strict=True):
+def test_what_the_rule_moves_is_counted(quantized: Quantised) -> None:
+    layers = agreement(quantized.core, quantized.host, IMAGE)
+    up, even = (run_core(quantized.core, split(IMAGE), half_even=rule)[0] for rule in (False, True))
+    for layer, op in zip(layers.layers, quantized.core.ops, strict=True):
         difference = up[op.output] - even[op.output]
         assert layer.moved == pytest.approx(np.count_nonzero(difference) / difference.size)
         assert layer.moved_by == np.abs(difference).max()
-    np.testing.assert_array_equal(layers.up, merged_correction(quantised.core, up))
-    np.testing.assert_array_equal(layers.even, merged_correction(quantised.core, even))
+    np.testing.assert_array_equal(layers.up, merged_correction(quantized.core, up))
+    np.testing.assert_array_equal(layers.even, merged_correction(quantized.core, even))
     assert max(layer.moved for layer in layers.layers) > 0

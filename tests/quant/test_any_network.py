@@ -24,7 +24,7 @@ from beers_deploy.quant.encodings import as_on_board, board_model, encoding_faul
 from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.integer.reference import agreement, run_core
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
-from beers_deploy.quant.quantise import Quantised, quantise_model
+from beers_deploy.quant.quantize import Quantised, quantize_model
 from beers_deploy.quant.reading.folding import simplest
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.tiling.walk import tiling_of
@@ -61,13 +61,13 @@ def float_network(name: str) -> onnx.ModelProto:
 
 
 @cache
-def quantised(name: str) -> Quantised:
+def quantized(name: str) -> Quantised:
     return quickly(float_network(name), patches_of(images(name)))
 
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_int8_stays_near_float(name: str) -> None:
-    int8 = quantised(name)
+    int8 = quantized(name)
     image = images(name)[1]
     expected = int8.core.ends.clipped(result_of(open_session(float_network(name)), image))
     actual = result_of(open_session(int8.host), image)
@@ -77,7 +77,7 @@ def test_int8_stays_near_float(name: str) -> None:
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_the_integer_reference_is_the_runtime_bit_for_bit(name: str) -> None:
-    int8 = quantised(name)
+    int8 = quantized(name)
     image = images(name)[2]
     layers = agreement(int8.core, int8.host, image)
     assert [layer.report.name for layer in layers.layers if layer.unequal] == []
@@ -87,13 +87,13 @@ def test_the_integer_reference_is_the_runtime_bit_for_bit(name: str) -> None:
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_what_is_trained_computes_the_reference_s_whole_numbers(name: str) -> None:
-    int8 = quantised(name)
+    int8 = quantized(name)
     hold_to_reference(moved(int8.core), int8.core.ends.split(images(name, 4)[3]))
 
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_no_image_leaves_the_proven_bounds(name: str) -> None:
-    core = quantised(name).core
+    core = quantized(name).core
     tensors, reports = run_core(core, core.ends.split(np.round(images(name)[0])))
     for op, bound, report in zip(core.ops, layer_bounds(core), reports, strict=True):
         assert max(bound.low, INT8_MIN) <= tensors[op.output].min(), op.name
@@ -103,7 +103,7 @@ def test_no_image_leaves_the_proven_bounds(name: str) -> None:
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_a_file_is_read_back_as_the_core_it_was_written_from(name: str) -> None:
-    int8 = quantised(name)
+    int8 = quantized(name)
     core = read_core(int8.host)
     assert encoding_faults(int8.host) == []
     for one, other in zip(core.convolutions, int8.core.convolutions, strict=True):
@@ -120,7 +120,7 @@ def test_a_file_is_read_back_as_the_core_it_was_written_from(name: str) -> None:
 
 
 def test_a_weight_that_is_not_what_the_file_says_is_a_fault() -> None:
-    corrupted = copied(quantised("unet").host)
+    corrupted = copied(quantized("unet").host)
     node = next(
         candidate for candidate in corrupted.graph.node if candidate.op_type == "ConvInteger"
     )
@@ -143,7 +143,7 @@ def test_a_weight_that_is_not_what_the_file_says_is_a_fault() -> None:
 def test_a_description_of_something_else_is_one_sentence(
     change: Callable[[dict[str, Any]], object],
 ) -> None:
-    corrupted = copied(quantised("unet").host)
+    corrupted = copied(quantized("unet").host)
     entry = next(candidate for candidate in corrupted.metadata_props if candidate.key == KEY)
     description = json.loads(entry.value)
     change(description)
@@ -158,13 +158,13 @@ def test_a_description_of_something_else_is_one_sentence(
 @pytest.mark.parametrize("name", NETWORKS)
 def test_the_core_is_legal_on_the_dpu(name: str) -> None:
     dpu = load_dpu("vck190", None)
-    for file in (quantised(name).host, board_model(quantised(name).core, {})):
+    for file in (quantized(name).host, board_model(quantized(name).core, {})):
         assert legality(place(network_of(file, 64), dpu)).passed
 
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_tiles_of_int8_are_the_whole(name: str) -> None:
-    model = quantised(name).host
+    model = quantized(name).host
     lattice_px = tiling_of(model).lattice_px
     check_tiles(model, images(name, 1, 64)[0], (16 // lattice_px, 24 // lattice_px))
 
@@ -194,8 +194,8 @@ def test_windows_make_a_result_finer_than_8_bits(
     errors = []
     for dual in (True, False):
         if not dual:
-            monkeypatch.setattr("beers_deploy.quant.quantise.takes_gains", lambda _: False)
-        int8 = quantise_model(model, patches, {})
+            monkeypatch.setattr("beers_deploy.quant.quantize.takes_gains", lambda _: False)
+        int8 = quantize_model(model, patches, {})
         expected = result_of(open_session(model), image_list[0])
         actual = result_of(open_session(int8.host), image_list[0])
         # The rounding of the one weight and bias is the same in both, and is left out.

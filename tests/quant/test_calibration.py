@@ -18,7 +18,7 @@ from beers_deploy.profiles.response import MtfTable
 from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.quant.calibration import draw_patches, stratified
 from beers_deploy.quant.graph import PLANES, Graph, graph_to_onnx, tensors
-from beers_deploy.quant.quantise import choose_frac_bits
+from beers_deploy.quant.quantize import choose_frac_bits
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import (
     TILE_PX,
@@ -162,7 +162,7 @@ def test_positions_of_a_large_image_are_those_of_its_whole(
     """In pieces or at once: found here by hand from whole tensors."""
     full_image = image(TILE_PX + 21, 50)
     # Without errors to weigh up, calibration takes the scale that clips nothing.
-    monkeypatch.setattr("beers_deploy.quant.quantise._errors", lambda *_: np.zeros(1))
+    monkeypatch.setattr("beers_deploy.quant.quantize._errors", lambda *_: np.zeros(1))
     frac_bits = choose_frac_bits(graph, [full_image])
     names = tensors(graph)
     values = open_session(graph_to_onnx(graph, names)).run(names, {PLANES: planes_of(full_image)})

@@ -65,7 +65,7 @@ def written(path: Path) -> Path:
 
 
 @pytest.mark.parametrize("per_channel", [False, True])
-def test_a_file_of_another_quantiser_has_none(per_channel: bool, tmp_path: Path) -> None:
+def test_a_file_of_another_quantizer_has_none(per_channel: bool, tmp_path: Path) -> None:
     model = written(tmp_path / "float.onnx")
     noise = list(np.random.default_rng(0).random((2, 1, 1, 32, 32), np.float32))
     quantize_static(model, tmp_path / "free.onnx", Calibration(noise), per_channel=per_channel)

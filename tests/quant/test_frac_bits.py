@@ -8,7 +8,7 @@ from beers_deploy.profiles.target import load_target
 from beers_deploy.quant.core import (
     SHIFTS,
     best_frac_bits,
-    quantise,
+    quantize,
     target_shifts,
     unclipped_frac_bits,
 )
@@ -43,7 +43,7 @@ def test_an_outlier_is_clipped_rather_than_coarsening_the_rest_and_zeros_have_a_
     [(0.5, 1), (-0.5, -1), (1.5, 2), (126.5, 127), (300.0, 127), (-300.0, -128)],
 )
 def test_constants_round_half_away_from_zero_and_saturate(value: float, expected: int) -> None:
-    assert quantise(np.array([value]), 0)[0] == expected
+    assert quantize(np.array([value]), 0)[0] == expected
 
 
 def test_the_windows_are_those_of_the_target() -> None:

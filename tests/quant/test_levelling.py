@@ -152,7 +152,7 @@ def test_what_calibration_sees_is_not_clipped_where_the_image_itself_passes(
     loud: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "beers_deploy.quant.quantise.level", lambda _g, _c, ranges, *_: loud * FULL / ranges
+        "beers_deploy.quant.quantize.level", lambda _g, _c, ranges, *_: loud * FULL / ranges
     )
     model, _, _, chain = read("espcn")
     int8 = quickly(model, patches_of(images()))
@@ -194,6 +194,6 @@ def test_unequal_channels_err_half_as_much_once_they_are_levelled(
 
     levelled = mae()
     monkeypatch.setattr(
-        "beers_deploy.quant.quantise.level", lambda _graph, _chain, _ranges, start, _trial: start
+        "beers_deploy.quant.quantize.level", lambda _graph, _chain, _ranges, start, _trial: start
     )
     assert levelled < 0.5 * mae()

@@ -14,7 +14,7 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph import read_network
 from beers_deploy.quant.integer.reference import agreement
 from beers_deploy.quant.onnx_file import GraphWriter, make_model
-from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.structure import saturated_shares, structure_checks
 from tests.quant.quick import patches_of
@@ -196,7 +196,7 @@ def test_near_float_equal_to_the_reference_and_without_faults(
         for k in range(3)
     ]
     patches = patches_of(samples)
-    int8 = quantise_model(model, patches, {})
+    int8 = quantize_model(model, patches, {})
     expected = int8.core.ends.clipped(result_of(open_session(model), samples[1]))
     actual = result_of(open_session(int8.host), samples[1])
     assert np.abs(actual - expected).mean() < 0.06 * expected.std()

@@ -40,7 +40,7 @@ from beers_deploy.quant.passes.stream import (
     streams,
     two_gains,
 )
-from beers_deploy.quant.quantise import Quantised, quantise_model
+from beers_deploy.quant.quantize import Quantised, quantize_model
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_session
 from tests.quant.quick import image, in_float, quickly
@@ -224,11 +224,11 @@ def test_a_trial_that_the_costliest_crops_favour_still_has_to_win_on_all(graph: 
     assert cost <= guesses[0]
 
 
-def test_a_shared_residual_scale_adds_without_rounding(quantised: Quantised) -> None:
-    adds = [op for op in quantised.core.ops if isinstance(op, Add)]
+def test_a_shared_residual_scale_adds_without_rounding(quantized: Quantised) -> None:
+    adds = [op for op in quantized.core.ops if isinstance(op, Add)]
     assert len(adds) == 3
     for op in adds:
-        shifts = {name: value for name, value, _ in op_shifts(op, quantised.core.frac_bits, SHIFTS)}
+        shifts = {name: value for name, value, _ in op_shifts(op, quantized.core.frac_bits, SHIFTS)}
         assert shifts == {"shift_read": 0, "shift_write": 0}
 
 
@@ -252,17 +252,17 @@ def test_the_fine_gain_is_believed_until_its_end() -> None:
 
 
 def test_all_passes_lose_far_less_than_none(
-    float_onnx: onnx.ModelProto, patches: Patches, quantised: Quantised
+    float_onnx: onnx.ModelProto, patches: Patches, quantized: Quantised
 ) -> None:
     def mae(int8: Quantised) -> float:
         return compare(open_session(float_onnx), open_session(int8.host), patches.pairs).mae
 
     few = Passes(dual_range=False, least_squares=False, equalising=False)
-    rounded = quantise_model(float_onnx, patches, {}, passes=few)
+    rounded = quantize_model(float_onnx, patches, {}, passes=few)
     last = rounded.core.ops[-1]
     assert isinstance(last, IntConv)
     assert len(last.weight) == 1
-    assert mae(quantised) < 0.6 * mae(rounded)
+    assert mae(quantized) < 0.6 * mae(rounded)
 
 
 def test_each_step_is_named(float_onnx: onnx.ModelProto, patches: Patches) -> None:

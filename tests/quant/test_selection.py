@@ -8,7 +8,7 @@ import onnx
 import pytest
 
 from beers_deploy.quant.passes.selection import ALL, Passes
-from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.session import open_session, result_of
 from tests.quant.quick import patches_of
 from tests.quant.test_odd_networks import Sketch, dead_channels
@@ -35,7 +35,7 @@ def results(float_onnx: onnx.ModelProto) -> Results:
 
     def of_passes(passes: Passes) -> list[np.ndarray]:
         networks = (float_onnx, dead_channels(Sketch()))
-        files = [quantise_model(network, patches, {}, passes=passes).host for network in networks]
+        files = [quantize_model(network, patches, {}, passes=passes).host for network in networks]
         return [result_of(open_session(file), waves(0)) for file in files]
 
     return of_passes

@@ -11,7 +11,7 @@ from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import Add
-from beers_deploy.quant.quantise import Quantised
+from beers_deploy.quant.quantize import Quantised
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.sensitivity import Loss, layer_errors, losses, spread_of
 from beers_deploy.quant.session import few_crops, open_session, run
@@ -24,29 +24,29 @@ def crops(patches: Patches) -> list[np.ndarray]:
 
 
 def test_layers_lose_together_what_the_int8_file_loses_and_adds_hardly_anything(
-    float_onnx: onnx.ModelProto, quantised: Quantised, crops: list[np.ndarray]
+    float_onnx: onnx.ModelProto, quantized: Quantised, crops: list[np.ndarray]
 ) -> None:
     """Their squared errors nearly add up; adds of a shared residual scale lose what saturates."""
-    layers, together = layer_errors(quantised.graph, quantised.core, crops)
-    sessions = open_session(float_onnx), open_session(quantised.host)
+    layers, together = layer_errors(quantized.graph, quantized.core, crops)
+    sessions = open_session(float_onnx), open_session(quantized.host)
     differences = [np.subtract(*(np.clip(run(s, crop), 0, 1) for s in sessions)) for crop in crops]
     assert together.mae == pytest.approx(float(np.mean(np.abs(differences))), rel=1e-3)
     squared_errors = {layer.name: layer.network.squared for layer in layers}
     assert sum(squared_errors.values()) == pytest.approx(together.squared, rel=0.4)
-    adds = sum(squared_errors.pop(op.name) for op in quantised.core.ops if isinstance(op, Add))
+    adds = sum(squared_errors.pop(op.name) for op in quantized.core.ops if isinstance(op, Add))
     assert adds < 0.1 * sum(squared_errors.values())
 
 
 @pytest.fixture(scope="module")
-def spoilt(quantised: Quantised) -> Quantised:
+def spoilt(quantized: Quantised) -> Quantised:
     """The weights of one layer lose their sign."""
-    spoilt = [op.name == "body.1.second" for op in quantised.core.ops]
+    spoilt = [op.name == "body.1.second" for op in quantized.core.ops]
     ops = [
         replace(op, weight=-op.weight) if bad and isinstance(op, IntConv) else op
-        for op, bad in zip(quantised.core.ops, spoilt, strict=True)
+        for op, bad in zip(quantized.core.ops, spoilt, strict=True)
     ]
-    core = replace(quantised.core, ops=tuple(ops))
-    return replace(quantised, core=core, host=host_model(core, {}))
+    core = replace(quantized.core, ops=tuple(ops))
+    return replace(quantized, core=core, host=host_model(core, {}))
 
 
 def test_what_is_lost_is_told_and_of_much_also_where(
@@ -85,7 +85,7 @@ def test_one_gain_is_attributed_as_two_are(
     crops: list[np.ndarray],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("beers_deploy.quant.quantise.takes_gains", lambda _: False)
+    monkeypatch.setattr("beers_deploy.quant.quantize.takes_gains", lambda _: False)
     int8 = quickly(float_onnx, patches)
     layers, _ = layer_errors(int8.graph, int8.core, crops)
     tail = layers[-1]
@@ -106,9 +106,9 @@ def test_loss_is_that_of_its_definition() -> None:
 
 
 def test_spread_counts_every_pixel_by_its_difference(
-    float_onnx: onnx.ModelProto, quantised: Quantised, crops: list[np.ndarray]
+    float_onnx: onnx.ModelProto, quantized: Quantised, crops: list[np.ndarray]
 ) -> None:
-    sessions = open_session(float_onnx), open_session(quantised.host)
+    sessions = open_session(float_onnx), open_session(quantized.host)
     spread = spread_of(*sessions, crops)
     difference = np.concatenate(
         [

@@ -36,7 +36,7 @@ from beers_deploy.quant.graph import (
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.integer.trainable import TrainableCore
 from beers_deploy.quant.passes.tune import BORDER_PX, Sample, Tuning, tune
-from beers_deploy.quant.quantise import Quantised, quantise_model
+from beers_deploy.quant.quantize import Quantised, quantize_model
 from beers_deploy.quant.samples import Patches, Remade
 from tests.quant.trained import hold_to_reference, moved
 
@@ -84,9 +84,9 @@ def difference(core: IntCore, other: IntCore, patches: Patches) -> float:
     return float(np.mean([np.square(a - b).mean() for a, b in zip(*results, strict=True)]))
 
 
-def test_it_begins_with_the_core_s_own_numbers(quantised: Quantised) -> None:
-    unchanged = TrainableCore(quantised.core).core()
-    for one, other in zip(quantised.core.convolutions, unchanged.convolutions, strict=True):
+def test_it_begins_with_the_core_s_own_numbers(quantized: Quantised) -> None:
+    unchanged = TrainableCore(quantized.core).core()
+    for one, other in zip(quantized.core.convolutions, unchanged.convolutions, strict=True):
         np.testing.assert_array_equal(one.weight, other.weight)
         np.testing.assert_array_equal(one.bias, other.bias)
 
@@ -151,25 +151,25 @@ def test_odd_operations_are_the_reference_s(seed: int) -> None:
 
 @pytest.mark.slow
 def test_without_references_it_comes_back_towards_the_float_network(
-    quantised: Quantised, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
+    quantized: Quantised, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
 ) -> None:
-    bad = spoilt(quantised.core)
+    bad = spoilt(quantized.core)
     tuned = trained(bad, float_onnx, Tuning(alone(patches), 40, rate=0.1))
-    assert difference(tuned, quantised.core, unseen) < 0.7 * difference(bad, quantised.core, unseen)
+    assert difference(tuned, quantized.core, unseen) < 0.7 * difference(bad, quantized.core, unseen)
     assert shift_faults(tuned) == []
-    assert tuned.frac_bits == quantised.core.frac_bits
+    assert tuned.frac_bits == quantized.core.frac_bits
 
 
 def test_what_comes_out_worse_is_not_kept(
-    quantised: Quantised, float_onnx: onnx.ModelProto, patches: Patches
+    quantized: Quantised, float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
-    tuned = trained(quantised.core, float_onnx, Tuning(alone(patches), 2, rate=60.0))
-    assert tuned is quantised.core
+    tuned = trained(quantized.core, float_onnx, Tuning(alone(patches), 2, rate=60.0))
+    assert tuned is quantized.core
 
 
 @pytest.mark.parametrize(("rate", "steps"), [(0.0, 12), (0.3, 14)])
 def test_it_goes_on_by_itself_while_held_out_pairs_gain(
-    quantised: Quantised,
+    quantized: Quantised,
     float_onnx: onnx.ModelProto,
     patches: Patches,
     monkeypatch: pytest.MonkeyPatch,
@@ -179,18 +179,18 @@ def test_it_goes_on_by_itself_while_held_out_pairs_gain(
     monkeypatch.setattr("beers_deploy.quant.passes.tune.ROUNDS", (12, 2))
     graph = read_planes(correction_graph(float_onnx))
     tuning = Tuning(alone(patches), None, rate)
-    assert tune(spoilt(quantised.core), graph, tuning)[1] == steps
+    assert tune(spoilt(quantized.core), graph, tuning)[1] == steps
 
 
 def test_a_reference_of_another_size_is_one_sentence(
-    quantised: Quantised, float_onnx: onnx.ModelProto, patches: Patches
+    quantized: Quantised, float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
     degraded, reference = patches.pairs[0]
     short = Remade(lambda _: (degraded, reference[..., :-2]), 2)
     with pytest.raises(
         ImageError, match=r"reference has the size 1 x 1 x 128 x 126, but .* 1 x 1 x 128 x 128"
     ):
-        trained(quantised.core, float_onnx, Tuning(short, 1))
+        trained(quantized.core, float_onnx, Tuning(short, 1))
 
 
 @pytest.mark.slow
@@ -201,7 +201,7 @@ def test_the_same_seed_gives_the_same_numbers(
         reported: list[Step] = []
         tuning = Tuning(patches.pairs, 3, rate=0.3, seed=seed)
         with reporting(reported.append), progress("calibrating"):
-            model = quantise_model(float_onnx, patches, {}, tuning=tuning)
+            model = quantize_model(float_onnx, patches, {}, tuning=tuning)
         assert reported[-1].what.startswith("calibrating: fine-tuning, step 3 of 3: ")
         assert {entry.key: entry.value for entry in model.host.metadata_props}[
             "finetune"
@@ -224,10 +224,10 @@ def test_the_border_is_the_float_network_s_where_the_reference_cannot_know(
 
 
 def test_slopes_pass_roundings_and_stop_where_int8_ends(
-    quantised: Quantised, patches: Patches
+    quantized: Quantised, patches: Patches
 ) -> None:
-    trainable = TrainableCore(quantised.core)
-    planes = torch.from_numpy(quantised.core.ends.split(patches.degraded[0]).astype(np.float32))
+    trainable = TrainableCore(quantized.core)
+    planes = torch.from_numpy(quantized.core.ends.split(patches.degraded[0]).astype(np.float32))
     trainable(planes).square().mean().backward()
     assert all(bool(weight.grad.abs().max() > 0) for weight in trainable.weights)
     with torch.no_grad():
@@ -258,7 +258,7 @@ def test_the_correction_of_a_result_makes_it(
 
 @pytest.mark.slow
 def test_training_on_references_pays_on_others(
-    quantised: Quantised, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
+    quantized: Quantised, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
 ) -> None:
-    tuned = trained(quantised.core, float_onnx, Tuning(patches.pairs, 20, rate=0.3))
-    assert error(tuned, unseen) < 0.97 * error(quantised.core, unseen)
+    tuned = trained(quantized.core, float_onnx, Tuning(patches.pairs, 20, rate=0.3))
+    assert error(tuned, unseen) < 0.97 * error(quantized.core, unseen)

@@ -89,7 +89,7 @@ def test_the_host_files_bits(
 
 
 @NETWORKS
-def test_the_layout_of_amds_quantiser(network: Callable[[], Graph]) -> None:
+def test_the_layout_of_amds_quantizer(network: Callable[[], Graph]) -> None:
     core = build_core(
         network(), {PLANES: PLANES_FRAC_BITS, **dict.fromkeys(ops.tensors(network()), 5)}
     )

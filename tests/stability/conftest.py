@@ -12,7 +12,7 @@ from beers_deploy.model.convbeers import ConvBEERS
 from beers_deploy.model.traditional.rows import one_thread_per_operation
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.onnx_file import save_onnx
-from beers_deploy.quant.quantise import Quantised
+from beers_deploy.quant.quantize import Quantised
 from beers_deploy.studies.stress.networks import Subject, open_subject
 from tests.model.networks import plain
 from tests.quant.quick import drawn, quickly
@@ -44,25 +44,25 @@ def float_onnx(network: ConvBEERS) -> onnx.ModelProto:
 
 
 @pytest.fixture(scope="session")
-def quantised(float_onnx: onnx.ModelProto) -> Quantised:
-    return quickly_quantised(float_onnx)
+def quantized(float_onnx: onnx.ModelProto) -> Quantised:
+    return quickly_quantized(float_onnx)
 
 
-def quickly_quantised(float_onnx: onnx.ModelProto) -> Quantised:
+def quickly_quantized(float_onnx: onnx.ModelProto) -> Quantised:
     return quickly(float_onnx, drawn(2, seed=5))
 
 
 @pytest.fixture(scope="session")
 def pair(
-    float_onnx: onnx.ModelProto, quantised: Quantised, tmp_path_factory: pytest.TempPathFactory
+    float_onnx: onnx.ModelProto, quantized: Quantised, tmp_path_factory: pytest.TempPathFactory
 ) -> list[Path]:
     """The two files."""
-    return saved(float_onnx, quantised, tmp_path_factory.mktemp("pair"))
+    return saved(float_onnx, quantized, tmp_path_factory.mktemp("pair"))
 
 
-def saved(float_onnx: onnx.ModelProto, quantised: Quantised, folder: Path) -> list[Path]:
+def saved(float_onnx: onnx.ModelProto, quantized: Quantised, folder: Path) -> list[Path]:
     paths = [folder / "float.onnx", folder / "int8.onnx"]
-    for model, path in zip((float_onnx, quantised.host), paths, strict=True):
+    for model, path in zip((float_onnx, quantized.host), paths, strict=True):
         save_onnx(model, path)
     return paths
 
@@ -76,5 +76,5 @@ def subject(pair: list[Path]) -> Subject:
 def coarse(tmp_path_factory: pytest.TempPathFactory) -> Subject:
     """A network at half resolution, in both precisions."""
     model = to_onnx(small_network(Variant(blocks=1, features=8, scale=2)), {"variant": "test"})
-    paths = saved(model, quickly_quantised(model), tmp_path_factory.mktemp("coarse"))
+    paths = saved(model, quickly_quantized(model), tmp_path_factory.mktemp("coarse"))
     return open_subject(paths[0], paths[1])

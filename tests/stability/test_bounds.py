@@ -15,7 +15,7 @@ from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import CORRECTION, split
 from beers_deploy.quant.integer.reference import INT32_BITS, correction, run_core
 from beers_deploy.quant.onnx_file import load_onnx
-from beers_deploy.quant.quantise import Quantised
+from beers_deploy.quant.quantize import Quantised
 from beers_deploy.quant.session import open_session, run
 
 
@@ -24,22 +24,22 @@ def images(seed: int, shape: tuple[int, int], binary: bool) -> np.ndarray:
     return np.rint(noise) if binary else noise
 
 
-def test_no_image_leaves_the_integer_bounds(quantised: Quantised) -> None:
-    bounds = {bound.name: bound for bound in layer_bounds(quantised.core)}
+def test_no_image_leaves_the_integer_bounds(quantized: Quantised) -> None:
+    bounds = {bound.name: bound for bound in layer_bounds(quantized.core)}
     for seed in range(6):
         planes = split(images(seed, (17, 23), seed % 2 == 0).astype(np.float32))
-        for report in run_core(quantised.core, planes)[1]:
+        for report in run_core(quantized.core, planes)[1]:
             bound = bounds[report.name]
             assert report.peak_bits <= bound.bits < INT32_BITS
             assert bound.saturates or report.saturated == 0
 
 
-def test_an_accumulator_that_overflows_is_found(quantised: Quantised) -> None:
-    op = quantised.core.convolutions[0]
+def test_an_accumulator_that_overflows_is_found(quantized: Quantised) -> None:
+    op = quantized.core.convolutions[0]
     huge = replace(
         op, bias=np.full(len(op.bias), 2**31, np.int64), bias_frac_bits=op.weight_frac_bits + 7
     )
-    core = replace(quantised.core, ops=(huge, *quantised.core.ops[1:]))
+    core = replace(quantized.core, ops=(huge, *quantized.core.ops[1:]))
     assert layer_bounds(core)[0].bits >= INT32_BITS
 
 
@@ -49,18 +49,18 @@ def test_shipped_accumulators_cannot_overflow(path: Path) -> None:
     assert max(bound.bits for bound in layer_bounds(core)) < INT32_BITS
 
 
-def test_a_core_is_read_back_from_its_file(quantised: Quantised) -> None:
-    core = read_core(quantised.host)
+def test_a_core_is_read_back_from_its_file(quantized: Quantised) -> None:
+    core = read_core(quantized.host)
     image = images(3, (19, 26), False).astype(np.float32)
     merged = Ends(gains=2).merge(
         correction(core, split(image), half_even=True), core.scale(CORRECTION)
     )
     np.testing.assert_array_equal(
-        np.clip(image + merged, 0, 1), run(open_session(quantised.host), image)
+        np.clip(image + merged, 0, 1), run(open_session(quantized.host), image)
     )
 
 
-def test_another_spelling_has_no_core(quantised: Quantised, float_onnx: onnx.ModelProto) -> None:
-    for model in (float_onnx, board_model(quantised.core, {})):
+def test_another_spelling_has_no_core(quantized: Quantised, float_onnx: onnx.ModelProto) -> None:
+    for model in (float_onnx, board_model(quantized.core, {})):
         with pytest.raises(ModelError, match="does not describe its integers"):
             read_core(model)

@@ -14,7 +14,7 @@ from beers_deploy.profiles.sensor import MAX_DN
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, split
 from beers_deploy.quant.integer.reference import SOUND, Faults, merged_correction, run_core
-from beers_deploy.quant.quantise import Quantised
+from beers_deploy.quant.quantize import Quantised
 from beers_deploy.studies.stress.faults import (
     SHIFT_BITS,
     Guards,
@@ -51,8 +51,8 @@ def flipped(a: np.ndarray, b: np.ndarray, bits: int) -> int:
 
 
 @pytest.fixture(scope="module")
-def core(quantised: Quantised) -> IntCore:
-    return as_stored(quantised.core)
+def core(quantized: Quantised) -> IntCore:
+    return as_stored(quantized.core)
 
 
 @given(st.sampled_from(sorted(KINDS)), st.integers(0, 2**32 - 1), st.data())
@@ -78,14 +78,14 @@ def test_the_rate_is_that_of_a_megabit() -> None:
     assert flip_count(1000, 1e9, np.random.default_rng(0)) == 1000
 
 
-def test_the_stored_bias_is_int8_and_the_network_the_same(quantised: Quantised) -> None:
-    stored = as_stored(quantised.core)
+def test_the_stored_bias_is_int8_and_the_network_the_same(quantized: Quantised) -> None:
+    stored = as_stored(quantized.core)
     assert all(op.bias.dtype == np.int8 for op in stored.convolutions)
     assert weight_bits(stored) == 8 * sum(
         op.weight.size + op.bias.size for op in stored.convolutions
     )
     planes = split(image())
-    before = run_core(quantised.core, planes)[0]
+    before = run_core(quantized.core, planes)[0]
     after = run_core(stored, planes)[0]
     for name in before:
         np.testing.assert_array_equal(before[name], after[name])
@@ -111,21 +111,21 @@ def test_every_shift_is_what_the_core_uses(core: IntCore) -> None:
     assert bits_apart(injected, shifts) == 3
 
 
-def test_numbers_that_the_board_could_not_store_are_refused(quantised: Quantised) -> None:
-    op = quantised.core.convolutions[0]
+def test_numbers_that_the_board_could_not_store_are_refused(quantized: Quantised) -> None:
+    op = quantized.core.convolutions[0]
     too_large = replace(op, bias=np.full(len(op.bias), 100_001), bias_frac_bits=op.bias_frac_bits)
     far = replace(
         op, weight_frac_bits=op.weight_frac_bits + 40, bias_frac_bits=op.bias_frac_bits + 40
     )
     for wrong in (too_large, far):
         with pytest.raises(ModelError, match=op.name):
-            as_stored(replace(quantised.core, ops=(wrong, *quantised.core.ops[1:])))
+            as_stored(replace(quantized.core, ops=(wrong, *quantized.core.ops[1:])))
 
 
-def test_maps_have_the_channels_that_run(quantised: Quantised) -> None:
-    tensors, _ = run_core(quantised.core, split(image()))
+def test_maps_have_the_channels_that_run(quantized: Quantised) -> None:
+    tensors, _ = run_core(quantized.core, split(image()))
     assert {name: tensor.shape[1] for name, tensor in tensors.items()} == map_channels(
-        quantised.core
+        quantized.core
     )
 
 

@@ -59,7 +59,7 @@ RULES: Mapping[Kind, tuple[Rule, ...]] = {
     "resize": (other_rules.resize_mode, other_rules.resize_scale, other_rules.resize_channels),
     "pixel shuffle": (other_rules.shuffle_place, other_rules.shuffle_channels),
     "argmax": (other_rules.argmax_channels,),
-    **dict.fromkeys(("quantise", "dequantise", "other"), (other_rules.known_operator,)),
+    **dict.fromkeys(("quantize", "dequantize", "other"), (other_rules.known_operator,)),
 }
 """What a node of each kind has to keep, float or quantised."""
 
@@ -106,20 +106,20 @@ class Broken:
     finding: Finding
 
 
-def judge(op: Operation, dpu: Dpu, quantised: bool) -> tuple[Broken, ...]:
+def judge(op: Operation, dpu: Dpu, quantized: bool) -> tuple[Broken, ...]:
     """Every rule that a node breaks, none where one of its `forms` breaks none.
 
     The rules of numbers are asked only where the file holds quantised ones.
     """
-    breaches = [_broken(form, dpu, quantised) for form in forms(op, dpu)]
+    breaches = [_broken(form, dpu, quantized) for form in forms(op, dpu)]
     # The first form is the operation as the file has it: the report is about that one.
     return breaches[0] if all(breaches) else ()
 
 
-def _broken(op: Operation, dpu: Dpu, quantised: bool) -> tuple[Broken, ...]:
+def _broken(op: Operation, dpu: Dpu, quantized: bool) -> tuple[Broken, ...]:
     rules = RULES[op.kind] + EVERY
     # The results of these two kinds are no numbers of 8 bits.
-    if quantised and op.kind not in ("other", "argmax"):
+    if quantized and op.kind not in ("other", "argmax"):
         rules += NUMBERS + SHIFTS.get(op.kind, ())
     findings = ((rule, rule(op, dpu)) for rule in rules if applies(rule, dpu))
     return tuple(

@@ -121,14 +121,14 @@ def place(network: Network, dpu: Dpu) -> Placement:
     require_known(dpu)
     parts = _parts(network)
     pairs = zip(network.operations, parts, strict=True)
-    broken = [judge(op, dpu, network.quantised) if part == "dpu-core" else () for op, part in pairs]
+    broken = [judge(op, dpu, network.quantized) if part == "dpu-core" else () for op, part in pairs]
     # In a float file a cut at an end costs time and no more.
-    if not network.quantised:
+    if not network.quantized:
         parts = _left_to_the_host(network, parts, broken)
     devices = [_device(part, bool(rules)) for part, rules in zip(parts, broken, strict=True)]
     subgraphs = _subgraphs(network.operations, devices)
     nodes = tuple(map(PlacedNode, network.operations, parts, devices, broken, subgraphs))
-    return Placement(nodes, tuple(_cuts(network, nodes)), "" if network.quantised else FLOAT_NOTE)
+    return Placement(nodes, tuple(_cuts(network, nodes)), "" if network.quantized else FLOAT_NOTE)
 
 
 def _device(part: Part, breaks_rules: bool) -> Device:
@@ -212,7 +212,7 @@ def _is_host_front(op: Operation, network: Network, *, trails: bool) -> bool:
         and op.attributes.get("mode") == "reflect"
     )
     moves = (op.op_type == "SpaceToDepth" or mirrors) and not trails
-    return network.quantised or op.op_type in SCALING or moves
+    return network.quantized or op.op_type in SCALING or moves
 
 
 def _is_host_back(op: Operation, network: Network, *, leads: bool) -> bool:
@@ -221,8 +221,8 @@ def _is_host_back(op: Operation, network: Network, *, leads: bool) -> bool:
     """
     if op.kind in CONVOLUTIONS:
         return False
-    if network.quantised:
-        return not op.integer and (op.kind == "dequantise" or op.op_type in SCALING)
+    if network.quantized:
+        return not op.integer and (op.kind == "dequantize" or op.op_type in SCALING)
     if op.op_type in SHAPING | DECODING:
         return not leads
     return op.op_type in SCALING and (

@@ -75,7 +75,7 @@ def shuffles(placement: Placement, dpu: Dpu, tile_px: int) -> str:
 
 def unread(placement: Placement, dpu: Dpu, tile_px: int) -> str:
     """Operators that the part of AMD's table that was read does not have."""
-    core = {op.op_type for op in placement.core if op.kind not in ("quantise", "dequantise")}
+    core = {op.op_type for op in placement.core if op.kind not in ("quantize", "dequantize")}
     names = ", ".join(sorted(core - {*dpu.target.npu["int8"].value}))
     return names and f"{names}: not in the part of AMD's table that was read, look there"
 
@@ -105,7 +105,7 @@ def is_island(node: PlacedNode, placement: Placement) -> bool:
     op = node.op
     weight = node.op.constants.get("weight")
     in_float = not op.integer or (weight is not None and weight.dtype == np.float32)
-    return not placement.note and node.device == "DPU" and op.kind != "dequantise" and in_float
+    return not placement.note and node.device == "DPU" and op.kind != "dequantize" and in_float
 
 
 def unknown(placement: Placement, dpu: Dpu, tile_px: int) -> str:

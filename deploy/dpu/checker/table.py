@@ -20,7 +20,7 @@ from beers_deploy.profiles.figures import Check, Figure, Row, predicted, unavail
 from beers_deploy.profiles.target import TILE_PX, TargetProfile, require_side
 from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.graph import refusal
-from beers_deploy.quant.onnx_file import is_quantised, metadata
+from beers_deploy.quant.onnx_file import is_quantized, metadata
 from beers_deploy.results import Table
 
 SOURCE = "operator rules of the target profile"
@@ -116,7 +116,7 @@ def _notes(placement: Placement, source: Network) -> list[str]:
     if not placement.note:
         return []
     refused = refusal(source.model)
-    note = OTHERS_NOTE if is_quantised(source.model) else placement.note
+    note = OTHERS_NOTE if is_quantized(source.model) else placement.note
     return [note, f"'quantize' refuses it: {refused}" if refused else "'quantize' accepts it"]
 
 
@@ -152,7 +152,7 @@ def _file_checks(model: onnx.ModelProto, dpu: Dpu) -> list[Check]:
     """What a VINT8 file must keep as a whole; none of a float file or a host's, which no compiler
     is given.
     """
-    if not is_quantised(model) or KEY in metadata(model):
+    if not is_quantized(model) or KEY in metadata(model):
         return []
     # ONNX allows both names for its own domain.
     opset = max(entry.version for entry in model.opset_import if entry.domain in ("", "ai.onnx"))

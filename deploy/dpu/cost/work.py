@@ -9,7 +9,7 @@ from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.finding import groups_of
 from beers_deploy.dpu.graph import Operation, Shape
 
-FUSED = ("activation", "quantise", "dequantise", "pixel shuffle")
+FUSED = ("activation", "quantize", "dequantize", "pixel shuffle")
 """Kinds that cost nothing: done on the way out of the operation before; a pixel shuffle is where
 its results go.
 """

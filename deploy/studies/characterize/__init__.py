@@ -1,4 +1,4 @@
-"""A sensor profile from raw frames of the sensor's own: what `characterise` does between options
+"""A sensor profile from raw frames of the sensor's own: what `characterize` does between options
 and TOML.
 
 - `frames`: which frames, what one digital number is, where the dark lies
@@ -68,7 +68,7 @@ class Stated:
                 )
 
 
-def characterise(
+def characterize(
     images: Sequence[Path], edges: Sequence[str] = (), stated: Stated | None = None
 ) -> Characterised:
     """Measure a sensor on its own frames.
@@ -118,7 +118,7 @@ def measured_sensor(
             _as_file(image, Path(folder) / f"image{number}.tif")
             for number, image in enumerate(_several(images))
         ]
-        measurement = characterise(paths, edges, stated)
+        measurement = characterize(paths, edges, stated)
         toml = profile_toml(measurement)
         profile = Path(folder) / "measured.toml"
         profile.write_text(toml, encoding="utf-8")

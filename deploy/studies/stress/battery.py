@@ -94,7 +94,7 @@ def _cannot_be_looked_at(subject: Subject, stage: str) -> str:
     """Why a stage has nothing to look at; empty where it has."""
     try:
         if stage == "INT8":
-            _ = subject.quantised
+            _ = subject.quantized
         elif stage == "INT8 reference":
             _ = subject.core
     except BeersError as error:

@@ -36,7 +36,7 @@ from beers_deploy.quant.graph import (
     image_channels,
 )
 from beers_deploy.quant.integer.reference import merged_correction, run_core
-from beers_deploy.quant.onnx_file import any_size, require_quantised
+from beers_deploy.quant.onnx_file import any_size, require_quantized
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.walk import Tiling, tiling_of
 from beers_deploy.restoration.plan import make_plan
@@ -107,10 +107,10 @@ class Subject:
     @cached_property
     def core(self) -> IntCore:
         """The whole numbers of the INT8 file."""
-        return read_core(self.quantised.model)
+        return read_core(self.quantized.model)
 
     @property
-    def quantised(self) -> Network:
+    def quantized(self) -> Network:
         """The INT8 network."""
         if self.int8 is None:
             raise ModelError("The INT8 network is missing. Give its file as the second argument.")
@@ -137,7 +137,7 @@ def open_subject(
         networks = [Network(source.model) for source in opened]
     else:
         floating = Opened.load(float_network, sensor=profile, int8=False)
-        require_quantised(floating.model, floating.label, wanted=False)
+        require_quantized(floating.model, floating.label, wanted=False)
         opened = (floating,)
         networks = [Network(floating.model)]
     for network in networks:
@@ -216,7 +216,7 @@ def float32(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Meas
 
 def int8(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
     """The INT8 network by onnxruntime's integer kernels, on an image (H, W) in DN."""
-    network = subject.quantised
+    network = subject.quantized
     measures = restoration(network, case, image, INT8_GAIN_DN)
     if case.pixels == "sound" and not case.large:
         apart = np.abs(network.restore(image) - subject.float32.restore(image))
@@ -250,7 +250,7 @@ def restoration(
 def reference(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
     """The INT8 network in whole numbers alone, on 48 x 48 pixels of larger images (H, W)."""
     core = subject.core
-    network = subject.quantised
+    network = subject.quantized
     if case.pixels != "sound":
         return []
     crop = network.extended(_fractions(image[:CROP_PX, :CROP_PX]))

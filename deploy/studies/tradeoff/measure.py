@@ -20,7 +20,7 @@ from beers_deploy.profiles.figures import Figure, measured
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import load_sensor, sensor_names
 from beers_deploy.quant.calibration import Calibration
-from beers_deploy.quant.quantise import quantise_model
+from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.restoration.method import Restore, network_method
 from beers_deploy.restoration.plan import Plan, make_plan
 from beers_deploy.restoration.tiles.exposures import tiles_by_factor
@@ -217,5 +217,5 @@ def make_int8(network: Network, scenes: Path | None, sensor: Sensor, seed: int) 
     named = network.sensor
     calibration_sensor = load_sensor(named) if named in sensor_names() else sensor
     patches = Calibration(calibration_sensor, scenes, PATCHES, PATCH_PX, seed)
-    result = quantise_model(network.model, patches.drawn, patches.about)
+    result = quantize_model(network.model, patches.drawn, patches.about)
     return Network(result.host, f"{network.name}-int8")

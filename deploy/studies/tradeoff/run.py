@@ -116,13 +116,13 @@ def benchmark_of(study: Study) -> tuple[Benchmark, list[str]]:
 
 def points_for(study: Study) -> list[Point]:
     """Return the points of a study; float networks are quantised."""
-    quantise = partial(
+    quantize = partial(
         make_int8,
         scenes=study.calibration,
         sensor=study.sensors[0],
         seed=study.seed,
     )
-    variants = network_variants(list(study.networks), study.sensors[0], quantise)
+    variants = network_variants(list(study.networks), study.sensors[0], quantize)
     return points_of(variants, study.boards, Swath(*study.size))
 
 

@@ -74,7 +74,7 @@ class IntegerSketch(Sketch):
             self.constant(np.array(zero, np.int8)),
         )
 
-    def quantised(self, source: str) -> str:
+    def quantized(self, source: str) -> str:
         return self.node("QuantizeLinear", source, *self.numbers)
 
     def qconv(
@@ -103,7 +103,7 @@ def integer_convbeers(
     """The host's integer encoding, one int8 plane in, the correction added to the image behind."""
     s = IntegerSketch()
     wide = (features, features, 3, 3)
-    stream = head = s.qconv(s.quantised("image"), (features, 1, 3, 3), weight_scale)
+    stream = head = s.qconv(s.quantized("image"), (features, 1, 3, 3), weight_scale)
     for _ in range(blocks):
         inner = s.node("Relu", s.qconv(stream, wide, weight_scale))
         stream = s.qadd(stream, s.qconv(inner, wide, weight_scale))

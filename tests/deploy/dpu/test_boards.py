@@ -229,7 +229,7 @@ def test_the_shipped_files_run_whole_on_every_board(variant: str) -> None:
         assert placement.failed == (), name
 
 
-def test_every_board_has_the_shifts_of_the_quantiser() -> None:
+def test_every_board_has_the_shifts_of_the_quantizer() -> None:
     assert {name: target_shifts(dpu.target) for name, dpu in DPUS.items()} == dict.fromkeys(
         DPUS, SHIFTS
     )

@@ -22,7 +22,7 @@ from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.shipped import shipped_names
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.encodings import board_model
-from beers_deploy.quant.quantise import Quantised, quantise_model
+from beers_deploy.quant.quantize import Quantised, quantize_model
 from tests.deploy.dpu.draws import rules_of
 from tests.deploy.dpu.graphs import IntegerSketch
 from tests.model.networks import plain
@@ -42,7 +42,7 @@ def rules(model: onnx.ModelProto) -> set[str]:
 
 
 @cache
-def quantised(spread: float) -> Quantised:
+def quantized(spread: float) -> Quantised:
     """A small network of random weights, its biases so large."""
     network = plain(Variant(blocks=1, features=4), seed=7)
     generator = torch.Generator().manual_seed(7)
@@ -50,12 +50,12 @@ def quantised(spread: float) -> Quantised:
         for name, value in network.named_parameters():
             if name.endswith("bias"):
                 value.normal_(0, spread, generator=generator)
-    return quantise_model(to_onnx(network, {}), drawn(2, seed=5), {})
+    return quantize_model(to_onnx(network, {}), drawn(2, seed=5), {})
 
 
 def own_file() -> onnx.ModelProto:
     """The host's, to be spoilt."""
-    return copied(quantised(0.1).host)
+    return copied(quantized(0.1).host)
 
 
 def fits_int8(values: list[int]) -> bool:
@@ -93,7 +93,7 @@ def test_the_bias_of_an_integer_kernel_is_looked_at(
     tmp_path: Path, bias: list[int], expected: set[str]
 ) -> None:
     s = IntegerSketch()
-    inner = s.qconv(s.quantised("image"), (4, 1, 3, 3), bias=np.array(bias, np.int32))
+    inner = s.qconv(s.quantized("image"), (4, 1, 3, 3), bias=np.array(bias, np.int32))
     path = s.save(tmp_path / "b.onnx", s.node("DequantizeLinear", inner, *s.numbers))
     nodes = place(read_network(path, 20), DPU).failed
     assert set(rules_of(nodes)) == expected
@@ -108,7 +108,7 @@ def test_the_shipped_files_keep_every_rule(name: str) -> None:
 @pytest.mark.parametrize("spread", [0.001, 0.1, 3.0])
 def test_what_quantize_writes_of_random_networks_keeps_every_rule(spread: float) -> None:
     """In both encodings, biases small and large beside the products."""
-    network = quantised(spread)
+    network = quantized(spread)
     assert rules(network.host) == rules(board_model(network.core, {})) == set()
 
 

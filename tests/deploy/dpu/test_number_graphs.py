@@ -121,8 +121,8 @@ def test_two_nodes_may_read_the_same_constant_at_two_scales(tmp_path: Path) -> N
         weight = s.constant(np.ones((4, 4, 3, 3), np.int8))
         bias = s.stored(np.zeros(4, np.int8))
         for frac_bits in (7, 5):
-            dequantised = s.node("DequantizeLinear", weight, *s.scale(frac_bits))
-            x = s.pair(s.node("Conv", x, dequantised, bias, pads=[1] * 4))
+            dequantized = s.node("DequantizeLinear", weight, *s.scale(frac_bits))
+            x = s.pair(s.node("Conv", x, dequantized, bias, pads=[1] * 4))
         return x
 
     assert remedies(tmp_path / "n.onnx", draw) == {}

@@ -198,9 +198,9 @@ def test_a_wider_array_needs_more_of_the_weight_bank(tmp_path: Path) -> None:
     assert broken_rules(path, load_dpu("vck190", "C64B1")) == ["conv weight bank"]
 
 
-def test_a_float_convolution_in_a_quantised_file_is_refused(tmp_path: Path) -> None:
+def test_a_float_convolution_in_a_quantized_file_is_refused(tmp_path: Path) -> None:
     sketch = IntegerSketch()
-    first = sketch.qconv(sketch.quantised("image"), (4, 1, 3, 3))
+    first = sketch.qconv(sketch.quantized("image"), (4, 1, 3, 3))
     path = sketch.save(
         tmp_path / "f.onnx",
         sketch.conv(sketch.node("DequantizeLinear", first, *sketch.numbers), (1, 4, 3, 3)),

@@ -38,7 +38,7 @@ def test_the_integer_file_has_three_parts_and_one_subgraph(tmp_path: Path) -> No
     assert "subgraphs" not in remarks
 
 
-def test_a_float_file_is_judged_as_if_quantised(tmp_path: Path) -> None:
+def test_a_float_file_is_judged_as_if_quantized(tmp_path: Path) -> None:
     placement = placed(float_convbeers(tmp_path / "f.onnx", 2, 8))
     assert placement.note == FLOAT_NOTE
     assert [node.part for node in placement.nodes].count("host-back") == 1
@@ -120,7 +120,7 @@ def test_what_a_classifier_ends_in_is_the_hosts(tmp_path: Path) -> None:
 
 def test_a_relu_behind_the_last_convolution_stays_on_the_dpu(tmp_path: Path) -> None:
     sketch = IntegerSketch()
-    last = sketch.node("Relu", sketch.qconv(sketch.quantised("image"), (4, 1, 3, 3)))
+    last = sketch.node("Relu", sketch.qconv(sketch.quantized("image"), (4, 1, 3, 3)))
     path = sketch.save(tmp_path / "r.onnx", sketch.node("DequantizeLinear", last, *sketch.numbers))
     devices = [node.device for node in placed(path).nodes]
     assert devices == ["host", "DPU", "DPU", "host"]

@@ -13,7 +13,7 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.encodings import PLACE_PX, board_model
 from beers_deploy.quant.onnx_file import save_onnx
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
-from tests.quant.tiling.small_networks import quantised_half_resolution
+from tests.quant.tiling.small_networks import quantized_half_resolution
 
 
 def core(path: Path) -> list[tuple[object, ...]]:
@@ -44,8 +44,8 @@ def test_a_board_file_keeps_only_the_conversions_at_its_border_and_its_numbers(
     tmp_path: Path,
 ) -> None:
     first, *middle, last = read_network(board_convbeers(tmp_path / "b.onnx", 3, 8), 64).operations
-    assert (first.kind, last.kind) == ("quantise", "dequantise")
-    assert {op.kind for op in middle}.isdisjoint(("quantise", "dequantise"))
+    assert (first.kind, last.kind) == ("quantize", "dequantize")
+    assert {op.kind for op in middle}.isdisjoint(("quantize", "dequantize"))
     conv = next(op for op in middle if op.kind == "conv")
     assert conv.integer
     assert {role: scale.frac_bits for role, scale in conv.scales.items()} == dict.fromkeys(
@@ -138,7 +138,7 @@ def test_the_core_of_a_network_at_half_resolution_has_maps_of_half_the_tile(
     """In the host's file the core is only described, and the board's begins
     behind the rearranging.
     """
-    network = quantised_half_resolution()
+    network = quantized_half_resolution()
     model = board_model(network.core, {}) if on_board else network.host
     save_onnx(model, tmp_path / "half.onnx")
     convolutions = [
@@ -153,7 +153,7 @@ def test_the_core_of_a_network_at_half_resolution_has_maps_of_half_the_tile(
 def test_a_core_at_half_resolution_that_is_fixed_to_a_tile_is_fixed_to_half_of_it(
     tmp_path: Path,
 ) -> None:
-    model = quantised_half_resolution()
+    model = quantized_half_resolution()
     fixed = board_model(model.core, {}, 64)
     assert [d.dim_value for d in fixed.graph.input[0].type.tensor_type.shape.dim[2:]] == [32, 32]
     assert own_tile_px(fixed) == 64
@@ -164,7 +164,7 @@ def test_a_core_at_half_resolution_that_is_fixed_to_a_tile_is_fixed_to_half_of_i
 
 @pytest.mark.parametrize("text", ["0", "-2", "half", "1000000"])
 def test_places_that_cannot_be_are_refused(text: str, tmp_path: Path) -> None:
-    model = board_model(quantised_half_resolution().core, {})
+    model = board_model(quantized_half_resolution().core, {})
     next(entry for entry in model.metadata_props if entry.key == PLACE_PX).value = text
     save_onnx(model, tmp_path / "half.onnx")
     with pytest.raises(ModelError, match="contradict"):

@@ -70,7 +70,7 @@ def test_between_two_convolutions_of_the_dpu_there_is_no_prediction(tmp_path: Pa
 
 def test_numbers_that_the_dpu_refuses_are_no_work_for_the_processor(tmp_path: Path) -> None:
     sketch = IntegerSketch()
-    first = sketch.qconv(sketch.quantised("image"), (4, 1, 3, 3))
+    first = sketch.qconv(sketch.quantized("image"), (4, 1, 3, 3))
     last = sketch.qconv(first, (4, 4, 3, 3), weight_scale=0.3)
     path = sketch.save(tmp_path / "n.onnx", sketch.node("DequantizeLinear", last, *sketch.numbers))
     with pytest.raises(ModelError, match="check"):

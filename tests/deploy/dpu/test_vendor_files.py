@@ -44,7 +44,7 @@ def float_file(path: Path) -> Path:
     return s.save(path, s.biased(s.node("LeakyRelu", up, alpha=26 / 256), 1, 8, 3, 3))
 
 
-def quantised(
+def quantized(
     path: Path,
     form: QuantFormat,
     kind: QuantType,
@@ -78,7 +78,7 @@ def test_onnxruntimes_files_are_refused_for_their_numbers_alone(
 ) -> None:
     signed = kind == QuantType.QInt8
     placement = place(
-        read_network(quantised(tmp_path / "q.onnx", form, kind, per_channel, signed), TILE_PX), DPU
+        read_network(quantized(tmp_path / "q.onnx", form, kind, per_channel, signed), TILE_PX), DPU
     )
     expected = (
         {"power of two"}
@@ -97,7 +97,7 @@ def test_onnxruntimes_files_are_refused_for_their_numbers_alone(
 @pytest.mark.parametrize("kind", [QuantType.QInt8, QuantType.QUInt8])
 def test_a_vendors_power_of_two_file_passes_whole(tmp_path: Path, kind: QuantType) -> None:
     """What AMD's quantisers write for the DPU: QDQ, 2^-n, symmetric, int8 bias."""
-    path = quantised(tmp_path / "q.onnx", QuantFormat.QDQ, kind, symmetric=True)
+    path = quantized(tmp_path / "q.onnx", QuantFormat.QDQ, kind, symmetric=True)
     onnx.save_model(with_scales(onnx.load_model(path)), path)
     placement = place(read_network(path, TILE_PX), DPU)
     assert rules(placement) == set()
@@ -128,7 +128,7 @@ def with_scales(model: onnx.ModelProto) -> onnx.ModelProto:
     return model
 
 
-def test_nodes_of_a_quantiser_that_onnx_does_not_know_are_named_with_a_remedy(
+def test_nodes_of_a_quantizer_that_onnx_does_not_know_are_named_with_a_remedy(
     tmp_path: Path,
 ) -> None:
     s = Sketch(4)

@@ -17,7 +17,7 @@ from beers_deploy.model.convbeers import BankedConvBEERS, Rounding, initialise
 from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.banked.calibrate import bank_results, map_steps, quantise_family
+from beers_deploy.quant.banked.calibrate import bank_results, map_steps, quantize_family
 from beers_deploy.quant.banked.family import (
     FAMILY,
     Family,
@@ -70,7 +70,7 @@ def pair(request: pytest.FixtureRequest) -> tuple[BankedConvBEERS, Family]:
         for k, vector in enumerate(SENSORS)
     ]
     middle = bank_of_vector((0.0, 0.0, 0.0, 0.0))
-    return float_network, quantise_family(
+    return float_network, quantize_family(
         weights_of(float_network), middle, Remade(images.__getitem__, len(images))
     )
 

@@ -116,4 +116,4 @@ def test_moves_between_integers_are_of_integers() -> None:
         nodes, *(numpy_helper.from_array(np.asarray(value), name) for name, value in values.items())
     )
     kinds = [(op.kind, op.integer) for op in network_of(model, 8).operations]
-    assert kinds == [("quantise", True), ("pixel shuffle", True), ("dequantise", False)]
+    assert kinds == [("quantize", True), ("pixel shuffle", True), ("dequantize", False)]

@@ -80,7 +80,7 @@ def test_shipped_networks_come_in_both_precisions_with_the_sensors_profile() -> 
     assert precisions == ["float32", "int8"]
 
 
-def test_an_own_network_is_quantised_and_one_that_cannot_be_stays_float(
+def test_an_own_network_is_quantized_and_one_that_cannot_be_stays_float(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = float_file(tmp_path / "net.onnx")

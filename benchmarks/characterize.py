@@ -1,7 +1,7 @@
-"""What `characterise` finds on simulated images of known sensors: errors, and how often the
+"""What `characterize` finds on simulated images of known sensors: errors, and how often the
 intervals hold the truth.
 
-    python benchmarks/characterise.py --images aerial-test/ --weights convbeers-s.safetensors
+    python benchmarks/characterize.py --images aerial-test/ --weights convbeers-s.safetensors
 
 Each sensor sees twelve of the folder's photographs; then with a checkerboard laid into one of them
 (60 m a side at 0.5 m, two by two fields, as calibration sites have), searched for and pointed at.
@@ -35,7 +35,7 @@ from beers_deploy.parity import torch_network
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument
 from beers_deploy.profiles.sensor_file import load_sensor
-from beers_deploy.studies.characterize import Characterised, Stated, characterise, profile_toml
+from beers_deploy.studies.characterize import Characterised, Stated, characterize, profile_toml
 from beers_deploy.studies.characterize.instrument import AXES
 from beers_deploy.studies.characterize.profile import SHOWN_CPX
 from beers_deploy.studies.evaluation.pairs import simulate_pairs
@@ -211,7 +211,7 @@ class Findings:
         """Characterise one sensor."""
         self.asked += 2
         try:
-            estimate = characterise(paths, boxes, Stated(sensor.bits, sensor.gain_dn_per_radiance))
+            estimate = characterize(paths, boxes, Stated(sensor.bits, sensor.gain_dn_per_radiance))
         except ImageError as error:
             print(f"- {error}")
             return None

@@ -10,76 +10,76 @@ from beers_deploy.quant.encodings import board_model
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import correction_graph, read_planes
 from beers_deploy.quant.onnx_file import metadata
-from beers_deploy.quant.quantise import Quantised, quantise_model
+from beers_deploy.quant.quantize import Quantised, quantize_model
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.tiling.walk import tiling_of
 
 
-def test_scales_are_powers_of_two_and_numbers_are_int8(quantised: Quantised) -> None:
-    for model in (quantised.host, board_model(quantised.core, {})):
+def test_scales_are_powers_of_two_and_numbers_are_int8(quantized: Quantised) -> None:
+    for model in (quantized.host, board_model(quantized.core, {})):
         for tensor in model.graph.initializer:
             value = numpy_helper.to_array(tensor)
             if tensor.name.startswith("scale_"):
                 assert np.log2(value) == np.rint(np.log2(value))
-    for op in quantised.core.ops:
+    for op in quantized.core.ops:
         if isinstance(op, IntConv):
             assert op.weight.dtype == op.bias.dtype == np.int8
 
 
 def test_every_shift_is_within_its_window_and_one_that_is_not_is_named(
-    quantised: Quantised,
+    quantized: Quantised,
 ) -> None:
-    assert shift_faults(quantised.core) == []
+    assert shift_faults(quantized.core) == []
     faults = shift_faults(
-        replace(quantised.core, frac_bits={**quantised.core.frac_bits, "head": 40})
+        replace(quantized.core, frac_bits={**quantized.core.frac_bits, "head": 40})
     )
     assert any(fault.startswith("head: shift_cut") for fault in faults)
 
 
 def test_unreachable_positions_are_moved_to_legal_ones(
-    float_onnx: onnx.ModelProto, quantised: Quantised
+    float_onnx: onnx.ModelProto, quantized: Quantised
 ) -> None:
     graph = read_planes(correction_graph(float_onnx))
     wild = {
-        name: (p if name == "planes" else p + 20) for name, p in quantised.core.frac_bits.items()
+        name: (p if name == "planes" else p + 20) for name, p in quantized.core.frac_bits.items()
     }
     assert shift_faults(build_core(graph, wild)) == []
 
 
-def test_every_convolution_is_an_integer_kernel(quantised: Quantised) -> None:
-    kinds = [node.op_type for node in quantised.host.graph.node]
+def test_every_convolution_is_an_integer_kernel(quantized: Quantised) -> None:
+    kinds = [node.op_type for node in quantized.host.graph.node]
     # These are the head, two in each of two blocks, the end and the tail.
     assert kinds.count("QLinearConv") == 7
     assert "Conv" not in kinds
 
 
 def test_int8_stays_close_to_float(
-    float_onnx: onnx.ModelProto, quantised: Quantised, patches: Patches
+    float_onnx: onnx.ModelProto, quantized: Quantised, patches: Patches
 ) -> None:
     assert (
-        compare(open_session(float_onnx), open_session(quantised.host), patches.pairs).mae < 0.002
+        compare(open_session(float_onnx), open_session(quantized.host), patches.pairs).mae < 0.002
     )
 
 
 def test_the_same_patches_give_the_same_bytes(
-    float_onnx: onnx.ModelProto, quantised: Quantised, patches: Patches
+    float_onnx: onnx.ModelProto, quantized: Quantised, patches: Patches
 ) -> None:
-    repeated = quantise_model(float_onnx, patches, {"seed": "5"})
-    assert repeated.host.SerializeToString() == quantised.host.SerializeToString()
+    repeated = quantize_model(float_onnx, patches, {"seed": "5"})
+    assert repeated.host.SerializeToString() == quantized.host.SerializeToString()
 
 
-def test_the_file_says_what_it_was_calibrated_on(quantised: Quantised, patches: Patches) -> None:
-    about = metadata(quantised.host)
+def test_the_file_says_what_it_was_calibrated_on(quantized: Quantised, patches: Patches) -> None:
+    about = metadata(quantized.host)
     assert about["calibration_sha256"] == patches.digest
     assert about["precision"] == "int8 legal"
 
 
 @pytest.mark.parametrize("encoding", ["float", "host", "board"])
 def test_the_radius_is_read_from_the_graph(
-    encoding: str, float_onnx: onnx.ModelProto, quantised: Quantised
+    encoding: str, float_onnx: onnx.ModelProto, quantized: Quantised
 ) -> None:
-    model = {"float": float_onnx, "host": quantised.host, "board": board_model(quantised.core, {})}[
+    model = {"float": float_onnx, "host": quantized.host, "board": board_model(quantized.core, {})}[
         encoding
     ]
     assert tiling_of(model).halo_px == 7

@@ -185,7 +185,7 @@ def _chain(graph: Graph, ends: Ends, streams: list[Stream]) -> Chain:
     return Chain(tuple(alone), tuple(widths[name] for name in alone))
 
 
-def quantise_model(
+def quantize_model(
     model: onnx.ModelProto,
     patches: Patches,
     about: dict[str, str],
