@@ -35,7 +35,7 @@ from beers_deploy.parity import torch_network
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Instrument
 from beers_deploy.profiles.sensor_file import load_sensor
-from beers_deploy.studies.characterize import Characterised, Stated, characterize, profile_toml
+from beers_deploy.studies.characterize import Measurement, Stated, measure, profile_toml
 from beers_deploy.studies.characterize.instrument import AXES
 from beers_deploy.studies.characterize.profile import SHOWN_CPX
 from beers_deploy.studies.evaluation.pairs import simulate_pairs
@@ -104,7 +104,7 @@ def look(
     scenes: Sequence[Scene],
     number: int,
     folder: Path,
-) -> Characterised | None:
+) -> Measurement | None:
     """Characterise one sensor in each way; what was found where the checkerboard had to be searched
     for.
     """
@@ -207,11 +207,11 @@ class Findings:
 
     def look(
         self, sensor: Instrument, paths: tuple[Path, ...], boxes: tuple[str, ...] = ()
-    ) -> Characterised | None:
+    ) -> Measurement | None:
         """Characterise one sensor."""
         self.asked += 2
         try:
-            estimate = characterize(paths, boxes, Stated(sensor.bits, sensor.gain_dn_per_radiance))
+            estimate = measure(paths, boxes, Stated(sensor.bits, sensor.gain_dn_per_radiance))
         except ImageError as error:
             print(f"- {error}")
             return None

@@ -27,13 +27,13 @@ from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.results import Table, input_of
 from beers_deploy.studies.characterize.frames import cut_box, open_frames
 from beers_deploy.studies.characterize.instrument import Mtf, measure_mtf, measure_noise, snr_at
-from beers_deploy.studies.characterize.profile import PARTS, Characterised, profile_toml
+from beers_deploy.studies.characterize.profile import PARTS, Measurement, profile_toml
 
 __all__ = [
-    "Characterised",
     "MeasuredSensor",
+    "Measurement",
     "Stated",
-    "characterise",
+    "measure",
     "measured_sensor",
     "profile_toml",
 ]
@@ -68,9 +68,9 @@ class Stated:
                 )
 
 
-def characterize(
+def measure(
     images: Sequence[Path], edges: Sequence[str] = (), stated: Stated | None = None
-) -> Characterised:
+) -> Measurement:
     """Measure a sensor on its own frames.
 
     Args:
@@ -87,7 +87,7 @@ def characterize(
         mtf = measure_mtf(frames, regions, noise.model)
     gain = stated.gain or frames.full_scale_dn / FULL_SCALE_RADIANCE
     low, high = (snr_at(noise.model, frames.full_scale_dn / part, gain) for part in PARTS)
-    return Characterised(
+    return Measurement(
         frames, noise, mtf, (low, high), gain, stated.gain is not None, stated.gsd_m, stated.mtf
     )
 
@@ -118,7 +118,7 @@ def measured_sensor(
             _as_file(image, Path(folder) / f"image{number}.tif")
             for number, image in enumerate(_several(images))
         ]
-        measurement = characterize(paths, edges, stated)
+        measurement = measure(paths, edges, stated)
         toml = profile_toml(measurement)
         profile = Path(folder) / "measured.toml"
         profile.write_text(toml, encoding="utf-8")

@@ -26,7 +26,7 @@ MARGIN = 1e-5
 
 
 @dataclass(frozen=True)
-class Characterised:
+class Measurement:
     """What was found of a camera.
 
     Attributes:
@@ -139,7 +139,7 @@ def _blocks(noise: Noise) -> str:
     return f"{noise.model.blocks} blocks of 16 x 16{still}"
 
 
-def profile_toml(found: Characterised) -> str:
+def profile_toml(found: Measurement) -> str:
     """The profile as its TOML file; the source of what was measured has its interval, and any
     doubt.
     """
@@ -182,7 +182,7 @@ def profile_toml(found: Characterised) -> str:
     return sensor_toml(f"Measured on {images}.", tables)
 
 
-def _mtf_table(sensor: Characterised, images: str) -> dict[str, object]:
+def _mtf_table(sensor: Measurement, images: str) -> dict[str, object]:
     """Measured curves, what the user states, or an assumption; an axis without a curve has the
     other's.
     """
@@ -221,7 +221,7 @@ def _intervals(curve: MtfCurve) -> str:
     )
 
 
-def _noise_table(sensor: Characterised, images: str) -> dict[str, object]:
+def _noise_table(sensor: Measurement, images: str) -> dict[str, object]:
     """The SNRs are linear ratios without the rounding to whole DN; the darker one is kept within
     physics.
     """

@@ -15,7 +15,7 @@ from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.profiles.errors import BeersError, OptionError
 from beers_deploy.profiles.sensor import Instrument, noise_from_snr
 from beers_deploy.profiles.sensor_file import load_sensor
-from beers_deploy.studies.characterize import Stated, characterize, profile_toml
+from beers_deploy.studies.characterize import Stated, measure, profile_toml
 from beers_deploy.studies.characterize.frames import Frames, cut_box
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
@@ -103,8 +103,8 @@ def transfer(frequencies: np.ndarray, mtf_nyquist: float) -> np.ndarray:
 
 def test_without_a_gain_the_noise_over_full_scale_stands(raw: tuple[Path, Path]) -> None:
     """To a network only that matters: any gain leaves it."""
-    with_gain = characterize(raw, stated=Stated(bits=12, gain=3.0))
-    without_gain = characterize(raw, stated=Stated(bits=12))
+    with_gain = measure(raw, stated=Stated(bits=12, gain=3.0))
+    without_gain = measure(raw, stated=Stated(bits=12))
     assert without_gain.gain == pytest.approx(4095 / 400)
     for one, other in zip(with_gain.snrs, without_gain.snrs, strict=True):
         assert one.value == pytest.approx(other.value)
@@ -119,7 +119,7 @@ def test_a_box_gives_one_axis_for_both(raw: tuple[Path, Path]) -> None:
     # each side of an image.
     middle = SIDE // RATIO // 2 - 32
     box = f"{raw[0]}:{middle - 11},{middle - 38},30,28"
-    result = characterize(raw, (box,), Stated(bits=12))
+    result = measure(raw, (box,), Stated(bits=12))
     assert list(result.mtf.curves) == ["across"]
     value, (low, high) = result.mtf.curves["across"].at(0.5)
     assert low <= 0.09 <= high < 2 * low
@@ -155,12 +155,12 @@ def test_steps_and_a_black_level_change_nothing_but_the_units(
     raw: tuple[Path, Path], tmp_path: Path
 ) -> None:
     """Ten bits stored in sixteen, above a pedestal: the noise above the dark is the same."""
-    plain = characterize(raw, stated=Stated(bits=12, mtf=(0.1, 0.1)))
+    plain = measure(raw, stated=Stated(bits=12, mtf=(0.1, 0.1)))
     folder = tmp_path / "frames"
     folder.mkdir()
     for path in raw:
         tifffile.imwrite(folder / path.name, ((tifffile.imread(path) + 200) * 8).astype(np.uint16))
-    result = characterize([folder], stated=Stated(bits=15, black_level=1600, mtf=(0.1, 0.1)))
+    result = measure([folder], stated=Stated(bits=15, black_level=1600, mtf=(0.1, 0.1)))
     assert (result.frames.step, result.frames.bits, result.frames.stored_full_scale) == (
         8,
         12,
@@ -171,7 +171,7 @@ def test_steps_and_a_black_level_change_nothing_but_the_units(
     assert tomllib.loads(profile_toml(result))["offset"]["offset_dn"]["value"] == 200
     assert any("full scale 32760" in note for note in result.notes())
     assert not any("black level" in note for note in result.notes())
-    hidden = characterize([folder], stated=Stated(bits=15, mtf=(0.1, 0.1)))
+    hidden = measure([folder], stated=Stated(bits=15, mtf=(0.1, 0.1)))
     assert any("black level" in note for note in hidden.notes())
 
 
@@ -184,10 +184,10 @@ def test_pairs_of_one_scene_give_the_noise_alone(tmp_path: Path) -> None:
         tifffile.imwrite(
             tmp_path / f"{number}.tif", np.clip(noisy.round(), 1, 4094).astype(np.uint16)
         )
-    result = characterize([tmp_path], stated=Stated(bits=12, mtf=(0.1, 0.1)))
+    result = measure([tmp_path], stated=Stated(bits=12, mtf=(0.1, 0.1)))
     assert result.noise.pairs == 1
     assert result.noise.model.at(1000).value == pytest.approx(500, rel=0.05)
-    alone = characterize([tmp_path / "0.tif"], stated=Stated(bits=12, mtf=(0.1, 0.1)))
+    alone = measure([tmp_path / "0.tif"], stated=Stated(bits=12, mtf=(0.1, 0.1)))
     assert alone.noise.model.at(1000).value > 1500
 
 
@@ -288,20 +288,20 @@ def test_pixels_clipped_at_full_scale_tell_the_bits(raw: tuple[Path, Path], tmp_
     pixels = tifffile.imread(raw[0]).copy()
     pixels[:4, :4] = 4095
     image = tiff(tmp_path, pixels)
-    result = characterize((image, raw[1]))
+    result = measure((image, raw[1]))
     assert result.frames.bits == 12
     assert tomllib.loads(profile_toml(result))["digitiser"]["bits"]["status"] == "measured"
     with pytest.raises(BeersError, match="clipped pixels"):
-        characterize((image, raw[1]), (f"{image}:0,0,30,30",))
+        measure((image, raw[1]), (f"{image}:0,0,30,30",))
     pixels[:4, :4] = 4000
     with pytest.raises(BeersError, match="bits"):
-        characterize((tiff(tmp_path, pixels), raw[1]))
+        measure((tiff(tmp_path, pixels), raw[1]))
 
 
 def test_names_cannot_break_the_profile(raw: tuple[Path, Path], tmp_path: Path) -> None:
     odd = tmp_path / 'a "quoted" \x7f\u202e name.tif'
     odd.write_bytes(raw[0].read_bytes())
-    text = profile_toml(characterize((odd, raw[1]), stated=Stated(bits=12)))
+    text = profile_toml(measure((odd, raw[1]), stated=Stated(bits=12)))
     assert "\x7f" not in text
     assert "quoted" in tomllib.loads(text)["description"]
 
@@ -310,7 +310,7 @@ def test_the_noise_of_a_bound_is_a_profile_that_loads(
     raw: tuple[Path, Path], tmp_path: Path
 ) -> None:
     """All noise in beta, or in alpha: decimals must not put the SNR beyond what physics allows."""
-    result = characterize(raw, stated=Stated(bits=12))
+    result = measure(raw, stated=Stated(bits=12))
     full_scale = 4095 / result.gain
     for dark in (math.sqrt(1 / 4), 1 / 4):
         bright = replace(result.snrs[1], radiance=full_scale / 4, value=100 / 3)
