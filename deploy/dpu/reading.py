@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 
-from beers_deploy.dpu.graph import Network, Operation, Shape, Window
+from beers_deploy.dpu.graph import Network, Operation, Pair, Shape, Window
 from beers_deploy.model.bank import GAINS, LARGEST, WIDE
 from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.encodings import BORDER_PX, PLACE_PX, as_on_board
@@ -126,9 +126,9 @@ class _Reader:
         inputs = self.integers.activations(node)
         formats = self.integers.formats(node)
         shapes = tuple(map(self.shapes.get, inputs))
-        window = _window(node, weight, shapes)
+        kernel, window = _window(node, weight, shapes)
         channels = _channels(node, weight, shapes)
-        shape = out_shape(node, kind, shapes, window, channels[1], self.graph.constants)
+        shape = out_shape(node, kind, shapes, kernel, window, channels[1], self.graph.constants)
         outputs = tuple(self.integers.resolve(name) for name in node.outputs if name)
         self.shapes |= dict.fromkeys(outputs, shape)
         self.kinds |= dict.fromkeys(outputs, kind)
@@ -140,6 +140,7 @@ class _Reader:
             outputs=outputs,
             in_shapes=shapes,
             out_shape=shape,
+            kernel=kernel,
             window=window,
             channels=channels,
             weight_bytes=weight.size if weight is not None else 0,
@@ -178,12 +179,14 @@ class _Reader:
         return None if value is None else value.shape
 
 
-def _window(node: Node, weight: np.ndarray | None, shapes: Sequence[Shape | None]) -> Window:
+def _window(
+    node: Node, weight: np.ndarray | None, shapes: Sequence[Shape | None]
+) -> tuple[Pair, Window]:
     # The window of a global pool is its whole map.
     size = shapes[0][1:] if shapes and shapes[0] else (0, 0)
     if "Global" in node.op_type:
-        return Window(size if any(size) else (1, 1))
-    return node.window(() if weight is None else weight.shape[2:], size) or Window()
+        return size if any(size) else (1, 1), Window()
+    return node.window(() if weight is None else weight.shape[2:], size) or ((1, 1), Window())
 
 
 def _channels(

@@ -30,7 +30,6 @@ from beers_deploy.quant.graph.operations import (
     Pointwise,
     Resize,
     Shuffle,
-    Window,
     read_planes,
     same,
     split,
@@ -46,6 +45,7 @@ from beers_deploy.quant.graph.reader import (
     refusal,
 )
 from beers_deploy.quant.graph.writer import graph_to_onnx
+from beers_deploy.quant.window import Window
 
 __all__ = [
     "COARSE_MAX",

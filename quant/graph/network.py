@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from beers_deploy.profiles.errors import LONGEST, ModelError, printable
-from beers_deploy.quant.graph.nodes import Pair, Window
 from beers_deploy.quant.graph.operations import (
     CORRECTION,
     IMAGE,
@@ -25,6 +24,7 @@ from beers_deploy.quant.graph.operations import (
     Resize,
     Shuffle,
 )
+from beers_deploy.quant.window import Pair
 
 REMEDY = (
     "See docs/reference/any-network.md for the operators that 'quantize' accepts; 'check' names "
@@ -205,9 +205,9 @@ def sized(graph: Graph, size: Pair) -> Graph:
 def _size(op: Op, size: Pair) -> Pair:
     if isinstance(op, Conv | MaxPool | AveragePool):
         rows, columns = op.weight.shape[2:] if isinstance(op, Conv) else op.kernel or size
-        window = Window((rows, columns), op.window.strides, op.window.pads, op.window.dilations)
-        move = window.put_down if isinstance(op, Conv) and op.transposed else window.slid
-        return move(0, size[0]), move(1, size[1])
+        is_transposed = isinstance(op, Conv) and op.transposed
+        side = op.window.transposed_size if is_transposed else op.window.output_size
+        return side(0, rows, size[0]), side(1, columns, size[1])
     if isinstance(op, Resize):
         return size[0] * op.factor, size[1] * op.factor
     if isinstance(op, Shuffle):

@@ -7,7 +7,7 @@ prove, `check` all, with the sizes of what each node computes of one image.
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
@@ -21,9 +21,8 @@ from beers_deploy.quant.onnx_file import constants
 from beers_deploy.quant.reading.folding import OPSET
 from beers_deploy.quant.reading.nodes import attributes_of
 from beers_deploy.quant.untrusted import LIST_VALUES
+from beers_deploy.quant.window import Pair, Window
 
-Pair = tuple[int, int]
-"""Of rows and columns."""
 Kind = Literal[
     "conv",
     "grouped conv",
@@ -65,59 +64,6 @@ WEIGHTS = {"Conv": 1, "ConvInteger": 1, "ConvTranspose": 1, "QLinearConv": 3}
 """Operator, and which input holds its weights."""
 
 
-@dataclass(frozen=True)
-class Window:
-    """What a convolution or a pool reads for one output pixel; pairs are (height, width), axis 0 is
-    the height.
-    """
-
-    kernel: Pair = (1, 1)
-    stride: Pair = (1, 1)
-    pads: tuple[int, int, int, int] = (0, 0, 0, 0)  # top, left, bottom, right
-    dilation: Pair = (1, 1)
-    output_padding: Pair = (0, 0)
-
-    def extent(self, axis: int) -> int:
-        """Pixels from the first to the last that it reads."""
-        return (self.kernel[axis] - 1) * self.dilation[axis] + 1
-
-    def slid(self, axis: int, size: int, ceil: bool = False) -> int:
-        """How many places it has on so many pixels; with `ceil` the last may reach beyond the
-        padding.
-        """
-        stride = self.stride[axis]
-        before = self.pads[axis]
-        room = size + before + self.pads[axis + 2] - self.extent(axis)
-        if not ceil:
-            return room // stride + 1
-        # ONNX lets the last window reach beyond the padding, but it must begin on the map or on the
-        # padding before it.
-        return min(-(-room // stride), (size + before - 1) // stride) + 1
-
-    def put_down(self, axis: int, size: int) -> int:
-        """How many pixels it makes of so many where it is put down at each, as a transposed
-        convolution does.
-        """
-        beyond = self.output_padding[axis] - self.pads[axis] - self.pads[axis + 2]
-        return self.stride[axis] * (size - 1) + self.extent(axis) + beyond
-
-    def padded(self, auto_pad: str, size: Pair) -> "Window":
-        """With the pads that `auto_pad` asks for on such a map: as many places as size / stride,
-        rounded up.
-        """
-        total = (
-            [0, 0] if auto_pad == "VALID" else [self._lacking(axis, size[axis]) for axis in (0, 1)]
-        )
-        less = [t // 2 for t in total]
-        more = [t - t // 2 for t in total]
-        # Of an odd number SAME_LOWER puts the extra pixel before the map, SAME_UPPER behind it.
-        begin, end = (more, less) if auto_pad == "SAME_LOWER" else (less, more)
-        return replace(self, pads=(begin[0], begin[1], end[0], end[1]))
-
-    def _lacking(self, axis: int, size: int) -> int:
-        return max(self.extent(axis) - self.stride[axis] + -size % self.stride[axis], 0)
-
-
 @dataclass(frozen=True, eq=False)
 class Node:
     """An operator, in ONNX's words; an input that is left out has no name."""
@@ -141,34 +87,35 @@ class Node:
     def __str__(self) -> str:
         return f"{self.op_type} {self.name}"
 
-    def window(self, kernel: Sequence[int] = (), size: Pair = (0, 0)) -> Window | None:
-        """How it moves over rows and columns, None where it states no window of these.
+    def window(self, kernel: Sequence[int] = (), size: Pair = (0, 0)) -> tuple[Pair, Window] | None:
+        """Return its kernel and how that moves over rows and columns; None if the node states none.
 
         Args:
-            kernel: of its weights; what it states where there are none.
-            size: of the map that it reads, or any that is smaller or larger by whole strides: for
-                `auto_pad`.
+            kernel: sides of its weights; empty for what the node states itself.
+            size: of the map that it reads, or any that differs by whole strides: for `auto_pad`.
         """
         attribute = self.attributes.get
         sides = (
             kernel or attribute("kernel_shape", ()),
             attribute("strides", (1, 1)),
             attribute("dilations", (1, 1)),
+            self.output_padding,
         )
         pads = attribute("pads", (0, 0, 0, 0))
-        beyond = attribute("output_padding", (0, 0))
         # In one dimension or three the lists are shorter or longer.
-        lengths = [len(numbers) for numbers in (*sides, pads, beyond)]
-        if lengths != [2, 2, 2, 4, 2]:
+        if any(len(numbers) != 2 for numbers in sides) or len(pads) != 4:
             return None
-        (rows, columns), stride, dilation = sides
-        window = Window((rows, columns), tuple(stride), tuple(pads), tuple(dilation), tuple(beyond))
+        (rows, columns), strides, dilations, _ = sides
+        window = Window(tuple(strides), tuple(pads), tuple(dilations))
         auto_pad = attribute("auto_pad", "NOTSET")
-        return (
-            window.padded(auto_pad, size)
-            if auto_pad in ("VALID", "SAME_UPPER", "SAME_LOWER")
-            else window
-        )
+        if auto_pad in ("VALID", "SAME_UPPER", "SAME_LOWER"):
+            window = window.padded(auto_pad, (rows, columns), size)
+        return (rows, columns), window
+
+    @property
+    def output_padding(self) -> Sequence[int]:
+        """Rows and columns that a transposed convolution adds behind its result."""
+        return self.attributes.get("output_padding", (0, 0))  # type: ignore[no-any-return]
 
 
 class OnnxGraph:
@@ -248,6 +195,7 @@ def out_shape(
     node: Node,
     kind: Kind,
     shapes: Sequence[Shape | None],
+    kernel: Pair,
     window: Window,
     channels: int,
     constants: Mapping[str, np.ndarray],
@@ -258,7 +206,8 @@ def out_shape(
         node: the node.
         kind: what it computes.
         shapes: of the tensors that it reads.
-        window: of a convolution or pool.
+        kernel: of a convolution or pool.
+        window: of the same.
         channels: of a convolution's result.
         constants: the file's, for operators that read sizes from them.
     """
@@ -269,9 +218,9 @@ def out_shape(
     if kind in WINDOWED:
         ceil = bool(node.attributes.get("ceil_mode", 0))
         rows, columns = (
-            window.put_down(axis, first[1 + axis])
+            window.transposed_size(axis, kernel[axis], first[1 + axis]) + node.output_padding[axis]
             if kind == "transposed"
-            else window.slid(axis, first[1 + axis], ceil)
+            else window.output_size(axis, kernel[axis], first[1 + axis], ceil)
             for axis in (0, 1)
         )
         return (channels, rows, columns) if min(rows, columns) > 0 else None

@@ -21,7 +21,7 @@ from beers_deploy.quant.graph.network import (
     sized,
     unsupported,
 )
-from beers_deploy.quant.graph.nodes import Node, Pair
+from beers_deploy.quant.graph.nodes import Node
 from beers_deploy.quant.graph.operations import (
     CORRECTION,
     IMAGE,
@@ -38,11 +38,11 @@ from beers_deploy.quant.graph.operations import (
     Pointwise,
     Resize,
     Shuffle,
-    Window,
     same,
 )
 from beers_deploy.quant.reading.equivalents import per_channel
 from beers_deploy.quant.untrusted import check_runnable, contradictions, times
+from beers_deploy.quant.window import Pair, Window
 
 
 def read_network(model: onnx.ModelProto) -> Network:
@@ -264,15 +264,15 @@ class _Reader:
         )
 
     def _window(self, node: Node, kernel: Sequence[int] = ()) -> tuple[Pair, Window]:
-        window = node.window(kernel)
+        kernel_and_window = node.window(kernel)
         auto = str(node.attributes.get("auto_pad", ""))
-        if window is None:
+        if kernel_and_window is None:
             raise unsupported(f"{node} must have a window over rows and columns.")
-        has_pads = window.stride == (1, 1) or not auto.startswith("SAME")
+        has_pads = kernel_and_window[1].strides == (1, 1) or not auto.startswith("SAME")
         self._require(
             has_pads, node, f"must state its pads instead of auto_pad {auto} with strides"
         )
-        return window.kernel, Window(window.stride, window.pads, window.dilation)
+        return kernel_and_window
 
     def _add_or_mul(self, node: Node) -> Op:
         kind = Add if node.op_type == "Add" else Mul

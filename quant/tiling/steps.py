@@ -15,8 +15,9 @@ from typing import Any
 
 from beers_deploy.profiles.errors import LONGEST, ModelError, printable
 from beers_deploy.quant.graph.moves import PLACES, ROUNDINGS, Resizing
-from beers_deploy.quant.graph.nodes import WEIGHTS, Node, OnnxGraph, Window
+from beers_deploy.quant.graph.nodes import WEIGHTS, Node, OnnxGraph
 from beers_deploy.quant.untrusted import WINDOW_PX, times
+from beers_deploy.quant.window import Window
 
 
 @dataclass(frozen=True)
@@ -98,26 +99,30 @@ class Along:
         by_axis = dict(zip((int(axis) % 4 for axis in axes), numbers, strict=True))
         return by_axis.get(2 + self.axis, otherwise)
 
-    def slid(self, window: Window, ceil: bool = False) -> Step:
+    def slid(self, window: Window, kernel: int = 1, ceil: bool = False) -> Step:
         """A window that slides over its padded source."""
-        extra = window.slid(self.axis, self.extra, ceil)
+        extra = window.output_size(self.axis, kernel, self.extra, ceil)
         before = window.pads[self.axis]
-        high = window.extent(self.axis) - 1 - before
-        return Step(Fraction(1, window.stride[self.axis]), extra, Fraction(-before), Fraction(high))
+        high = window.extent(self.axis, kernel) - 1 - before
+        growth = Fraction(1, window.strides[self.axis])
+        return Step(growth, extra, Fraction(-before), Fraction(high))
 
-    def put_down(self, window: Window) -> Step:
+    def put_down(self, window: Window, kernel: int) -> Step:
         """A window that is put down at each pixel of its source; the result is
         cut by the padding.
         """
-        stride = window.stride[self.axis]
+        stride = window.strides[self.axis]
         before = window.pads[self.axis]
+        extra = window.transposed_size(self.axis, kernel, self.extra)
+        extra += self.node.output_padding[self.axis]
         # Pixel k of the source writes `extent` pixels of the result, from k * stride - before on.
-        low = Fraction(before - window.extent(self.axis) + 1, stride)
+        low = Fraction(before - window.extent(self.axis, kernel) + 1, stride)
         high = Fraction(before, stride)
-        return Step(Fraction(stride), window.put_down(self.axis, self.extra), low, high)
+        return Step(Fraction(stride), extra, low, high)
 
 
-def _window(at: Along) -> Window:
+def _window(at: Along) -> tuple[int, Window]:
+    """Return its side along the axis, and how it moves."""
     weight = WEIGHTS.get(at.node.op_type)
     kernel = () if weight is None else at.shapes.get(at.node.inputs[weight], ())[2:]
     window = at.node.window(kernel, (at.extra, at.extra))
@@ -125,27 +130,30 @@ def _window(at: Along) -> Window:
         window is not None and not at.given("channels_last", 0),
         "has no constant window of rows and columns",
     )
-    return window or Window()
+    assert window is not None  # noqa: S101 - required above
+    return window[0][at.axis], window[1]
 
 
 def _slide(at: Along) -> Step:
-    return at.slid(_window(at), bool(at.given("ceil_mode", 0)))
+    kernel, window = _window(at)
+    return at.slid(window, kernel, bool(at.given("ceil_mode", 0)))
 
 
 def _transpose(at: Along) -> Step:
     has_pads = at.given("auto_pad", "NOTSET") == "NOTSET" and at.given("output_shape", None) is None
     at.require(has_pads, "has a fixed or automatic size")
-    return at.put_down(_window(at))
+    kernel, window = _window(at)
+    return at.put_down(window, kernel)
 
 
 def _shuffle(at: Along) -> Step:
     """Channels become squares of pixels, or squares of pixels channels."""
     block = int(at.given("blocksize", 1))
-    window = Window((block, block), (block, block))
+    window = Window((block, block))
     if at.node.op_type == "DepthToSpace":
-        return at.put_down(window)
+        return at.put_down(window, block)
     at.require(at.extra % block == 0, "makes channels of blocks that do not fit the image")
-    return at.slid(window)
+    return at.slid(window, block)
 
 
 def _pad(at: Along) -> Step:
@@ -177,7 +185,7 @@ def _slice(at: Along) -> Step:
     # A start from the end or an end from the start lies elsewhere for each size of the image.
     at.require(start >= 0 and step > 0 and (end < 0 or end >= FAR), "cuts at a fixed position")
     behind = min(end, 0)
-    return at.slid(Window(stride=(step, step), pads=(-start, -start, behind, behind)))
+    return at.slid(Window(strides=(step, step), pads=(-start, -start, behind, behind)))
 
 
 def _resize(at: Along) -> Step:

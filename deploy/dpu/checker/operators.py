@@ -148,7 +148,11 @@ def forms(op: Operation, dpu: Dpu) -> Iterator[Operation]:
         part = replace(op, channels=(op.channels[0], outputs), out_shape=(outputs, 1, 1))
         yield part
         yield replace(
-            part, in_shapes=((values, 1, 1),), window=Window(), channels=(values, outputs)
+            part,
+            in_shapes=((values, 1, 1),),
+            kernel=(1, 1),
+            window=Window(),
+            channels=(values, outputs),
         )
 
 
@@ -158,8 +162,8 @@ def fully_connected(op: Operation) -> bool:
     window = op.window
     covers_map = (
         shape is not None
-        and window.kernel == shape[1:]
-        and window.dilation == (1, 1)
+        and op.kernel == shape[1:]
+        and window.dilations == (1, 1)
         and not any(window.pads)
     )
     return op.kind == "conv" and covers_map
