@@ -8,7 +8,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from beers_deploy.dpu.graph import Kind, Network, Operation, Shape, Window
+from beers_deploy.dpu.graph import Operation, SizedGraph
+from beers_deploy.dpu.shapes import Kind, Shape
+from beers_deploy.quant.window import Window
 
 Size = int | tuple[int, int]
 """One number for both sides, or (height, width)."""
@@ -35,7 +37,7 @@ class Written:
     image.
     """
 
-    network: Network
+    network: SizedGraph
     read_bytes: Mapping[str, int]
 
 
@@ -200,7 +202,7 @@ class Builder:
         if not self._read_bytes:
             self.out(last)
         names = tuple(self._read_bytes)
-        net = Network(
+        net = SizedGraph(
             tuple(self._operations), {self.image.name: self.image.shape}, names, quantized=False
         )
         return Written(net, self._read_bytes)

@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from beers_deploy.dpu.shapes import Kind, Shape
 from beers_deploy.profiles.errors import ModelError, printable
-from beers_deploy.quant.graph.nodes import Kind, Shape
 from beers_deploy.quant.graph.quantized import Scale
 from beers_deploy.quant.window import Pair, Window
-
-__all__ = ["CONVOLUTIONS", "Kind", "Network", "Operation", "Pair", "Scale", "Shape", "Window"]
 
 CONVOLUTIONS = frozenset({"conv", "grouped conv", "depthwise", "transposed"})
 
@@ -72,7 +70,7 @@ class Operation:
 
 
 @dataclass(frozen=True)
-class Network:
+class SizedGraph:
     """Operations in order; the names and shapes of the inputs; the names of the outputs."""
 
     operations: tuple[Operation, ...]

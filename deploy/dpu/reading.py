@@ -14,15 +14,17 @@ from pathlib import Path
 import numpy as np
 import onnx
 
-from beers_deploy.dpu.graph import Network, Operation, Pair, Shape, Window
+from beers_deploy.dpu.graph import Operation, SizedGraph
+from beers_deploy.dpu.shapes import Kind, Shape, kind_of, out_shape
 from beers_deploy.model.bank import GAINS, LARGEST, WIDE
 from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.encodings import BORDER_PX, PLACE_PX, as_on_board
-from beers_deploy.quant.graph.moves import with_shuffles
-from beers_deploy.quant.graph.nodes import Kind, Node, OnnxGraph, kind_of, out_shape
+from beers_deploy.quant.graph.pixel_shuffle import with_shuffles
 from beers_deploy.quant.graph.quantized import Integers
 from beers_deploy.quant.onnx_file import load_onnx, metadata
+from beers_deploy.quant.onnx_graph import Node, OnnxGraph
 from beers_deploy.quant.untrusted import contradictions
+from beers_deploy.quant.window import Pair, Window
 
 BANK_GAINS = np.arange(8 * GAINS[0], 8 * GAINS[1] + 1) / 8
 BANK_REACHES = (
@@ -37,7 +39,7 @@ PLACE_MAX_PX = 64
 """Beyond what any network rearranges: a place of more pixels is a damaged file."""
 
 
-def read_network(path: Path, tile_px: int | None = 640) -> Network:
+def read_network(path: Path, tile_px: int | None = 640) -> SizedGraph:
     """Read an ONNX file as a network for one image with sides of `tile_px`; None is the size that
     it is fixed to.
 
@@ -71,7 +73,9 @@ def _places(model: onnx.ModelProto) -> tuple[int, int]:
     return place_px, border_px
 
 
-def network_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model") -> Network:
+def network_of(
+    model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model"
+) -> SizedGraph:
     """As `read_network`, of a model in memory; a host's file is read as the board gets it."""
     model = as_on_board(model)
     if not model.graph.node:
@@ -112,11 +116,11 @@ class _Reader:
         self.kinds: dict[str, Kind] = {}
         self.integers = Integers(graph)
 
-    def network(self) -> Network:
+    def network(self) -> SizedGraph:
         """The operations, the notation of quantisation dissolved."""
         operations = tuple(chain.from_iterable(map(self._read, self.graph.nodes)))
         outputs = tuple(map(self.integers.resolve, self.graph.outputs))
-        return Network(operations, self.inputs, outputs, self.integers.present)
+        return SizedGraph(operations, self.inputs, outputs, self.integers.present)
 
     def _read(self, node: Node) -> Iterator[Operation]:
         if self.integers.is_notation(node):

@@ -24,12 +24,12 @@ from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Add, Conv, 
 from beers_deploy.quant.graph.writer import onnx_weight, write_float
 from beers_deploy.quant.onnx_file import (
     GraphWriter,
-    constants,
     fixed_tile_px,
     image_info,
     make_model,
     metadata,
 )
+from beers_deploy.quant.onnx_graph import constants
 from beers_deploy.quant.untrusted import contradictions
 
 

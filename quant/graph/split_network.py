@@ -33,7 +33,7 @@ REMEDY = (
 
 
 @dataclass(frozen=True)
-class Network:
+class SplitNetwork:
     """A float network, cut where the DPU's part begins and ends.
 
     Attributes:
@@ -70,7 +70,7 @@ def unsupported(fault: str, remedy: str = REMEDY) -> ModelError:
     return ModelError(f"{printable(fault, 4 * LONGEST)} {remedy}")
 
 
-def cut(graph: Graph, channels: int) -> Network:
+def cut(graph: Graph, channels: int) -> SplitNetwork:
     """The network of operations from `IMAGE` to `CORRECTION`: what the host does at both ends is
     taken off.
 
@@ -91,7 +91,7 @@ def cut(graph: Graph, channels: int) -> Network:
     while isinstance(first := _only_reader(graph), Shuffle) and not first.up:
         front.append(first)
         graph = tuple(renamed(op, {first.output: IMAGE}) for op in graph if op is not first)
-    network = Network(graph, channels, tuple(front), back, adds_image, last)
+    network = SplitNetwork(graph, channels, tuple(front), back, adds_image, last)
     return replace(network, graph=_image_for_convolutions(graph, network.core_channels))
 
 
@@ -161,7 +161,7 @@ def _is_ours(name: str) -> bool:
     return name in ours or name.startswith(("host_front.", "host_back.", f"{IMAGE}."))
 
 
-def check_network(network: Network) -> None:
+def check_network(network: SplitNetwork) -> None:
     """Raise ModelError if a network cannot be quantised, before anything is computed."""
     graph = network.graph
     if not graph or graph[-1].output != CORRECTION:

@@ -9,7 +9,7 @@ import numpy as np
 import onnx
 from onnx import NodeProto, TensorProto, helper, numpy_helper
 
-from beers_deploy.quant.reading.folding import OPSET
+from beers_deploy.quant.domains import OPSET
 
 CHANNELS = 4
 WEIGHTS: dict[str, tuple[int, ...]] = {

@@ -26,10 +26,10 @@ from fractions import Fraction
 
 import onnx
 
-from beers_deploy.quant.graph.moves import MOVES, with_shuffles
-from beers_deploy.quant.graph.nodes import Node, OnnxGraph
+from beers_deploy.quant.graph.pixel_shuffle import MOVES, with_shuffles
 from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px
-from beers_deploy.quant.tiling.steps import STEPS, Along, Step, not_tileable
+from beers_deploy.quant.onnx_graph import Node, OnnxGraph
+from beers_deploy.quant.tiling.axis_maps import STEPS, Along, Step, not_tileable
 from beers_deploy.quant.untrusted import contradictions
 
 

@@ -14,9 +14,10 @@ from itertools import product
 from typing import Any
 
 from beers_deploy.profiles.errors import LONGEST, ModelError, printable
-from beers_deploy.quant.graph.moves import PLACES, ROUNDINGS, Resizing
-from beers_deploy.quant.graph.nodes import WEIGHTS, Node, OnnxGraph
-from beers_deploy.quant.untrusted import WINDOW_PX, times
+from beers_deploy.quant.graph.resize import PLACES, ROUNDINGS, Resizing
+from beers_deploy.quant.onnx_graph import WEIGHTS, Node, OnnxGraph
+from beers_deploy.quant.runnable import WINDOW_PX
+from beers_deploy.quant.untrusted import times
 from beers_deploy.quant.window import Window
 
 
