@@ -30,7 +30,7 @@ from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 from beers_deploy.quant.domains import OPSET
 from beers_deploy.quant.encodings import board_model, read_core, vint8_model
-from beers_deploy.quant.external_weights import unchanged
+from beers_deploy.quant.onnx.external_weights import unchanged
 from beers_deploy.quant.onnx_file import (
     fixed_tile_px,
     is_quantized,

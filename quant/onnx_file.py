@@ -29,8 +29,8 @@ from beers_deploy.profiles.errors import (
 )
 from beers_deploy.profiles.toml import read_whole, unreadable
 from beers_deploy.quant.domains import IR_VERSION, OPSET, opset_of
-from beers_deploy.quant.external_weights import take_in
-from beers_deploy.quant.runnable import check_runnable
+from beers_deploy.quant.onnx.external_weights import take_in
+from beers_deploy.quant.onnx.runnable import check_runnable
 from beers_deploy.quant.simplify.simplify import simplify
 from beers_deploy.quant.simplify.training_mode import require_inference
 from beers_deploy.quant.untrusted import FILE_BYTES, check_content

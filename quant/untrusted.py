@@ -1,6 +1,6 @@
 """Check that an ONNX file holds what it states, before anything is made of it.
 
-Whether a runtime may open it is checked by `quant.runnable`.
+Whether a runtime may open it is checked by `quant.onnx.runnable`.
 """
 
 import math

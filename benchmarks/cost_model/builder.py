@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 from beers_deploy.dpu.graph import Operation, SizedGraph
 from beers_deploy.dpu.shapes import Kind, Shape
-from beers_deploy.quant.window import Window
+from beers_deploy.quant.onnx.window import Window
 
 Size = int | tuple[int, int]
 """One number for both sides, or (height, width)."""

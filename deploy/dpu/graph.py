@@ -11,7 +11,7 @@ import numpy as np
 from beers_deploy.dpu.shapes import Kind, Shape
 from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.graph.quantized import Scale
-from beers_deploy.quant.window import Pair, Window
+from beers_deploy.quant.onnx.window import Pair, Window
 
 CONVOLUTIONS = frozenset({"conv", "grouped conv", "depthwise", "transposed"})
 

@@ -21,10 +21,10 @@ from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.encodings import BORDER_PX, PLACE_PX, as_on_board
 from beers_deploy.quant.graph.pixel_shuffle import with_shuffles
 from beers_deploy.quant.graph.quantized import Integers
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.window import Pair, Window
 from beers_deploy.quant.onnx_file import load_onnx, metadata
-from beers_deploy.quant.onnx_graph import Node, OnnxGraph
 from beers_deploy.quant.untrusted import contradictions
-from beers_deploy.quant.window import Pair, Window
 
 BANK_GAINS = np.arange(8 * GAINS[0], 8 * GAINS[1] + 1) / 8
 BANK_REACHES = (

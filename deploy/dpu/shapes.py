@@ -9,9 +9,9 @@ from onnx import TensorProto, helper, numpy_helper, shape_inference
 
 from beers_deploy.profiles.errors import CODE_FAULTS
 from beers_deploy.quant.domains import OPSET
-from beers_deploy.quant.onnx_graph import Node, sizes_of
-from beers_deploy.quant.runnable import LIST_VALUES
-from beers_deploy.quant.window import Pair, Window
+from beers_deploy.quant.onnx.graph import Node, sizes_of
+from beers_deploy.quant.onnx.runnable import LIST_VALUES
+from beers_deploy.quant.onnx.window import Pair, Window
 
 Kind = Literal[
     "conv",

@@ -40,7 +40,7 @@ from beers_deploy.quant.graph.plain import correction_graph, image_channels, pla
 from beers_deploy.quant.graph.reader import read_network, refusal
 from beers_deploy.quant.graph.split_network import SplitNetwork, channels_of, check_network
 from beers_deploy.quant.graph.writer import graph_to_onnx
-from beers_deploy.quant.window import Window
+from beers_deploy.quant.onnx.window import Window
 
 __all__ = [
     "COARSE_MAX",

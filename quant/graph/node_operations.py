@@ -21,8 +21,8 @@ from beers_deploy.quant.graph.operations import (
 from beers_deploy.quant.graph.pixel_shuffle import MOVES, ORDERS
 from beers_deploy.quant.graph.resize import Resizing
 from beers_deploy.quant.graph.split_network import unsupported
-from beers_deploy.quant.onnx_graph import Node, OnnxGraph
-from beers_deploy.quant.window import Pair, Window
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.window import Pair, Window
 
 
 def require(condition: bool, node: Node, rule: str) -> None:

@@ -12,7 +12,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from beers_deploy.profiles.sensor import MAX_DN
-from beers_deploy.quant.window import Pair, Window
+from beers_deploy.quant.onnx.window import Pair, Window
 
 IMAGE = "image"
 CORRECTION = "correction"

@@ -13,7 +13,7 @@ import onnx
 from onnx import TypeProto, helper
 
 from beers_deploy.quant.graph.operations import Shuffle
-from beers_deploy.quant.onnx_graph import Node, OnnxGraph, sizes_of
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
 
 MOVES: dict[str, tuple[str, Callable[[np.ndarray, list[int]], np.ndarray]]] = {
     "Reshape": (

@@ -33,8 +33,8 @@ from beers_deploy.quant.graph.split_network import (
     sized,
     unsupported,
 )
-from beers_deploy.quant.onnx_graph import Node
-from beers_deploy.quant.runnable import check_runnable
+from beers_deploy.quant.onnx.graph import Node
+from beers_deploy.quant.onnx.runnable import check_runnable
 from beers_deploy.quant.simplify.fold_affine import per_channel
 from beers_deploy.quant.untrusted import contradictions, times
 

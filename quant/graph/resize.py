@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from beers_deploy.quant.onnx_graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 
 PLACES: dict[str, Callable[[int, float], float]] = {
     "asymmetric": lambda pixel, factor: pixel / factor,

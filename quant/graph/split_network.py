@@ -24,7 +24,7 @@ from beers_deploy.quant.graph.operations import (
     Resize,
     Shuffle,
 )
-from beers_deploy.quant.window import Pair
+from beers_deploy.quant.onnx.window import Pair
 
 REMEDY = (
     "See docs/reference/any-network.md for the operators that 'quantize' accepts; 'check' names "

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beers_deploy.quant.onnx_graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.standard_operators import Shapes
 
 NORMALISATION = "BatchNormalization"
@@ -40,7 +40,7 @@ def add_negated(graph: OnnxGraph, node: Node) -> list[Node] | None:
     before = graph.sole_writer(node.inputs[1])
     if before is None or not is_convolution(graph, before):
         return None
-    _scale_results(graph, before, Affine(np.full(1, -1.0), np.zeros(1)))
+    _fold(graph, before, Affine(np.full(1, -1.0), np.zeros(1)), into_results=True)
     return [Node.new("Add", node.inputs, node.outputs[0], node.proto.name)]
 
 
@@ -55,7 +55,7 @@ def fold_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
         return None
     if affine.channels not in (1, _width(graph, before)):
         return None
-    _scale_results(graph, before, affine)
+    _fold(graph, before, affine, into_results=True)
     graph.rename(source, node.outputs[0])
     return []
 
@@ -74,9 +74,9 @@ def fold_in_front(graph: OnnxGraph, shapes: Shapes) -> None:
         size = shapes.get(source, ())
         if affine.channels != 1 and (len(size) != 4 or size[1] != affine.channels):
             continue
-        if all(_may_scale_inputs(graph, reader, result, affine) for reader in behind):
+        if all(_may_take_in(graph, reader, result, affine) for reader in behind):
             for reader in behind:
-                _scale_inputs(graph, reader, affine)
+                _fold(graph, reader, affine, into_results=False)
                 reader.inputs = (source, *reader.inputs[1:])
             # The map's readers change with each fold, and the loop goes on with what writes it.
             others = [reader for reader in graph.readers[source] if reader is not node]
@@ -172,7 +172,7 @@ def _width(graph: OnnxGraph, node: Node) -> int:
     """Return the channels that a convolution writes."""
     shape = graph.constants[node.inputs[1]].shape
     # A transposed convolution has weights (I, O / groups, kh, kw).
-    return shape[0] if node.op_type == "Conv" else shape[1] * node.attributes.get("group", 1)
+    return shape[0] if node.op_type == "Conv" else shape[1] * int(node.attributes.get("group", 1))
 
 
 def _weights(graph: OnnxGraph, node: Node) -> tuple[np.ndarray, np.ndarray]:
@@ -190,22 +190,28 @@ def _set_weights(graph: OnnxGraph, node: Node, weight: np.ndarray, bias: np.ndar
     node.inputs = (node.inputs[0], *names)
 
 
-def _scale_results(graph: OnnxGraph, node: Node, affine: Affine) -> None:
-    """Fold into a convolution what is done to its results."""
+def _fold(graph: OnnxGraph, node: Node, affine: Affine, into_results: bool) -> None:
+    """Fold into a convolution what is done to its results, or to the map that it reads."""
     weight, bias = _weights(graph, node)
-    scale = np.broadcast_to(affine.scale, bias.shape)
-    if node.op_type == "Conv":
-        weight = weight * scale.reshape(-1, 1, 1, 1)
-    else:
-        # A transposed convolution has its weights as (I, O / groups, kh, kw): the results of a
-        # group stand along the second axis.
-        groups = node.attributes.get("group", 1)
-        split = weight.reshape(groups, -1, *weight.shape[1:]) * scale.reshape(groups, 1, -1, 1, 1)
-        weight = split.reshape(weight.shape)
-    _set_weights(graph, node, weight, bias * scale + affine.shift)
+    groups = node.attributes.get("group", 1)
+    split = weight.reshape(groups, -1, *weight.shape[1:])
+    # A convolution has its weights as (O, I / groups, kh, kw), a transposed one as
+    # (I, O / groups, kh, kw): the channels in question stand along the first axis of a group, or
+    # along the second.
+    stands_first = into_results == (node.op_type == "Conv")
+    channels = groups * split.shape[1 if stands_first else 2]
+    shape = (groups, -1, 1, 1, 1) if stands_first else (groups, 1, -1, 1, 1)
+    scale, shift = (
+        np.broadcast_to(v, channels).reshape(shape) for v in (affine.scale, affine.shift)
+    )
+    if into_results:
+        bias = bias * scale.ravel() + shift.ravel()
+    elif node.op_type == "Conv":  # `_may_take_in` lets no shift reach a transposed one
+        bias = bias + (split * shift).sum(axis=(2, 3, 4)).ravel()
+    _set_weights(graph, node, (split * scale).reshape(weight.shape), bias)
 
 
-def _may_scale_inputs(graph: OnnxGraph, node: Node, name: str, affine: Affine) -> bool:
+def _may_take_in(graph: OnnxGraph, node: Node, name: str, affine: Affine) -> bool:
     """Return True if a convolution can take in what is done to the tensor `name` that it reads."""
     attributes = node.attributes
     states_pads = attributes.get("auto_pad", "NOTSET") in ("NOTSET", "VALID")
@@ -214,20 +220,3 @@ def _may_scale_inputs(graph: OnnxGraph, node: Node, name: str, affine: Affine) -
     # alone.
     exact = unpadded or not affine.shift.any()
     return is_convolution(graph, node) and node.inputs.count(name) == 1 and exact
-
-
-def _scale_inputs(graph: OnnxGraph, node: Node, affine: Affine) -> None:
-    """Fold into a convolution what is done to the map that it reads."""
-    weight, bias = _weights(graph, node)
-    if node.op_type == "ConvTranspose":
-        # Its weights begin with the inputs, and `_may_scale_inputs` lets no shift reach it.
-        _set_weights(graph, node, weight * affine.scale.reshape(-1, 1, 1, 1), bias)
-        return
-    groups = node.attributes.get("group", 1)
-    split = weight.reshape(groups, -1, *weight.shape[1:])  # (G, O / G, I / G, kh, kw)
-    scale, shift = (
-        np.broadcast_to(v, groups * weight.shape[1]).reshape(groups, 1, -1, 1, 1)
-        for v in (affine.scale, affine.shift)
-    )
-    offset = (split * shift).sum(axis=(2, 3, 4)).reshape(-1)
-    _set_weights(graph, node, (split * scale).reshape(weight.shape), bias + offset)

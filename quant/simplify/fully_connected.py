@@ -13,7 +13,7 @@ from math import prod
 
 import numpy as np
 
-from beers_deploy.quant.onnx_graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.standard_operators import Shapes
 
 POINTWISE = {"Clip", "Elu", "HardSigmoid", "HardSwish", "LeakyRelu", "Relu", "Sigmoid", "Tanh"}

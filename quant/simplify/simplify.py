@@ -40,7 +40,7 @@ from onnx.shape_inference import InferenceError
 
 from beers_deploy.profiles.errors import ModelError, reason_of
 from beers_deploy.quant.domains import IR_VERSION, OPSET, opset_of
-from beers_deploy.quant.onnx_graph import OnnxGraph, free_name
+from beers_deploy.quant.onnx.graph import OnnxGraph, free_name
 from beers_deploy.quant.simplify.fold_affine import (
     add_negated,
     affine_of,

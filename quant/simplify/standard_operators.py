@@ -3,7 +3,7 @@
 import numpy as np
 from onnx import TensorProto
 
-from beers_deploy.quant.onnx_graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 
 Shapes = dict[str, tuple[int, ...]]
 

@@ -329,7 +329,7 @@ def test_there_is_one_door() -> None:
         "onnx.load": set(),
         # A digest looks only for the names of files beside a network.
         "ParseFromString(": {
-            "quant/external_weights.py",
+            "quant/onnx/external_weights.py",
             "quant/simplify/simplify.py",
             "quant/onnx_file.py",
         },

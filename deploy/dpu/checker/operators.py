@@ -21,7 +21,7 @@ from beers_deploy.dpu.graph import Operation
 from beers_deploy.dpu.shapes import Kind
 from beers_deploy.profiles.constant import check_keys
 from beers_deploy.profiles.errors import MachineError
-from beers_deploy.quant.window import Window
+from beers_deploy.quant.onnx.window import Window
 
 CONV: tuple[Rule, ...] = (
     conv_rules.conv_kernel,

@@ -14,7 +14,7 @@ import onnx
 from onnx import NodeProto, TypeProto, helper, numpy_helper, shape_inference
 
 from beers_deploy.quant.domains import Functions, functions_of, operator_name
-from beers_deploy.quant.window import Pair, Window
+from beers_deploy.quant.onnx.window import Pair, Window
 
 WEIGHTS = {"Conv": 1, "ConvInteger": 1, "ConvTranspose": 1, "QLinearConv": 3}
 """Operators with weights, and which input holds them."""
