@@ -125,18 +125,18 @@ def _conv(core: IntCore, op: IntConv, source: Range) -> Accumulated:
     bias = op.bias.astype(np.int64) << (product_bits - op.bias_frac_bits)
     # A sum is largest where each positive weight reads its channel's high end and each negative
     # one the low end.
-    least = _grouped(up, low, op.groups) + _grouped(down, high, op.groups) + bias
-    most = _grouped(up, high, op.groups) + _grouped(down, low, op.groups) + bias
+    if op.groups == 1:
+        least = up @ low + down @ high + bias
+        most = up @ high + down @ low + bias
+    else:  # depthwise: each channel its own
+        up = up[:, 0]
+        down = down[:, 0]
+        least = up * low + down * high + bias
+        most = up * high + down * low + bias
     (least, finer), (most, _) = (
         activated(end, op.activation, product_bits) for end in (least, most)
     )
     return least, most, product_bits - core.frac_bits[op.output] + finer
-
-
-def _grouped(weight: np.ndarray, values: np.ndarray, groups: int) -> np.ndarray:
-    """Return the sums (O,) of products of weights (O, I / groups) and one value a channel (I,)."""
-    split = weight.reshape(groups, -1, weight.shape[1])
-    return np.asarray((split @ values.reshape(groups, -1, 1)).ravel())
 
 
 def _whole_add(core: IntCore, op: Add, inputs: list[Range]) -> Accumulated:

@@ -172,7 +172,8 @@ def _width(graph: OnnxGraph, node: Node) -> int:
     """Return the channels that a convolution writes."""
     shape = graph.constants[node.inputs[1]].shape
     # A transposed convolution has weights (I, O / groups, kh, kw).
-    return shape[0] if node.op_type == "Conv" else shape[1] * int(node.attributes.get("group", 1))
+    groups = node.attributes.get("group", 1)
+    return int(shape[0] if node.op_type == "Conv" else shape[1] * groups)
 
 
 def _weights(graph: OnnxGraph, node: Node) -> tuple[np.ndarray, np.ndarray]:

@@ -3,12 +3,14 @@ spelling.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import onnx
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
 from beers_deploy.float_onnx import to_onnx
@@ -49,6 +51,42 @@ def folded(model: onnx.ModelProto, atol: float = 2e-5) -> dict[str, int]:
 def test_what_exporters_leave_is_folded_and_computes_the_same(case: str) -> None:
     nodes, left = CASES[case]
     assert folded(made(nodes)) == left
+
+
+CONVOLUTIONS = {"Conv", "ConvTranspose"}
+PARTS: dict[str, Callable[..., onnx.NodeProto]] = {
+    "convolution": lambda source, to: conv(source, to),
+    "unpadded": lambda source, to: conv(source, to, pad_px=0),
+    "depthwise": lambda source, to: conv(source, to, "deep", group=4),
+    "transposed": lambda source, to: node(
+        "ConvTranspose", source, "up", to=to, strides=[2, 2], group=2
+    ),
+    "normal": normal,
+    "from six": lambda source, to: node("Sub", "six", source, to=to),
+    "Relu": lambda source, to: node("Relu", source, to=to),
+    **{
+        kind: lambda source, to, kind=kind: node(kind, source, "image", to=to)
+        for kind in ("Add", "Sub", "Mul", "Div")
+    },
+}
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.sampled_from(sorted(PARTS)), min_size=2, max_size=4))
+def test_what_works_on_each_channel_is_folded_into_convolutions(parts: list[str]) -> None:
+    tensors = ["x", *(f"t{k}" for k in range(1, len(parts))), "y"]
+    model = made([PARTS[part](*tensors[k : k + 2]) for k, part in enumerate(parts)])
+    short = simplify(model, "a.onnx")
+    (before,), (after,) = results(model), results(short)
+    np.testing.assert_allclose(after, before, rtol=0, atol=1e-5 * max(np.abs(before).max(), 1))
+    kind = {tensor: n.op_type for n in short.graph.node for tensor in n.output}
+    assert "BatchNormalization" not in kind.values()
+    for n in short.graph.node:
+        sources = CONVOLUTIONS.intersection(kind.get(name, "") for name in n.input)
+        assert not sources or n.op_type in {"Relu", *CONVOLUTIONS}
+        # A shift stays in front of zeros that a convolution pads with, a factor does not.
+        is_scaled = n.op_type in CONVOLUTIONS and kind.get(n.input[0]) in ("Mul", "Div")
+        assert not is_scaled
 
 
 def test_numbers_shared_by_two_convolutions_are_folded_into_one_of_them() -> None:
