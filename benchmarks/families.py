@@ -50,7 +50,7 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.calibration import Calibration, draw_patches
 from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.samples import Patches
-from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.quant.tiling.receptive_field import tiling_of
 
 FAMILIES = "4x64@2,8x48@2,2x32@2,u48@2,u64@2,d8x64@2,d8x96@2,k2x32@2,k3x48@2,u32,8x32"
 NAME = re.compile(r"(?P<kind>[udkawb]?)(?:(?P<blocks>\d+)x)?(?P<features>\d+)(?:@(?P<scale>\d+))?")

@@ -29,7 +29,7 @@ from beers_deploy.model.variants import Variant
 from beers_deploy.performance.swath import PAPER_SIZE, Swath, parse_size, swath_latency
 from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.samples import Patches, Remade
-from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.quant.tiling.receptive_field import tiling_of
 
 SHAPES = "4x16,8x32,16x64,2x32@2,8x32@2,4x48@2,4x64@2,2x64@4,4x128@4"
 SHAPE = re.compile(r"(\d+)x(\d+)(?:@(\d+))?")

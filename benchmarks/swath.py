@@ -39,7 +39,7 @@ from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import VARIANTS, Variant
 from beers_deploy.network import Network
 from beers_deploy.performance.swath import parse_size
-from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.quant.tiling.receptive_field import tiling_of
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.runtime import Runtime, open_runtime
 from beers_deploy.restoration.tiles.exposures import restore_window

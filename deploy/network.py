@@ -28,7 +28,9 @@ from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND, DEFAULT_TARGET
 from beers_deploy.profiles.target import TargetProfile
+from beers_deploy.quant.domains import OPSET
 from beers_deploy.quant.encodings import board_model, read_core, vint8_model
+from beers_deploy.quant.onnx.external_weights import unchanged
 from beers_deploy.quant.onnx_file import (
     fixed_tile_px,
     is_quantized,
@@ -37,10 +39,8 @@ from beers_deploy.quant.onnx_file import (
     read_onnx,
     save_onnx,
 )
-from beers_deploy.quant.reading.external import unchanged
-from beers_deploy.quant.reading.folding import OPSET
 from beers_deploy.quant.session import open_session, result_of
-from beers_deploy.quant.tiling.walk import Tiling, tiling_of
+from beers_deploy.quant.tiling.receptive_field import Tiling, tiling_of
 from beers_deploy.quant.untrusted import times
 from beers_deploy.results import Input, Table
 

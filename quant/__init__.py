@@ -9,8 +9,8 @@ float ONNX (`onnx_file`) -> `graph` -> `calibration` -> `passes` -> integer `cor
 - `gate` and `structure` judge an INT8 file, `sensitivity` says which layers err;
 - `tiling` says how an image may be cut for a network: lattice, halo and scale; `samples` are a
   user's own;
-- `reading` folds what exporters leave in a float file, `untrusted` looks at files before they are
-  used.
+- `onnx` has the one graph of a file, `simplify` folds what exporters leave in a float one, and
+  `untrusted` checks files before they are used.
 """
 
 import os

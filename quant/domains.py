@@ -9,6 +9,9 @@ from collections.abc import Collection
 
 from onnx import ModelProto, NodeProto
 
+OPSET = 17
+IR_VERSION = 8
+"""The version of ONNX's operators, and of its files, that we write."""
 STANDARD = ("", "ai.onnx")
 MICROSOFT = "com.microsoft"
 SEPARATOR = "::"
@@ -43,6 +46,12 @@ OTHERS = "export the network with operators of ONNX itself"
 
 Functions = Collection[tuple[str, str]]
 """Domain and name of each function that a file defines."""
+
+
+def opset_of(model: ModelProto) -> int:
+    """Return the version of ONNX's own operators that a model has."""
+    versions = [opset.version for opset in model.opset_import if opset.domain in STANDARD]
+    return max(versions, default=1)
 
 
 def functions_of(model: ModelProto) -> Functions:

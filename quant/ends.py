@@ -29,8 +29,8 @@ from beers_deploy.quant.graph import (
     PLANES,
     QUARTER,
     STEP,
-    Network,
     Shuffle,
+    SplitNetwork,
     channels_of,
     split,
 )
@@ -49,8 +49,8 @@ FINE_MAX = 126
 class Ends:
     """The host's part of an INT8 network.
 
-    What does not stand here is as in `quant.graph.Network`; a sum with the image is clipped to [0,
-    1].
+    What does not stand here is as in `quant.graph.SplitNetwork`; a sum with the image is clipped to
+    [0, 1].
 
     Attributes:
         channels: of the core's image, behind `front`.
@@ -219,7 +219,7 @@ ONE_CHANNEL = Ends()
 """An image of one channel, and a correction of it that is added."""
 
 
-def ends_of(network: Network, gains: int = 1) -> Ends:
+def ends_of(network: SplitNetwork, gains: int = 1) -> Ends:
     """The ends of a network whose correction comes in so many gains."""
     steps = network.front, network.back, network.adds_image, network.last
     outputs = channels_of(network.graph, {IMAGE: network.core_channels})[CORRECTION]

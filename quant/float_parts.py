@@ -10,8 +10,8 @@ import onnx
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.figures import Check
 from beers_deploy.quant.encodings import read_core
-from beers_deploy.quant.graph.nodes import Node, OnnxGraph
 from beers_deploy.quant.graph.quantized import Integers
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 
 LAYERS = {
     "Attention",

@@ -31,8 +31,8 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from beers_deploy.profiles.errors import ModelError, printable
-from beers_deploy.quant.onnx_file import constants
-from beers_deploy.quant.untrusted import opset_of
+from beers_deploy.quant.domains import opset_of
+from beers_deploy.quant.onnx.graph import constants
 
 INT16_MAX = 32767
 INT16_MIN = -32768

@@ -28,11 +28,12 @@ from beers_deploy.profiles.errors import (
     reason_of,
 )
 from beers_deploy.profiles.toml import read_whole, unreadable
-from beers_deploy.quant.domains import functions_of, operator_name
-from beers_deploy.quant.reading.external import take_in
-from beers_deploy.quant.reading.folding import IR_VERSION, OPSET, simplest
-from beers_deploy.quant.reading.training_mode import require_inference
-from beers_deploy.quant.untrusted import FILE_BYTES, check_content, check_runnable, opset_of
+from beers_deploy.quant.domains import IR_VERSION, OPSET, opset_of
+from beers_deploy.quant.onnx.external_weights import take_in
+from beers_deploy.quant.onnx.runnable import check_runnable
+from beers_deploy.quant.simplify.simplify import simplify
+from beers_deploy.quant.simplify.training_mode import require_inference
+from beers_deploy.quant.untrusted import FILE_BYTES, check_content
 
 REMEDY = (
     "Give an ONNX file, as 'beers-deploy export', 'beers-deploy quantize' or PyTorch writes it."
@@ -43,7 +44,7 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
     """Read an ONNX model, with weights that it keeps beside it: the one way by which a file comes
     in.
 
-    A float network comes as its simplest equal (`quant.reading.folding`), an INT8 one as it is. One
+    A float network comes as its simplest equal (`quant.simplify`), an INT8 one as it is. One
     that no runtime may get comes as it is too, where it is only looked at.
 
     Args:
@@ -62,22 +63,22 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
         raise ModelError(
             f"The network {printable(str(path))} cannot be read: {reason}. {REMEDY}"
         ) from error
-    return _simplest(parse_onnx(content, str(path), to_run, path), str(path), to_run)
+    return _simplified(parse_onnx(content, str(path), to_run, path), str(path), to_run)
 
 
 def read_onnx(content: bytes, where: str) -> onnx.ModelProto:
     """As `load_onnx`, of the bytes of a network that holds all its weights."""
-    return _simplest(parse_onnx(content, where), where, True)
+    return _simplified(parse_onnx(content, where), where, True)
 
 
-def _simplest(model: onnx.ModelProto, where: str, to_run: bool) -> onnx.ModelProto:
+def _simplified(model: onnx.ModelProto, where: str, to_run: bool) -> onnx.ModelProto:
     try:
         # First, because folding removes the Dropout and BatchNormalization that show the mode.
         require_inference(model, where)
         if is_quantized(model):
             return model
         check_runnable(model, where)
-        return simplest(model, where)
+        return simplify(model, where)
     except ModelError:
         if to_run:
             raise
@@ -218,17 +219,6 @@ def with_outputs(model: onnx.ModelProto, kinds: Mapping[str, int]) -> onnx.Model
         if name not in names
     )
     return extended
-
-
-def constants(model: onnx.ModelProto) -> dict[str, np.ndarray]:
-    """The constants of a model by name: initializers, and what nodes of the kind Constant hold."""
-    arrays = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
-    functions = functions_of(model)
-    for node in model.graph.node:
-        values = [a.t for a in node.attribute if a.name == "value"]
-        if operator_name(node, functions) == "Constant" and values:
-            arrays[node.output[0]] = numpy_helper.to_array(values[0])
-    return arrays
 
 
 def fixed_tile_px(model: onnx.ModelProto) -> int | None:

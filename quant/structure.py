@@ -22,11 +22,11 @@ from beers_deploy.quant.encodings import encoding_faults, read_core
 from beers_deploy.quant.ends import ZERO, Ends
 from beers_deploy.quant.float_parts import float_layers_check
 from beers_deploy.quant.graph import CORRECTION
-from beers_deploy.quant.graph.nodes import Node, OnnxGraph
 from beers_deploy.quant.graph.quantized import Scale, stated
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx_file import any_size, with_outputs
 from beers_deploy.quant.session import open_any_size, open_session, result_of, tensors_of
-from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.quant.tiling.receptive_field import tiling_of
 from beers_deploy.quant.untrusted import contradictions
 
 RELUS = ("Relu", "Max")

@@ -8,7 +8,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from beers_deploy.dpu.graph import Kind, Network, Operation, Shape, Window
+from beers_deploy.dpu.graph import Operation, SizedGraph
+from beers_deploy.dpu.shapes import Kind, Shape
+from beers_deploy.quant.onnx.window import Window
 
 Size = int | tuple[int, int]
 """One number for both sides, or (height, width)."""
@@ -35,7 +37,7 @@ class Written:
     image.
     """
 
-    network: Network
+    network: SizedGraph
     read_bytes: Mapping[str, int]
 
 
@@ -71,32 +73,34 @@ class Builder:
         """
         if x.channels % g or channels % g:
             raise ValueError(f"{x.channels} to {channels} channels are no {g} equal groups")
-        window = _window(kernel, stride, valid, d)
-        weights = channels * (x.channels // g) * window.kernel[0] * window.kernel[1]
-        shape = (channels, *_slide(x.shape, window, valid))
+        sides = _pair(kernel)
+        window = _window(sides, stride, valid, d)
+        weights = channels * (x.channels // g) * sides[0] * sides[1]
+        shape = (channels, *_slide(x.shape, sides, window, valid))
         return self._append(
-            "Conv", "grouped conv" if g > 1 else "conv", (x,), shape, window, weights
+            "Conv", "grouped conv" if g > 1 else "conv", (x,), shape, sides, window, weights
         )
 
     def depthwise(
         self, x: Tensor, kernel: Size = 3, stride: Size = 1, *, d: int = 1, m: int = 1
     ) -> Tensor:
         """Each channel by itself, or into `m` channels; `d` is the dilation."""
-        window = _window(kernel, stride, 0, d)
+        sides = _pair(kernel)
+        window = _window(sides, stride, 0, d)
         channels = x.channels * m
-        weights = channels * window.kernel[0] * window.kernel[1]
-        return self._append(
-            "Conv", "depthwise", (x,), (channels, *_slide(x.shape, window, 0)), window, weights
-        )
+        shape = (channels, *_slide(x.shape, sides, window, 0))
+        weights = channels * sides[0] * sides[1]
+        return self._append("Conv", "depthwise", (x,), shape, sides, window, weights)
 
     def transposed(self, x: Tensor, channels: int, kernel: int, stride: int) -> Tensor:
         """A transposed convolution that enlarges by its stride."""
         cut = max(kernel - stride, 0)
         pads = (cut // 2, cut // 2, cut - cut // 2, cut - cut // 2)
-        window = Window((kernel, kernel), (stride, stride), pads)
+        window = Window((stride, stride), pads)
         shape = (channels, x.shape[1] * stride, x.shape[2] * stride)
+        weights = channels * x.channels * kernel**2
         return self._append(
-            "ConvTranspose", "transposed", (x,), shape, window, channels * x.channels * kernel**2
+            "ConvTranspose", "transposed", (x,), shape, (kernel, kernel), window, weights
         )
 
     def pool(
@@ -112,21 +116,21 @@ class Builder:
         """The largest value of a window, or its mean; `ceil` counts windows that only begin inside
         a bare image.
         """
-        window = _window(kernel, stride, valid or ceil, 1)
+        sides = _pair(kernel)
+        window = _window(sides, stride, valid or ceil, 1)
         shape = x.shape
         # Pad behind the image by as much as a stride may lose.
         if ceil:
-            behind = window.stride[0] - 1, window.stride[1] - 1
+            behind = window.strides[0] - 1, window.strides[1] - 1
             window = replace(window, pads=(0, 0, *behind))
             shape = (x.channels, x.shape[1] + behind[0], x.shape[2] + behind[1])
-        return self._append(
-            op_type, "pool", (x,), (x.channels, *_slide(shape, window, valid or ceil)), window
-        )
+        result = (x.channels, *_slide(shape, sides, window, valid or ceil))
+        return self._append(op_type, "pool", (x,), result, sides, window)
 
     def global_mean(self, x: Tensor) -> Tensor:
         """The mean of each channel."""
-        window = Window(kernel=x.shape[1:])
-        return self._append("GlobalAveragePool", "pool", (x,), (x.channels, 1, 1), window)
+        shape = (x.channels, 1, 1)
+        return self._append("GlobalAveragePool", "pool", (x,), shape, x.shape[1:])
 
     def add(self, x: Tensor, *others: Tensor) -> Tensor:
         """The sum of results of one shape."""
@@ -198,7 +202,7 @@ class Builder:
         if not self._read_bytes:
             self.out(last)
         names = tuple(self._read_bytes)
-        net = Network(
+        net = SizedGraph(
             tuple(self._operations), {self.image.name: self.image.shape}, names, quantized=False
         )
         return Written(net, self._read_bytes)
@@ -209,6 +213,7 @@ class Builder:
         kind: Kind,
         inputs: tuple[Tensor, ...],
         shape: Shape,
+        kernel: tuple[int, int] = (1, 1),
         window: Window = Window(),  # noqa: B008 - frozen
         weights: int = 0,
         attributes: Mapping[str, object] = NOTHING,
@@ -225,6 +230,7 @@ class Builder:
                 outputs=(result.name,),
                 in_shapes=tuple(tensor.shape for tensor in inputs),
                 out_shape=shape,
+                kernel=kernel,
                 window=window,
                 channels=(inputs[0].channels, shape[0]),
                 weight_bytes=weights,
@@ -243,26 +249,22 @@ def _require_same(one: tuple[int, ...], other: tuple[int, ...]) -> None:
         raise ValueError(f"shapes differ: {one} and {other}")
 
 
-def _window(kernel: Size, stride: Size, valid: int, dilation: int) -> Window:
-    height, width = _pair(kernel)
+def _window(kernel: tuple[int, int], stride: Size, valid: int, dilation: int) -> Window:
+    height, width = kernel
     rows, columns = (0, 0) if valid else ((height - 1) * dilation // 2, (width - 1) * dilation // 2)
-    return Window(
-        (height, width), _pair(stride), (rows, columns, rows, columns), (dilation, dilation)
-    )
+    return Window(_pair(stride), (rows, columns, rows, columns), (dilation, dilation))
 
 
 def _pair(size: Size) -> tuple[int, int]:
     return size if isinstance(size, tuple) else (size, size)
 
 
-def _slide(shape: Shape, window: Window, valid: int) -> tuple[int, int]:
+def _slide(shape: Shape, kernel: tuple[int, int], window: Window, valid: int) -> tuple[int, int]:
     """Size / stride rounded up, of the whole input or of the positions where a
     window fits into it.
     """
-    border_px = [
-        (k - 1) * d if valid else 0 for k, d in zip(window.kernel, window.dilation, strict=True)
-    ]
+    border_px = [(k - 1) * d if valid else 0 for k, d in zip(kernel, window.dilations, strict=True)]
     height, width = (
-        -(-(s - n) // t) for s, n, t in zip(shape[1:], border_px, window.stride, strict=True)
+        -(-(s - n) // t) for s, n, t in zip(shape[1:], border_px, window.strides, strict=True)
     )
     return height, width

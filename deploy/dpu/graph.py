@@ -4,14 +4,14 @@ written in.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from beers_deploy.dpu.shapes import Kind, Shape
 from beers_deploy.profiles.errors import ModelError, printable
-from beers_deploy.quant.graph.nodes import Kind, Shape, Window
 from beers_deploy.quant.graph.quantized import Scale
-
-__all__ = ["CONVOLUTIONS", "Kind", "Network", "Operation", "Scale", "Shape", "Window"]
+from beers_deploy.quant.onnx.window import Pair, Window
 
 CONVOLUTIONS = frozenset({"conv", "grouped conv", "depthwise", "transposed"})
 
@@ -31,11 +31,12 @@ class Operation:
     outputs: tuple[str, ...]
     in_shapes: tuple[Shape | None, ...] = ()
     out_shape: Shape | None = None
+    kernel: Pair = (1, 1)
     window: Window = field(default_factory=Window)
     channels: tuple[int, int] = (0, 0)  # input, output
     weight_bytes: int = 0
     constant_shape: tuple[int, ...] | None = None
-    attributes: Mapping[str, object] = field(default_factory=dict)
+    attributes: Mapping[str, Any] = field(default_factory=dict)
     follows: Kind | None = None  # what computes the first input
     integer: bool = False
     # The keys are "input 0", ..., "weight", "bias" and "output".
@@ -69,7 +70,7 @@ class Operation:
 
 
 @dataclass(frozen=True)
-class Network:
+class SizedGraph:
     """Operations in order; the names and shapes of the inputs; the names of the outputs."""
 
     operations: tuple[Operation, ...]

@@ -14,13 +14,15 @@ from pathlib import Path
 import numpy as np
 import onnx
 
-from beers_deploy.dpu.graph import Network, Operation, Shape, Window
+from beers_deploy.dpu.graph import Operation, SizedGraph
+from beers_deploy.dpu.shapes import Kind, Shape, kind_of, out_shape
 from beers_deploy.model.bank import GAINS, LARGEST, WIDE
 from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.encodings import BORDER_PX, PLACE_PX, as_on_board
-from beers_deploy.quant.graph.moves import with_shuffles
-from beers_deploy.quant.graph.nodes import Kind, Node, OnnxGraph, kind_of, out_shape
+from beers_deploy.quant.graph.pixel_shuffle import with_shuffles
 from beers_deploy.quant.graph.quantized import Integers
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.window import Pair, Window
 from beers_deploy.quant.onnx_file import load_onnx, metadata
 from beers_deploy.quant.untrusted import contradictions
 
@@ -37,7 +39,7 @@ PLACE_MAX_PX = 64
 """Beyond what any network rearranges: a place of more pixels is a damaged file."""
 
 
-def read_network(path: Path, tile_px: int | None = 640) -> Network:
+def read_network(path: Path, tile_px: int | None = 640) -> SizedGraph:
     """Read an ONNX file as a network for one image with sides of `tile_px`; None is the size that
     it is fixed to.
 
@@ -71,7 +73,9 @@ def _places(model: onnx.ModelProto) -> tuple[int, int]:
     return place_px, border_px
 
 
-def network_of(model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model") -> Network:
+def network_of(
+    model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model"
+) -> SizedGraph:
     """As `read_network`, of a model in memory; a host's file is read as the board gets it."""
     model = as_on_board(model)
     if not model.graph.node:
@@ -112,11 +116,11 @@ class _Reader:
         self.kinds: dict[str, Kind] = {}
         self.integers = Integers(graph)
 
-    def network(self) -> Network:
+    def network(self) -> SizedGraph:
         """The operations, the notation of quantisation dissolved."""
         operations = tuple(chain.from_iterable(map(self._read, self.graph.nodes)))
         outputs = tuple(map(self.integers.resolve, self.graph.outputs))
-        return Network(operations, self.inputs, outputs, self.integers.present)
+        return SizedGraph(operations, self.inputs, outputs, self.integers.present)
 
     def _read(self, node: Node) -> Iterator[Operation]:
         if self.integers.is_notation(node):
@@ -126,9 +130,9 @@ class _Reader:
         inputs = self.integers.activations(node)
         formats = self.integers.formats(node)
         shapes = tuple(map(self.shapes.get, inputs))
-        window = _window(node, weight, shapes)
+        kernel, window = _window(node, weight, shapes)
         channels = _channels(node, weight, shapes)
-        shape = out_shape(node, kind, shapes, window, channels[1], self.graph.constants)
+        shape = out_shape(node, kind, shapes, kernel, window, channels[1], self.graph.constants)
         outputs = tuple(self.integers.resolve(name) for name in node.outputs if name)
         self.shapes |= dict.fromkeys(outputs, shape)
         self.kinds |= dict.fromkeys(outputs, kind)
@@ -140,6 +144,7 @@ class _Reader:
             outputs=outputs,
             in_shapes=shapes,
             out_shape=shape,
+            kernel=kernel,
             window=window,
             channels=channels,
             weight_bytes=weight.size if weight is not None else 0,
@@ -178,12 +183,14 @@ class _Reader:
         return None if value is None else value.shape
 
 
-def _window(node: Node, weight: np.ndarray | None, shapes: Sequence[Shape | None]) -> Window:
+def _window(
+    node: Node, weight: np.ndarray | None, shapes: Sequence[Shape | None]
+) -> tuple[Pair, Window]:
     # The window of a global pool is its whole map.
     size = shapes[0][1:] if shapes and shapes[0] else (0, 0)
     if "Global" in node.op_type:
-        return Window(size if any(size) else (1, 1))
-    return node.window(() if weight is None else weight.shape[2:], size) or Window()
+        return size if any(size) else (1, 1), Window()
+    return node.window(() if weight is None else weight.shape[2:], size) or ((1, 1), Window())
 
 
 def _channels(

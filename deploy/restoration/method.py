@@ -13,7 +13,7 @@ import onnx
 from beers_deploy.model.consistency import Consistency
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.shipped import TILE_PX
-from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.quant.tiling.receptive_field import tiling_of
 from beers_deploy.restoration.plan import Plan, make_plan
 from beers_deploy.restoration.runtime import AtFirstCall, open_runtime
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork

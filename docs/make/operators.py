@@ -24,10 +24,10 @@ from beers_deploy.dpu.checker.operators import (
 from beers_deploy.dpu.checker.other_rules import INSTEAD
 from beers_deploy.dpu.checker.remarks import REMARKS
 from beers_deploy.dpu.cost.latency import dpu_power
+from beers_deploy.dpu.shapes import KINDS, Kind
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.shipped import board_names, npu_names
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.quant.graph.nodes import KINDS, Kind
 
 TARGET = Path(__file__).parents[1] / "reference" / "operators.md"
 DPUS = {name: load_dpu(name) for name in board_names()}

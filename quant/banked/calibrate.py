@@ -44,7 +44,7 @@ from beers_deploy.quant.graph import (
     Window,
     same,
 )
-from beers_deploy.quant.graph.network import renamed
+from beers_deploy.quant.graph.split_network import renamed
 from beers_deploy.quant.integer.arithmetic import convolve
 from beers_deploy.quant.passes.level import Chain
 from beers_deploy.quant.passes.selection import ALL, Passes

@@ -22,9 +22,9 @@ from beers_deploy.quant.encodings.description import BORDER_PX, KEY, PLACE_PX, d
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Add, Conv, Op, Pointwise
 from beers_deploy.quant.graph.writer import onnx_weight, write_float
+from beers_deploy.quant.onnx.graph import constants
 from beers_deploy.quant.onnx_file import (
     GraphWriter,
-    constants,
     fixed_tile_px,
     image_info,
     make_model,

@@ -47,7 +47,8 @@ from beers_deploy.quant.integer.arithmetic import (
     mean_factor,
     six_in_units,
 )
-from beers_deploy.quant.onnx_file import constants, fixed_tile_px, image_info, make_model, metadata
+from beers_deploy.quant.onnx.graph import constants
+from beers_deploy.quant.onnx_file import fixed_tile_px, image_info, make_model, metadata
 from beers_deploy.quant.untrusted import contradictions
 
 MICROSOFT = "com.microsoft"

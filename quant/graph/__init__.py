@@ -1,14 +1,13 @@
 """A network as the short list of operations that a DPU computes: what quantisation works on.
 
-- `nodes`: the one reading of an ONNX file, for `check` and tiling too, with `moves` of pixels in
-  one spelling and how numbers are `quantized`;
 - `operations`: what there is, convolutions to pixel shuffles, which tensors must share a scale, and
   how 12 bits enter int8;
-- `reader`: from float ONNX to a `network`, cut where the host's part ends;
-- `writer`: back to float ONNX.
+- `reader`: from float ONNX (`node_operations`, one by one) to a `split_network`, cut where the
+  host's part ends; `plain` accepts networks of ConvBEERS' kind only;
+- `writer`: back to float ONNX;
+- `pixel_shuffle`, `resize`, `quantized`: what checker and tiling read of a file as well.
 """
 
-from beers_deploy.quant.graph.network import Network, channels_of, check_network
 from beers_deploy.quant.graph.operations import (
     COARSE_MAX,
     CORRECTION,
@@ -30,7 +29,6 @@ from beers_deploy.quant.graph.operations import (
     Pointwise,
     Resize,
     Shuffle,
-    Window,
     read_planes,
     same,
     split,
@@ -38,14 +36,11 @@ from beers_deploy.quant.graph.operations import (
     tied,
     ties_scales,
 )
-from beers_deploy.quant.graph.reader import (
-    correction_graph,
-    image_channels,
-    plain_network,
-    read_network,
-    refusal,
-)
+from beers_deploy.quant.graph.plain import correction_graph, image_channels, plain_network
+from beers_deploy.quant.graph.reader import read_network, refusal
+from beers_deploy.quant.graph.split_network import SplitNetwork, channels_of, check_network
 from beers_deploy.quant.graph.writer import graph_to_onnx
+from beers_deploy.quant.onnx.window import Window
 
 __all__ = [
     "COARSE_MAX",
@@ -64,11 +59,11 @@ __all__ = [
     "Graph",
     "MaxPool",
     "Mul",
-    "Network",
     "Op",
     "Pointwise",
     "Resize",
     "Shuffle",
+    "SplitNetwork",
     "Window",
     "channels_of",
     "check_network",

@@ -12,12 +12,12 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from beers_deploy.profiles.instrument import MAX_DN
+from beers_deploy.quant.onnx.window import Pair, Window
 
 IMAGE = "image"
 CORRECTION = "correction"
 """What a network reads, and what its last operation writes."""
 
-Pair = tuple[int, int]
 LEAKY_SLOPE = 26 / 256
 """The one slope of LeakyReLU that a DPU computes."""
 SIX = 6
@@ -94,17 +94,6 @@ class HasWeight(Op, Protocol):
 
 
 Graph = tuple[Op, ...]
-
-
-@dataclass(frozen=True)
-class Window:
-    """How a window moves over the image: strides and dilations (rows, columns); pads top, left,
-    bottom, right.
-    """
-
-    strides: Pair = (1, 1)
-    pads: tuple[int, int, int, int] = (0, 0, 0, 0)
-    dilations: Pair = (1, 1)
 
 
 def same(weight: np.ndarray) -> Window:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from onnx import TensorProto, helper
 
-from beers_deploy.quant.graph.nodes import WEIGHTS, Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import WEIGHTS, Node, OnnxGraph
 
 RESULT = -1
 ONE = {0: (1, 2), RESULT: (3, 4)}

@@ -24,8 +24,8 @@ from beers_deploy.quant.graph.operations import (
     Pointwise,
     Resize,
     Shuffle,
-    Window,
 )
+from beers_deploy.quant.onnx.window import Window
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 
 

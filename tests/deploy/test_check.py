@@ -10,7 +10,7 @@ import pytest
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph import read_network
-from beers_deploy.quant.graph.network import REMEDY
+from beers_deploy.quant.graph.split_network import REMEDY
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers

@@ -28,7 +28,7 @@ from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import fixed_tile_px, metadata, save_onnx
 from beers_deploy.quant.session import open_session, run
-from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.quant.tiling.receptive_field import tiling_of
 from tests.deploy.command_line import done, refused
 from tests.model.networks import behind_a_bank, plain, radius_px
 from tests.profiles.own_sensor import own_sensor

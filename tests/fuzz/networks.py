@@ -22,10 +22,10 @@ from beers_deploy.quant.graph import correction_graph
 from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx
 from beers_deploy.quant.session import open_any_size, open_session, run
 from beers_deploy.quant.structure import count_relus, rounded_tensors, saturated_shares
-from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.quant.tiling.receptive_field import tiling_of
 from tests.deploy.dpu.graphs import board_convbeers, float_convbeers, integer_convbeers
 from tests.fuzz.pictures import written
-from tests.quant.reading.networks import CASES, made
+from tests.quant.simplify.networks import CASES, made
 
 SIDE_PX = 16
 RECIPE = TrainingRecipe(steps=10)

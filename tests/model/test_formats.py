@@ -17,7 +17,7 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import load_onnx
 from tests.deploy.command_line import refused
 from tests.deploy.dpu.graphs import board_convbeers, float_convbeers, integer_convbeers
-from tests.quant.reading.networks import CASES, made
+from tests.quant.simplify.networks import CASES, made
 
 LAYER = torch.nn.Conv2d(1, 1, 3)
 STATE = LAYER.state_dict()

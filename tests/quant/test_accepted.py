@@ -17,7 +17,7 @@ from beers_deploy.quant.graph import (
     PLANES,
     Conv,
     Graph,
-    Network,
+    SplitNetwork,
     check_network,
     correction_graph,
     read_planes,
@@ -70,9 +70,9 @@ def twice(values: np.ndarray) -> np.ndarray:
 def test_what_cannot_be_quantized_is_refused(
     spoil: Callable[[Graph], Graph], message: str, graph: Graph
 ) -> None:
-    check_network(Network(graph))
+    check_network(SplitNetwork(graph))
     with pytest.raises(ModelError, match=message):
-        check_network(Network(spoil(graph)))
+        check_network(SplitNetwork(spoil(graph)))
 
 
 def test_a_layer_that_never_fires_costs_nothing(

@@ -25,9 +25,9 @@ from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.integer.reference import agreement, run_core
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from beers_deploy.quant.quantize import Quantised, quantize_model
-from beers_deploy.quant.reading.folding import simplest
 from beers_deploy.quant.session import open_session, result_of
-from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.quant.simplify.simplify import simplify
+from beers_deploy.quant.tiling.receptive_field import tiling_of
 from examples.networks import NETWORKS, build, to_onnx
 from tests.quant.quick import copied, patches_of, quickly
 from tests.quant.tiling.small_networks import check_tiles
@@ -57,7 +57,7 @@ def images(name: str, count: int = 3, side_px: int = SIDE_PX) -> list[np.ndarray
 
 
 def float_network(name: str) -> onnx.ModelProto:
-    return simplest(to_onnx(name, build(name, torch.Generator().manual_seed(0))), name)
+    return simplify(to_onnx(name, build(name, torch.Generator().manual_seed(0))), name)
 
 
 @cache

@@ -29,14 +29,14 @@ from beers_deploy.quant.passes import level
 from beers_deploy.quant.passes.equalise import FULL, MOST_CHANNELS, Costs
 from beers_deploy.quant.passes.level import Chain, chain_ranges
 from beers_deploy.quant.passes.stream import STREAM_FRAC_BITS, lone_tensors
-from beers_deploy.quant.reading.folding import simplest
 from beers_deploy.quant.session import open_session
+from beers_deploy.quant.simplify.simplify import simplify
 from examples.networks import build, to_onnx
 from tests.quant.quick import in_float, patches_of, quickly, with_relu6
 
 
 def read(name: str) -> tuple[onnx.ModelProto, Graph, Ends, Chain]:
-    model = simplest(to_onnx(name, build(name, torch.Generator().manual_seed(0))), name)
+    model = simplify(to_onnx(name, build(name, torch.Generator().manual_seed(0))), name)
     network = read_network(model)
     graph = read_planes(network.graph)
     ends = ends_of(network)
@@ -182,7 +182,7 @@ def test_unequal_channels_err_half_as_much_once_they_are_levelled(
             norm.weight.mul_(factors)
             norm.bias.mul_(factors)  # type: ignore[union-attr]
             conv.weight.div_(factors[:, None, None])
-    model = simplest(to_onnx("dncnn", network), "dncnn")
+    model = simplify(to_onnx("dncnn", network), "dncnn")
     image_list = images()
     patches = patches_of(image_list)
 

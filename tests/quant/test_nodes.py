@@ -9,7 +9,7 @@ from onnx import helper
 from onnx.reference import ReferenceEvaluator
 
 from beers_deploy.dpu.reading import network_of
-from beers_deploy.quant.graph.moves import MOVES
+from beers_deploy.quant.graph.pixel_shuffle import MOVES
 from beers_deploy.quant.session import open_session, result_of
 from tests.quant.tiling.small_networks import Row, taps
 

@@ -13,7 +13,7 @@ from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.quant.quantize import Quantised, quantize_model
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.session import open_session
-from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.quant.tiling.receptive_field import tiling_of
 
 
 def test_scales_are_powers_of_two_and_numbers_are_int8(quantized: Quantised) -> None:

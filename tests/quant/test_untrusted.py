@@ -17,10 +17,10 @@ from beers_deploy.dpu.reading import network_of, read_network
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import any_size, load_onnx, parse_onnx
 from beers_deploy.quant.session import open_session, run
-from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.quant.tiling.receptive_field import tiling_of
 from beers_deploy.quant.untrusted import FILE_BYTES
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
-from tests.quant.reading.networks import node
+from tests.quant.simplify.networks import node
 
 Change = Callable[[onnx.ModelProto], object]
 IMAGE = np.full((1, 1, 12, 14), 0.25, np.float32)
@@ -329,8 +329,8 @@ def test_there_is_one_door() -> None:
         "onnx.load": set(),
         # A digest looks only for the names of files beside a network.
         "ParseFromString(": {
-            "quant/reading/external.py",
-            "quant/reading/folding.py",
+            "quant/onnx/external_weights.py",
+            "quant/simplify/simplify.py",
             "quant/onnx_file.py",
         },
         # The processor is asked with a model of our own making, before any file comes in.
@@ -339,7 +339,7 @@ def test_there_is_one_door() -> None:
             "deploy/kit/host.py",
             "deploy/kit/measure.py",
             "model/processor.py",
-            "quant/reading/folding.py",
+            "quant/simplify/simplify.py",
             "quant/session.py",
         },
     }

@@ -11,7 +11,7 @@ import pytest
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import save_onnx
-from beers_deploy.quant.tiling.walk import Tiling
+from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.tiles.rows import restore_floats
 from beers_deploy.studies.stress.battery import StageResult, run_battery, worst

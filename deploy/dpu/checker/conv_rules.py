@@ -16,7 +16,7 @@ def conv_kernel(op: Operation, dpu: Dpu) -> Finding | None:
         f"use a kernel of at most {limit.high:g}, or stack small ones: two 3 x 3 see as "
         "far as one 5 x 5"
     )
-    return beyond_range("kernel", op.window.kernel, limit, remedy)
+    return beyond_range("kernel", op.kernel, limit, remedy)
 
 
 def conv_stride(op: Operation, dpu: Dpu) -> Finding | None:
@@ -25,7 +25,7 @@ def conv_stride(op: Operation, dpu: Dpu) -> Finding | None:
     remedy = (
         f"use a stride of at most {limit.high:g}, or two convolutions whose strides multiply to it"
     )
-    return beyond_range("stride", op.window.stride, limit, remedy)
+    return beyond_range("stride", op.window.strides, limit, remedy)
 
 
 def conv_channels(op: Operation, dpu: Dpu) -> Finding | None:
@@ -37,7 +37,7 @@ def conv_padding(op: Operation, dpu: Dpu) -> Finding | None:
     """Padding on each side is 0 to (kernel - 1) * dilation ({documents[operators]}, conv2d)."""
     window = op.window
     # ONNX lists the pads of top and left first, then those of bottom and right.
-    room = [(k - 1) * d for k, d in zip(window.kernel, window.dilation, strict=True)] * 2
+    room = [(k - 1) * d for k, d in zip(op.kernel, window.dilations, strict=True)] * 2
     if all(0 <= pad <= most for pad, most in zip(window.pads, room, strict=True)):
         return None
     remedy = (
@@ -54,7 +54,7 @@ def conv_weight_bank(op: Operation, dpu: Dpu) -> Finding | None:
     ceil(output channels at a time / {memory[weight_banks]}) + {conv[weight_bias_depth]} for the
     bias.
     """
-    area = op.window.kernel[0] * op.window.kernel[1]
+    area = op.kernel[0] * op.kernel[1]
     inputs = groups_of(op.channels[0], dpu.input_parallel)
     depth = area * inputs * groups_of(dpu.output_parallel, dpu.whole("memory", "weight_banks"))
     # The bias lies in the same buffer.
@@ -75,7 +75,7 @@ def conv_window(op: Operation, dpu: Dpu) -> Finding | None:
     """Kernel area * ceil(ic / {conv[window_channels]}) is at most {conv[window_max]}
     ({conv[window_max].source}).
     """
-    area = op.window.kernel[0] * op.window.kernel[1]
+    area = op.kernel[0] * op.kernel[1]
     size = area * groups_of(op.channels[0], max(dpu.whole("conv", "window_channels"), 1))
     most = dpu.whole("conv", "window_max")
     if size <= most:
@@ -88,25 +88,25 @@ def conv_window(op: Operation, dpu: Dpu) -> Finding | None:
 
 def conv_area(op: Operation, dpu: Dpu) -> Finding | None:
     """The kernel's height * width is at most {conv[area_max]} ({conv[area_max].source})."""
-    area = op.window.kernel[0] * op.window.kernel[1]
+    area = op.kernel[0] * op.kernel[1]
     most = dpu.value("conv", "area_max")
     if area <= most:
         return None
     side = math.isqrt(max(int(most), 1))
-    reason = f"kernel ({shown(op.window.kernel)}) has {area} positions: at most {int(most)}"
+    reason = f"kernel ({shown(op.kernel)}) has {area} positions: at most {int(most)}"
     return Finding(reason, f"use a kernel of at most {side} x {side}, or stack small ones")
 
 
 def conv_dilation(op: Operation, dpu: Dpu) -> Finding | None:
     """Dilation * input channels is at most {limits[channels]} ({documents[operators]}, conv2d)."""
-    size = max(op.window.dilation) * op.channels[0]
+    size = max(op.window.dilations) * op.channels[0]
     most = dpu.channels_max
     # Without dilation this is the rule of channels, which `conv_channels` reports.
-    if max(op.window.dilation) == 1 or size <= most:
+    if max(op.window.dilations) == 1 or size <= most:
         return None
     remedy = f"use a dilation of at most {most // op.channels[0]}, or fewer input channels"
     return Finding(
-        f"dilation {max(op.window.dilation)} * {op.channels[0]} input channels exceeds {most}",
+        f"dilation {max(op.window.dilations)} * {op.channels[0]} input channels exceeds {most}",
         remedy,
     )
 
@@ -129,7 +129,7 @@ def depthwise_kernel(op: Operation, dpu: Dpu) -> Finding | None:
 
     Their product is at most {depthwise[window_max]} ({depthwise[window_max].source}).
     """
-    kernel = op.window.kernel
+    kernel = op.kernel
     limit = dpu.limit("depthwise", "kernel")
     most = dpu.whole("depthwise", "window_max")
     if not outside(kernel, limit) and kernel[0] * kernel[1] <= most:
@@ -142,7 +142,7 @@ def depthwise_stride(op: Operation, dpu: Dpu) -> Finding | None:
     """Strides are {depthwise[stride]} ({depthwise[stride].source})."""
     limit = dpu.limit("depthwise", "stride")
     return beyond_range(
-        "stride", op.window.stride, limit, f"use a stride of at most {limit.high:g}"
+        "stride", op.window.strides, limit, f"use a stride of at most {limit.high:g}"
     )
 
 
@@ -165,20 +165,21 @@ def transposed_kernel(op: Operation, dpu: Dpu) -> Finding | None:
     """
     limit = dpu.limit("transposed", "kernel_per_stride")
     ratios: list[int] = []
-    for kernel, stride in zip(op.window.kernel, op.window.stride, strict=True):
+    for kernel, stride in zip(op.kernel, op.window.strides, strict=True):
         ratios += [kernel // stride, groups_of(kernel, stride)]
     if not outside(tuple(ratios), limit):
         return None
-    sides = f"kernel ({shown(op.window.kernel)}) / stride ({shown(op.window.stride)})"
+    sides = f"kernel ({shown(op.kernel)}) / stride ({shown(op.window.strides)})"
     remedy = "use a kernel at least as large as the stride, such as 4 x 4 with stride 2"
     return Finding(f"{sides} is not in the DPU's range {limit}", remedy)
 
 
 def transposed_output_padding(op: Operation, dpu: Dpu) -> Finding | None:
     """output_padding is {transposed[output_padding]} ({transposed[output_padding].source})."""
-    if max(op.window.output_padding) == dpu.whole("transposed", "output_padding"):
+    padding = tuple(op.attributes.get("output_padding", (0, 0)))
+    if max(padding) == dpu.whole("transposed", "output_padding"):
         return None
-    reason = f"the DPU does not support output_padding {op.window.output_padding}"
+    reason = f"the DPU does not support output_padding {padding}"
     return Finding(
         reason, "use an even kernel, such as 4 x 4 with stride 2 and padding 1: it needs none"
     )
@@ -188,10 +189,10 @@ def transposed_padding(op: Operation, dpu: Dpu) -> Finding | None:
     """Padding on each side is 0 to the kernel's side ({documents[operators]},
     transposed-conv2d).
     """
-    room = op.window.kernel * 2
+    room = op.kernel * 2
     if all(0 <= pad <= most for pad, most in zip(op.window.pads, room, strict=True)):
         return None
-    reason = f"pads {op.window.pads} exceed the kernel ({shown(op.window.kernel)})"
+    reason = f"pads {op.window.pads} exceed the kernel ({shown(op.kernel)})"
     return Finding(reason, "pad less, and crop on the host")
 
 

@@ -7,7 +7,8 @@ import numpy as np
 
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.finding import Finding, outside
-from beers_deploy.dpu.graph import Operation, Scale
+from beers_deploy.dpu.graph import Operation
+from beers_deploy.quant.graph.quantized import Scale
 
 # ruff: noqa: ARG001 - every rule takes the operation and the DPU
 

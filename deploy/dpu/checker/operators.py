@@ -17,9 +17,11 @@ from itertools import chain
 from beers_deploy.dpu.board import SIZED, Dpu
 from beers_deploy.dpu.checker import conv_rules, number_rules, other_rules
 from beers_deploy.dpu.checker.finding import Finding, Rule
-from beers_deploy.dpu.graph import Kind, Operation, Window
+from beers_deploy.dpu.graph import Operation
+from beers_deploy.dpu.shapes import Kind
 from beers_deploy.profiles.errors import MachineError
 from beers_deploy.profiles.validation import check_keys
+from beers_deploy.quant.onnx.window import Window
 
 CONV: tuple[Rule, ...] = (
     conv_rules.conv_kernel,
@@ -148,7 +150,11 @@ def forms(op: Operation, dpu: Dpu) -> Iterator[Operation]:
         part = replace(op, channels=(op.channels[0], outputs), out_shape=(outputs, 1, 1))
         yield part
         yield replace(
-            part, in_shapes=((values, 1, 1),), window=Window(), channels=(values, outputs)
+            part,
+            in_shapes=((values, 1, 1),),
+            kernel=(1, 1),
+            window=Window(),
+            channels=(values, outputs),
         )
 
 
@@ -158,8 +164,8 @@ def fully_connected(op: Operation) -> bool:
     window = op.window
     covers_map = (
         shape is not None
-        and window.kernel == shape[1:]
-        and window.dilation == (1, 1)
+        and op.kernel == shape[1:]
+        and window.dilations == (1, 1)
         and not any(window.pads)
     )
     return op.kind == "conv" and covers_map

@@ -155,13 +155,13 @@ def _too_many(channels: int, most: int, remedy: str) -> Finding | None:
 def pool_kernel(op: Operation, dpu: Dpu) -> Finding | None:
     """Pool kernel sides are {pool[kernel]} ({pool[kernel].source})."""
     remedy = "pool in two steps, or a smaller tile where the pool is global"
-    return beyond_range("kernel", op.window.kernel, dpu.limit("pool", "kernel"), remedy)
+    return beyond_range("kernel", op.kernel, dpu.limit("pool", "kernel"), remedy)
 
 
 def pool_stride(op: Operation, dpu: Dpu) -> Finding | None:
     """Pool strides are {pool[stride]} ({pool[stride].source})."""
     return beyond_range(
-        "stride", op.window.stride, dpu.limit("pool", "stride"), "pool in two steps"
+        "stride", op.window.strides, dpu.limit("pool", "stride"), "pool in two steps"
     )
 
 
@@ -294,7 +294,7 @@ def map_exists(op: Operation, dpu: Dpu) -> Finding | None:
     before = op.in_shapes[0] if op.in_shapes else None
     if op.kind not in WINDOWED or before is None or op.out_shape is not None:
         return None
-    window = f"a kernel of {shown(op.window.kernel)}, stride {shown(op.window.stride)}"
+    window = f"a kernel of {shown(op.kernel)}, stride {shown(op.window.strides)}"
     reason = f"nothing is left of a map of {shown(before[1:])} under {window}"
     return Finding(reason, "use a larger tile, or fewer strides before it")
 

@@ -18,7 +18,7 @@ from typing import Literal
 
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.operators import Broken, judge, require_known
-from beers_deploy.dpu.graph import CONVOLUTIONS, Network, Operation
+from beers_deploy.dpu.graph import CONVOLUTIONS, Operation, SizedGraph
 from beers_deploy.quant.domains import is_foreign
 
 Part = Literal["host-front", "dpu-core", "host-back"]
@@ -48,7 +48,7 @@ makes scores of them.
 """
 
 DECODING = {"Exp", "Pow", "Sigmoid", "Slice", "Softplus", "Split", "Sqrt", "Tanh", "Transpose"}
-"""What it may do to make boxes of the result, which `quant.graph.tail` leaves to the host too."""
+"""What it may do to make boxes of the result, which `quantize` leaves to the host too."""
 
 FLOAT_NOTE = "a float file: judged as if its tensors had 8 bits, its final add left to the host"
 
@@ -115,7 +115,7 @@ class Placement:
         return tuple(node.op for node in self.nodes if node.device == "DPU")
 
 
-def place(network: Network, dpu: Dpu) -> Placement:
+def place(network: SizedGraph, dpu: Dpu) -> Placement:
     """Judge every node of a network against the rules of a DPU."""
     # A misspelt constant would silence the rule that it is for.
     require_known(dpu)
@@ -138,7 +138,7 @@ def _device(part: Part, breaks_rules: bool) -> Device:
     return "CPU" if breaks_rules else "DPU"
 
 
-def _parts(network: Network) -> list[Part]:
+def _parts(network: SizedGraph) -> list[Part]:
     """A node before the first or behind the last convolution is the host's if it is one of the
     host's kinds.
     """
@@ -165,7 +165,7 @@ def _parts(network: Network) -> list[Part]:
 
 
 def _left_to_the_host(
-    network: Network, parts: list[Part], broken: list[tuple[Broken, ...]]
+    network: SizedGraph, parts: list[Part], broken: list[tuple[Broken, ...]]
 ) -> list[Part]:
     """Behind the last convolution, what reads a result of the CPU stays with it: it is not handed
     over again.
@@ -182,7 +182,7 @@ def _left_to_the_host(
     return moved
 
 
-def _convolved(network: Network) -> set[str]:
+def _convolved(network: SizedGraph) -> set[str]:
     convolutions = (op for op in network.operations if op.kind in CONVOLUTIONS)
     return set(chain.from_iterable(op.outputs for op in convolutions))
 
@@ -201,7 +201,7 @@ def _reached(operations: Sequence[Operation], starts: set[str], *, forwards: boo
     return results
 
 
-def _is_host_front(op: Operation, network: Network, *, trails: bool) -> bool:
+def _is_host_front(op: Operation, network: SizedGraph, *, trails: bool) -> bool:
     """In a quantised file whatever leads to the core; in a float file scaling, mirroring, and
     pixels to channels.
     """
@@ -215,7 +215,7 @@ def _is_host_front(op: Operation, network: Network, *, trails: bool) -> bool:
     return network.quantized or op.op_type in SCALING or moves
 
 
-def _is_host_back(op: Operation, network: Network, *, leads: bool) -> bool:
+def _is_host_back(op: Operation, network: SizedGraph, *, leads: bool) -> bool:
     """In a quantised file what is float again; in a float file the add of the image, scaling,
     shaping.
     """
@@ -263,7 +263,7 @@ def _root(parents: dict[str, str], name: str) -> str:
     return root
 
 
-def _cuts(network: Network, nodes: Iterable[PlacedNode]) -> Iterable[Cut]:
+def _cuts(network: SizedGraph, nodes: Iterable[PlacedNode]) -> Iterable[Cut]:
     """Tensors written on one side and read on the other, the network's own ends included."""
     on_dpu: dict[str, bool] = {}
     for node in nodes:

@@ -7,7 +7,8 @@ from itertools import chain
 
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.finding import groups_of
-from beers_deploy.dpu.graph import Operation, Shape
+from beers_deploy.dpu.graph import Operation
+from beers_deploy.dpu.shapes import Shape
 
 FUSED = ("activation", "quantize", "dequantize", "pixel shuffle")
 """Kinds that cost nothing: done on the way out of the operation before; a pixel shuffle is where
@@ -89,7 +90,7 @@ def _array_operations(op: Operation, dpu: Dpu) -> int:
     pixels = _positions(
         op.out_shape, dpu.whole("array", "pixel_parallel"), dpu.whole("array", "column_parallel")
     )
-    inputs = op.window.kernel[0] * _row_inputs(op.channels[0], op.window.kernel[1], dpu)
+    inputs = op.kernel[0] * _row_inputs(op.channels[0], op.kernel[1], dpu)
     return 2 * inputs * _up(op.channels[1], dpu.output_parallel) * pixels
 
 
@@ -115,7 +116,7 @@ def _lane_steps(op: Operation, dpu: Dpu) -> int:
         return 0
     # A depthwise convolution with several results a channel passes over its map for each of them.
     passes = max(op.channels[1] // max(op.channels[0], 1), 1) if op.kind == "depthwise" else 1
-    taps = op.window.kernel[0] * op.window.kernel[1] * passes
+    taps = op.kernel[0] * op.kernel[1] * passes
     channels = _up(op.in_shapes[0][0], dpu.whole("elementwise", "channels_per_cycle"))
     rows = min(dpu.whole("elementwise", "pixels_per_cycle"), dpu.whole("array", "pixel_parallel"))
     return taps * channels * _positions(op.out_shape, rows)

@@ -16,7 +16,7 @@ from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.full_scale import remedy_outside
 from beers_deploy.model.raster.source import Source
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.quant.tiling.walk import Tiling
+from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Span
 from beers_deploy.restoration.radiometry import require_room

@@ -14,7 +14,7 @@ import onnx
 
 from beers_deploy.model.consistency import RAW_REACH_PX, REACH_PX
 from beers_deploy.model.raster.facts import Raster
-from beers_deploy.quant.tiling.walk import Tiling
+from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.plan import Plan, Span, plan_for
 from beers_deploy.restoration.prepare import NetworkPipeline

@@ -27,7 +27,8 @@ from beers_deploy.profiles.errors import (
     printable,
     reason_of,
 )
-from beers_deploy.quant.onnx_file import constants, fixed_tile_px, load_onnx, metadata
+from beers_deploy.quant.onnx.graph import constants
+from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata
 from beers_deploy.quant.session import open_session
 from beers_deploy.studies.detection.boxes import MOST, Boxes, Letterbox, suppress
 

@@ -38,7 +38,7 @@ from beers_deploy.quant.graph import (
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.onnx_file import any_size, require_quantized
 from beers_deploy.quant.session import open_session, run
-from beers_deploy.quant.tiling.walk import Tiling, tiling_of
+from beers_deploy.quant.tiling.receptive_field import Tiling, tiling_of
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.runtime import Infer
 from beers_deploy.restoration.tiles.rows import restore_floats

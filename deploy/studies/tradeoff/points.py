@@ -17,7 +17,7 @@ from pathlib import Path
 from beers_deploy.dpu.board import Dpu, dpu_of
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import dpu_power, predict
-from beers_deploy.dpu.graph import Network as Graph
+from beers_deploy.dpu.graph import SizedGraph
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.model.shipped import shipped_names
 from beers_deploy.model.traditional.nl_bayes import QUALITIES
@@ -30,7 +30,7 @@ from beers_deploy.profiles.figures import Figure, predicted, unavailable
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.quant.tiling.walk import Tiling
+from beers_deploy.quant.tiling.receptive_field import Tiling
 
 logger = logging.getLogger(__name__)
 
@@ -262,7 +262,7 @@ def network_of_variant(variant: Variant) -> Network:
 
 
 @cache
-def _graph(network: Network, tile_px: int) -> Graph:
+def _graph(network: Network, tile_px: int) -> SizedGraph:
     return network_of(network.model, tile_px, network.label)
 
 

@@ -16,7 +16,7 @@ from beers_deploy.dpu.checker.operators import all_rules, applies, rule_name, ru
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.checker.remarks import REMARKS
 from beers_deploy.dpu.cost.latency import dpu_power
-from beers_deploy.dpu.graph import Operation, Window
+from beers_deploy.dpu.graph import Operation
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.model.shipped import shipped_names
 from beers_deploy.performance.swath import efficiency, energy
@@ -163,8 +163,8 @@ def test_more_channels_than_others_take(tmp_path: Path) -> None:
 @given(st.integers(1, 16), st.integers(1, 16), st.integers(1, 8192))
 def test_weights_fit_by_each_manuals_formula(height: int, width: int, channels: int) -> None:
     """UG1414 3.5, conv2d; for the VCK190 by dpu_op_filter.py."""
-    window = Window((height, width))
-    op = Operation("c", "Conv", "conv", ("in",), ("out",), window=window, channels=(channels, 8))
+    kernel = height, width
+    op = Operation("c", "Conv", "conv", ("in",), ("out",), kernel=kernel, channels=(channels, 8))
     area = height * width
     depths = {"zcu102": area * -(-channels // 16), "vek280": area * -(-channels // 32) * 8 + 4}
     depths["vck190"] = area * -(-channels // 16) * 2

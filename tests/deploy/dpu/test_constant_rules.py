@@ -16,12 +16,13 @@ from onnx import numpy_helper
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker import number_rules
 from beers_deploy.dpu.checker.placement import place
-from beers_deploy.dpu.graph import Operation, Scale
+from beers_deploy.dpu.graph import Operation
 from beers_deploy.dpu.reading import network_of, read_network
 from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.shipped import shipped_names
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.encodings import board_model
+from beers_deploy.quant.graph.quantized import Scale
 from beers_deploy.quant.quantize import Quantised, quantize_model
 from tests.deploy.dpu.draws import rules_of
 from tests.deploy.dpu.graphs import IntegerSketch

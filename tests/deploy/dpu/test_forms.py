@@ -21,7 +21,7 @@ def placed(path: Path, weight: tuple[int, ...], tile_px: int) -> PlacedNode:
 def test_a_layer_as_large_as_its_map_is_also_one_pixel_of_all_its_values(tmp_path: Path) -> None:
     op = placed(tmp_path / "n.onnx", (10, 8, 20, 20), 20).op
     assert fully_connected(op)
-    shapes = [(form.window.kernel, form.channels) for form in forms(op, DPU)]
+    shapes = [(form.kernel, form.channels) for form in forms(op, DPU)]
     assert shapes[1:] == [((20, 20), (8, 10)), ((1, 1), (3200, 10))]
 
 

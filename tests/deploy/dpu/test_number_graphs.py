@@ -14,8 +14,9 @@ from beers_deploy.dpu.checker import number_rules
 from beers_deploy.dpu.checker.finding import Rule
 from beers_deploy.dpu.checker.number_rules import AGAIN, MOVE
 from beers_deploy.dpu.checker.placement import place
-from beers_deploy.dpu.graph import Operation, Scale
+from beers_deploy.dpu.graph import Operation
 from beers_deploy.dpu.reading import read_network
+from beers_deploy.quant.graph.quantized import Scale
 from tests.deploy.dpu.graphs import QdqSketch
 
 DPU = load_dpu("vck190")

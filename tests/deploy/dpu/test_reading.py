@@ -19,7 +19,15 @@ from tests.quant.tiling.small_networks import quantized_half_resolution
 def core(path: Path) -> list[tuple[object, ...]]:
     """What the three encodings have in common."""
     return [
-        (op.kind, op.in_shapes, op.out_shape, op.window, op.channels, op.weight_bytes, op.follows)
+        (
+            op.kind,
+            op.in_shapes,
+            op.out_shape,
+            (op.kernel, op.window),
+            op.channels,
+            op.weight_bytes,
+            op.follows,
+        )
         for op in read_network(path, 96).operations
         if op.kind in ("conv", "add", "activation")
     ]

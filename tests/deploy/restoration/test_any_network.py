@@ -15,7 +15,7 @@ from onnx import helper
 from beers_deploy.profiles.errors import MachineError, ModelError, OptionError
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.session import open_session, tensors_of
-from beers_deploy.quant.tiling.walk import Tiling, tiling_of
+from beers_deploy.quant.tiling.receptive_field import Tiling, tiling_of
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import restored, stopped_after

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.source import ArraySource
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.quant.tiling.walk import Tiling
+from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.restoration.plan import Plan, make_plan
 from beers_deploy.restoration.runtime import AT_ONCE, Infer, session_threads, tiles_at_once
 from beers_deploy.restoration.tiles.engine import Restorer

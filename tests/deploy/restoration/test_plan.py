@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.quant.tiling.walk import Tiling
+from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.restoration.plan import even_side_px, make_plan, plan_side
 
 RADIUS_PX = 5

@@ -21,7 +21,7 @@ from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import MachineError
 from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
-from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.quant.tiling.receptive_field import tiling_of
 from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import noise, stopped_after
 from tests.deploy.two_workers import local_cluster

@@ -33,7 +33,7 @@ from beers_deploy.quant.encodings import board_model, encoding_faults, host_mode
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.samples import Remade
 from beers_deploy.quant.session import open_session, run
-from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.quant.tiling.receptive_field import tiling_of
 from tests.model.networks import told_of
 from tests.quant.banked.test_filters import textured
 

@@ -19,7 +19,7 @@ from beers_deploy.model.variants import Variant
 from beers_deploy.quant.onnx_file import any_size, image_info, make_model
 from beers_deploy.quant.quantize import Quantised
 from beers_deploy.quant.session import open_session, result_of
-from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.quant.tiling.receptive_field import tiling_of
 from tests.quant.quick import patches_of, quickly
 
 

@@ -15,9 +15,9 @@ from torch import nn
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.graph import read_network
-from beers_deploy.quant.graph.moves import with_shuffles
-from beers_deploy.quant.reading.folding import simplest
-from beers_deploy.quant.tiling.walk import Tiling, tiling_of
+from beers_deploy.quant.graph.pixel_shuffle import with_shuffles
+from beers_deploy.quant.simplify.simplify import simplify
+from beers_deploy.quant.tiling.receptive_field import Tiling, tiling_of
 from tests.quant.tiling.small_networks import graph, whole
 
 
@@ -50,7 +50,7 @@ def test_what_torch_makes_of_an_unshuffle_is_one(size: int, any_size: bool, tmp_
     model = exported(network, any_size, tmp_path)
     assert "Transpose" in {node.op_type for node in model.graph.node}
     assert tiling_of(model) == Tiling(size, size, fixed_px=None if any_size else 70)
-    front = read_network(simplest(model, "exported")).front
+    front = read_network(simplify(model, "exported")).front
     assert [(shuffle.block, shuffle.up, shuffle.columns_first) for shuffle in front] == [
         (size, False, True)
     ]

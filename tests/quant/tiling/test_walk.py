@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.tiling.walk import Tiling, tiling_of
+from beers_deploy.quant.tiling.receptive_field import Tiling, tiling_of
 from tests.quant.tiling.small_networks import (
     Row,
     check_tiles,

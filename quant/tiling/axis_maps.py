@@ -1,9 +1,9 @@
-"""What an operator's pixels read along one side of the image: windows, transposed windows,
-shuffles, enlargements.
+"""Which pixels of its source an operator reads, along one axis of the image.
 
-`STEPS` says it of each operator that reads other pixels than the one in its own place. Sizes are
-followed as a share of the image's, and what a tensor has beyond that share: so it does not matter
-where pixels were padded and where windows used them up.
+`AXIS_MAPS` has each operator that reads other pixels than the one in its own place: windows,
+transposed windows, shuffles, enlargements. Sizes are followed as a share of the image's, and what a
+tensor has beyond that share. So it does not matter where pixels were padded and where windows used
+them up.
 """
 
 import math
@@ -14,13 +14,15 @@ from itertools import product
 from typing import Any
 
 from beers_deploy.profiles.errors import LONGEST, ModelError, printable
-from beers_deploy.quant.graph.moves import PLACES, ROUNDINGS, Resizing
-from beers_deploy.quant.graph.nodes import WEIGHTS, Node, OnnxGraph, Window
-from beers_deploy.quant.untrusted import WINDOW_PX, times
+from beers_deploy.quant.graph.resize import PLACES, ROUNDINGS, Resizing
+from beers_deploy.quant.onnx.graph import WEIGHTS, Node, OnnxGraph
+from beers_deploy.quant.onnx.runnable import WINDOW_PX
+from beers_deploy.quant.onnx.window import Window
+from beers_deploy.quant.untrusted import times
 
 
 @dataclass(frozen=True)
-class Step:
+class AxisMap:
     """What an operator does along one side.
 
     Attributes:
@@ -38,7 +40,7 @@ class Step:
     mirrored: int = 0
 
     def reads(self, first: int, last: int, size: int) -> tuple[int, int]:
-        """The first and the last pixel of the source that some pixels of the result read.
+        """Return the first and the last pixel of the source that pixels of the result read.
 
         Args:
             first: of the result's pixels.
@@ -55,7 +57,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Along:
+class AxisNode:
     """A node along one side of the image.
 
     Attributes:
@@ -82,82 +84,90 @@ class Along:
                 f"{self.node} {why}"
             )
 
-    def given(self, key: str, otherwise: Any) -> Any:
-        """An attribute of the node."""
+    def attribute(self, key: str, otherwise: Any) -> Any:
+        """Return an attribute of the node."""
         return self.node.attributes.get(key, otherwise)
 
     def numbers(self, place: int, key: str, otherwise: Sequence[float] = ()) -> list[Any]:
-        """What the node states in an input or, of older opsets, in an attribute."""
+        """Return what the node states in an input or, of older opsets, in an attribute."""
         values = self.graph.numbers(self.node, place, key, otherwise)
         self.require(values is not None, "has sizes that are computed (fold them)")
         return values or []
 
     def own(self, numbers: Sequence[Any], axes: Sequence[int], otherwise: Any) -> Any:
-        """This side's number, of some for these axes of (N, C, H, W)."""
+        """Return this side's number, of some for these axes of (N, C, H, W)."""
         # A negative axis counts from the last one.
         by_axis = dict(zip((int(axis) % 4 for axis in axes), numbers, strict=True))
         return by_axis.get(2 + self.axis, otherwise)
 
-    def slid(self, window: Window, ceil: bool = False) -> Step:
-        """A window that slides over its padded source."""
-        extra = window.slid(self.axis, self.extra, ceil)
+    def slide(self, window: Window, kernel: int = 1, ceil: bool = False) -> AxisMap:
+        """Return the map of a window that slides over its padded source."""
+        extra = window.output_size(self.axis, kernel, self.extra, ceil)
         before = window.pads[self.axis]
-        high = window.extent(self.axis) - 1 - before
-        return Step(Fraction(1, window.stride[self.axis]), extra, Fraction(-before), Fraction(high))
+        high = window.extent(self.axis, kernel) - 1 - before
+        growth = Fraction(1, window.strides[self.axis])
+        return AxisMap(growth, extra, Fraction(-before), Fraction(high))
 
-    def put_down(self, window: Window) -> Step:
-        """A window that is put down at each pixel of its source; the result is
-        cut by the padding.
-        """
-        stride = window.stride[self.axis]
+    def transpose(self, window: Window, kernel: int) -> AxisMap:
+        """Return the map of a transposed window; the padding cuts its result."""
+        stride = window.strides[self.axis]
         before = window.pads[self.axis]
+        extra = window.transposed_size(self.axis, kernel, self.extra)
+        extra += self.node.output_padding[self.axis]
         # Pixel k of the source writes `extent` pixels of the result, from k * stride - before on.
-        low = Fraction(before - window.extent(self.axis) + 1, stride)
+        low = Fraction(before - window.extent(self.axis, kernel) + 1, stride)
         high = Fraction(before, stride)
-        return Step(Fraction(stride), window.put_down(self.axis, self.extra), low, high)
+        return AxisMap(Fraction(stride), extra, low, high)
 
 
-def _window(at: Along) -> Window:
+def _window(at: AxisNode) -> tuple[int, Window]:
+    """Return its side along the axis, and how it moves."""
     weight = WEIGHTS.get(at.node.op_type)
     kernel = () if weight is None else at.shapes.get(at.node.inputs[weight], ())[2:]
     window = at.node.window(kernel, (at.extra, at.extra))
     at.require(
-        window is not None and not at.given("channels_last", 0),
+        window is not None and not at.attribute("channels_last", 0),
         "has no constant window of rows and columns",
     )
-    return window or Window()
+    assert window is not None  # noqa: S101 - required above
+    return window[0][at.axis], window[1]
 
 
-def _slide(at: Along) -> Step:
-    return at.slid(_window(at), bool(at.given("ceil_mode", 0)))
+def _slide(at: AxisNode) -> AxisMap:
+    kernel, window = _window(at)
+    return at.slide(window, kernel, bool(at.attribute("ceil_mode", 0)))
 
 
-def _transpose(at: Along) -> Step:
-    has_pads = at.given("auto_pad", "NOTSET") == "NOTSET" and at.given("output_shape", None) is None
+def _transpose(at: AxisNode) -> AxisMap:
+    has_pads = (
+        at.attribute("auto_pad", "NOTSET") == "NOTSET"
+        and at.attribute("output_shape", None) is None
+    )
     at.require(has_pads, "has a fixed or automatic size")
-    return at.put_down(_window(at))
+    kernel, window = _window(at)
+    return at.transpose(window, kernel)
 
 
-def _shuffle(at: Along) -> Step:
+def _shuffle(at: AxisNode) -> AxisMap:
     """Channels become squares of pixels, or squares of pixels channels."""
-    block = int(at.given("blocksize", 1))
-    window = Window((block, block), (block, block))
+    block = int(at.attribute("blocksize", 1))
+    window = Window((block, block))
     if at.node.op_type == "DepthToSpace":
-        return at.put_down(window)
+        return at.transpose(window, block)
     at.require(at.extra % block == 0, "makes channels of blocks that do not fit the image")
-    return at.slid(window)
+    return at.slide(window, block)
 
 
-def _pad(at: Along) -> Step:
+def _pad(at: AxisNode) -> AxisMap:
     """Padding by itself; less than none cuts off."""
-    mode = at.given("mode", "constant")
+    mode = at.attribute("mode", "constant")
     at.require(mode != "wrap", "joins opposite borders")
     pads = at.numbers(1, "pads")
     axes = at.numbers(3, "axes", range(4))
     at.require(len(pads) == 2 * len(axes), "has an unknown padding")
     ends = [at.own(part, axes, 0) for part in (pads[: len(axes)], pads[len(axes) :])]
     # A pad is a window of one pixel that slides over the padded source.
-    step = at.slid(Window(pads=(ends[0], ends[0], ends[1], ends[1])))
+    step = at.slide(Window(pads=(ends[0], ends[0], ends[1], ends[1])))
     return replace(step, mirrored=max(ends) if mode == "reflect" else 0)
 
 
@@ -165,7 +175,7 @@ FAR = 1 << 30
 """An end of a slice that stands for the image's own."""
 
 
-def _slice(at: Along) -> Step:
+def _slice(at: AxisNode) -> AxisMap:
     """A part that is counted from the borders, or every n-th pixel."""
     starts = at.numbers(1, "starts")
     ends = at.numbers(2, "ends")
@@ -177,10 +187,10 @@ def _slice(at: Along) -> Step:
     # A start from the end or an end from the start lies elsewhere for each size of the image.
     at.require(start >= 0 and step > 0 and (end < 0 or end >= FAR), "cuts at a fixed position")
     behind = min(end, 0)
-    return at.slid(Window(stride=(step, step), pads=(-start, -start, behind, behind)))
+    return at.slide(Window(strides=(step, step), pads=(-start, -start, behind, behind)))
 
 
-def _resize(at: Along) -> Step:
+def _resize(at: AxisNode) -> AxisMap:
     """Enlarging by whole factors, or taking every 2nd, 4th, ... pixel; linear where all weights are
     exact floats.
     """
@@ -202,7 +212,7 @@ def _resize(at: Along) -> Step:
         "uses coordinates that depend on the size",
     )
     linear = resizing.mode == "linear"
-    antialias = " with antialiasing" if at.given("antialias", 0) else ""
+    antialias = " with antialiasing" if at.attribute("antialias", 0) else ""
     at.require(
         not antialias and (linear or resizing.mode == "nearest"),
         f"resizes in mode {resizing.mode}{antialias}",
@@ -216,10 +226,10 @@ def _resize(at: Along) -> Step:
     pixels = range(growth.numerator)
     places = [(k / growth, PLACES[resizing.where](k, float(growth))) for k in pixels]
     offsets = [way(place) - share for way, (share, place) in product(ways, places)]
-    return Step(growth, math.floor(at.extra * growth), min(offsets), max(offsets))
+    return AxisMap(growth, math.floor(at.extra * growth), min(offsets), max(offsets))
 
 
-STEPS: dict[str, Callable[[Along], Step]] = {
+AXIS_MAPS: dict[str, Callable[[AxisNode], AxisMap]] = {
     **dict.fromkeys(("Conv", "ConvInteger", "QLinearConv"), _slide),
     **dict.fromkeys(("AveragePool", "LpPool", "MaxPool", "QLinearAveragePool"), _slide),
     **dict.fromkeys(("DepthToSpace", "SpaceToDepth"), _shuffle),

@@ -13,8 +13,8 @@ from onnx import TensorProto
 
 from beers_deploy.model.io.files import sha256
 from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.onnx.external_weights import network_sha256, take_in
 from beers_deploy.quant.onnx_file import load_onnx
-from beers_deploy.quant.reading.external import network_sha256, take_in
 from beers_deploy.quant.session import open_session, run
 from tests.deploy.dpu.graphs import float_convbeers
 

@@ -3,22 +3,25 @@ spelling.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import onnx
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
 from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.domains import OPSET
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
-from beers_deploy.quant.reading.folding import HALVES, OPSET, simplest
 from beers_deploy.quant.session import open_session, tensors_of
-from tests.quant.reading.networks import CASES, CHANNELS, conv, made, node, normal
+from beers_deploy.quant.simplify.simplify import HALVES, simplify
+from tests.quant.simplify.networks import CASES, CHANNELS, conv, made, node, normal
 from tests.shipped import shipped_pair
 
 
@@ -36,7 +39,7 @@ def folded(model: onnx.ModelProto, atol: float = 2e-5) -> dict[str, int]:
     """The kinds of nodes that are left, once it is seen that the results are the same and the
     network sound.
     """
-    short = simplest(model, "a.onnx")
+    short = simplify(model, "a.onnx")
     onnx.checker.check_model(short)
     for before, after in zip(results(model), results(short), strict=True):
         np.testing.assert_allclose(after, before, rtol=2e-5, atol=atol)
@@ -50,8 +53,44 @@ def test_what_exporters_leave_is_folded_and_computes_the_same(case: str) -> None
     assert folded(made(nodes)) == left
 
 
+CONVOLUTIONS = {"Conv", "ConvTranspose"}
+PARTS: dict[str, Callable[..., onnx.NodeProto]] = {
+    "convolution": lambda source, to: conv(source, to),
+    "unpadded": lambda source, to: conv(source, to, pad_px=0),
+    "depthwise": lambda source, to: conv(source, to, "deep", group=4),
+    "transposed": lambda source, to: node(
+        "ConvTranspose", source, "up", to=to, strides=[2, 2], group=2
+    ),
+    "normal": normal,
+    "from six": lambda source, to: node("Sub", "six", source, to=to),
+    "Relu": lambda source, to: node("Relu", source, to=to),
+    **{
+        kind: lambda source, to, kind=kind: node(kind, source, "image", to=to)
+        for kind in ("Add", "Sub", "Mul", "Div")
+    },
+}
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.sampled_from(sorted(PARTS)), min_size=2, max_size=4))
+def test_what_works_on_each_channel_is_folded_into_convolutions(parts: list[str]) -> None:
+    tensors = ["x", *(f"t{k}" for k in range(1, len(parts))), "y"]
+    model = made([PARTS[part](*tensors[k : k + 2]) for k, part in enumerate(parts)])
+    short = simplify(model, "a.onnx")
+    (before,), (after,) = results(model), results(short)
+    np.testing.assert_allclose(after, before, rtol=0, atol=1e-5 * max(np.abs(before).max(), 1))
+    kind = {tensor: n.op_type for n in short.graph.node for tensor in n.output}
+    assert "BatchNormalization" not in kind.values()
+    for n in short.graph.node:
+        sources = CONVOLUTIONS.intersection(kind.get(name, "") for name in n.input)
+        assert not sources or n.op_type in {"Relu", *CONVOLUTIONS}
+        # A shift stays in front of zeros that a convolution pads with, a factor does not.
+        is_scaled = n.op_type in CONVOLUTIONS and kind.get(n.input[0]) in ("Mul", "Div")
+        assert not is_scaled
+
+
 def test_numbers_shared_by_two_convolutions_are_folded_into_one_of_them() -> None:
-    short = simplest(
+    short = simplify(
         made([conv(), normal("c", "n"), node("Relu", "n", to="r"), conv("r", "y")]), "a.onnx"
     )
     first, second = (n.input[1] for n in short.graph.node if n.op_type == "Conv")
@@ -69,14 +108,14 @@ def test_operators_of_other_opsets_become_ours(opset: int) -> None:
             helper.make_attribute("coordinate_transformation_mode", "asymmetric")
         )
     model = made([conv(), resize, clip], opset)
-    short = simplest(model, "a.onnx")
+    short = simplify(model, "a.onnx")
     assert [(o.domain, o.version) for o in short.opset_import] == [("", OPSET)]
     assert folded(model) == {"Conv": 1, "Resize": 1, "Clip": 1}
     assert all(n.op_type != "Clip" or len(n.input) == 3 for n in short.graph.node)
 
 
 def test_an_operator_that_our_opset_lacks_stays_of_its_own() -> None:
-    short = simplest(made([conv(), normal("c", "n"), node("Gelu", "n")], 20), "a.onnx")
+    short = simplify(made([conv(), normal("c", "n"), node("Gelu", "n")], 20), "a.onnx")
     assert kinds(short) == {"Conv": 1, "Gelu": 1}
     assert short.opset_import[0].version == 20
 
@@ -84,7 +123,7 @@ def test_an_operator_that_our_opset_lacks_stays_of_its_own() -> None:
 @pytest.mark.parametrize("kind", HALVES)
 def test_weights_of_16_bits_become_float32(kind: int) -> None:
     model = made([conv(), normal("c", "n"), node("Relu", "n")], kind=kind)
-    short = simplest(model, "a.onnx")
+    short = simplify(model, "a.onnx")
     assert {t.data_type for t in short.graph.initializer} == {TensorProto.FLOAT}
     assert short.graph.input[0].type.tensor_type.elem_type == TensorProto.FLOAT
     assert np.abs(results(short)[0]).max() > 0.1
@@ -99,7 +138,7 @@ def test_names_and_what_is_said_of_a_network_stay() -> None:
     model.graph.node[0].name = ""
     model.graph.node[2].name = "c"
     helper.set_model_props(model, {"variant": "mine"})
-    short = simplest(model, "a.onnx")
+    short = simplify(model, "a.onnx")
     assert [v.name for v in (*short.graph.input, *short.graph.output)] == ["x", "y", "z"]
     assert short.graph.input[0] == model.graph.input[0]
     assert [(p.key, p.value) for p in short.metadata_props] == [("variant", "mine")]
@@ -112,7 +151,7 @@ def test_weights_that_are_inputs_too_are_weights() -> None:
     model.graph.input.extend(
         helper.make_tensor_value_info(t.name, t.data_type, t.dims) for t in model.graph.initializer
     )
-    short = simplest(model, "a.onnx")
+    short = simplify(model, "a.onnx")
     assert [v.name for v in short.graph.input] == ["x"]
     assert kinds(short) == {"Conv": 1}
 
@@ -128,10 +167,10 @@ def test_the_same_file_gives_the_same_bytes_and_is_not_changed() -> None:
         ]
     )
     before = model.SerializeToString()
-    short = simplest(model, "a.onnx")
-    assert short.SerializeToString() == simplest(model, "b.onnx").SerializeToString()
+    short = simplify(model, "a.onnx")
+    assert short.SerializeToString() == simplify(model, "b.onnx").SerializeToString()
     assert model.SerializeToString() == before
-    repeated = simplest(short, "a.onnx")
+    repeated = simplify(short, "a.onnx")
     assert repeated.SerializeToString() == short.SerializeToString()
 
 
@@ -145,7 +184,7 @@ def test_files_that_need_nothing_stay_as_they_are(tmp_path: Path) -> None:
 def test_a_network_that_the_runtime_does_not_read_is_one_sentence() -> None:
     model = made([conv(weight="b"), normal()])
     with pytest.raises(ModelError, match=r"onnxruntime cannot run a\.onnx"):
-        simplest(model, "a.onnx")
+        simplify(model, "a.onnx")
 
 
 def test_sizes_that_contradict_the_nodes_are_one_sentence_or_read() -> None:
@@ -153,7 +192,7 @@ def test_sizes_that_contradict_the_nodes_are_one_sentence_or_read() -> None:
     model = made([node("Sub", "x", "image", to="m"), conv("m", "y")], 9)
     del model.graph.output[0].type.tensor_type.shape.dim[3]
     try:
-        assert "Conv" in kinds(simplest(model, "a.onnx"))
+        assert "Conv" in kinds(simplify(model, "a.onnx"))
     except ModelError as error:
         assert "a.onnx" in str(error)  # noqa: PT017 - either will do
 

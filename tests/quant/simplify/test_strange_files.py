@@ -18,7 +18,7 @@ from beers_deploy.dpu.reading import read_network
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session, tensors_of
-from tests.quant.reading.networks import conv, made, node, normal
+from tests.quant.simplify.networks import conv, made, node, normal
 
 LIGHT = sorted((Path(onnx.__file__).parent / "backend" / "test" / "data" / "light").glob("*.onnx"))
 SMALL = [path for path in LIGHT if path.stem.removeprefix("light_") in ("shufflenet", "squeezenet")]

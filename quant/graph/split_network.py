@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from beers_deploy.profiles.errors import LONGEST, ModelError, printable
-from beers_deploy.quant.graph.nodes import Pair, Window
 from beers_deploy.quant.graph.operations import (
     CORRECTION,
     IMAGE,
@@ -25,6 +24,7 @@ from beers_deploy.quant.graph.operations import (
     Resize,
     Shuffle,
 )
+from beers_deploy.quant.onnx.window import Pair
 
 REMEDY = (
     "See docs/reference/any-network.md for the operators that 'quantize' accepts; 'check' names "
@@ -33,7 +33,7 @@ REMEDY = (
 
 
 @dataclass(frozen=True)
-class Network:
+class SplitNetwork:
     """A float network, cut where the DPU's part begins and ends.
 
     Attributes:
@@ -70,7 +70,7 @@ def unsupported(fault: str, remedy: str = REMEDY) -> ModelError:
     return ModelError(f"{printable(fault, 4 * LONGEST)} {remedy}")
 
 
-def cut(graph: Graph, channels: int) -> Network:
+def cut(graph: Graph, channels: int) -> SplitNetwork:
     """The network of operations from `IMAGE` to `CORRECTION`: what the host does at both ends is
     taken off.
 
@@ -91,7 +91,7 @@ def cut(graph: Graph, channels: int) -> Network:
     while isinstance(first := _only_reader(graph), Shuffle) and not first.up:
         front.append(first)
         graph = tuple(renamed(op, {first.output: IMAGE}) for op in graph if op is not first)
-    network = Network(graph, channels, tuple(front), back, adds_image, last)
+    network = SplitNetwork(graph, channels, tuple(front), back, adds_image, last)
     return replace(network, graph=_image_for_convolutions(graph, network.core_channels))
 
 
@@ -161,7 +161,7 @@ def _is_ours(name: str) -> bool:
     return name in ours or name.startswith(("host_front.", "host_back.", f"{IMAGE}."))
 
 
-def check_network(network: Network) -> None:
+def check_network(network: SplitNetwork) -> None:
     """Raise ModelError if a network cannot be quantised, before anything is computed."""
     graph = network.graph
     if not graph or graph[-1].output != CORRECTION:
@@ -205,9 +205,9 @@ def sized(graph: Graph, size: Pair) -> Graph:
 def _size(op: Op, size: Pair) -> Pair:
     if isinstance(op, Conv | MaxPool | AveragePool):
         rows, columns = op.weight.shape[2:] if isinstance(op, Conv) else op.kernel or size
-        window = Window((rows, columns), op.window.strides, op.window.pads, op.window.dilations)
-        move = window.put_down if isinstance(op, Conv) and op.transposed else window.slid
-        return move(0, size[0]), move(1, size[1])
+        is_transposed = isinstance(op, Conv) and op.transposed
+        side = op.window.transposed_size if is_transposed else op.window.output_size
+        return side(0, rows, size[0]), side(1, columns, size[1])
     if isinstance(op, Resize):
         return size[0] * op.factor, size[1] * op.factor
     if isinstance(op, Shuffle):

@@ -26,10 +26,10 @@ from fractions import Fraction
 
 import onnx
 
-from beers_deploy.quant.graph.moves import MOVES, with_shuffles
-from beers_deploy.quant.graph.nodes import Node, OnnxGraph
+from beers_deploy.quant.graph.pixel_shuffle import MOVES, with_shuffles
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px
-from beers_deploy.quant.tiling.steps import STEPS, Along, Step, not_tileable
+from beers_deploy.quant.tiling.axis_maps import AXIS_MAPS, AxisMap, AxisNode, not_tileable
 from beers_deploy.quant.untrusted import contradictions
 
 
@@ -171,7 +171,7 @@ class _Walk:
         self._axis = axis
         self._shapes = {name: value.shape for name, value in graph.constants.items()}
         self._grids = dict.fromkeys(graph.inputs, _Grid(Fraction(1), 0))
-        self._steps: list[tuple[Node, Step]] = []
+        self._steps: list[tuple[Node, AxisMap]] = []
         self.least_px = 1
         for node in graph.nodes:
             self._visit(node)
@@ -197,7 +197,7 @@ class _Walk:
 
     def _visit(self, node: Node) -> None:
         grids = [self._grids[name] for name in node.inputs if name in self._grids]
-        at = Along(node, self._axis, grids[0].extra if grids else 0, self._graph, self._shapes)
+        at = AxisNode(node, self._axis, grids[0].extra if grids else 0, self._graph, self._shapes)
         if grids:
             step = self._step(at, grids)
             at.require(step.growth > 0, "has no positive stride")
@@ -212,8 +212,8 @@ class _Walk:
             at.require(node.op_type in KEEPING, "reads constants only (fold them)")
             self._shapes[node.outputs[0]] = self._shapes[node.inputs[0]]
 
-    def _step(self, at: Along, grids: list[_Grid]) -> Step:
-        if at.node.op_type in STEPS:
+    def _step(self, at: AxisNode, grids: list[_Grid]) -> AxisMap:
+        if at.node.op_type in AXIS_MAPS:
             at.require(
                 at.node.inputs[0] in self._grids and len(grids) == 1,
                 "has parameters that the image determines",
@@ -221,10 +221,10 @@ class _Walk:
             at.require(
                 len([name for name in at.node.outputs if name]) == 1, "returns positions as well"
             )
-            return STEPS[at.node.op_type](at)
+            return AXIS_MAPS[at.node.op_type](at)
         _require_pointwise(at)
         at.require(len(set(grids)) == 1, "combines tensors of different sizes")
-        return Step(Fraction(1), at.extra)
+        return AxisMap(Fraction(1), at.extra)
 
     def _radius_px(self, output: str) -> int:
         """How far beyond a cell of the lattice lies what its result depends on."""
@@ -253,14 +253,14 @@ def _hull(ranges: list[tuple[int, int]]) -> tuple[int, int]:
     return min(first for first, _ in ranges), max(last for _, last in ranges)
 
 
-def _require_pointwise(at: Along) -> None:
+def _require_pointwise(at: AxisNode) -> None:
     kind = at.node.op_type
     if kind in AXES:
-        at.require(at.given("axis", AXES[kind]) in (1, -3), "does not work along the channels")
+        at.require(at.attribute("axis", AXES[kind]) in (1, -3), "does not work along the channels")
     elif kind == "Gather":
         # Our host files have an activation by itself as a table.
         table = at.shapes.get(at.node.inputs[0], ())
-        at.require(len(table) == 1 and at.given("axis", 0) == 0, "moves pixels")
+        at.require(len(table) == 1 and at.attribute("axis", 0) == 0, "moves pixels")
     else:
         why = next(
             (why for why, marks in WHY.items() if any(mark in kind for mark in marks)),

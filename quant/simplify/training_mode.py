@@ -10,9 +10,8 @@ import onnx
 from onnx import NodeProto, TensorProto, numpy_helper
 
 from beers_deploy.profiles.errors import ModelError, printable
-from beers_deploy.quant.domains import STANDARD
-from beers_deploy.quant.reading.nodes import attributes_of
-from beers_deploy.quant.untrusted import opset_of
+from beers_deploy.quant.domains import STANDARD, opset_of
+from beers_deploy.quant.onnx.graph import attributes_of
 
 IS_TEST_UNTIL = 6
 """The last opset whose operators state by `is_test` whether they are in use; without it they are in

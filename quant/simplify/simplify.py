@@ -1,20 +1,20 @@
-"""A float ONNX file as exporters leave it, turned into its simplest equal: `simplest(model, where)
--> model`.
+"""Turn a float ONNX file as exporters leave it into its simplest equal.
 
-`quant.onnx_file.load_onnx` calls it for whoever reads a file, once; behind it these hold of a float
+`quant.onnx_file.load_onnx` does it once for whoever reads a file. Afterwards these hold of a float
 network:
 
-- constants are initializers, each float32 where it was float16 too, and no initializer is an input;
-- no Identity, Constant, Dropout, needless Cast, no arithmetic on constants;
-- no BatchNormalization, and no Mul, Add, Sub or Div by one constant a channel, behind a convolution
-  that only it reads, nor in front of convolutions where they are exact; a BatchNormalization of
-  images that is left is a depthwise 1 x 1 convolution; zeros that Pad adds are the convolution's
-  own;
-- Sub of a convolution's result is Add, Sum is Add, a mean over the image is GlobalAveragePool,
-  HardSwish is itself, ReLU6 is Clip from 0 to 6;
-- operators of opset 17, unless one has no form there; inputs, outputs, metadata and nodes that stay
-  keep their names, each node has one, and no two convolutions share what was folded into one of
-  them.
+1. Constants are initializers, each float32 where it was float16 too, and no initializer is an
+   input.
+2. There is no Identity, Constant, Dropout, needless Cast, and no arithmetic on constants.
+3. There is no BatchNormalization, and no Mul, Add, Sub or Div by one constant a channel, behind a
+   convolution that only it reads, nor in front of convolutions where they are exact. A
+   BatchNormalization of images that is left is a depthwise 1 x 1 convolution. Zeros that Pad adds
+   are the convolution's own.
+4. Sub of a convolution's result is Add, Sum is Add, a mean over the image is GlobalAveragePool,
+   HardSwish is itself, ReLU6 is Clip from 0 to 6.
+5. Operators are those of opset 17, unless one has no form there.
+6. Inputs, outputs, metadata and nodes that stay keep their names, each node has one, and no two
+   convolutions share what was folded into one of them.
 
 A network that needs none of it is returned as it is: its results stay the same to the bit. The same
 file gives the same bytes. INT8 files do not come here.
@@ -22,11 +22,12 @@ file gives the same bytes. INT8 files do not come here.
 Constants, normalisation behind convolutions, padding and what does nothing are folded by
 onnxruntime's basic optimisation, which every installation has: it keeps to standard operators, and
 its own tests run on every release. (onnxsim or onnxscript's optimizer would be further packages for
-the same.) What it leaves is rewritten by `quant.reading.equivalents`; onnx's own converter changes
-the opset. Only what `quant.untrusted` has let through may come here: a runtime opens it.
+the same.) What it leaves is for the passes of this package; onnx's own converter changes the opset.
+Only what `quant.untrusted` has let through may come here: a runtime opens it.
 """
 
 from copy import deepcopy
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -38,12 +39,24 @@ from onnx import TensorProto, numpy_helper, version_converter
 from onnx.shape_inference import InferenceError
 
 from beers_deploy.profiles.errors import ModelError, reason_of
-from beers_deploy.quant.reading.equivalents import rewrite
-from beers_deploy.quant.reading.nodes import fresh
-from beers_deploy.quant.untrusted import contradictions, held_tensors, opset_of
-
-OPSET = 17
-IR_VERSION = 8
+from beers_deploy.quant.domains import IR_VERSION, OPSET, opset_of
+from beers_deploy.quant.onnx.graph import OnnxGraph, free_name
+from beers_deploy.quant.simplify.fold_affine import (
+    add_negated,
+    affine_of,
+    convolve_normalisation,
+    fold_behind,
+    fold_in_front,
+)
+from beers_deploy.quant.simplify.fully_connected import ConnectByConvolutions
+from beers_deploy.quant.simplify.standard_operators import (
+    drop_cast,
+    float_shapes,
+    join_hard_swish,
+    pool_mean,
+    split_sums,
+)
+from beers_deploy.quant.untrusted import contradictions, held_tensors
 
 PLAIN = {
     "Add",
@@ -67,18 +80,22 @@ shuffles that are spelled out would not be recognised.
 HALVES = (TensorProto.FLOAT16, TensorProto.BFLOAT16)
 
 
-def simplest(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
-    """The float network's simplest equal, as the module says.
+NEEDS_SHAPES = {"Cast", "Gemm", "ReduceMean", "Softmax"}
+"""What may be rewritten where shapes are known."""
+
+
+def simplify(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
+    """Return the float network's simplest equal, as the module says.
 
     Args:
         model: what `check_content` and `check_runnable` let through; not changed.
-        where: its file, for the sentence.
+        where: name of the network for messages, such as "a.onnx".
     """
     with contradictions(where):
-        return model if _is_plain(model) else _simplest(model, where)
+        return model if _is_plain(model) else _simplified(model, where)
 
 
-def _simplest(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
+def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     network = deepcopy(model)
     _widen(network)
     weights = {tensor.name for tensor in network.graph.initializer}
@@ -92,12 +109,31 @@ def _simplest(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     if opset_of(model) < OPSET:
         network = _of_our_opset(network)
     network = _of_our_opset(_folded(network, where))
-    rewrite(network)
+    _run_passes(network)
     # Inputs and outputs stay as the file states them.
     _replace(network.graph.input, inputs)
     _replace(network.graph.output, outputs)
     _tidy(network, model)
     return network
+
+
+def _run_passes(model: onnx.ModelProto) -> None:
+    """Rewrite the nodes of a network in place; its inputs and outputs keep their names."""
+    graph = OnnxGraph(model)
+    for rewriting in (split_sums, add_negated, fold_behind, join_hard_swish):
+        graph.rewrite(rewriting)
+    graph.save()
+    if not any(node.op_type in NEEDS_SHAPES or affine_of(graph, node) for node in graph.nodes):
+        return
+    shapes = float_shapes(graph)
+    fold_in_front(graph, shapes)
+    for with_shapes in (drop_cast, pool_mean, convolve_normalisation):
+        graph.rewrite(partial(with_shapes, shapes))
+    # A normalisation that has become a convolution takes in what stands around it.
+    graph.rewrite(fold_behind)
+    fold_in_front(graph, shapes)
+    graph.rewrite(ConnectByConvolutions(shapes))
+    graph.save()
 
 
 def _is_plain(model: onnx.ModelProto) -> bool:
@@ -208,7 +244,7 @@ def _tidy(network: onnx.ModelProto, model: onnx.ModelProto) -> None:
     name_counts = dict.fromkeys((node.name for node in graph.node), 0)
     for node in graph.node:
         if not node.name:
-            node.name = fresh(node.output[0] or node.op_type, name_counts)
+            node.name = free_name(node.output[0] or node.op_type, name_counts)
 
 
 def _replace(field: object, values: object) -> None:

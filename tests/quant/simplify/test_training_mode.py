@@ -14,7 +14,7 @@ from onnx import NodeProto, helper, numpy_helper
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import load_onnx
 from tests.deploy.command_line import refused
-from tests.quant.reading.networks import made
+from tests.quant.simplify.networks import made
 
 RATIO = numpy_helper.from_array(np.array(0.5, np.float32))
 

@@ -1,0 +1,220 @@
+"""Read one node of a float network as the operation of the short list that it is.
+
+Each function raises ModelError with the rule that a node breaks. The graph gives the constants.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from beers_deploy.quant.graph.operations import (
+    LEAKY_SLOPE,
+    Activation,
+    AveragePool,
+    Concat,
+    Conv,
+    MaxPool,
+    Op,
+    Resize,
+    Shuffle,
+)
+from beers_deploy.quant.graph.pixel_shuffle import MOVES, ORDERS
+from beers_deploy.quant.graph.resize import Resizing
+from beers_deploy.quant.graph.split_network import unsupported
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.window import Pair, Window
+
+
+def require(condition: bool, node: Node, rule: str) -> None:
+    """Raise ModelError unless a node meets a rule: "must ..." or "has ..."."""
+    if not condition:
+        raise unsupported(f"{node} {rule}.")
+
+
+def _weights(node: Node, graph: OnnxGraph) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weights (O, I / groups, kh, kw) of a convolution, and its bias (O,)."""
+    weight = graph.value(node, 1)
+    bias = graph.value(node, 2)
+    if weight is None:
+        raise unsupported(f"{node} must have constant weights, but they are computed.")
+    require(
+        weight.ndim == 4,
+        node,
+        f"must be a convolution over rows and columns, but its weights have {weight.ndim} "
+        "dimensions",
+    )
+    if node.op_type == "ConvTranspose":
+        weight = np.ascontiguousarray(weight.swapaxes(0, 1))
+    bias = np.zeros(len(weight)) if bias is None else bias
+    return weight.astype(np.float32), bias.astype(np.float32)
+
+
+def _read_conv(node: Node, graph: OnnxGraph) -> Op:
+    """Read a convolution of one group, or of one for each channel."""
+    weight, bias = _weights(node, graph)
+    groups = int(node.attributes.get("group", 1))
+    # A DPU has one group or one a channel: its tools leave others to the processor.
+    depthwise = groups == len(weight) and weight.shape[1] == 1
+    require(
+        groups == 1 or depthwise,
+        node,
+        f"must have one group, or one for each channel (depthwise), got {groups} groups",
+    )
+    _, window = _window(node, weight.shape[2:])
+    return Conv(
+        node.name, node.inputs[0], node.outputs[0], weight, bias, window=window, groups=groups
+    )
+
+
+def _read_transposed_conv(node: Node, graph: OnnxGraph) -> Op:
+    """Read a transposed convolution that enlarges rows and columns alike."""
+    weight, bias = _weights(node, graph)
+    attributes = node.attributes
+    strides = attributes.get("strides", [1, 1])
+    # AMD's tools leave a transposed convolution with output padding to the processor.
+    plain = int(attributes.get("group", 1)) == 1 and not any(node.output_padding)
+    require(plain, node, "must have one group and no output padding")
+    even = (
+        set(attributes.get("dilations", [1])) == {1}
+        and len(set(strides)) == 1
+        and "output_shape" not in attributes
+    )
+    require(
+        even,
+        node,
+        "must have one stride for rows and columns, no dilation and no output_shape, got "
+        f"strides {list(strides)}",
+    )
+    require(
+        attributes.get("auto_pad", "NOTSET") == "NOTSET",
+        node,
+        "must state its pads instead of auto_pad",
+    )
+    _, window = _window(node, weight.shape[2:])
+    return Conv(
+        node.name, node.inputs[0], node.outputs[0], weight, bias, window=window, transposed=True
+    )
+
+
+def _window(node: Node, kernel: Sequence[int] = ()) -> tuple[Pair, Window]:
+    kernel_and_window = node.window(kernel)
+    auto_pad = str(node.attributes.get("auto_pad", ""))
+    if kernel_and_window is None:
+        raise unsupported(f"{node} must have a window over rows and columns.")
+    has_pads = kernel_and_window[1].strides == (1, 1) or not auto_pad.startswith("SAME")
+    require(has_pads, node, f"must state its pads instead of auto_pad {auto_pad} with strides")
+    return kernel_and_window
+
+
+def _read_concat(node: Node, graph: OnnxGraph) -> Op:
+    axis = node.attributes.get("axis")
+    require(axis in (1, -3), node, f"must concatenate along the channels, got axis {axis}")
+    computed = graph.constants.keys().isdisjoint(node.inputs)
+    require(computed, node, "must concatenate computed tensors, got a constant")
+    return Concat(node.name, node.inputs, node.outputs[0])
+
+
+def _read_max_pool(node: Node, _: OnnxGraph) -> Op:
+    plain = len(node.outputs) == 1 and not node.attributes.get("ceil_mode", 0)
+    require(plain, node, "must pool without indices and ceil_mode")
+    return MaxPool(node.name, node.inputs[0], node.outputs[0], *_window(node))
+
+
+def _read_average_pool(node: Node, _: OnnxGraph) -> Op:
+    kernel, window = _window(node)
+    zeros = bool(node.attributes.get("count_include_pad", 0)) or not any(window.pads)
+    plain = zeros and not node.attributes.get("ceil_mode", 0)
+    require(plain, node, "must count its padding and have no ceil_mode")
+    return AveragePool(node.name, node.inputs[0], node.outputs[0], kernel, window)
+
+
+def _read_resize(node: Node, graph: OnnxGraph) -> Op:
+    resizing = Resizing.of(node, graph)
+    is_uniform = resizing.factors[:2] == (1, 1) and resizing.factors[2] == resizing.factors[3]
+    require(is_uniform, node, "must enlarge rows and columns by one constant factor")
+    factor = int(resizing.factors[2])
+    where = resizing.where
+    require(
+        resizing.factors[2] == factor >= 1,
+        node,
+        f"must enlarge by an integer factor, got {resizing.factors[2]:g}",
+    )
+    # A DPU enlarges bilinearly by 2 and 4 alone where centres are half-pixel ones.
+    if resizing.mode == "linear":
+        half = where in ("half_pixel", "pytorch_half_pixel") and factor in (2, 4)
+        require(
+            half,
+            node,
+            f"must enlarge bilinearly by 2 or 4 with half-pixel centres, got {where} by {factor}",
+        )
+    else:
+        blocks = resizing.mode == "nearest" and resizing.makes_blocks(factor)
+        require(
+            blocks,
+            node,
+            "must be a nearest resize that makes a block of each pixel, got "
+            f"{resizing.mode}, {where}, {resizing.rounding} by {factor}",
+        )
+    return Resize(node.name, node.inputs[0], node.outputs[0], factor, resizing.mode == "linear")
+
+
+def _read_shuffle(node: Node, _: OnnxGraph) -> Op:
+    """Read a pixel shuffle; Reshape and Transpose that make one are one already."""
+    mode = node.attributes.get("mode", "DCR") if node.op_type not in MOVES else ""
+    require(
+        mode in ORDERS,
+        node,
+        "must be a pixel shuffle, or part of a Reshape and Transpose that make one",
+    )
+    up = node.op_type == "DepthToSpace"
+    block = int(node.attributes["blocksize"])
+    # Of several nodes that spell one shuffle it is the last one's name.
+    name = node.proto.name or node.name
+    return Shuffle(name, node.inputs[0], node.outputs[0], block, up, ORDERS[mode])
+
+
+READERS: dict[str, Callable[[Node, OnnxGraph], Op]] = {
+    "AveragePool": _read_average_pool,
+    "Concat": _read_concat,
+    "Conv": _read_conv,
+    "ConvTranspose": _read_transposed_conv,
+    "DepthToSpace": _read_shuffle,
+    "GlobalAveragePool": lambda node, _: AveragePool(
+        node.name, node.inputs[0], node.outputs[0], None
+    ),
+    "MaxPool": _read_max_pool,
+    "Resize": _read_resize,
+    "SpaceToDepth": _read_shuffle,
+    **dict.fromkeys(MOVES, _read_shuffle),
+}
+"""Operators that are an operation whatever stands before them."""
+
+ACTIVATIONS = {
+    "Relu": Activation.relu,
+    "Clip": Activation.relu6,
+    "LeakyRelu": Activation.leaky_relu,
+    "HardSigmoid": Activation.hard_sigmoid,
+    "HardSwish": Activation.hard_swish,
+}
+
+
+def read_activation(node: Node, graph: OnnxGraph) -> Activation:
+    """Return the activation that a node of `ACTIVATIONS` is."""
+    activation = ACTIVATIONS[node.op_type]
+    if node.op_type == "LeakyRelu":
+        slope = float(node.attributes.get("alpha", 0.01))
+        require(
+            slope == np.float32(LEAKY_SLOPE),
+            node,
+            f"must have a slope of 26/256 (0.1015625), got {slope:g}",
+        )
+    if node.op_type == "Clip":
+        low, high = (graph.value(node, k) for k in (1, 2))
+        six = low is not None and high is not None and float(low) == 0 and float(high) == 6
+        require(six, node, "must clip from 0 to 6 (ReLU6)")
+    if node.op_type == "HardSigmoid":
+        alpha = node.attributes.get("alpha", 0.2)
+        beta = node.attributes.get("beta", 0.5)
+        plain = bool(np.isclose(alpha, 1 / 6, 1e-4)) and beta == 0.5
+        require(plain, node, f"must have alpha 1/6 and beta 0.5, got {alpha:g} and {beta:g}")
+    return activation

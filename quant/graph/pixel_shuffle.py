@@ -1,0 +1,134 @@
+"""Find the pixel shuffles that exporters write as Reshape and Transpose.
+
+torch writes PixelUnshuffle so, and PixelShuffle in old opsets. What such nodes do is tried out on
+an image of numbered pixels.
+"""
+
+import math
+from collections.abc import Callable
+from fractions import Fraction
+
+import numpy as np
+import onnx
+from onnx import TypeProto, helper
+
+from beers_deploy.quant.graph.operations import Shuffle
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
+
+MOVES: dict[str, tuple[str, Callable[[np.ndarray, list[int]], np.ndarray]]] = {
+    "Reshape": (
+        "shape",
+        lambda image, sizes: image.reshape([n or image.shape[k] for k, n in enumerate(sizes)]),
+    ),
+    "Squeeze": ("axes", lambda image, axes: image.squeeze(tuple(axes) or None)),
+    "Transpose": ("perm", lambda image, axes: image.transpose(axes or None)),
+    "Unsqueeze": ("axes", lambda image, axes: np.expand_dims(image, tuple(axes))),
+}
+"""Operators that only move pixels: what they state, in an input or an attribute, and what they do.
+"""
+ORDERS = {"CRD": True, "DCR": False}
+"""The modes of ONNX's DepthToSpace, and whether columns come first."""
+SIDES_PX = 24, 35
+"""Sides of images that moves are tried on: blocks of 2 to 8 fit one of them."""
+VALUES = 1 << 22
+"""The largest image of a stated size that moves are tried on."""
+
+
+def with_shuffles(model: onnx.ModelProto) -> OnnxGraph:
+    """Return the graph of a model, each pixel shuffle being one node whichever way it is spelled.
+
+    A spelled-out one becomes DepthToSpace or SpaceToDepth. Its `mode`, also of SpaceToDepth, is the
+    order of the channels: one of `ORDERS`, empty for any other.
+    """
+    graph = OnnxGraph(model)
+    chains = _chains(graph)
+    if not chains:
+        return graph
+    types = graph.tensor_types()
+    # The last node of a chain stands for all of them, so that no reader of the result moves.
+    replacements: dict[Node, list[Node]] = {}
+    for chain in chains:
+        sizes = sizes_of(types.get(chain[0].inputs[0], TypeProto.Tensor()))
+        shuffle = _shuffle(chain, sizes, graph)
+        if shuffle is not None:
+            replacements |= {**{node: [] for node in chain}, chain[-1]: [shuffle]}
+    graph.rewrite(lambda _, node: replacements.get(node))
+    return graph
+
+
+def _chains(graph: OnnxGraph) -> list[list[Node]]:
+    """Return nodes that only move pixels, in chains of which only the next node reads each."""
+    chains: dict[str, list[Node]] = {}  # by the last result
+    for node in graph.nodes:
+        if node.op_type in MOVES:
+            chain = chains.pop(node.inputs[0], []) if graph.n_reads(node.inputs[0]) == 1 else []
+            chain.append(node)
+            chains[node.outputs[0]] = chain
+    return list(chains.values())
+
+
+def _shuffle(chain: list[Node], sizes: tuple[int, ...], graph: OnnxGraph) -> Node | None:
+    """Return the pixel shuffle that a chain makes of an image; 0 stands for free sizes.
+
+    None if the chain makes no shuffle.
+    """
+    for side_px in SIDES_PX if len(sizes) == 4 and sizes[1] else ():
+        shape = sizes[0] or 1, sizes[1], sizes[2] or side_px, sizes[3] or 2 * side_px
+        if math.prod(shape) > VALUES:
+            continue
+        # Each pixel has a number of its own, so that the result says where each one went.
+        image = np.arange(math.prod(shape)).reshape(shape)
+        result = _moved(chain, image, graph)
+        growth = _growth(result, shape)
+        if growth is None:
+            continue
+        up = growth > 1
+        block = max(growth.numerator, growth.denominator)
+        mode = _order(image, result, block, up) if block > 1 else ""
+        kind = "DepthToSpace" if up else "SpaceToDepth"
+        # Messages name the first node of the chain, and files that we write the last one.
+        ends = [chain[0].inputs[0]], [chain[-1].outputs[0]]
+        proto = helper.make_node(kind, *ends, chain[-1].name, blocksize=block)
+        attributes = {"blocksize": block, "mode": mode}
+        return Node(kind, chain[0].name, tuple(ends[0]), tuple(ends[1]), attributes, proto)
+    return None
+
+
+def _order(image: np.ndarray, result: np.ndarray, block: int, up: bool) -> str:
+    """Return the mode of a pixel shuffle that makes the result of the image; empty if none does."""
+    for mode, columns_first in ORDERS.items():
+        shuffle = Shuffle("", "", "", block, up, columns_first)
+        if np.array_equal(shuffle(image), result):
+            return mode
+    return ""
+
+
+def _moved(chain: list[Node], image: np.ndarray, graph: OnnxGraph) -> np.ndarray:
+    """Return an image as a chain moves its pixels; empty if the chain does not fit."""
+    for node in chain:
+        key, move = MOVES[node.op_type]
+        numbers = graph.numbers(node, 1, key)
+        if numbers is None:
+            return np.array([])
+        try:
+            image = move(image, numbers)
+        except (IndexError, ValueError):
+            return np.array([])
+    return image
+
+
+def _growth(result: np.ndarray, shape: tuple[int, int, int, int]) -> Fraction | None:
+    """Return the pixels of a shuffle's result for one of its source, along either side.
+
+    It is a shuffle if each pixel comes from its own place: the pixel there, or the block of them.
+    None for anything else.
+    """
+    if result.ndim != 4 or len(result) != shape[0]:
+        return None
+    growth = Fraction(result.shape[2], shape[2])
+    rows, columns = (source // growth.denominator for source in np.unravel_index(result, shape)[2:])
+    down, across = (np.arange(side) // growth.numerator for side in result.shape[2:])
+    # Numerator or denominator is 1 where blocks become pixels or pixels become blocks.
+    in_blocks = 1 in (growth.numerator, growth.denominator)
+    in_place = (rows == down[:, None]).all() and (columns == across).all()
+    return growth if in_blocks and in_place else None

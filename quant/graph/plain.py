@@ -1,0 +1,52 @@
+"""Networks of ConvBEERS' kind: what proofs, the stress battery and bit flips accept."""
+
+import onnx
+
+from beers_deploy.quant.graph.operations import IMAGE, Activation, Add, Conv, Graph, Op, same
+from beers_deploy.quant.graph.reader import read_network
+from beers_deploy.quant.graph.split_network import SplitNetwork, unsupported
+
+
+def plain_network(model: onnx.ModelProto) -> SplitNetwork:
+    """Read a network of ConvBEERS' kind.
+
+    It adds a correction to an image of one channel, and computes it by same-size convolutions of
+    stride 1, ReLU and adds; at full resolution, or at a lower one, with the image's pixels
+    rearranged into channels and back.
+    """
+    network = read_network(model)
+    blocks = [[shuffle.block for shuffle in end] for end in (network.front, network.back)]
+    adds_to_one_channel = network == SplitNetwork(
+        network.graph, front=network.front, back=network.back
+    )
+    if not (adds_to_one_channel and blocks[0] == blocks[1] and len(blocks[0]) <= 1):
+        raise unsupported(
+            "The network must read an image of one channel, and add it to its result at the end "
+            "(a global add)."
+        )
+    for op in network.graph:
+        if not _is_plain(op):
+            raise unsupported(
+                "The network may have only same-size convolutions of stride 1, ReLU and adds, but "
+                f"it has {op.name}."
+            )
+    return network
+
+
+def _is_plain(op: Op) -> bool:
+    if isinstance(op, Conv):
+        alone = op.groups == 1 and not op.transposed and op.window == same(op.weight)
+        return alone and op.activation in (Activation.none, Activation.relu)
+    return isinstance(op, Add) and op.activation is Activation.none
+
+
+def correction_graph(model: onnx.ModelProto) -> Graph:
+    """Return its operations, from `image` (N, S^2, H / S, W / S) to `correction` of that shape."""
+    return plain_network(model).graph
+
+
+def image_channels(graph: Graph) -> int:
+    """Return the channels of the image as such operations read it: S^2, the pixels of a place."""
+    return next(
+        int(op.weight.shape[1]) for op in graph if isinstance(op, Conv) and op.input == IMAGE
+    )

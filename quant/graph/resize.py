@@ -1,0 +1,61 @@
+"""Resizes of all opsets, with ONNX's defaults filled in."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+
+PLACES: dict[str, Callable[[int, float], float]] = {
+    "asymmetric": lambda pixel, factor: pixel / factor,
+    "half_pixel": lambda pixel, factor: (pixel + 0.5) / factor - 0.5,
+    "pytorch_half_pixel": lambda pixel, factor: (pixel + 0.5) / factor - 0.5,
+    "tf_half_pixel_for_nn": lambda pixel, factor: (pixel + 0.5) / factor,
+}
+"""Where a pixel of an enlarged image lies in the image before.
+
+ONNX's other coordinates depend on the sizes.
+"""
+ROUNDINGS: dict[str, Callable[[float], int]] = {
+    "floor": math.floor,
+    "ceil": math.ceil,
+    "round_prefer_floor": lambda place: math.ceil(place - 0.5),
+    "round_prefer_ceil": lambda place: math.floor(place + 0.5),
+}
+
+
+@dataclass(frozen=True)
+class Resizing:
+    """A Resize, or an Upsample of older opsets, with ONNX's defaults filled in.
+
+    `factors` are those of N, C, H and W; none where they are computed, or a size is stated.
+    """
+
+    factors: tuple[float, ...]
+    mode: str
+    where: str
+    rounding: str
+
+    @classmethod
+    def of(cls, node: Node, graph: OnnxGraph) -> "Resizing":
+        """Return what a node states."""
+        # Before opset 11 the factors are the second input, and places start at the corner.
+        old = node.op_type == "Upsample" or len(node.inputs) == 2
+        attribute = node.attributes.get
+        scales = graph.numbers(node, 1 if old else 2, "scales") or []
+        axes = [axis % 4 for axis in attribute("axes", range(4))]
+        factors = dict(zip(axes, scales, strict=bool(scales)))
+        return cls(
+            tuple(factors.get(axis, 1.0) for axis in range(4)) if factors else (),
+            attribute("mode", "nearest"),
+            attribute("coordinate_transformation_mode", "asymmetric" if old else "half_pixel"),
+            attribute("nearest_mode", "floor" if old else "round_prefer_floor"),
+        )
+
+    def makes_blocks(self, factor: int) -> bool:
+        """Return True if each nearest pixel becomes a block of `factor` x `factor` pixels."""
+        if self.where not in PLACES or self.rounding not in ROUNDINGS:
+            return False
+        place = PLACES[self.where]
+        rounded = ROUNDINGS[self.rounding]
+        return all(rounded(place(k, factor)) == k // factor for k in range(factor))

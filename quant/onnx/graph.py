@@ -1,0 +1,260 @@
+"""The one graph of an ONNX file: its nodes, who writes and reads each tensor, and its constants.
+
+Simplification edits it, tiling walks it, the quantiser reads typed operations from it and the
+checker sized ones. Nothing is refused here.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import NodeProto, TypeProto, helper, numpy_helper, shape_inference
+
+from beers_deploy.quant.domains import Functions, functions_of, operator_name
+from beers_deploy.quant.onnx.window import Pair, Window
+
+WEIGHTS = {"Conv": 1, "ConvInteger": 1, "ConvTranspose": 1, "QLinearConv": 3}
+"""Operators with weights, and which input holds them."""
+
+
+@dataclass(eq=False)
+class Node:
+    """An operator, in ONNX's words.
+
+    Attributes:
+        op_type: its operator, as `quant.domains.operator_name` spells it.
+        name: its own name, or that of its first result.
+        inputs: the tensors it reads; one that is left out has an empty name.
+        outputs: the tensors it writes.
+        attributes: those that it states, text as such.
+        proto: the message it was read from; inputs and outputs may have changed since.
+    """
+
+    op_type: str
+    name: str
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    attributes: Mapping[str, Any]
+    proto: NodeProto
+
+    @classmethod
+    def of(cls, proto: NodeProto, functions: Functions = ()) -> "Node":
+        """Return the node of a file that may define functions."""
+        op_type = operator_name(proto, functions)
+        name = proto.name or proto.output[0]
+        inputs = tuple(proto.input)
+        return cls(op_type, name, inputs, tuple(proto.output), attributes_of(proto), proto)
+
+    @classmethod
+    def new(
+        cls, op_type: str, inputs: Sequence[str], output: str, name: str, **attributes: Any
+    ) -> "Node":
+        """Return a node of one result."""
+        return cls.of(helper.make_node(op_type, inputs, [output], name, **attributes))
+
+    def __str__(self) -> str:
+        return f"{self.op_type} {self.name}"
+
+    def written(self) -> NodeProto:
+        """Return the message of the node as it is now."""
+        proto = NodeProto()
+        proto.CopyFrom(self.proto)
+        proto.input[:] = self.inputs
+        proto.output[:] = self.outputs
+        return proto
+
+    def window(self, kernel: Sequence[int] = (), size: Pair = (0, 0)) -> tuple[Pair, Window] | None:
+        """Return its kernel and how that moves over rows and columns; None if the node states none.
+
+        Args:
+            kernel: sides of its weights; empty for what the node states itself.
+            size: of the map that it reads, or any that differs by whole strides: for `auto_pad`.
+        """
+        attribute = self.attributes.get
+        sides = (
+            kernel or attribute("kernel_shape", ()),
+            attribute("strides", (1, 1)),
+            attribute("dilations", (1, 1)),
+            self.output_padding,
+        )
+        pads = attribute("pads", (0, 0, 0, 0))
+        # In one dimension or three the lists are shorter or longer.
+        if any(len(numbers) != 2 for numbers in sides) or len(pads) != 4:
+            return None
+        (rows, columns), strides, dilations, _ = sides
+        window = Window(tuple(strides), tuple(pads), tuple(dilations))
+        auto_pad = attribute("auto_pad", "NOTSET")
+        if auto_pad in ("VALID", "SAME_UPPER", "SAME_LOWER"):
+            window = window.padded(auto_pad, (rows, columns), size)
+        return (rows, columns), window
+
+    @property
+    def output_padding(self) -> Sequence[int]:
+        """Rows and columns that a transposed convolution adds behind its result."""
+        return self.attributes.get("output_padding", (0, 0))  # type: ignore[no-any-return]
+
+
+Rewriting = Callable[["OnnxGraph", Node], list[Node] | None]
+"""Returns the nodes that take the place of a node; None if it stays."""
+
+
+class OnnxGraph:
+    """The nodes of a model in order, but for those that only hold a constant.
+
+    Attributes:
+        nodes: in order.
+        constants: initializers and what nodes of the kind Constant hold, by name.
+        inputs: tensors that are no constants, with their sizes, 0 where the file states none.
+        types: ONNX's number of what each input holds.
+        outputs: the names of the results.
+        readers: for each tensor the nodes that read it, one as often as it does.
+        writers: for each tensor the node that writes it.
+    """
+
+    def __init__(self, model: onnx.ModelProto) -> None:
+        self._model = model
+        functions = functions_of(model)
+        self.constants = constants(model)
+        nodes = [Node.of(node, functions) for node in model.graph.node]
+        inputs = {
+            v.name: v.type.tensor_type for v in model.graph.input if v.name not in self.constants
+        }
+        self.inputs = {name: list(sizes_of(tensor)) for name, tensor in inputs.items()}
+        self.types = {name: tensor.elem_type for name, tensor in inputs.items()}
+        self.outputs = tuple(value.name for value in model.graph.output)
+        # Of each name in use how many others were derived from it, so that a thousand nodes of one
+        # name do not try each other's.
+        self._name_counts = dict.fromkeys(self.constants, 0)
+        for node in nodes:
+            self._name_counts.update(dict.fromkeys((*node.inputs, *node.outputs), 0))
+        self.set_nodes([node for node in nodes if node.op_type != "Constant"])
+
+    def set_nodes(self, nodes: list[Node]) -> None:
+        """Put nodes in the place of the present ones."""
+        self.nodes = nodes
+        self.readers: dict[str, list[Node]] = defaultdict(list)
+        self.writers: dict[str, Node] = {}
+        for node in nodes:
+            for name in node.inputs:
+                self.readers[name].append(node)
+            # A result that is left out has an empty name, which nobody may read.
+            self.writers.update((name, node) for name in node.outputs if name)
+
+    def rewrite(self, rewriting: Rewriting) -> None:
+        """Replace each node, in order, by what `rewriting(graph, node)` returns for it.
+
+        Readers are those from before the pass; writers are up to date.
+        """
+        nodes: list[Node] = []
+        for node in self.nodes:
+            replacement = rewriting(self, node)
+            new_nodes = [node] if replacement is None else replacement
+            # At once, because the pass looks up the writers of what later nodes read.
+            for new in new_nodes:
+                self.writers.update((name, new) for name in new.outputs if name)
+            nodes += new_nodes
+        self.set_nodes(nodes)
+
+    def save(self) -> None:
+        """Write the nodes that lead to an output, and the constants, into the model."""
+        needed = set(self.outputs)
+        nodes: list[Node] = []
+        # Backwards, because a node is needed only where something behind it reads its result.
+        for node in reversed(self.nodes):
+            if needed.intersection(node.outputs):
+                needed.update(node.inputs)
+                nodes.append(node)
+        self.set_nodes(nodes[::-1])
+        graph = self._model.graph
+        del graph.node[:]
+        graph.node.extend(node.written() for node in self.nodes)
+        stored = {tensor.name for tensor in graph.initializer}
+        new = {name: value for name, value in self.constants.items() if name not in stored}
+        graph.initializer.extend(
+            numpy_helper.from_array(value, name) for name, value in new.items()
+        )
+
+    def tensor_types(self) -> dict[str, TypeProto.Tensor]:
+        """Infer the type and the sizes of each tensor of the model; empty if its sizes conflict."""
+        try:
+            graph = shape_inference.infer_shapes(self._model).graph
+        except shape_inference.InferenceError:
+            return {}
+        values = (*graph.input, *graph.value_info, *graph.output)
+        return {value.name: value.type.tensor_type for value in values}
+
+    def n_reads(self, name: str) -> int:
+        """Return how often a tensor is read, by nodes and as a result."""
+        return len(self.readers.get(name, ())) + self.outputs.count(name)
+
+    def sole_writer(self, name: str) -> Node | None:
+        """Return the node that writes a tensor; None if the tensor is not read exactly once."""
+        return self.writers.get(name) if self.n_reads(name) == 1 else None
+
+    def rename(self, result: str, name: str) -> None:
+        """Let a result have the name of the one that it takes the place of."""
+        writer = self.writers[result]
+        self.writers[name] = writer
+        writer.outputs = tuple(name if output == result else output for output in writer.outputs)
+
+    def add_constant(self, name: str, value: np.ndarray) -> str:
+        """Store a constant as float32 under a name that is free, and return the name."""
+        name = free_name(name, self._name_counts)
+        self.constants[name] = value.astype(np.float32)
+        return name
+
+    def value(self, node: Node, place: int) -> np.ndarray | None:
+        """Return the constant that a node reads; None if it reads none there."""
+        return self.constants.get(node.inputs[place]) if place < len(node.inputs) else None
+
+    def numbers(
+        self, node: Node, place: int, key: str, otherwise: Sequence[float] = ()
+    ) -> list[Any] | None:
+        """Return what a node states in a constant input or, of older opsets, in an attribute.
+
+        None if other nodes compute it.
+        """
+        if place < len(node.inputs) and node.inputs[place]:
+            value = self.value(node, place)
+            return None if value is None else list(value.ravel().tolist())
+        return list(node.attributes.get(key, otherwise))
+
+
+def constants(model: onnx.ModelProto) -> dict[str, np.ndarray]:
+    """Return the constants of a model by name: initializers, and what Constant nodes hold."""
+    arrays = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
+    functions = functions_of(model)
+    for node in model.graph.node:
+        values = [a.t for a in node.attribute if a.name == "value"]
+        if operator_name(node, functions) == "Constant" and values:
+            arrays[node.output[0]] = numpy_helper.to_array(values[0])
+    return arrays
+
+
+def attributes_of(node: NodeProto) -> dict[str, Any]:
+    """Return the attributes that a node states, by name, text as such."""
+    values = {a.name: helper.get_attribute_value(a) for a in node.attribute}
+    return {k: v.decode(errors="replace") if isinstance(v, bytes) else v for k, v in values.items()}
+
+
+def sizes_of(tensor: TypeProto.Tensor) -> tuple[int, ...]:
+    """Return the sizes of a tensor, 0 where none is stated."""
+    return tuple(dim.dim_value for dim in tensor.shape.dim)
+
+
+def free_name(name: str, taken: dict[str, int]) -> str:
+    """Return the name, or one like it that is free, and note it in `taken`.
+
+    Args:
+        name: the name to begin with.
+        taken: of each name how many others were derived from it.
+    """
+    candidate = name
+    while candidate in taken:
+        taken[name] += 1
+        candidate = f"{name}_{taken[name] if taken[name] > 1 else ''}"
+    taken[candidate] = 0
+    return candidate

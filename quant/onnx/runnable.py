@@ -1,0 +1,244 @@
+"""Check that a runtime may open an ONNX file: operators of ONNX itself, and sizes within bounds.
+
+Only the file's content has been checked before (`quant.untrusted`).
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import onnx
+from onnx import AttributeProto, NodeProto, TensorProto, numpy_helper
+
+from beers_deploy.profiles.errors import ModelError, printable
+from beers_deploy.quant.domains import INLINE, MICROSOFT, STANDARD, foreign_remedy, opset_of
+from beers_deploy.quant.untrusted import RANK, check_size, times
+
+WINDOW_PX = 1024
+"""Kernel, stride, dilation or padding of a window, or a factor of enlargement."""
+
+ONNXRUNTIMES = {(MICROSOFT, "QLinearAdd"), (MICROSOFT, "QLinearMul")}
+"""Its operators that we write."""
+
+WINDOWS = {"kernel_shape", "strides", "dilations", "pads", "output_padding", "blocksize"}
+SIZES = {"CenterCropPad": (1,), "Expand": (1,), "MaxUnpool": (2,), "OneHot": (1,), "Resize": (3,)}
+"""Operators with an input that says how large the result is, and which."""
+FACTORS = {"Pad": (1,), "Resize": (2,), "Tile": (1,), "Upsample": (1,)}
+"""The same, of an input that says by how much larger."""
+KEEPING = {
+    "Cast",
+    "Constant",
+    "DequantizeLinear",
+    "Identity",
+    "Neg",
+    "QuantizeLinear",
+    "Reshape",
+    "Sqrt",
+    "Squeeze",
+    "Transpose",
+    "Unsqueeze",
+}
+"""What may be computed of constants alone: no result of these is larger than what they read."""
+
+
+def check_runnable(model: onnx.ModelProto, where: str) -> None:
+    """Raise ModelError if no runtime should open a model.
+
+    Args:
+        model: to be checked.
+        where: name of the network for the message, such as "a.onnx" or "the float network".
+    """
+    for function in model.functions:
+        name = printable(f"{function.name} of {function.domain!r}")
+        raise _not_of_onnx(f"{name}, a function that the file defines", where, INLINE)
+    if model.graph.sparse_initializer:
+        raise ModelError(
+            f"{where} has sparse weights, which are not supported. Export it without them."
+        )
+    constants = _Constants(model, where)
+    # What follows from the image is sized by it; what follows from constants alone may have any
+    # size.
+    of_image = {value.name for value in model.graph.input} - set(constants.values)
+    for node in model.graph.node:
+        _check_operator(node, where)
+        _check_windows(node, where)
+        _check_growth(node, constants.values, of_image, where)
+        if of_image.intersection(node.input):
+            of_image.update(node.output)
+        else:
+            constants.follow(node)
+
+
+class _Constants:
+    """What is computed of constants alone: its values, where they are a short list, and how much
+    there is of it.
+    """
+
+    def __init__(self, model: onnx.ModelProto, where: str) -> None:
+        self.values = {tensor.name: tensor for tensor in model.graph.initializer}
+        self._arrays: dict[str, np.ndarray] = {}
+        self._made = 0
+        self._where = where
+        self._opset = opset_of(model)
+
+    def follow(self, node: NodeProto) -> None:
+        """Note a node that reads no image."""
+        stored = (
+            [a.t for a in node.attribute if a.name == "value"] if node.op_type == "Constant" else []
+        )
+        if stored:
+            self.values[node.output[0]] = stored[0]
+            return
+        arrays = [self._array(name) for name in node.input]
+        self._check_filled(node, arrays)
+        result = _computed(node, arrays, self._opset)
+        if result is not None:
+            self.values[node.output[0]] = numpy_helper.from_array(result, node.output[0])
+        elif node.op_type not in KEEPING | {"ConstantOfShape"}:
+            raise ModelError(
+                f"{printable(named(node))} in {self._where} reads constants only, but only "
+                "operators on the image are supported here. Fold its constants."
+            )
+
+    def _array(self, name: str) -> np.ndarray | None:
+        """A short list, None where it is none."""
+        tensor = self.values.get(name)
+        if (
+            name not in self._arrays
+            and tensor is not None
+            and math.prod(tensor.dims) <= LIST_VALUES
+        ):
+            self._arrays[name] = numpy_helper.to_array(tensor)
+        return self._arrays.get(name)
+
+    def _check_filled(self, node: NodeProto, arrays: list[np.ndarray | None]) -> None:
+        """Weights may be filled with one number, as far as the file states how many."""
+        if node.op_type != "ConstantOfShape":
+            return
+        if len(arrays) != 1 or arrays[0] is None:
+            raise _computed_size(node, self._where)
+        sizes = [int(size) for size in arrays[0].ravel()[: RANK + 1]]
+        check_size(named(node), sizes, self._where)
+        self._made += math.prod(max(size, 0) for size in sizes)
+        check_size("all filled constants", [self._made], self._where)
+
+
+LIST_VALUES = 4096
+"""Of one list; a runtime that computes with such ones is done in a moment."""
+
+COMPUTED = {
+    "Add",
+    "Cast",
+    "Concat",
+    "ConstantOfShape",
+    "Div",
+    "Gather",
+    "Identity",
+    "Mul",
+    "Neg",
+    "Reshape",
+    "Shape",
+    "Slice",
+    "Sqrt",
+    "Squeeze",
+    "Sub",
+    "Transpose",
+    "Unsqueeze",
+}
+
+
+def _computed(
+    node: NodeProto, values: Sequence[np.ndarray | None], opset: int
+) -> np.ndarray | None:
+    """What a node computes of short lists, None where that is no short list of numbers or not
+    computed here.
+
+    Exporters leave a dozen nodes to state four sizes. They are computed by onnx's reference in
+    Python, before a runtime has the file: so the sizes that follow are looked at like those that a
+    file states. The caller has bounded what ConstantOfShape makes.
+    """
+    short = all(value is not None and value.size <= LIST_VALUES for value in values)
+    if node.op_type not in COMPUTED or not short:
+        return None
+    # Importing it takes half a second, which only files that compute sizes should cost.
+    from onnx.reference import ReferenceEvaluator
+
+    try:
+        with np.errstate(all="ignore"):
+            feeds = dict(zip(node.input, values, strict=True))
+            result = next(iter(ReferenceEvaluator(node, opsets={"": opset}).run(None, feeds)))
+    except Exception:  # noqa: BLE001 - whatever the reference raises of a node that is none means: not known
+        return None
+    array = np.asarray(result)
+    return array if array.dtype.kind in "biuf" and array.size <= LIST_VALUES else None
+
+
+def named(node: NodeProto) -> str:
+    """A node's operator and name, as sentences say it."""
+    return f"{node.op_type} {node.name}".strip()
+
+
+def _check_operator(node: NodeProto, where: str) -> None:
+    if node.domain not in STANDARD and (node.domain, node.op_type) not in ONNXRUNTIMES:
+        name = printable(f"{named(node)} of {node.domain!r}")
+        raise _not_of_onnx(name, where, foreign_remedy(node.domain, node.op_type))
+    if any(a.HasField("g") or a.graphs or a.HasField("sparse_tensor") for a in node.attribute):
+        raise ModelError(
+            f"{printable(named(node))} in {where} contains a graph, such as the body of a loop. "
+            "Unroll it, so that each node runs once."
+        )
+
+
+def _not_of_onnx(name: str, where: str, remedy: str) -> ModelError:
+    return ModelError(
+        f"{where} uses {name}, but only operators of ONNX itself are supported: {remedy}."
+    )
+
+
+def _computed_size(node: NodeProto, where: str) -> ModelError:
+    return ModelError(
+        f"{printable(named(node))} in {where} has a size that other nodes compute, but the file "
+        "must state it. Fold it into a constant."
+    )
+
+
+def _check_windows(node: NodeProto, where: str) -> None:
+    for attribute in node.attribute:
+        if attribute.name in WINDOWS and attribute.type in (
+            AttributeProto.INT,
+            AttributeProto.INTS,
+        ):
+            largest = max(map(abs, (attribute.i, *attribute.ints)))
+            if largest > WINDOW_PX:
+                raise ModelError(
+                    f"{printable(named(node))} in {where} has {attribute.name} of {largest}, but a "
+                    f"window has at most {WINDOW_PX} pixels. Export the network again."
+                )
+        elif attribute.name in ("shape", "output_shape"):
+            check_size(named(node), attribute.ints, where)
+
+
+def _check_growth(
+    node: NodeProto, constants: dict[str, TensorProto], of_image: set[str], where: str
+) -> None:
+    """A size that the file holds is looked at; one of the image's own is its matter; any other
+    could be anything.
+    """
+    for places, absolute in ((SIZES, True), (FACTORS, False)):
+        for name in (node.input[i] for i in places.get(node.op_type, ()) if i < len(node.input)):
+            if not name or name in of_image:
+                continue
+            if name not in constants:
+                raise _computed_size(node, where)
+            # At most one more than any list of sizes has.
+            values = [
+                float(value)
+                for value in numpy_helper.to_array(constants[name]).ravel()[: 2 * RANK + 1]
+            ]
+            if absolute:
+                check_size(named(node), values, where)
+            elif not max(map(abs, values), default=0) <= WINDOW_PX:
+                raise ModelError(
+                    f"{printable(named(node))} in {where} enlarges by {times(values)}, but the "
+                    f"largest factor is {WINDOW_PX}. Export the network again."
+                )

@@ -1,0 +1,69 @@
+"""How a window moves over an image, and how large its result is along each axis."""
+
+from dataclasses import dataclass, replace
+
+Pair = tuple[int, int]
+"""Rows and columns."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """How a convolution or a pool moves over the image, in ONNX's terms.
+
+    Axis 0 means the rows, axis 1 the columns. The size of the window itself is the `kernel` of the
+    operation, because a convolution's weights have it.
+
+    Attributes:
+        strides: of rows and columns.
+        pads: top, left, bottom, right.
+        dilations: of rows and columns.
+    """
+
+    strides: Pair = (1, 1)
+    pads: tuple[int, int, int, int] = (0, 0, 0, 0)
+    dilations: Pair = (1, 1)
+
+    def extent(self, axis: int, kernel: int) -> int:
+        """Return the pixels from the first to the last that it reads."""
+        return (kernel - 1) * self.dilations[axis] + 1
+
+    def output_size(self, axis: int, kernel: int, size: int, ceil: bool = False) -> int:
+        """Return how many places the window has on `size` pixels.
+
+        Args:
+            axis: 0 for the rows, 1 for the columns.
+            kernel: side of the window along the axis.
+            size: pixels of the map along the axis.
+            ceil: whether the last window may reach beyond the padding.
+        """
+        stride = self.strides[axis]
+        before = self.pads[axis]
+        room = size + before + self.pads[axis + 2] - self.extent(axis, kernel)
+        if not ceil:
+            return room // stride + 1
+        # ONNX lets the last window reach beyond the padding, but it must begin on the map or on the
+        # padding before it.
+        return min(-(-room // stride), (size + before - 1) // stride) + 1
+
+    def transposed_size(self, axis: int, kernel: int, size: int) -> int:
+        """Return how many pixels a transposed convolution makes of `size`."""
+        beyond = self.extent(axis, kernel) - self.pads[axis] - self.pads[axis + 2]
+        return self.strides[axis] * (size - 1) + beyond
+
+    def padded(self, auto_pad: str, kernel: Pair, size: Pair) -> "Window":
+        """Return the window with the pads that `auto_pad` asks for on a map of this size.
+
+        With SAME the window has as many places as size / stride, rounded up.
+        """
+        total = (0, 0)
+        if auto_pad != "VALID":
+            total = self._missing(0, kernel, size), self._missing(1, kernel, size)
+        less = [t // 2 for t in total]
+        more = [t - t // 2 for t in total]
+        # Of an odd number SAME_LOWER puts the extra pixel before the map, SAME_UPPER behind it.
+        begin, end = (more, less) if auto_pad == "SAME_LOWER" else (less, more)
+        return replace(self, pads=(begin[0], begin[1], end[0], end[1]))
+
+    def _missing(self, axis: int, kernel: Pair, size: Pair) -> int:
+        stride = self.strides[axis]
+        return max(self.extent(axis, kernel[axis]) - stride + -size[axis] % stride, 0)

@@ -1,0 +1,223 @@
+"""Fold what multiplies and shifts each channel by itself into the convolutions next to it.
+
+1. A Sub of what a convolution computes becomes an Add: the convolution is negated.
+2. A BatchNormalization, or arithmetic with one constant a channel, is folded into the convolution
+   that it follows, if nothing else reads that one's result.
+3. What stands in front of convolutions is folded into all of them, if that is exact: the zeros that
+   a convolution pads with are not shifted.
+4. A BatchNormalization of images that is left becomes a depthwise convolution of one pixel.
+
+All of it is exact but for the rounding of float32, borders included.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.simplify.standard_operators import Shapes
+
+NORMALISATION = "BatchNormalization"
+
+
+@dataclass(frozen=True)
+class Affine:
+    """scale * x + shift, each (C,) float64, or (1,) for all channels."""
+
+    scale: np.ndarray
+    shift: np.ndarray
+
+    @property
+    def channels(self) -> int:
+        """How many numbers it has."""
+        return max(len(self.scale), len(self.shift))
+
+
+def add_negated(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Negate the convolution that computes what is subtracted, and add its result (1)."""
+    if node.op_type != "Sub" or node.inputs[0] in graph.constants:
+        return None
+    before = graph.sole_writer(node.inputs[1])
+    if before is None or not is_convolution(graph, before):
+        return None
+    _fold(graph, before, Affine(np.full(1, -1.0), np.zeros(1)), into_results=True)
+    return [Node.new("Add", node.inputs, node.outputs[0], node.proto.name)]
+
+
+def fold_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Fold what works on each channel into the convolution that it follows (2)."""
+    match = affine_of(graph, node)
+    if match is None:
+        return None
+    source, affine = match
+    before = graph.sole_writer(source)
+    if before is None or not is_convolution(graph, before):
+        return None
+    if affine.channels not in (1, _width(graph, before)):
+        return None
+    _fold(graph, before, affine, into_results=True)
+    graph.rename(source, node.outputs[0])
+    return []
+
+
+def fold_in_front(graph: OnnxGraph, shapes: Shapes) -> None:
+    """Fold what works on each channel into the convolutions that read it (3)."""
+    folded = set[Node]()
+    for node in graph.nodes[::-1]:
+        result = node.outputs[0]
+        match = affine_of(graph, node)
+        behind = list(dict.fromkeys(graph.readers.get(result, [])))
+        if match is None or not behind or result in graph.outputs:
+            continue
+        source, affine = match
+        # One channel times many constants would be many channels.
+        size = shapes.get(source, ())
+        if affine.channels != 1 and (len(size) != 4 or size[1] != affine.channels):
+            continue
+        if all(_may_take_in(graph, reader, result, affine) for reader in behind):
+            for reader in behind:
+                _fold(graph, reader, affine, into_results=False)
+                reader.inputs = (source, *reader.inputs[1:])
+            # The map's readers change with each fold, and the loop goes on with what writes it.
+            others = [reader for reader in graph.readers[source] if reader is not node]
+            graph.readers[source] = others + behind
+            folded.add(node)
+    graph.set_nodes([node for node in graph.nodes if node not in folded])
+
+
+def convolve_normalisation(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace a normalisation of images that is left by a depthwise convolution (4)."""
+    # The normalisation in front may just have become a convolution, which takes this one in.
+    replacement = fold_behind(graph, node)
+    match = affine_of(graph, node) if node.op_type == NORMALISATION else None
+    if replacement is not None or match is None or len(shapes.get(node.inputs[0], ())) != 4:
+        return replacement
+    source, affine = match
+    attributes = {"kernel_shape": [1, 1], "group": affine.channels}
+    name = node.proto.name or node.outputs[0]
+    conv = Node.new("Conv", [source], node.outputs[0], name, **attributes)
+    _set_weights(graph, conv, affine.scale.reshape(-1, 1, 1, 1), affine.shift)
+    return [conv]
+
+
+def affine_of(graph: OnnxGraph, node: Node) -> tuple[str, Affine] | None:
+    """Return the tensor that a node works on and what it does to each channel.
+
+    None if the node does something else.
+    """
+    if node.op_type == NORMALISATION:
+        return _normalisation(graph, node)
+    if node.op_type not in ("Add", "Div", "Mul", "Sub"):
+        return None
+    for place in (0, 1):
+        value = per_channel(_float64(graph, node, 1 - place))
+        if value is not None and node.inputs[place] not in graph.constants:
+            affine = _arithmetic(node.op_type, value, place)
+            return None if affine is None else (node.inputs[place], affine)
+    return None
+
+
+def _arithmetic(kind: str, value: np.ndarray, place: int) -> Affine | None:
+    """Return what one constant a channel does to the operand at this place."""
+    one = np.ones_like(value)
+    zero = np.zeros_like(value)
+    if kind == "Add":
+        return Affine(one, value)
+    if kind == "Mul":
+        return Affine(value, zero)
+    if kind == "Sub":
+        return Affine(one, -value) if place == 0 else Affine(-one, value)
+    return Affine(1 / value, zero) if place == 0 and value.all() else None
+
+
+def _normalisation(graph: OnnxGraph, node: Node) -> tuple[str, Affine] | None:
+    values = [_float64(graph, node, place) for place in range(1, 5)]
+    is_trained = node.attributes.get("training_mode", 0) or len(node.outputs) > 1
+    if is_trained or any(value is None for value in values):
+        return None
+    gain, offset, mean, variance = values
+    scale = gain / np.sqrt(variance + node.attributes.get("epsilon", 1e-5))
+    return node.inputs[0], Affine(scale, offset - mean * scale)
+
+
+def per_channel(value: np.ndarray | None) -> np.ndarray | None:
+    """Return (C,) or (1,) of a constant that is one number a channel of (N, C, H, W).
+
+    None for any other.
+    """
+    if value is None or value.ndim > 4:
+        return None
+    shape = (1,) * (4 - value.ndim) + value.shape
+    return value.reshape(-1) if shape[0] == shape[2] == shape[3] == 1 else None
+
+
+def _float64(graph: OnnxGraph, node: Node, place: int) -> np.ndarray | None:
+    """Return a constant of float32 that a node reads, in float64; None for any other."""
+    value = graph.value(node, place)
+    return value.astype(np.float64) if value is not None and value.dtype == np.float32 else None
+
+
+def is_convolution(graph: OnnxGraph, node: Node) -> bool:
+    """Return True for a convolution of images, transposed or not, of constant weights and bias."""
+    if node.op_type not in ("Conv", "ConvTranspose"):
+        return False
+    numbers = [graph.constants.get(name) for name in node.inputs[1:] if name]
+    if not all(value is not None and value.dtype == np.float32 for value in numbers):
+        return False
+    weight = graph.value(node, 1)
+    return weight is not None and weight.ndim == 4
+
+
+def _width(graph: OnnxGraph, node: Node) -> int:
+    """Return the channels that a convolution writes."""
+    shape = graph.constants[node.inputs[1]].shape
+    # A transposed convolution has weights (I, O / groups, kh, kw).
+    groups = node.attributes.get("group", 1)
+    return int(shape[0] if node.op_type == "Conv" else shape[1] * groups)
+
+
+def _weights(graph: OnnxGraph, node: Node) -> tuple[np.ndarray, np.ndarray]:
+    """Return weights and bias (O,) of a convolution, in float64."""
+    weight = graph.constants[node.inputs[1]].astype(np.float64)
+    bias = _float64(graph, node, 2)
+    return weight, np.zeros(_width(graph, node)) if bias is None else bias
+
+
+def _set_weights(graph: OnnxGraph, node: Node, weight: np.ndarray, bias: np.ndarray) -> None:
+    """Give a convolution weights and a bias of its own: the old ones may serve others too."""
+    name = node.proto.name or node.outputs[0]
+    numbers = {"weight": weight, "bias": bias}
+    names = [graph.add_constant(f"{name}.{role}", value) for role, value in numbers.items()]
+    node.inputs = (node.inputs[0], *names)
+
+
+def _fold(graph: OnnxGraph, node: Node, affine: Affine, into_results: bool) -> None:
+    """Fold into a convolution what is done to its results, or to the map that it reads."""
+    weight, bias = _weights(graph, node)
+    groups = node.attributes.get("group", 1)
+    split = weight.reshape(groups, -1, *weight.shape[1:])
+    # A convolution has its weights as (O, I / groups, kh, kw), a transposed one as
+    # (I, O / groups, kh, kw): the channels in question stand along the first axis of a group, or
+    # along the second.
+    stands_first = into_results == (node.op_type == "Conv")
+    channels = groups * split.shape[1 if stands_first else 2]
+    shape = (groups, -1, 1, 1, 1) if stands_first else (groups, 1, -1, 1, 1)
+    scale, shift = (
+        np.broadcast_to(v, channels).reshape(shape) for v in (affine.scale, affine.shift)
+    )
+    if into_results:
+        bias = bias * scale.ravel() + shift.ravel()
+    elif node.op_type == "Conv":  # `_may_take_in` lets no shift reach a transposed one
+        bias = bias + (split * shift).sum(axis=(2, 3, 4)).ravel()
+    _set_weights(graph, node, (split * scale).reshape(weight.shape), bias)
+
+
+def _may_take_in(graph: OnnxGraph, node: Node, name: str, affine: Affine) -> bool:
+    """Return True if a convolution can take in what is done to the tensor `name` that it reads."""
+    attributes = node.attributes
+    states_pads = attributes.get("auto_pad", "NOTSET") in ("NOTSET", "VALID")
+    unpadded = node.op_type == "Conv" and states_pads and not any(attributes.get("pads", []))
+    # Zeros that a convolution pads with are not shifted, so a shift passes one without padding
+    # alone.
+    exact = unpadded or not affine.shift.any()
+    return is_convolution(graph, node) and node.inputs.count(name) == 1 and exact

@@ -1,0 +1,80 @@
+"""Operators that exporters spell in several ways become the one operator that a DPU has."""
+
+import numpy as np
+from onnx import TensorProto
+
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+
+Shapes = dict[str, tuple[int, ...]]
+
+
+def float_shapes(graph: OnnxGraph) -> Shapes:
+    """Infer the sizes of each float32 tensor whose rank is known, 0 for a size that is not."""
+    return {
+        name: tuple(dim.dim_value for dim in tensor.shape.dim)
+        for name, tensor in graph.tensor_types().items()
+        if tensor.elem_type == TensorProto.FLOAT and tensor.HasField("shape")
+    }
+
+
+def split_sums(_: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace a Sum of several tensors by Adds, one after the other."""
+    if node.op_type != "Sum" or len(node.inputs) < 2:
+        return None
+    subtotal = node.inputs[0]
+    (output,) = node.outputs
+    adds = []
+    for number, name in enumerate(node.inputs[1:], 1):
+        is_last = number == len(node.inputs) - 1
+        result = output if is_last else f"{output}.{number}"
+        own_name = node.proto.name if is_last else result
+        adds.append(Node.new("Add", [subtotal, name], result, own_name))
+        subtotal = result
+    return adds
+
+
+def join_hard_swish(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace a tensor times its own HardSigmoid by HardSwish.
+
+    The runtime and older exporters spell it so.
+    """
+    if node.op_type != "Mul":
+        return None
+    for source, gate in (node.inputs, node.inputs[::-1]):
+        before = graph.writers.get(gate)
+        if before is None or before.op_type != "HardSigmoid" or before.inputs[0] != source:
+            continue
+        slope_and_offset = before.attributes.get("alpha", 0.2), before.attributes.get("beta", 0.5)
+        if np.allclose(slope_and_offset, (1 / 6, 0.5), atol=1e-6):
+            return [Node.new("HardSwish", [source], node.outputs[0], node.proto.name)]
+    return None
+
+
+def drop_cast(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Remove a Cast to float32 of what is float32 already.
+
+    The runtime leaves such a Cast where it writes a result.
+    """
+    if node.op_type != "Cast" or node.inputs[0] not in shapes:
+        return None
+    if graph.sole_writer(node.inputs[0]) is None or node.attributes["to"] != TensorProto.FLOAT:
+        return None
+    graph.rename(node.inputs[0], node.outputs[0])
+    return []
+
+
+def pool_mean(shapes: Shapes, _: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace a mean over rows and columns by GlobalAveragePool, and Flatten if it drops both."""
+    axes = {axis % 4 for axis in node.attributes.get("axes", [])}
+    size = shapes.get(node.inputs[0], ()) if node.op_type == "ReduceMean" else ()
+    if len(size) != 4 or axes != {2, 3}:
+        return None
+    (output,) = node.outputs
+    if node.attributes.get("keepdims", 1):
+        return [Node.new("GlobalAveragePool", node.inputs, output, node.proto.name)]
+    pooled = f"{output}.pooled"
+    shapes[pooled] = (*size[:2], 1, 1)
+    return [
+        Node.new("GlobalAveragePool", node.inputs, pooled, node.proto.name),
+        Node.new("Flatten", [pooled], output, f"{output}.flat"),
+    ]
