@@ -26,7 +26,7 @@ TERMS = (
     "told sensor",
     "DPU",
     "MTF",
-    "residual stream",
+    "residual group",
     "encoding",
     "gate",
     "swath",
