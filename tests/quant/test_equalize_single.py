@@ -1,5 +1,5 @@
-"""Levelling a network without a stream: the float network stays, the search only gains, most on
-unequal channels.
+"""Equalizing single tensors: the float network stays, the search only gains, most on unequal
+channels.
 """
 
 import numpy as np
@@ -61,7 +61,7 @@ def correction(graph: Graph, ends: Ends) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["dncnn", "espcn", "unet", "segment", "mobile"])
-def test_levelling_leaves_the_float_network_as_it_was(name: str) -> None:
+def test_equalizing_leaves_the_float_network_as_it_was(name: str) -> None:
     _, graph, ends, singles = read(name)
     factors = np.random.default_rng(1).uniform(0.2, 5, sum(singles.widths))
     expected = correction(graph, ends)
@@ -169,7 +169,7 @@ def test_what_calibration_sees_is_not_clipped_where_the_image_itself_passes(
     assert largest.max() <= FULL * (1 + 1e-5)
 
 
-def test_unequal_channels_err_half_as_much_once_they_are_levelled(
+def test_unequal_channels_err_half_as_much_once_they_are_equalized(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A network whose channels differ thirtyfold, as training with batch
@@ -197,9 +197,9 @@ def test_unequal_channels_err_half_as_much_once_they_are_levelled(
         int8 = quickly(model, patches)
         return compare(open_session(model), open_session(int8.host), patches).mae
 
-    levelled = mae()
+    equalized = mae()
     monkeypatch.setattr(
         "beers_deploy.quant.quantize.equalize_single",
         lambda _graph, _chain, _ranges, start, _trial: start,
     )
-    assert levelled < 0.5 * mae()
+    assert equalized < 0.5 * mae()

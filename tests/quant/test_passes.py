@@ -55,7 +55,7 @@ def correction(graph: Graph) -> np.ndarray:
     return in_float(graph, image(23, 31))
 
 
-def test_equalising_leaves_the_float_network_as_it_was(graph: Graph) -> None:
+def test_equalizing_leaves_the_float_network_as_it_was(graph: Graph) -> None:
     factors = np.random.default_rng(1).uniform(0.2, 5, 8)
     scaled = equalize(graph, group_of(graph), factors)
     np.testing.assert_allclose(correction(scaled), correction(graph), atol=2e-6)
@@ -63,7 +63,7 @@ def test_equalising_leaves_the_float_network_as_it_was(graph: Graph) -> None:
     assert np.abs(correction(first_alone) - correction(graph)).max() > 1e-3
 
 
-def test_ranges_are_levelled_to_the_stream_s_own(graph: Graph, patches: Patches) -> None:
+def test_ranges_are_equalized_to_the_group_s_own(graph: Graph, patches: Patches) -> None:
     images = [image for image, _ in patches.pairs]
     ranges = channel_ranges(graph, group_of(graph), images)
     assert ranges.shape == (8,)
@@ -114,7 +114,7 @@ def skipping(seed: int = 0) -> Graph:
     )
 
 
-def test_a_stream_goes_through_pools_enlargements_and_concats() -> None:
+def test_a_group_goes_through_pools_enlargements_and_concats() -> None:
     graph = skipping()
     fine = slice(2, 5)
     coarse = slice(0, 2)
@@ -138,7 +138,7 @@ def test_a_stream_goes_through_pools_enlargements_and_concats() -> None:
     np.testing.assert_allclose(results[1], results[0], atol=1e-4)
 
 
-def test_a_tensor_that_would_have_two_places_is_in_no_stream() -> None:
+def test_a_tensor_that_would_have_two_places_is_in_no_group() -> None:
     *before, join, last = skipping()
     assert isinstance(last, Conv)
     twice = replace(join, inputs=("sum", "sum"))  # type: ignore[type-var]
@@ -208,7 +208,7 @@ def test_the_search_ends_below_its_best_guess_and_drops_a_trial_that_fails_on_it
     assert runs.count(FIRST_CROPS) > len(runs) / 3
 
 
-def test_a_wide_stream_is_not_searched_channel_by_channel(
+def test_a_wide_group_is_not_searched_channel_by_channel(
     graph: Graph, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("beers_deploy.quant.passes.equalize.MOST_CHANNELS", 7)

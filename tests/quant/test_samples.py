@@ -120,21 +120,14 @@ def with_reference(
         (two_arrays, "got first, second"),
         (cut_off, "a .npy or .npz file of numbers"),
         (with_reference(np.array(0.5)), "a reference for each of its 3 images"),
-        (with_reference(np.zeros((2, 1))), "a reference for each of its 3 images"),
         (
             with_reference(np.full((3, 2), "text")),
             r"The reference of x.npz\[0\] must be of real numbers",
         ),
         (with_reference(np.zeros((3, 2), np.complex64)), "got complex64"),
-        (with_reference(np.zeros((3, 2), "datetime64[s]")), "got datetime64"),
-        (with_reference(np.zeros((3, 2), [("a", "f4")])), "must be of real numbers"),
         (
-            with_reference(np.array([0.5, np.nan, 0.5])),
+            with_reference(np.array([0.5, np.nan, np.inf])),
             r"x.npz\[1\] has 1 values that are NaN or infinite",
-        ),
-        (
-            with_reference(np.array([0.5, 0.5, np.inf])),
-            r"x.npz\[2\] has 1 values that are NaN or infinite",
         ),
         (with_reference(np.zeros((3, 2)), RAMP[:, :1, :0]), "has no pixels"),
         (lambda folder: folder / "missing.npy", "no such file"),
