@@ -1,7 +1,7 @@
 """Which layer costs what: each one in int8 while all others stay in float.
 
 A convolution errs by its int8 weights and bias, and by rounding and clipping its result. An add
-errs by what it does to sums of integers: in a stream of one scale nothing, but where it
+errs by what it does to sums of integers: in a group of one scale nothing, but where it
 saturates. What a layer's inputs had already lost does not count.
 """
 

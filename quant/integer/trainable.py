@@ -191,7 +191,7 @@ def _add(op: Add, inputs: Sequence[Tensor], bits: Bits) -> Tensor:
     terms = []
     for name, values in zip(op.inputs, inputs, strict=True):
         power = frac_bits - bits[name]
-        # In a stream of one scale the power is 0, and a product by 1 would be another pass.
+        # In a residual group of one scale the power is 0, and a product by 1 would be another pass.
         terms.append(values * 2.0**power if power else values)
     sums = terms[0] + terms[1]
     # A result as fine as its inputs has no ties to lift.

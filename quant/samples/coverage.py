@@ -82,8 +82,8 @@ def range_from(counts: np.ndarray) -> SampleRange:
     """Compute the range of samples from the sum of their histograms, (BINS,)."""
     shares = np.cumsum(counts) / counts.sum()
     # The numbers of the bins are digital numbers, and the last of them is full scale.
-    places = np.searchsorted(shares, SHARES) / (BINS - 1)
-    return SampleRange(*places.tolist(), float(counts[-1] / counts.sum()))
+    p1, p50, p99, p99_9 = (np.searchsorted(shares, SHARES) / (BINS - 1)).tolist()
+    return SampleRange(p1, p50, p99, p99_9, float(counts[-1] / counts.sum()))
 
 
 def recorded_range(about: Mapping[str, str]) -> SampleRange | None:

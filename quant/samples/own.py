@@ -9,7 +9,6 @@ import hashlib
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -208,9 +207,8 @@ def read_samples(
     if isinstance(source, Path):
         label = str(source)
         name = source.name
-        items = chain.from_iterable(map(_stored, sample_files(source)))
-        if not source.is_dir():
-            items = _stored_batch(source)
+        folder = source.is_dir()
+        items = map(_stored, sample_files(source)) if folder else _stored_batch(source)
     else:
         items = ((f"{IN_MEMORY}[{k}]", *pair) for k, pair in enumerate(source))
     samples = list[Named]()
@@ -240,15 +238,15 @@ def sample_files(path: Path) -> list[Path]:
     )
 
 
-def _stored(file: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield name, image (C, H, W) and reference of the one sample in a file of a folder."""
+def _stored(file: Path) -> tuple[str, np.ndarray, np.ndarray]:
+    """Return name, image (C, H, W) and reference of the one sample in a file of a folder."""
     if file.suffix.lower() != ARRAY_SUFFIX:
         image = _bands_first(file, read_pixels(file))
     else:
         image, _ = _arrays(file)
         if image.ndim != 3:
             raise ImageError(f"{file} must be one image (C, H, W), got {_shape(image)}. {REMEDY}")
-    yield file.name, image, NO_REFERENCE
+    return file.name, image, NO_REFERENCE
 
 
 def _stored_batch(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
