@@ -21,12 +21,12 @@ import onnx
 from beers_deploy.model.shipped import SENSOR, shipped_names, shipped_weights
 from beers_deploy.network_files import Conditioned, int8_for_sensor
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.quant.calibration import unseen_patches
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.passes.selection import ALL, Passes
 from beers_deploy.quant.quantize import quantize_model
-from beers_deploy.quant.samples import samples_of
+from beers_deploy.quant.samples.own import samples_of
+from beers_deploy.quant.samples.simulated import unseen_patches
 from beers_deploy.quant.session import open_any_size, open_session, result_of
 from beers_deploy.quantization import family_model
 from benchmarks.small_networks import NETWORKS, SIDE_PX, Drawn, losses, save, slug, trained
@@ -89,13 +89,13 @@ def shipped(name: str, arguments: argparse.Namespace) -> Loss:
     network = Conditioned(name, shipped_weights(name))
     sensor = Sensor.load(SENSOR)
     float_session = open_any_size(network.model(sensor, int8=False))
-    pairs = unseen_patches(sensor, arguments.held_out, UNSEEN, 0).pairs
+    unseen = unseen_patches(sensor, arguments.held_out, UNSEEN, 0)
     folders = [arguments.images] if arguments.images else []
 
     def loss_of(passes: Passes) -> float:
         family: onnx.ModelProto = family_model(network, folders, passes=passes)
         int8 = open_any_size(int8_for_sensor(family, sensor))
-        return float(compare(float_session, int8, pairs).drop_db)
+        return float(compare(float_session, int8, unseen).drop_db)
 
     return loss_of
 

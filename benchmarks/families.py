@@ -47,9 +47,9 @@ from beers_deploy.model.training.patches import PatchRecipe
 from beers_deploy.model.training.source import PatchSource
 from beers_deploy.network import Network
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.quant.calibration import Calibration, draw_patches
 from beers_deploy.quant.quantize import quantize_model
-from beers_deploy.quant.samples import Patches
+from beers_deploy.quant.samples.patches import Patches
+from beers_deploy.quant.samples.simulated import Calibration, draw_patches
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 
 FAMILIES = "4x64@2,8x48@2,2x32@2,u48@2,u64@2,d8x64@2,d8x96@2,k2x32@2,k3x48@2,u32,8x32"

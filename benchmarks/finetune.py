@@ -22,8 +22,7 @@ from beers_deploy.model.processor import processor_name
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.integer.trainable import TrainableCore
-from beers_deploy.quant.passes.tune import Descent, Sample, Tuning
-from beers_deploy.quant.samples import Remade
+from beers_deploy.quant.passes.finetune import Sample, Tuning, descend
 from examples.networks import UNet
 
 PATCHES = 4
@@ -93,8 +92,7 @@ def tuning_step(core: IntCore) -> Callable[[], None]:
             memory_format=torch.channels_last
         )
         samples.append(Sample(image, planes, torch.zeros(1, 1, SIDE_PX, SIDE_PX), None, 1.0))
-    descent = Descent(TrainableCore(core), samples, Tuning(Remade(lambda _: (image, image), 1)))
-    return partial(next, descent.round(10**6))
+    return partial(next, descend(TrainableCore(core), samples, Tuning([(image, image)]), [10**6]))
 
 
 def main() -> None:

@@ -40,13 +40,13 @@ def main() -> None:
 def ours(network: Path, images: np.ndarray, out: Path) -> None:
     """The host file of `quantize`, of these images (K, 1, H, W) in [0, 1]."""
     from beers_deploy.quant.quantize import quantize_model
-    from beers_deploy.quant.samples import Patches, Remade
+    from beers_deploy.quant.samples.patches import Patches, Regenerated
 
     def image(number: int) -> np.ndarray:
         return images[number : number + 1]
 
     count = len(images)
-    patches = Patches([], Remade(lambda k: (image(k), image(k)), count), Remade(image, count))
+    patches = Patches(Regenerated(lambda k: (image(k), image(k)), count), Regenerated(image, count))
     model = onnx.load(network)
     onnx.save(quantize_model(model, patches, {}).host, out)
 

@@ -43,10 +43,11 @@ from beers_deploy.model.shipped import shipped_weights
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.network import Network
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.quant.calibration import HELD_OUT_SEED, draw_patches
 from beers_deploy.quant.ends import Ends, ends_of
 from beers_deploy.quant.graph import CORRECTION, PLANES, graph_to_onnx, read_network, read_planes
-from beers_deploy.quant.samples import Pair, samples_of
+from beers_deploy.quant.samples.own import samples_of
+from beers_deploy.quant.samples.patches import Pair
+from beers_deploy.quant.samples.simulated import HELD_OUT_SEED, draw_patches
 from beers_deploy.quant.session import open_session, planes_of, result_of
 
 HERE = Path(__file__).parent

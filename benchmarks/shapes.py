@@ -28,7 +28,7 @@ from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import Variant
 from beers_deploy.performance.swath import PAPER_SIZE, Swath, parse_size, swath_latency
 from beers_deploy.quant.quantize import quantize_model
-from beers_deploy.quant.samples import Patches, Remade
+from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 
 SHAPES = "4x16,8x32,16x64,2x32@2,8x32@2,4x48@2,4x64@2,2x64@4,4x128@4"
@@ -79,9 +79,9 @@ def int8(variant: Variant) -> onnx.ModelProto:
     network = ConvBEERS(variant)
     initialise(network, torch.Generator().manual_seed(0))
     image = np.random.default_rng(0).random((1, 1, SIDE_PX, SIDE_PX), dtype=np.float32)
-    patches = Patches([], Remade(lambda _: (image, image), 1), Remade(lambda _: image, 1))
+    patches = Patches([(image, image)], [image])
     # The search does not try channels one by one.
-    with patch("beers_deploy.quant.passes.equalise.MOST_CHANNELS", 0):
+    with patch("beers_deploy.quant.passes.equalize.MOST_CHANNELS", 0):
         return quantize_model(to_onnx(network.eval(), {}), patches, {}).host
 
 

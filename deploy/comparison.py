@@ -1,33 +1,123 @@
 """What INT8 changes: a float and an INT8 network on samples that calibration did not see."""
 
+import hashlib
+import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from beers_deploy.baseline import data_inputs, sensor_input
+from beers_deploy.model.io.files import sha256
 from beers_deploy.model.progress import Progress, reporting
+from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.shipped import INT8, SENSOR, VARIANT, shipped_weights
 from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.profiles.errors import OptionError, printable
-from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.quant.gate import METRICS, GateResult, verdict_row
+from beers_deploy.profiles.sensor import Sensor, numbers_of
+from beers_deploy.quant.gate import METRICS, GateResult, gate_row
 from beers_deploy.quant.gate import compare as differences_of
 from beers_deploy.quant.onnx_file import faults_named, metadata, require_quantized
-from beers_deploy.quant.sample_range import range_row, recorded_range, uncovered
-from beers_deploy.quant.samples import CALIBRATED_ON, digest_of, samples_of
+from beers_deploy.quant.samples.coverage import recorded_range, uncovered
+from beers_deploy.quant.samples.own import (
+    CALIBRATED_ON,
+    OwnSamples,
+    digest_of,
+    sample_files,
+    samples_of,
+)
 from beers_deploy.quant.session import open_any_size
 from beers_deploy.quant.structure import saturated_shares
 from beers_deploy.results import Input, Table
 
 if TYPE_CHECKING:
-    from beers_deploy.quant.samples import Patches
+    from beers_deploy.quant.samples.simulated import Calibration
 
 HEADINGS = {"gate": "float against INT8", "samples": "what the samples cover"}
 IN_MEMORY = "in memory"
 """What arguments and inputs call samples that are no file."""
+
+
+@dataclass(frozen=True)
+class Data:
+    """What a network is calibrated or judged on.
+
+    Attributes:
+        sensor: of the simulated patches.
+        samples: the user's own, in place of patches; None for none.
+        images: folder of scenes for the patches; None for drawn ones.
+        patches: number of patches.
+        seed: of the patches.
+        patch_px: their side; those of a gate have 128 pixels.
+    """
+
+    sensor: Sensor
+    samples: object = None
+    images: Path | None = None
+    patches: int = 64
+    seed: int = 0
+    patch_px: int = 128
+
+    def own(self, network: Network) -> OwnSamples | None:
+        """Read the user's samples for a network; None for simulated patches."""
+        with faults_named(network.label):
+            return samples_of(network.model, self.samples)
+
+    @property
+    def simulated(self) -> "Calibration":
+        """The source of simulated patches."""
+        # This loads SciPy, which samples of one's own do without.
+        from beers_deploy.quant.samples.simulated import Calibration
+
+        return Calibration(self.sensor, self.images, self.patches, self.patch_px, self.seed)
+
+    @property
+    def arguments(self) -> dict[str, object]:
+        """The arguments that say what float and INT8 are compared on."""
+        samples = self.samples
+        if isinstance(samples, str | os.PathLike):
+            samples = os.fspath(samples)
+        elif samples is not None:
+            samples = IN_MEMORY
+        return {
+            "sensor": self.sensor.name,
+            "images": None if self.images is None else os.fspath(self.images),
+            "patches": self.patches,
+            "seed": self.seed,
+            "samples": samples,
+        }
+
+    @property
+    def inputs(self) -> list[Input]:
+        """The images and the samples in files, as what figures rest on."""
+        inputs = []
+        if self.images is not None:
+            inputs.append(_files_input("scenes", self.images, list_images(self.images)))
+        if isinstance(self.samples, str | os.PathLike):
+            path = Path(self.samples)
+            inputs.append(_files_input("samples", path, sample_files(path)))
+        return inputs
+
+
+def sensor_input(sensor: Sensor) -> Input:
+    """Return a sensor as what figures rest on: its name, and the digest of its numbers."""
+    text = json.dumps(numbers_of(sensor), sort_keys=True, default=str)
+    return Input(f"sensor {sensor.name}", hashlib.sha256(text.encode()).hexdigest())
+
+
+def _files_input(kind: str, path: Path, files: Iterable[Path]) -> Input:
+    """Return a file, or the files of a folder that are read: others that lie there change no
+    figure.
+    """
+    if path.is_file():
+        return Input(f"{kind} {path.name}", sha256(path))
+    digest = hashlib.sha256()
+    # Systems list a folder in different orders, which must not change the digest.
+    for file in sorted(files):
+        digest.update(
+            f"{file.relative_to(path).as_posix()} {sha256(file)}\n".encode(errors="surrogateescape")
+        )
+    return Input(f"{kind} {path.name}", digest.hexdigest())
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -92,42 +182,68 @@ def compare(
             f"`images` ({images}) cannot be combined with `samples`, because images are for "
             "simulated patches. Leave one of them out."
         )
-    require_metric(metric)
+    if metric not in (None, *METRICS):
+        raise OptionError(
+            f"`metric` must be one of {', '.join(METRICS)}, but it is {printable(repr(metric))}."
+        )
     floating, int8 = pair_of(float_network, int8_network, profile)
-    scenes = None if images is None else Path(images)
+    data = Data(profile, samples, None if images is None else Path(images), patches, seed)
     with reporting(progress):
-        with faults_named(floating.label):
-            judged, simulated, notes = _samples(
-                int8, floating, profile, samples, scenes, patches, seed
+        return compared(floating, int8, data, data.own(floating), metric or "")
+
+
+def compared(
+    floating: Network, int8: Network, data: Data, own: OwnSamples | None, metric: str
+) -> Comparison:
+    """Run both networks, and return what INT8 changes.
+
+    Args:
+        floating: the float network.
+        int8: the INT8 network.
+        data: what they are compared on.
+        own: the user's samples, as `data` reads them; None for simulated patches.
+        metric: by which results are compared with the references too; empty for none.
+    """
+    notes = []
+    if own is None:
+        # This loads SciPy, which samples of one's own do without.
+        from beers_deploy.quant.samples.simulated import unseen_patches
+
+        patches = unseen_patches(data.sensor, data.images, data.patches, data.seed)
+    else:
+        patches = own.all
+        # The INT8 file says which samples it was calibrated on, but it may not choose its judges.
+        calibrated = set(metadata(int8.model).get(CALIBRATED_ON, "").split())
+        count = sum(digest_of(degraded) in calibrated for degraded in patches.degraded)
+        if count:
+            notes.append(
+                f"by the INT8 file's own record, {count} of the {len(patches.pairs)} samples were "
+                "its calibration: on those INT8 loses less than on others"
             )
-            reference = open_any_size(floating.model)
-        with faults_named(int8.label):
-            session = open_any_size(int8.model)
-            result = differences_of(
-                reference, session, judged.pairs, simulated, metric, judged.names
-            )
-            shares = saturated_shares(int8.model, judged.degraded)
-    path = Path(samples) if isinstance(samples, str | os.PathLike) else None
-    rests_on = [sensor_input(profile), *data_inputs(scenes, path)]
+    with faults_named(floating.label):
+        float_session = open_any_size(floating.model)
+    with faults_named(int8.label):
+        result = differences_of(float_session, open_any_size(int8.model), patches, metric)
+        shares = saturated_shares(int8.model, patches.degraded)
+    rests_on = [sensor_input(data.sensor), *data.inputs]
     # Samples in memory are no file, so the digest is that of their values.
-    if samples is not None and path is None:
-        rests_on.append(Input(f"samples {IN_MEMORY}", judged.digest))
-    rows, range_notes = _range_rows(int8, result)
+    if data.arguments["samples"] == IN_MEMORY:
+        rests_on.append(Input(f"samples {IN_MEMORY}", patches.digest))
+    judged = result.sample_range
+    rows = [gate_row(result, shares), judged.row("judged on", result.source)]
+    recorded = recorded_range(metadata(int8.model))
+    if recorded is not None:
+        rows.append(
+            recorded.row("calibrated on", "recorded in the INT8 file, which nothing verifies")
+        )
+    missing = uncovered(judged, recorded)
     return Comparison(
         title=f"{floating.name} against {int8.name}",
         command="compare",
-        arguments={
-            "float": floating.name,
-            "int8": int8.name,
-            "sensor": profile.name,
-            "images": images,
-            "patches": patches,
-            "seed": seed,
-            "samples": name_of_samples(samples),
-        },
+        arguments={"float": floating.name, "int8": int8.name, **data.arguments},
         inputs=(floating.input, int8.input, *rests_on),
-        rows=(verdict_row(result, shares), *rows),
-        notes=(*notes, *range_notes),
+        rows=tuple(rows),
+        notes=(*notes, missing) if missing else tuple(notes),
         headings=HEADINGS,
         result=result,
         shares=shares,
@@ -135,21 +251,6 @@ def compare(
         int8=int8,
         rests_on=tuple(rests_on),
     )
-
-
-def require_metric(metric: str | None) -> None:
-    """Raise OptionError if there is no such metric."""
-    if metric not in (None, *METRICS):
-        raise OptionError(
-            f"`metric` must be one of {', '.join(METRICS)}, but it is {printable(repr(metric))}."
-        )
-
-
-def name_of_samples(samples: object) -> str | None:
-    """Return what a document calls samples; None for simulated patches."""
-    if isinstance(samples, str | os.PathLike):
-        return os.fspath(samples)
-    return None if samples is None else IN_MEMORY
 
 
 def pair_of(
@@ -199,52 +300,3 @@ def _shipped_int8(network: NetworkLike | None) -> str:
         f"The INT8 network of {label} is missing. Give it as `int8_network`, or give the name of "
         "a shipped pair."
     )
-
-
-def _range_rows(int8: Network, result: GateResult) -> tuple[list[Row], list[str]]:
-    """Return the range of the samples, the one that the INT8 file records, and a note if bright
-    ground is missing.
-    """
-    judged = result.sample_range
-    assert judged is not None  # noqa: S101 - `quant.gate.compare` measures it
-    rows = [range_row(judged, "judged on", result.source)]
-    recorded = recorded_range(metadata(int8.model))
-    if recorded is not None:
-        rows.append(
-            range_row(
-                recorded, "calibrated on", "recorded in the INT8 file, which nothing verifies"
-            )
-        )
-    note = uncovered(judged, recorded)
-    return rows, [note] if note else []
-
-
-def _samples(
-    int8: Network,
-    floating: Network,
-    sensor: Sensor,
-    samples: object,
-    images: Path | None,
-    patches: int,
-    seed: int,
-) -> "tuple[Patches, bool, tuple[str, ...]]":
-    """Return what the two are compared on, whether it is simulated, and notes for the reader.
-
-    All samples that were given are judged. The INT8 file says which of them it was calibrated on,
-    but it may not choose its judges: that is a note.
-    """
-    own = samples_of(floating.model, samples)
-    if own is None:
-        # This loads SciPy, which samples of one's own do without.
-        from beers_deploy.quant.calibration import unseen_patches
-
-        return unseen_patches(sensor, images, patches, seed), True, ()
-    calibrated = set(metadata(int8.model).get(CALIBRATED_ON, "").split())
-    count = sum(digest_of(degraded) in calibrated for degraded in own.all.degraded)
-    if count == 0:
-        return own.all, False, ()
-    note = (
-        f"by the INT8 file's own record, {count} of the {len(own.all.pairs)} samples were "
-        "its calibration"
-    )
-    return own.all, False, (f"{note}: on those INT8 loses less than on others",)

@@ -47,7 +47,8 @@ from beers_deploy.results import Input, Table
 if TYPE_CHECKING:
     import torch
 
-    from beers_deploy.quant.quantize import Quantised
+    from beers_deploy.quant.quantize import Quantized
+
 
 NetworkLike = Union["Network", onnx.ModelProto, "torch.nn.Module", str, os.PathLike[str]]
 SensorLike = Sensor | str | os.PathLike[str]
@@ -82,7 +83,7 @@ class Network:
     path: Path | None = None
     origin: "Network | None" = None
     layers: tuple[Row, ...] = ()
-    quantized: "Quantised | None" = None
+    quantized: "Quantized | None" = None
     file_sha256: str = ""
     weights: Conditioned | None = None
     profile: Sensor | None = None

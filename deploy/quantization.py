@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 import onnx
 
-from beers_deploy.baseline import data_inputs
+from beers_deploy.comparison import Data
 from beers_deploy.model.bank import bank_of_vector
 from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.files import sha256
@@ -31,25 +30,23 @@ from beers_deploy.quant.integer.reference import integer_rows
 from beers_deploy.quant.onnx_file import faults_named, load_onnx, metadata, require_quantized
 from beers_deploy.quant.passes.selection import ALL, Passes
 from beers_deploy.quant.quantize import quantize_model
-from beers_deploy.quant.samples import OwnSamples, samples_of
+from beers_deploy.quant.samples.own import OwnSamples
 from beers_deploy.quant.sensitivity import (
     WORST,
     headline,
     layer_error_rows,
     sizes_row,
-    spread_of,
     worst_row,
 )
 from beers_deploy.quant.session import open_any_size
 from beers_deploy.quant.untrusted import contradictions
 from beers_deploy.report.page import Report
 from beers_deploy.report.sensitivity_page import sensitivity_page
-from beers_deploy.results import Input
 
 if TYPE_CHECKING:
     from beers_deploy.model.convbeers import Rounding
-    from beers_deploy.quant.calibration import Calibration
-    from beers_deploy.quant.samples import Patches
+    from beers_deploy.quant.samples.patches import Patches
+    from beers_deploy.quant.samples.simulated import Calibration
 
 Source: TypeAlias = "Calibration | OwnSamples"
 """Where patches come from: simulated ones, or a user's own."""
@@ -69,45 +66,6 @@ def steps_of(finetune: int | str) -> int | None:
             f"{printable(repr(finetune))}. Choose 'auto'."
         )
     return int(text)
-
-
-@dataclass(frozen=True)
-class Data:
-    """What a network is calibrated on.
-
-    Attributes:
-        sensor: of the simulated patches.
-        samples: the user's own, in place of patches; None for none.
-        images: folder of scenes for the patches; None for drawn ones.
-        patches: number of patches.
-        patch_px: their side.
-        seed: of the patches.
-    """
-
-    sensor: Sensor
-    samples: object = None
-    images: Path | None = None
-    patches: int = 64
-    patch_px: int = 128
-    seed: int = 0
-
-    @property
-    def simulated(self) -> "Calibration":
-        """The source of simulated patches."""
-        # This loads SciPy, which samples of one's own do without.
-        from beers_deploy.quant.calibration import Calibration
-
-        return Calibration(self.sensor, self.images, self.patches, self.patch_px, self.seed)
-
-    def source_for(self, model: onnx.ModelProto) -> Source:
-        """Return the samples for a network, or else simulated patches."""
-        return samples_of(model, self.samples) or self.simulated
-
-    @property
-    def inputs(self) -> list[Input]:
-        """The images and samples in files."""
-        named = isinstance(self.samples, str | os.PathLike)
-        return data_inputs(self.images, Path(str(self.samples)) if named else None)
 
 
 def quantized(
@@ -144,7 +102,7 @@ def quantized(
             int8 = quantize_conditioned(banked, origin, data.simulated, data.sensor, target)
             return int8, None
         # Samples in memory may be given one after the other, so they are read only here.
-        source = data.source_for(origin.model)
+        source = data.own(origin) or data.simulated
         return quantize_alone(origin, source, target, steps), source.unseen
 
 
@@ -163,7 +121,7 @@ def quantize_alone(
     tuning = None
     if steps != 0:
         optional("torch", "finetune")
-        from beers_deploy.quant.passes.tune import Tuning
+        from beers_deploy.quant.passes.finetune import Tuning
 
         tuning = Tuning(calibration.for_tuning.pairs, steps)
     with progress("calibrating"):
@@ -208,21 +166,19 @@ def _shifts_of(target: TargetProfile) -> Shifts:
     return target_shifts(target)
 
 
-def differences_of(network: Network, held_out: "Patches", simulated: bool) -> GateResult:
+def differences_of(network: Network, held_out: "Patches") -> GateResult:
     """Return what INT8 changes in a network that was quantised here.
 
     Args:
         network: the INT8 one.
         held_out: samples that calibration did not see.
-        simulated: whether they are simulated patches.
     """
     assert network.origin is not None  # noqa: S101
-    sessions = open_any_size(network.origin.model), open_any_size(network.model)
-    return compare(*sessions, held_out.pairs, simulated)
+    return compare(open_any_size(network.origin.model), open_any_size(network.model), held_out)
 
 
 def sensitivity_report(
-    network: Network, held_out: "Patches", differences: GateResult, more: Sequence[Row] = ()
+    network: Network, held_out: "Patches", differences: GateResult
 ) -> tuple[list[Row], Report]:
     """Return where INT8 errs on samples that calibration did not see: rows, and a page.
 
@@ -230,21 +186,24 @@ def sensitivity_report(
         network: that was quantised here.
         held_out: the samples.
         differences: that were measured on them.
-        more: rows that the page shows behind.
     """
     assert network.origin is not None and network.quantized is not None  # noqa: S101, PT018
-    sessions = open_any_size(network.origin.model), open_any_size(network.model)
-    spread = spread_of(*sessions, held_out.degraded)
-    worst = spread.worst(WORST)
+    worst = differences.spread.worst(WORST)
     layers = layer_error_rows(network.quantized, held_out)
     rows = [
         gate_row(differences),
         *layers,
-        *(worst_row(k, held_out, spread) for k in worst),
-        sizes_row(spread),
+        *(worst_row(k, held_out, differences.spread) for k in worst),
+        sizes_row(differences.spread),
     ]
+    sessions = open_any_size(network.origin.model), open_any_size(network.model)
     return rows, sensitivity_page(
-        headline(differences, layers), [*rows, *more], spread, held_out, sessions, worst
+        headline(differences, layers),
+        [*rows, *network.layers],
+        differences.spread,
+        held_out,
+        sessions,
+        worst,
     )
 
 

@@ -2,40 +2,45 @@
 
 Checked, in this order:
 
-1. The differences that `comparison` found: MAE, percentile, PSNRs (`quant.gate`), and the results
-  inside the INT8 network that saturate (`quant.structure`).
-2. The MAE that an earlier gate found on the same patches, where there is a baseline.
+1. The differences that `comparison` measured: MAE, percentile, PSNRs (`quant.gate`), and the MAE of
+   an earlier gate on the same patches, where there is a baseline.
+2. The results inside the INT8 network that saturate (`quant.structure`).
 3. The INT8 file: the DPU's rules, its ReLUs, its encoding, the same bits with onnxruntime's
-  optimisations as without.
+   optimisations as without.
+
+A baseline is the document of an earlier gate. It is checked before anything is compared with it.
 """
 
+import json
 import math
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
 import onnx
+from jsonschema import Draft202012Validator
 
-from beers_deploy.baseline import Baseline, read_baseline
 from beers_deploy.comparison import Comparison
 from beers_deploy.dpu.board import ruled
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.checker.table import legality
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.network import Network
-from beers_deploy.profiles.errors import OptionError, printable
+from beers_deploy.profiles.errors import OptionError, encodable, printable, reason_of
 from beers_deploy.profiles.figures import Check
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.profiles.target import TargetProfile
+from beers_deploy.profiles.toml import read_json
 from beers_deploy.quant.float_parts import float_note
-from beers_deploy.quant.gate import GateResult, judge, judge_saturation, unfit_reference
-from beers_deploy.quant.limits import Limits
+from beers_deploy.quant.gate import SCALE, GateResult, unfit_reference
+from beers_deploy.quant.limits import Limits, judge
 from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px
-from beers_deploy.quant.samples import OwnSamples, samples_of
+from beers_deploy.quant.samples.own import OwnSamples
 from beers_deploy.quant.structure import ENCODING, structure_checks
-from beers_deploy.results import Table
+from beers_deploy.results import SCHEMA_PATH, Input, Table
 
 JUNIT_CHARACTERS = 2000
 """Of a message in JUnit XML, at most."""
@@ -49,6 +54,160 @@ LEAST_CONTRAST = 0.0014
 """Mean absolute deviation of the results from the mean of their sample, over full scale: twice the
 default limit of the MAE.
 """
+
+
+PATCHES = ("sensor", "images", "patches", "seed", "samples")
+"""The arguments that say what INT8 and float are compared on."""
+
+SAME_DB = 0.01
+"""Between the PSNRs of one float network on two processors: most differ by less
+than a thousandth.
+"""
+
+REMAKE = "Make it again with 'gate --json' and these arguments."
+
+
+def read_document(path: Path) -> dict[str, object]:
+    """Read a results document; refuse what does not follow the schema."""
+    try:
+        document = read_json(path)
+        schema = Draft202012Validator(json.loads(SCHEMA_PATH.read_text(encoding="utf-8")))
+        error = next(schema.iter_errors(document), None)
+        fault = "" if error is None else error.message
+    except FileNotFoundError:
+        fault = "there is no such file"
+    except (OSError, ValueError) as error:
+        fault = reason_of(error)
+    if fault:
+        raise OptionError(
+            f"{path} is not a results document: {fault[:100].removesuffix('.')}. Give what a "
+            "command wrote with '--json'."
+        )
+    return document  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """The figures of an earlier gate that passed.
+
+    Attributes:
+        path: of its document.
+        mae: over full scale.
+        psnr_float_db: of the float network against the references; NaN without any.
+        digests: SHA-256 of what it rested on, by name; two networks may have one file name.
+        checks: names of its checks.
+    """
+
+    path: Path
+    mae: float
+    psnr_float_db: float
+    digests: Mapping[str, Set[str]]
+    checks: Set[str] = frozenset()
+
+    def require_same(
+        self, float_sha256: str, psnr_float_db: float, inputs: Iterable[Input]
+    ) -> None:
+        """Raise OptionError if the baseline is of another float network, sensor, or of other images
+        or samples.
+
+        Args:
+            float_sha256: digest of the float network that is judged now.
+            psnr_float_db: its PSNR, by which the network is recognised if it was saved again as
+                another file.
+            inputs: everything else that the comparison rests on, networks left out.
+        """
+        # A network that was saved again has another digest, but the same PSNR.
+        same_psnr = abs(psnr_float_db - self.psnr_float_db) < SAME_DB
+        if not same_psnr and not any(float_sha256 in digests for digests in self.digests.values()):
+            raise OptionError(f"{self.path} is the baseline of another float network. {REMAKE}")
+        for item in inputs:
+            before = self.digests.get(encodable(item.name))
+            if before is None:
+                raise OptionError(
+                    f"{self.path} is the baseline of a gate without {item.name}. {REMAKE}"
+                )
+            if before != {item.sha256}:
+                raise OptionError(
+                    f"{self.path} is the baseline of a gate in which {item.name} had other "
+                    f"content. {REMAKE}"
+                )
+
+
+def read_baseline(path: Path, arguments: Mapping[str, Any]) -> Baseline:
+    """Read the document of an earlier gate that passed on the same patches.
+
+    Args:
+        path: of the document.
+        arguments: of the gate that is to be compared with it.
+
+    Raises:
+        OptionError: a file that is no results document, of another command, of a gate that failed
+            or of one on other patches, one that contradicts itself, or one without an MAE that was
+            measured over full scale.
+    """
+    document: Any = read_document(path)
+    if document["command"] != "gate":
+        command = printable(repr(document["command"]))
+        raise OptionError(f"{path} is a document of {command}, not of 'gate'. {REMAKE}")
+    if document["verdict"] != "passed":
+        raise OptionError(
+            f"{path} is the document of a gate that failed. Give the document of a version that "
+            "passed."
+        )
+    before = document["arguments"]
+    for name in PATCHES:
+        then = _plain(name, before.get(name))
+        now = _plain(name, arguments.get(name))
+        if then != now:
+            raise OptionError(
+                f"{path} is the baseline of other patches: its `{name}` is {printable(then)}, but "
+                f"here it is {printable(now)}. {REMAKE}"
+            )
+    rows = [row for row in document["rows"] if row["table"] == "gate"]
+    figures: dict[str, Any] = rows[0]["figures"] if rows else {}
+    mae = figures.get("MAE", {})
+    if mae.get("mode") != "measured" or mae.get("unit") != SCALE or not 0 <= mae["value"] <= 1:
+        found = f"{mae.get('value')} {mae.get('unit')}, {mae.get('mode')}" if mae else "no MAE"
+        raise OptionError(
+            f"{path} must have a measured MAE from 0 to 1 {SCALE}, but it has {printable(found)}. "
+            f"{REMAKE}"
+        )
+    contradiction = _contradiction(document["checks"], len(rows), mae["value"])
+    if contradiction:
+        raise OptionError(f"{path} contradicts itself: it has {printable(contradiction)}. {REMAKE}")
+    psnr_db = figures.get("PSNR float", {}).get("value")
+    digests = defaultdict[str, set[str]](set)
+    for entry in document["inputs"]:
+        digests[entry["name"]].add(entry["sha256"])
+    checks = {check["name"] for check in document["checks"]}
+    return Baseline(
+        path, float(mae["value"]), math.nan if psnr_db is None else float(psnr_db), digests, checks
+    )
+
+
+def _contradiction(checks: Iterable[Mapping[str, Any]], rows: int, mae: float) -> str:
+    """Return what in a document contradicts itself, in words; empty if nothing does."""
+    if rows > 1:
+        return f"{rows} rows of the table gate"
+    for check in checks:
+        name, value, limit = (check[key] for key in ("name", "value", "limit"))
+        if name == "MAE" and value != mae:
+            return f"an MAE of {mae} in the figures and of {value} in the checks"
+        # JSON has no number for infinity and NaN.
+        if value is None or limit is None:
+            continue
+        if Check(name, value, limit, check["unit"], check["bound"]).passed != check["passed"]:
+            return f"{name} {value} with the limit {limit} and passed {check['passed']}"
+    return ""
+
+
+def _plain(name: str, value: object) -> str:
+    """Return an argument as text; of a folder of images its name, because the folder may lie
+    elsewhere.
+    """
+    return encodable(
+        Path(str(value)).name if name in ("images", "samples", "sensor") else str(value)
+    )
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -93,8 +252,7 @@ def baseline_for(
         OptionError: a limit that needs a baseline or a metric, and none is given; a baseline of
             other patches.
     """
-    before = None if path is None else read_baseline(Path(path), arguments)
-    if before is None and limits.mae_growth is not None:
+    if path is None and limits.mae_growth is not None:
         raise OptionError(
             "The limit 'mae_growth' needs a `baseline`, but none is given. Give what an earlier "
             "'gate --json' wrote, or leave that limit out."
@@ -104,29 +262,19 @@ def baseline_for(
             "The limit 'metric_loss' needs a `metric`, but none is given. Name the metric, or "
             "leave that limit out."
         )
-    return before
+    return None if path is None else read_baseline(Path(path), arguments)
 
 
-def references_for(
-    floating: Network, samples: object, limits: Limits, metric: str | None
-) -> OwnSamples | None:
-    """Return a user's own samples if a metric or a limit needs their references.
-
-    Raises:
-        OptionError: the samples have no references.
-    """
+def require_references(own: OwnSamples | None, limits: Limits, metric: str | None) -> None:
+    """Raise OptionError if a metric or a limit needs references, and the samples have none."""
     purpose = "`metric`" if metric else ""
     if limits.psnr_drop_db is not None:
         purpose = "the limit 'psnr_drop_db'"
-    if not purpose or samples is None:
-        return None
-    own = samples_of(floating.model, samples)
-    if own is not None and not any(reference.size for _, reference in own.all.pairs):
+    if own and purpose and not any(reference.size for _, reference in own.all.pairs):
         raise OptionError(
             f"`samples` must have references for {purpose}, but it has images alone. Give images "
             f"and references, or leave {purpose} out."
         )
-    return own
 
 
 def judged(
@@ -143,33 +291,37 @@ def judged(
         limits: that the differences may not exceed.
         baseline: of an earlier gate, or None.
         target: whose rules the INT8 file must obey.
-        own: the user's samples, if a limit needs their references.
+        own: the user's samples that both were compared on; None for simulated patches.
 
     Raises:
         OptionError: samples with too little contrast for the limits, a baseline of other networks
             or samples.
     """
     result = comparison.result
-    _require_contrast(result)
+    if result.contrast < LEAST_CONTRAST:
+        raise OptionError(
+            "The results on `samples` must have a mean absolute deviation of at least "
+            f"{LEAST_CONTRAST:g} of full scale, but it is {result.contrast:.3g}, so a network that "
+            "returned the mean of each sample would hardly differ. Give samples with more contrast."
+        )
     psnr_missing = math.isnan(result.psnr_float_db) and not math.isnan(result.mae)
     if own is not None and limits.psnr_drop_db is not None and psnr_missing:
-        shape = own.all.pairs[0][1].shape
-        raise unfit_reference(own.all.names[0], shape, "the limit 'psnr_drop_db'")
+        raise unfit_reference(own.all, 0, "the limit 'psnr_drop_db'")
     # Only the comparison has the PSNR by which a float network that was saved again is recognised.
     if baseline is not None:
         sha256 = comparison.floating.sha256
         baseline.require_same(sha256, result.psnr_float_db, comparison.rests_on)
-    checks = judge(result, limits, baseline.mae if baseline else None)
-    checks += judge_saturation(comparison.shares, limits)
+    checks = judge(result, limits, baseline.mae if baseline else None, comparison.shares)
     # Without this, the file that is judged would decide itself whether its encoding is checked.
     must_describe = baseline is not None and ENCODING in baseline.checks
     checks += file_checks(comparison.floating.model, comparison.int8, target, must_describe)
-    notes = (
-        *comparison.notes,
-        *_mae_note(result, limits, checks),
-        *float_note(comparison.int8.model),
-        *_unchecked(checks),
-    )
+    notes = [*comparison.notes, *_mae_note(result, limits, checks)]
+    notes += float_note(comparison.int8.model)
+    if not any(check.name == ENCODING for check in checks):
+        notes.append(
+            f"not checked: {ENCODING}, because the INT8 file does not describe its integers, as a "
+            "file that 'quantize' wrote does"
+        )
     return Verdict(
         title=comparison.title,
         command="gate",
@@ -177,22 +329,10 @@ def judged(
         inputs=comparison.inputs,
         rows=comparison.rows,
         checks=tuple(checks),
-        notes=notes,
+        notes=tuple(notes),
         headings=comparison.headings,
         comparison=comparison,
     )
-
-
-def _require_contrast(result: GateResult) -> None:
-    """Raise OptionError if a network that returned the mean of each sample would nearly keep the
-    default limit.
-    """
-    if result.contrast < LEAST_CONTRAST:
-        raise OptionError(
-            "The results on `samples` must have a mean absolute deviation of at least "
-            f"{LEAST_CONTRAST:g} of full scale, but it is {result.contrast:.3g}, so a network that "
-            "returned the mean of each sample would hardly differ. Give samples with more contrast."
-        )
 
 
 def _mae_note(result: GateResult, limits: Limits, checks: Sequence[Check]) -> list[str]:
@@ -214,16 +354,6 @@ def _mae_note(result: GateResult, limits: Limits, checks: Sequence[Check]) -> li
     return [note]
 
 
-def _unchecked(checks: Sequence[Check]) -> list[str]:
-    """Return a note if the encoding was not checked: the judged file itself decides whether it
-    describes integers.
-    """
-    if any(check.name == ENCODING for check in checks):
-        return []
-    reason = "the INT8 file does not describe its integers, as a file that 'quantize' wrote does"
-    return [f"not checked: {ENCODING}, because {reason}"]
-
-
 def file_checks(
     float_model: onnx.ModelProto, int8: Network, target: TargetProfile, must_describe: bool = False
 ) -> list[Check]:
@@ -236,25 +366,28 @@ def file_checks(
     return [legality(place(graph, ruled(target)), npu=bool(target.npu)), *checks]
 
 
-def junit_error(title: str, message: str) -> str:
-    """Return JUnit XML that says that nothing could be judged, and why."""
-    suite = ET.Element(
-        "testsuite", name=printable(title), attrib={"tests": "1", "failures": "0", "errors": "1"}
-    )
-    case = ET.SubElement(suite, "testcase", classname=printable(title), name="gate")
-    text = printable(message, JUNIT_CHARACTERS)
-    ET.SubElement(case, "error", message=text).text = text
-    return ET.tostring(suite, encoding="unicode") + "\n"
-
-
 def junit_text(title: str, checks: Sequence[Check]) -> str:
     """Return the verdict as JUnit XML: a test case for each check."""
-    failures = sum(not check.passed for check in checks)
-    counts = {"tests": str(len(checks)), "failures": str(failures), "errors": "0"}
+    faults = {
+        check.name: f"found {check.found}, allowed {check.allowed}"
+        for check in checks
+        if not check.passed
+    }
+    return _junit(title, "failure", [check.name for check in checks], faults)
+
+
+def junit_error(title: str, message: str) -> str:
+    """Return JUnit XML that says that nothing could be judged, and why."""
+    return _junit(title, "error", ["gate"], {"gate": printable(message, JUNIT_CHARACTERS)})
+
+
+def _junit(title: str, kind: str, cases: Sequence[str], faults: Mapping[str, str]) -> str:
+    counts = {"tests": str(len(cases)), "failures": "0", "errors": "0"}
+    counts[f"{kind}s"] = str(len(faults))
     suite = ET.Element("testsuite", name=printable(title), attrib=counts)
-    for check in checks:
-        case = ET.SubElement(suite, "testcase", classname=printable(title), name=check.name)
-        if not check.passed:
-            text = f"found {check.found}, allowed {check.allowed}"
-            ET.SubElement(case, "failure", message=text).text = text
+    for name in cases:
+        case = ET.SubElement(suite, "testcase", classname=printable(title), name=name)
+        if name in faults:
+            text = faults[name]
+            ET.SubElement(case, kind, message=text).text = text
     return ET.tostring(suite, encoding="unicode") + "\n"

@@ -1,14 +1,15 @@
 """The numbers: from a float network to INT8 under a DPU's rules, and what that costs.
 
-float ONNX (`onnx_file`) -> `graph` -> `calibration` -> `passes` -> integer `core` -> two
+float ONNX (`onnx_file`) -> `graph` -> `samples` -> `passes` -> integer `core` -> two
 `encodings`: the host's file for onnxruntime, the board's for its own flow
 
 - `quantize` does it in one call;
 - `session` runs networks on onnxruntime, `kernels` in ways that add exactly on this processor;
-- `integer` is the core's arithmetic in whole numbers, `bounds` proves what holds for any input;
-- `gate` and `structure` judge an INT8 file, `sensitivity` says which layers err;
-- `tiling` says how an image may be cut for a network: lattice, halo and scale; `samples` are a
-  user's own;
+- `integer` is the core's arithmetic in integers, `bounds` proves what holds for any input;
+- `gate` measures what INT8 changes, `limits` and `structure` judge it, `sensitivity` says which
+  layers err;
+- `tiling` says how an image may be cut for a network: lattice, halo and scale; `samples` are
+  simulated patches or a user's own;
 - `onnx` has the one graph of a file, `simplify` folds what exporters leave in a float one, and
   `untrusted` checks files before they are used.
 """

@@ -247,7 +247,7 @@ def _quantize_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts) -> IntCo
 
 def _activation(op: Conv, frac_bits: int) -> Activation:
     """Of whole numbers: ReLU6 is ReLU where int8 ends no later than the six, as it does once
-    `equalise` scaled.
+    `equalize` scaled.
     """
     ends_first = op.ceiling is not None or INT8_MAX * 2.0**-frac_bits <= SIX
     return Activation.relu if op.activation is Activation.relu6 and ends_first else op.activation

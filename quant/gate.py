@@ -1,25 +1,29 @@
-"""The float/INT8 gate: measure what INT8 changes, and compare it with the limits."""
+"""What INT8 changes: both networks run once on all patches, and are compared with each other and
+with the references.
+"""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import onnxruntime as ort
 
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
-from beers_deploy.profiles.figures import Check, Figure, Row, measured, unavailable
-from beers_deploy.quant.limits import MAE_GROWTH, Limits
-from beers_deploy.quant.sample_range import RangeCounts, SampleRange
-from beers_deploy.quant.samples import LARGEST
+from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
+from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.quant.samples.coverage import BINS, SampleRange, histogram, range_from
+from beers_deploy.quant.samples.own import LARGEST
+from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import result_of
 from beers_deploy.quant.untrusted import times
 
-if TYPE_CHECKING:
-    from beers_deploy.quant.samples import Pair
+SCALE = "of full scale"
+MOST = 0.5
+"""Share of a float network's results that lie in [0, 1] where they are an image, and not of another
+scale.
+"""
 
 
 @dataclass(frozen=True)
@@ -45,11 +49,7 @@ def _similarity(result: np.ndarray, reference: np.ndarray) -> float:
 METRICS: Mapping[str, Metric] = {
     "psnr": Metric("dB", True, lambda result, reference: psnr_db(result, reference, 1.0)),
     "ssim": Metric("ratio", True, _similarity),
-    "mae": Metric(
-        "of full scale",
-        False,
-        lambda result, reference: float(np.abs(result - reference).mean()),
-    ),
+    "mae": Metric(SCALE, False, lambda result, reference: float(np.abs(result - reference).mean())),
 }
 
 
@@ -64,15 +64,61 @@ def metric_value(name: str, result: np.ndarray, reference: np.ndarray) -> float:
 
 
 @dataclass(frozen=True)
+class Spread:
+    """Differences of INT8 from float, patch by patch.
+
+    Attributes:
+        counts: (2 * 4095 + 1,) pixels by their signed difference in whole DN, from -4095 on.
+        mae: (K,) mean absolute difference of each patch, of full scale.
+        largest: (K,) largest difference of each patch, of full scale.
+    """
+
+    counts: np.ndarray
+    mae: np.ndarray
+    largest: np.ndarray
+
+    @property
+    def std_dn(self) -> float:
+        """Standard deviation in DN, of the differences in whole DN."""
+        dn = np.arange(-MAX_DN, MAX_DN + 1)
+        mean = np.average(dn, weights=self.counts)
+        return float(np.sqrt(np.average((dn - mean) ** 2, weights=self.counts)))
+
+    def share_beyond(self, dn: int) -> float:
+        """Return the share of the pixels that differ by more than so many whole DN."""
+        return 1 - float(self.counts[MAX_DN - dn : MAX_DN + dn + 1].sum() / self.counts.sum())
+
+    def worst(self, count: int) -> list[int]:
+        """Return the patches of the largest MAE, the worst first."""
+        # Stable, so that patches of equal error keep their order.
+        return [int(k) for k in np.argsort(-self.mae, kind="stable")[:count]]
+
+
+@dataclass(frozen=True)
 class GateResult:
     """Differences in [0, 1] of full scale over all pixels; PSNRs over full scale, in dB, NaN
     without references.
 
-    `metric` is what the user measures results by, `metric_float` and
-    `metric_int8` what was found of the two. `worst_drop_db` is what the patch loses that loses
-    most. `input_change` is the mean absolute difference of the float results from their inputs, NaN
-    where these have another shape. `contrast` is the mean absolute deviation of the float results
-    from their own means. `sample_range` says which part of the range the samples cover.
+    Attributes:
+        mae: mean absolute difference of INT8 from float.
+        std: standard deviation of the difference.
+        max_abs: its largest size.
+        p999: 99.9th percentile of its size.
+        psnr_between_db: PSNR of INT8 against float.
+        psnr_degraded_db: PSNR of the input against the reference.
+        psnr_float_db: PSNR of the float results.
+        psnr_int8_db: PSNR of the INT8 results.
+        patches: number of patches.
+        sample_range: the part of the range that the patches cover.
+        spread: the differences patch by patch.
+        simulated: whether they are simulated, and not a user's own samples.
+        worst_drop_db: PSNR drop of the patch that loses most.
+        metric: the user's metric; empty for none.
+        metric_float: its value of the float results.
+        metric_int8: its value of the INT8 results.
+        input_change: mean absolute difference of the float results from their inputs; NaN where
+            these have another shape.
+        contrast: mean absolute deviation of the float results from their own means.
     """
 
     mae: float
@@ -84,6 +130,8 @@ class GateResult:
     psnr_float_db: float
     psnr_int8_db: float
     patches: int
+    sample_range: SampleRange
+    spread: Spread
     simulated: bool = True
     worst_drop_db: float = math.nan
     metric: str = ""
@@ -91,7 +139,6 @@ class GateResult:
     metric_int8: float = math.nan
     input_change: float = math.nan
     contrast: float = math.nan
-    sample_range: SampleRange | None = None
 
     @property
     def metric_loss(self) -> float:
@@ -102,11 +149,8 @@ class GateResult:
     @property
     def source(self) -> str:
         """Where the figures come from."""
-        return (
-            f"{self.patches} simulated patches of 128 x 128"
-            if self.simulated
-            else f"{self.patches} samples"
-        )
+        kind = "simulated patches of 128 x 128" if self.simulated else "samples"
+        return f"{self.patches} {kind}"
 
     @property
     def drop_db(self) -> float:
@@ -117,13 +161,6 @@ class GateResult:
     def gain_db(self) -> float:
         """PSNR that the float network gains over its input."""
         return self.psnr_float_db - self.psnr_degraded_db
-
-    @property
-    def drop_share(self) -> float:
-        """PSNR lost over PSNR gained by the float network; NaN where that gains nothing, or without
-        references.
-        """
-        return self.drop_db / self.gain_db if self.gain_db > 0 else math.nan
 
     @property
     def std_over_mae(self) -> float:
@@ -137,13 +174,10 @@ class GateResult:
 def compare(
     float_session: ort.InferenceSession,
     int8_session: ort.InferenceSession,
-    pairs: "Iterable[Pair]",
-    simulated: bool = True,
-    metric: str | None = None,
-    names: Sequence[str] = (),
+    patches: Patches,
+    metric: str = "",
 ) -> GateResult:
-    """Run both networks on (degraded, reference) pairs of (1, C, H, W) in [0, 1]; images clipped as
-    a file would.
+    """Run both networks on patches; images are clipped as a file would.
 
     Without references, or where they have another size than what is compared, the PSNRs to them are
     NaN.
@@ -151,10 +185,8 @@ def compare(
     Args:
         float_session: the float network's.
         int8_session: the INT8 network's.
-        pairs: what both are run on.
-        simulated: whether these are simulated patches.
+        patches: that both are run on.
         metric: one of `METRICS`, by which results are compared with the references too.
-        names: of the samples, for messages.
 
     Raises:
         ModelError: results of different shapes.
@@ -162,193 +194,146 @@ def compare(
             others have it.
         OptionError: references that the metric does not take.
     """
+    counts = np.zeros(BINS, np.int64)
+    dn_counts = np.zeros(2 * MAX_DN + 1, np.int64)
     differences = []
-    errors = []
     changes = []
     contrasts = []
-    counts = RangeCounts()
-    metric_values = list[list[float]]()
-    unfit_shapes = dict[str, tuple[int, ...]]()
-    for number, (degraded, reference) in enumerate(pairs):
-        counts.add(degraded)
-        results = [result_of(s, degraded) for s in (float_session, int8_session)]
-        if results[0].shape != results[1].shape:
-            float_size, int8_size = (times(result.shape) for result in results)
-            raise ModelError(
-                f"The results of the INT8 network are {int8_size}, but those of the float network "
-                f"are {float_size}. Give the INT8 file that was made from this float network."
-            )
-        if results[0].ndim != 4:
-            raise ModelError(
-                f"The results of the networks must be images (N, C, H, W), but they are "
-                f"{times(results[0].shape)}. The gate is for networks that make an image of an "
-                "image; 'check' and 'bench' read any network."
-            )
-        # The float result alone decides, so that both are clipped or neither is.
-        inside = ((results[0] >= 0) & (results[0] <= 1)).mean()
-        is_image = results[0].shape[1] == degraded.shape[1] and bool(inside >= MOST)
-        in_float, in_int8 = (_as_in_a_file(result, is_image) for result in results)
-        differences.append((in_int8 - in_float).ravel())
+    errors = []
+    metric_values = []
+    unfit = dict[int, np.ndarray]()
+    for number, (degraded, reference) in enumerate(patches.pairs):
+        counts += histogram(degraded)
+        in_float, in_int8 = _results(float_session, int8_session, degraded)
+        difference = (in_int8 - in_float).ravel()
+        differences.append(difference)
+        # Shifted by the largest digital number, because `bincount` counts from 0 on.
+        dn = np.rint(np.nan_to_num(difference).clip(-1, 1) * MAX_DN).astype(np.int64) + MAX_DN
+        dn_counts += np.bincount(dn, minlength=len(dn_counts))
         same_shape = in_float.shape == degraded.shape
         changes.append(float(np.abs(in_float - degraded).mean()) if same_shape else math.nan)
         contrasts.append(float(np.abs(in_float - in_float.mean()).mean()))
-        name = names[number] if names else f"sample {number}"
         if reference.shape != in_float.shape:
-            unfit_shapes[name] = reference.shape
-        else:
-            _require_full_scale(name, reference)
-        errors.append([_psnr_db(image, reference) for image in (degraded, in_float, in_int8)])
-        if metric is not None:
-            metric_values.append(
-                [metric_value(metric, result, reference) for result in (in_float, in_int8)]
+            unfit[number] = reference
+        elif not (reference.min() >= 0 and reference.max() <= LARGEST):
+            raise ImageError(
+                f"The reference of {_name(patches, number)} must have values in [0, 1], but they "
+                f"are {reference.min():.4g} to {reference.max():.4g}. Divide it by full scale."
             )
-    some_fit = not np.isnan([in_float for _, in_float, _ in errors]).all()
-    if unfit_shapes and some_fit:
+        errors.append([_psnr_db(image, reference) for image in (degraded, in_float, in_int8)])
+        if metric:
+            metric_values.append([metric_value(metric, r, reference) for r in (in_float, in_int8)])
+    if unfit and len(unfit) < len(errors):
         # A mean over some of them would be NaN, and its check left out.
-        name, shape = next(iter(unfit_shapes.items()))
-        raise unfit_reference(name, shape, "the PSNRs, because other samples have one")
-    difference = np.concatenate(differences).astype(np.float64)
-    degraded_db, float_db, int8_db = np.mean(errors, axis=0)
-    metric_float = metric_int8 = math.nan
-    if metric is not None:
-        metric_float, metric_int8 = np.mean(metric_values, axis=0).tolist()
+        raise unfit_reference(
+            patches, next(iter(unfit)), "the PSNRs, because other samples have one"
+        )
+    everything = np.concatenate(differences).astype(np.float64)
+    degraded_db, float_db, int8_db = np.mean(errors, axis=0).tolist()
+    metric_float, metric_int8 = np.mean(metric_values or [[math.nan] * 2], axis=0).tolist()
     return GateResult(
-        mae=float(np.abs(difference).mean()),
-        std=float(difference.std()),
-        max_abs=float(np.abs(difference).max()),
-        p999=float(np.quantile(np.abs(difference), 0.999)),
-        psnr_between_db=psnr_db(difference, np.zeros_like(difference), 1.0),
-        psnr_degraded_db=float(degraded_db),
-        psnr_float_db=float(float_db),
-        psnr_int8_db=float(int8_db),
+        mae=float(np.abs(everything).mean()),
+        std=float(everything.std()),
+        max_abs=float(np.abs(everything).max()),
+        p999=float(np.quantile(np.abs(everything), 0.999)),
+        psnr_between_db=psnr_db(everything, np.zeros_like(everything), 1.0),
+        psnr_degraded_db=degraded_db,
+        psnr_float_db=float_db,
+        psnr_int8_db=int8_db,
         patches=len(errors),
-        simulated=simulated,
-        metric=metric or "",
+        simulated=bool(patches.views),
+        metric=metric,
         metric_float=metric_float,
         metric_int8=metric_int8,
         worst_drop_db=float(np.max([in_float - in_int8 for _, in_float, in_int8 in errors])),
         input_change=float(np.mean(changes)),
         contrast=float(np.mean(contrasts)),
-        sample_range=counts.range,
+        sample_range=range_from(counts),
+        spread=Spread(
+            dn_counts,
+            np.array([float(np.abs(difference).mean()) for difference in differences]),
+            np.array([float(np.abs(difference).max()) for difference in differences]),
+        ),
     )
 
 
-def _require_full_scale(name: str, reference: np.ndarray) -> None:
-    low = float(reference.min())
-    high = float(reference.max())
-    if not (low >= 0 and high <= LARGEST):
-        raise ImageError(
-            f"The reference of {name} must have values in [0, 1], but they are {low:.4g} to "
-            f"{high:.4g}. Divide it by full scale."
+def _results(
+    float_session: ort.InferenceSession, int8_session: ort.InferenceSession, degraded: np.ndarray
+) -> list[np.ndarray]:
+    """Return the float and the INT8 result, clipped to [0, 1] if they are images; NaN where
+    infinite, which no clipping makes a pixel.
+    """
+    results = [result_of(session, degraded) for session in (float_session, int8_session)]
+    if results[0].shape != results[1].shape:
+        float_size, int8_size = (times(result.shape) for result in results)
+        raise ModelError(
+            f"The results of the INT8 network are {int8_size}, but those of the float network "
+            f"are {float_size}. Give the INT8 file that was made from this float network."
         )
+    if results[0].ndim != 4:
+        raise ModelError(
+            f"The results of the networks must be images (N, C, H, W), but they are "
+            f"{times(results[0].shape)}. The gate is for networks that make an image of an "
+            "image; 'check' and 'bench' read any network."
+        )
+    # The float result alone decides, so that both are clipped or neither is.
+    inside = ((results[0] >= 0) & (results[0] <= 1)).mean()
+    is_image = results[0].shape[1] == degraded.shape[1] and inside >= MOST
+    return [
+        np.where(np.isinf(result), np.nan, np.clip(result, 0, 1) if is_image else result)
+        for result in results
+    ]
 
 
-def unfit_reference(name: str, shape: Sequence[int], wanted: str) -> ImageError:
-    """Return the error of a reference of another size than the network's results, which `wanted`
+def _name(patches: Patches, number: int) -> str:
+    return patches.names[number] if patches.names else f"sample {number}"
+
+
+def unfit_reference(patches: Patches, number: int, purpose: str) -> ImageError:
+    """Return the error of a reference of another size than the network's results, which `purpose`
     needs.
     """
+    shape = patches.pairs[number][1].shape
     fault = f"its reference has {times(shape[1:])}" if math.prod(shape) else "it has none"
     return ImageError(
-        f"{name} must have a reference of the size of the network's results for {wanted}, but "
-        f"{fault}. Give references of that size for all samples, or none."
+        f"{_name(patches, number)} must have a reference of the size of the network's results for "
+        f"{purpose}, but {fault}. Give references of that size for all samples, or none."
     )
-
-
-MOST = 0.5
-"""Of a float network's results lie in [0, 1] where they are an image, and not of another scale."""
-
-
-def _as_in_a_file(result: np.ndarray, is_image: bool) -> np.ndarray:
-    """An image clipped to [0, 1], anything else as it is; NaN where infinite, which no clipping
-    makes a pixel.
-    """
-    return np.where(np.isinf(result), np.nan, np.clip(result, 0, 1) if is_image else result)
 
 
 def _psnr_db(image: np.ndarray, reference: np.ndarray) -> float:
     return psnr_db(image, reference, 1.0) if reference.shape == image.shape else math.nan
 
 
-def judge(result: GateResult, limits: Limits, baseline_mae: float | None = None) -> list[Check]:
-    """Every limit that is set, against what was found."""
-    scale = "of full scale"
-    checks = [
-        _at_most("MAE", result.mae, limits.mae, scale),
-        _at_most("99.9th percentile", result.p999, limits.p999, scale),
-        _at_most("std / MAE", result.std_over_mae, limits.std_over_mae, "ratio"),
-        _at_most("PSNR drop", result.drop_db, limits.psnr_drop_db, "dB"),
-    ]
-    # Without references the gain is NaN, and where float gains nothing a share of it says nothing.
-    if result.gain_db > 0:
-        gained = f"the float network gains {result.gain_db:.2f} dB"
-        checks.append(
-            _at_most("PSNR drop over gain", result.drop_share, limits.drop_share, "ratio", gained)
-        )
-    if limits.metric_loss is not None and result.metric:
-        unit = METRICS[result.metric].unit
-        checks.append(
-            _at_most(f"{result.metric} lost", result.metric_loss, limits.metric_loss, unit)
-        )
-    if limits.min_psnr_float_int8_db is not None:
-        least = limits.min_psnr_float_int8_db
-        checks.append([Check("PSNR float-INT8", result.psnr_between_db, least, "dB", "at least")])
-    if baseline_mae is not None:
-        growth = MAE_GROWTH if limits.mae_growth is None else limits.mae_growth
-        allowed = growth * baseline_mae
-        detail = f"the baseline has {baseline_mae:.4g}"
-        checks.append(_at_most("MAE against the baseline", result.mae, allowed, scale, detail))
-    return list(chain.from_iterable(checks))
+def gate_row(result: GateResult, shares: Mapping[str, float] | None = None) -> Row:
+    """Return what INT8 changes as a row of the table "gate".
 
-
-def judge_saturation(shares: Mapping[str, float], limits: Limits) -> list[Check]:
-    """The layer that saturates most, against the limit if there is one; where nothing is 8-bit none
-    is kept.
+    Args:
+        result: what was measured.
+        shares: of each layer's results the share at the ends of 8 bits, which a gate also prints.
     """
-    none = ("any layer: none is 8-bit", math.nan)
-    layer, share = max(shares.items(), key=lambda item: item[1], default=none)
-    return _at_most("saturated results", share, limits.saturated, "of a layer's", f"in {layer}")
-
-
-def _at_most(
-    name: str, value: float, limit: float | None, unit: str, detail: str = ""
-) -> list[Check]:
-    return [] if limit is None else [Check(name, value, limit, unit, detail=detail)]
-
-
-def gate_row(result: GateResult) -> Row:
-    """What INT8 changes, on patches that calibration did not see."""
     entries = {
-        "MAE": (result.mae, "of full scale"),
-        "std": (result.std, "of full scale"),
+        "MAE": (result.mae, SCALE),
+        "std": (result.std, SCALE),
         "std / MAE": (result.std_over_mae, "ratio"),
-        "99.9th percentile": (result.p999, "of full scale"),
-        "max": (result.max_abs, "of full scale"),
+        "99.9th percentile": (result.p999, SCALE),
+        "max": (result.max_abs, SCALE),
         "PSNR float-INT8": (result.psnr_between_db, "dB"),
         "PSNR degraded": (result.psnr_degraded_db, "dB"),
         "PSNR float": (result.psnr_float_db, "dB"),
         "PSNR INT8": (result.psnr_int8_db, "dB"),
     }
-    figures = {name: _figure(value, unit, result) for name, (value, unit) in entries.items()}
     if result.metric:
-        values = {
-            "float": result.metric_float,
-            "INT8": result.metric_int8,
-            "lost": result.metric_loss,
-        }
         unit = METRICS[result.metric].unit
-        for name, value in values.items():
-            figures[f"{result.metric} {name}"] = _figure(value, unit, result)
+        entries[f"{result.metric} float"] = (result.metric_float, unit)
+        entries[f"{result.metric} INT8"] = (result.metric_int8, unit)
+        entries[f"{result.metric} lost"] = (result.metric_loss, unit)
+    if shares is not None:
+        entries["PSNR drop"] = (result.drop_db, "dB")
+    figures = {name: _figure(value, unit, result) for name, (value, unit) in entries.items()}
+    if shares is not None:
+        figures["saturated results"] = _saturation(shares, result.source)
     return Row("gate", "INT8 against float", figures)
-
-
-def verdict_row(result: GateResult, shares: Mapping[str, float]) -> Row:
-    """The figures of a gate: those of `gate_row`, the PSNR lost to the reference, the worst layer's
-    saturation.
-    """
-    row = gate_row(result)
-    drop = _figure(result.drop_db, "dB", result)
-    worst = saturation_figure(shares, result.source)
-    return replace(row, figures={**row.figures, "PSNR drop": drop, "saturated results": worst})
 
 
 def _figure(value: float, unit: str, result: GateResult) -> Figure:
@@ -361,8 +346,8 @@ def _figure(value: float, unit: str, result: GateResult) -> Figure:
     return measured(value, unit, result.source)
 
 
-def saturation_figure(shares: Mapping[str, float], source: str) -> Figure:
-    """What share of its results comes to the ends of 8 bits, in the layer where most do."""
+def _saturation(shares: Mapping[str, float], source: str) -> Figure:
+    """Return the share of results at the ends of 8 bits, in the layer where it is largest."""
     if not shares:
         return unavailable("%", "no result in the file is rounded to 8 bits")
     layer = max(shares, key=lambda name: shares[name])

@@ -7,16 +7,16 @@ proven exact, chosen as the file is opened:
 
 1. SIGNED: weights stay as they are, for no two neighbouring products can leave int16, whatever the
   activations. a. A tensor behind a ReLU is stored as 128..255 around 128. Moved down to 0..127
-  around 0, no weights saturate. b. Otherwise all pairs of weights that a kernel may form are looked
-  at.
+  around 0, no weights saturate. b. Otherwise all pairs of weights that a kernel may form are
+  checked.
 2. UNSIGNED: weights stored as uint8, 128 higher and around 128. These kernels add in int32, at half
   the speed.
 3. CONVERTED: the same for signed activations, which are moved to uint8 before the operator, and
   back behind it.
 
-Each is the same sum of the same whole numbers, so the results are those of an exact processor, bit
+Each is the same sum of the same integers, so the results are those of an exact processor, bit
 for bit. Float operators between 8-bit tensors (QDQ), of which onnxruntime makes integer ones, are
-looked at as what they become.
+checked as what they become.
 """
 
 import hashlib
@@ -80,23 +80,52 @@ point.
 """
 
 
+class _Rewriting:
+    """A copy of a model whose nodes are replaced one by one, and its constants."""
+
+    def __init__(self, model: onnx.ModelProto) -> None:
+        self.model = deepcopy(model)
+        self.arrays = constants(model)
+
+    def around(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
+        """Return what replaces a node."""
+        raise NotImplementedError
+
+    def rewritten(self) -> onnx.ModelProto:
+        """Replace every node, and return the model."""
+        nodes = list(chain.from_iterable(map(self.around, self.model.graph.node)))
+        del self.model.graph.node[:]
+        self.model.graph.node.extend(nodes)
+        return self.model
+
+    def constant(self, value: np.ndarray | np.generic, name: str = "") -> str:
+        """Return the name of a constant that holds this value; equal values share one unless they
+        are named.
+        """
+        array = np.asarray(value)
+        if not name:
+            digest = hashlib.sha256(array.tobytes()).hexdigest()[:16]
+            name = f"exact.{array.dtype}.{'x'.join(map(str, array.shape))}.{digest}"
+        if name not in self.arrays:
+            self.arrays[name] = array
+            self.model.graph.initializer.append(numpy_helper.from_array(array, name))
+        return name
+
+
 def made_exact(model: onnx.ModelProto) -> tuple[onnx.ModelProto, dict[str, Way]]:
-    """The model with the same results on kernels that add exactly, and the way of each operator by
-    its name.
+    """Return the model with the same results on kernels that add exactly, and the way of each
+    operator by its name.
     """
-    work = _Rewriting(model)
-    relus = [node for node in work.model.graph.node if node.op_type == "Max"]
-    for relu in relus:
+    work = _Exact(model)
+    for relu in [node for node in work.model.graph.node if node.op_type == "Max"]:
         work.move_relu_down(relu)
-    nodes = list(chain.from_iterable(map(work.around, work.model.graph.node)))
-    del work.model.graph.node[:]
-    work.model.graph.node.extend(nodes)
-    return work.model, work.ways
+    return work.rewritten(), work.ways
 
 
 def cannot_saturate(kind: str, weight: np.ndarray, largest: int) -> bool:
-    """Whether no pair of neighbouring products can leave int16, for any activations from 0 to
-    `largest`.
+    """Return True if no pair of neighbouring products can leave int16.
+
+    This holds for any activations from 0 to `largest`.
 
     Args:
         kind: the ONNX operator.
@@ -115,7 +144,7 @@ def cannot_saturate(kind: str, weight: np.ndarray, largest: int) -> bool:
 
 
 def _rows(kind: str, weight: np.ndarray) -> np.ndarray:
-    """The weights of each result in the order of the sum, (O, terms) int64."""
+    """Return the weights of each result in the order of the sum, (O, terms) int64."""
     # A convolution's kernels add over the channels of a tap, then tap by tap.
     if kind == "QLinearConv":
         ordered = np.moveaxis(weight.reshape(*weight.shape[:2], -1), 1, 2)
@@ -124,12 +153,11 @@ def _rows(kind: str, weight: np.ndarray) -> np.ndarray:
     return ordered.reshape(len(ordered), -1).astype(np.int64)
 
 
-class _Rewriting:
-    """A copy of the model, what is known of it, and the ways chosen so far."""
+class _Exact(_Rewriting):
+    """Computes each operator in a way that adds exactly."""
 
     def __init__(self, model: onnx.ModelProto) -> None:
-        self.model = deepcopy(model)
-        self.arrays = constants(model)
+        super().__init__(model)
         self.ways = dict[str, Way]()
         self.writers: dict[str, onnx.NodeProto] = {}
         self.readers: dict[str, list[onnx.NodeProto]] = defaultdict(list)
@@ -163,18 +191,16 @@ class _Rewriting:
             return
         # With a zero point of 0 the writer clips at 0 itself, which is the ReLU. What remains is
         # the upper end: 255 around the old zero point is 255 - middle around 0.
-        zero = self._constant(np.uint8(0))
+        zero = self.constant(np.uint8(0))
         self.largest[result] = UINT8_MAX - int(middle.ravel()[0])
         writer.input[place] = zero
         relu.op_type = "Min"
-        relu.input[1] = self._constant(np.uint8(self.largest[result]))
+        relu.input[1] = self.constant(np.uint8(self.largest[result]))
         for reader in readers:
             reader.input[OPERATORS[reader.op_type].zero] = zero
 
     def _reads(self, node: onnx.NodeProto, name: str, zero: np.ndarray) -> bool:
-        """Whether a node is an operator that reads the tensor as its activations, around this zero
-        point.
-        """
+        """Return True if an operator reads the tensor as activations around this zero point."""
         places = OPERATORS.get(node.op_type)
         return (
             places is not None
@@ -191,7 +217,7 @@ class _Rewriting:
         )
 
     def around(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
-        """The node computed in an exact way, with what converts before and behind it."""
+        """Return the node computed in an exact way, with what converts before and behind it."""
         if node.op_type in FLOAT_OPERATORS:
             return self._between(node)
         places = OPERATORS.get(node.op_type)
@@ -218,9 +244,7 @@ class _Rewriting:
         return self._converted(node, places) if signed else [node]
 
     def _between(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
-        """A float operator whose weights are dequantised int8, and what dequantises them from uint8
-        if need be.
-        """
+        """Return a float operator on dequantised weights, after what dequantises uint8 ones."""
         source = self.writers.get(node.input[1])
         weight = (
             self.arrays.get(source.input[0])
@@ -251,12 +275,10 @@ class _Rewriting:
             # A zero point that is left out is 0.
             value = self.arrays.get(node.input[place], np.zeros((), np.int8))
             # The sum is formed in int16, because int8 wraps around above 127.
-            node.input[place] = self._constant((value.astype(np.int16) + MIDDLE).astype(np.uint8))
+            node.input[place] = self.constant((value.astype(np.int16) + MIDDLE).astype(np.uint8))
 
     def _converted(self, node: onnx.NodeProto, places: Places) -> list[onnx.NodeProto]:
-        """The node on uint8 activations, between what moves them up and, where it is of 8 bits, its
-        result down.
-        """
+        """Return the node on uint8 activations, between what moves these up and its result down."""
         self._lift(node, places.zero)
         before, node.input[0] = self._moved(node.input[0], MIDDLE, TensorProto.UINT8)
         if places.result_zero is None:
@@ -271,9 +293,7 @@ class _Rewriting:
     def _moved(
         self, source: str, by: int, kind: int, result: str = ""
     ) -> tuple[list[onnx.NodeProto], str]:
-        """An 8-bit tensor as another type of 8 bits, its numbers that much higher; made once for
-        all its readers.
-        """
+        """Return what moves an 8-bit tensor to another type of 8 bits, once for all its readers."""
         result = result or f"{source}.unsigned"
         if result in self.moved:
             return [], result
@@ -282,21 +302,11 @@ class _Rewriting:
         total = f"{result}.moved"
         nodes = [
             helper.make_node("Cast", [source], [wide], name=wide, to=TensorProto.INT32),
-            helper.make_node("Add", [wide, self._constant(np.int32(by))], [total], name=total),
+            helper.make_node("Add", [wide, self.constant(np.int32(by))], [total], name=total),
             helper.make_node("Cast", [total], [result], name=f"{result}.cast", to=kind),
         ]
         self.moved.add(result)
         return nodes, result
-
-    def _constant(self, value: np.ndarray | np.generic) -> str:
-        """A constant of the model that holds this value."""
-        array = np.asarray(value)
-        digest = hashlib.sha256(array.tobytes()).hexdigest()[:16]
-        name = f"exact.{array.dtype}.{'x'.join(map(str, array.shape))}.{digest}"
-        if name not in self.arrays:
-            self.arrays[name] = array
-            self.model.graph.initializer.append(numpy_helper.from_array(array, name))
-        return name
 
 
 # On onnxruntime's integer kernels two output channels took four times as long as sixteen.
@@ -307,29 +317,23 @@ FIRST_OPSET = 11
 
 
 def filled(model: onnx.ModelProto) -> onnx.ModelProto:
-    """The model with the same results, its integer convolutions no narrower
-    than suits onnxruntime.
+    """Return the model with the same results, its integer convolutions no narrower than suits
+    onnxruntime.
     """
     if opset_of(model) < FIRST_OPSET:
         return model
-    result = deepcopy(model)
-    work = _ChannelPadding(result.graph, constants(model))
-    nodes = list(chain.from_iterable(map(work.around, result.graph.node)))
-    del result.graph.node[:]
-    result.graph.node.extend(nodes)
-    return result
+    return _ChannelPadding(model).rewritten()
 
 
-class _ChannelPadding:
-    """What is filled already: convolutions may share an input."""
+class _ChannelPadding(_Rewriting):
+    """Widens narrow convolutions; convolutions may share a widened input."""
 
-    def __init__(self, graph: onnx.GraphProto, arrays: dict[str, np.ndarray]) -> None:
-        self.graph = graph
-        self.arrays = arrays
+    def __init__(self, model: onnx.ModelProto) -> None:
+        super().__init__(model)
         self.wide_inputs = set[str]()
 
     def around(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
-        """The node, and what widens its input and narrows its output."""
+        """Return the node, and what widens its input and narrows its output."""
         weight = self.arrays.get(node.input[3]) if node.op_type == "QLinearConv" else None
         if weight is None or weight.ndim != 4 or not self._takes_zeros(node):
             return [node]
@@ -343,7 +347,7 @@ class _ChannelPadding:
         return [*before, node, *(self._cut(node, outputs) if more_outputs else [])]
 
     def _takes_zeros(self, node: onnx.NodeProto) -> bool:
-        """Whether a stored 0 is a weight of 0, and each output reads every input."""
+        """Return True if a stored 0 is a weight of 0, and each output reads every input."""
         middle = self.arrays.get(node.input[5])
         grouped = any(
             attribute.name == "group" and attribute.i != 1 for attribute in node.attribute
@@ -362,8 +366,8 @@ class _ChannelPadding:
             value = self.arrays.get(node.input[place]) if place < len(node.input) else None
             if value is not None and value.shape == (len(weight),) and outputs:
                 widened = np.pad(value, (0, outputs), mode="edge")
-                node.input[place] = self._constant(f"{name}.filled.{place}", widened)
-        node.input[3] = self._constant(f"{name}.filled.weight", padded_weight)
+                node.input[place] = self.constant(widened, f"{name}.filled.{place}")
+        node.input[3] = self.constant(padded_weight, f"{name}.filled.weight")
 
     def _padded(self, node: onnx.NodeProto, count: int) -> list[onnx.NodeProto]:
         source = node.input[0]
@@ -371,7 +375,7 @@ class _ChannelPadding:
         if source in self.wide_inputs:
             return []
         self.wide_inputs.add(source)
-        pads = self._constant(f"{source}.padded.pads", np.array([0, 0, 0, 0, 0, count, 0, 0]))
+        pads = self.constant(np.array([0, 0, 0, 0, 0, count, 0, 0]))
         return [
             helper.make_node("Pad", [source, pads], [f"{source}.padded"], name=f"{source}.padded")
         ]
@@ -379,14 +383,6 @@ class _ChannelPadding:
     def _cut(self, node: onnx.NodeProto, count: int) -> list[onnx.NodeProto]:
         name = node.output[0]
         node.output[0] = f"{name}.filled"
-        start = self._constant(f"{name}.filled.from", np.array([0]))
-        end = self._constant(f"{name}.filled.to", np.array([count]))
-        axis = self._constant("filled.channels", np.array([1]))
-        feeds = [f"{name}.filled", start, end, axis]
+        places = [self.constant(np.array([place])) for place in (0, count, 1)]
+        feeds = [f"{name}.filled", *places]
         return [helper.make_node("Slice", feeds, [name], name=f"{name}.cut")]
-
-    def _constant(self, name: str, value: np.ndarray) -> str:
-        if name not in self.arrays:
-            self.arrays[name] = value
-            self.graph.initializer.append(numpy_helper.from_array(value, name))
-        return name

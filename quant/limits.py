@@ -1,7 +1,8 @@
-"""The limits of the gate, by name: their defaults, the values that make sense, and the TOML file
-that sets them.
+"""The limits of the gate: their defaults, the values that make sense, the TOML file that sets them,
+and a check of each.
 """
 
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -9,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from beers_deploy.profiles.errors import OptionError, printable
+from beers_deploy.profiles.figures import Check
 from beers_deploy.profiles.toml import read_toml_text, unreadable
+from beers_deploy.quant.gate import METRICS, SCALE, GateResult
 
 # Of 17 tampered files this stopped 15, all that cost more than 0.03 dB.
 MAE_GROWTH = 1.05
@@ -85,18 +88,30 @@ def limits_of(
     Raises:
         OptionError: no limits, unknown ones, or some that no network breaks.
     """
+    limits: Limits
+    where = "`limits`"
     if isinstance(given, str | os.PathLike):
-        limits = _read(Path(given))
+        where = str(given)
+        try:
+            limits = _named(where, read_toml_text(Path(given)))
+        except (OSError, ValueError) as error:
+            reason = unreadable(Path(given)) or printable(str(error))
+            raise OptionError(
+                f"The limits cannot be read from {where}: {reason}. Give a TOML file with lines "
+                "such as mae = 0.0007."
+            ) from error
     elif isinstance(given, Mapping):
-        limits = _named("`limits`", given)
+        limits = _named(where, given)
     else:
-        limits = _require_breakable("`limits`", given or Limits())
-    return (
-        limits if max_mae is None else _require_breakable("`max_mae`", replace(limits, mae=max_mae))
-    )
+        limits = given or Limits()
+    _require_breakable(where, limits)
+    if max_mae is not None:
+        limits = replace(limits, mae=max_mae)
+        _require_breakable("`max_mae`", limits)
+    return limits
 
 
-def _require_breakable(where: str, limits: Limits) -> Limits:
+def _require_breakable(where: str, limits: Limits) -> None:
     """Raise OptionError if no network would break a limit: a gate that cannot fail is none."""
     for name, (low, high) in BREAKABLE.items():
         value = getattr(limits, name)
@@ -105,19 +120,6 @@ def _require_breakable(where: str, limits: Limits) -> Limits:
                 f"{where}: the limit {name} must be between {low:g} and {high:g}, got {value:g}. "
                 "Set a limit that a broken network would not meet."
             )
-    return limits
-
-
-def _read(path: Path) -> Limits:
-    try:
-        raw = read_toml_text(path)
-    except (OSError, ValueError) as error:
-        reason = unreadable(path) or printable(str(error))
-        raise OptionError(
-            f"The limits cannot be read from {path}: {reason}. Give a TOML file with lines such as "
-            "mae = 0.0007."
-        ) from error
-    return _named(str(path), raw)
 
 
 def _named(where: str, raw: Mapping[str, object]) -> Limits:
@@ -133,7 +135,7 @@ def _named(where: str, raw: Mapping[str, object]) -> Limits:
                 f"{printable(f'{name} = {value!r}')}. Correct that line."
             )
     values: dict[str, Any] = dict(raw)
-    return _require_breakable(where, Limits(**values))
+    return Limits(**values)
 
 
 def _is_limit(value: object) -> bool:
@@ -142,3 +144,56 @@ def _is_limit(value: object) -> bool:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
     return value >= 0 and (isinstance(value, float) or value < 1 << 64)
+
+
+AT_LEAST = "PSNR float-INT8"
+"""The one figure of which a large value is good."""
+
+
+def judge(
+    result: GateResult,
+    limits: Limits,
+    baseline_mae: float | None = None,
+    shares: Mapping[str, float] | None = None,
+) -> list[Check]:
+    """Check every limit that is set.
+
+    Args:
+        result: what INT8 changes.
+        limits: the largest values allowed.
+        baseline_mae: the MAE of an earlier gate, if there is a baseline.
+        shares: of each layer's results the share at the ends of 8 bits; None leaves them out, and
+            no limit is kept where nothing is 8-bit.
+    """
+    figures: list[tuple[str, float, float | None, str, str]] = [
+        ("MAE", result.mae, limits.mae, SCALE, ""),
+        ("99.9th percentile", result.p999, limits.p999, SCALE, ""),
+        ("std / MAE", result.std_over_mae, limits.std_over_mae, "ratio", ""),
+        ("PSNR drop", result.drop_db, limits.psnr_drop_db, "dB", ""),
+    ]
+    # Without references the gain is NaN, and where float gains nothing a share of it says nothing.
+    if result.gain_db > 0:
+        gained = f"the float network gains {result.gain_db:.2f} dB"
+        share = result.drop_db / result.gain_db
+        figures.append(("PSNR drop over gain", share, limits.drop_share, "ratio", gained))
+    if result.metric:
+        unit = METRICS[result.metric].unit
+        name = f"{result.metric} lost"
+        figures.append((name, result.metric_loss, limits.metric_loss, unit, ""))
+    least_db = limits.min_psnr_float_int8_db
+    figures.append((AT_LEAST, result.psnr_between_db, least_db, "dB", ""))
+    if baseline_mae is not None:
+        growth = MAE_GROWTH if limits.mae_growth is None else limits.mae_growth
+        allowed = growth * baseline_mae
+        detail = f"the baseline has {baseline_mae:.4g}"
+        figures.append(("MAE against the baseline", result.mae, allowed, SCALE, detail))
+    if shares is not None:
+        worst = max(shares, key=lambda layer: shares[layer], default="any layer: none is 8-bit")
+        share = shares.get(worst, math.nan)
+        unit = "of a layer's"
+        figures.append(("saturated results", share, limits.saturated, unit, f"in {worst}"))
+    return [
+        Check(name, value, limit, unit, "at least" if name == AT_LEAST else "at most", detail)
+        for name, value, limit, unit, detail in figures
+        if limit is not None
+    ]

@@ -1,24 +1,24 @@
 """Which layer costs what: each one in int8 while all others stay in float.
 
 A convolution errs by its int8 weights and bias, and by rounding and clipping its result. An add
-errs by what it does to sums of whole numbers: in a stream of one scale nothing, but where it
-saturates. What a layer's inputs had already lost is not held against it.
+errs by what it does to sums of integers: in a group of one scale nothing, but where it
+saturates. What a layer's inputs had already lost does not count.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import onnx
-import onnxruntime as ort
 from onnx import TensorProto, helper
 
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
-from beers_deploy.profiles.instrument import MAX_DN, Instrument
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Instrument
 from beers_deploy.quant.core import IntConv, IntCore, dequantized, rounded_to
 from beers_deploy.quant.encodings import host_model
-from beers_deploy.quant.gate import GateResult
+from beers_deploy.quant.gate import GateResult, Spread
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
@@ -32,15 +32,14 @@ from beers_deploy.quant.graph import (
     tensors,
     ties_scales,
 )
-from beers_deploy.quant.quantize import Quantised
-from beers_deploy.quant.samples import Patches
+from beers_deploy.quant.quantize import Quantized
+from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import (
     few_crops,
     halo_of,
     open_session,
     planes_of,
     result_of,
-    run,
     tensor_values,
 )
 
@@ -57,7 +56,7 @@ CLIPPING = 1.6
 
 
 class Loss:
-    """Adds up how far results lie from what was wanted, array by array."""
+    """The difference of results from what was wanted, added up array by array."""
 
     def __init__(self) -> None:
         self._signal = 0.0
@@ -113,12 +112,12 @@ class LayerError:
 def layer_errors(
     graph: Graph, core: IntCore, crops: Iterable[np.ndarray]
 ) -> tuple[list[LayerError], Loss]:
-    """What each layer of a network loses, and what all lose together, over crops (1, 1, H, W) in
-    [0, 1].
+    """Return what each layer of a network loses, and what all lose jointly, over crops (1, 1, H, W)
+    in [0, 1].
 
     Args:
         graph: plane-reading, in float: what the core was rounded from.
-        core: the same operations in whole numbers.
+        core: the same operations in integers.
         crops: each passes through the network once for every layer.
     """
     # The same convolutions, by their side, with the values that their int8 weights and biases stand
@@ -167,7 +166,7 @@ def layer_errors(
 
 
 def _rest(graph: Graph, tensor: str, width: int) -> onnx.ModelProto:
-    """The float network from one of its tensors, given beside the planes, to the correction."""
+    """Return the float network from one of its tensors, an input next to the planes, on."""
     model = graph_to_onnx(tuple(op for op in graph if op.output != tensor), [CORRECTION], width)
     model.graph.input.append(
         helper.make_tensor_value_info(tensor, TensorProto.FLOAT, ["N", "C", None, None])
@@ -176,7 +175,7 @@ def _rest(graph: Graph, tensor: str, width: int) -> onnx.ModelProto:
 
 
 def _in_int8(op: Op, core: IntCore, exact: Mapping[str, np.ndarray]) -> np.ndarray:
-    """A layer's result when it alone is in int8."""
+    """Return a layer's result when it alone is in int8."""
     if isinstance(op, Conv):
         return rounded_to(exact[op.output + IN_INT8], core.frac_bits[op.output])
     # What only hands values on rounds nothing, because its inputs and result have one scale.
@@ -190,61 +189,8 @@ def _in_int8(op: Op, core: IntCore, exact: Mapping[str, np.ndarray]) -> np.ndarr
     return np.asarray(exact[op.output] + error)
 
 
-@dataclass(frozen=True)
-class Spread:
-    """Differences of INT8 from float, both clipped to [0, 1].
-
-    Attributes:
-        counts: (2 * 4095 + 1,) pixels by their signed difference in whole DN, from -4095 on.
-        mae: (K,) mean absolute difference of each patch, of full scale.
-        largest: (K,) largest difference of each patch, of full scale.
-    """
-
-    counts: np.ndarray
-    mae: np.ndarray
-    largest: np.ndarray
-
-    @property
-    def std_dn(self) -> float:
-        """Standard deviation in DN, of the differences in whole DN."""
-        dn = np.arange(-MAX_DN, MAX_DN + 1)
-        mean = np.average(dn, weights=self.counts)
-        return float(np.sqrt(np.average((dn - mean) ** 2, weights=self.counts)))
-
-    def share_beyond(self, dn: int) -> float:
-        """Share of the pixels that differ by more than so many whole DN."""
-        return 1 - float(self.counts[MAX_DN - dn : MAX_DN + dn + 1].sum() / self.counts.sum())
-
-    def worst(self, count: int) -> list[int]:
-        """The patches of the largest MAE, the worst first."""
-        # Stable, so that patches of equal error keep their order.
-        return [int(k) for k in np.argsort(-self.mae, kind="stable")[:count]]
-
-
-def spread_of(
-    float_session: ort.InferenceSession,
-    int8_session: ort.InferenceSession,
-    images: Iterable[np.ndarray],
-) -> Spread:
-    """Run both networks on images (1, 1, H, W) in [0, 1], one at a time."""
-    counts = np.zeros(2 * MAX_DN + 1, np.int64)
-    mae = []
-    largest = []
-    for image in images:
-        in_float, in_int8 = (
-            np.clip(run(session, image), 0, 1) for session in (float_session, int8_session)
-        )
-        difference = (in_int8 - in_float).ravel()
-        # Shifted by the largest digital number, because `bincount` counts from 0 on.
-        dn = np.rint(difference * MAX_DN).astype(np.int64) + MAX_DN
-        counts += np.bincount(dn, minlength=len(counts))
-        mae.append(float(np.abs(difference).mean()))
-        largest.append(float(np.abs(difference).max()))
-    return Spread(counts, np.array(mae), np.array(largest))
-
-
-def layer_error_rows(result: Quantised, patches: Patches) -> list[Row]:
-    """Every layer in int8 by itself, and all of them."""
+def layer_error_rows(result: Quantized, patches: Patches) -> list[Row]:
+    """Return a row for every layer in int8 by itself, and one for all of them."""
     crops = few_crops(patches.degraded, result.host)
     layers, together = layer_errors(result.graph, result.core, crops)
     source = f"{len(crops)} patches, all other layers in float"
@@ -273,7 +219,7 @@ def _sqnr(loss: Loss, source: str) -> Figure:
 
 
 def worst_row(number: int, patches: Patches, spread: Spread) -> Row:
-    """The errors of a patch; of a simulated one also what it shows through which sensor."""
+    """Return the errors of a patch; of a simulated one also what it shows through which sensor."""
     errors = {"MAE": spread.mae[number], "max": spread.largest[number]}
     kind = "simulated patch" if patches.views else "sample"
     figures = {
@@ -294,15 +240,15 @@ def worst_row(number: int, patches: Patches, spread: Spread) -> Row:
 
 
 def _mtf(sensor: Instrument) -> str:
-    """One value, or two where the sensor's axes differ: what the profile gave to this patch,
-    measured nowhere.
+    """Return one value, or two where the sensor's axes differ. The profile gave them to this patch;
+    nothing was measured.
     """
     across, along = (f"{100 * value:.3g} %" for value in sensor.mtf_axes)
     return across if across == along else f"{across} across the track, {along} along it"
 
 
 def sizes_row(spread: Spread) -> Row:
-    """How many pixels differ by more than a few DN, and by more than many."""
+    """Return the share of the pixels that differ by more than a few DN, and by more than many."""
     source = f"{len(spread.mae)} patches"
     figures = {
         f"beyond {dn} DN": measured(100 * spread.share_beyond(dn), "%", source) for dn in BEYOND_DN
@@ -314,44 +260,48 @@ MUCH_DB = 0.2
 """From here on, or below, a network has lost so much that it is worth asking where."""
 
 
-def losses(result: Quantised, gate: GateResult, patches: Patches) -> str:
-    """What INT8 costs, on the worst patch too; where that is much, which tensors cost most and what
-    to try.
+def losses(
+    result: Quantized, gate: GateResult, patches: Patches, layers: Sequence[Row] = ()
+) -> str:
+    """Return the loss of INT8 in a sentence, on the worst patch too; where it is large, also which
+    tensors cost most and what to try.
+
+    Args:
+        result: the network.
+        gate: the differences on the patches.
+        patches: that calibration did not see.
+        layers: of `layer_error_rows`, if they were computed before.
     """
-    if not math.isnan(gate.drop_db):
-        worst = (
-            f"{gate.drop_db:.2f} dB of {gate.psnr_float_db:.2f}, and "
-            f"{gate.worst_drop_db:.2f} dB where most"
-        )
-        message = f"INT8 loses {worst}"
-        much = gate.drop_db > MUCH_DB
-    else:
-        message = f"INT8 differs from float by {gate.mae:.2g} of full scale on average"
-        much = False
-    if not much:
-        return f"{message} ({gate.source})"
-    costliest = _costliest(layer_error_rows(result, patches))
+    if math.isnan(gate.drop_db):
+        mae = f"{gate.mae:.2g} of full scale on average"
+        return f"INT8 differs from float by {mae} ({gate.source})"
+    message = (
+        f"INT8 loses {gate.drop_db:.2f} dB of {gate.psnr_float_db:.2f}, and "
+        f"{gate.worst_drop_db:.2f} dB where most ({gate.source})"
+    )
+    if gate.drop_db <= MUCH_DB:
+        return message
+    costliest = _costliest(layers or layer_error_rows(result, patches))
     names = ", ".join(f"{name} ({share:.0f} %)" for name, share in costliest)
     add = ""
     if not result.core.ends.adds_image:
         add = ", or a network that ends with a global add, of which INT8 errs less"
-    return f"{message} ({gate.source}): most of it in {names}; try `finetune` auto{add}"
+    return f"{message}: most of it in {names}; try `finetune` auto{add}"
 
 
 MOST = 3
 """Layers that are named."""
 
 
-def _costliest(layers: list[Row]) -> list[tuple[str, float]]:
-    """The layers that make most of the squared error, with their shares in per cent; the last row
-    is of all.
-    """
+def _costliest(layers: Sequence[Row]) -> list[tuple[str, float]]:
+    """Return the layers that make most of the squared error, with their shares in per cent."""
+    # The last row is of all layers.
     shares = {row.name: row.figures["share of squared error"].value or 0 for row in layers[:-1]}
     return sorted(shares.items(), key=lambda share: share[1], reverse=True)[:MOST]
 
 
-def headline(gate: GateResult, layers: list[Row]) -> str:
-    """How much INT8 loses, of what kind the errors are, and which layers make most of them."""
+def headline(gate: GateResult, layers: Sequence[Row]) -> str:
+    """Return how much INT8 loses, the kind of the errors, and the layers that make most of them."""
     names = ", ".join(f"{name} {share:.0f} %" for name, share in _costliest(layers))
     drop = "" if math.isnan(gate.drop_db) else f" and costs {gate.drop_db:.2f} dB"
     return (
@@ -362,7 +312,7 @@ def headline(gate: GateResult, layers: list[Row]) -> str:
 
 
 def kind_of_error(std_over_mae: float) -> str:
-    """What std / MAE says, in one sentence."""
+    """Return what std / MAE says, in one sentence."""
     sentence = f"std / MAE is {std_over_mae:.2f}, where a Gaussian has 1.25"
     if std_over_mae <= ROUNDING:
         return f"{sentence}: the errors are mostly those of rounding."

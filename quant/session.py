@@ -87,7 +87,7 @@ def open_session(
 
 
 def open_any_size(model: onnx.ModelProto, optimise: bool = True) -> ort.InferenceSession:
-    """A session that takes patches of any size, also of a network that is fixed to one tile."""
+    """Open a session for images of any size, also of a network that is fixed to one tile."""
     return open_session(any_size(model), optimise=optimise)
 
 
@@ -104,14 +104,14 @@ def run(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:
 
 
 def result_of(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:
-    """What a network makes of (N, C, H, W) float32 in [0, 1], whatever its size."""
+    """Return the result for an image (N, C, H, W) float32 in [0, 1], whatever its size."""
     return tensors_of(session, None, image)[0]
 
 
 def tensors_of(
     session: ort.InferenceSession, names: list[str] | None, image: np.ndarray
 ) -> list[np.ndarray]:
-    """The named outputs, or all, for an image (N, 1, H, W) float32 in [0, 1]."""
+    """Return the named outputs, or all, for an image (N, 1, H, W) float32 in [0, 1]."""
     try:
         values = session.run(names, {session.get_inputs()[0].name: image})
         return [np.asarray(value) for value in values]
@@ -148,8 +148,7 @@ TILE_PX = 128
 
 
 def crops(image: np.ndarray, halo_px: int | None = 0) -> list[np.ndarray]:
-    """Crops (1, C, h, w) of at most TILE_PX a side that tile an image (1, C, H, W): small images by
-    themselves.
+    """Return crops (1, C, h, w) of at most TILE_PX a side that tile an image (1, C, H, W).
 
     Where the network has no halo, None, the image is left whole: as `tensor_values` does.
     """
@@ -163,8 +162,8 @@ def tensor_values(
     halo_px: int | None,
     ends: Ends = ONE_CHANNEL,
 ) -> Iterator[list[np.ndarray]]:
-    """The named tensors (1, C, h, w) of a plane-reading float network, tile by tile of an image (1,
-    C', H, W).
+    """Yield the named tensors (1, C, h, w) of a plane-reading float network for an image
+    (1, C', H, W), tile by tile.
 
     Each tile is computed with a halo of the pixels that its values depend on, which is then cut
     off: together the tiles hold what the whole image would have given, its zero-padded borders
@@ -187,21 +186,19 @@ def tensor_values(
 def values_of(
     graph: Graph, names: list[str], images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL
 ) -> Iterator[list[np.ndarray]]:
-    """As `tensor_values`, of a plane-reading float graph and for every tile of every image."""
+    """Yield the same of a plane-reading float graph, for every tile of every image."""
     session = open_session(graph_to_onnx(graph, names, ends.planes * ends.channels))
     for image in images:
         yield from tensor_values(session, names, image, halo_of(graph), ends)
 
 
 def planes_of(image: np.ndarray, ends: Ends = ONE_CHANNEL) -> np.ndarray:
-    """An image (N, C, H, W) in [0, 1] as a plane-reading float network takes it: (N, P, H, W)
-    float32.
-    """
+    """Return the planes (N, P, H, W) float32 of an image (N, C, H, W) in [0, 1]."""
     return ends.split(image).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)
 
 
 def halo_of(graph: Graph) -> int | None:
-    """Pixels on each side that a value can depend on: no path passes more than all of the
+    """Return the pixels on each side that a value can depend on: no path passes more than all
     convolutions.
 
     None where values are not on the image's own lattice, or windows do not keep it.
@@ -235,8 +232,8 @@ LAYER_PATCHES = 4
 
 
 def few_crops(images: Iterable[np.ndarray], model: onnx.ModelProto) -> list[np.ndarray]:
-    """One crop of each of the first few images: what is looked at layer by layer; all of it where a
-    size is fixed.
+    """Return one crop of each of the first few images, for figures of each layer; the whole image
+    where a size is fixed.
     """
     halo_px = None if fixed_tile_px(any_size(model)) is not None else 0
     return [crops(image, halo_px)[0] for image in islice(images, LAYER_PATCHES)]

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-    from beers_deploy.quant.sensitivity import Spread  # which would load torch for a plot
+    from beers_deploy.quant.gate import Spread
 
 PX_PER_INCH = 72
 FONT_PX = 13

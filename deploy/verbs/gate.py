@@ -103,12 +103,12 @@ def gate(
 
             require_library()
         # Imported here: if a library does not load, no older verdict is left either.
-        from beers_deploy.comparison import compare, name_of_samples, pair_of
+        from beers_deploy.comparison import Data, compared, pair_of
         from beers_deploy.model.io.files import write_text
         from beers_deploy.profiles.sensor import Sensor
         from beers_deploy.profiles.target import TargetProfile
         from beers_deploy.quant.limits import limits_of
-        from beers_deploy.verdict import baseline_for, judged, references_for
+        from beers_deploy.verdict import baseline_for, judged, require_references
 
         if samples is not None:
             refuse_with(
@@ -118,21 +118,13 @@ def gate(
         board = TargetProfile.load(target)
         profile = Sensor.load(sensor)
         floating, int8 = pair_of(float_network, int8_network, profile)
-        arguments = {"sensor": profile.name, "images": images, "patches": patches, "seed": seed}
-        arguments |= {"samples": name_of_samples(samples)}
-        earlier = baseline_for(baseline, arguments, allowed, metric)
+        scenes = None if images is None else Path(images)
+        data = Data(profile, samples, scenes, patches, seed)
+        earlier = baseline_for(baseline, data.arguments, allowed, metric)
         # Missing references are refused before the networks run.
-        own = references_for(floating, samples, allowed, metric)
-        comparison = compare(
-            floating,
-            int8,
-            samples=samples,
-            sensor=profile,
-            images=images,
-            patches=patches,
-            seed=seed,
-            metric=metric,
-        )
+        own = data.own(floating)
+        require_references(own, allowed, metric)
+        comparison = compared(floating, int8, data, own, metric or "")
         verdict = judged(comparison, allowed, earlier, board, own)
         asked = recorded({"limits": limits, "baseline": baseline, "metric": metric})
         verdict = replace(verdict, arguments={**verdict.arguments, **asked})

@@ -29,7 +29,7 @@ from beers_deploy.verbs.verb import recorded, refuse_with, refuse_without, verb
 if TYPE_CHECKING:
     from beers_deploy.network import Network
     from beers_deploy.profiles.figures import Row
-    from beers_deploy.quant.samples import Patches
+    from beers_deploy.quant.samples.patches import Patches
 
 logger = logging.getLogger(__name__)
 
@@ -104,12 +104,13 @@ def quantize(
         'int8'
     """
     from beers_deploy.board_file import require_core_file, save_core
+    from beers_deploy.comparison import Data
     from beers_deploy.profiles.sensor import Sensor
     from beers_deploy.profiles.target import TargetProfile
     from beers_deploy.quant.encodings import read_core
     from beers_deploy.quant.onnx_file import metadata, require_onnx_name
-    from beers_deploy.quant.sample_range import recorded_range
-    from beers_deploy.quantization import Data, quantized
+    from beers_deploy.quant.samples.coverage import recorded_range
+    from beers_deploy.quantization import quantized
     from beers_deploy.results import Table
 
     if board_file is None:
@@ -129,7 +130,7 @@ def quantize(
     require_onnx_name(*files)
     require_core_file(board, files[1], tile, inputs)
     data = Data(
-        Sensor.load(sensor), samples, None if images is None else Path(images), patches, patch, seed
+        Sensor.load(sensor), samples, None if images is None else Path(images), patches, seed, patch
     )
     result, held_out = quantized(network, data, board, finetune)
     # Both are made before the first is written: a core that is refused leaves no file.
@@ -145,7 +146,7 @@ def quantize(
     rows = list(result.layers)
     if held_out is not None:
         page = pages[0] if pages else None
-        more, sentence = _judged(result, held_out, samples is None, page)
+        more, sentence = _judged(result, held_out, page)
         rows = [*more, *rows]
         notes.append(sentence)
     assert result.origin is not None  # noqa: S101
@@ -197,9 +198,7 @@ DETAILS = frozenset(
 """Tables and figures for a closer look."""
 
 
-def _judged(
-    network: "Network", held_out: "Patches", simulated: bool, page: Path | None
-) -> "tuple[list[Row], str]":
+def _judged(network: "Network", held_out: "Patches", page: Path | None) -> "tuple[list[Row], str]":
     """Return what INT8 changes on samples that calibration did not see: rows and a sentence.
 
     With a page there are rows of layers and of the worst samples, and the page is written.
@@ -209,13 +208,14 @@ def _judged(
     from beers_deploy.report.page import write_report
 
     assert network.quantized is not None  # noqa: S101 - it was quantised here
-    differences = differences_of(network, held_out, simulated)
+    differences = differences_of(network, held_out)
     rows: list[Row] = []
     if page is not None:
-        rows, report = sensitivity_report(network, held_out, differences, network.layers)
+        rows, report = sensitivity_report(network, held_out, differences)
         write_report(report, page)
         logger.info("wrote %s: %s", page, report.headline)
-    return rows, losses(network.quantized, differences, held_out)
+    layers = [row for row in rows if row.table == "layers"]
+    return rows, losses(network.quantized, differences, held_out, layers)
 
 
 def _report_files(folder: OutputFolder | None, network: Any) -> list[Path]:

@@ -151,7 +151,7 @@ def _bit_flips(
     from beers_deploy.model.io.files import write_text
     from beers_deploy.profiles.sensor import Sensor
     from beers_deploy.profiles.target import TargetProfile
-    from beers_deploy.quant.calibration import Calibration
+    from beers_deploy.quant.samples.simulated import Calibration
     from beers_deploy.results import Table
     from beers_deploy.studies.stress.battery import TITLES
     from beers_deploy.studies.stress.bit_flips import flip_curves_svg, flip_rows

@@ -12,7 +12,7 @@ from beers_deploy.model.io.files import write_text
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.quant.calibration import Calibration
+from beers_deploy.quant.samples.simulated import Calibration
 from beers_deploy.studies.stress.bit_flips import SETS, flip_curves_svg, flip_rows
 from beers_deploy.studies.stress.networks import open_subject
 

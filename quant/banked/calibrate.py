@@ -28,7 +28,6 @@ from beers_deploy.quant.banked.filters import (
     spread_over_a_step,
     whole_bank,
 )
-from beers_deploy.quant.calibration import draw_patches
 from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, Shifts, quantize_bias
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import (
@@ -46,11 +45,12 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.graph.split_network import renamed
 from beers_deploy.quant.integer.arithmetic import convolve
-from beers_deploy.quant.passes.level import Chain
+from beers_deploy.quant.passes.equalize_single import SingleTensors
+from beers_deploy.quant.passes.residual_groups import residual_groups, single_tensors
 from beers_deploy.quant.passes.selection import ALL, Passes
-from beers_deploy.quant.passes.stream import lone_tensors, streams
 from beers_deploy.quant.quantize import Plan, rounded
-from beers_deploy.quant.samples import PATCH_PX, Remade
+from beers_deploy.quant.samples.patches import PATCH_PX, Regenerated
+from beers_deploy.quant.samples.simulated import draw_patches
 
 LIKE = "pleiades-degraded"
 """The profile that gives gain and bits; what is computed is over full scale."""
@@ -194,7 +194,7 @@ def bank_results(
 def quantize_family(
     weights: Weights,
     bank: Bank,
-    images: Remade[np.ndarray],
+    images: Sequence[np.ndarray],
     shifts: Shifts = SHIFTS,
     passes: Passes = ALL,
 ) -> Family:
@@ -266,9 +266,9 @@ def _plan(weights: Weights, shifts: Shifts, passes: Passes) -> Plan:
     scale = weights.variant.scale
     width = len(channels()) * scale**2 + SENSOR_VALUES
     ends = Ends(width, 1, adds_image=False, gains=2, outputs=scale**2, direct=True)
-    inner = tuple(lone_tensors(graph))
-    chain = Chain(inner, (weights.variant.features,) * len(inner), by_channel=False)
-    return Plan(graph, ends, streams(graph), chain, shifts, passes)
+    inner = tuple(single_tensors(graph))
+    singles = SingleTensors(inner, (weights.variant.features,) * len(inner), by_channel=False)
+    return Plan(graph, ends, residual_groups(graph), singles, shifts, passes)
 
 
 PATCHES = 80
@@ -280,7 +280,7 @@ it at theirs.
 
 def family_images(
     scenes: list[Scene], scale: int, seed: int, kernels: Kernels, patch_px: int = PATCH_PX
-) -> Remade[np.ndarray]:
+) -> Sequence[np.ndarray]:
     """What a family is calibrated on: scenes as many sensors of it see them, behind the bank of
     each.
 
@@ -304,4 +304,4 @@ def family_images(
         vector = sensor_vector(sensor).values
         return bank_results(patches.degraded[number], bank, vector, scale, kernels)
 
-    return Remade(results, len(patches.views))
+    return Regenerated(results, len(patches.views))

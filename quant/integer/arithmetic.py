@@ -1,4 +1,4 @@
-"""The integer reference's operators on whole numbers (N, C, H, W): exact products, sums, maxima,
+"""The integer reference's operators on integers (N, C, H, W): exact products, sums, maxima,
 and their bounds.
 """
 
@@ -13,7 +13,7 @@ from beers_deploy.quant.graph import Activation, AveragePool, MaxPool, Pointwise
 from beers_deploy.quant.graph.operations import SIX
 
 FLOAT32_WHOLE_MAX = 2**24
-"""Up to here float32 holds whole numbers exactly, and sums them in any order."""
+"""Up to here float32 holds integers exactly, and sums them in any order."""
 STRIP_VALUES = 1 << 22
 """Values of the windows that are laid out at a time: 16 MB of float32."""
 LEAKY_OF_256 = 26
@@ -22,8 +22,8 @@ LEAKY_OF_256 = 26
 def convolve(
     image: np.ndarray, weight: np.ndarray, window: Window, groups: int = 1, transposed: bool = False
 ) -> np.ndarray:
-    """The sums of products of a convolution with zero padding, (N, I, H, W) to (N, O, H', W')
-    int64.
+    """Return the sums of products of a convolution with zero padding, (N, I, H, W) to
+    (N, O, H', W') int64.
 
     A product of matrices a strip of rows, in floats that hold its sums exactly: the windows of a
     whole image would take kh kw times its memory.
@@ -48,7 +48,7 @@ def _padded(image: np.ndarray, window: Window, fill: int = 0) -> np.ndarray:
 
 
 def _windows(wide: np.ndarray, kernel: Sequence[int], window: Window) -> np.ndarray:
-    """The windows (N, C, H, W, kh, kw) of an image that is padded already."""
+    """Return the windows (N, C, H, W, kh, kw) of an image that is padded already."""
     rows, columns = window.strides
     tall, broad = window.dilations
     extent = (kernel[0] - 1) * tall + 1, (kernel[1] - 1) * broad + 1
@@ -58,8 +58,8 @@ def _windows(wide: np.ndarray, kernel: Sequence[int], window: Window) -> np.ndar
 def _between_zeros(
     image: np.ndarray, weight: np.ndarray, window: Window
 ) -> tuple[np.ndarray, Window]:
-    """What a transposed convolution is of stride 1 over, its kernel turned: the pixels with zeros
-    between them.
+    """Return the pixels with zeros between them. A transposed convolution is one of stride 1 over
+    these, its kernel turned.
     """
     count, channels, height, width = image.shape
     rows, columns = window.strides
@@ -75,7 +75,7 @@ def _between_zeros(
 
 
 def _products(windows: np.ndarray, weight: np.ndarray, groups: int) -> np.ndarray:
-    """Of windows (N, I, H, W, kh, kw) and weights (O, I / groups, kh, kw)."""
+    """Return the products of windows (N, I, H, W, kh, kw) and weights (O, I / groups, kh, kw)."""
     count, channels, height, width = windows.shape[:4]
     sums = np.empty((count, len(weight), height, width), np.int64)
     inputs = channels // groups
@@ -92,17 +92,15 @@ def _products(windows: np.ndarray, weight: np.ndarray, groups: int) -> np.ndarra
 
 
 def bound_of(op: IntConv, bias: np.ndarray) -> float:
-    """Bits, without the sign, that no sum exceeds: of 128 times the sizes of the weights, and the
-    bias.
+    """Return the bits, without the sign, of 128 times the weights' sizes plus the bias: no sum
+    exceeds these.
     """
     sizes = np.abs(op.weight.astype(np.int64)).sum((1, 2, 3))
     return float(np.log2(max(int((128 * sizes + np.abs(bias)).max()), 1)))
 
 
 def activated(sums: np.ndarray, activation: Activation, frac_bits: int) -> tuple[np.ndarray, int]:
-    """The sums behind an activation that is computed on them, and how many fractional bits they
-    have gained.
-    """
+    """Return the sums behind an activation, and the fractional bits that they have gained."""
     if activation is Activation.relu:
         return np.maximum(sums, 0), 0
     if activation is Activation.relu6:
@@ -114,15 +112,15 @@ def activated(sums: np.ndarray, activation: Activation, frac_bits: int) -> tuple
 
 
 def window_maxima(image: np.ndarray, op: MaxPool) -> np.ndarray:
-    """The largest value of each window (N, C, H, W), padding never."""
+    """Return the largest value of each window (N, C, H, W), padding never."""
     # No value is below the smallest of the type, so the padding never is a window's maximum.
     wide = _padded(image, op.window, int(np.iinfo(image.dtype).min))
     return np.asarray(_windows(wide, op.kernel, op.window).max((4, 5)))
 
 
 def means(image: np.ndarray, op: AveragePool) -> tuple[np.ndarray, int, float]:
-    """Each window's sum times the DPU's factor, the shift behind it, and the bits that it cannot
-    exceed.
+    """Return each window's sum times the DPU's factor, the shift behind it, and the bits that it
+    cannot exceed.
     """
     assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
     factor, shift = mean_factor(op.kernel)
@@ -133,7 +131,7 @@ def means(image: np.ndarray, op: AveragePool) -> tuple[np.ndarray, int, float]:
 
 
 def enlarged(image: np.ndarray, factor: int) -> tuple[np.ndarray, int, float]:
-    """Bilinear enlargement with half-pixel centres, its edges repeated: sums, the shift behind
+    """Enlarge by bilinear weights with half-pixel centres, edges repeated: sums, the shift behind
     them, their bits.
     """
     weight, shift = bilinear_weights(factor)
@@ -173,7 +171,7 @@ def mean_factor(kernel: tuple[int, int]) -> tuple[int, int]:
 
 
 def bilinear_weights(factor: int) -> tuple[np.ndarray, int]:
-    """Whole weights (factor^2, 3, 3) of each phase of a bilinear enlargement by 2 or 4, and the
+    """Return integer weights (factor^2, 3, 3) of each phase of an enlargement by 2 or 4, and the
     shift behind them.
     """
     places = (np.arange(factor) + 0.5) / factor - 0.5  # half-pixel centres, in input pixels
@@ -190,9 +188,7 @@ def six_in_units(frac_bits: int) -> int:
 
 
 def activation_table(op: Pointwise, frac_bits: Mapping[str, int]) -> np.ndarray:
-    """What an activation makes of every int8 value from -128 on: (256,) int16, rounded half up,
-    clipped.
-    """
+    """Return an activation of every int8 value from -128 on: (256,) int16, clipped."""
     values = op.activation(np.arange(INT8_MIN, INT8_MAX + 1) * 2.0 ** -frac_bits[op.input])
     # The DPU rounds activations half up, where np.rint would round half to even.
     units = np.floor(values * 2.0 ** frac_bits[op.output] + 0.5)

@@ -1,4 +1,4 @@
-"""The DPU's arithmetic in whole numbers, as documented, independent of any runtime (facts: UG1414
+"""The DPU's arithmetic in integers, as documented, independent of any runtime (facts: UG1414
 3.5, vai_q).
 
     convolution: int8 products added in int32, plus bias << shift_bias, ReLU,
@@ -57,7 +57,7 @@ BITS_SOURCE = "128 times the sum of the weights' sizes, plus the bias: no input 
 
 @dataclass(frozen=True)
 class Faults:
-    """What goes wrong while the core runs, or is held in check.
+    """Faults that are injected while the core runs, and guards against them.
 
     Attributes:
         shifts: wrong shifts, by operation and field: `shift_cut`, `shift_bias` of a convolution,
@@ -70,7 +70,7 @@ class Faults:
     touch: Callable[[str, np.ndarray], np.ndarray] = field(default=lambda _, tensor: tensor)
 
     def shift(self, op: str, name: str, meant: int) -> int:
-        """The shift that an operation uses."""
+        """Return the shift that an operation uses."""
         return self.shifts.get((op, name), meant)
 
 
@@ -79,7 +79,7 @@ SOUND = Faults()
 
 @dataclass(frozen=True)
 class LayerReport:
-    """What one operation did on the images it saw.
+    """What one operation did on the images that it was run on.
 
     Attributes:
         name: of the operation.
@@ -100,7 +100,9 @@ class LayerReport:
 def run_core(
     core: IntCore, planes: np.ndarray, half_even: bool = False, faults: Faults = SOUND
 ) -> tuple[dict[str, np.ndarray], list[LayerReport]]:
-    """Every tensor of the core for its int8 planes (N, P, H, W), as int16, and a report a layer."""
+    """Return every tensor of the core for its int8 planes (N, P, H, W), as int16, and a report a
+    layer.
+    """
     tensors = {PLANES: faults.touch(PLANES, planes.astype(np.int16))}
     reports = []
     for op in core.ops:
@@ -117,15 +119,15 @@ def run_core(
 
 
 def correction(core: IntCore, planes: np.ndarray, half_even: bool = False) -> np.ndarray:
-    """The correction (N, C, H, W), all its copies, as float32 multiples of its scale, of int8
-    planes (N, P, H, W).
+    """Return the correction (N, C, H, W) for int8 planes (N, P, H, W), all its copies, as float32
+    multiples of its scale.
     """
     tensors, _ = run_core(core, planes, half_even)
     return np.asarray(tensors[CORRECTION] * np.float32(core.scale(CORRECTION)), np.float32)
 
 
 def merged_correction(core: IntCore, tensors: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The correction (N, C, H, W) of full scale as the host reads it, from the tensors of a run."""
+    """Return the correction (N, C, H, W) of full scale as the host reads it from the tensors."""
     scale = core.scale(CORRECTION)
     return core.ends.merge((tensors[CORRECTION] * np.float32(scale)).astype(np.float32), scale)
 
@@ -142,7 +144,7 @@ INT8_BITS = 7.0
 def layer_sums(
     core: IntCore, op: IntConv | Op, tensors: Mapping[str, np.ndarray], faults: Faults = SOUND
 ) -> Sums:
-    """What an operation adds up, before it is rounded to int8.
+    """Return the sums of an operation before they are rounded to int8.
 
     Args:
         core: of the operation.
@@ -169,7 +171,7 @@ def layer_sums(
 
 
 def _moving(core: IntCore, op: Op, inputs: list[np.ndarray]) -> np.ndarray:
-    """What hands values on, or looks them up."""
+    """Return values that are handed on, or looked up."""
     if isinstance(op, Concat):
         return np.concatenate(inputs, axis=1)
     if isinstance(op, MaxPool):
@@ -198,7 +200,7 @@ def _conv(core: IntCore, op: IntConv, image: np.ndarray, faults: Faults) -> Sums
 
 
 def _add(core: IntCore, op: Add, inputs: list[np.ndarray], faults: Faults) -> Sums:
-    """The sum at the finer input's scale, exact; the shift that remains; and its bits."""
+    """Return the exact sum at the finer input's scale, the shift that remains, and its bits."""
     finest = max(core.frac_bits[name] for name in op.inputs)
     shifts = [finest - core.frac_bits[name] for name in op.inputs]
     # At the finest scale no input loses a bit, so the result is rounded once.
@@ -214,7 +216,7 @@ def _add(core: IntCore, op: Add, inputs: list[np.ndarray], faults: Faults) -> Su
 
 
 def rounded(sums: np.ndarray, shift: int, half_even: bool) -> tuple[np.ndarray, float]:
-    """Sums divided by 2^shift and rounded, not clipped; and the share that lay half-way."""
+    """Return sums divided by 2^shift and rounded, not clipped; and the share that lay half-way."""
     if shift <= 0:
         return sums << min(-shift, 8), 0.0  # by 8 all but 0 lies beyond int8
     half = 1 << (shift - 1)
@@ -228,7 +230,7 @@ def rounded(sums: np.ndarray, shift: int, half_even: bool) -> tuple[np.ndarray, 
 
 
 def saturated(whole: np.ndarray) -> np.ndarray:
-    """Whole numbers clipped to int8, as int16."""
+    """Clip integers to int8, as int16."""
     return np.asarray(np.clip(whole, INT8_MIN, INT8_MAX), np.int16)
 
 
@@ -265,7 +267,7 @@ def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreem
     """Run the core by both rules and in onnxruntime.
 
     Args:
-        core: whole numbers.
+        core: the integers.
         host: the same in the host's encoding.
         image: (N, C, H, W) in [0, 1].
     """
@@ -289,8 +291,8 @@ def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreem
 def integer_rows(
     model: onnx.ModelProto, core: IntCore, host: onnx.ModelProto, images: Iterable[np.ndarray]
 ) -> tuple[Row, ...]:
-    """Each integer operation on a crop of a few images (1, C, H, W); last what the DPU's tie
-    rounding changes.
+    """Return a row for each integer operation on a crop of a few images (1, C, H, W), and last one
+    for what the DPU's tie rounding changes.
     """
     patches = few_crops(images, model)
     agreements = [agreement(core, host, crop) for crop in patches]
@@ -332,8 +334,8 @@ def _layer_row(layers: list[LayerAgreement], source: str) -> Row:
 
 
 def _rounding_row(in_float: list[np.ndarray], results: list[list[np.ndarray]], source: str) -> Row:
-    """How far the DPU's rounding of ties, up, leads away from the runtime's, to even; which is
-    nearer to float.
+    """Return how far the DPU's rounding of ties, up, leads away from the runtime's, to even, and
+    which is nearer to float.
     """
     up, even = (np.concatenate([pair[k].ravel() for pair in results]) for k in (0, 1))
     floats = np.concatenate([result.ravel() for result in in_float])

@@ -1,7 +1,7 @@
-"""The integer core in torch, so that its numbers can be trained: whole numbers forwards, slopes
+"""The integer core in torch, so that its numbers can be trained: integers forwards, slopes
 backwards.
 
-Forwards every tensor holds the very whole numbers of `quant.integer.reference`. Backwards rounding
+Forwards every tensor holds the very integers of `quant.integer.reference`. Backwards rounding
 counts as the identity, and clipping as what it is (the straight-through estimator, Bengio et al.
 2013). A step costs about what one of the float network does: weights carry the shift to the
 result's unit, biases what makes ties round up, and one pass over the sums clips them, another
@@ -11,6 +11,7 @@ A result in windows or two gains is trained as one copy of it, which is not roun
 what the host computes by up to half a unit. `TrainableCore.core` makes the other copies.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
@@ -48,11 +49,11 @@ Bits = Mapping[str, int]
 
 
 NEAR = 0.49
-"""How far from int8's ends a value may lie and is not clipped: what is rounded to them."""
+"""How far beyond int8's ends a value may lie without being clipped, because it rounds to them."""
 
 
 def to_int8(values: Tensor, low: int = INT8_MIN, high: int = INT8_MAX) -> Tensor:
-    """Rounded, ties to even, and clipped; the slope is 1, and 0 where it is clipped."""
+    """Round, ties to even, and clip; the slope is 1, and 0 where it is clipped."""
     # hardtanh has slope 0 outside its limits, so a value must pass as long as it rounds to an end.
     clipped = functional.hardtanh(values, low - NEAR, high + NEAR)
     # Rounding `data` is unseen by autograd: backwards it counts as the identity.
@@ -64,12 +65,12 @@ class TrainableCore(torch.nn.Module):
     """An integer core whose weights and biases are parameters, in units of their own scale; all
     scales stay.
 
-    They may lie between whole numbers while they are trained; forwards the nearest whole numbers
+    They may lie between integers while they are trained; forwards the nearest integers
     count.
     """
 
     def __init__(self, core: IntCore) -> None:
-        """Parameters that begin at the core's whole numbers."""
+        """Start the parameters at the core's integers."""
         super().__init__()
         self._core = core
         self._convs = [_one_copy(op, core.ends) for op in core.convolutions]
@@ -80,7 +81,7 @@ class TrainableCore(torch.nn.Module):
             self.biases[-1].data.copy_(torch.from_numpy(_window_bias(self._convs[-1], core.ends)))
 
     def core(self) -> IntCore:
-        """The core with its weights and biases as they stand, in whole numbers."""
+        """Return the core with its weights and biases as they stand, in integers."""
         weights = map(_whole, self.weights)
         biases = map(_whole, self.biases)
         trained = {
@@ -98,11 +99,11 @@ class TrainableCore(torch.nn.Module):
         return replace(self._core, ops=tuple(ops), ends=ends)
 
     def forward(self, planes: Tensor) -> Tensor:
-        """The one correction (N, C, H, W) in float, of int8 planes (N, P, H, W) as float32."""
+        """Return the one correction (N, C, H, W) for int8 planes (N, P, H, W), both in float32."""
         return self.tensors(planes)[CORRECTION] * self._core.scale(CORRECTION)
 
     def tensors(self, planes: Tensor) -> dict[str, Tensor]:
-        """Every tensor (N, C, H, W) by its name in whole numbers; of a correction in copies one,
+        """Return every tensor (N, C, H, W) by its name in integers; of a correction in copies one,
         unrounded.
         """
         tensors = {PLANES: planes}
@@ -116,7 +117,7 @@ class TrainableCore(torch.nn.Module):
         return tensors
 
     def _convolved(self, op: IntConv, weight: Tensor, bias: Tensor, image: Tensor) -> Tensor:
-        """A convolution's result, of its parameters and what it reads."""
+        """Return a convolution's result from its parameters and its input."""
         ends = self._core.ends
         frac_bits = self._core.frac_bits[op.output]
         # Scaled parameters give sums in the result's unit, which saves a pass over the sums. The
@@ -141,7 +142,7 @@ def _whole(values: Tensor) -> np.ndarray:
 
 
 def _products(op: IntConv, image: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """The sums of a convolution, padding inside it as far as it is the same on both sides."""
+    """Return the sums of a convolution."""
     window = op.window
     top, left, bottom, right = window.pads
     # torch pads both sides alike; only the surplus of one side costs a copy of the image.
@@ -164,7 +165,7 @@ def _products(op: IntConv, image: Tensor, weight: Tensor, bias: Tensor) -> Tenso
 
 
 def _lift(activation: Activation = Activation.none) -> float:
-    """What sums are raised by, in their unit, so that ties to even become ties up and nothing else
+    """Return what sums are raised by, in their unit: ties to even become ties up, and nothing else
     moves.
 
     LeakyReLU divides the unit by 128 and what is added by ten.
@@ -174,7 +175,7 @@ def _lift(activation: Activation = Activation.none) -> float:
 
 
 def _rounded(sums: Tensor, activation: Activation, frac_bits: int) -> Tensor:
-    """Lifted sums behind their activation, in int8."""
+    """Apply an activation to lifted sums, and round to int8."""
     if activation is Activation.leaky_relu:
         sums = functional.leaky_relu(sums, LEAKY_SLOPE)
     # ReLU and ReLU6 are limits of the same clip that int8 needs, so they cost no pass.
@@ -184,13 +185,13 @@ def _rounded(sums: Tensor, activation: Activation, frac_bits: int) -> Tensor:
 
 
 def _add(op: Add, inputs: Sequence[Tensor], bits: Bits) -> Tensor:
-    """Nothing is rounded, nor lifted, where the result is as fine as what is added."""
+    """Add two tensors at the scale of the result."""
     frac_bits = bits[op.output]
     finest = max(bits[name] for name in op.inputs)
     terms = []
     for name, values in zip(op.inputs, inputs, strict=True):
         power = frac_bits - bits[name]
-        # In a stream of one scale the power is 0, and a product by 1 would be another pass.
+        # In a residual group of one scale the power is 0, and a product by 1 would be another pass.
         terms.append(values * 2.0**power if power else values)
     sums = terms[0] + terms[1]
     # A result as fine as its inputs has no ties to lift.
@@ -238,25 +239,15 @@ def _resize(op: Resize, inputs: Sequence[Tensor], _: Bits) -> Tensor:
 
 
 def _shuffle(op: Shuffle, inputs: Sequence[Tensor], _: Bits) -> Tensor:
-    image = inputs[0]
-    squares = op.block**2
-    # torch knows one order of the channels alone, in which a channel's own pixels lie together.
-    if op.up:
-        groups = image if op.columns_first else _turned(image, squares)
-        return functional.pixel_shuffle(groups, op.block)
-    places = functional.pixel_unshuffle(image, op.block)
-    return places if op.columns_first else _turned(places, places.shape[1] // squares)
-
-
-def _turned(image: Tensor, outer: int) -> Tensor:
-    """Channels of so many groups, their places in the groups counted first."""
-    count, channels, height, width = image.shape
-    groups = image.reshape(count, outer, channels // outer, height, width)
-    return groups.transpose(1, 2).reshape(count, channels, height, width)
+    # The operation itself says where each value goes; gathering has the inverse as its slope.
+    count, *shape = inputs[0].shape
+    order = np.asarray(op(np.arange(math.prod(shape)).reshape(1, *shape)))
+    places = torch.from_numpy(order.ravel())
+    return inputs[0].reshape(count, -1)[:, places].reshape(count, *order.shape[1:])
 
 
 def _pointwise(op: Pointwise, inputs: Sequence[Tensor], bits: Bits) -> Tensor:
-    """Its table's values, with the function's slope between neighbours."""
+    """Return the values of its table, with the function's slope between neighbours."""
     units = np.arange(INT8_MIN, INT8_MAX + 1)
     smooth = op.activation(units * 2.0 ** -bits[op.input]) * 2.0 ** bits[op.output]
     image = inputs[0]
@@ -282,7 +273,7 @@ _OPERATIONS: Mapping[type, Callable[..., Tensor]] = MappingProxyType(
 
 
 def _one_copy(op: IntConv, ends: Ends) -> IntConv:
-    """Of a convolution that writes copies of the result the first fine one; any other as it is."""
+    """Return the first fine copy of a convolution that writes copies; any other as it is."""
     if op.output != CORRECTION or ends.copies == 1:
         return op
     first = ends.outputs if ends.offsets else 0
@@ -296,14 +287,14 @@ def _one_copy(op: IntConv, ends: Ends) -> IntConv:
 def _all_copies(
     last: IntConv, ends: Ends, weight: np.ndarray, bias: np.ndarray
 ) -> tuple[IntConv, Ends]:
-    """All copies moved as one was trained, the coarse one by an eighth; a window's bias moves the
+    """Move all copies as one was trained, the coarse one by an eighth; a window's bias moves the
     host's offsets.
 
     Args:
         last: the convolution that writes the copies, as it was.
         ends: of the core, as they were.
-        weight: of the copy that was trained, (O, I, kh, kw) in whole numbers.
-        bias: of that copy, (O,), in whole numbers; of a window in units of its scale with the
+        weight: of the copy that was trained, (O, I, kh, kw) in integers.
+        bias: of that copy, (O,), in integers; of a window in units of its scale with the
             offset.
     """
     one = _one_copy(last, ends)
@@ -322,11 +313,11 @@ def _all_copies(
 
 
 def _window_bias(one: IntConv, ends: Ends) -> np.ndarray:
-    """What the DPU and the host add to a result in windows, (O,) in units of the bias."""
+    """Return what the DPU and the host add to a result in windows, (O,) in units of the bias."""
     return np.asarray(one.bias + np.array(ends.offsets[0]) * 2.0**one.bias_frac_bits, np.float32)
 
 
 def _moved(copies: np.ndarray, shares: np.ndarray, move: np.ndarray) -> np.ndarray:
-    """Copies one behind the other, each moved by its share, in whole numbers."""
+    """Move copies, which lie one behind the other, each by its share, in integers."""
     moves = np.rint(np.multiply.outer(shares, move)).reshape(copies.shape)
     return np.asarray(np.clip(copies + moves, INT8_MIN, INT8_MAX), np.int8)

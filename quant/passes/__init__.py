@@ -1,5 +1,9 @@
-"""What makes INT8 lose less than rounding every tensor would: one file a pass, each with its
-reason.
+"""Passes that make INT8 lose less than rounding every tensor would, one file each.
 
-`benchmarks/ablation.py` measures what each buys.
+- `least_squares`: the scale of each tensor.
+- `residual_groups`: the tensors that adds connect, and those that stand alone.
+- `equalize`, `equalize_single`: factors for the channels of both; `trial`: what factors cost.
+- `dual_range`: the result in copies of several scales.
+- `finetune`: the integers trained with their rounding.
+- `selection`: the passes to apply; `benchmarks/ablation.py` measures what each buys.
 """

@@ -14,11 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import beers_deploy as bd
-from beers_deploy.baseline import Baseline, data_inputs, read_baseline, sensor_input
+from beers_deploy.comparison import Data, sensor_input
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Check, Row, measured
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.results import Input, Table
+from beers_deploy.verdict import Baseline, read_baseline
 from tests.deploy.command_line import done, refused
 
 ASKED: dict[str, Any] = {"sensor": "pleiades-degraded", "images": None, "patches": 2, "seed": 0}
@@ -206,7 +207,8 @@ def test_a_folder_is_known_by_its_files(change: str, tmp_path: Path) -> None:
     folder.mkdir()
     (folder / "a.tif").write_bytes(b"1")
     (folder / "b.tif").write_bytes(b"2")
-    before = data_inputs(folder, None)
+    data = Data(Sensor.load("pleiades-degraded"), images=folder)
+    before = data.inputs
     # A file that is not read as a scene does not count.
     (folder / "gate.json").touch()
     if change == "content":
@@ -215,7 +217,7 @@ def test_a_folder_is_known_by_its_files(change: str, tmp_path: Path) -> None:
         (folder / "a.tif").rename(folder / "c.tif")
     elif change == "one more":
         (folder / "c.tif").write_bytes(b"")
-    assert (data_inputs(folder, None) == before) == (change == "none")
+    assert (data.inputs == before) == (change == "none")
 
 
 def test_a_baseline_holds_the_mae(scenes: Path, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The gate catches faults of quantised files, and a CI job can read its verdict."""
 
 import json
+import math
 import runpy
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,8 +23,8 @@ from beers_deploy.profiles.figures import Bound, Check
 from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.encodings import read_core
-from beers_deploy.quant.gate import compare, judge, judge_saturation
-from beers_deploy.quant.limits import Limits, limits_of
+from beers_deploy.quant.gate import compare
+from beers_deploy.quant.limits import BREAKABLE, Limits, judge, limits_of
 from beers_deploy.quant.onnx_file import (
     GraphWriter,
     image_info,
@@ -32,7 +33,8 @@ from beers_deploy.quant.onnx_file import (
     metadata,
     save_onnx,
 )
-from beers_deploy.quant.samples import CALIBRATED_ON, Patches, digest_of
+from beers_deploy.quant.samples.own import CALIBRATED_ON, digest_of
+from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.structure import Relus, count_relus, rounded_tensors, saturated_shares
 from beers_deploy.results import Table
@@ -61,11 +63,9 @@ def failed(
     model = onnx.load(shipped_pair("convbeers-xs")[1])
     spoil(model)
     save_onnx(model, folder / "spoilt.onnx")
-    result = compare(open_session(reference_model), open_session(model), unseen.pairs)
+    result = compare(open_session(reference_model), open_session(model), unseen)
     limits = Limits(std_over_mae=2.5, saturated=0.001)
-    checks = judge(result, limits) + judge_saturation(
-        saturated_shares(model, unseen.degraded), limits
-    )
+    checks = judge(result, limits, shares=saturated_shares(model, unseen.degraded))
     checks += file_checks(reference_model, Network(model, "spoilt"), TargetProfile.load("vck190"))
     return {check.name for check in checks if not check.passed}
 
@@ -175,30 +175,19 @@ def test_limits_come_from_a_file(tmp_path: Path) -> None:
     assert limits_of(path) == Limits(mae_growth=1.2)
 
 
-UNBREAKABLE = [
-    "mae = inf",
-    "mae = 0.5",
-    "p999 = 1.1",
-    "saturated = 2",
-    "mae_growth = inf",
-    "std_over_mae = 1e300",
-]
-UNBREAKABLE += ["psnr_drop_db = inf", "min_psnr_float_int8_db = 1e-9"]
-
-
-@pytest.mark.parametrize("text", UNBREAKABLE)
-def test_a_limit_that_no_network_breaks_is_refused(text: str, tmp_path: Path) -> None:
-    (tmp_path / "gate.toml").write_text(text)
-    name, value = text.split(" = ")
-    for limits in (
-        tmp_path / "gate.toml",
-        {name: float(value)},
-        replace(Limits(), **{name: float(value)}),
-    ):
-        with pytest.raises(OptionError, match="broken network"):
-            limits_of(limits)
+@pytest.mark.parametrize("name", BREAKABLE)
+def test_a_limit_that_no_network_breaks_is_refused(name: str, tmp_path: Path) -> None:
+    low, high = BREAKABLE[name]
+    for value in (low, high):
+        assert limits_of({name: value}) == replace(Limits(), **{name: value})
+    for value in (high * 1.001, math.inf, *([low / 1.001] if low else [])):
+        (tmp_path / "gate.toml").write_text(f"{name} = {value}")
+        one = {name: value}
+        for limits in (tmp_path / "gate.toml", one, replace(Limits(), **one)):
+            with pytest.raises(OptionError, match="broken network"):
+                limits_of(limits)
     with pytest.raises(OptionError, match="max_mae"):
-        limits_of(None, float("inf"))
+        limits_of(None, math.inf)
 
 
 NO_LIMITS = [
@@ -226,8 +215,10 @@ def test_limits_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
 
 
 def test_without_8_bit_results_no_limit_on_them_is_kept() -> None:
-    assert judge_saturation({}, Limits()) == []
-    (check,) = judge_saturation({}, Limits(saturated=0.5))
+    result = bd.compare("convbeers-xs", patches=1).result
+    unlimited = len(judge(result, Limits(), shares={}))
+    *others, check = judge(result, Limits(saturated=0.5), shares={})
+    assert len(others) == unlimited
     assert not check.passed
     assert "none is 8-bit" in check.found
 
@@ -335,10 +326,11 @@ def test_what_is_no_image_is_compared_unclipped_and_other_shapes_are_refused() -
         ends = [image_info("x", 1, None)], [image_info("y", channels, None)]
         return open_session(make_model(w.graph("g", *ends), {}))
 
-    pairs = [(np.random.default_rng(0).random((1, 1, 8, 9), np.float32), np.empty(0, np.float32))]
-    assert compare(shifted(-2), shifted(-3), pairs).mae == pytest.approx(1)
+    image = np.random.default_rng(0).random((1, 1, 8, 9), np.float32)
+    patches = Patches([(image, np.empty(0, np.float32))], [image])
+    assert compare(shifted(-2), shifted(-3), patches).mae == pytest.approx(1)
     with pytest.raises(ModelError, match="1 x 3 x 8 x 9"):
-        compare(shifted(0), shifted(0, 3), pairs)
+        compare(shifted(0), shifted(0, 3), patches)
 
 
 def test_samples_without_contrast_judge_nothing() -> None:
@@ -363,14 +355,14 @@ def test_a_baseline_shows_a_wrong_bias_in_nearly_any_layer(factor: int, unseen: 
     weights, path = shipped_pair(SMALL, BLIND)
     session = open_session(float_model(weights))
     intact = onnx.load(path)
-    before = compare(session, open_session(intact), unseen.pairs).mae
+    before = compare(session, open_session(intact), unseen).mae
     biases = [node.input[8] for node in intact.graph.node if node.op_type == "QLinearConv"]
     names = [name for name in biases if name not in ("bank.bias", "analytic.bias")]
     assert len(names) == 11
     hidden = set()
     for name in names:
         model = changed(intact, name, lambda bias: bias * factor)
-        checks = judge(compare(session, open_session(model), unseen.pairs), Limits(), before)
+        checks = judge(compare(session, open_session(model), unseen), Limits(), before)
         hidden |= {name.removesuffix(".bias")} if all(check.passed for check in checks) else set()
     assert hidden == {"body.2.second", "body.3.second"} | ({"body.3.first"} if factor else set())
 

@@ -24,7 +24,7 @@ from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.banked.family import FAMILY, WEIGHTS
 from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
-from beers_deploy.quant.samples import CALIBRATED_ON
+from beers_deploy.quant.samples.own import CALIBRATED_ON
 from beers_deploy.results import Table
 from beers_deploy.verbs.gate import gate
 from tests.deploy.command_line import done, refused

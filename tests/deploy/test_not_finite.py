@@ -17,6 +17,7 @@ from beers_deploy.quant.gate import compare
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.session import open_session
 from tests.deploy.command_line import done
+from tests.quant.quick import patches_of
 
 VARIANT = "convbeers-xs"
 INT8 = f"{VARIANT}-int8"
@@ -139,4 +140,4 @@ def test_the_gate_does_not_take_an_infinite_pixel_for_full_scale() -> None:
         helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     )
     image = np.full((1, 1, 8, 8), 0.5, np.float32)
-    assert np.isnan(compare(session, session, [(image, image)]).mae)
+    assert np.isnan(compare(session, session, patches_of([image])).mae)

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import jsonschema
+import numpy as np
 import pytest
 
 from beers_deploy.profiles.figures import (
@@ -16,8 +17,9 @@ from beers_deploy.profiles.figures import (
     published,
     unavailable,
 )
-from beers_deploy.quant.gate import GateResult, gate_row, judge
-from beers_deploy.quant.limits import Limits
+from beers_deploy.quant.gate import GateResult, Spread, gate_row
+from beers_deploy.quant.limits import Limits, judge
+from beers_deploy.quant.samples.coverage import SampleRange
 from beers_deploy.results import SCHEMA_PATH, Table
 
 SCHEMA = json.loads(SCHEMA_PATH.read_text())
@@ -105,7 +107,9 @@ def test_a_gate_on_a_network_gone_wrong_still_writes_json(value: float, tmp_path
     """A network that gives NaN has no MAE: unavailable with a reason, in JSON that every reader
     takes.
     """
-    result = GateResult(value, value, value, value, value, value, value, value, patches=1)
+    coverage = SampleRange(0, 0, 1, 1, 0)
+    spread = Spread(np.ones(1), np.zeros(1), np.zeros(1))
+    result = GateResult(*[value] * 8, patches=1, sample_range=coverage, spread=spread)
     checks = tuple(judge(result, Limits(mae=1.0)))
     Table("gate", {}, (), (gate_row(result),), checks).save(tmp_path / "gate.json")
     jsonschema.validate(strictly((tmp_path / "gate.json").read_text()), SCHEMA)

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from beers_deploy.baseline import read_document
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Check, Row, measured, predicted
 from beers_deploy.results import Table
+from beers_deploy.verdict import read_document
 
 
 def test_a_document_is_read_as_it_was_written(tmp_path: Path) -> None:

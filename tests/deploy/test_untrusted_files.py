@@ -16,7 +16,6 @@ import tifffile
 import torch
 from typer.testing import CliRunner
 
-from beers_deploy.baseline import PATCHES, read_baseline, read_document
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.model.convbeers import arrays, load_network
 from beers_deploy.model.dataset import _read_summary
@@ -35,6 +34,7 @@ from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.journal import FinishedRow, journal_text
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.results import Table
+from beers_deploy.verdict import PATCHES, read_baseline, read_document
 from tests.deploy.command_line import refused
 from tests.fuzz.networks import checkpoint_seeds, go_on
 from tests.fuzz.parsers import JOB, SHAPE

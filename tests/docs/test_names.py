@@ -27,7 +27,7 @@ TERMS = (
     "told sensor",
     "DPU",
     "MTF",
-    "residual stream",
+    "residual group",
     "encoding",
     "gate",
     "swath",

@@ -11,7 +11,7 @@ import torch
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.quant.samples import read_samples
+from beers_deploy.quant.samples.own import read_samples
 from examples.networks import NETWORKS, build
 from examples.samples import GAINS, batches, bright, main
 from examples.train_network import criterion
@@ -68,7 +68,7 @@ def test_a_file_of_samples_is_read_as_data(
     out = tmp_path / "samples.npz"
     assert main([name, "--count", "5", "--out", str(out)]) == 0
     assert "wrote" in capsys.readouterr().out
-    pairs = list(read_samples(out, NETWORKS[name].inputs, None).pairs)
+    pairs = list(read_samples(out, NETWORKS[name].inputs, None).all.pairs)
     assert len(pairs) == 5
     assert (pairs[0][1].size > 0) == NETWORKS[name].restores
 

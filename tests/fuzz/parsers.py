@@ -11,7 +11,6 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from beers_deploy.baseline import PATCHES, read_baseline, read_document
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.model import Layers
@@ -35,6 +34,7 @@ from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.journal import FinishedRow, journal_text
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.results import Table
+from beers_deploy.verdict import PATCHES, read_baseline, read_document
 from tests.deploy.dpu.graphs import integer_convbeers
 from tests.deploy.studies.detection.folders import coco, voc
 from tests.fuzz.detection import (

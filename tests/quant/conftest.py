@@ -8,8 +8,8 @@ from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.graph import Graph, correction_graph, read_planes
-from beers_deploy.quant.quantize import Quantised, quantize_model
-from beers_deploy.quant.samples import Patches
+from beers_deploy.quant.quantize import Quantized, quantize_model
+from beers_deploy.quant.samples.patches import Patches
 from tests.model.networks import plain
 from tests.quant.quick import drawn
 
@@ -46,5 +46,5 @@ def unseen() -> Patches:
 
 
 @pytest.fixture(scope="session")
-def quantized(float_onnx: onnx.ModelProto, patches: Patches) -> Quantised:
+def quantized(float_onnx: onnx.ModelProto, patches: Patches) -> Quantized:
     return quantize_model(float_onnx, patches, {"seed": "5"})

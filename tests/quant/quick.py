@@ -14,7 +14,6 @@ from onnxruntime.quantization import CalibrationDataReader
 
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.quant.calibration import draw_patches
 from beers_deploy.quant.ends import ONE_CHANNEL, Ends
 from beers_deploy.quant.graph import (
     CORRECTION,
@@ -27,8 +26,9 @@ from beers_deploy.quant.graph import (
     same,
 )
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
-from beers_deploy.quant.quantize import Quantised, quantize_model
-from beers_deploy.quant.samples import Patches, Remade
+from beers_deploy.quant.quantize import Quantized, quantize_model
+from beers_deploy.quant.samples.patches import Patches
+from beers_deploy.quant.samples.simulated import draw_patches
 from beers_deploy.quant.session import open_session, planes_of
 
 
@@ -40,11 +40,7 @@ def image(height: int = 37, width: int = 53, seed: int = 0) -> np.ndarray:
 
 def patches_of(images: list[np.ndarray]) -> Patches:
     """These images, each its own reference."""
-    return Patches(
-        [],
-        Remade(lambda k: (images[k], images[k]), len(images)),
-        Remade(lambda k: images[k], len(images)),
-    )
+    return Patches([(image, image) for image in images], images)
 
 
 def drawn(count: int, seed: int, scene: int = 1, patch_px: int = 128) -> Patches:
@@ -116,15 +112,15 @@ def changed(
 @contextmanager
 def one_guess() -> Iterator[None]:
     """One guess in the place of the search that equalises channels."""
-    guess: dict[str, Any] = {"LEVELLING": (0.5,), "HEADROOM": (1.0,)}
+    guess: dict[str, Any] = {"GAMMAS": (0.5,), "HEADROOM": (1.0,)}
     with (
-        patch.multiple("beers_deploy.quant.passes.equalise", STEPS=(), **guess),
-        patch.multiple("beers_deploy.quant.passes.level", **guess),
+        patch.multiple("beers_deploy.quant.passes.equalize", STEPS=(), **guess),
+        patch.multiple("beers_deploy.quant.passes.equalize_single", **guess),
     ):
         yield
 
 
-def quickly(model: onnx.ModelProto, patches: Patches, **more: Any) -> Quantised:
+def quickly(model: onnx.ModelProto, patches: Patches, **more: Any) -> Quantized:
     with one_guess():
         return quantize_model(model, patches, {}, **more)
 

@@ -23,7 +23,7 @@ from beers_deploy.quant.graph import (
     read_planes,
 )
 from beers_deploy.quant.quantize import quantize_model
-from beers_deploy.quant.samples import Patches
+from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session
 from tests.quant.quick import changed, one_guess, quickly
 
@@ -85,7 +85,7 @@ def test_a_layer_that_never_fires_costs_nothing(
     def mae(model: onnx.ModelProto) -> float:
         with one_guess():
             int8 = quantize_model(model, patches, {}).host
-        return compare(open_session(model), open_session(int8), unseen.pairs).mae
+        return compare(open_session(model), open_session(int8), unseen).mae
 
     assert mae(dead) < 1.5 * mae(float_onnx)
 

@@ -12,13 +12,13 @@ from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import split
 from beers_deploy.quant.integer.reference import agreement, merged_correction, run_core
 from beers_deploy.quant.onnx_file import load_onnx
-from beers_deploy.quant.quantize import Quantised
+from beers_deploy.quant.quantize import Quantized
 from tests.quant.quick import changed
 
 IMAGE = np.random.default_rng(4).random((2, 1, 35, 41), dtype=np.float32)
 
 
-def test_every_layer_of_a_new_file_is_equal(quantized: Quantised) -> None:
+def test_every_layer_of_a_new_file_is_equal(quantized: Quantized) -> None:
     layers = agreement(quantized.core, quantized.host, IMAGE).layers
     assert [layer.report.name for layer in layers] == [op.name for op in quantized.core.ops]
     assert {layer.unequal for layer in layers} == {0.0}
@@ -34,7 +34,7 @@ def test_every_layer_of_a_shipped_file_is_equal(path: Path) -> None:
     assert (layers.up != layers.even).any()
 
 
-def test_a_layer_that_computes_something_else_is_found(quantized: Quantised) -> None:
+def test_a_layer_that_computes_something_else_is_found(quantized: Quantized) -> None:
     corrupted = changed(quantized.host, "body.0.second.bias", lambda bias: bias * 2 + 900)
     layers = agreement(quantized.core, corrupted, IMAGE).layers
     unequal = {layer.report.name: layer.unequal > 0 for layer in layers}
@@ -43,7 +43,7 @@ def test_a_layer_that_computes_something_else_is_found(quantized: Quantised) -> 
     assert unequal["tail"]
 
 
-def test_what_the_rule_moves_is_counted(quantized: Quantised) -> None:
+def test_what_the_rule_moves_is_counted(quantized: Quantized) -> None:
     layers = agreement(quantized.core, quantized.host, IMAGE)
     up, even = (run_core(quantized.core, split(IMAGE), half_even=rule)[0] for rule in (False, True))
     for layer, op in zip(layers.layers, quantized.core.ops, strict=True):

@@ -24,7 +24,8 @@ from beers_deploy.quant.encodings import as_on_board, board_model, encoding_faul
 from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.integer.reference import agreement, run_core
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
-from beers_deploy.quant.quantize import Quantised, quantize_model
+from beers_deploy.quant.passes.selection import Passes
+from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.simplify import simplify
 from beers_deploy.quant.tiling.receptive_field import tiling_of
@@ -61,7 +62,7 @@ def float_network(name: str) -> onnx.ModelProto:
 
 
 @cache
-def quantized(name: str) -> Quantised:
+def quantized(name: str) -> Quantized:
     return quickly(float_network(name), patches_of(images(name)))
 
 
@@ -185,17 +186,13 @@ def one_convolution(weight: float, bias: float) -> onnx.ModelProto:
 
 
 @pytest.mark.parametrize(("weight", "bias"), [(1.0, 0.0), (-0.7, 0.93), (0.4, -0.31)])
-def test_windows_make_a_result_finer_than_8_bits(
-    weight: float, bias: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_windows_make_a_result_finer_than_8_bits(weight: float, bias: float) -> None:
     image_list = images("ffdnet")
     patches = patches_of(image_list)
     model = one_convolution(weight, bias)
     errors = []
     for dual in (True, False):
-        if not dual:
-            monkeypatch.setattr("beers_deploy.quant.quantize.takes_gains", lambda _: False)
-        int8 = quantize_model(model, patches, {})
+        int8 = quantize_model(model, patches, {}, passes=Passes(dual_range=dual))
         expected = result_of(open_session(model), image_list[0])
         actual = result_of(open_session(int8.host), image_list[0])
         # The rounding of the one weight and bias is the same in both, and is left out.

@@ -16,10 +16,11 @@ from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.response import MtfTable
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.quant.calibration import draw_patches, stratified
 from beers_deploy.quant.graph import PLANES, Graph, graph_to_onnx, tensors
-from beers_deploy.quant.quantize import choose_frac_bits
-from beers_deploy.quant.samples import Patches
+from beers_deploy.quant.passes.least_squares import choose_frac_bits
+from beers_deploy.quant.samples.patches import Patches
+from beers_deploy.quant.samples.simulated import draw_patches
+from beers_deploy.quant.samples.views import stratified
 from beers_deploy.quant.session import (
     TILE_PX,
     crops,
@@ -157,13 +158,11 @@ def test_crops_tile_the_image() -> None:
 
 
 def test_positions_of_a_large_image_are_those_of_its_whole(
-    graph: Graph, monkeypatch: pytest.MonkeyPatch
+    graph: Graph,
 ) -> None:
     """In pieces or at once: found here by hand from whole tensors."""
     full_image = image(TILE_PX + 21, 50)
-    # Without errors to weigh up, calibration takes the scale that clips nothing.
-    monkeypatch.setattr("beers_deploy.quant.quantize._errors", lambda *_: np.zeros(1))
-    frac_bits = choose_frac_bits(graph, [full_image])
+    frac_bits = choose_frac_bits(graph, [full_image], least_squares=False)
     names = tensors(graph)
     values = open_session(graph_to_onnx(graph, names)).run(names, {PLANES: planes_of(full_image)})
     for name, tensor in zip(names, values, strict=True):

@@ -11,19 +11,19 @@ from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings import board_model
 from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, Activation, Add, split
 from beers_deploy.quant.integer.reference import correction, run_core
-from beers_deploy.quant.quantize import Quantised
+from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.session import open_session
 from tests.quant.quick import image
 
 
-def by_runtime(quantized: Quantised, planes: np.ndarray) -> np.ndarray:
+def by_runtime(quantized: Quantized, planes: np.ndarray) -> np.ndarray:
     feed = {PLANES: planes.astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
     return np.asarray(open_session(board_model(quantized.core, {})).run(None, feed)[0])
 
 
 @pytest.mark.parametrize("shape", [(37, 53), (1, 1), (1, 40), (64, 33)])
 def test_it_equals_the_runtime_bit_for_bit_under_the_runtime_s_rounding(
-    shape: tuple[int, int], quantized: Quantised
+    shape: tuple[int, int], quantized: Quantized
 ) -> None:
     for seed in range(3):
         planes = split(image(*shape, seed))
@@ -32,7 +32,7 @@ def test_it_equals_the_runtime_bit_for_bit_under_the_runtime_s_rounding(
         )
 
 
-def test_under_the_dpu_s_rounding_it_differs_by_halves_alone(quantized: Quantised) -> None:
+def test_under_the_dpu_s_rounding_it_differs_by_halves_alone(quantized: Quantized) -> None:
     """The first layer's differences are its ties, one unit up; later layers carry them on."""
     planes = split(image())
     up, reports = run_core(quantized.core, planes)

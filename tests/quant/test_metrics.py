@@ -13,7 +13,7 @@ from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.quant.gate import METRICS, compare, metric_value
 from beers_deploy.quant.session import open_session
 from examples.networks import build, to_onnx
-from tests.quant.quick import one_guess
+from tests.quant.quick import one_guess, patches_of
 
 
 def measured(name: str, results: list[np.ndarray], references: list[np.ndarray]) -> float:
@@ -74,4 +74,4 @@ def test_a_gate_of_classes_is_refused() -> None:
     classes = nn.Sequential(nn.Conv2d(1, 3, 3), nn.AdaptiveAvgPool2d(1), nn.Flatten())
     session = open_session(bd.Network.load(classes, example=image.shape).model)
     with pytest.raises(ModelError, match=r"must be images .*, but they are 1 x 3"):
-        compare(session, session, [(image, image)])
+        compare(session, session, patches_of([image]))

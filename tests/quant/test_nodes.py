@@ -15,7 +15,7 @@ from tests.quant.tiling.small_networks import Row, taps
 
 
 @st.composite
-def windowed(draw: st.DrawFn) -> Row:
+def with_offset_windows(draw: st.DrawFn) -> Row:
     """A transposed convolution, one with automatic padding, or a pool."""
     pairs = st.tuples(*[st.integers(1, 3)] * 2)
     kernel = draw(pairs)
@@ -40,7 +40,7 @@ def windowed(draw: st.DrawFn) -> Row:
 
 
 @settings(max_examples=60)
-@given(windowed(), st.integers(5, 13))
+@given(with_offset_windows(), st.integers(5, 13))
 def test_sizes_are_the_runtimes_own(row: Row, side: int) -> None:
     model = row.model()
     shape = network_of(model, side).operations[0].out_shape

@@ -24,54 +24,52 @@ from beers_deploy.quant.graph import (
     Window,
     graph_to_onnx,
 )
-from beers_deploy.quant.passes.equalise import (
+from beers_deploy.quant.passes.dual_range import with_copies
+from beers_deploy.quant.passes.equalize import (
     FIRST_CROPS,
     Costs,
     channel_ranges,
-    equalise,
+    equalize,
     first_guess,
     search,
 )
-from beers_deploy.quant.passes.selection import Passes
-from beers_deploy.quant.passes.stream import (
-    STREAM_FRAC_BITS,
-    Stream,
+from beers_deploy.quant.passes.residual_groups import (
+    GROUP_FRAC_BITS,
+    ResidualGroup,
     exceeds_six,
-    streams,
-    two_gains,
+    residual_groups,
 )
-from beers_deploy.quant.quantize import Quantised, quantize_model
-from beers_deploy.quant.samples import Patches
+from beers_deploy.quant.passes.selection import Passes
+from beers_deploy.quant.quantize import Quantized, quantize_model
+from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session
 from tests.quant.quick import image, in_float, quickly
 
 
-def stream_of(graph: Graph) -> Stream:
-    (stream,) = streams(graph)
-    return stream
+def group_of(graph: Graph) -> ResidualGroup:
+    (group,) = residual_groups(graph)
+    return group
 
 
 def correction(graph: Graph) -> np.ndarray:
     return in_float(graph, image(23, 31))
 
 
-def test_equalising_leaves_the_float_network_as_it_was(graph: Graph) -> None:
+def test_equalizing_leaves_the_float_network_as_it_was(graph: Graph) -> None:
     factors = np.random.default_rng(1).uniform(0.2, 5, 8)
-    scaled = equalise(graph, stream_of(graph), factors)
+    scaled = equalize(graph, group_of(graph), factors)
     np.testing.assert_allclose(correction(scaled), correction(graph), atol=2e-6)
     first_alone = (scaled[0], *graph[1:])
     assert np.abs(correction(first_alone) - correction(graph)).max() > 1e-3
 
 
-def test_ranges_are_levelled_to_the_stream_s_own(graph: Graph, patches: Patches) -> None:
+def test_ranges_are_equalized_to_the_group_s_own(graph: Graph, patches: Patches) -> None:
     images = [image for image, _ in patches.pairs]
-    ranges = channel_ranges(graph, stream_of(graph), images)
+    ranges = channel_ranges(graph, group_of(graph), images)
     assert ranges.shape == (8,)
     factors = first_guess(ranges, 1.0, 1.0)
-    np.testing.assert_allclose(ranges * factors, 127 * 2.0**-STREAM_FRAC_BITS)
-    new_ranges = channel_ranges(
-        equalise(graph, stream_of(graph), factors), stream_of(graph), images
-    )
+    np.testing.assert_allclose(ranges * factors, 127 * 2.0**-GROUP_FRAC_BITS)
+    new_ranges = channel_ranges(equalize(graph, group_of(graph), factors), group_of(graph), images)
     np.testing.assert_allclose(new_ranges, ranges * factors, rtol=1e-4)
 
 
@@ -79,7 +77,7 @@ def test_a_dead_channel_is_not_blown_up(graph: Graph, patches: Patches) -> None:
     dead = np.ones(8)
     dead[3] = 1e-12
     ranges = channel_ranges(
-        equalise(graph, stream_of(graph), dead), stream_of(graph), [patches.pairs[0][0]]
+        equalize(graph, group_of(graph), dead), group_of(graph), [patches.pairs[0][0]]
     )
     assert ranges[3] >= 1e-4 * ranges.max()
 
@@ -116,7 +114,7 @@ def skipping(seed: int = 0) -> Graph:
     )
 
 
-def test_a_stream_goes_through_pools_enlargements_and_concats() -> None:
+def test_a_group_goes_through_pools_enlargements_and_concats() -> None:
     graph = skipping()
     fine = slice(2, 5)
     coarse = slice(0, 2)
@@ -128,35 +126,38 @@ def test_a_stream_goes_through_pools_enlargements_and_concats() -> None:
         "deep": coarse,
         "up": coarse,
     }
-    assert stream_of(graph) == expected | {"both": slice(0, 5)}
+    assert group_of(graph) == expected | {"both": slice(0, 5)}
     planes = {PLANES: np.random.default_rng(1).normal(0, 3, (1, 3, 6, 10)).astype(np.float32)}
     results = [
         open_session(graph_to_onnx(variant, [CORRECTION])).run(None, planes)[0]
         for variant in (
             graph,
-            equalise(graph, stream_of(graph), np.random.default_rng(2).lognormal(-1, 1, 5)),
+            equalize(graph, group_of(graph), np.random.default_rng(2).lognormal(-1, 1, 5)),
         )
     ]
     np.testing.assert_allclose(results[1], results[0], atol=1e-4)
 
 
-def test_a_tensor_that_would_have_two_places_is_in_no_stream() -> None:
+def test_a_tensor_that_would_have_two_places_is_in_no_group() -> None:
     *before, join, last = skipping()
     assert isinstance(last, Conv)
     twice = replace(join, inputs=("sum", "sum"))  # type: ignore[type-var]
-    assert streams((*before, twice, replace(last, weight=np.ones((1, 6, 1, 1), np.float32)))) == []
+    assert (
+        residual_groups((*before, twice, replace(last, weight=np.ones((1, 6, 1, 1), np.float32))))
+        == []
+    )
 
 
 @pytest.mark.parametrize(("bits", "beyond"), [(5, False), (4, True)])
 def test_sums_beyond_a_relu6_are_told_by_their_scale(bits: int, beyond: bool) -> None:
     graph = skipping()
-    frac_bits = dict.fromkeys(stream_of(graph), 5) | {"sum": bits}
-    assert exceeds_six(graph, stream_of(graph), frac_bits) is beyond
+    frac_bits = dict.fromkeys(group_of(graph), 5) | {"sum": bits}
+    assert exceeds_six(graph, group_of(graph), frac_bits) is beyond
     plain = tuple(
         replace(op, activation=Activation.relu) if op.output == "head" else op  # type: ignore[type-var]
         for op in graph
     )
-    assert not exceeds_six(plain, stream_of(plain), frac_bits)
+    assert not exceeds_six(plain, group_of(plain), frac_bits)
 
 
 CROPS = 5
@@ -186,11 +187,11 @@ def searched(graph: Graph, weights: np.ndarray) -> tuple[list[float], float, lis
 
         return of
 
-    factors = search(graph, stream_of(graph), RANGES, trial)
+    factors = search(graph, group_of(graph), RANGES, trial)
     pairs = product((0.5, 0.75, 1.0), (0.64, 0.8, 1.0, 1.25))
     guesses = [first_guess(RANGES, g, h) for g, h in pairs]
     ends = [
-        float(costs(equalise(graph, stream_of(graph), factor)).sum())
+        float(costs(equalize(graph, group_of(graph), factor)).sum())
         for factor in (*guesses, factors)
     ]
     return ends[:-1], ends[-1], runs
@@ -207,10 +208,10 @@ def test_the_search_ends_below_its_best_guess_and_drops_a_trial_that_fails_on_it
     assert runs.count(FIRST_CROPS) > len(runs) / 3
 
 
-def test_a_wide_stream_is_not_searched_channel_by_channel(
+def test_a_wide_group_is_not_searched_channel_by_channel(
     graph: Graph, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("beers_deploy.quant.passes.equalise.MOST_CHANNELS", 7)
+    monkeypatch.setattr("beers_deploy.quant.passes.equalize.MOST_CHANNELS", 7)
     guesses, cost, runs = searched(graph, np.arange(1.0, CROPS + 1))
     assert cost == min(guesses)
     assert len(runs) == len(guesses)
@@ -224,7 +225,7 @@ def test_a_trial_that_the_costliest_crops_favour_still_has_to_win_on_all(graph: 
     assert cost <= guesses[0]
 
 
-def test_a_shared_residual_scale_adds_without_rounding(quantized: Quantised) -> None:
+def test_a_shared_residual_scale_adds_without_rounding(quantized: Quantized) -> None:
     adds = [op for op in quantized.core.ops if isinstance(op, Add)]
     assert len(adds) == 3
     for op in adds:
@@ -233,7 +234,7 @@ def test_a_shared_residual_scale_adds_without_rounding(quantized: Quantised) -> 
 
 
 def test_the_second_gain_is_the_same_correction_coarser(graph: Graph) -> None:
-    both = correction(two_gains(graph))
+    both = correction(with_copies(graph, Ends(gains=2)))
     assert both.shape[1] == 2
     np.testing.assert_allclose(both[:, 1:] * GAIN, correction(graph), atol=1e-6)
 
@@ -252,12 +253,12 @@ def test_the_fine_gain_is_believed_until_its_end() -> None:
 
 
 def test_all_passes_lose_far_less_than_none(
-    float_onnx: onnx.ModelProto, patches: Patches, quantized: Quantised
+    float_onnx: onnx.ModelProto, patches: Patches, quantized: Quantized
 ) -> None:
-    def mae(int8: Quantised) -> float:
-        return compare(open_session(float_onnx), open_session(int8.host), patches.pairs).mae
+    def mae(int8: Quantized) -> float:
+        return compare(open_session(float_onnx), open_session(int8.host), patches).mae
 
-    few = Passes(dual_range=False, least_squares=False, equalising=False)
+    few = Passes(dual_range=False, least_squares=False, equalization=False)
     rounded = quantize_model(float_onnx, patches, {}, passes=few)
     last = rounded.core.ops[-1]
     assert isinstance(last, IntConv)

@@ -10,13 +10,13 @@ from beers_deploy.quant.encodings import board_model
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import correction_graph, read_planes
 from beers_deploy.quant.onnx_file import metadata
-from beers_deploy.quant.quantize import Quantised, quantize_model
-from beers_deploy.quant.samples import Patches
+from beers_deploy.quant.quantize import Quantized, quantize_model
+from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 
 
-def test_scales_are_powers_of_two_and_numbers_are_int8(quantized: Quantised) -> None:
+def test_scales_are_powers_of_two_and_numbers_are_int8(quantized: Quantized) -> None:
     for model in (quantized.host, board_model(quantized.core, {})):
         for tensor in model.graph.initializer:
             value = numpy_helper.to_array(tensor)
@@ -28,7 +28,7 @@ def test_scales_are_powers_of_two_and_numbers_are_int8(quantized: Quantised) -> 
 
 
 def test_every_shift_is_within_its_window_and_one_that_is_not_is_named(
-    quantized: Quantised,
+    quantized: Quantized,
 ) -> None:
     assert shift_faults(quantized.core) == []
     faults = shift_faults(
@@ -38,7 +38,7 @@ def test_every_shift_is_within_its_window_and_one_that_is_not_is_named(
 
 
 def test_unreachable_positions_are_moved_to_legal_ones(
-    float_onnx: onnx.ModelProto, quantized: Quantised
+    float_onnx: onnx.ModelProto, quantized: Quantized
 ) -> None:
     graph = read_planes(correction_graph(float_onnx))
     wild = {
@@ -47,7 +47,7 @@ def test_unreachable_positions_are_moved_to_legal_ones(
     assert shift_faults(build_core(graph, wild)) == []
 
 
-def test_every_convolution_is_an_integer_kernel(quantized: Quantised) -> None:
+def test_every_convolution_is_an_integer_kernel(quantized: Quantized) -> None:
     kinds = [node.op_type for node in quantized.host.graph.node]
     # These are the head, two in each of two blocks, the end and the tail.
     assert kinds.count("QLinearConv") == 7
@@ -55,21 +55,19 @@ def test_every_convolution_is_an_integer_kernel(quantized: Quantised) -> None:
 
 
 def test_int8_stays_close_to_float(
-    float_onnx: onnx.ModelProto, quantized: Quantised, patches: Patches
+    float_onnx: onnx.ModelProto, quantized: Quantized, patches: Patches
 ) -> None:
-    assert (
-        compare(open_session(float_onnx), open_session(quantized.host), patches.pairs).mae < 0.002
-    )
+    assert compare(open_session(float_onnx), open_session(quantized.host), patches).mae < 0.002
 
 
 def test_the_same_patches_give_the_same_bytes(
-    float_onnx: onnx.ModelProto, quantized: Quantised, patches: Patches
+    float_onnx: onnx.ModelProto, quantized: Quantized, patches: Patches
 ) -> None:
     repeated = quantize_model(float_onnx, patches, {"seed": "5"})
     assert repeated.host.SerializeToString() == quantized.host.SerializeToString()
 
 
-def test_the_file_says_what_it_was_calibrated_on(quantized: Quantised, patches: Patches) -> None:
+def test_the_file_says_what_it_was_calibrated_on(quantized: Quantized, patches: Patches) -> None:
     about = metadata(quantized.host)
     assert about["calibration_sha256"] == patches.digest
     assert about["precision"] == "int8 legal"
@@ -77,7 +75,7 @@ def test_the_file_says_what_it_was_calibrated_on(quantized: Quantised, patches: 
 
 @pytest.mark.parametrize("encoding", ["float", "host", "board"])
 def test_the_radius_is_read_from_the_graph(
-    encoding: str, float_onnx: onnx.ModelProto, quantized: Quantised
+    encoding: str, float_onnx: onnx.ModelProto, quantized: Quantized
 ) -> None:
     model = {"float": float_onnx, "host": quantized.host, "board": board_model(quantized.core, {})}[
         encoding

@@ -11,11 +11,12 @@ from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import Add
-from beers_deploy.quant.quantize import Quantised
-from beers_deploy.quant.samples import Patches
-from beers_deploy.quant.sensitivity import Loss, layer_errors, losses, spread_of
+from beers_deploy.quant.passes.selection import Passes
+from beers_deploy.quant.quantize import Quantized
+from beers_deploy.quant.samples.patches import Patches
+from beers_deploy.quant.sensitivity import Loss, layer_errors, losses
 from beers_deploy.quant.session import few_crops, open_session, run
-from tests.quant.quick import quickly
+from tests.quant.quick import patches_of, quickly
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +25,7 @@ def crops(patches: Patches) -> list[np.ndarray]:
 
 
 def test_layers_lose_together_what_the_int8_file_loses_and_adds_hardly_anything(
-    float_onnx: onnx.ModelProto, quantized: Quantised, crops: list[np.ndarray]
+    float_onnx: onnx.ModelProto, quantized: Quantized, crops: list[np.ndarray]
 ) -> None:
     """Their squared errors nearly add up; adds of a shared residual scale lose what saturates."""
     layers, together = layer_errors(quantized.graph, quantized.core, crops)
@@ -38,7 +39,7 @@ def test_layers_lose_together_what_the_int8_file_loses_and_adds_hardly_anything(
 
 
 @pytest.fixture(scope="module")
-def spoilt(quantized: Quantised) -> Quantised:
+def spoilt(quantized: Quantized) -> Quantized:
     """The weights of one layer lose their sign."""
     spoilt = [op.name == "body.1.second" for op in quantized.core.ops]
     ops = [
@@ -50,9 +51,9 @@ def spoilt(quantized: Quantised) -> Quantised:
 
 
 def test_what_is_lost_is_told_and_of_much_also_where(
-    float_onnx: onnx.ModelProto, spoilt: Quantised, patches: Patches
+    float_onnx: onnx.ModelProto, spoilt: Quantized, patches: Patches
 ) -> None:
-    gate = compare(open_session(float_onnx), open_session(spoilt.host), patches.pairs)
+    gate = compare(open_session(float_onnx), open_session(spoilt.host), patches)
     assert gate.worst_drop_db > gate.drop_db
     little, much = (
         losses(
@@ -70,7 +71,7 @@ def test_what_is_lost_is_told_and_of_much_also_where(
     assert much.endswith("; try `finetune` auto")
 
 
-def test_a_spoilt_layer_is_found(spoilt: Quantised, crops: list[np.ndarray]) -> None:
+def test_a_spoilt_layer_is_found(spoilt: Quantized, crops: list[np.ndarray]) -> None:
     """It, and no other, gets the error."""
     layers, _ = layer_errors(spoilt.graph, spoilt.core, crops)
     worst = min(layers, key=lambda layer: layer.alone.sqnr_db)
@@ -80,13 +81,9 @@ def test_a_spoilt_layer_is_found(spoilt: Quantised, crops: list[np.ndarray]) -> 
 
 
 def test_one_gain_is_attributed_as_two_are(
-    float_onnx: onnx.ModelProto,
-    patches: Patches,
-    crops: list[np.ndarray],
-    monkeypatch: pytest.MonkeyPatch,
+    float_onnx: onnx.ModelProto, patches: Patches, crops: list[np.ndarray]
 ) -> None:
-    monkeypatch.setattr("beers_deploy.quant.quantize.takes_gains", lambda _: False)
-    int8 = quickly(float_onnx, patches)
+    int8 = quickly(float_onnx, patches, passes=Passes(dual_range=False))
     layers, _ = layer_errors(int8.graph, int8.core, crops)
     tail = layers[-1]
     assert tail.alone.sqnr_db == pytest.approx(tail.network.sqnr_db, abs=1)
@@ -106,10 +103,10 @@ def test_loss_is_that_of_its_definition() -> None:
 
 
 def test_spread_counts_every_pixel_by_its_difference(
-    float_onnx: onnx.ModelProto, quantized: Quantised, crops: list[np.ndarray]
+    float_onnx: onnx.ModelProto, quantized: Quantized, crops: list[np.ndarray]
 ) -> None:
     sessions = open_session(float_onnx), open_session(quantized.host)
-    spread = spread_of(*sessions, crops)
+    spread = compare(*sessions, patches_of(crops)).spread
     difference = np.concatenate(
         [
             np.subtract(*(np.clip(run(s, crop), 0, 1) for s in reversed(sessions))).ravel()

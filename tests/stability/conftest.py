@@ -12,7 +12,7 @@ from beers_deploy.model.convbeers import ConvBEERS
 from beers_deploy.model.traditional.rows import one_thread_per_operation
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.onnx_file import save_onnx
-from beers_deploy.quant.quantize import Quantised
+from beers_deploy.quant.quantize import Quantized
 from beers_deploy.studies.stress.networks import Subject, open_subject
 from tests.model.networks import plain
 from tests.quant.quick import drawn, quickly
@@ -44,23 +44,23 @@ def float_onnx(network: ConvBEERS) -> onnx.ModelProto:
 
 
 @pytest.fixture(scope="session")
-def quantized(float_onnx: onnx.ModelProto) -> Quantised:
+def quantized(float_onnx: onnx.ModelProto) -> Quantized:
     return quickly_quantized(float_onnx)
 
 
-def quickly_quantized(float_onnx: onnx.ModelProto) -> Quantised:
+def quickly_quantized(float_onnx: onnx.ModelProto) -> Quantized:
     return quickly(float_onnx, drawn(2, seed=5))
 
 
 @pytest.fixture(scope="session")
 def pair(
-    float_onnx: onnx.ModelProto, quantized: Quantised, tmp_path_factory: pytest.TempPathFactory
+    float_onnx: onnx.ModelProto, quantized: Quantized, tmp_path_factory: pytest.TempPathFactory
 ) -> list[Path]:
     """The two files."""
     return saved(float_onnx, quantized, tmp_path_factory.mktemp("pair"))
 
 
-def saved(float_onnx: onnx.ModelProto, quantized: Quantised, folder: Path) -> list[Path]:
+def saved(float_onnx: onnx.ModelProto, quantized: Quantized, folder: Path) -> list[Path]:
     paths = [folder / "float.onnx", folder / "int8.onnx"]
     for model, path in zip((float_onnx, quantized.host), paths, strict=True):
         save_onnx(model, path)

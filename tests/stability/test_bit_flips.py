@@ -13,10 +13,10 @@ from beers_deploy.performance.swath import predict_network
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import TILE_PX
-from beers_deploy.quant.calibration import Calibration
 from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.graph import Activation
 from beers_deploy.quant.integer.reference import SOUND
+from beers_deploy.quant.samples.simulated import Calibration
 from beers_deploy.studies.stress.bit_flips import (
     FaultTarget,
     curve_rows,

@@ -15,7 +15,7 @@ from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import CORRECTION, split
 from beers_deploy.quant.integer.reference import INT32_BITS, correction, run_core
 from beers_deploy.quant.onnx_file import load_onnx
-from beers_deploy.quant.quantize import Quantised
+from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.session import open_session, run
 
 
@@ -24,7 +24,7 @@ def images(seed: int, shape: tuple[int, int], binary: bool) -> np.ndarray:
     return np.rint(noise) if binary else noise
 
 
-def test_no_image_leaves_the_integer_bounds(quantized: Quantised) -> None:
+def test_no_image_leaves_the_integer_bounds(quantized: Quantized) -> None:
     bounds = {bound.name: bound for bound in layer_bounds(quantized.core)}
     for seed in range(6):
         planes = split(images(seed, (17, 23), seed % 2 == 0).astype(np.float32))
@@ -34,7 +34,7 @@ def test_no_image_leaves_the_integer_bounds(quantized: Quantised) -> None:
             assert bound.saturates or report.saturated == 0
 
 
-def test_an_accumulator_that_overflows_is_found(quantized: Quantised) -> None:
+def test_an_accumulator_that_overflows_is_found(quantized: Quantized) -> None:
     op = quantized.core.convolutions[0]
     huge = replace(
         op, bias=np.full(len(op.bias), 2**31, np.int64), bias_frac_bits=op.weight_frac_bits + 7
@@ -49,7 +49,7 @@ def test_shipped_accumulators_cannot_overflow(path: Path) -> None:
     assert max(bound.bits for bound in layer_bounds(core)) < INT32_BITS
 
 
-def test_a_core_is_read_back_from_its_file(quantized: Quantised) -> None:
+def test_a_core_is_read_back_from_its_file(quantized: Quantized) -> None:
     core = read_core(quantized.host)
     image = images(3, (19, 26), False).astype(np.float32)
     merged = Ends(gains=2).merge(
@@ -60,7 +60,7 @@ def test_a_core_is_read_back_from_its_file(quantized: Quantised) -> None:
     )
 
 
-def test_another_spelling_has_no_core(quantized: Quantised, float_onnx: onnx.ModelProto) -> None:
+def test_another_spelling_has_no_core(quantized: Quantized, float_onnx: onnx.ModelProto) -> None:
     for model in (float_onnx, board_model(quantized.core, {})):
         with pytest.raises(ModelError, match="does not describe its integers"):
             read_core(model)

@@ -19,7 +19,7 @@ from beers_deploy.quant.encodings import board_model, host_model
 from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, split
 from beers_deploy.quant.integer.reference import correction
-from beers_deploy.quant.quantize import Quantised
+from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.session import open_session, run
 
 
@@ -74,7 +74,7 @@ def biased(core: IntCore, generator: np.random.Generator) -> IntCore:
 @pytest.mark.parametrize("shape", [(17, 20), (1, 1), (1, 19), (12, 2)])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_both_files_hold_every_bias_at_its_scale(
-    seed: int, shape: tuple[int, int], quantized: Quantised
+    seed: int, shape: tuple[int, int], quantized: Quantized
 ) -> None:
     generator = np.random.default_rng(seed)
     core = biased(quantized.core, generator)

@@ -14,7 +14,7 @@ from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, split
 from beers_deploy.quant.integer.reference import SOUND, Faults, merged_correction, run_core
-from beers_deploy.quant.quantize import Quantised
+from beers_deploy.quant.quantize import Quantized
 from beers_deploy.studies.stress.faults import (
     SHIFT_BITS,
     Guards,
@@ -51,7 +51,7 @@ def flipped(a: np.ndarray, b: np.ndarray, bits: int) -> int:
 
 
 @pytest.fixture(scope="module")
-def core(quantized: Quantised) -> IntCore:
+def core(quantized: Quantized) -> IntCore:
     return as_stored(quantized.core)
 
 
@@ -78,7 +78,7 @@ def test_the_rate_is_that_of_a_megabit() -> None:
     assert flip_count(1000, 1e9, np.random.default_rng(0)) == 1000
 
 
-def test_the_stored_bias_is_int8_and_the_network_the_same(quantized: Quantised) -> None:
+def test_the_stored_bias_is_int8_and_the_network_the_same(quantized: Quantized) -> None:
     stored = as_stored(quantized.core)
     assert all(op.bias.dtype == np.int8 for op in stored.convolutions)
     assert weight_bits(stored) == 8 * sum(
@@ -111,7 +111,7 @@ def test_every_shift_is_what_the_core_uses(core: IntCore) -> None:
     assert bits_apart(injected, shifts) == 3
 
 
-def test_numbers_that_the_board_could_not_store_are_refused(quantized: Quantised) -> None:
+def test_numbers_that_the_board_could_not_store_are_refused(quantized: Quantized) -> None:
     op = quantized.core.convolutions[0]
     too_large = replace(op, bias=np.full(len(op.bias), 100_001), bias_frac_bits=op.bias_frac_bits)
     far = replace(
@@ -122,7 +122,7 @@ def test_numbers_that_the_board_could_not_store_are_refused(quantized: Quantised
             as_stored(replace(quantized.core, ops=(wrong, *quantized.core.ops[1:])))
 
 
-def test_maps_have_the_channels_that_run(quantized: Quantised) -> None:
+def test_maps_have_the_channels_that_run(quantized: Quantized) -> None:
     tensors, _ = run_core(quantized.core, split(image()))
     assert {name: tensor.shape[1] for name, tensor in tensors.items()} == map_channels(
         quantized.core

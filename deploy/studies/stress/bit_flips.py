@@ -20,10 +20,10 @@ from beers_deploy.performance.swath import predict_network
 from beers_deploy.profiles.figures import Row, measured, predicted
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.quant.calibration import HELD_OUT_SEED, Calibration
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.graph import Activation
 from beers_deploy.quant.integer.reference import SOUND
+from beers_deploy.quant.samples.simulated import HELD_OUT_SEED, Calibration
 from beers_deploy.report.plots import Curve, curves_svg
 from beers_deploy.studies.stress import faults
 from beers_deploy.studies.stress.networks import Subject

@@ -19,8 +19,8 @@ from beers_deploy.performance.traditional import drawn_acquisition
 from beers_deploy.profiles.figures import Figure, measured
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import sensor_names
-from beers_deploy.quant.calibration import Calibration
 from beers_deploy.quant.quantize import quantize_model
+from beers_deploy.quant.samples.simulated import Calibration
 from beers_deploy.restoration.method import Restore, network_method
 from beers_deploy.restoration.plan import Plan, make_plan
 from beers_deploy.restoration.tiles.exposures import tiles_by_factor

@@ -23,7 +23,7 @@ from beers_deploy.model.shipped import shipped_names
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.encodings import board_model
 from beers_deploy.quant.graph.quantized import Scale
-from beers_deploy.quant.quantize import Quantised, quantize_model
+from beers_deploy.quant.quantize import Quantized, quantize_model
 from tests.deploy.dpu.draws import rules_of
 from tests.deploy.dpu.graphs import IntegerSketch
 from tests.model.networks import plain
@@ -43,7 +43,7 @@ def rules(model: onnx.ModelProto) -> set[str]:
 
 
 @cache
-def quantized(spread: float) -> Quantised:
+def quantized(spread: float) -> Quantized:
     """A small network of random weights, its biases so large."""
     network = plain(Variant(blocks=1, features=4), seed=7)
     generator = torch.Generator().manual_seed(7)

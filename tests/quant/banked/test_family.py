@@ -31,7 +31,6 @@ from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.core import IntConv, IntCore, shift_faults
 from beers_deploy.quant.encodings import board_model, encoding_faults, host_model, read_core
 from beers_deploy.quant.integer.reference import merged_correction, run_core
-from beers_deploy.quant.samples import Remade
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from tests.model.networks import told_of
@@ -70,9 +69,7 @@ def pair(request: pytest.FixtureRequest) -> tuple[BankedConvBEERS, Family]:
         for k, vector in enumerate(SENSORS)
     ]
     middle = bank_of_vector((0.0, 0.0, 0.0, 0.0))
-    return float_network, quantize_family(
-        weights_of(float_network), middle, Remade(images.__getitem__, len(images))
-    )
+    return float_network, quantize_family(weights_of(float_network), middle, images)
 
 
 def core_of(family: Family, vector: tuple[float, ...]) -> IntCore:

@@ -17,7 +17,7 @@ from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.onnx_file import any_size, image_info, make_model
-from beers_deploy.quant.quantize import Quantised
+from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from tests.quant.quick import patches_of, quickly
@@ -365,7 +365,7 @@ def half_resolution() -> onnx.ModelProto:
 
 
 @cache
-def quantized_half_resolution() -> Quantised:
+def quantized_half_resolution() -> Quantized:
     """The same in legal INT8, for the host and for the board."""
     return quickly(
         half_resolution(),

@@ -6,8 +6,8 @@ samples that a network was calibrated on, and the gate prints the range of those
 
 import json
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -24,8 +24,8 @@ BINS = 4096
 Pixels in the last one are saturated.
 """
 
-PERCENTS = (1, 50, 99, 99.9)
-"""The percentiles of a range."""
+SHARES = (0.01, 0.5, 0.99, 0.999)
+"""Of the percentiles of a range."""
 
 COVERED = 0.9
 """Samples whose 99.9th percentile lies at this share of full scale cover bright ground."""
@@ -49,50 +49,41 @@ class SampleRange:
         return self.p99_9 >= COVERED
 
     def __str__(self) -> str:
-        shares = (
-            f"1, 50, 99 and 99.9 % of the pixels lie below {self.p1:.3f}, {self.p50:.3f}, "
-            f"{self.p99:.3f} and"
-        )
         return (
-            f"{shares} {self.p99_9:.3f} of full scale, {100 * self.saturated:.2g} % are saturated"
+            f"1, 50, 99 and 99.9 % of the pixels lie below {self.p1:.3f}, {self.p50:.3f}, "
+            f"{self.p99:.3f} and {self.p99_9:.3f} of full scale, {100 * self.saturated:.2g} % are "
+            "saturated"
         )
 
     def to_words(self) -> str:
         """Return the range as it stands in the metadata of an INT8 file."""
         return json.dumps({name: round(value, 6) for name, value in asdict(self).items()})
 
-
-class RangeCounts:
-    """A histogram of pixels, to which one sample after the other is added."""
-
-    def __init__(self) -> None:
-        self._counts = np.zeros(BINS, np.int64)
-
-    def add(self, sample: np.ndarray) -> None:
-        """Add a sample of any shape, values in [0, 1]."""
-        # The value 1 would open a bin of its own, so it is clipped to the last.
-        bins = np.clip(sample * np.float32(BINS), 0, BINS - 1).astype(np.int64)
-        self._counts += np.bincount(bins.ravel(), minlength=BINS)
-
-    @property
-    def range(self) -> SampleRange:
-        """The range of what was added."""
-        # Without samples the sum is 0.
-        shares = np.cumsum(self._counts) / max(int(self._counts.sum()), 1)
-        # The numbers of the bins are digital numbers, and the last of them is full scale.
-        p1, p50, p99, p99_9 = (
-            float(np.searchsorted(shares, percent / 100)) / (BINS - 1) for percent in PERCENTS
-        )
-        saturated = float(self._counts[-1] / max(int(self._counts.sum()), 1))
-        return SampleRange(p1, p50, p99, p99_9, saturated)
+    def row(self, name: str, source: str) -> Row:
+        """Return the range as a row of the table "samples"."""
+        figures = {
+            "1st percentile": measured(self.p1, "of full scale", source),
+            "median": measured(self.p50, "of full scale", source),
+            "99th percentile": measured(self.p99, "of full scale", source),
+            "99.9th percentile": measured(self.p99_9, "of full scale", source),
+            "saturated": measured(100 * self.saturated, "%", source),
+        }
+        return Row("samples", name, figures)
 
 
-def range_of(samples: Iterable[np.ndarray]) -> SampleRange:
-    """Compute the range of samples of any shape, values in [0, 1]."""
-    counts = RangeCounts()
-    for sample in samples:
-        counts.add(sample)
-    return counts.range
+def histogram(sample: np.ndarray) -> np.ndarray:
+    """Count the pixels of a sample of any shape, values in [0, 1], by bin: (BINS,)."""
+    # The value 1 would open a bin of its own, so it is clipped to the last.
+    bins = np.clip(sample * np.float32(BINS), 0, BINS - 1).astype(np.int64)
+    return np.bincount(bins.ravel(), minlength=BINS)
+
+
+def range_from(counts: np.ndarray) -> SampleRange:
+    """Compute the range of samples from the sum of their histograms, (BINS,)."""
+    shares = np.cumsum(counts) / counts.sum()
+    # The numbers of the bins are digital numbers, and the last of them is full scale.
+    p1, p50, p99, p99_9 = (np.searchsorted(shares, SHARES) / (BINS - 1)).tolist()
+    return SampleRange(p1, p50, p99, p99_9, float(counts[-1] / counts.sum()))
 
 
 def recorded_range(about: Mapping[str, str]) -> SampleRange | None:
@@ -108,24 +99,10 @@ def recorded_range(about: Mapping[str, str]) -> SampleRange | None:
         record = SampleRange(**{name: float(value) for name, value in values.items()})
     except (ValueError, TypeError, AttributeError):
         return None
-    percentiles = [record.p1, record.p50, record.p99, record.p99_9]
-    plausible = all(
-        math.isfinite(value) and 0 <= value <= 1 for value in (*percentiles, record.saturated)
-    )
+    *percentiles, saturated = astuple(record)
+    plausible = all(math.isfinite(value) and 0 <= value <= 1 for value in (*percentiles, saturated))
     # Percentiles rise by definition; others were not computed from any image.
     return record if plausible and percentiles == sorted(percentiles) else None
-
-
-def range_row(found: SampleRange, name: str, source: str) -> Row:
-    """Return the range as a row of the table "samples"."""
-    figures = {
-        "1st percentile": measured(found.p1, "of full scale", source),
-        "median": measured(found.p50, "of full scale", source),
-        "99th percentile": measured(found.p99, "of full scale", source),
-        "99.9th percentile": measured(found.p99_9, "of full scale", source),
-        "saturated": measured(100 * found.saturated, "%", source),
-    }
-    return Row("samples", name, figures)
 
 
 def uncovered(judged: SampleRange, calibrated: SampleRange | None) -> str:

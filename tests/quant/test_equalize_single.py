@@ -1,5 +1,5 @@
-"""Levelling a network without a stream: the float network stays, the search only gains, most on
-unequal channels.
+"""Equalizing single tensors: the float network stays, the search only gains, most on unequal
+channels.
 """
 
 import numpy as np
@@ -25,24 +25,29 @@ from beers_deploy.quant.graph import (
     split,
 )
 from beers_deploy.quant.integer.reference import run_core
-from beers_deploy.quant.passes import level
-from beers_deploy.quant.passes.equalise import FULL, MOST_CHANNELS, Costs
-from beers_deploy.quant.passes.level import Chain, chain_ranges
-from beers_deploy.quant.passes.stream import STREAM_FRAC_BITS, lone_tensors
+from beers_deploy.quant.passes import equalize_single as single
+from beers_deploy.quant.passes.equalize import FULL, MOST_CHANNELS, Costs
+from beers_deploy.quant.passes.equalize_single import SingleTensors, single_ranges
+from beers_deploy.quant.passes.residual_groups import GROUP_FRAC_BITS, single_tensors
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.simplify.simplify import simplify
 from examples.networks import build, to_onnx
 from tests.quant.quick import in_float, patches_of, quickly, with_relu6
 
 
-def read(name: str) -> tuple[onnx.ModelProto, Graph, Ends, Chain]:
+def read(name: str) -> tuple[onnx.ModelProto, Graph, Ends, SingleTensors]:
     model = simplify(to_onnx(name, build(name, torch.Generator().manual_seed(0))), name)
     network = read_network(model)
     graph = read_planes(network.graph)
     ends = ends_of(network)
     widths = channels_of(graph, {PLANES: ends.planes * ends.channels})
-    alone = lone_tensors(graph)
-    return model, graph, ends, Chain(tuple(alone), tuple(widths[tensor] for tensor in alone))
+    alone = single_tensors(graph)
+    return (
+        model,
+        graph,
+        ends,
+        SingleTensors(tuple(alone), tuple(widths[tensor] for tensor in alone)),
+    )
 
 
 def images(count: int = 3, side_px: int = 40) -> list[np.ndarray]:
@@ -56,44 +61,46 @@ def correction(graph: Graph, ends: Ends) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["dncnn", "espcn", "unet", "segment", "mobile"])
-def test_levelling_leaves_the_float_network_as_it_was(name: str) -> None:
-    _, graph, ends, chain = read(name)
-    factors = np.random.default_rng(1).uniform(0.2, 5, sum(chain.widths))
+def test_equalizing_leaves_the_float_network_as_it_was(name: str) -> None:
+    _, graph, ends, singles = read(name)
+    factors = np.random.default_rng(1).uniform(0.2, 5, sum(singles.widths))
     expected = correction(graph, ends)
     np.testing.assert_allclose(
-        correction(chain.scaled(graph, factors), ends), expected, atol=2e-5 * np.abs(expected).max()
+        correction(singles.scaled(graph, factors), ends),
+        expected,
+        atol=2e-5 * np.abs(expected).max(),
     )
-    pairs = zip(chain.scaled(graph, factors), graph, strict=True)
+    pairs = zip(singles.scaled(graph, factors), graph, strict=True)
     assert any(isinstance(op, Conv) and not np.allclose(op.weight, was.weight) for op, was in pairs)  # type: ignore[attr-defined]
 
 
 def test_what_others_read_or_factors_do_not_pass_is_left_alone() -> None:
-    _, graph, _, chain = read("unet")
+    _, graph, _, singles = read("unet")
     pooled = set[str]()
     for op in graph:
         if not isinstance(op, Conv):
             pooled |= {*op.inputs, op.output}
     assert pooled
-    assert not pooled & set(chain.tensors)
-    _, graph, _, chain = read("segment")
+    assert not pooled & set(singles.tensors)
+    _, graph, _, singles = read("segment")
     curved = {op.output for op in graph if op.name.endswith("HardSwish") or "Hardswish" in op.name}
-    assert not curved & set(chain.tensors)
-    assert CORRECTION not in chain.tensors
+    assert not curved & set(singles.tensors)
+    assert CORRECTION not in singles.tensors
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 1.0, 3.0]))
 def test_relu6_is_the_end_of_int8_whatever_the_factors(seed: int, size: float) -> None:
     graph = with_relu6(size)
     ends = Ends()
-    chain = Chain(tuple(lone_tensors(graph)), (5, 5, 4))
-    assert chain.tensors == ("a", "b", "c")
-    scaled = chain.scaled(graph, np.random.default_rng(seed).lognormal(-2, 1, 14))
+    singles = SingleTensors(tuple(single_tensors(graph)), (5, 5, 4))
+    assert singles.tensors == ("a", "b", "c")
+    scaled = singles.scaled(graph, np.random.default_rng(seed).lognormal(-2, 1, 14))
     expected = correction(graph, ends)
     np.testing.assert_allclose(
         correction(scaled, ends), expected, atol=2e-5 * np.abs(expected).max()
     )
     core = build_core(
-        scaled, {PLANES: PLANES_FRAC_BITS, CORRECTION: 4} | dict.fromkeys("abc", STREAM_FRAC_BITS)
+        scaled, {PLANES: PLANES_FRAC_BITS, CORRECTION: 4} | dict.fromkeys("abc", GROUP_FRAC_BITS)
     )
     kinds = [op.activation for op in core.convolutions]
     assert kinds == [Activation.relu] * 3 + [Activation.none]
@@ -125,26 +132,26 @@ class Bowl:
 
 @pytest.mark.parametrize("most", [MOST_CHANNELS, 10])
 def test_the_search_never_ends_above_its_start(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(level, "MOST_CHANNELS", most)
-    _, graph, ends, chain = read("espcn")
-    ranges = chain_ranges(graph, chain, images(), ends)
+    monkeypatch.setattr(single, "MOST_CHANNELS", most)
+    _, graph, ends, singles = read("espcn")
+    ranges = single_ranges(graph, singles, images(), ends)
     trial = Bowl(graph)
     for start in (
-        np.ones(sum(chain.widths)),
-        np.concatenate([trial.lowest, np.ones(chain.widths[1])]),
+        np.ones(sum(singles.widths)),
+        np.concatenate([trial.lowest, np.ones(singles.widths[1])]),
     ):
-        factors = level.level(graph, chain, ranges, start, trial)
+        factors = single.equalize_single(graph, singles, ranges, start, trial)
         before, after = (
-            trial(chain.scaled(graph, trial_factors))(None).sum()
+            trial(singles.scaled(graph, trial_factors))(None).sum()
             for trial_factors in (start, factors)
         )
         assert after <= before
 
 
 def test_the_start_leaves_each_tensor_the_scale_it_has() -> None:
-    *_, chain = read("espcn")
-    factors = chain.unscaled(dict.fromkeys(chain.tensors, STREAM_FRAC_BITS - 2))
-    np.testing.assert_array_equal(factors, np.full(sum(chain.widths), 0.25))
+    *_, singles = read("espcn")
+    factors = singles.unscaled(dict.fromkeys(singles.tensors, GROUP_FRAC_BITS - 2))
+    np.testing.assert_array_equal(factors, np.full(sum(singles.widths), 0.25))
 
 
 @pytest.mark.parametrize("loud", [0.1, 20.0])
@@ -152,24 +159,24 @@ def test_what_calibration_sees_is_not_clipped_where_the_image_itself_passes(
     loud: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "beers_deploy.quant.quantize.level", lambda _g, _c, ranges, *_: loud * FULL / ranges
+        "beers_deploy.quant.quantize.equalize_single",
+        lambda _g, _c, ranges, *_: loud * FULL / ranges,
     )
-    model, _, _, chain = read("espcn")
+    model, _, _, singles = read("espcn")
     int8 = quickly(model, patches_of(images()))
     assert int8.core.ends.offsets
-    assert chain_ranges(int8.graph, chain, images(), int8.core.ends, quantile=1.0).max() <= FULL * (
-        1 + 1e-5
-    )
+    largest = single.largest_values(int8.graph, singles, images(), int8.core.ends)
+    assert largest.max() <= FULL * (1 + 1e-5)
 
 
-def test_unequal_channels_err_half_as_much_once_they_are_levelled(
+def test_unequal_channels_err_half_as_much_once_they_are_equalized(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A network whose channels differ thirtyfold, as training with batch
     normalisation leaves them.
     """
     # Only the first guesses are tried, because the search of each channel takes half a minute.
-    monkeypatch.setattr(level, "MOST_CHANNELS", 0)
+    monkeypatch.setattr(single, "MOST_CHANNELS", 0)
     network = build("dncnn", torch.Generator().manual_seed(0))
     layers = [
         layer
@@ -188,12 +195,11 @@ def test_unequal_channels_err_half_as_much_once_they_are_levelled(
 
     def mae() -> float:
         int8 = quickly(model, patches)
-        return compare(
-            open_session(model), open_session(int8.host), patches.pairs, simulated=False
-        ).mae
+        return compare(open_session(model), open_session(int8.host), patches).mae
 
-    levelled = mae()
+    equalized = mae()
     monkeypatch.setattr(
-        "beers_deploy.quant.quantize.level", lambda _graph, _chain, _ranges, start, _trial: start
+        "beers_deploy.quant.quantize.equalize_single",
+        lambda _graph, _chain, _ranges, start, _trial: start,
     )
-    assert levelled < 0.5 * mae()
+    assert equalized < 0.5 * mae()

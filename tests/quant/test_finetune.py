@@ -35,9 +35,9 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.integer.trainable import TrainableCore
-from beers_deploy.quant.passes.tune import BORDER_PX, Sample, Tuning, tune
-from beers_deploy.quant.quantize import Quantised, quantize_model
-from beers_deploy.quant.samples import Patches, Remade
+from beers_deploy.quant.passes.finetune import BORDER_PX, Sample, Tuning, finetune
+from beers_deploy.quant.quantize import Quantized, quantize_model
+from beers_deploy.quant.samples.patches import Patches
 from tests.quant.trained import hold_to_reference, moved
 
 
@@ -62,14 +62,14 @@ def error(core: IntCore, patches: Patches) -> float:
     return float(np.mean(errors))
 
 
-def alone(patches: Patches) -> Remade[tuple[np.ndarray, np.ndarray]]:
+def alone(patches: Patches) -> list[tuple[np.ndarray, np.ndarray]]:
     """The pairs without their references."""
     nothing = np.empty(0, np.float32)
-    return Remade(lambda k: (patches.pairs[k][0], nothing), len(patches.pairs))
+    return [(image, nothing) for image in patches.degraded]
 
 
 def trained(core: IntCore, model: onnx.ModelProto, tuning: Tuning) -> IntCore:
-    return tune(core, read_planes(correction_graph(model)), tuning)[0]
+    return finetune(core, read_planes(correction_graph(model)), tuning)[0]
 
 
 def difference(core: IntCore, other: IntCore, patches: Patches) -> float:
@@ -84,7 +84,7 @@ def difference(core: IntCore, other: IntCore, patches: Patches) -> float:
     return float(np.mean([np.square(a - b).mean() for a, b in zip(*results, strict=True)]))
 
 
-def test_it_begins_with_the_core_s_own_numbers(quantized: Quantised) -> None:
+def test_it_begins_with_the_core_s_own_numbers(quantized: Quantized) -> None:
     unchanged = TrainableCore(quantized.core).core()
     for one, other in zip(quantized.core.convolutions, unchanged.convolutions, strict=True):
         np.testing.assert_array_equal(one.weight, other.weight)
@@ -151,7 +151,7 @@ def test_odd_operations_are_the_reference_s(seed: int) -> None:
 
 @pytest.mark.slow
 def test_without_references_it_comes_back_towards_the_float_network(
-    quantized: Quantised, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
+    quantized: Quantized, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
 ) -> None:
     bad = spoilt(quantized.core)
     tuned = trained(bad, float_onnx, Tuning(alone(patches), 40, rate=0.1))
@@ -161,7 +161,7 @@ def test_without_references_it_comes_back_towards_the_float_network(
 
 
 def test_what_comes_out_worse_is_not_kept(
-    quantized: Quantised, float_onnx: onnx.ModelProto, patches: Patches
+    quantized: Quantized, float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
     tuned = trained(quantized.core, float_onnx, Tuning(alone(patches), 2, rate=60.0))
     assert tuned is quantized.core
@@ -169,24 +169,24 @@ def test_what_comes_out_worse_is_not_kept(
 
 @pytest.mark.parametrize(("rate", "steps"), [(0.0, 12), (0.3, 14)])
 def test_it_goes_on_by_itself_while_held_out_pairs_gain(
-    quantized: Quantised,
+    quantized: Quantized,
     float_onnx: onnx.ModelProto,
     patches: Patches,
     monkeypatch: pytest.MonkeyPatch,
     rate: float,
     steps: int,
 ) -> None:
-    monkeypatch.setattr("beers_deploy.quant.passes.tune.ROUNDS", (12, 2))
+    monkeypatch.setattr("beers_deploy.quant.passes.finetune.ROUNDS", (12, 2))
     graph = read_planes(correction_graph(float_onnx))
     tuning = Tuning(alone(patches), None, rate)
-    assert tune(spoilt(quantized.core), graph, tuning)[1] == steps
+    assert finetune(spoilt(quantized.core), graph, tuning)[1] == steps
 
 
 def test_a_reference_of_another_size_is_one_sentence(
-    quantized: Quantised, float_onnx: onnx.ModelProto, patches: Patches
+    quantized: Quantized, float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
     degraded, reference = patches.pairs[0]
-    short = Remade(lambda _: (degraded, reference[..., :-2]), 2)
+    short = [(degraded, reference[..., :-2])] * 2
     with pytest.raises(
         ImageError, match=r"reference has the size 1 x 1 x 128 x 126, but .* 1 x 1 x 128 x 128"
     ):
@@ -224,7 +224,7 @@ def test_the_border_is_the_float_network_s_where_the_reference_cannot_know(
 
 
 def test_slopes_pass_roundings_and_stop_where_int8_ends(
-    quantized: Quantised, patches: Patches
+    quantized: Quantized, patches: Patches
 ) -> None:
     trainable = TrainableCore(quantized.core)
     planes = torch.from_numpy(quantized.core.ends.split(patches.degraded[0]).astype(np.float32))
@@ -258,7 +258,7 @@ def test_the_correction_of_a_result_makes_it(
 
 @pytest.mark.slow
 def test_training_on_references_pays_on_others(
-    quantized: Quantised, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
+    quantized: Quantized, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
 ) -> None:
     tuned = trained(quantized.core, float_onnx, Tuning(patches.pairs, 20, rate=0.3))
     assert error(tuned, unseen) < 0.97 * error(quantized.core, unseen)

@@ -1,0 +1,82 @@
+"""Write the result in several copies, so that rounding its small values costs little.
+
+1. A correction that the host adds to the image is written twice: fine for nearly all pixels, and
+   coarser by GAIN for the strongest edges, which clip in the fine copy.
+2. A result that nothing is added to is written in windows: fine copies side by side over all that
+   it is in float, and one coarser by GAIN for what lies outside.
+3. Nothing is done where the last operation is no convolution that can write copies, or where its
+   channels would be too many for the DPU.
+"""
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from beers_deploy.quant.ends import FINE_MAX, GAIN, Ends
+from beers_deploy.quant.graph import CORRECTION, Activation, Conv, Graph
+from beers_deploy.quant.session import values_of
+
+MAX_WINDOWS = 8
+MAX_CHANNELS = 4096
+"""That a convolution of the DPU writes."""
+FINER = GAIN.bit_length() - 1
+"""Fractional bits by which a window is finer than the result's own scale."""
+
+
+def can_write_copies(graph: Graph) -> bool:
+    """Return True if the last operation is a convolution that can write its channels twice."""
+    last = graph[-1]
+    return isinstance(last, Conv) and last.activation is Activation.none and last.groups == 1
+
+
+def with_copies(graph: Graph, ends: Ends) -> Graph:
+    """Return the graph whose last convolution writes the copies that the host reads."""
+    if ends.offsets:
+        # 2. The host merges the coarse copy first, then the windows in their order.
+        copies = [(GAIN, 0.0), *((1, offset) for offset in np.array(ends.offsets))]
+    elif ends.gains == 2 and can_write_copies(graph):
+        # 1. Here the fine copy comes first.
+        copies = [(1, 0.0), (GAIN, 0.0)]
+    else:
+        return graph
+    *before, last = graph
+    assert isinstance(last, Conv)  # noqa: S101 - can_write_copies has seen to it
+    weight = np.concatenate([last.weight / gain for gain, _ in copies])
+    bias = np.concatenate([last.bias / gain - offset for gain, offset in copies])
+    return (*before, replace(last, weight=weight.astype(np.float32), bias=bias.astype(np.float32)))
+
+
+def with_windows(graph: Graph, ends: Ends, frac_bits: int, images: Iterable[np.ndarray]) -> Ends:
+    """Return the host part with windows over all that the result is in float, if it takes any.
+
+    Args:
+        graph: plane-reading, in float.
+        ends: its host part.
+        frac_bits: of the result's own scale, than which windows are finer by GAIN.
+        images: (1, C, H, W) that the result's range is measured on.
+    """
+    plain = ends.gains == 1 and not ends.adds_image
+    # 3. One convolution of the DPU has to write the coarse copy and a window at the least.
+    if not (plain and can_write_copies(graph) and ends.outputs <= MAX_CHANNELS // 2):
+        return ends
+    low = np.array(np.inf)
+    high = np.array(-np.inf)
+    for (result,) in values_of(graph, [CORRECTION], images, ends):
+        low = np.minimum(low, result[0].min((1, 2)))
+        high = np.maximum(high, result[0].max((1, 2)))
+    offsets = window_offsets(low, high, 2.0 ** -(frac_bits + FINER))
+    return replace(ends, offsets=tuple(tuple(map(float, window)) for window in offsets))
+
+
+def window_offsets(low: np.ndarray, high: np.ndarray, unit: float) -> np.ndarray:
+    """Return the middles (W, C) of as many windows of int8, its step `unit`, as hold values from
+    low to high, (C,) each.
+    """
+    # The coarse copy takes one of the places that a convolution's channels have.
+    most = min(MAX_WINDOWS, MAX_CHANNELS // len(low) - 1)
+    # A window is believed up to FINE_MAX units on either side of its middle.
+    needed = np.ceil((high - low).max() / (2 * FINE_MAX * unit))
+    count = int(np.clip(needed, 1, max(most, 1)))
+    shares = (np.arange(count)[:, None] + 0.5) / count
+    return np.asarray(low + shares * (high - low))

@@ -1,0 +1,177 @@
+"""Equalize the channels of single tensors, which convolutions alone write and read, at no cost in
+the network.
+
+Each channel may be scaled by a factor of its own, as in `quant.passes.equalize`. A factor is any
+number, so the scale of the tensor, and that of the weights that read it, are no longer bound to
+powers of two.
+
+1. Let a channel's range be the one that most tiles keep.
+2. Guess k = range^-gamma, but let no weak channel's weights outgrow those of the stronger half: the
+   weights that write a tensor share one scale.
+3. Try the guesses on all tensors together, because the error of the worst hides what the others
+   gain.
+4. Try them on one tensor after the other, from the last, because what is rounded late reaches the
+   result. Then try each of its channels larger and smaller.
+
+Next to a residual group this made no network of dense convolutions better that is made for one
+sensor. It helps those with depthwise ones. It helps those behind a bank too, where one file serves
+sensors of little noise and of much, and what lies inside a block is small in most channels.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from beers_deploy.model.progress import steps
+from beers_deploy.quant.ends import Ends
+from beers_deploy.quant.graph import Conv, Graph
+from beers_deploy.quant.passes.equalize import (
+    MOST_CHANNELS,
+    QUANTILE,
+    Best,
+    above_dead,
+    channel_sizes,
+    equalize,
+    first_guess,
+    stepped,
+)
+from beers_deploy.quant.passes.residual_groups import GROUP_FRAC_BITS, only
+from beers_deploy.quant.passes.trial import Costs, Trial
+
+GAMMAS = (0.0, 0.25, 0.5, 1.0)
+HEADROOM = (0.5, 0.75, 1.0, 1.4)
+"""First guesses tried, as in `quant.passes.equalize`; at 0.5 twice the range still fits."""
+TILES = 0.85
+"""A channel's range is this quantile over the tiles.
+
+The widest tile would set the step of all others: with the brightest ground among the patches, a
+DnCNN lost 1.4 dB by it instead of 0.6 (measured on photographs).
+"""
+FEW_TENSORS = 4
+"""Of a deep network next to a residual group, to be tried one by one."""
+
+EVERY = 8
+CLEARLY = 1.1
+"""A guess is tried on one of so many crops first, and dropped where it costs so much more there."""
+
+
+def _guess(ranges: np.ndarray, weights: np.ndarray, gamma: float, headroom: float) -> np.ndarray:
+    """Return the factors (C,) of step 2.
+
+    A channel that is hardly ever on would else be blown up until its weights, `weights` the largest
+    of those that write each, ruled the scale of all.
+    """
+    factors = first_guess(ranges, gamma, headroom)
+    # The weights that write a tensor share one scale, which the largest of them sets.
+    limit = (weights * factors)[ranges >= np.median(ranges)].max()
+    return np.asarray(np.minimum(factors, limit / np.maximum(weights, 1e-12)))
+
+
+@dataclass(frozen=True)
+class SingleTensors:
+    """Tensors that may be equalized, in the graph's order, and how many channels each has.
+
+    Factors and ranges of all of them are one array (sum of the channels,), tensor behind tensor.
+    Next to a residual group `by_channel` is off: trying each channel buys nothing there, nor each
+    tensor of a deep network.
+    """
+
+    tensors: tuple[str, ...]
+    widths: tuple[int, ...]
+    by_channel: bool = True
+
+    @property
+    def parts(self) -> dict[str, slice]:
+        """The place of each tensor's channels."""
+        ends = np.cumsum([0, *self.widths]).tolist()
+        return dict(zip(self.tensors, map(slice, ends, ends[1:]), strict=True))
+
+    def scaled(self, graph: Graph, factors: np.ndarray) -> Graph:
+        """Return the same network with each channel scaled by its factor."""
+        for name, part in self.parts.items():
+            graph = equalize(graph, only(name), factors[part])
+        return graph
+
+    def unscaled(self, frac_bits: Mapping[str, int]) -> np.ndarray:
+        """Return the factors that leave every tensor the scale that it has by itself."""
+        # In the core these tensors have the groups' scale, so the factor stands for their own.
+        scales = [2.0 ** (frac_bits[name] - GROUP_FRAC_BITS) for name in self.tensors]
+        return np.repeat(scales, self.widths)
+
+
+def single_ranges(
+    graph: Graph, singles: SingleTensors, images: Iterable[np.ndarray], ends: Ends
+) -> np.ndarray:
+    """Return the range of every channel over images (1, C, H, W), which most tiles keep."""
+    return _over_tiles(graph, singles, images, ends, QUANTILE, TILES)
+
+
+def largest_values(
+    graph: Graph, singles: SingleTensors, images: Iterable[np.ndarray], ends: Ends
+) -> np.ndarray:
+    """Return the largest size of every channel over images (1, C, H, W)."""
+    return _over_tiles(graph, singles, images, ends, 1.0, 1.0)
+
+
+def _over_tiles(
+    graph: Graph,
+    singles: SingleTensors,
+    images: Iterable[np.ndarray],
+    ends: Ends,
+    quantile: float,
+    tiles: float,
+) -> np.ndarray:
+    """Return a quantile over the tiles of a quantile of each channel's sizes in a tile."""
+    sizes = channel_sizes(graph, list(singles.tensors), images, ends, quantile)
+    by_tensor = zip(*sizes, strict=True)
+    return np.concatenate([above_dead(np.quantile(each, tiles, axis=0)) for each in by_tensor])
+
+
+def equalize_single(
+    graph: Graph, singles: SingleTensors, ranges: np.ndarray, start: np.ndarray, trial: Trial
+) -> np.ndarray:
+    """Return the factors of least error, never more than that of `start`."""
+    weights_of = {
+        op.output: np.abs(op.weight).max((1, 2, 3)) for op in graph if isinstance(op, Conv)
+    }
+    tensors = [(part, ranges[part], weights_of[name]) for name, part in singles.parts.items()]
+
+    def costs_of(factors: np.ndarray) -> Costs:
+        return trial(singles.scaled(graph, factors))
+
+    def guessed(best: Best, group: list[tuple[slice, np.ndarray, np.ndarray]]) -> Best:
+        """Return the best of the first guesses for these tensors, the others as they are."""
+        for shape in product(GAMMAS, HEADROOM):
+            candidate = best.factors.copy()
+            for part, sizes, weights in group:
+                candidate[part] = _guess(sizes, weights, *shape)
+            best = _better(candidate, costs_of, best)
+        return best
+
+    # 3.
+    best = guessed(Best(start, costs_of(start)(None)), tensors)
+    if not singles.by_channel and len(tensors) > FEW_TENSORS:
+        return best.factors
+    with steps("tensors", len(tensors)) as bar:
+        # 4.
+        for tensor in reversed(tensors):
+            best = guessed(best, [tensor])
+            if singles.by_channel and len(ranges) <= MOST_CHANNELS:
+                best = stepped(costs_of, range(tensor[0].start, tensor[0].stop), best)
+            bar.advance()
+    return best.factors
+
+
+def _better(factors: np.ndarray, costs_of: Callable[[np.ndarray], Costs], best: Best) -> Best:
+    """Return the better of two on all crops: so large a step may cost the hardest ones and be worth
+    it.
+    """
+    cost = costs_of(factors)
+    # An eighth of the runs shows which guesses are clearly worse.
+    some = np.arange(0, len(best.costs), EVERY)
+    if cost(some).sum() > CLEARLY * best.costs[some].sum():
+        return best
+    costs = cost(None)
+    return Best(factors, costs) if costs.sum() < best.costs.sum() else best

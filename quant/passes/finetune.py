@@ -1,0 +1,204 @@
+"""Train the integers themselves: weights and biases of the integer core, with roundings and
+clippings in the loop.
+
+Rounding each tensor as well as it can be done leaves errors that meet behind many layers, and noise
+that no rounding takes back. So the core is run as it is, and its numbers follow the slope of its
+result's error (training that sees the quantiser, Jacob et al. 2018): from the reference where there
+is one, and from the float network. Scales and shifts stay, so the core stays as legal as it was.
+
+1. Hold out some of the pairs.
+2. Take steps of gradient descent on the others.
+3. Every few steps round the numbers, and keep the core that errs least on the held-out pairs.
+4. Stop after a round of steps that gained little.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from beers_deploy.model.progress import step
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.quant.core import IntCore
+from beers_deploy.quant.encodings import host_model
+from beers_deploy.quant.ends import Ends
+from beers_deploy.quant.graph import CORRECTION, Graph, graph_to_onnx
+from beers_deploy.quant.integer.trainable import Tensor, TrainableCore
+from beers_deploy.quant.samples.patches import Pair
+from beers_deploy.quant.session import open_session, result_of, tensor_values
+from beers_deploy.quant.untrusted import times
+
+HELD_OUT_EVERY = 8
+"""One pair of so many is not trained on, but judges what is kept."""
+MOST_HELD_OUT = 16
+BATCH_PIXELS = 4 * 128**2
+"""Of the planes in one step."""
+BORDER_PX = 8
+"""Not compared with a reference in a result of at least four times as many a side: there a patch
+ends, and its image goes on. The float network has the same border.
+"""
+ROUNDS = (400, 800, 1600)
+"""Steps of each round of "auto"."""
+LEAST_GAIN = 0.02
+"""Of what INT8 lost at first: a round that wins back less is the last one."""
+JUDGED_EVERY = 20
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """What to train on, how long and how fast.
+
+    Attributes:
+        pairs: images (1, C, H, W) in [0, 1] and their references, which may be empty.
+        steps: gradient steps; None adds rounds of them until pairs that are held out err no less.
+        rate: the highest rate of learning, in units of each number's scale.
+        seed: of the order of the pairs.
+    """
+
+    pairs: Sequence[Pair]
+    steps: int | None = None
+    rate: float = 0.05
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A pair for the core: an image in, corrections (1, C, H', W') out.
+
+    Attributes:
+        image: (1, C, H, W) in [0, 1].
+        planes: of the image, (1, P, H, W) as float32.
+        floats: the float network's correction.
+        reference: the correction that would restore it wholly, or None.
+        weight: of its errors: over the float network's own, so that dark and busy patches count
+            alike.
+    """
+
+    image: np.ndarray
+    planes: Tensor
+    floats: Tensor
+    reference: Tensor | None
+    weight: float
+
+    def error(self, correction: Tensor) -> Tensor:
+        """Return the mean squared errors of a correction, added up and weighted."""
+        error = (correction - self.floats).square().mean()
+        if self.reference is not None:
+            error = error + _inner_error(correction, self.reference)
+        return self.weight * error
+
+
+def finetune(core: IntCore, full: Graph, tuning: Tuning) -> tuple[IntCore, int]:
+    """Return the core with the integers that erred least on held-out pairs, and the steps taken.
+
+    Args:
+        core: to start from; it comes back as it is if training finds nothing better.
+        full: the float network that reads all planes.
+        tuning: on what, how long, how fast.
+    """
+    # 1.
+    samples = list(_samples(core.ends, full, tuning.pairs))
+    # Too few samples to hold one out are trained on and judged by.
+    held_out = (samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or samples)[:MOST_HELD_OUT]
+    training = [sample for k, sample in enumerate(samples) if (k + 1) % HELD_OUT_EVERY] or samples
+    rounds = (tuning.steps,) if tuning.steps else ROUNDS
+    most = f"{'' if tuning.steps else 'at most '}{sum(rounds)}"
+    trainable = TrainableCore(core)
+    first = least = before = loss_of(core, held_out)
+    done = 0
+    # 2.
+    for done, remainder in descend(trainable, training, tuning, rounds):
+        # 3. Counted from the end, so that the last step is judged, where the rate is near 0.
+        if remainder % JUDGED_EVERY == 0:
+            candidate = trainable.core()
+            loss = loss_of(candidate, held_out)
+            if loss < least:
+                core = candidate
+                least = loss
+            step(
+                f"fine-tuning, step {done} of {most}: held-out pairs lose "
+                f"{least / max(first, LEAST_ERROR):.2f} of the first"
+            )
+        # 4.
+        if remainder == 0:
+            if before - least < LEAST_GAIN * first:
+                break
+            before = least
+    return core, done
+
+
+def descend(
+    trainable: TrainableCore, samples: Sequence[Sample], tuning: Tuning, rounds: Iterable[int]
+) -> Iterator[tuple[int, int]]:
+    """Train by Adam; yield the steps taken and the steps left in the round, after each.
+
+    In each round the rate of learning falls to 0 as a half cosine: while it is high, numbers turn
+    to and fro at the thresholds of their rounding, and no judgement is of use.
+    """
+    generator = torch.Generator().manual_seed(tuning.seed)
+    # Without references errors and gradients are small: Adam's eps must be smaller still.
+    optimizer = torch.optim.Adam(trainable.parameters(), eps=1e-15)
+    batch = max(BATCH_PIXELS // math.prod(samples[0].planes.shape[2:]), 1)
+    done = 0
+    for steps in rounds:
+        for taken in range(steps):
+            rate = tuning.rate * 0.5 * (1 + math.cos(math.pi * taken / steps))
+            optimizer.param_groups[0]["lr"] = rate
+            optimizer.zero_grad()
+            for number in torch.randint(len(samples), (batch,), generator=generator).tolist():
+                sample = samples[number]
+                # Gradients of the batch add up sample by sample, whose sizes may differ.
+                (sample.error(trainable(sample.planes)) / batch).backward()
+            optimizer.step()
+            done += 1
+            yield done, steps - taken - 1
+
+
+def loss_of(core: IntCore, samples: Sequence[Sample]) -> float:
+    """Return the mean error of a core, as the host computes it, beyond the float network's own."""
+    # Samples are corrections, so the host must stop once it has merged gains or windows.
+    ends = replace(core.ends, back=(), adds_image=False, last=())
+    session = open_session(host_model(replace(core, ends=ends), {}))
+    errors = [float(s.error(torch.from_numpy(result_of(session, s.image)))) for s in samples]
+    # The float network errs from a reference as well, and no integers can be blamed for that.
+    in_float = [float(sample.error(sample.floats)) for sample in samples]
+    return float(np.mean(errors)) - float(np.mean(in_float))
+
+
+def _samples(ends: Ends, full: Graph, pairs: Sequence[Pair]) -> Iterator[Sample]:
+    session = open_session(graph_to_onnx(full, [CORRECTION], ends.planes * ends.channels))
+    for image, reference in pairs:
+        ((floats,),) = tensor_values(session, [CORRECTION], image, None, ends)
+        planes = torch.from_numpy(ends.split(image).astype(np.float32)).to(
+            memory_format=torch.channels_last
+        )
+        result = torch.from_numpy(floats)
+        if not reference.size:
+            yield Sample(image, planes, result, None, 1.0)
+            continue
+        size = times(reference.shape)
+        expected = times(ends.finished(image, floats).shape)
+        if size != expected:
+            raise ImageError(
+                f"A reference has the size {size}, but the network's result has {expected}. Give "
+                "references of the size of the results."
+            )
+        target = torch.from_numpy(ends.correction_of(image, reference))
+        # Over the float network's own error, dark and busy patches count alike.
+        weight = 1 / max(float(_inner_error(result, target)), LEAST_ERROR)
+        yield Sample(image, planes, result, target, weight)
+
+
+LEAST_ERROR = 1e-9
+"""Mean squared, of full scale: below it, by 90 dB, a float network is as good as perfect."""
+
+
+def _inner_error(result: Tensor, target: Tensor) -> Tensor:
+    """Return the mean squared error, but for a border that no network could restore."""
+    # In a small result the border would be most of it.
+    border_px = BORDER_PX if min(result.shape[2:]) >= 4 * BORDER_PX else 0
+    height, width = result.shape[2:]
+    inner = (result - target)[..., border_px : height - border_px, border_px : width - border_px]
+    return inner.square().mean()

@@ -1,0 +1,143 @@
+"""Find the residual groups: tensors that adds connect, and that share one scale in the core.
+
+1. Group tensors that an add, a pool, an enlargement or a concat connects.
+2. Place each tensor's channels among the group's factors: a concat puts them side by side.
+3. Leave out groups with an operation that a factor per channel does not pass, or that the host
+   writes or reads.
+4. Find single tensors: those of no group that convolutions alone write and read.
+
+One scale for a whole group makes its adds exact: nothing has to be aligned, so nothing is rounded.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import accumulate, chain, repeat
+
+from beers_deploy.quant.core import INT8_MAX
+from beers_deploy.quant.graph import (
+    CORRECTION,
+    PLANES,
+    Activation,
+    Add,
+    AveragePool,
+    Concat,
+    Conv,
+    Graph,
+    MaxPool,
+    Op,
+    Resize,
+    channels_of,
+)
+from beers_deploy.quant.graph.operations import SIX, united
+
+GROUP_FRAC_BITS = 8
+"""Any would do: `equalize` scales the group to it."""
+
+
+ResidualGroup = Mapping[str, slice]
+"""Tensors that have the same factors, channel by channel: each is added to another of them, or is
+such a sum, or what a pool, an enlargement or a concat makes of them. And where in the factors the
+channels of each stand.
+"""
+PASSING = (Concat, MaxPool, AveragePool, Resize)
+"""What hands channels on without mixing them."""
+
+
+def only(name: str) -> ResidualGroup:
+    """Return the group of a tensor by itself."""
+    return {name: slice(None)}
+
+
+def residual_groups(graph: Graph) -> list[ResidualGroup]:
+    """Return the groups that can share a scale and be equalized, in the order of the graph.
+
+    Convolutions and adds alone write and read them, and what hands channels on, with nothing
+    between that a factor does not pass; so not where a product, a pixel shuffle or the network's
+    end reads them.
+    """
+    # 1.
+    linking = [op for op in graph if isinstance(op, (Add, *PASSING))]
+    leader = united((*op.inputs, op.output) for op in linking)
+    sums = {leader[op.output] for op in linking if isinstance(op, Add)}
+    groups = [
+        [name for name in leader if leader[name] == first]
+        for first in dict.fromkeys(leader.values())
+    ]
+    # 2.
+    placed = [_placed(linking, group, graph) for group in groups if leader[group[0]] in sums]
+    # 3.
+    return [group for group in placed if group and _passes_factors(graph, group)]
+
+
+def _placed(linking: Sequence[Op], names: Sequence[str], graph: Graph) -> ResidualGroup:
+    """Return where the channels of these tensors stand; empty if one would have to stand in two
+    places.
+    """
+    writers = [op for op in linking if op.output in names]
+    # Only a concat puts channels at other places than those of its inputs.
+    if not any(isinstance(op, Concat) for op in writers):
+        return dict.fromkeys(names, slice(None))
+    planes = next(op.weight.shape[1] for op in graph if isinstance(op, Conv))
+    widths = channels_of(graph, {PLANES: planes})
+    links = list(chain.from_iterable(_links(op, widths) for op in writers))
+    first = {names[0]: 0}
+    # The tensors are linked to each other, so every sweep places at least one more.
+    while len(first) < len(names):
+        for part, result, by in links:
+            if result in first:
+                first.setdefault(part, first[result] + by)
+            elif part in first:
+                first[result] = first[part] - by
+    # A channel at two places would need two factors.
+    if any(first[part] != first[result] + by for part, result, by in links):
+        return {}
+    least = min(first.values())
+    return {
+        name: slice(start - least, start - least + widths[name]) for name, start in first.items()
+    }
+
+
+def _links(op: Op, widths: Mapping[str, int]) -> list[tuple[str, str, int]]:
+    """Return each input, the output, and where the input's channels stand in the output."""
+    before = accumulate((widths[name] for name in op.inputs[:-1]), initial=0)
+    offsets = before if isinstance(op, Concat) else repeat(0, len(op.inputs))
+    return [(name, op.output, by) for name, by in zip(op.inputs, offsets, strict=True)]
+
+
+def exceeds_six(graph: Graph, group: ResidualGroup, frac_bits: Mapping[str, int]) -> bool:
+    """Return True if a ReLU6 writes to it, and int8 ends beyond the six in one of its tensors."""
+    clipped = any(
+        isinstance(op, Conv) and op.activation is Activation.relu6 and op.output in group
+        for op in graph
+    )
+    # Where int8 ends beyond the six there are larger sums, and its end cannot serve as their clip.
+    return clipped and any(INT8_MAX * 2.0 ** -frac_bits[name] > SIX for name in group)
+
+
+def single_tensors(graph: Graph) -> list[str]:
+    """Return the tensors of no group that convolutions alone write and read: each of their channels
+    may have a factor.
+    """
+    # 4.
+    adds = [op for op in graph if isinstance(op, Add)]
+    terms = set(chain.from_iterable((*op.inputs, op.output) for op in adds))
+    outputs = [op.output for op in graph if isinstance(op, Conv) and op.output not in terms]
+    passing = set(chain.from_iterable(op.inputs for op in graph if isinstance(op, PASSING)))
+    return [name for name in outputs if name not in passing and _passes_factors(graph, only(name))]
+
+
+def _passes_factors(graph: Graph, group: ResidualGroup) -> bool:
+    """Return True if factors pass.
+
+    They pass through ReLU6 where `equalize` may make int8's end its clip, so not behind an add.
+    """
+    touching = [op for op in graph if group.keys() & {*op.inputs, op.output}]
+    # The host writes the planes and reads the correction, and knows no factors.
+    if group.keys() & {PLANES, CORRECTION}:
+        return False
+    if not all(isinstance(op, (Conv, Add, *PASSING)) for op in touching):
+        return False
+    return all(
+        op.activation.homogeneous or (isinstance(op, Conv) and op.activation is Activation.relu6)
+        for op in touching
+        if op.output in group and isinstance(op, Conv | Add)
+    )

@@ -1,0 +1,7 @@
+"""What a network is calibrated and judged on.
+
+- `patches`: images with their references, in memory or simulated each time they are read.
+- `own`: a user's own samples, from files or arrays, checked and cut to patches.
+- `views`, `simulated`: patches that are drawn from scenes, sensors and light.
+- `coverage`: which part of the sensor's range samples cover.
+"""

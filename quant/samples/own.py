@@ -1,0 +1,385 @@
+"""A user's own samples, as their network reads them: what any network is calibrated and judged on.
+
+One .npy or .npz file of a batch (N, C, H, W), or a folder of images and .npy files of one image
+each, (C, H, W). Values are in [0, 1] of full scale: of pixels of 8 bits 255, of more 4095. A .npz
+file may hold what the network should give in addition to what it reads, as `image` and `reference`.
+"""
+
+import hashlib
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+
+from beers_deploy.model.io.files import IMAGE_SUFFIXES
+from beers_deploy.model.raster.images import read_pixels
+from beers_deploy.profiles.arrays import load_arrays
+from beers_deploy.profiles.errors import ImageError, ModelError, OptionError, printable
+from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.quant.onnx_file import fixed_tile_px
+from beers_deploy.quant.samples.patches import PATCH_PX, Pair, Patches
+from beers_deploy.quant.tiling.walk import tiling_of
+from beers_deploy.quant.untrusted import times
+
+ARRAY_SUFFIX = ".npy"
+IN_MEMORY = "samples"
+"""What messages and files call samples that are no file."""
+NO_REFERENCE = np.empty(0, np.float32)
+Named = tuple[str, Pair]
+"""A sample with its name, for messages."""
+
+HELD_OUT_EVERY = 4
+"""One sample of so many is held out from calibration, to judge what INT8 changes."""
+CALIBRATED_ON = "calibration_samples"
+"""What an INT8 file calls the digests of the samples that it was calibrated on."""
+DIGEST_DIGITS = 16
+LARGEST = 1 + 1e-6
+LEAST_CONTRAST = 1 / MAX_DN
+FULL_SCALE_8 = 255
+REMEDY = "See docs/reference/any-network.md for how to give samples."
+
+
+@dataclass(frozen=True)
+class OwnSamples:
+    """A user's samples, in the place of `quant.samples.simulated.Calibration`."""
+
+    name: str
+    samples: Sequence[Named]
+
+    @property
+    def all(self) -> Patches:
+        """Every sample."""
+        return _patches(self.samples)
+
+    @property
+    def drawn(self) -> Patches:
+        """The samples that the network is calibrated on."""
+        return _patches([s for k, s in enumerate(self.samples) if (k + 1) % HELD_OUT_EVERY])
+
+    @property
+    def for_tuning(self) -> Patches:
+        """The same samples: there are no others to train the integers on."""
+        return self.drawn
+
+    @property
+    def unseen(self) -> Patches:
+        """Every fourth sample, which calibration does not see."""
+        # Fewer than four samples are too few to leave one out of calibration.
+        return _patches(self.samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or self.samples)
+
+    @property
+    def about(self) -> dict[str, str]:
+        """The metadata by which an INT8 file describes its calibration."""
+        digests = " ".join(map(digest_of, self.drawn.degraded))
+        return {"calibration_data": self.name, CALIBRATED_ON: digests}
+
+
+def _patches(samples: Sequence[Named]) -> Patches:
+    pairs = [pair for _, pair in samples]
+    return Patches(pairs, [image for image, _ in pairs], [name for name, _ in samples])
+
+
+def digest_of(sample: np.ndarray) -> str:
+    """Return a digest that tells a sample (1, C, h, w) from any other."""
+    content = np.ascontiguousarray(sample, np.float32).tobytes()
+    return hashlib.sha256(content).hexdigest()[:DIGEST_DIGITS]
+
+
+def samples_of(model: onnx.ModelProto, given: object) -> OwnSamples | None:
+    """Read a user's samples for a network; return None if there are none and simulated patches suit
+    it.
+
+    Args:
+        model: the network.
+        given: a path, or what `samples_in` accepts; None for simulated patches.
+
+    Raises:
+        OptionError: no samples, and simulated patches do not suit the network.
+        ImageError: samples that the network does not accept.
+    """
+    channels = int(model.graph.input[0].type.tensor_type.shape.dim[1].dim_value) or 1
+    fixed_px = fixed_tile_px(model)
+    try:
+        multiple_px = tiling_of(model).lattice_px
+    except ModelError:
+        multiple_px = 0
+    if given is not None:
+        source = Path(given) if isinstance(given, str | os.PathLike) else samples_in(given)
+        return read_samples(source, channels, fixed_px, multiple_px or 1)
+    # Simulated patches have one channel and PATCH_PX a side.
+    if not multiple_px:
+        what = f"only images of {fixed_px} x {fixed_px} pixels"
+    elif channels != 1:
+        what = f"{channels} channels"
+    elif PATCH_PX % multiple_px:
+        what = f"images of multiples of {multiple_px} pixels"
+    else:
+        return None
+    raise OptionError(
+        f"`samples` must be given, because the network reads {what}, and simulated patches "
+        f"are {PATCH_PX} x {PATCH_PX} pixels of one channel. Give a .npy or .npz file of "
+        "(N, C, H, W) in [0, 1], or a folder of images."
+    )
+
+
+def samples_in(given: object) -> list[Pair]:
+    """Return the samples in an array, in a pair of arrays (images, references), or in what gives
+    such one after the other.
+
+    Args:
+        given: a batch (N, C, H, W), or one image (C, H, W), of NumPy or torch and in [0, 1]; a
+            tuple of two; a simulated pair, which knows its full scale; or an iterable of any of
+            these, such as a DataLoader.
+    """
+    # A simulated pair holds digital numbers, and alone knows its full scale.
+    if hasattr(given, "degraded") and hasattr(given, "reference"):
+        pair: Any = given
+        largest = np.float32(pair.sensor.max_dn)
+        degraded = np.asarray(pair.degraded, np.float32)[None] / largest
+        reference = np.asarray(pair.reference, np.float32)[None] / largest
+        return [(degraded, reference)]
+    if hasattr(given, "ndim"):
+        return [(image, NO_REFERENCE) for image in _batch(given)]
+    if isinstance(given, tuple) and [hasattr(array, "ndim") for array in given] == [True, True]:
+        # A reference may have another size than its image.
+        images = _batch(given[0])
+        references = _plain(given[1])
+        references = references[None] if np.ndim(given[0]) == 3 else references
+        if references.ndim == 0 or len(images) != len(references):
+            raise ImageError(
+                f"`{IN_MEMORY}` must have a reference for each image, got images of "
+                f"{times(images.shape)} and references of {_shape(references)}. {REMEDY}"
+            )
+        return list(zip(images, references, strict=True))
+    if not isinstance(given, Iterable) or isinstance(given, str | bytes | Mapping):
+        raise ImageError(
+            f"`{IN_MEMORY}` must be arrays (N, C, H, W) or a path, got {type(given).__name__}. "
+            f"{REMEDY}"
+        )
+    samples = list[Pair]()
+    for item in given:
+        # A DataLoader gives a batch as a list: of images and references, or of images alone.
+        batch = tuple(item) if isinstance(item, list) and len(item) == 2 else item
+        alone = isinstance(batch, list | tuple) and len(batch) == 1
+        samples += samples_in(batch[0] if alone else batch)
+    return samples
+
+
+def _batch(array: Any) -> np.ndarray:
+    """Return one image or a batch of NumPy or torch as (N, C, H, W)."""
+    batch = _plain(array)
+    if batch.ndim not in (3, 4):
+        raise ImageError(
+            f"`{IN_MEMORY}` must be a batch of (N, C, H, W), got {times(batch.shape)}. {REMEDY}"
+        )
+    return batch if batch.ndim == 4 else batch[None]
+
+
+def _plain(array: Any) -> np.ndarray:
+    # NumPy refuses a tensor of torch that still has a gradient.
+    return np.asarray(array.detach() if hasattr(array, "detach") else array)
+
+
+def read_samples(
+    source: Path | Sequence[Pair], channels: int, fixed_px: int | None, multiple_px: int = 1
+) -> OwnSamples:
+    """Read the samples of a file, a folder or arrays, cut to what the network takes: each
+    (1, C, h, w) float32 in [0, 1].
+
+    Args:
+        source: the file or folder, or the samples (C, H, W) with their references.
+        channels: that the network reads.
+        fixed_px: side of the image that the network is fixed to; None cuts large samples to
+            patches.
+        multiple_px: what sides must be multiples of; the rest is cut off.
+
+    Raises:
+        ImageError: samples that the network does not accept, or of which none has contrast.
+    """
+    # Messages name a sample by its file or, in memory, by its place.
+    label = f"`{IN_MEMORY}`"
+    name = IN_MEMORY
+    items: Iterable[tuple[str, np.ndarray, np.ndarray]]
+    if isinstance(source, Path):
+        label = str(source)
+        name = source.name
+        folder = source.is_dir()
+        items = map(_stored, sample_files(source)) if folder else _stored_batch(source)
+    else:
+        items = ((f"{IN_MEMORY}[{k}]", *pair) for k, pair in enumerate(source))
+    samples = list[Named]()
+    for sample, image, reference in items:
+        pixels = _valid_image(sample, image, channels)
+        target = _valid_reference(sample, reference)
+        samples += [(sample, p) for p in _cut(pixels, target, sample, fixed_px, multiple_px)]
+    if not samples:
+        raise ImageError(f"{label} contains no sample, but at least one is needed. {REMEDY}")
+    # Any network keeps what is constant, so a mean over such samples would hide errors.
+    textured = [s for s in samples if np.ptp(s[1][0]) >= LEAST_CONTRAST]
+    if not textured:
+        raise ImageError(
+            f"All samples of {label} are constant, but samples need contrast. Give real images."
+        )
+    return OwnSamples(name, textured)
+
+
+def sample_files(path: Path) -> list[Path]:
+    """Return the files that samples are read from: those of a folder in their order, or the file
+    itself.
+    """
+    if not path.is_dir():
+        return [path]
+    return sorted(
+        file for file in path.iterdir() if file.suffix.lower() in {ARRAY_SUFFIX, *IMAGE_SUFFIXES}
+    )
+
+
+def _stored(file: Path) -> tuple[str, np.ndarray, np.ndarray]:
+    """Return name, image (C, H, W) and reference of the one sample in a file of a folder."""
+    if file.suffix.lower() != ARRAY_SUFFIX:
+        image = _bands_first(file, read_pixels(file))
+    else:
+        image, _ = _arrays(file)
+        if image.ndim != 3:
+            raise ImageError(f"{file} must be one image (C, H, W), got {_shape(image)}. {REMEDY}")
+    return file.name, image, NO_REFERENCE
+
+
+def _stored_batch(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yield name, image (C, H, W) and reference of the samples of one file."""
+    images, references = _arrays(path)
+    if images.ndim != 4:
+        raise ImageError(f"{path} must be a batch of (N, C, H, W), got {_shape(images)}. {REMEDY}")
+    if references is NO_REFERENCE:
+        references = np.empty((len(images), 0), np.float32)
+    if references.ndim == 0 or len(references) != len(images):
+        raise ImageError(
+            f"{path} must have a reference for each of its {len(images)} images, got references "
+            f"of {_shape(references)}. {REMEDY}"
+        )
+    for number, pair in enumerate(zip(images, references, strict=True)):
+        yield f"{path.name}[{number}]", *pair
+
+
+def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return the array of a .npy file, mapped rather than read; of a .npz file `image` and
+    `reference`, or its only array.
+
+    Nothing is unpickled.
+    """
+    try:
+        arrays = load_arrays(path)
+    except ValueError as error:
+        raise ImageError(
+            f"Samples are a .npy or .npz file of numbers, or a folder of images, but {path} cannot "
+            f"be read as such: {printable(str(error))}. {REMEDY}"
+        ) from error
+    # One array alone may have any name: `np.savez(file, images)` calls it `arr_0`.
+    image = next(iter(arrays)) if len(arrays) == 1 else "image"
+    if image not in arrays:
+        names = printable(", ".join(arrays)) or "no array"
+        raise ImageError(
+            f"{path} must have arrays named 'image' and 'reference', got {names}. {REMEDY}"
+        )
+    return arrays[image], arrays.get("reference", NO_REFERENCE)
+
+
+def _bands_first(path: Path, pixels: np.ndarray) -> np.ndarray:
+    """Return pixels (H, W) or (H, W, bands) as stored as (C, H, W) of full scale; floats are of
+    full scale already.
+    """
+    bands = pixels[None] if pixels.ndim == 2 else np.moveaxis(pixels, -1, 0)
+    if bands.dtype.kind == "f":
+        return bands
+    if bands.dtype.kind not in "ui":
+        raise ImageError(f"The pixels of {path} must be numbers, got {bands.dtype}. {REMEDY}")
+    # Files state no full scale: pixels of 8 bits use all of them, others are taken for 12 bits.
+    return bands / np.float32(FULL_SCALE_8 if bands.dtype.itemsize == 1 else MAX_DN)
+
+
+def _shape(array: np.ndarray) -> str:
+    return times(array.shape) or "no dimension"
+
+
+def _valid_reference(name: str, reference: np.ndarray) -> np.ndarray:
+    """Return a reference as float32; raise ImageError if it is not made of real, finite numbers.
+
+    Whether it must be an image in [0, 1] of the result's size depends on what is measured:
+    `quant.gate.compare`.
+    """
+    if reference.dtype.kind not in "fuib":
+        raise ImageError(
+            f"The reference of {name} must be of real numbers, got {reference.dtype}. {REMEDY}"
+        )
+    values = np.asarray(reference, np.float32)
+    lost = np.count_nonzero(~np.isfinite(values))
+    if lost:
+        raise ImageError(
+            f"The reference of {name} has {lost} values that are NaN or infinite. Leave out "
+            "samples whose references lack pixels."
+        )
+    return values
+
+
+def _valid_image(name: str, image: np.ndarray, channels: int) -> np.ndarray:
+    if image.dtype.kind not in "fui" or len(image) != channels:
+        raise ImageError(
+            f"{name} must have {channels} channels of numbers, as the network reads, got "
+            f"{len(image)} channels of {image.dtype}. {REMEDY}"
+        )
+    if not image.size:
+        raise ImageError(f"{name} has no pixels: its shape is {_shape(image)}. {REMEDY}")
+    values = np.asarray(image, np.float32)
+    low = float(values.min())
+    high = float(values.max())
+    # NaN fails every comparison, so it is refused as well.
+    if not (low >= 0 and high <= LARGEST):
+        remedy = (
+            "Divide them by full scale."
+            if np.isfinite(high)
+            else "Leave out samples with missing pixels."
+        )
+        raise ImageError(
+            f"The values of {name} must be in [0, 1], but they are {low:.4g} to {high:.4g}. "
+            f"{remedy}"
+        )
+    # What rounding has left above 1, within the tolerance of LARGEST.
+    return np.minimum(values, 1)
+
+
+def _cut(
+    image: np.ndarray, reference: np.ndarray, name: str, fixed_px: int | None, multiple_px: int
+) -> Iterator[Pair]:
+    """Yield patches of an image (C, H, W), or the whole where a reference belongs to it."""
+    height, width = image.shape[1:]
+    size = times((height, width))
+    # A reference may be of another size, such as an enlarged image: it cannot be cut.
+    if reference.size:
+        if fixed_px is not None and (height, width) != (fixed_px, fixed_px):
+            raise ImageError(
+                f"{name} must have {fixed_px} x {fixed_px} pixels, to which the network is fixed, "
+                f"got {size}. {REMEDY}"
+            )
+        if height % multiple_px or width % multiple_px:
+            raise ImageError(
+                f"{name} has a reference, so its sides must be multiples of {multiple_px} pixels, "
+                f"got {size}. Cut both."
+            )
+        yield image[None], reference[None]
+        return
+    side = fixed_px or PATCH_PX // multiple_px * multiple_px
+    # An image smaller than a patch is one patch, cut to the sides that the network takes.
+    rows, columns = (side if n >= side else n // multiple_px * multiple_px for n in image.shape[1:])
+    if 0 in (rows, columns) or (fixed_px is not None and (rows, columns) != (side, side)):
+        raise ImageError(
+            f"{name} must have at least {fixed_px or multiple_px} pixels a side, got {size}. "
+            "Give larger images."
+        )
+    for top in range(0, height - rows + 1, rows):
+        for left in range(0, width - columns + 1, columns):
+            patch = image[None, :, top : top + rows, left : left + columns]
+            yield np.ascontiguousarray(patch), NO_REFERENCE

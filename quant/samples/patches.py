@@ -1,0 +1,62 @@
+"""Patches: images with their references, in memory or simulated each time they are read."""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from beers_deploy.quant.samples.views import View
+
+PATCH_PX = 128
+Pair = tuple[np.ndarray, np.ndarray]
+"""(degraded, reference) of a patch; the reference of a user's own sample that has none is empty."""
+T = TypeVar("T")
+
+
+class Regenerated(Sequence[T]):
+    """A sequence whose items are computed each time they are read: none is stored."""
+
+    def __init__(self, item: Callable[[int], T], count: int) -> None:
+        """Compute item k, of `count` items, as `item(k)`."""
+        self._item = item
+        self._count = count
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, number: int) -> T:  # type: ignore[override]  # nobody reads slices
+        # `Sequence` ends a loop at the first IndexError.
+        if not 0 <= number < self._count:
+            raise IndexError(number)
+        return self._item(number)
+
+
+@dataclass(frozen=True)
+class Patches:
+    """Images (1, C, h, w) float32 in [0, 1], and their references.
+
+    Attributes:
+        pairs: (degraded, reference) of each patch.
+        degraded: the same degraded patches alone: to simulate these is half the work.
+        names: of a user's own samples, for messages; empty for simulated patches.
+        views: what each simulated patch shows, and the sensors that see it; empty for a user's own
+            samples.
+    """
+
+    pairs: Sequence[Pair]
+    degraded: Sequence[np.ndarray]
+    names: Sequence[str] = ()
+    views: "Sequence[View]" = ()
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the bytes of all pairs."""
+        digest = hashlib.sha256()
+        for pair in self.pairs:
+            for image in pair:
+                digest.update(image.tobytes())
+        return digest.hexdigest()

@@ -1,0 +1,170 @@
+"""Simulated patches for calibration, and to judge what INT8 changes.
+
+Patches are simulated anew for each pass over them, which costs a tenth of what the network does
+with them. So memory grows neither with their number nor with their size.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from beers_deploy.model.family import SensorFamily
+from beers_deploy.model.simulator.acquire import acquire
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.mtf import transfer_function
+from beers_deploy.model.simulator.procedural import load_scenes
+from beers_deploy.model.simulator.sampling import Scene, scene_spectrum
+from beers_deploy.model.training.patches import PatchRecipe, turn
+from beers_deploy.profiles.sensor import Instrument, Sensor
+from beers_deploy.quant.samples.patches import PATCH_PX, Pair, Patches, Regenerated
+from beers_deploy.quant.samples.views import (
+    CALIBRATION,
+    JUDGING,
+    Ground,
+    Lightings,
+    draw_views,
+    relit,
+)
+
+HELD_OUT_SEED = 1000
+"""Added to a run's seed where patches must be others than calibration's."""
+HELD_OUT_PATCHES = 32
+TUNING_SEED = 2000
+"""Added to a run's seed for the patches that the integers are trained on."""
+TUNING_PATCHES = 256
+ROLES = "degraded", "reference"
+"""Of the sensors of a pair, each with noise of its own: a degraded patch is the same in a pair and
+alone.
+"""
+NO_LIGHTING: Lightings = {}
+
+
+def draw_patches(
+    scenes: list[Scene],
+    degraded: Sensor,
+    reference: Sensor,
+    count: int,
+    seed: int,
+    patch_px: int = PATCH_PX,
+    family: SensorFamily | None = None,
+    lightings: Lightings = NO_LIGHTING,
+) -> Patches:
+    """Draw patches by sensor profile and seed, spread over the profile's ranges and over
+    brightness.
+
+    Args:
+        scenes: that are seen.
+        degraded: the sensors that see them, unless a family does.
+        reference: the sensor of the wanted images.
+        count: of patches.
+        seed: of everything that is drawn.
+        patch_px: side of a patch.
+        family: of sensors with the gain and bits of `degraded`.
+        lightings: how the ground is lit, so that the patches cover the sensor's range; without any
+            it is as bright as the scenes show it.
+
+    Raises:
+        ImageError: no scene holds a patch.
+        ProfileError: the two profiles differ in gain, bits or offset.
+    """
+    recipe = PatchRecipe(degraded, reference, patch_px=patch_px, family=family)
+    # Each purpose has a generator of its own, so that lightings change no other draw.
+    views = draw_views(scenes, recipe, count, Draw(seed).generator("views"))
+    if lightings:
+        views = relit(views, lightings, Draw(seed).generator("lighting"))
+
+    # Keyed by the patch's number, because patches are simulated in any order.
+    def pair(number: int) -> Pair:
+        view = views[number]
+        image, target = _simulate(view.ground, (view.degraded, view.reference), Draw(seed, number))
+        return image, target
+
+    def alone(number: int) -> np.ndarray:
+        view = views[number]
+        return _simulate(view.ground, (view.degraded,), Draw(seed, number))[0]
+
+    return Patches(Regenerated(pair, count), Regenerated(alone, count), views=views)
+
+
+def _simulate(ground: Ground, sensors: Sequence[Instrument], draw: Draw) -> list[np.ndarray]:
+    """Return what the degraded sensor, and the reference if given, produce from the same ground:
+    patches (1, 1, P, P).
+    """
+    radiance = ground.radiance
+    spectrum = scene_spectrum(radiance)
+    width = radiance.shape[-1]
+    images = [
+        acquire(spectrum, width, sensor, ground.oversampling, draw, role) / sensor.max_dn
+        for role, sensor in zip(ROLES, sensors, strict=False)
+    ]
+    # No two patches share a transfer function, and each is megabytes.
+    transfer_function.cache_clear()
+    mirrors, quarters = sensors[0].symmetry
+    turned = turn(np.stack(images)[:, None], draw.generator("turn"), quarters, mirrors)
+    return [np.ascontiguousarray(image[None]) for image in turned]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Where a run's patches come from."""
+
+    sensor: Sensor
+    images: Path | None
+    patches: int
+    patch_px: int
+    seed: int
+
+    @cached_property
+    def drawn(self) -> Patches:
+        """The patches that the network is calibrated on."""
+        return self._draw(self.patches, self.seed)
+
+    @property
+    def for_tuning(self) -> Patches:
+        """Other patches of the same scenes, for fine-tuning, which needs more of them."""
+        return self._draw(TUNING_PATCHES, self.seed + TUNING_SEED)
+
+    @property
+    def unseen(self) -> Patches:
+        """Patches of the same scenes, or of other drawn ones, held out from calibration."""
+        return unseen_patches(self.sensor, self.images, HELD_OUT_PATCHES, self.seed)
+
+    @property
+    def about(self) -> dict[str, str]:
+        """The metadata by which an INT8 file describes its calibration."""
+        return {"calibration_sensor": self.sensor.name, "calibration_seed": str(self.seed)}
+
+    def _draw(self, count: int, seed: int) -> Patches:
+        reference = self.sensor.reference
+        return draw_patches(
+            self._scenes,
+            self.sensor,
+            reference,
+            count,
+            seed,
+            self.patch_px,
+            lightings=CALIBRATION,
+        )
+
+    @cached_property
+    def _scenes(self) -> list[Scene]:
+        return load_scenes(self.images, self.sensor.reference.nominal(), self.seed)
+
+
+def unseen_patches(degraded: Sensor, images: Path | None, patches: int, seed: int) -> Patches:
+    """Draw patches of 128 x 128 that calibration with the same seed does not draw.
+
+    Args:
+        degraded: the sensor's profile; the reference is the one that belongs to it.
+        images: folder of scenes; None for drawn ones, which are others than calibration's.
+        patches: how many.
+        seed: of the calibration.
+    """
+    reference = degraded.reference
+    # Another seed draws other scenes, and other patches of the same images.
+    other = seed + HELD_OUT_SEED
+    scenes = load_scenes(images, reference.nominal(), other, patches)
+    return draw_patches(scenes, degraded, reference, patches, other, lightings=JUDGING)
