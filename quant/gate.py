@@ -12,7 +12,7 @@ import onnxruntime as ort
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.samples.coverage import BINS, SampleRange, histogram, range_from
 from beers_deploy.quant.samples.own import LARGEST
 from beers_deploy.quant.samples.patches import Patches

@@ -18,7 +18,8 @@ from beers_deploy.model.simulator.mtf import transfer_function
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.model.simulator.sampling import Scene, scene_spectrum
 from beers_deploy.model.training.patches import PatchRecipe, turn
-from beers_deploy.profiles.sensor import Instrument, Sensor
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.samples.patches import PATCH_PX, Pair, Patches, Regenerated
 from beers_deploy.quant.samples.views import (
     CALIBRATION,

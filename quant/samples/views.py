@@ -18,7 +18,7 @@ from beers_deploy.model.simulator.acquire import MARGIN_PX
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.training.patches import PatchRecipe
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.instrument import Instrument
 
 CANDIDATES = 8
 """Drawn for each view."""
