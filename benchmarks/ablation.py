@@ -20,7 +20,7 @@ import onnx
 
 from beers_deploy.model.shipped import SENSOR, shipped_names, shipped_weights
 from beers_deploy.network_files import Conditioned, int8_for_sensor
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.calibration import unseen_patches
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.onnx_file import load_onnx
@@ -87,7 +87,7 @@ def small(name: str, arguments: argparse.Namespace, folder: Path) -> Loss:
 def shipped(name: str, arguments: argparse.Namespace) -> Loss:
     """Return the loss of a shipped network behind the bank of one sensor."""
     network = Conditioned(name, shipped_weights(name))
-    sensor = load_sensor(SENSOR)
+    sensor = Sensor.load(SENSOR)
     float_session = open_any_size(network.model(sensor, int8=False))
     pairs = unseen_patches(sensor, arguments.held_out, UNSEEN, 0).pairs
     folders = [arguments.images] if arguments.images else []

@@ -17,7 +17,8 @@ from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.model.shipped import INT8, SHIPPED, shipped_names, shipped_weights
 from beers_deploy.network_files import Conditioned
-from beers_deploy.profiles.target import board_names, load_target
+from beers_deploy.profiles.shipped import board_names
+from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.core import target_shifts
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quantization import family_model
@@ -31,7 +32,7 @@ def files(images: Path | None, variants: list[str]) -> None:
         shipped = integers(load_onnx(SHIPPED / f"{variant}{INT8}.onnx"))
         for name in board_names():
             start = time.perf_counter()
-            target = load_target(name)
+            target = TargetProfile.load(name)
             network_family = family_model(
                 network, [images] if images else [], shifts=target_shifts(target)
             )

@@ -33,15 +33,15 @@ from beers_deploy.model.simulator.mtf import mtf
 from beers_deploy.model.simulator.sampling import Scene, crop_divisible, read_scene, scene_spectrum
 from beers_deploy.parity import torch_network
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.characterize import Measurement, Stated, measure, profile_toml
 from beers_deploy.studies.characterize.instrument import AXES
 from beers_deploy.studies.characterize.profile import SHOWN_CPX
 from beers_deploy.studies.evaluation.pairs import simulate_pairs
 
 LIKE, REFERENCE = (
-    load_sensor(name).nominal() for name in ("pleiades-degraded", "pleiades-reference")
+    Sensor.load(name).nominal() for name in ("pleiades-degraded", "pleiades-reference")
 )
 MTF_RANGE = (0.02, 0.12)
 RATIO = 4
@@ -83,7 +83,7 @@ def main() -> None:
                 profile.write_text(profile_toml(estimate), encoding="utf-8")
                 losses_db.append(
                     psnr_lost(
-                        arguments.weights, subset[0], sensor, load_sensor(str(profile)).nominal()
+                        arguments.weights, subset[0], sensor, Sensor.load(str(profile)).nominal()
                     )
                 )
     print("| figure | images | found | error, median | mean, signed | worst | in the interval |")

@@ -26,11 +26,11 @@ from beers_deploy.model.simulator.acquire import acquire_padded, fitting_oversam
 from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene, crop_divisible, read_scene
-from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.detectors.look import BandFaults, look_at_detectors
 
-LIKE = load_sensor("pleiades-degraded").nominal()
+LIKE = Sensor.load("pleiades-degraded").nominal()
 LEAST_SIDE_PX = 140
 SIDE_PX = 2048
 RATIOS = (4, 2)

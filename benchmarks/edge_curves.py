@@ -31,11 +31,11 @@ from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.simulator.acquire import acquire
 from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.sampling import read_scene, scene_spectrum
+from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import NYQUIST, MtfTable
-from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 
-LIKE = load_sensor("pleiades-degraded").nominal()
+LIKE = Sensor.load("pleiades-degraded").nominal()
 OVERSAMPLING = 4
 SIDE_PX = 112
 MARGIN_PX = 24

@@ -46,7 +46,7 @@ from beers_deploy.model.training.losses import LossWeights, RestorationLoss
 from beers_deploy.model.training.patches import PatchRecipe
 from beers_deploy.model.training.source import PatchSource
 from beers_deploy.network import Network
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.calibration import Calibration, draw_patches
 from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.samples import Patches
@@ -266,7 +266,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu", help="cpu or cuda, of the training")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    sensors = load_sensor(SENSOR), load_sensor(REFERENCE)
+    sensors = Sensor.load(SENSOR), Sensor.load(REFERENCE)
     scenes = [read_scene(file, sensors[1].nominal()) for file in list_images(arguments.images)]
     held_out_sites = sorted({site_of(scene.name) for scene in scenes})[::HELD_OUT_EVERY]
     held_out = [scene for scene in scenes if site_of(scene.name) in held_out_sites]
@@ -275,7 +275,7 @@ def main() -> None:
     source = PatchSource(
         training, PatchRecipe(*sensors, patch_px=PATCH_PX), BATCH, 0, device=arguments.device
     )
-    patches = Calibration(load_sensor(SENSOR), None, 64, 128, 0).drawn
+    patches = Calibration(Sensor.load(SENSOR), None, 64, 128, 0).drawn
     print(
         f"{processor_name()}, {arguments.steps * BATCH} patches each, judged by {HELD_OUT} of "
         f"{len(held_out_sites)} sites"

@@ -42,7 +42,7 @@ from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.model.shipped import shipped_weights
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.network import Network
-from beers_deploy.profiles.sensor_file import load_sensor, reference_for
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.calibration import HELD_OUT_SEED, draw_patches
 from beers_deploy.quant.ends import Ends, ends_of
 from beers_deploy.quant.graph import CORRECTION, PLANES, graph_to_onnx, read_network, read_planes
@@ -246,8 +246,8 @@ def drawn(model: onnx.ModelProto, arguments: argparse.Namespace) -> tuple[list[P
 
 
 def _simulated(images: Path | None, sensor: str, count: int, seed: int) -> list[Pair]:
-    profile = load_sensor(sensor)
-    aim = reference_for(profile)
+    profile = Sensor.load(sensor)
+    aim = profile.reference
     return list(
         draw_patches(load_scenes(images, aim.nominal(), seed), profile, aim, count, seed).pairs
     )

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from beers_deploy.model.raster.images import site_of
 from beers_deploy.model.simulator.mtf import mtf
 from beers_deploy.model.simulator.procedural import load_scenes
+from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import NYQUIST, MtfTable
-from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.method import Restore
 from beers_deploy.studies.evaluation.methods import (
     TRADITIONAL,
@@ -41,8 +41,8 @@ CUTOFFS = (0.5, 3.0)
 """Of a circular pupil, in cycles per pixel: the one that gives the contrast lies between."""
 
 Curve = NDArray[np.float64]
-DEGRADED = load_sensor("pleiades-degraded")
-REFERENCE = load_sensor("pleiades-reference")
+DEGRADED = Sensor.load("pleiades-degraded")
+REFERENCE = Sensor.load("pleiades-reference")
 
 
 def main() -> None:

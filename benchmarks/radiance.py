@@ -19,15 +19,15 @@ from beers_deploy.model.raster.images import read_pixels, site_of
 from beers_deploy.model.shipped import INT8, SENSOR, shipped_names
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.model.simulator.sampling import Scene, scene_of
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.evaluation.methods import method_named
 from beers_deploy.studies.evaluation.pairs import NamedPair, oversamplings_of, simulate_pairs
 from beers_deploy.studies.evaluation.scores import bias_percent
 
 CROP_PX = 700
 SEED = 0
-DEGRADED = load_sensor(SENSOR)
-REFERENCE = load_sensor("pleiades-reference")
+DEGRADED = Sensor.load(SENSOR)
+REFERENCE = Sensor.load("pleiades-reference")
 
 
 def main() -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from beers_deploy.model.processor import processor_name
 from beers_deploy.model.shipped import SENSOR, shipped_names, shipped_weights
 from beers_deploy.network_files import Conditioned
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.runtime import Infer, Runtime, open_runtime
 
 TILE_PX = 640
@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("--threads", default="1,2")
     arguments = parser.parse_args()
     image = np.random.default_rng(0).random((1, 1, TILE_PX, TILE_PX), np.float32)
-    sensor = load_sensor(SENSOR)
+    sensor = Sensor.load(SENSOR)
     print(f"{processor_name()}, a tile of {TILE_PX} x {TILE_PX} pixels")
     print("| network | threads | onnxruntime ms | OpenVINO ms | times faster | difference |")
     print("|---|---|---|---|---|---|")

@@ -28,12 +28,12 @@ from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import crop_divisible, read_scene
 from beers_deploy.network import Network
-from beers_deploy.profiles.sensor import Instrument, Sensor
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.sensor_check import SensorCheck, check_source
 from beers_deploy.studies.evaluation.methods import profile_of
 
-BASE = load_sensor("pleiades-degraded")
+BASE = Sensor.load("pleiades-degraded")
 THIRD = 4 / 3
 SIDE_PX = 2048
 Image = np.ndarray

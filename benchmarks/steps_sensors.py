@@ -21,7 +21,7 @@ from beers_deploy.model.metrics.fidelity import fidelity_db
 from beers_deploy.model.raster.images import site_of
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.model.simulator.sampling import Scene
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.steps import Around
 from beers_deploy.studies.evaluation.methods import method_named
 from beers_deploy.studies.evaluation.pairs import NamedPair, simulate_pairs
@@ -39,8 +39,8 @@ AROUND = {
     "exposure": Around(consistency=False, exposure=True),
     "both": Around(consistency=True, exposure=True),
 }
-DEGRADED = load_sensor("pleiades-degraded")
-REFERENCE = load_sensor("pleiades-reference")
+DEGRADED = Sensor.load("pleiades-degraded")
+REFERENCE = Sensor.load("pleiades-reference")
 
 Scores = dict[str, dict[str, dict[str, float]]]
 """Mean PSNR in dB by brightness and sensor, by network, and by what is around it."""

@@ -33,8 +33,8 @@ from beers_deploy.model.traditional.nl_bayes import QUALITIES
 from beers_deploy.model.traditional.noise import Noise, with_rounding_noise
 from beers_deploy.model.traditional.pipeline import WORKING_SIGMA, denoise_radiance
 from beers_deploy.model.traditional.regularisation import FIT, Fit, measure
-from beers_deploy.profiles.sensor import Instrument, noise_from_snr
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.instrument import Instrument, noise_from_snr
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.evaluation.pairs import NamedPair, simulate_pairs
 
 BORDER_PX = 24
@@ -65,12 +65,12 @@ BEFORE_PER_PERCENT = 3.3e-3
 image.
 """
 
-REFERENCE = load_sensor("pleiades-reference").nominal()
+REFERENCE = Sensor.load("pleiades-reference").nominal()
 
 
 def sensors() -> dict[str, Instrument]:
     """Return the sensors of the scan: MTF at Nyquist in %, SNR at 25 and 100 W/m2/sr/um."""
-    nominal = load_sensor("pleiades-degraded").nominal()
+    nominal = Sensor.load("pleiades-degraded").nominal()
     blurred = partial(replace, nominal)
     return {
         "7 %, 50 / 110": nominal,

@@ -33,7 +33,7 @@ from beers_deploy.model.training.patches import PatchRecipe
 from beers_deploy.model.training.source import Batch, PatchSource
 from beers_deploy.model.training.trainer import Precision, Trainer
 from beers_deploy.model.variants import VARIANTS
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 
 BATCH = 8
 PATCH_PX = 96
@@ -50,7 +50,7 @@ def main() -> None:
     parser.add_argument("--variant", choices=VARIANTS, default="convbeers-s")
     parser.add_argument("--steps", type=int, default=48)
     arguments = parser.parse_args()
-    profiles = load_sensor("pleiades-variable"), load_sensor("pleiades-reference")
+    profiles = Sensor.load("pleiades-variable"), Sensor.load("pleiades-reference")
     scenes = [procedural_scene(1200, 1600, np.random.default_rng(seed)) for seed in range(4)]
     source = PatchSource(scenes, PatchRecipe(*profiles, patch_px=PATCH_PX), BATCH, 0)
     recipe = TrainingRecipe(steps=(TURNS + 1) * arguments.steps, batch=BATCH, loss=LOSS)
@@ -94,8 +94,8 @@ def main() -> None:
 
 def kinds_of_patches() -> dict[str, PatchRecipe]:
     """Recipes of patches for any sensor, by name."""
-    degraded = load_sensor("pleiades-degraded")
-    reference = load_sensor("pleiades-reference")
+    degraded = Sensor.load("pleiades-degraded")
+    reference = Sensor.load("pleiades-reference")
     plain = PatchRecipe(degraded, reference, PATCH_PX, family=SensorFamily(degraded.nominal()))
     family = SensorFamily(degraded.nominal(), other_curves=0.4)
     return {

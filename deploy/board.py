@@ -22,8 +22,8 @@ from beers_deploy.network_files import other_sensor
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.figures import Figure, Mode, Row
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import BLIND, sensor_names
-from beers_deploy.profiles.target import TILE_PX, TargetProfile, board_names
+from beers_deploy.profiles.shipped import BLIND, TILE_PX, board_names, sensor_names
+from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.encodings import save_config
 from beers_deploy.quant.session import open_session, tensors_of
 from beers_deploy.results import Table

@@ -16,7 +16,8 @@ from beers_deploy.model.bank import FILTERS, in_places, network_bank
 from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.io.tensors import Weights, read_conditioned, read_plain
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.sensor import Instrument, Sensor
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, load_onnx, make_model
 
 if TYPE_CHECKING:

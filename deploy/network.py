@@ -26,8 +26,8 @@ from beers_deploy.network_files import (
 from beers_deploy.profiles.errors import ModelError, optional, reason_of
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import BLIND
-from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
+from beers_deploy.profiles.shipped import BLIND, DEFAULT_TARGET
+from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.encodings import board_model, read_core, vint8_model
 from beers_deploy.quant.onnx_file import (
     fixed_tile_px,

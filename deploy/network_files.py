@@ -26,7 +26,7 @@ from beers_deploy.model.shipped import (
 from beers_deploy.model.variants import Kernels
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import BLIND, BLIND_PROFILE
+from beers_deploy.profiles.shipped import BLIND, BLIND_PROFILE
 from beers_deploy.profiles.toml import unreadable
 from beers_deploy.quant.banked.family import required_family, with_delta
 from beers_deploy.quant.encodings import host_model

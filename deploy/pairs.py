@@ -16,7 +16,9 @@ from beers_deploy.model.io.pictures import picture_url, stretch_of
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor import Instrument, Sensor, require_same_units
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.reference import require_same_units
+from beers_deploy.profiles.sensor import Sensor
 
 if TYPE_CHECKING:
     from beers_deploy.model.simulator.sampling import Scene

@@ -17,7 +17,7 @@ from beers_deploy.model.convbeers import (
 )
 from beers_deploy.model.io.tensors import read_conditioned, read_plain
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.quant.session import open_session, run
 
 MAX_DIFFERENCE = 1e-5

@@ -6,20 +6,21 @@ from beers_deploy.profiles.constant import Constant, Words
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.response import MtfTable
-from beers_deploy.profiles.scene_call import load_scene_call, scene_names
-from beers_deploy.profiles.sensor import TABLES, Sensor, constant_keys
-from beers_deploy.profiles.sensor_file import load_sensor, sensor_names
-from beers_deploy.profiles.target import load_target, target_names
-from beers_deploy.profiles.toml import profile_path, read_toml
+from beers_deploy.profiles.scene_call import SceneCall
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import TABLES, constant_keys
+from beers_deploy.profiles.shipped import profile_path, scene_names, sensor_names, target_names
+from beers_deploy.profiles.target import TargetProfile
+from beers_deploy.profiles.toml import read_toml
 from beers_deploy.results import Table
 
 
 def list_of_profiles() -> Table:
     """Return all shipped profiles by kind."""
     kinds = {
-        "sensors": {name: load_sensor(name).description for name in sensor_names()},
-        "scenes": {name: load_scene_call(name).description for name in scene_names()},
-        "boards": {name: load_target(name).description for name in target_names()},
+        "sensors": {name: Sensor.load(name).description for name in sensor_names()},
+        "scenes": {name: SceneCall.load(name).description for name in scene_names()},
+        "boards": {name: TargetProfile.load(name).description for name in target_names()},
     }
     rows = []
     for kind, descriptions in kinds.items():
@@ -42,14 +43,14 @@ def table_of_profile(name: str) -> Table:
 def _profile(name: str) -> tuple[str, Table]:
     """Return the folder of a profile, and its table; tried as sensor, scene and target in turn."""
     if _is(name, "sensors", sensor_names(), "mtf"):
-        sensor = load_sensor(name)
+        sensor = Sensor.load(name)
         return "sensors", _table(sensor.name, sensor.description, _sensor_rows(sensor))
     if _is(name, "scenes", scene_names(), "radiance_scale"):
-        scene = load_scene_call(name)
+        scene = SceneCall.load(name)
         rows = [_row("radiance_scale", scene.radiance_scale), *_table_rows(scene.effects)]
         return "scenes", _table(scene.name, scene.description, rows)
     if name in target_names() or name.endswith(".toml"):
-        target = load_target(name)
+        target = TargetProfile.load(name)
         groups: dict[str, Mapping[str, Constant | Words]] = {
             **target.tables,
             **{f"configurations.{k}": v for k, v in target.configurations.items()},

@@ -21,8 +21,8 @@ from beers_deploy.network_files import Conditioned, conditioned, int8_for_sensor
 from beers_deploy.profiles.errors import ModelError, OptionError, optional, printable
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
-from beers_deploy.profiles.target import TargetProfile, board_names, npu_names
+from beers_deploy.profiles.shipped import REFERENCE, board_names, npu_names
+from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.banked.family import FAMILY, WEIGHTS, required_family
 from beers_deploy.quant.core import SHIFTS, Shifts, target_shifts
 from beers_deploy.quant.encodings import host_model, read_core
@@ -295,7 +295,7 @@ def family_model(
     from beers_deploy.quant.banked.calibrate import family_images, quantize_family
 
     weights = read_conditioned(network.weights)
-    aim = load_sensor(REFERENCE).nominal()
+    aim = Sensor.load(REFERENCE).nominal()
     scale = weights.variant.scale
     scenes = load_scenes(None, aim, seed)
     # Drawn scenes have stronger edges, photographs finer ground, so both are calibrated on.

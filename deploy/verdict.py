@@ -27,7 +27,8 @@ from beers_deploy.dpu.reading import network_of
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.figures import Check
-from beers_deploy.profiles.target import TILE_PX, TargetProfile
+from beers_deploy.profiles.shipped import TILE_PX
+from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.float_parts import float_note
 from beers_deploy.quant.gate import GateResult, judge, judge_saturation, unfit_reference
 from beers_deploy.quant.limits import Limits

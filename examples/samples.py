@@ -29,14 +29,14 @@ from beers_deploy.model.training.passes import Pass, Visited, detected, folded_s
 from beers_deploy.model.training.patches import PatchRecipe, draw_turn
 from beers_deploy.model.training.source import PatchSource, cut, turned
 from beers_deploy.profiles.errors import BeersError, ImageError, OptionError
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from examples.networks import NETWORKS
 
 BATCH = 8
 """Images of a batch."""
 PATCH_PX = 64
 """Side of an image."""
-RECIPE = PatchRecipe(load_sensor("pleiades-degraded"), load_sensor("pleiades-reference"), PATCH_PX)
+RECIPE = PatchRecipe(Sensor.load("pleiades-degraded"), Sensor.load("pleiades-reference"), PATCH_PX)
 
 GAINS = (0.7, 0.9, 1.0, 1.2)
 """Four bands of one ground, each as bright as this."""

@@ -29,9 +29,10 @@ from numpy.typing import ArrayLike, NDArray
 from beers_deploy.model.family import RANGES, noise_over_full_scale
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.model.variants import Kernels
+from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import NYQUIST
-from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import REFERENCE
 
 FILTERS = 4
 SIDE_PX = 7
@@ -156,7 +157,7 @@ def bank_of_vector(vector: tuple[float, ...], kernels: Kernels = "fitted") -> Ba
 
 @lru_cache
 def _reference() -> Instrument:
-    return load_sensor(REFERENCE).nominal()
+    return Sensor.load(REFERENCE).nominal()
 
 
 def _bank(sensor: Instrument, sigma: float, kernels: Kernels) -> Bank:

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from beers_deploy.model.simulator.mtf import sensor_mtf
-from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.instrument import Instrument
 
 Image = NDArray[np.float32]
 

@@ -38,7 +38,7 @@ from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.io.tensors import Weights, read_weights, write_weights
 from beers_deploy.model.variants import BANK_PLANES, SENSOR_VALUES, Kernels, Variant
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.instrument import Instrument
 
 
 class ResidualBlock(nn.Module):

@@ -34,9 +34,11 @@ from beers_deploy.model.simulator.plan import TOLERANCE_DN, make_plan
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene, read_scene, resample
 from beers_deploy.profiles.errors import ImageError, OptionError, reason_of
-from beers_deploy.profiles.sensor import Instrument, Sensor, require_same_units, same_instrument
-from beers_deploy.profiles.sensor_file import reference_beside, sensor_from_json
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.reference import reference_beside, require_same_units
+from beers_deploy.profiles.sensor import Sensor, same_instrument
 from beers_deploy.profiles.toml import parse_json, read_json
+from beers_deploy.profiles.validation import validated
 
 logger = logging.getLogger(__name__)
 
@@ -396,7 +398,7 @@ def read_pairs_recipe(folder: Path) -> PairsRecipe | None:
             f"{path} is not the recipe of a dataset. Simulate the pairs again, or remove the file "
             "and give `sensor`."
         ) from error
-    profiles = {role: sensor_from_json(f"{path} {role}", raw) for role, raw in sensors.items()}
+    profiles = {role: validated(Sensor, raw, f"{path} {role}") for role, raw in sensors.items()}
     return PairsRecipe(profiles["degraded"], profiles["reference"], scenes)
 
 

@@ -14,8 +14,8 @@ from beers_deploy.model.curves import (
 )
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.model.variants import Kernels
+from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import NYQUIST
-from beers_deploy.profiles.sensor import Instrument
 
 MARGIN = 0.05
 """How far a curve may lie outside those of training, as a share: networks lose 0.1 dB and more from

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
 from beers_deploy.model.family import RANGES, sensor_values
-from beers_deploy.profiles.sensor import Instrument, Sensor
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Sensor
 
 FACTORS = (2, 4, 8)
 """Powers of two, by which an image is multiplied without rounding."""

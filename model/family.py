@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from beers_deploy.model.curves import draw_table
-from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.instrument import Instrument
 
 RANGES: Mapping[str, tuple[float, float]] = {
     "mtf_across": (0.015, 0.15),

@@ -2,10 +2,12 @@
 
 It imports nothing of ours, and offers no names of its own, so that `--help` loads no NumPy.
 
-- `sensor`, `effects`, `scene_call`: instruments and scenes, short TOML files that `sensor_file`
-  reads;
-- `response`: a blur known by a table or a point-spread function;
-- `target`: processing boards, in `targets/`;
-- `constant`, `toml`: how such a file is read and checked, each number with its status and source;
+- `sensor`, `scene_call`: instruments and scenes, each a pydantic model with its short TOML file;
+  `sensor_file`: the tables of a sensor's file; `reference`: what a restoration aims at;
+- `instrument`, `effects`, `response`: the physics: noise, effects, and a blur that is known by a
+  table or a point-spread function; `point_spread_file`: the latter as a .npy file;
+- `target`: processing boards, in `targets/`; `target_limits`: the numbers that one can have;
+- `constant`: a number with its limits, status and source; `validation`: what pydantic finds wrong
+  with a file, in one sentence; `toml`: how a file is read; `shipped`: the names of those here;
 - `figures`: numbers with unit, mode and source; `errors`: what bad input becomes.
 """

@@ -1,27 +1,78 @@
 """A number, or a list of names, and where it comes from: what a profile holds."""
 
 import sys
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
-from typing import Literal, get_args
+from collections.abc import Mapping
+from dataclasses import dataclass as plain_dataclass
+from typing import Annotated, Any, Literal
 
-from beers_deploy.profiles.errors import ProfileError, printable
+from pydantic import AfterValidator, GetCoreSchemaHandler, PlainValidator, model_validator
+from pydantic.dataclasses import dataclass
+from pydantic_core import ArgsKwargs, CoreSchema, core_schema
+
+from beers_deploy.profiles.errors import printable
+from beers_deploy.profiles.validation import CONFIG
 
 Status = Literal["published", "inferred", "measured", "assumed", "stated"]
 """published: in a document; measured: on the instrument; inferred: computed from such; assumed: our
 choice; stated: the user's own.
 """
 
-Number = float | tuple[float, float]
+
+def is_number(raw: object) -> bool:
+    """Return True if a value of a file is a finite number that float64 holds."""
+    return (
+        # Python counts True as an int. TOML allows integers of any size, which float64 cannot hold.
+        isinstance(raw, int | float)
+        and not isinstance(raw, bool)
+        and abs(raw) <= sys.float_info.max
+    )
 
 
-@dataclass(frozen=True)
-class Constant:
+def _number(raw: Any) -> float | tuple[float, float]:
+    if is_number(raw):
+        return float(raw)
+    ends = raw if isinstance(raw, list | tuple) else ()
+    if len(ends) == 2 and all(map(is_number, ends)) and ends[0] <= ends[1]:
+        return (float(ends[0]), float(ends[1]))
+    value = printable(repr(raw))
+    raise ValueError(f"must be a finite number or a range [low, high], got {value}. Correct it.")
+
+
+Number = Annotated[float | tuple[float, float], PlainValidator(_number)]
+
+
+def _source(text: str) -> str:
+    if not text.strip():
+        raise ValueError("must name a document, but it is empty. State where the value comes from.")
+    return text
+
+
+@dataclass(frozen=True, config=CONFIG)
+class Stated:
+    """A value of any kind with its provenance.
+
+    A file states it as `{ value = ..., status = ..., source = ... }`. A bare value is the user's
+    own statement: status "stated".
+    """
+
+    value: Any
+    status: Status
+    source: Annotated[str, AfterValidator(_source)]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _bare(cls, raw: object) -> object:
+        if isinstance(raw, Mapping | Stated | ArgsKwargs):
+            return raw
+        source = "stated by the profile without a source"
+        return {"value": raw, "status": "stated", "source": source}
+
+
+@dataclass(frozen=True, config=CONFIG)
+class Constant(Stated):
     """A value, or a range [low, high], with its provenance."""
 
     value: Number
-    status: Status
-    source: str
 
     @property
     def low(self) -> float:
@@ -42,111 +93,64 @@ class Constant:
         return f"{self.low:g}" if self.low == self.high else f"{self.low:g} to {self.high:g}"
 
 
-@dataclass(frozen=True)
-class Words:
+@dataclass(frozen=True, config=CONFIG)
+class Words(Stated):
     """A list of names, which may be empty, with its provenance: what an operation can be fused
     with.
     """
 
     value: tuple[str, ...]
-    status: Status
-    source: str
 
     def __str__(self) -> str:
         return ", ".join(self.value) or "none"
 
 
-def read_words(where: str, raw: object, known: Collection[str] = ()) -> Words:
-    """Read `["ReLU"]` or `{ value = ["ReLU"], status = ..., source = ... }`; of any names where
-    none are known.
+NEARLY_0 = 1e-12
+"""A lower limit up to here stands for "above 0": the number is divided by."""
+
+
+@plain_dataclass(frozen=True)
+class Limits:
+    """The numbers that a constant can have, both ends included: `Annotated[Constant, Limits(0, 5)]`
+    is a type that pydantic checks.
+
+    Attributes:
+        low: the smallest.
+        high: the largest.
+        whole: True if the number counts something.
+        single: True if the number defines what others mean, so that there is no range to draw from.
+        hint: a sentence that follows the one about a wrong number.
     """
-    value, status, source = read_stated(where, raw)
-    if not isinstance(value, list) or not all(
-        isinstance(name, str) and name in (known or value) for name in value
-    ):
-        choices = f" out of {', '.join(known)}" if known else ""
-        raise ProfileError(
-            f"{where} must be a list of names{choices}, got {printable(repr(value))}. Correct the "
-            "names; an empty list stands for none."
-        )
-    return Words(tuple(value), status, source)
 
+    low: float
+    high: float
+    whole: bool = False
+    single: bool = False
+    hint: str = "Correct it; the unit is in the name."
 
-def read_constant(where: str, raw: object) -> Constant:
-    """Read `0.07`, `[0.03, 0.07]` or `{ value = ..., status = ..., source = ... }`.
+    def holds(self, value: float) -> bool:
+        """Return True if the constant can have the value."""
+        return self.low <= value <= self.high and not (self.whole and value % 1)
 
-    A bare number is the user's own statement: status "stated".
-    """
-    value, status, source = read_stated(where, raw)
-    return Constant(_number(where, value), status, source)
-
-
-def read_stated(where: str, raw: object) -> tuple[object, Status, str]:
-    """Value, status and source of what a profile states in either way; the value, of any kind, is
-    not checked.
-    """
-    if not isinstance(raw, Mapping):
-        return raw, "stated", "stated by the profile without a source"
-    check_keys(where, raw, required={"value", "status", "source"})
-    status = raw["status"]
-    source = raw["source"]
-    if status not in get_args(Status):
-        raise ProfileError(
-            f"{where}.status must be one of {', '.join(get_args(Status))}, got "
-            f"{printable(repr(status))}. State where the number comes from."
-        )
-    if not isinstance(source, str) or not source.strip():
-        raise ProfileError(
-            f"{where}.source must be a text that names a document, got {printable(repr(source))}. "
-            "State where the number comes from."
-        )
-    return raw["value"], status, source
-
-
-def check_keys(
-    where: str,
-    raw: Mapping[str, object],
-    required: set[str],
-    optional: set[str] = frozenset(),  # type: ignore[assignment]
-) -> None:
-    """Refuse unknown keys first (a typo is the likelier fault), then missing ones."""
-    allowed = required | optional
-    # A misspelt key is unknown, and leaves its right name missing: the first is the likelier fault.
-    for key in raw:
-        if key not in allowed:
-            raise ProfileError(
-                f"{where} has the unknown key {printable(repr(key))}; it can have the keys "
-                f"{', '.join(sorted(allowed))}. {_rename(key, allowed)}."
+    def check(self, constant: Constant) -> Constant:
+        """Return the constant, or raise ValueError if it cannot have its value."""
+        ends = dict.fromkeys((constant.low, constant.high))
+        stated = " to ".join(f"{value:.12g}" for value in ends)
+        if not all(map(self.holds, ends)):
+            raise ValueError(f"must be {self}, but it is {stated}. {self.hint}")
+        if self.single and len(ends) > 1:
+            raise ValueError(
+                f"must be one number, but it is the range {stated}. Write a profile for each "
+                "number."
             )
-    for key in sorted(required - set(raw)):
-        raise ProfileError(f"{where} has no key {key!r}. Add it; a shipped profile shows how.")
+        return constant
 
+    def __get_pydantic_core_schema__(
+        self, source: object, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        return core_schema.no_info_after_validator_function(self.check, handler(source))
 
-def _rename(key: str, allowed: set[str]) -> str:
-    """Point at the key that was meant: most often the same one with its unit."""
-    similar = sorted(name for name in allowed if name.startswith(key) or key.startswith(name))
-    return (
-        f"Write {similar[0]!r} (the unit belongs to the name)"
-        if similar
-        else "Remove it or correct its spelling"
-    )
-
-
-def _number(where: str, raw: object) -> Number:
-    if is_number(raw):
-        return float(raw)  # type: ignore[arg-type]
-    if isinstance(raw, list) and len(raw) == 2 and all(map(is_number, raw)) and raw[0] <= raw[1]:
-        return (float(raw[0]), float(raw[1]))
-    raise ProfileError(
-        f"{where} must be a finite number or a range [low, high], got {printable(repr(raw))}."
-    )
-
-
-def is_number(raw: object) -> bool:
-    """Whether a value of a file is a finite number that float64 holds."""
-    return (
-        # Python counts True as an int. TOML allows integers of any size, which float64 cannot hold.
-        isinstance(raw, int | float)
-        and not isinstance(raw, bool)
-        and abs(raw) <= sys.float_info.max
-    )
+    def __str__(self) -> str:
+        kind = "an integer" if self.whole else "a number"
+        least = "above 0" if 0 < self.low <= NEARLY_0 else f"of at least {self.low:g}"
+        return f"{kind} {least} and at most {self.high:g}"

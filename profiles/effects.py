@@ -9,15 +9,13 @@ values they leave the image as it is.
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, Protocol, get_type_hints
 
 import numpy as np
+from pydantic import AfterValidator, PlainValidator, create_model
 
-from beers_deploy.profiles.constant import Constant, check_keys, read_constant
-from beers_deploy.profiles.errors import ProfileError, printable
-
-if TYPE_CHECKING:
-    from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.constant import Constant, Limits
+from beers_deploy.profiles.validation import CONFIG
 
 PATTERN_LIMIT = 4.0
 """Detectors further out are rejected at the factory: draws are clipped here, so that bounds can be
@@ -28,15 +26,31 @@ Generator = Callable[[], np.random.Generator]
 """Makes the generator of an effect, for those that draw."""
 
 
+class Digitiser(Protocol):
+    """What an effect needs of the instrument that it belongs to."""
+
+    @property
+    def gain_dn_per_radiance(self) -> float:
+        """Digital numbers per W/m2/sr/um."""
+
+    @property
+    def max_dn(self) -> int:
+        """The largest digital number."""
+
+
 @dataclass(frozen=True)
 class Effect:
-    """Parameters, each a number within the limits that its annotation states."""
+    """Parameters, each a number within the limits that its annotation states.
+
+    Effects are made for every drawn sensor, so they are plain dataclasses: the limits are checked
+    once, on the tables that they are drawn from.
+    """
 
     cost: ClassVar[str] = "none: part of the MTF"
 
     @classmethod
-    def limits(cls) -> dict[str, tuple[float, float]]:
-        """The least and the largest value of each parameter."""
+    def limits(cls) -> dict[str, Limits]:
+        """Return the limits of each parameter."""
         hints = get_type_hints(cls, include_extras=True).items()
         return {name: hint.__metadata__[0] for name, hint in hints if hasattr(hint, "__metadata__")}
 
@@ -58,11 +72,11 @@ class PixelEffect(Effect, ABC):
         return 1.0
 
     @abstractmethod
-    def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
+    def apply(self, image: np.ndarray, sensor: Digitiser, generator: Generator) -> np.ndarray:
         """An image (..., H, W) with the effect."""
 
     @abstractmethod
-    def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
+    def bound_dn(self, sensor: Digitiser, low: float, high: float) -> float:
         """Largest change of any pixel, in DN, for a signal between `low` and `high` radiance."""
 
 
@@ -72,14 +86,14 @@ class AntiAlias(Effect):
     is none.
     """
 
-    sigma_px: Annotated[float, (0.0, 5.0)]
+    sigma_px: Annotated[float, Limits(0.0, 5.0)]
 
 
 @dataclass(frozen=True)
 class Smear(Effect):
     """Motion along the track during one exposure, in target pixels; 0 is none."""
 
-    length_px: Annotated[float, (0.0, 20.0)]
+    length_px: Annotated[float, Limits(0.0, 20.0)]
 
 
 @dataclass(frozen=True)
@@ -90,14 +104,14 @@ class Haze(PixelEffect):
     It is the same before and after the blur, whose gain at frequency 0 is 1.
     """
 
-    transmittance: Annotated[float, (0.0, 1.0)]
-    path_radiance: Annotated[float, (0.0, 1e4)]
+    transmittance: Annotated[float, Limits(0.0, 1.0)]
+    path_radiance: Annotated[float, Limits(0.0, 1e4)]
     acts_on = "radiance"
 
-    def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
+    def apply(self, image: np.ndarray, sensor: Digitiser, generator: Generator) -> np.ndarray:
         return image * self.transmittance + self.path_radiance
 
-    def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
+    def bound_dn(self, sensor: Digitiser, low: float, high: float) -> float:
         changes = (abs((self.transmittance - 1) * v + self.path_radiance) for v in (low, high))
         return sensor.gain_dn_per_radiance * max(changes)  # Affine in L: the ends decide.
 
@@ -112,9 +126,9 @@ class FullWell(PixelEffect):
     Below the well nothing changes; share 0 is a plain clip.
     """
 
-    radiance: Annotated[float, (1e-6, 1e6)]
-    blooming_share: Annotated[float, (0.0, 0.5)]
-    blooming_px: Annotated[float, (0.0, 64.0)]
+    radiance: Annotated[float, Limits(1e-6, 1e6)]
+    blooming_share: Annotated[float, Limits(0.0, 0.5)]
+    blooming_px: Annotated[float, Limits(0.0, 64.0)]
     acts_on = "radiance"
     cost = "1 pass, 1 convolution if it blooms"
     unseen = "the brightest signal stays below the well"
@@ -124,13 +138,13 @@ class FullWell(PixelEffect):
         # The kernel sums to 1 at most, so that blooming adds at most this share of a change.
         return 1 + self.blooming_share
 
-    def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
+    def apply(self, image: np.ndarray, sensor: Digitiser, generator: Generator) -> np.ndarray:
         excess = np.maximum(image - self.radiance, 0)
         if self.blooming_share > 0 and self.blooming_px > 0 and (excess > 0).any():
             image = image + self.blooming_share * _spread(excess, self.blooming_px)
         return np.asarray(np.minimum(image, self.radiance))
 
-    def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
+    def bound_dn(self, sensor: Digitiser, low: float, high: float) -> float:
         # What is cut off, and what is spilt, is no more than the excess.
         return sensor.gain_dn_per_radiance * max(high - self.radiance, 0.0)
 
@@ -139,7 +153,7 @@ class FullWell(PixelEffect):
 class Prnu(PixelEffect):
     """Relative spread of the detectors' responses, one detector a column; 0 is none."""
 
-    rms: Annotated[float, (0.0, 0.2)]
+    rms: Annotated[float, Limits(0.0, 0.2)]
     acts_on = "radiance"
     cost = "1 draw a column"
 
@@ -148,10 +162,10 @@ class Prnu(PixelEffect):
         # Each draw is clipped at PATTERN_LIMIT, so that no detector's factor is larger.
         return 1 + PATTERN_LIMIT * self.rms
 
-    def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
+    def apply(self, image: np.ndarray, sensor: Digitiser, generator: Generator) -> np.ndarray:
         return image * (1 + self.rms * _columns(image, generator()))
 
-    def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
+    def bound_dn(self, sensor: Digitiser, low: float, high: float) -> float:
         return sensor.gain_dn_per_radiance * PATTERN_LIMIT * self.rms * max(abs(low), abs(high))
 
 
@@ -159,14 +173,14 @@ class Prnu(PixelEffect):
 class Dsnu(PixelEffect):
     """Spread of the detectors' offsets in DN, one detector a column; 0 is none."""
 
-    rms_dn: Annotated[float, (0.0, 1e4)]
+    rms_dn: Annotated[float, Limits(0.0, 1e4)]
     acts_on = "DN"
     cost = "1 draw a column"
 
-    def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
+    def apply(self, image: np.ndarray, sensor: Digitiser, generator: Generator) -> np.ndarray:
         return image + self.rms_dn * _columns(image, generator())
 
-    def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
+    def bound_dn(self, sensor: Digitiser, low: float, high: float) -> float:
         return PATTERN_LIMIT * self.rms_dn
 
 
@@ -177,15 +191,15 @@ class Striping(PixelEffect):
     Half of it is added to even columns and taken from odd ones.
     """
 
-    odd_even_dn: Annotated[float, (0.0, 1e4)]
+    odd_even_dn: Annotated[float, Limits(0.0, 1e4)]
     acts_on = "DN"
 
-    def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
+    def apply(self, image: np.ndarray, sensor: Digitiser, generator: Generator) -> np.ndarray:
         return image + self.odd_even_dn * (
             0.5 - (np.arange(image.shape[-1]) % 2).astype(image.dtype)
         )
 
-    def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
+    def bound_dn(self, sensor: Digitiser, low: float, high: float) -> float:
         return self.odd_even_dn / 2
 
 
@@ -193,13 +207,13 @@ class Striping(PixelEffect):
 class Offset(PixelEffect):
     """Digital number of the dark; 0 is none."""
 
-    offset_dn: Annotated[float, (0.0, 65535.0)]
+    offset_dn: Annotated[float, Limits(0.0, 65535.0, single=True)]
     acts_on = "DN"
 
-    def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
+    def apply(self, image: np.ndarray, sensor: Digitiser, generator: Generator) -> np.ndarray:
         return image + self.offset_dn
 
-    def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
+    def bound_dn(self, sensor: Digitiser, low: float, high: float) -> float:
         return self.offset_dn
 
 
@@ -207,12 +221,12 @@ class Offset(PixelEffect):
 class Defects(PixelEffect):
     """Dead pixels (always 0) and hot ones (always full scale), per million; 0 is none."""
 
-    dead_per_million: Annotated[float, (0.0, 1e6)]
-    hot_per_million: Annotated[float, (0.0, 1e6)]
+    dead_per_million: Annotated[float, Limits(0.0, 1e6)]
+    hot_per_million: Annotated[float, Limits(0.0, 1e6)]
     acts_on = "DN"
     cost = "1 draw a pixel"
 
-    def apply(self, image: np.ndarray, sensor: "Instrument", generator: Generator) -> np.ndarray:
+    def apply(self, image: np.ndarray, sensor: Digitiser, generator: Generator) -> np.ndarray:
         draw = generator().random(image.shape, dtype=np.float32)
         dead = self.dead_per_million / 1e6
         hot = self.hot_per_million / 1e6
@@ -220,7 +234,7 @@ class Defects(PixelEffect):
         # One draw decides both, so a pixel is never dead and hot.
         return np.where(draw >= 1 - hot, np.float32(sensor.max_dn), image) if hot > 0 else image
 
-    def bound_dn(self, sensor: "Instrument", low: float, high: float) -> float:
+    def bound_dn(self, sensor: Digitiser, low: float, high: float) -> float:
         if self.dead_per_million + self.hot_per_million == 0:
             return 0.0
         # A pixel becomes 0 or full scale, whatever it was before: beyond the converter's range too.
@@ -279,40 +293,33 @@ def _spread(excess: np.ndarray, length_px: float) -> np.ndarray:
 
 
 Table = Mapping[str, Constant]
+"""The parameters of an effect as a file states them, each a number or a range."""
 
 
-def read_effect(where: str, name: str, raw: object) -> Table:
-    """Read one effect's table of a TOML file: every key of its dataclass and no other, each within
-    its limits.
-    """
-    limits = TABLES[name].limits()
-    if not isinstance(raw, Mapping):
-        raise ProfileError(
-            f"{where} must be a table, got {printable(repr(raw))}. Write it as [{name}]."
-        )
-    check_keys(where, raw, required=set(limits))
-    table = {key: read_constant(f"{where} {key}", raw[key]) for key in limits}
-    for key, constant in table.items():
-        low, high = limits[key]
-        if not low <= constant.low <= constant.high <= high:
-            raise ProfileError(
-                f"{where} {key} must be in the range {low:g} to {high:g}, but it is {constant}. "
-                "Correct the value."
-            )
-    return table
-
-
-def draw_effect(name: str, table: Table, generator: np.random.Generator) -> Effect:
-    """Settle every number of an effect; nothing is drawn where no range is stated."""
-    values = {
-        # A number without a range takes nothing from the generator: the numbers after it stay the
-        # same.
-        key: c.low if c.low == c.high else float(generator.uniform(c.low, c.high))
-        for key, c in table.items()
+def _table_type(effect: type[Effect]) -> Any:
+    """Return the type of an effect's table: every parameter and no other, within its limits."""
+    parameters: Any = {
+        key: (Annotated[Constant, limits], ...) for key, limits in effect.limits().items()
     }
-    return TABLES[name](**values)
+    model = create_model(effect.__name__, __config__=CONFIG, **parameters)
+    return Annotated[model, AfterValidator(dict)]
 
 
-def middle_effect(name: str, table: Table) -> Effect:
-    """The middle of every range."""
-    return TABLES[name](**{key: constant.middle for key, constant in table.items()})
+_OPTIONAL: Any = {name: (_table_type(effect) | None, None) for name, effect in TABLES.items()}
+AnyEffects = create_model("Effects", __config__=CONFIG, **_OPTIONAL)
+
+
+def _read_effects(raw: object) -> dict[str, Table]:
+    return {name: table for name, table in AnyEffects.model_validate(raw) if table is not None}
+
+
+Effects = Annotated[Mapping[str, Table], PlainValidator(_read_effects)]
+"""The tables of some effects by name, in the order of `TABLES`."""
+
+
+def settled(tables: Mapping[str, Table], number: Callable[[Constant], float]) -> dict[str, Effect]:
+    """Return effects by name, every parameter settled by `number`."""
+    return {
+        name: TABLES[name](**{key: number(constant) for key, constant in table.items()})
+        for name, table in tables.items()
+    }

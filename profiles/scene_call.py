@@ -3,16 +3,21 @@ over sea, ...).
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from typing import Annotated, Self
 
-from beers_deploy.profiles.constant import Constant, check_keys, read_constant
-from beers_deploy.profiles.effects import TABLES, Table, read_effect
-from beers_deploy.profiles.errors import OptionError, ProfileError, printable
+from pydantic import Field, model_validator
+from pydantic.dataclasses import dataclass
+
+from beers_deploy.profiles.constant import Constant, Limits
+from beers_deploy.profiles.effects import TABLES, AnyEffects, Effects, Table
+from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.toml import HERE, read_toml, shipped_names
+from beers_deploy.profiles.shipped import HERE
+from beers_deploy.profiles.toml import read_toml
+from beers_deploy.profiles.validation import CONFIG, check_keys, validated
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=CONFIG)
 class SceneCall:
     """One TOML file under `profiles/scenes/`.
 
@@ -21,50 +26,40 @@ class SceneCall:
 
     name: str
     description: str
-    radiance_scale: Constant
-    effects: dict[str, Table]
-    without: tuple[str, ...]
+    radiance_scale: Annotated[Constant, Limits(1e-12, 1e12, hint="Give 1 for a clear day.")]
+    effects: Effects = Field(default_factory=dict)
+    without: tuple[str, ...] = ()
 
+    @model_validator(mode="after")
+    def _agrees(self) -> Self:
+        if not set(self.without) <= set(TABLES):
+            raise ValueError(
+                f"without must be a list of names out of {', '.join(TABLES)}, got "
+                f"{list(self.without)}. Correct the names."
+            )
+        if both := set(self.without) & set(self.effects):
+            raise ValueError(
+                f"both adds and forbids {', '.join(sorted(both))}. Remove one of the two."
+            )
+        return self
 
-def scene_names() -> list[str]:
-    """The names of the shipped scenes."""
-    return shipped_names("scenes")
-
-
-def load_scene_call(name: str) -> SceneCall:
-    """Read a shipped scene by name, or the user's own by the path of its .toml file."""
-    label, raw = read_toml("scenes", name)
-    check_keys(
-        label, raw, required={"description", "radiance_scale"}, optional={"without", *TABLES}
-    )
-    scale = read_constant(f"{label} radiance_scale", raw["radiance_scale"])
-    if scale.low <= 0:
-        raise ProfileError(
-            f"{label} radiance_scale must be above 0, but it is {scale}. Give 1 for a clear day."
-        )
-    effects = {key: read_effect(f"{label} [{key}]", key, raw[key]) for key in TABLES if key in raw}
-    without = raw.get("without", [])
-    if not isinstance(without, list) or not all(
-        isinstance(w, str) and w in TABLES for w in without
-    ):
-        raise ProfileError(
-            f"{label} without must be a list of names out of {', '.join(TABLES)}, got "
-            f"{printable(repr(without))}. Correct the names."
-        )
-    if set(without) & set(effects):
-        both = ", ".join(sorted(set(without) & set(effects)))
-        raise ProfileError(f"{label} both adds and forbids {both}. Remove one of the two.")
-    return SceneCall(
-        label.removesuffix(".toml"), str(raw["description"]), scale, effects, tuple(without)
-    )
+    @classmethod
+    def load(cls, name: str) -> "SceneCall":
+        """Read a shipped scene by name, or the user's own by the path of its .toml file."""
+        label, raw = read_toml("scenes", name)
+        check_keys(label, raw, ("description", "radiance_scale"), ("without", *TABLES))
+        fields = {key: value for key, value in raw.items() if key not in TABLES}
+        fields["name"] = label.removesuffix(".toml")
+        fields["effects"] = {key: raw[key] for key in TABLES if key in raw}
+        return validated(SceneCall, fields, label, {"effects": ""})
 
 
 def typical_effects() -> dict[str, Table]:
-    """Typical values of every optional effect (`profiles/effects.toml`): what
-    `--with NAME` adds.
+    """Return typical values of every optional effect (`profiles/effects.toml`): what `--with NAME`
+    adds.
     """
     label, raw = read_toml("", str(HERE / "effects.toml"))
-    return {name: read_effect(f"{label} [{name}]", name, raw[name]) for name in TABLES}
+    return dict(validated(AnyEffects, raw, label))
 
 
 def calling_for(
@@ -86,11 +81,8 @@ def calling_for(
     effects = {**profile.effects, **(scene.effects if scene else {})}
     effects |= {name: typical[name] for name in add if name not in effects}
     forbidden = {*forbid, *(scene.without if scene else ())}
-    return replace(
-        profile,
-        effects={
-            name: effects[name] for name in TABLES if name in effects and name not in forbidden
-        },
+    return profile.with_fields(
+        effects={name: effects[name] for name in effects if name not in forbidden}
     )
 
 

@@ -5,25 +5,18 @@ board with a DPU of a known kind states its cores, clock and memory, and nothing
 """
 
 import os
-import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Self
+from typing import Annotated, Any, Self
 
-from beers_deploy.profiles.constant import Constant, Words, check_keys, read_constant, read_words
+from pydantic import AfterValidator, Field, model_validator
+from pydantic.dataclasses import dataclass
+
+from beers_deploy.profiles.constant import Constant, Words
 from beers_deploy.profiles.errors import OptionError, ProfileError, printable
-from beers_deploy.profiles.target_limits import CONFIGURATIONS, check_limits
-from beers_deploy.profiles.toml import profile_path, read_toml, shipped_names
-
-TILE_PX = 640
-"""Side of a tile unless somebody asks for another: what the paper's network was
-given on the board.
-"""
-DEFAULT_TARGET = "vck190"
-"""The board of the paper: what a command takes where no board is named."""
-
-MODEL_SUFFIX = "-model"
-"""What `bench` adds to a board's name: its figures are of a model of the board."""
+from beers_deploy.profiles.shipped import MODEL_SUFFIX, board_names, target_names
+from beers_deploy.profiles.target_limits import CONFIGURATION, TABLES, check_limits
+from beers_deploy.profiles.toml import read_toml
+from beers_deploy.profiles.validation import CONFIG, check_keys, validated
 
 FUSED = ("ReLU", "ReLU6", "LeakyReLU", "PReLU", "hard-sigmoid", "hard-swish")
 """The activations that a board's file can list, as its manual names them."""
@@ -44,7 +37,16 @@ WATTS = "_w"
 """How the names of measured powers end, which no board takes from another."""
 
 
-@dataclass(frozen=True, repr=False)
+def _activations(words: Words) -> Words:
+    if not set(words.value) <= set(FUSED):
+        raise ValueError(
+            f"must be a list of names out of {', '.join(FUSED)}, got {list(words.value)}. Correct "
+            "the names; an empty list stands for none."
+        )
+    return words
+
+
+@dataclass(frozen=True, repr=False, config=CONFIG)
 class TargetProfile:
     """What one TOML file under `profiles/targets/` states, its base included.
 
@@ -57,23 +59,39 @@ class TargetProfile:
 
     name: str
     description: str
-    default_configuration: str | None
-    configurations: dict[str, dict[str, Constant]]
     tables: dict[str, dict[str, Constant]]
-    activations: dict[str, Words] = field(default_factory=dict)
-    documents: dict[str, str] = field(default_factory=dict)
-    npu: dict[str, Words] = field(default_factory=dict)
+    default_configuration: str | None = None
+    configurations: dict[str, dict[str, Constant]] = Field(default_factory=dict)
+    activations: dict[str, Annotated[Words, AfterValidator(_activations)]] = Field(
+        default_factory=dict
+    )
+    documents: dict[str, str] = Field(default_factory=dict)
+    npu: dict[str, Words] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _is_possible(self) -> Self:
+        for name, table in self.tables.items():
+            check_limits(name, TABLES.get(name, {}), table)
+        for name, table in self.configurations.items():
+            check_limits(f"configurations.{name}", CONFIGURATION, table)
+        return self
 
     @classmethod
     def load(cls, board: "TargetProfile | str | os.PathLike[str]") -> Self:
         """A shipped board by its name, the user's own by the path of its .toml file, or the board
         given.
+
+        A board's cost model has the name of the board: `vck190-model`, as `bench` calls it, is
+        `vck190`.
+
+        Raises:
+            ProfileError: unknown name, wrong or missing key, or a number that no board can have.
         """
         if isinstance(board, cls):
             return board
-        return cls(
-            **vars(board if isinstance(board, TargetProfile) else load_target(os.fspath(board)))
-        )
+        if not isinstance(board, TargetProfile):
+            board = _read(os.fspath(board).removesuffix(MODEL_SUFFIX))
+        return cls(**vars(board))
 
     def __repr__(self) -> str:
         builds = f", {', '.join(self.configurations)}" if self.configurations else ""
@@ -109,76 +127,25 @@ class TargetProfile:
         return build, self.configurations[build]
 
 
-def target_names() -> list[str]:
-    """The names of the shipped target profiles."""
-    return shipped_names("targets")
-
-
-def board_names() -> list[str]:
-    """The names of the shipped targets with a DPU: their files name its manual."""
-    return _names_with(r"^(base =|operators =)")
-
-
-def npu_names() -> list[str]:
-    """The names of the shipped targets with an NPU: it has rules and no cost model."""
-    return _names_with(r"^\[npu]")
-
-
-def _names_with(line: str) -> list[str]:
-    texts = {
-        name: profile_path("targets", name).read_text(encoding="utf-8") for name in target_names()
-    }
-    return [name for name, text in texts.items() if re.search(line, text, re.MULTILINE)]
-
-
-def load_target(name: str) -> TargetProfile:
-    """Read a shipped target profile by name, or the user's own by the path of its .toml file.
-
-    A board's cost model has the name of the board: `vck190-model`, as `bench` calls it, is
-    `vck190`.
-    """
-    label, raw = _with_base(*read_toml("targets", name.removesuffix(MODEL_SUFFIX)))
-    special = {
-        "description",
-        "default_configuration",
-        "configurations",
-        "activations",
-        "documents",
-        "npu",
-    }
-    check_keys(label, {k: v for k, v in raw.items() if k in special}, {"description"}, special)
-    tables = {k: _table(f"{label} [{k}]", k, v) for k, v in raw.items() if k not in special}
-    configurations = {
-        k: _table(f"{label} [configurations.{k}]", CONFIGURATIONS, v)
-        for k, v in _mapping(f"{label} configurations", raw.get("configurations", {})).items()
-    }
-    default = raw.get("default_configuration")
-    activations = _whole_table(label, raw, "activations", PLACES)
-    npu = _whole_table(label, raw, "npu", NPU)
+def _read(name: str) -> TargetProfile:
+    label, raw = _with_base(*read_toml("targets", name))
+    own = TargetProfile.__dataclass_fields__.keys() - {"name", "tables"}
+    stated: dict[str, Any] = {key: raw[key] for key in own if key in raw}
     # The rules of an NPU stand in [npu], in place of a DPU's manuals.
-    documents = _whole_table(
-        label, raw, "documents", frozenset({"quantiser"}) if npu else DOCUMENTS
-    )
-    profile = TargetProfile(
-        label.removesuffix(".toml"),
-        str(raw["description"]),
-        str(default) if default else None,
-        configurations,
-        tables,
-        {
-            key: read_words(f"{label} [activations] {key}", value, FUSED)
-            for key, value in activations.items()
-        },
-        {key: str(value) for key, value in documents.items()},
-        {key: read_words(f"{label} [npu] {key}", value) for key, value in npu.items()},
-    )
-    if configurations:
+    documents = ("quantiser",) if "npu" in raw else DOCUMENTS
+    for key, names in (("activations", PLACES), ("npu", NPU), ("documents", documents)):
+        if isinstance(table := raw.get(key), Mapping):
+            check_keys(f"{label} {key}", table, names)
+    stated["tables"] = {key: table for key, table in raw.items() if key not in own}
+    stated["name"] = label.removesuffix(".toml")
+    profile = validated(TargetProfile, stated, label, {"tables": ""})
+    if profile.configurations:
         # This raises if the default is none of them.
         profile.configuration()
     return profile
 
 
-def _with_base(label: str, raw: dict[str, object]) -> tuple[str, dict[str, object]]:
+def _with_base(label: str, raw: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """The file's own tables over those of its base, key by key; a configuration's too."""
     base = raw.pop("base", None)
     if base is None:
@@ -191,57 +158,23 @@ def _with_base(label: str, raw: dict[str, object]) -> tuple[str, dict[str, objec
     inherited = _with_base(*read_toml("targets", str(base)))[1]
     # Measured powers belong to one board, and no other board inherits them.
     power = {
-        key: value
-        for key, value in _mapping(label, inherited.get("power", {})).items()
-        if not key.endswith(WATTS)
+        key: value for key, value in inherited.get("power", {}).items() if not key.endswith(WATTS)
     }
-    return label, _over(raw, {**inherited, "power": power}, depth=1)
+    below = {**inherited, "power": power}
+    table = _joined(raw, below)
+    # Under "configurations" each table holds the tables of the builds: one level more to join.
+    if isinstance(builds := raw.get("configurations", {}), Mapping):
+        table["configurations"] = _joined(builds, below.get("configurations", {}))
+    return label, table
 
 
-def _over(
-    above: Mapping[str, object], below: Mapping[str, object], depth: int
-) -> dict[str, object]:
-    """One table over another: `depth` levels of tables are joined, below them what stands above
-    replaces.
-    """
-    table = dict(below)
-    for key, value in above.items():
-        under = below.get(key)
-        if depth and isinstance(value, Mapping) and isinstance(under, Mapping):
-            # Under "configurations" each table holds the tables of the builds: one level more to
-            # join.
-            table[key] = _over(value, under, depth if key == "configurations" else depth - 1)
-        else:
-            table[key] = value
-    return table
-
-
-def _whole_table(
-    label: str, raw: Mapping[str, object], name: str, keys: frozenset[str]
-) -> Mapping[str, object]:
-    """A table that has all of its keys, or is not there at all."""
-    if name not in raw:
-        return {}
-    table = _mapping(f"{label} [{name}]", raw[name])
-    check_keys(f"{label} [{name}]", table, set(keys))
-    return table
-
-
-def _table(where: str, name: str, raw: object) -> dict[str, Constant]:
-    constants = {
-        key: read_constant(f"{where} {key}", value) for key, value in _mapping(where, raw).items()
-    }
-    check_limits(where, name, constants)
-    return constants
-
-
-def _mapping(where: str, raw: object) -> Mapping[str, object]:
-    if not isinstance(raw, Mapping):
-        raise ProfileError(
-            f"{where} must be a table of constants, got {printable(repr(raw))}. Write it as "
-            "[table]."
-        )
-    return raw
+def _joined(above: Mapping[str, Any], below: Mapping[str, Any]) -> dict[str, Any]:
+    """Return one set of tables over another, key by key; anything but a table replaces."""
+    tables = {**below, **above}
+    for key in above.keys() & below.keys():
+        if isinstance(above[key], Mapping) and isinstance(below[key], Mapping):
+            tables[key] = {**below[key], **above[key]}
+    return tables
 
 
 def require_side(tile_px: int) -> int:

@@ -6,29 +6,8 @@ not what is unusual.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
-from beers_deploy.profiles.constant import Constant
-from beers_deploy.profiles.errors import ProfileError
-
-
-@dataclass(frozen=True)
-class Limits:
-    """The numbers that a key can have, both ends included."""
-
-    low: float
-    high: float
-    whole: bool = False
-
-    def holds(self, value: float) -> bool:
-        """Return True if the key can have the value."""
-        return self.low <= value <= self.high and not (self.whole and value % 1)
-
-    def __str__(self) -> str:
-        kind = "an integer" if self.whole else "a number"
-        least = "above 0" if self.low == SMALLEST else f"of at least {self.low:g}"
-        return f"{kind} {least} and at most {self.high:g}"
-
+from beers_deploy.profiles.constant import Constant, Limits
 
 SMALLEST = 1e-30
 """Stands for what is above 0, and is divided by."""
@@ -57,8 +36,6 @@ SIZES = {
     "pixels_per_cycle": LANES,
 }
 """Keys that a configuration may state as well as the board."""
-
-CONFIGURATIONS = "configurations"
 
 CONFIGURATION = {
     "cores": COUNT,
@@ -156,25 +133,22 @@ their limits.
 """
 
 
-def check_limits(where: str, table: str, constants: Mapping[str, Constant]) -> None:
+def check_limits(place: str, limits: Mapping[str, Limits], table: Mapping[str, Constant]) -> None:
     """Refuse a number that no board can have.
 
     Args:
-        where: names file and table in the message.
-        table: its name; that of a configuration is `CONFIGURATIONS`.
-        constants: of the table. A key without limits is used by no rule and no prediction.
+        place: the dotted name of the table.
+        limits: of its keys. A key without limits is used by no rule and no prediction.
+        table: its constants.
 
     Raises:
-        ProfileError: the key, its limits and its number.
+        ValueError: the dotted key, its limits and its number.
     """
-    limits = CONFIGURATION if table == CONFIGURATIONS else TABLES.get(table, {})
-    for key, constant in constants.items():
-        # A key without limits takes part in no rule and no prediction.
-        allowed = limits.get(key, ANY_KEY.get(table))
-        values = (constant.low, constant.high)
-        if allowed is not None and not all(map(allowed.holds, values)):
-            stated = " to ".join(dict.fromkeys(f"{value:.12g}" for value in values))
-            raise ProfileError(
-                f"{where} {key} must be {allowed}, but it is {stated}, which no board can have. "
-                "Correct it; the unit is in the name."
-            )
+    for key, constant in table.items():
+        allowed = limits.get(key, ANY_KEY.get(place))
+        if allowed is None:
+            continue
+        try:
+            allowed.check(constant)
+        except ValueError as error:
+            raise ValueError(f"{place}.{key} {error}") from None

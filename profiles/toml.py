@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from beers_deploy.profiles.errors import ProfileError, printable
+from beers_deploy.profiles.shipped import profile_path, shipped_names
 
 TOML_BYTES = 1 << 16
 """The largest shipped profile takes a fifth of it."""
@@ -124,19 +125,6 @@ def unreadable(path: Path) -> str | None:
         if stream.read(len(LFS_POINTER)) == LFS_POINTER:
             return "it is a Git LFS pointer to the file, which 'git lfs pull' fetches"
     return None
-
-
-HERE = Path(__file__).parent
-
-
-def shipped_names(kind: str) -> list[str]:
-    """The names of the profiles shipped in `profiles/KIND/`."""
-    return sorted(path.stem for path in (HERE / kind).glob("*.toml"))
-
-
-def profile_path(kind: str, name: str) -> Path:
-    """Where the profile `name` lies: in `profiles/KIND/`, or where the user's own path says."""
-    return Path(name) if name.endswith(".toml") else HERE / kind / f"{name}.toml"
 
 
 def read_toml(kind: str, name: str) -> tuple[str, dict[str, object]]:

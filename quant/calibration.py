@@ -21,8 +21,8 @@ from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.model.simulator.sampling import Scene, scene_spectrum
 from beers_deploy.model.training.patches import PatchRecipe, turn
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor import Instrument, Sensor
-from beers_deploy.profiles.sensor_file import reference_for
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.lighting import (
     CALIBRATION,
     JUDGING,
@@ -312,7 +312,7 @@ class Calibration:
 
     @cached_property
     def _reference(self) -> Sensor:
-        return reference_for(self.sensor)
+        return self.sensor.reference
 
 
 def unseen_patches(degraded: Sensor, images: Path | None, patches: int, seed: int) -> Patches:
@@ -324,7 +324,7 @@ def unseen_patches(degraded: Sensor, images: Path | None, patches: int, seed: in
         patches: how many.
         seed: of the calibration.
     """
-    reference = reference_for(degraded)
+    reference = degraded.reference
     # Another seed draws other scenes, and other patches of the same images.
     other = seed + HELD_OUT_SEED
     scenes = load_scenes(images, reference.nominal(), other, patches)

@@ -12,7 +12,7 @@ import numpy as np
 from onnx import TensorProto, helper
 
 from beers_deploy.model.bank import SIDE_PX, UNIT_STEPS, WIDE
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.banked.filters import (
     ANALYTIC_COPIES,
     BITS,

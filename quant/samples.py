@@ -22,7 +22,7 @@ from beers_deploy.model.io.files import IMAGE_SUFFIXES
 from beers_deploy.model.raster.images import read_pixels
 from beers_deploy.profiles.arrays import load_arrays
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError, printable
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.onnx_file import fixed_tile_px
 from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.quant.untrusted import times

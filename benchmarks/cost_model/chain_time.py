@@ -27,8 +27,9 @@ from beers_deploy.model.traditional.pipeline import Chain, quality_named, restor
 from beers_deploy.model.traditional.rows import one_thread_per_operation
 from beers_deploy.performance.swath import Swath
 from beers_deploy.performance.traditional import CROP_PX, CROPS, drawn_acquisition
-from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
-from beers_deploy.profiles.target import TargetProfile, board_names, load_target
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import REFERENCE, board_names
+from beers_deploy.profiles.target import TargetProfile
 from benchmarks.cost_model.chain_work import FLOAT_BYTES, Work, chain_work
 
 ROUNDS = 25
@@ -284,7 +285,7 @@ Interval = tuple[float, float]
 def main() -> None:
     """A line for each board: the median of RUNS, each with rates and times of its own."""
     here = [measured_here() for _ in range(RUNS)]
-    for board in map(load_target, board_names()):
+    for board in map(TargetProfile.load, board_names()):
         ends = np.median([s_per_mpx(*run, board) for run in here], axis=0)
         low, high = (float(f"{end:.2g}") for end in ends)
         print(f"{board.name}: chain_s_per_mpx = [{low:g}, {high:g}]")
@@ -294,7 +295,7 @@ def measured_here() -> tuple[float, Mapping[str, float], Rates]:
     """CPU time of one core here for 10^6 pixels, in s; the share of it that each kind explains; the
     rates.
     """
-    sensors = load_sensor(SENSOR), load_sensor(REFERENCE)
+    sensors = Sensor.load(SENSOR), Sensor.load(REFERENCE)
     scene = drawn_acquisition(Swath(CROPS * CROP_PX, CROP_PX), *sensors)
     crops = [scene[:, k * CROP_PX : (k + 1) * CROP_PX] for k in range(CROPS)]
     chain = Chain(sensors[0].nominal(), sensors[1].nominal())

@@ -21,7 +21,7 @@ from scipy.stats import binom, spearmanr
 
 from beers_deploy.dpu.cost.model import Array, Constants, Regime, Structure, regime_of
 from beers_deploy.dpu.cost.own_runs import SCATTER
-from beers_deploy.profiles.target import load_target
+from beers_deploy.profiles.target import TargetProfile
 from benchmarks.cost_model.fit import Cases, fit
 from benchmarks.cost_model.published import boards, host_cores, published_cases
 
@@ -125,7 +125,7 @@ def chosen(board: str, left_out: str = "", *, seen: bool = True) -> float:
 
 @cache
 def _trial(board: str, crowding: float) -> "Trial":
-    documents = load_target(board).documents["operators"]
+    documents = TargetProfile.load(board).documents["operators"]
     overlap = next(OVERLAP[name] for name in OVERLAP if name in documents)
     return Trial(Cases(published_cases(board), Structure(overlap, crowding)))
 

@@ -9,7 +9,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.detection.detector import open_detector
 from beers_deploy.studies.detection.study import run_study
 from beers_deploy.studies.detection.table import detection_table
@@ -32,7 +32,7 @@ def main() -> None:
     arguments = parser.parse_args()
     detector = open_detector(DETECTOR)
     scenes, notes = synthetic_scenes(arguments.drawn, arguments.seed, detector.names, {})
-    sensors = [load_sensor(name) for name in arguments.sensor.split(",")]
+    sensors = [Sensor.load(name) for name in arguments.sensor.split(",")]
     methods = [DEGRADED, *arguments.methods.split(",")]
     compared = run_study(detector, scenes, sensors, methods, seed=arguments.seed)
     table = detection_table(compared, DETECTOR, detector, scenes, notes, arguments.out)

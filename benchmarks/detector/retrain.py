@@ -18,7 +18,7 @@ import numpy as np
 from beers_deploy.model.progress import steps
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
-from beers_deploy.profiles.sensor_file import load_sensor, reference_for
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.results import Table
 from beers_deploy.studies.detection.average_precision import find_hits, score
@@ -106,8 +106,8 @@ def conditions(sensors: Sequence[str], method: str) -> list[Condition]:
     """The reference, then degraded and restored images of each sensor."""
     result: list[Condition] = []
     for name in sensors:
-        degraded = load_sensor(name)
-        pair = SensorPair(degraded, reference_for(degraded))
+        degraded = Sensor.load(name)
+        pair = SensorPair(degraded, degraded.reference)
         if not result:
             result.append(Condition(REFERENCE, pair, None))
         methods = (method_named(word, pair.degraded, pair.reference) for word in (DEGRADED, method))

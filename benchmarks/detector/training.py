@@ -19,7 +19,8 @@ from beers_deploy.model.io.pictures import stretch_of
 from beers_deploy.model.simulator.acquire import acquire_padded
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import REFERENCE
 from benchmarks.detector.network import STRIDE_PX, DetectorNetwork, decoded, initialise
 from benchmarks.detector.scenes import synthetic_scene
 
@@ -54,7 +55,7 @@ def drawn_picture(side_px: int, seed: int, number: int) -> Picture:
     `side_px` a side.
     """
     side = side_px * OVERSAMPLING
-    sensor = load_sensor(REFERENCE).nominal()
+    sensor = Sensor.load(REFERENCE).nominal()
     radiance, truth = synthetic_scene(np.random.default_rng([STREAM, seed, number]), side, side)
     dn = acquire_padded(radiance, sensor, OVERSAMPLING, Draw(seed, number), "reference")
     rgb = stretch_of(dn).to_srgb(dn).transpose(2, 0, 1)

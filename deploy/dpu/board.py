@@ -7,7 +7,8 @@ from functools import cached_property
 
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import OptionError, ProfileError, printable
-from beers_deploy.profiles.target import MODEL_SUFFIX, TargetProfile, board_names, load_target
+from beers_deploy.profiles.shipped import MODEL_SUFFIX, board_names
+from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.profiles.target_limits import CONFIGURATION
 
 BoardLike = TargetProfile | str | os.PathLike[str]
@@ -25,9 +26,9 @@ def boards_of(board: BoardLike | Sequence[BoardLike]) -> list[TargetProfile]:
             it; "all" stands for the shipped boards with a DPU.
     """
     if isinstance(board, str) and board.removesuffix(MODEL_SUFFIX) == ALL:
-        return [load_target(name) for name in board_names()]
+        return [TargetProfile.load(name) for name in board_names()]
     if isinstance(board, str):
-        return [load_target(name.strip()) for name in board.split(",")]
+        return [TargetProfile.load(name.strip()) for name in board.split(",")]
     if isinstance(board, os.PathLike | TargetProfile):
         return [TargetProfile.load(board)]
     return [TargetProfile.load(source) for source in board]
@@ -133,7 +134,7 @@ class Dpu:
 
 def load_dpu(target: str, configuration: str | None = None) -> Dpu:
     """Read a target profile and one of its configurations."""
-    return dpu_of(load_target(target), configuration)
+    return dpu_of(TargetProfile.load(target), configuration)
 
 
 def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:

@@ -9,7 +9,7 @@ from beers_deploy.model.exposure import HEADROOM
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import BLIND
+from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.quant.banked.filters import MIDDLE_DN, PART, STEP_DN
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.ends import FINE_MAX

@@ -37,8 +37,10 @@ from beers_deploy.performance.tables import (
 )
 from beers_deploy.profiles.errors import ModelError, OptionError, printable
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.sensor import MAX_DN, Sensor
-from beers_deploy.profiles.target import TILE_PX, TargetProfile
+from beers_deploy.profiles.instrument import MAX_DN
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import TILE_PX
+from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.restoration.plan import make_plan, parse_halo
 from beers_deploy.restoration.steps import keeps_pixels, offset_of
 from beers_deploy.restoration.tiles.exposures import tiles_by_factor

@@ -14,7 +14,7 @@ from beers_deploy.model.raster.facts import SIDE_PX
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.figures import Figure, predicted, unavailable
-from beers_deploy.profiles.target import TILE_PX
+from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.restoration.plan import plan_side
 
 COST_SOURCE = "cost model fitted on published networks, docs/explanation/cost-model.md"

@@ -22,7 +22,7 @@ from markupsafe import Markup
 
 from beers_deploy.profiles.errors import visible
 from beers_deploy.profiles.figures import number
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.instrument import MAX_DN
 
 if TYPE_CHECKING:
     from matplotlib.axis import Axis

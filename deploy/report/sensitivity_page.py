@@ -7,7 +7,7 @@ import onnxruntime as ort
 
 from beers_deploy.model.io.pictures import error_row, grid, picture_url, stretch_of, strip_row
 from beers_deploy.profiles.figures import Row, by_table
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.samples import Patches
 from beers_deploy.quant.sensitivity import Spread
 from beers_deploy.quant.session import run

@@ -15,7 +15,7 @@ from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.network_files import other_sensor
 from beers_deploy.profiles.errors import ModelError, OptionError, printable
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import BLIND
+from beers_deploy.profiles.shipped import BLIND
 
 logger = logging.getLogger(__name__)
 

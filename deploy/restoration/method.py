@@ -11,8 +11,8 @@ import numpy as np
 import onnx
 
 from beers_deploy.model.consistency import Consistency
-from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.profiles.target import TILE_PX
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.restoration.plan import Plan, make_plan
 from beers_deploy.restoration.runtime import AtFirstCall, open_runtime

@@ -16,7 +16,7 @@ import psutil
 from beers_deploy.model.raster.source import Source
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import MachineError, ModelError, OptionError, printable, sizes
-from beers_deploy.profiles.target import TILE_PX
+from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.quant.tiling.walk import Tiling
 
 

@@ -19,7 +19,7 @@ from beers_deploy.cluster import Cluster
 from beers_deploy.model.raster.source import Source
 from beers_deploy.network import Network
 from beers_deploy.profiles.figures import Figure
-from beers_deploy.profiles.sensor_file import BLIND
+from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.detectors.words import warn_of_detectors
 from beers_deploy.restoration.figures import plan_figures, seam_figures

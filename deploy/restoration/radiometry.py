@@ -13,7 +13,7 @@ import numpy as np
 from beers_deploy.model.raster.facts import Extent, Raster
 from beers_deploy.model.raster.full_scale import settled_scale
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.instrument import MAX_DN
 
 
 @dataclass(frozen=True)

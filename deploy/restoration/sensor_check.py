@@ -38,9 +38,10 @@ from beers_deploy.model.raster.source import Source
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.profiles.errors import ImageError, printable
 from beers_deploy.profiles.figures import Figure, measured, unavailable
+from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import NYQUIST
-from beers_deploy.profiles.sensor import Instrument, Sensor
-from beers_deploy.profiles.sensor_file import BLIND
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.restoration.bands import in_order
 

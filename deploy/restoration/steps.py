@@ -15,7 +15,7 @@ from beers_deploy.model.consistency import Consistency
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.network import Network
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import BLIND
+from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.quant.tiling.walk import Tiling
 from beers_deploy.restoration.bands import in_order
 from beers_deploy.restoration.runtime import Infer

@@ -24,9 +24,9 @@ from beers_deploy.performance.swath import Swath, predict_network
 from beers_deploy.performance.traditional import measure_chain
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Row, measured
-from beers_deploy.profiles.sensor import MAX_DN, Sensor
-from beers_deploy.profiles.sensor_file import reference_for
-from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX, board_names
+from beers_deploy.profiles.instrument import MAX_DN
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import DEFAULT_TARGET, TILE_PX, board_names
 from beers_deploy.report.page import Picture, Section
 
 BITS = 12
@@ -86,7 +86,7 @@ def load_sensors(sensor: SensorLike = SENSOR) -> tuple[Sensor, Sensor]:
             f"`sensor` must have {BITS} bits, but {degraded.name} has {degraded.nominal().bits}. "
             "Use 'restore', with a full scale or the traditional method."
         )
-    return degraded, reference_for(degraded)
+    return degraded, degraded.reference
 
 
 def read_input(

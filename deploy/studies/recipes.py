@@ -27,7 +27,8 @@ from beers_deploy.model.training.run import Run, train
 from beers_deploy.model.training.trainer import Worker
 from beers_deploy.model.variants import VARIANTS, Variant
 from beers_deploy.network_files import Conditioned
-from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import REFERENCE
 from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.quantization import family_model, rounding_of
 
@@ -92,8 +93,8 @@ def stage_run(
             save_onnx(family_model(Conditioned(recipe.variant, start), images), int8)
         rounding = rounding_of(int8, start)
         digest = sha256(int8)
-    degraded = load_sensor(SENSOR)
-    reference = load_sensor(REFERENCE)
+    degraded = Sensor.load(SENSOR)
+    reference = Sensor.load(REFERENCE)
     family = SensorFamily(degraded.nominal(), other_curves=recipe.other_curves)
     patches = PatchRecipe(
         degraded,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError, missing_extra
-from beers_deploy.profiles.target import DEFAULT_TARGET, MODEL_SUFFIX, TILE_PX
+from beers_deploy.profiles.shipped import DEFAULT_TARGET, MODEL_SUFFIX, TILE_PX
 from beers_deploy.verbs.parameters import (
     Halo,
     InputPath,
@@ -187,7 +187,7 @@ def _with_traditional(table: "Bench") -> "Bench":
         note = f"The traditional pipeline is not measured here: {reason}"
         return replace(table, notes=(*table.notes, note))
     from beers_deploy.profiles.sensor import Sensor
-    from beers_deploy.profiles.sensor_file import REFERENCE
+    from beers_deploy.profiles.shipped import REFERENCE
 
     sensors = Sensor.load(SENSOR), Sensor.load(REFERENCE)
     dn = drawn_acquisition(table.swath, *sensors) if table.dn is None else table.dn

@@ -76,7 +76,7 @@ def characterize(
 
 def contrasts(mtf: str | tuple[float, float]) -> tuple[float, float]:
     """Return the contrast at Nyquist across and along the track; one number stands for both."""
-    from beers_deploy.profiles.sensor import MTF_NYQUIST_MAX
+    from beers_deploy.profiles.instrument import MTF_NYQUIST_MAX
 
     parts = mtf.split(",") if isinstance(mtf, str) else list(mtf)
     try:

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Annotated
 
-from beers_deploy.profiles.target import DEFAULT_TARGET
+from beers_deploy.profiles.shipped import DEFAULT_TARGET
 from beers_deploy.verbs.parameters import Interval, NetworkLike, TargetLike
 from beers_deploy.verbs.verb import verb
 

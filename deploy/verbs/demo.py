@@ -60,7 +60,7 @@ def demo(
     from beers_deploy.model.progress import steps
     from beers_deploy.model.raster.writer import write_tiff
     from beers_deploy.network import Network
-    from beers_deploy.profiles.sensor import MAX_DN
+    from beers_deploy.profiles.instrument import MAX_DN
     from beers_deploy.report.page import Report, Section, write_report
     from beers_deploy.results import Table
     from beers_deploy.studies import demo as parts

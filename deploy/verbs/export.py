@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from beers_deploy.model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_weights
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.profiles.target import DEFAULT_TARGET
+from beers_deploy.profiles.shipped import DEFAULT_TARGET
 from beers_deploy.verbs.parameters import (
     InputPath,
     Interval,

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Annotated
 
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.target import DEFAULT_TARGET
+from beers_deploy.profiles.shipped import DEFAULT_TARGET
 from beers_deploy.verbs.parameters import (
     Holds,
     InputPath,

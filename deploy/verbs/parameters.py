@@ -89,7 +89,7 @@ def network_names() -> list[str]:
 
 def sensor_names() -> list[str]:
     """Return the names of the shipped sensors."""
-    from beers_deploy.profiles.sensor_file import sensor_names as shipped
+    from beers_deploy.profiles.shipped import sensor_names as shipped
 
     return list(shipped())
 
@@ -97,14 +97,14 @@ def sensor_names() -> list[str]:
 @lru_cache(maxsize=1)
 def target_names() -> list[str]:
     """Return the names of the boards and NPUs."""
-    from beers_deploy.profiles.target import board_names, npu_names
+    from beers_deploy.profiles.shipped import board_names, npu_names
 
     return [*board_names(), *npu_names()]
 
 
 def profile_names() -> list[str]:
     """Return the names of all shipped profiles."""
-    from beers_deploy.profiles.scene_call import scene_names
+    from beers_deploy.profiles.shipped import scene_names
 
     return [*sensor_names(), *scene_names(), *target_names()]
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError, optional, printable
-from beers_deploy.profiles.target import DEFAULT_TARGET
+from beers_deploy.profiles.shipped import DEFAULT_TARGET
 from beers_deploy.verbs.parameters import (
     Holds,
     InputPath,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from beers_deploy.model.raster.compression import Compression
 from beers_deploy.profiles.errors import OptionError, optional
-from beers_deploy.profiles.target import DEFAULT_TARGET, TILE_PX
+from beers_deploy.profiles.shipped import DEFAULT_TARGET, TILE_PX
 from beers_deploy.verbs.parameters import (
     BandSensors,
     Halo,
@@ -254,13 +254,13 @@ def _output(
 def _preview(image: Path, pipeline: "Pipeline", reading: "Reading") -> "Table":
     """Return what an image is, how it would be cut and how long that would take."""
     from beers_deploy.dry_run import preview_row
-    from beers_deploy.profiles.target import load_target
+    from beers_deploy.profiles.target import TargetProfile
     from beers_deploy.restoration.prepare import NetworkPipeline
     from beers_deploy.results import Table
 
     # The traditional pipeline has no plan of tiles, and is refused before.
     assert isinstance(pipeline, NetworkPipeline)  # noqa: S101
-    row = preview_row(image, pipeline, reading, load_target(DEFAULT_TARGET))
+    row = preview_row(image, pipeline, reading, TargetProfile.load(DEFAULT_TARGET))
     # The image has no digest here, because the whole file would be read for it.
     networks = tuple(network.input for network in pipeline.networks.values())
     return Table(title=str(image), inputs=networks, rows=(row,), headings={"restore": ""})

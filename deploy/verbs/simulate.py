@@ -119,7 +119,7 @@ def simulate(
         >>> degraded.shape, degraded.dtype
         ((96, 96), dtype('uint16'))
     """
-    from beers_deploy.profiles.scene_call import calling_for, load_scene_call, origins
+    from beers_deploy.profiles.scene_call import SceneCall, calling_for, origins
     from beers_deploy.profiles.sensor import Sensor
 
     if out is None:
@@ -131,7 +131,7 @@ def simulate(
     if scheduler is not None:
         refuse_with("`scheduler`", workers=workers != 0)
     usual, patch_px = (SENSOR, None) if preset is None else PRESETS[preset]
-    call = None if scene is None else load_scene_call(os.fspath(scene))
+    call = None if scene is None else SceneCall.load(os.fspath(scene))
     own = Sensor.load(sensor or usual)
     degraded = calling_for(own, call, with_, without)
     scale = call.radiance_scale.low if call else 1.0
@@ -202,7 +202,7 @@ def _recipe(
 ) -> "DatasetRecipe":
     """Return what decides the pixels of a data set."""
     from beers_deploy.model.dataset import DatasetRecipe
-    from beers_deploy.profiles.sensor_file import reference_beside
+    from beers_deploy.profiles.reference import reference_beside
 
     scene_ratio = oversampling or degraded.oversampling.low
     # The scene is resampled first where its ratio is no integer.

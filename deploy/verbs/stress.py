@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.profiles.target import DEFAULT_TARGET
+from beers_deploy.profiles.shipped import DEFAULT_TARGET
 from beers_deploy.verbs.parameters import (
     InputPath,
     Interval,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.target import DEFAULT_TARGET
+from beers_deploy.profiles.shipped import DEFAULT_TARGET
 from beers_deploy.verbs.parameters import (
     Holds,
     InputPath,
@@ -96,8 +96,8 @@ def tradeoff(
     """
     from beers_deploy.dpu.board import boards_of
     from beers_deploy.performance.swath import parse_size
+    from beers_deploy.profiles.reference import reference_beside
     from beers_deploy.profiles.sensor import Sensor
-    from beers_deploy.profiles.sensor_file import reference_beside
     from beers_deploy.studies.tradeoff.advice import parse_constraints
 
     if dry_run:

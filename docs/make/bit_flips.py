@@ -10,8 +10,8 @@ from pathlib import Path
 
 from beers_deploy.model.io.files import write_text
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.sensor_file import load_sensor
-from beers_deploy.profiles.target import load_target
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.calibration import Calibration
 from beers_deploy.studies.stress.bit_flips import SETS, flip_curves_svg, flip_rows
 from beers_deploy.studies.stress.networks import open_subject
@@ -20,7 +20,7 @@ DOCS = Path(__file__).parents[1]
 PAGE = DOCS / "explanation" / "bit-flips.md"
 PICTURE = DOCS / "assets" / "bit-flips.svg"
 VARIANTS = ("convbeers-s", "convbeers-half", "convbeers-xs")
-SOURCE = Calibration(load_sensor("pleiades-degraded"), None, patches=6, patch_px=96, seed=0)
+SOURCE = Calibration(Sensor.load("pleiades-degraded"), None, patches=6, patch_px=96, seed=0)
 BOARD = "vck190"
 
 OPENING = f"""# Bit flips
@@ -92,7 +92,7 @@ def table(networks: Mapping[str, Sequence[Row]]) -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    board = load_target(BOARD)
+    board = TargetProfile.load(BOARD)
     studies = {variant: flip_rows(open_subject(variant), SOURCE, board) for variant in VARIANTS}
     write_text(PAGE, document(studies))
     write_text(PICTURE, flip_curves_svg(studies))

@@ -18,7 +18,7 @@ from beers_deploy.cli.generate import (
     spellings_of,
     text_for_command,
 )
-from beers_deploy.profiles.target import board_names, npu_names
+from beers_deploy.profiles.shipped import board_names, npu_names
 from beers_deploy.verbs.parameters import Interval
 from beers_deploy.verbs.verb import marker
 

@@ -17,15 +17,11 @@ from beers_deploy.model.simulator.acquire import MARGIN_PX, prepare_scene, simul
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.plan import ORDER, TOLERANCE_DN, Plan, make_plan, scene_stats
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.profiles.effects import TABLES, middle_effect
-from beers_deploy.profiles.scene_call import (
-    calling_for,
-    load_scene_call,
-    scene_names,
-    typical_effects,
-)
-from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.effects import TABLES, settled
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.scene_call import SceneCall, calling_for, typical_effects
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import scene_names
 
 DOCS = Path(__file__).parents[1]
 PAGE = DOCS / "explanation" / "effects.md"
@@ -85,7 +81,7 @@ def document() -> str:
 
 def plain() -> Instrument:
     """A sensor with no optional effect."""
-    return load_sensor("pleiades-degraded").nominal()
+    return Sensor.load("pleiades-degraded").nominal()
 
 
 def figure() -> Image.Image:
@@ -93,7 +89,7 @@ def figure() -> Image.Image:
     side = (SIDE_PX + 2 * MARGIN_PX) * RATIO
     radiance = procedural_scene(3520, 3520, np.random.default_rng(0)).radiance
     scene = prepare_scene(radiance[2000 : 2000 + side, 2300 : 2300 + side], RATIO)
-    typical = {name: middle_effect(name, table) for name, table in typical_effects().items()}
+    typical = settled(typical_effects(), lambda constant: constant.middle)
     effects = {name: replace(effect, **SHOWN.get(name, {})) for name, effect in typical.items()}
     sensors = {"blur and noise": plain()}
     sensors |= {f"+ {name}": replace(plain(), effects={name: effects[name]}) for name in TABLES}
@@ -114,8 +110,8 @@ def bounds(radiance: np.ndarray) -> Iterator[str]:
     """The effects that each scene asks for, as a Markdown table of their bounds."""
     plans = dict[str, Plan]()
     for name in scene_names():
-        call = load_scene_call(name)
-        sensor = calling_for(load_sensor("pleiades-degraded"), call).nominal()
+        call = SceneCall.load(name)
+        sensor = calling_for(Sensor.load("pleiades-degraded"), call).nominal()
         plans[name] = make_plan(sensor, scene_stats(radiance * call.radiance_scale.low, RATIO))
     yield f"| effect | {' | '.join(plans)} |"
     yield "|---" * (len(plans) + 1) + "|"

@@ -25,7 +25,8 @@ from beers_deploy.dpu.checker.other_rules import INSTEAD
 from beers_deploy.dpu.checker.remarks import REMARKS
 from beers_deploy.dpu.cost.latency import dpu_power
 from beers_deploy.profiles.constant import Constant
-from beers_deploy.profiles.target import board_names, load_target, npu_names
+from beers_deploy.profiles.shipped import board_names, npu_names
+from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.graph.nodes import KINDS, Kind
 
 TARGET = Path(__file__).parents[1] / "reference" / "operators.md"
@@ -60,7 +61,7 @@ def document() -> str:
     )
     parts += _rules("Remarks, which break no rule", REMARKS)
     for name in npu_names():
-        parts += _npu(ruled(load_target(name)))
+        parts += _npu(ruled(TargetProfile.load(name)))
     parts += ["## What to use instead\n"]
     parts += [f"- {names}: {remedy}" for names, remedy in _alike(dict(sorted(INSTEAD.items())))]
     return "\n".join([*parts, ""])

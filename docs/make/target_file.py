@@ -11,8 +11,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from beers_deploy.profiles import target_limits
-from beers_deploy.profiles.constant import Constant
-from beers_deploy.profiles.target import DOCUMENTS, FUSED, NPU, PLACES, board_names, load_target
+from beers_deploy.profiles.constant import Constant, Limits
+from beers_deploy.profiles.shipped import board_names
+from beers_deploy.profiles.target import DOCUMENTS, FUSED, NPU, PLACES, TargetProfile
 
 TARGET = Path(__file__).parents[1] / "reference" / "target-file.md"
 BUILD = "configurations.NAME"
@@ -158,7 +159,7 @@ file has its constants, so leave out what your DPU does not limit.
 def shipped() -> dict[str, dict[str, list[Constant]]]:
     """The constants of every shipped board with a DPU, by table and key."""
     by_table: dict[str, dict[str, list[Constant]]] = defaultdict(lambda: defaultdict(list))
-    for board in map(load_target, board_names()):
+    for board in map(TargetProfile.load, board_names()):
         tables = [
             *board.tables.items(),
             *((BUILD, build) for build in board.configurations.values()),
@@ -169,20 +170,18 @@ def shipped() -> dict[str, dict[str, list[Constant]]]:
     return by_table
 
 
-def limits(table: str) -> Mapping[str, target_limits.Limits]:
+def limits(table: str) -> Mapping[str, Limits]:
     """The numbers that the keys of a table can have."""
     return target_limits.CONFIGURATION if table == BUILD else target_limits.TABLES[table]
 
 
-def accepted(limit: target_limits.Limits) -> str:
+def accepted(limit: Limits) -> str:
     """The numbers of a key in a few words."""
     low = "above 0" if limit.low == target_limits.SMALLEST else f"{limit.low:g}"
     return f"{'whole, ' if limit.whole else ''}{low} to {limit.high:g}"
 
 
-def line(
-    key: str, unit: str, meaning: str, limit: target_limits.Limits, constants: list[Constant]
-) -> str:
+def line(key: str, unit: str, meaning: str, limit: Limits, constants: list[Constant]) -> str:
     """A key: what it is, its unit, the values among the shipped boards, and
     those that it can have.
     """

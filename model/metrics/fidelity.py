@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.instrument import MAX_DN
 
 SSIM_SIGMA_PX = 1.5
 SSIM_RADIUS_PX = 5

@@ -6,7 +6,7 @@ import numpy as np
 
 from beers_deploy.model.raster.facts import Extent
 from beers_deploy.profiles.errors import ImageError, OptionError
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.instrument import MAX_DN
 
 UNIT_MAX = 2.0
 """Floats no larger may be shares of full scale, or reflectances, which pass 1 on snow and glint.

@@ -11,7 +11,7 @@ from beers_deploy.model.raster.facts import extent_of
 from beers_deploy.model.raster.full_scale import remedy_outside, settled_scale
 from beers_deploy.model.raster.reader import open_raster
 from beers_deploy.profiles.errors import ImageError, MachineError, sizes
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.instrument import MAX_DN
 
 CAMERA = r"[_-](?:dji|img|image|dsc[nf]?|fhd|mos|gopr|frame|p)[_-]?"
 """How cameras and programs begin the names of their files, after the name of a place."""

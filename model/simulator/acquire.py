@@ -13,7 +13,7 @@ from beers_deploy.model.simulator.mtf import sensor_transfer
 from beers_deploy.model.simulator.plan import Plan, SceneStats, scene_stats
 from beers_deploy.model.simulator.sampling import crop_divisible, sample, scene_spectrum
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.instrument import Instrument
 
 MARGIN_PX = 32
 """Target pixels cropped on each side: the FFT wraps around, and the PSF's tail is long (10.8 DN at

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from beers_deploy.profiles.effects import pixel_effects
-from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.instrument import Instrument
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.instrument import MTF_NYQUIST_MAX, Instrument, mtf_limit
 from beers_deploy.profiles.response import PointSpread, Response
-from beers_deploy.profiles.sensor import MTF_NYQUIST_MAX, Instrument, mtf_limit
 
 
 def gamma_from_mtf(mtf_nyquist: float, antialias_sigma_px: float = 0.0) -> float:

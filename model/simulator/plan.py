@@ -21,7 +21,7 @@ from scipy import fft
 from beers_deploy.model.simulator.detector import NOISE_LIMIT
 from beers_deploy.model.simulator.mtf import Blur, smear_response, transfer_function
 from beers_deploy.profiles.effects import TABLES, PixelEffect, pixel_effects
-from beers_deploy.profiles.sensor import Instrument, mtf_limit
+from beers_deploy.profiles.instrument import Instrument, mtf_limit
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from scipy import fft
 
 from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.simulator.sampling import Scene, read_scene
-from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.instrument import Instrument
 
 SCENES = 3
 SCENE_SIDE_PX = 2400

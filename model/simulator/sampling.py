@@ -12,7 +12,7 @@ from scipy import fft
 
 from beers_deploy.model.raster.images import read_pixels
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.instrument import Instrument
 
 
 def scene_spectrum(radiance: np.ndarray) -> np.ndarray:

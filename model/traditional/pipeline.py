@@ -31,7 +31,7 @@ from beers_deploy.model.traditional.noise import (
 )
 from beers_deploy.model.traditional.regularisation import derived_epsilon, measure
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.instrument import Instrument
 
 WORKING_SIGMA = 12.0
 """Noise level at which NL-Bayes runs: the stabilised image is scaled to it, where the published

@@ -32,8 +32,8 @@ from torch import Tensor
 from beers_deploy.model.simulator.detector import to_radiance
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.model.traditional.noise import with_rounding_noise
+from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import NYQUIST
-from beers_deploy.profiles.sensor import Instrument
 
 
 class Fit(NamedTuple):

@@ -23,7 +23,7 @@ from torch.nn.functional import avg_pool2d, interpolate
 
 from beers_deploy.model.consistency import BLOCK_PX
 from beers_deploy.model.metrics.perceptual import Lpips
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.instrument import MAX_DN
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from beers_deploy.model.simulator.mtf import Blur, gamma_from_mtf, transfer_func
 from beers_deploy.model.simulator.sampling import Scene, crop_divisible
 from beers_deploy.model.training.looks import Look
 from beers_deploy.profiles.effects import pixel_effects
+from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import MtfTable, PointSpread
-from beers_deploy.profiles.sensor import Instrument
 
 GAMMAS = 513
 """Radii at which a table's gamma is known; between them it is interpolated, which is off by 1e-4 at

@@ -11,7 +11,8 @@ from beers_deploy.model.family import SensorFamily
 from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.training.looks import ORDINARY, Looks
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor import Sensor, require_same_units
+from beers_deploy.profiles.reference import require_same_units
+from beers_deploy.profiles.sensor import Sensor
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,10 @@ from beers_deploy.model.training.looks import Looks
 from beers_deploy.model.training.losses import LossWeights
 from beers_deploy.model.training.trainer import Precision
 from beers_deploy.model.variants import variant_named
-from beers_deploy.profiles.constant import check_keys, is_number
+from beers_deploy.profiles.constant import is_number
 from beers_deploy.profiles.errors import ProfileError, printable
 from beers_deploy.profiles.toml import read_toml_text
+from beers_deploy.profiles.validation import check_keys
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 

@@ -50,7 +50,8 @@ from beers_deploy.model.training.stored import StoredPairs
 from beers_deploy.model.training.trainer import Batches, Precision, Schedule, Speed, Trainer, Worker
 from beers_deploy.model.variants import Variant, variant_named
 from beers_deploy.profiles.errors import ModelError, OptionError
-from beers_deploy.profiles.sensor import Instrument, Sensor, numbers_of
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Sensor, numbers_of
 
 logger = logging.getLogger(__name__)
 

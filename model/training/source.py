@@ -30,7 +30,7 @@ from beers_deploy.model.training.passes import (
 )
 from beers_deploy.model.training.patches import PatchRecipe, draw_turn
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.instrument import Instrument
 
 
 class Batch(NamedTuple):

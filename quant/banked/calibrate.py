@@ -16,7 +16,8 @@ from beers_deploy.model.family import SensorFamily, sensor_vector
 from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.variants import SENSOR_VALUES, Kernels
-from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import REFERENCE
 from beers_deploy.quant.banked.family import BANK, Family, bank_layer
 from beers_deploy.quant.banked.filters import (
     ANALYTIC_COPIES,
@@ -290,8 +291,8 @@ def family_images(
         kernels: of the banks.
         patch_px: side of a patch.
     """
-    like = load_sensor(LIKE)
-    reference = load_sensor(REFERENCE)
+    like = Sensor.load(LIKE)
+    reference = Sensor.load(REFERENCE)
     patches = draw_patches(
         scenes, like, reference, PATCHES, seed, patch_px, SensorFamily(like.nominal(), SNR)
     )

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from beers_deploy.model.bank import FILTERS, SIDE_PX, UNIT_STEPS, WIDE, Bank, in_places
 from beers_deploy.model.variants import Kernels
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.instrument import MAX_DN
 
 STEP_DN = 16
 MIDDLE_DN = 2048

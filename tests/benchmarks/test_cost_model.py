@@ -9,7 +9,8 @@ from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import predict
 from beers_deploy.dpu.cost.model import Constants, Structure
 from beers_deploy.model.traditional.nl_bayes import QUALITIES
-from beers_deploy.profiles.target import board_names, load_target
+from beers_deploy.profiles.shipped import board_names
+from beers_deploy.profiles.target import TargetProfile
 from benchmarks.cost_model.builder import Builder
 from benchmarks.cost_model.chain_time import BOUND_BY, HEIGHT_PX, WIDTH_PX, Rates, s_per_mpx
 from benchmarks.cost_model.chain_work import UNITS, chain_work
@@ -130,7 +131,7 @@ MEASURED_PX = 256
 @pytest.mark.parametrize("board", board_names())
 def test_the_stored_time_of_the_pipeline_is_what_the_model_says(board: str) -> None:
     """Of rates measured on another day: within a fifth at each end."""
-    target = load_target(board)
+    target = TargetProfile.load(board)
     quality = QUALITIES["standard"]
     explained = (
         math.fsum(MEASURED.times_s(chain_work(MEASURED_PX, MEASURED_PX, quality)).values())

@@ -17,7 +17,7 @@ import beers_deploy as bd
 from beers_deploy.baseline import Baseline, data_inputs, read_baseline, sensor_input
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Check, Row, measured
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.results import Input, Table
 from tests.deploy.command_line import done, refused
 
@@ -194,7 +194,7 @@ def test_what_else_it_rests_on_must_be_the_same(digest: str) -> None:
 
 
 def test_a_sensor_of_the_same_name_and_other_numbers_is_another() -> None:
-    sensor = load_sensor("pleiades-degraded")
+    sensor = Sensor.load("pleiades-degraded")
     other = sensor.replace(gain_dn_per_radiance=2 * sensor.gain_dn_per_radiance.low)
     assert sensor_input(sensor).name == sensor_input(other).name
     assert sensor_input(sensor).sha256 != sensor_input(other).sha256

@@ -25,14 +25,9 @@ from beers_deploy.model.dataset import (
 from beers_deploy.model.manifest import DIGESTS, Line, line_text
 from beers_deploy.profiles.effects import TABLES
 from beers_deploy.profiles.errors import ImageError, OptionError
-from beers_deploy.profiles.scene_call import (
-    calling_for,
-    load_scene_call,
-    origins,
-    scene_names,
-    typical_effects,
-)
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.scene_call import SceneCall, calling_for, origins, typical_effects
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import scene_names
 from beers_deploy.results import Table
 from beers_deploy.verbs.simulate import simulate
 from tests.deploy.command_line import done, refused
@@ -55,8 +50,8 @@ def dataset(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-VARIABLE = load_sensor("pleiades-variable")
-REFERENCE = load_sensor("pleiades-reference")
+VARIABLE = Sensor.load("pleiades-variable")
+REFERENCE = Sensor.load("pleiades-reference")
 
 
 def small(scene: Path, patch_px: int | None = 24) -> DatasetRecipe:
@@ -278,15 +273,15 @@ def test_every_effect_has_a_typical_value_and_every_scene_loads() -> None:
     assert [*typical_effects()] == [*TABLES]
     assert len(TABLES) == 9
     assert scene_names() == ["desert-noon", "haze-over-sea", "night-port", "snow"]
-    profile = load_sensor("pleiades-degraded")
+    profile = Sensor.load("pleiades-degraded")
     for name in scene_names():
-        call = load_scene_call(name)
+        call = SceneCall.load(name)
         assert set(calling_for(profile, call).effects) == set(call.effects)
 
 
 def test_effects_are_added_and_forbidden() -> None:
-    profile = load_sensor("pleiades-degraded")
-    haze = load_scene_call("haze-over-sea")
+    profile = Sensor.load("pleiades-degraded")
+    haze = SceneCall.load("haze-over-sea")
     assert set(calling_for(profile, haze, ["prnu"], ["veil"]).effects) == {"striping", "prnu"}
     transmittance = calling_for(profile, haze, ["veil"]).effects["veil"]["transmittance"]
     # This is the scene's own value, not the typical one.
@@ -296,8 +291,8 @@ def test_effects_are_added_and_forbidden() -> None:
 
 
 def test_each_effect_says_who_asks_for_it() -> None:
-    profile = load_sensor("pleiades-degraded")
-    haze = load_scene_call("haze-over-sea")
+    profile = Sensor.load("pleiades-degraded")
+    haze = SceneCall.load("haze-over-sea")
     base = {"mtf": "sensor pleiades-degraded", "noise": "sensor pleiades-degraded"}
     assert origins(profile, None) == base
     assert origins(profile, haze, ["prnu", "striping"], ["veil"]) == base | {
@@ -350,7 +345,7 @@ def test_a_dataset_begun_here_is_finished_by_a_scheduler_s_workers(
 
     options = ["--images", scene, "--oversampling", "2", "--patch", "8"]
     recipe = DatasetRecipe(
-        (scene,), load_sensor("pleiades-degraded"), REFERENCE, oversampling=2, patch_px=8
+        (scene,), Sensor.load("pleiades-degraded"), REFERENCE, oversampling=2, patch_px=8
     )
     with pytest.raises(KeyboardInterrupt):
         write_dataset(recipe, tmp_path / "d", 1, resume=False, tick=stop)

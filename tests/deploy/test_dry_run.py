@@ -13,7 +13,7 @@ from beers_deploy.dry_run import preview_row
 from beers_deploy.model.raster.reader import GdalSource
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.target import load_target
+from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.restoration.plan import Tiles
 from beers_deploy.restoration.prepare import NetworkPipeline
 from beers_deploy.restoration.reading import Reading
@@ -40,7 +40,7 @@ def about(
     """Return the facts of an image and of its restoration by a network."""
     pipeline = NetworkPipeline({"": Network.load(network)}, Tiles(tile_px))
     return preview_row(
-        image, pipeline, Reading(full_scale=full_scale), load_target("vck190"), measure
+        image, pipeline, Reading(full_scale=full_scale), TargetProfile.load("vck190"), measure
     )
 
 

@@ -25,7 +25,7 @@ from beers_deploy.model.variants import VARIANTS, Variant
 from beers_deploy.network import Network
 from beers_deploy.parity import require_parity, torch_network
 from beers_deploy.profiles.errors import ModelError, OptionError
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import fixed_tile_px, metadata, save_onnx
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.walk import tiling_of
@@ -58,7 +58,7 @@ def test_torch_and_onnxruntime_agree(scale: int, tile_px: int | None, tmp_path: 
 @pytest.mark.parametrize("name", shipped_names())
 def test_torch_and_onnxruntime_agree_on_shipped_weights(name: str) -> None:
     weights = shipped_weights(name)
-    sensor = load_sensor("pleiades-degraded")
+    sensor = Sensor.load("pleiades-degraded")
     require_parity(torch_network(weights, sensor.nominal()), float_for(weights, name, sensor), 38)
 
 
@@ -70,7 +70,7 @@ def test_a_network_behind_a_bank_is_exported_for_one_sensor(
     the same.
     """
     banked = behind_a_bank(Variant(1, 8, scale), 0.1)
-    sensor = load_sensor("pleiades-degraded").nominal()
+    sensor = Sensor.load("pleiades-degraded").nominal()
     model = banked_to_onnx(Weights(arrays(banked.state_dict()), banked.variant, {}), sensor, {})
     image = np.random.default_rng(1).random((2, 1, rows, columns), dtype=np.float32) * 0.02 + 0.4
     with torch.inference_mode():
@@ -88,7 +88,7 @@ def test_a_network_behind_a_bank_is_exported_for_one_sensor(
 def test_the_shipped_network_at_half_resolution_restores_the_same_image() -> None:
     """Rearranged on both sides: in torch's order of the channels and in ONNX's."""
     small = load_network(shipped_weights("convbeers-xs"))[0]
-    sensor = load_sensor("pleiades-degraded").nominal()
+    sensor = Sensor.load("pleiades-degraded").nominal()
     coarse = grow(small, VARIANTS["convbeers-half"], torch.Generator().manual_seed(0))
     both_weights = [
         Weights(arrays(network.state_dict()), network.variant, {}) for network in (small, coarse)
@@ -134,7 +134,7 @@ def test_conditioned_weights_become_the_sensors(
         )
     assert path.read_bytes() == again.read_bytes()
     unfolded = load_network(conditioned)[0]
-    nominal = load_sensor(sensor).nominal()
+    nominal = Sensor.load(sensor).nominal()
     plain = told(unfolded, vector_tensor(nominal), network_bank(nominal))
     image = np.random.default_rng(1).random((1, 1, 27, 35), dtype=np.float32)
     with torch.inference_mode():

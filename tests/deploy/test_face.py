@@ -18,8 +18,7 @@ import torch
 import beers_deploy as bd
 from beers_deploy.model.progress import Step
 from beers_deploy.profiles.sensor import numbers_of
-from beers_deploy.profiles.sensor_file import sensor_names
-from beers_deploy.profiles.target import board_names
+from beers_deploy.profiles.shipped import board_names, sensor_names
 from beers_deploy.results import SCHEMA_PATH
 from beers_deploy.studies.tradeoff.page import Tradeoff
 from tests.deploy.studies.tradeoff.small import small_studies

@@ -19,8 +19,8 @@ from beers_deploy.float_onnx import float_model
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.profiles.figures import Bound, Check
-from beers_deploy.profiles.sensor_file import BLIND
-from beers_deploy.profiles.target import load_target
+from beers_deploy.profiles.shipped import BLIND
+from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.gate import compare, judge, judge_saturation
 from beers_deploy.quant.limits import Limits, limits_of
@@ -66,7 +66,7 @@ def failed(
     checks = judge(result, limits) + judge_saturation(
         saturated_shares(model, unseen.degraded), limits
     )
-    checks += file_checks(reference_model, Network(model, "spoilt"), load_target("vck190"))
+    checks += file_checks(reference_model, Network(model, "spoilt"), TargetProfile.load("vck190"))
     return {check.name for check in checks if not check.passed}
 
 
@@ -422,14 +422,16 @@ def test_a_file_of_another_quantizer_is_judged_without_the_rules_of_a_dpu(
     noise = list(np.random.default_rng(0).random((2, 1, 1, 32, 32), np.float32))
     quantize_static(model, path, Calibration(noise), per_channel=True)
     free = Network(onnx.load(path), "free", path)
-    checks = file_checks(reference_model, free, load_target("host-cpu"))
+    checks = file_checks(reference_model, free, TargetProfile.load("host-cpu"))
     assert [(c.name, c.passed) for c in checks] == [
         ("ReLUs lost or added", True),
         ("layers computed in float", True),
         ("optimised against unoptimised", True),
     ]
     (rules,) = {
-        c.name for c in file_checks(reference_model, free, load_target("vck190")) if not c.passed
+        c.name
+        for c in file_checks(reference_model, free, TargetProfile.load("vck190"))
+        if not c.passed
     }
     assert rules == "nodes the DPU refuses"
 

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
-from beers_deploy.profiles.sensor_file import BLIND
+from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import noise

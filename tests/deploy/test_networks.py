@@ -26,8 +26,8 @@ from beers_deploy.model.shipped import (
 from beers_deploy.network import Network
 from beers_deploy.network_files import int8_for_sensor, weights_file
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.profiles.sensor import numbers_of
-from beers_deploy.profiles.sensor_file import BLIND, BLIND_PROFILE, load_sensor
+from beers_deploy.profiles.sensor import Sensor, numbers_of
+from beers_deploy.profiles.shipped import BLIND, BLIND_PROFILE
 from beers_deploy.quant.banked import calibrate
 from beers_deploy.quant.banked.family import WEIGHTS
 from beers_deploy.quant.onnx_file import load_onnx, metadata
@@ -35,7 +35,7 @@ from tests.deploy.command_line import done, refused
 from tests.profiles.own_sensor import own_sensor
 from tests.shipped import shipped_pair
 
-KNOWN = load_sensor(SENSOR)
+KNOWN = Sensor.load(SENSOR)
 
 
 def test_the_same_numbers_are_the_same_sensor_and_others_are_not(
@@ -49,7 +49,7 @@ def test_the_same_numbers_are_the_same_sensor_and_others_are_not(
         ("c", "value = 0.07", "value = 0.08"),
     ):
         (tmp_path / folder).mkdir()
-        sensor = load_sensor(str(own_sensor(tmp_path / folder, (old, new))))
+        sensor = Sensor.load(str(own_sensor(tmp_path / folder, (old, new))))
         networks.append(Network.load(conditioned, sensor=sensor))
     weights = [
         [tensor.raw_data for tensor in network.model.graph.initializer] for network in networks
@@ -76,7 +76,7 @@ def test_int8_is_calibrated_once_and_then_conditioned_on_any_sensor(
     other = load_onnx(Path("mine.onnx"))
     assert (metadata(base)["sensor"], metadata(other)["sensor"]) == (
         SENSOR,
-        load_sensor(str(sensor)).name,
+        Sensor.load(str(sensor)).name,
     )
     again = int8_for_sensor(other, KNOWN)
     assert again.SerializeToString(deterministic=True) == base.SerializeToString(deterministic=True)
@@ -109,8 +109,8 @@ def test_an_unknown_name_is_refused_with_the_names_that_exist() -> None:
 
 
 def test_blind_is_the_middle_of_a_range_of_sensors() -> None:
-    blind = load_sensor(BLIND)
-    assert (blind.name, numbers_of(blind)) == (BLIND, numbers_of(load_sensor(BLIND_PROFILE)))
+    blind = Sensor.load(BLIND)
+    assert (blind.name, numbers_of(blind)) == (BLIND, numbers_of(Sensor.load(BLIND_PROFILE)))
     floating = [Network.load("convbeers-xs", sensor=name).model for name in (BLIND, BLIND_PROFILE)]
     weights = [[tensor.raw_data for tensor in model.graph.initializer] for model in floating]
     assert weights[0] == weights[1]
@@ -119,7 +119,7 @@ def test_blind_is_the_middle_of_a_range_of_sensors() -> None:
 def test_a_value_outside_the_training_is_reported_each_time(
     conditioned: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    sensor = load_sensor(str(own_sensor(tmp_path, ("value = 0.07", "value = 0.004"))))
+    sensor = Sensor.load(str(own_sensor(tmp_path, ("value = 0.07", "value = 0.004"))))
     for _ in range(2):
         Network.load(conditioned, sensor=sensor)
     assert [record.levelno for record in caplog.records] == 4 * [logging.WARNING]

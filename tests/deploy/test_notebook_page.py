@@ -10,8 +10,7 @@ import pytest
 import tifffile
 
 import beers_deploy as bd
-from beers_deploy.profiles.sensor_file import BLIND
-from beers_deploy.profiles.toml import profile_path
+from beers_deploy.profiles.shipped import BLIND, profile_path
 from beers_deploy.verbs.restore import restore
 from tests.shipped import shipped_pair
 

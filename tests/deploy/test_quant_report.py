@@ -15,8 +15,8 @@ from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.sensor import MAX_DN
-from beers_deploy.profiles.sensor_file import load_sensor, reference_for
+from beers_deploy.profiles.instrument import MAX_DN
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.calibration import draw_patches
 from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, save_onnx
 from beers_deploy.quant.sensitivity import Spread, kind_of_error, worst_row
@@ -141,10 +141,10 @@ def test_labels_of_the_histogram_can_be_read_on_the_narrowest_page(farthest: int
 
 
 def test_what_the_profile_gave_is_no_measurement() -> None:
-    profile = load_sensor("pleiades-degraded")
+    profile = Sensor.load("pleiades-degraded")
     sensor = replace(profile.nominal(), mtf_nyquist=0.05)
     scene = procedural_scene(700, 700, np.random.default_rng(0))
-    patches = draw_patches([scene], profile, reference_for(profile), 1, 0)
+    patches = draw_patches([scene], profile, profile.reference, 1, 0)
     for along, expected in ((None, "5 %"), (0.03, "5 % across the track, 3 % along it")):
         views = [replace(patches.views[0], degraded=replace(sensor, mtf_nyquist_along=along))]
         row = worst_row(0, replace(patches, views=views), spread(np.zeros(9)))

@@ -15,13 +15,13 @@ from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.training.patches import PatchRecipe
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.reference import reference_beside
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import load_sensor, reference_beside
 from beers_deploy.studies.evaluation.methods import method_named
 from beers_deploy.studies.evaluation.pairs import simulate_pairs
 from beers_deploy.studies.evaluation.scores import Instruments
 
-DEGRADED = load_sensor("pleiades-degraded")
+DEGRADED = Sensor.load("pleiades-degraded")
 METHODS = ("degraded", "traditional-fast", "convbeers-xs")
 SCENE = procedural_scene(330, 346, np.random.default_rng(3))
 
@@ -54,7 +54,7 @@ def evaluated(bits: int, dimmer: float, offset_dn: float) -> tuple[np.ndarray, i
     """Return the PSNR in dB over full scale of each method, (3,), and the number of pixels."""
     degraded, reference = (
         rescaled(profile, bits, dimmer, offset_dn)
-        for profile in (DEGRADED, load_sensor("pleiades-reference"))
+        for profile in (DEGRADED, Sensor.load("pleiades-reference"))
     )
     scene = replace(SCENE, radiance=SCENE.radiance / dimmer)
     (pair,), _ = simulate_pairs([scene], degraded, reference, 0, (2,))
@@ -111,7 +111,7 @@ def test_a_named_reference_of_other_units_is_converted_and_logged(
 
 def test_recipes_refuse_a_reference_of_other_units() -> None:
     degraded = with_units(DEGRADED, 10, 12)
-    reference = load_sensor("pleiades-reference")
+    reference = Sensor.load("pleiades-reference")
     with pytest.raises(ProfileError, match=r"10 DN per W/m2/sr/um, 12 bits.*10\.2375"):
         PatchRecipe(degraded, reference)
     with pytest.raises(ProfileError, match="reference of pleiades-degraded"):

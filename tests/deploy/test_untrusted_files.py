@@ -28,7 +28,8 @@ from beers_deploy.model.raster.images import read_pixels
 from beers_deploy.model.training.run import Log
 from beers_deploy.profiles.errors import BeersError, ModelError, OptionError, ProfileError
 from beers_deploy.profiles.figures import Check, Row, measured
-from beers_deploy.profiles.toml import HERE, read_json, read_toml_text
+from beers_deploy.profiles.shipped import HERE
+from beers_deploy.profiles.toml import read_json, read_toml_text
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.journal import FinishedRow, journal_text

@@ -18,7 +18,7 @@ from beers_deploy.model.simulator.acquire import acquire
 from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.model.variants import Variant
-from beers_deploy.profiles.toml import HERE as PROFILES
+from beers_deploy.profiles.shipped import HERE as PROFILES
 from tests.deploy.studies.characterize.test_characterize import RATIO, SENSOR, SIDE, landscape
 from tests.deploy.studies.detection.folders import Object, dior
 from tests.deploy.studies.detection.networks import detector, raw

@@ -14,7 +14,8 @@ import pytest
 from beers_deploy import __version__
 from beers_deploy.cli.commands import COMMANDS
 from beers_deploy.profiles.effects import TABLES
-from beers_deploy.profiles.scene_call import load_scene_call, scene_names
+from beers_deploy.profiles.scene_call import SceneCall
+from beers_deploy.profiles.shipped import scene_names
 from docs.make import api, commands, operators, target_file
 
 ROOT = Path(__file__).parents[2]
@@ -91,7 +92,7 @@ def test_the_scenes_page_is_true_and_its_example_a_scene(tmp_path: Path) -> None
         ", ".join(f"`{name}`" for name in scene_names())
     ]
     (tmp_path / "mine.toml").write_text(example, encoding="utf-8")
-    assert load_scene_call(str(tmp_path / "mine.toml")).without == ("striping",)
+    assert SceneCall.load(str(tmp_path / "mine.toml")).without == ("striping",)
 
 
 def test_the_commands_that_give_a_verdict_are_named() -> None:

@@ -26,10 +26,10 @@ from beers_deploy.model.metrics.perceptual import read_tensors
 from beers_deploy.model.raster.images import read_pixels
 from beers_deploy.model.training.run import Log
 from beers_deploy.profiles.figures import Check, Row, measured, predicted, unavailable
-from beers_deploy.profiles.response import read_response
-from beers_deploy.profiles.scene_call import load_scene_call
-from beers_deploy.profiles.sensor_file import load_sensor
-from beers_deploy.profiles.target import load_target
+from beers_deploy.profiles.point_spread_file import PointSpreadFile
+from beers_deploy.profiles.scene_call import SceneCall
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.limits import limits_of
 from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.journal import FinishedRow, journal_text
@@ -117,17 +117,20 @@ def point_seeds(folder: Path) -> list[bytes]:
 
 
 def read_point(path: Path) -> object:
-    response, *_ = read_response("a test", {"psf": path.name, "psf_samples_per_px": 4}, path.parent)
-    return response.at(np.ones((1, 1)), np.ones((1, 1)))
+    return (
+        PointSpreadFile(path.name, 4.0)
+        .read("a test", path.parent)
+        .at(np.ones((1, 1)), np.ones((1, 1)))
+    )
 
 
 def recipe_seeds(folder: Path) -> list[bytes]:
     """The sensors of a folder of pairs, with a table and with a point-spread function."""
     path = folder / "a.toml"
     path.write_bytes(described_seeds(folder)[0])
-    profile = load_sensor(str(path))
+    profile = Sensor.load(str(path))
     (folder / "point.npy").write_bytes(point_seeds(folder)[0])
-    point, *_ = read_response("a test", {"psf": "point.npy", "psf_samples_per_px": 4}, folder)
+    point = PointSpreadFile("point.npy", 4.0).read("a test", folder)
     across, along = (replace(profile.mtf_nyquist, value=value) for value in point.at_nyquist)
     other = replace(profile, response=point, mtf_nyquist=across, mtf_nyquist_along=along)
     recipe = {
@@ -205,7 +208,7 @@ def manifest_seeds(_: Path) -> list[bytes]:
 
 def board_of(path: Path) -> None:
     """A target of the user's, and a network placed on it and timed."""
-    load_target(str(path))
+    TargetProfile.load(str(path))
     dpu = load_dpu(str(path))
     Layers.of(count_work(place(_network(), dpu).core, dpu), dpu)
 
@@ -243,14 +246,14 @@ PARSERS: tuple[Parser, ...] = (
     Parser("JPEG", ".jpg", lambda _: [image_of({"format": "JPEG"})], read_pixels),
     *(of_gdal(kind, name) for kind, name in GDAL.items()),
     Parser(
-        "sensor TOML", ".toml", lambda _: _files("sensors"), lambda p: load_sensor(str(p)).nominal()
+        "sensor TOML", ".toml", lambda _: _files("sensors"), lambda p: Sensor.load(str(p)).nominal()
     ),
     Parser(
-        "sensor TOML, MTF table", ".toml", described_seeds, lambda p: load_sensor(str(p)).nominal()
+        "sensor TOML, MTF table", ".toml", described_seeds, lambda p: Sensor.load(str(p)).nominal()
     ),
     Parser("point spread, npy", ".npy", point_seeds, read_point),
     Parser("recipe of pairs", ".json", recipe_seeds, read_recipe, of_json),
-    Parser("scene TOML", ".toml", lambda _: _files("scenes"), lambda p: load_scene_call(str(p))),
+    Parser("scene TOML", ".toml", lambda _: _files("scenes"), lambda p: SceneCall.load(str(p))),
     Parser("target TOML", ".toml", lambda _: _files("targets"), board_of, share=0.3),
     Parser("gate limits TOML", ".toml", lambda _: LIMITS, limits_of),
     Parser("results JSON", ".json", document_seeds, read_results, of_json),

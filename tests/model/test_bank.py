@@ -26,13 +26,13 @@ from beers_deploy.model.family import RANGES, noise_over_full_scale, sensor_vect
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.model.traditional.compensate import compensation_kernel
 from beers_deploy.profiles.effects import Smear
+from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import unpacked
-from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from tests.model.simulator.stages import lopsided_point, point_spread, with_response
 
-REFERENCE = load_sensor("pleiades-reference").nominal()
-NOMINAL = load_sensor("pleiades-degraded").nominal()
+REFERENCE = Sensor.load("pleiades-reference").nominal()
+NOMINAL = Sensor.load("pleiades-degraded").nominal()
 CONTRAST = st.floats(0.015, 0.15)
 
 

@@ -18,9 +18,9 @@ from scipy.ndimage import gaussian_filter
 from beers_deploy.model.consistency import RAW_REACH_PX, REACH_PX, Consistency, Placed
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.profiles.effects import AntiAlias, Offset, Smear
+from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import PointSpread, packed, unpacked
-from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from tests.model.simulator.stages import (
     formula_table,
     gaussian_pixel,
@@ -33,7 +33,7 @@ Pixels = NDArray[np.float64] | NDArray[np.float32]
 Cut = tuple[int, int, int, int]
 
 FULL_SCALE = 4095
-REFERENCE = load_sensor("pleiades-degraded").reference.nominal()
+REFERENCE = Sensor.load("pleiades-degraded").reference.nominal()
 TWO_AXES = replace(plain_sensor(), mtf_nyquist=0.12, mtf_nyquist_along=0.04)
 POINT = lopsided_point()
 SENSORS: dict[str, Instrument] = {

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from beers_deploy.model.curves import FREQUENCIES, OBSCURATIONS, draw_table, pupil_contrast
 from beers_deploy.model.departure import departure
 from beers_deploy.model.family import SensorFamily, sensor_vector
+from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import READING, MtfTable
-from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 
-NOMINAL = load_sensor("pleiades-degraded").nominal()
+NOMINAL = Sensor.load("pleiades-degraded").nominal()
 CONTRAST = st.floats(0.015, 0.15)
 
 
@@ -89,7 +89,7 @@ def test_curves_that_no_training_drew_are_said() -> None:
 
 
 def test_a_family_draws_other_curves_in_their_share_and_none_is_outside_the_ranges() -> None:
-    family = SensorFamily(load_sensor("pleiades-degraded").nominal(), other_curves=0.5)
+    family = SensorFamily(Sensor.load("pleiades-degraded").nominal(), other_curves=0.5)
     generator = np.random.default_rng(0)
     curves = [family.draw(generator) for _ in range(400)]
     assert np.mean([sensor.response is not None for sensor in curves]) == pytest.approx(

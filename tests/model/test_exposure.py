@@ -18,11 +18,11 @@ from beers_deploy.model.exposure import (
     factors_for,
 )
 from beers_deploy.model.family import RANGES, sensor_values
-from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Sensor
 
 FULL_SCALE = 4095.0
-NOMINAL = load_sensor("pleiades-degraded").nominal()
+NOMINAL = Sensor.load("pleiades-degraded").nominal()
 
 
 def noisier(times: float) -> Instrument:
@@ -63,12 +63,12 @@ def test_a_noisier_sensor_has_no_higher_factor(times: float, more: float) -> Non
     [("pleiades-degraded", (1, 4, 8)), ("dior-medium", (1, 2, 4)), ("dior-high", (1,))],
 )
 def test_the_factors_of_shipped_sensors(name: str, factors: tuple[int, ...]) -> None:
-    assert factors_for(load_sensor(name).nominal()) == factors
+    assert factors_for(Sensor.load(name).nominal()) == factors
 
 
 @pytest.mark.parametrize("factor", FACTORS)
 def test_a_brightened_sensor_has_more_gain_and_is_otherwise_the_same(factor: int) -> None:
-    sensor = load_sensor("pleiades-variable")
+    sensor = Sensor.load("pleiades-variable")
     other = brightened(sensor, factor)
     changed = {
         item.name

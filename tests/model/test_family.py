@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from beers_deploy.model.convbeers import vector_tensor
 from beers_deploy.model.family import RANGES, SensorFamily, sensor_values, sensor_vector
 from beers_deploy.profiles.effects import Smear
-from beers_deploy.profiles.sensor import Instrument, noise_from_snr
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.instrument import Instrument, noise_from_snr
+from beers_deploy.profiles.sensor import Sensor
 
-NOMINAL = load_sensor("pleiades-degraded").nominal()
+NOMINAL = Sensor.load("pleiades-degraded").nominal()
 FAMILY = SensorFamily(NOMINAL)
 
 

@@ -11,16 +11,12 @@ from PIL import Image
 
 from beers_deploy.model.dataset import DatasetRecipe, profiles_for, read_pairs_recipe, write_dataset
 from beers_deploy.profiles.errors import OptionError, ProfileError
-from beers_deploy.profiles.sensor import same_instrument
-from beers_deploy.profiles.sensor_file import (
-    load_sensor,
-    reference_for,
-    sensor_from_json,
-    sensor_names,
-)
+from beers_deploy.profiles.sensor import Sensor, same_instrument
+from beers_deploy.profiles.shipped import sensor_names
+from beers_deploy.profiles.validation import validated
 from beers_deploy.studies.evaluation.pairs import oversamplings_of, read_pairs
 
-SEVERE = load_sensor("dior-high")
+SEVERE = Sensor.load("dior-high")
 
 
 @pytest.fixture(scope="module")
@@ -34,9 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pixels = np.random.default_rng(len(scenes)).integers(0, 255, (170, 192), np.uint8)
         Image.fromarray(pixels).save(here / name)
         scenes.append(here / name)
-    recipe = DatasetRecipe(
-        tuple(scenes), SEVERE, reference_for(SEVERE), oversampling=2, patch_px=15
-    )
+    recipe = DatasetRecipe(tuple(scenes), SEVERE, SEVERE.reference, oversampling=2, patch_px=15)
     write_dataset(recipe, here / "out", 1, False, lambda _: None)
     return here / "out"
 
@@ -82,12 +76,12 @@ def test_a_recipe_of_another_kind_is_refused(tmp_path: Path, text: str) -> None:
 
 @pytest.mark.parametrize("name", sensor_names())
 def test_a_profile_comes_back_from_json(name: str) -> None:
-    profile = load_sensor(name)
-    assert sensor_from_json("a test", json.loads(json.dumps(asdict(profile)))) == profile
+    profile = Sensor.load(name)
+    assert validated(Sensor, json.loads(json.dumps(asdict(profile))), "a test") == profile
 
 
 def test_the_profiles_oversampling_is_kept_up_to_four() -> None:
-    assert oversamplings_of(load_sensor("pleiades-degraded")) == (4, 2)
+    assert oversamplings_of(Sensor.load("pleiades-degraded")) == (4, 2)
     assert oversamplings_of(SEVERE) == (3, 2)
 
 

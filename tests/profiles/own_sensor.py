@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from beers_deploy.profiles.toml import HERE
+from beers_deploy.profiles.shipped import HERE
 
 SHIPPED = (HERE / "sensors" / "pleiades-degraded.toml").read_text(encoding="utf-8")
 

@@ -9,9 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.profiles.errors import ProfileError
-from beers_deploy.profiles.sensor import TABLES, noise_from_snr, snr_0_bounds
-from beers_deploy.profiles.sensor_file import load_sensor
-from beers_deploy.profiles.target import load_target
+from beers_deploy.profiles.instrument import noise_from_snr, snr_0_bounds
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import TABLES
+from beers_deploy.profiles.target import TargetProfile
 from tests.profiles.own_sensor import SHIPPED, own_sensor
 
 KEYS: list[tuple[str, str]] = []
@@ -22,7 +23,7 @@ for name, ways in TABLES.items():
 def refusal(path: Path) -> str:
     """Return the message, after checking that it names the file and ends like a sentence."""
     with pytest.raises(ProfileError) as caught:
-        load_sensor(str(path))
+        Sensor.load(str(path))
     message = str(caught.value)
     assert "mine" in message
     assert message.endswith(".")
@@ -34,7 +35,9 @@ def refusal(path: Path) -> str:
 @pytest.mark.parametrize(("table", "key"), KEYS)
 def test_a_missing_key_is_named_with_its_table(table: str, key: str, tmp_path: Path) -> None:
     lines = [line for line in SHIPPED.splitlines() if not line.startswith(f"{key} =")]
-    assert f"[{table}] has no key {key!r}" in refusal(own_sensor(tmp_path, text="\n".join(lines)))
+    assert f"mine.toml {table} has no key {key!r}" in refusal(
+        own_sensor(tmp_path, text="\n".join(lines))
+    )
 
 
 @pytest.mark.parametrize("table", TABLES)
@@ -51,7 +54,7 @@ def test_a_missing_table_is_named(table: str, tmp_path: Path) -> None:
 )
 def test_an_mtf_that_is_no_contrast_is_refused(value: str, tmp_path: Path) -> None:
     message = refusal(own_sensor(tmp_path, ("value = 0.07", f"value = {value}")))
-    assert "mine.toml [mtf] mtf_nyquist must " in message
+    assert "mine.toml mtf.mtf_nyquist must " in message
 
 
 def test_text_that_is_not_unicode_is_refused(tmp_path: Path) -> None:
@@ -71,7 +74,7 @@ def test_text_that_is_not_unicode_is_refused(tmp_path: Path) -> None:
 def test_a_range_is_drawn_from_or_refused(old: str, new: str, tmp_path: Path) -> None:
     """Never accepted and then quietly cut to its lower end."""
     try:
-        profile = load_sensor(str(own_sensor(tmp_path, (old, new))))
+        profile = Sensor.load(str(own_sensor(tmp_path, (old, new))))
     except ProfileError:
         return
     sensors = [profile.draw(np.random.default_rng(seed)) for seed in range(8)]
@@ -89,7 +92,7 @@ def test_what_loads_can_be_drawn_at_the_very_bounds(
     path = own_sensor(
         tmp_path, ("value = 50,", f"value = {snr_0},"), ("value = 110,", f"value = {snr_1},")
     )
-    sensor = load_sensor(str(path)).draw(np.random.default_rng(0))
+    sensor = Sensor.load(str(path)).draw(np.random.default_rng(0))
     assert sensor.alpha >= 0
     assert sensor.beta >= 0
     assert 25 / sensor.noise_sigma(25) == pytest.approx(snr_0)
@@ -113,27 +116,30 @@ def test_noise_reproduces_any_two_points(
     ("text", "words"),
     [
         ("", ("'description'",)),
-        ("description = 'x'\nclock = 3", ("[clock]", "table of constants")),
+        ("description = 'x'\nclock = 3", ("mine.toml clock must be a table",)),
         ("description = 'x'\n[dpu]\nclock_mhz = 'fast'", ("clock_mhz", "finite number")),
-        ("description = 'x'\n[dpu]\nclock_mhz = { value = 333 }", ("clock_mhz", "'source'")),
+        (
+            "description = 'x'\n[dpu]\nclock_mhz = { value = 333 }",
+            ("dpu.clock_mhz has", "'status'"),
+        ),
         (
             "description = 'x'\ndefault_configuration = 'Z'\n[configurations.A]\nn = 3",
             ("configuration 'Z'", "`dpu`: A."),
         ),
-        ("description = 'x'\nconfigurations = 3", ("configurations", "table of constants")),
+        ("description = 'x'\nconfigurations = 3", ("configurations must be a table",)),
     ],
 )
 def test_a_wrong_target_gets_one_sentence(
     text: str, words: tuple[str, ...], tmp_path: Path
 ) -> None:
     with pytest.raises(ProfileError) as caught:
-        load_target(str(own_sensor(tmp_path, text=text)))
+        TargetProfile.load(str(own_sensor(tmp_path, text=text)))
     for word in ("mine", *words):
         assert word in str(caught.value)
 
 
 def test_a_target_names_what_it_lacks() -> None:
-    target = load_target("vck190")
+    target = TargetProfile.load("vck190")
     with pytest.raises(ProfileError, match=r"vck190.*\[magic\] wand"):
         target.value("magic", "wand")
     with pytest.raises(ProfileError, match="C99"):

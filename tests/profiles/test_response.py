@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from beers_deploy.cli.commands import app
 from beers_deploy.profiles.response import MtfTable, PointSpread, centroid, packed, unpacked
 from beers_deploy.profiles.sensor import Sensor, same_instrument
-from beers_deploy.profiles.sensor_file import load_sensor, sensor_from_json
+from beers_deploy.profiles.validation import validated
 from tests.profiles.own_sensor import SHIPPED, own_sensor
 from tests.profiles.test_profile_files import refusal
 
@@ -48,7 +48,7 @@ def sensor_file(folder: Path, mtf: str, noise: str | None = None) -> Path:
 
 def with_psf(folder: Path, samples: np.ndarray, mtf: str = PSF) -> Sensor:
     np.save(folder / "psf.npy", samples)
-    return load_sensor(str(sensor_file(folder, mtf)))
+    return Sensor.load(str(sensor_file(folder, mtf)))
 
 
 def formula(frequency: np.ndarray, contrast: float) -> np.ndarray:
@@ -56,7 +56,7 @@ def formula(frequency: np.ndarray, contrast: float) -> np.ndarray:
 
 
 def test_a_table_says_what_stands_in_it(tmp_path: Path) -> None:
-    profile = load_sensor(str(sensor_file(tmp_path, TABLE)))
+    profile = Sensor.load(str(sensor_file(tmp_path, TABLE)))
     sensor = profile.nominal()
     f = np.array([[0.0, 0.25, 0.5]])
     assert isinstance(sensor.response, MtfTable)
@@ -64,7 +64,7 @@ def test_a_table_says_what_stands_in_it(tmp_path: Path) -> None:
     assert sensor.response.at(np.zeros((1, 1)), f.T)[:, 0] == pytest.approx([1, 0.4, 0.05])
     assert sensor.mtf_axes == pytest.approx((0.12, 0.05))
     assert sensor == profile.draw(np.random.default_rng(3))
-    one_axis = load_sensor(str(sensor_file(tmp_path, TABLE.rsplit("\n", 1)[0])))
+    one_axis = Sensor.load(str(sensor_file(tmp_path, TABLE.rsplit("\n", 1)[0])))
     assert one_axis.mtf_nyquist_along is None
     assert one_axis.nominal().mtf_axes == pytest.approx((0.12, 0.12))
 
@@ -156,11 +156,11 @@ def test_a_profile_comes_back_from_json_without_its_file(
     mtf: str, noise: str | None, tmp_path: Path
 ) -> None:
     np.save(tmp_path / "psf.npy", lopsided())
-    profile = load_sensor(str(sensor_file(tmp_path, mtf, noise)))
+    profile = Sensor.load(str(sensor_file(tmp_path, mtf, noise)))
     (tmp_path / "psf.npy").unlink()
-    saved = load_sensor(str(profile.save(tmp_path / "saved.toml")))
+    saved = Sensor.load(str(profile.save(tmp_path / "saved.toml")))
     assert saved.nominal().mtf_axes == pytest.approx(profile.nominal().mtf_axes, rel=1e-4)
-    back = sensor_from_json("a test", json.loads(json.dumps(asdict(profile))))
+    back = validated(Sensor, json.loads(json.dumps(asdict(profile))), "a test")
     assert back == profile
     assert same_instrument(back, profile)
     assert hash(back.response) == hash(profile.response)
@@ -169,7 +169,7 @@ def test_a_profile_comes_back_from_json_without_its_file(
 
 
 def test_another_contrast_beside_a_response_is_refused(tmp_path: Path) -> None:
-    sensor = load_sensor(str(sensor_file(tmp_path, TABLE))).nominal()
+    sensor = Sensor.load(str(sensor_file(tmp_path, TABLE))).nominal()
     with pytest.raises(ValueError, match="but the response has"):
         replace(sensor, mtf_nyquist=0.2)
     assert replace(sensor, mtf_nyquist=0.2, mtf_nyquist_along=None, response=None).mtf_axes == (
@@ -190,32 +190,32 @@ def test_another_contrast_beside_a_response_is_refused(tmp_path: Path) -> None:
         ("across = [1, 0.1]", ("'frequency'",)),
         ("frequency = [0, 0.5]", ("'across'",)),
         ("psf_samples_per_px = 8", ("'psf'",)),
-        (TABLE.replace("0.25", "0.6"), ("that are not ascending",)),
+        (TABLE.replace("0.25", "0.6"), ("ascending from 0", "got (0.0, 0.6, 0.5)")),
         (TABLE.replace("[0, 0.25", "[0.1, 0.25"), ("ascending from 0",)),
-        (TABLE.replace("0.25, 0.5]", "0.25, 0.4]"), ("to at least 0.5", "to 0.4.")),
+        (TABLE.replace("0.25, 0.5]", "0.25, 0.4]"), ("to at least 0.5", "0.4)")),
         (TABLE.replace("0.25, 0.5]", "0.25, 1.0]"), ("below 1",)),
-        (TABLE.replace("0.5]", "nan]"), ("finite numbers",)),
-        (TABLE.replace("0.25, 0.5]", '0.25, "x"]'), ("finite numbers",)),
-        (TABLE.replace("0.25, 0.5]", f"0.25, {'9' * 320}]"), ("finite numbers",)),
+        (TABLE.replace("0.5]", "nan]"), ("mtf.frequency.2 must be a finite number",)),
+        (TABLE.replace("0.25, 0.5]", '0.25, "x"]'), ("frequency.2", "valid number")),
+        (TABLE.replace("0.25, 0.5]", f"0.25, {'9' * 320}]"), ("frequency.2", "valid number")),
         (TABLE.replace("0.25", "1e-310"), ("0.0001 apart",)),
         (
             TABLE.replace("[1, 0.4", "[0.9, 0.4"),
-            ("the first of them 1,", "the first of them 0.9", "along"),
+            ("first of them 1,", "got (0.9, 0.4", "along"),
         ),
         (TABLE.replace("[1, 0.4, 0.05]", "[1, 0.4]"), ("3 contrasts", "along")),
         (TABLE.replace("0.12", "0"), ("above 0", "across", "psf")),
         (TABLE.replace("0.05]", "-0.05]"), ("above 0", "along", "psf")),
         (TABLE.replace("1, 0.5, 0.12", "1, 0.95, 0.12"), ("0.9003", "sinc")),
-        (TABLE + "\n[antialias]\nsigma_px = 0.1", ("no table [antialias]", "MTF table", "Remove")),
-        (PSF.replace("4", "1"), ("2 to 64",)),
-        (PSF.replace("4", "true"), ("2 to 64",)),
-        (PSF.replace("4", '"x"'), ("2 to 64",)),
+        (TABLE + "\n[antialias]\nsigma_px = 0.1", ("no table antialias", "MTF table", "Remove")),
+        (PSF.replace("4", "1"), ("mtf.psf_samples_per_px", "or equal to 2, got 1.")),
+        (PSF.replace("4", "true"), ("valid number", "True")),
+        (PSF.replace("4", '"x"'), ("valid number", "'x'")),
         (PSF.replace("psf.npy", "none.npy"), ("no such file", "none.npy")),
         (PSF.replace("psf.npy", "psf.png"), (".npy", "'.png'")),
         (PSF.replace("psf.npy", "."), (".npy",)),
         (PSF.replace("psf.npy", "../psf.npy"), ("or below it", "'../psf.npy'")),
         (PSF.replace("psf.npy", "/psf.npy"), ("or below it", "'/psf.npy'")),
-        (PSF.replace('"psf.npy"', "3"), ("or below it", "got 3")),
+        (PSF.replace('"psf.npy"', "3"), ("mtf.psf", "a text, got 3")),
     ],
 )
 def test_a_wrong_blur_gets_one_sentence(mtf: str, words: tuple[str, ...], tmp_path: Path) -> None:
@@ -267,16 +267,16 @@ def test_a_damaged_file_gets_one_sentence(content: bytes, tmp_path: Path) -> Non
 
 
 def test_alpha_and_beta_are_the_noise_itself(tmp_path: Path) -> None:
-    plain = load_sensor("pleiades-degraded")
+    plain = Sensor.load("pleiades-degraded")
     alpha = plain.nominal().alpha
     beta = plain.nominal().beta
-    profile = load_sensor(
+    profile = Sensor.load(
         str(sensor_file(tmp_path, "mtf_nyquist = 0.07", f"alpha = {alpha}\nbeta = {beta}"))
     )
     assert profile.nominal() == plain.nominal()
     # The radiances are shares of the shipped full scale, 400.
     assert (profile.radiance_0.low, profile.radiance_1.low) == (25, 100)
-    ranged = load_sensor(
+    ranged = Sensor.load(
         str(
             sensor_file(
                 tmp_path, "mtf_nyquist = 0.07", "alpha = [0.1, 0.2]\nbeta = 0\nradiance_1 = 60"
@@ -295,8 +295,8 @@ def test_alpha_and_beta_are_the_noise_itself(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("noise", "words"),
     [
-        ("alpha = -1\nbeta = 1", ("alpha", "0 or more")),
-        ("alpha = 1\nbeta = [-1, 1]", ("beta", "0 or more")),
+        ("alpha = -1\nbeta = 1", ("alpha", "of at least 0")),
+        ("alpha = 1\nbeta = [-1, 1]", ("beta", "of at least 0")),
         ("alpha = 0\nbeta = 0", ("not both be 0",)),
         ("alpha = 1", ("'beta'",)),
         ("alpha = 1\nbeta = 1\nsnr_0 = 50", ("alpha and beta", "Keep one")),

@@ -5,7 +5,7 @@ import re
 import tomllib
 from itertools import chain
 from pathlib import Path
-from typing import get_args
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -13,10 +13,13 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 from beers_deploy.cli.commands import app
-from beers_deploy.profiles.constant import Status, read_constant
+from beers_deploy.profiles.constant import Constant, Status
 from beers_deploy.profiles.effects import TABLES as EFFECTS
-from beers_deploy.profiles.sensor import MTF_NYQUIST_MAX, TABLES, same_instrument, table_keys
-from beers_deploy.profiles.sensor_file import SINGLE, load_sensor, read_sensor, sensor_names
+from beers_deploy.profiles.instrument import MTF_NYQUIST_MAX
+from beers_deploy.profiles.sensor import Sensor, same_instrument
+from beers_deploy.profiles.sensor_file import TABLE_OF, TABLES, table_keys
+from beers_deploy.profiles.shipped import sensor_names
+from beers_deploy.profiles.validation import validated
 from tests.deploy.command_line import done
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "sensor-profile.md").read_text(
@@ -37,14 +40,17 @@ def test_the_page_has_every_key_and_no_other() -> None:
 
 @pytest.mark.parametrize("name", EFFECTS)
 def test_the_page_gives_the_ranges_of_effects(name: str) -> None:
-    for key, (low, high) in EFFECTS[name].limits().items():
-        assert ROWS[f"[{name}] {key}"].startswith(f"{low:g} to {high:g}")
+    for key, limits in EFFECTS[name].limits().items():
+        assert ROWS[f"[{name}] {key}"].startswith(f"{limits.low:g} to {limits.high:g}")
 
 
 def test_the_page_says_where_a_range_is_refused_and_what_bounds_the_mtf() -> None:
-    single = set[str]()
-    for table in TABLES:
-        single |= {f"[{table}] {key}" for key in table_keys(table) if key in SINGLE}
+    hints = get_type_hints(Sensor, include_extras=True)
+    single = {
+        f"[{table}] {key}"
+        for key, table in TABLE_OF.items()
+        if any(limits.single for limits in getattr(hints[key], "__metadata__", ()))
+    }
     assert {key for key, allowed in ROWS.items() if "no range" in allowed} == {
         *single,
         "[offset] offset_dn",
@@ -55,9 +61,8 @@ def test_the_page_says_where_a_range_is_refused_and_what_bounds_the_mtf() -> Non
 @pytest.mark.parametrize("status", get_args(Status))
 def test_the_page_names_every_status_and_each_is_read(status: str) -> None:
     assert f"`{status}`" in PAGE
-    assert (
-        read_constant("a test", {"value": 1, "status": status, "source": "a test"}).status == status
-    )
+    stated = {"value": 1, "status": status, "source": "a test"}
+    assert validated(Constant, stated, "a test").status == status
 
 
 WHOLE, *PARTS = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
@@ -65,8 +70,7 @@ WHOLE, *PARTS = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
 
 def test_the_example_of_the_page_is_a_profile(tmp_path: Path) -> None:
     (tmp_path / "my-sensor.toml").write_text(WHOLE, encoding="utf-8")
-    assert load_sensor(str(tmp_path / "my-sensor.toml")).units == (10, 12, 0)
-    assert read_sensor("a test", tomllib.loads(WHOLE)).mtf_nyquist.low == 0.05
+    assert Sensor.load(str(tmp_path / "my-sensor.toml")).units == (10, 12, 0)
 
 
 @pytest.mark.parametrize(
@@ -82,7 +86,7 @@ def test_each_other_way_of_the_page_fits_into_the_example(
     (name,) = tomllib.loads(part)
     text = re.sub(rf"\[{name}\].*?(?=\n\[)", lambda _: part, WHOLE, flags=re.DOTALL)
     (tmp_path / "my-sensor.toml").write_text(text, encoding="utf-8")
-    assert load_sensor(str(tmp_path / "my-sensor.toml")).nominal().mtf_axes == pytest.approx(
+    assert Sensor.load(str(tmp_path / "my-sensor.toml")).nominal().mtf_axes == pytest.approx(
         axes, abs=1e-3
     )
 
@@ -93,7 +97,7 @@ def test_profiles_print_the_file_to_start_from(tmp_path: Path) -> None:
         (tmp_path / "mine.toml").write_text(printed, encoding="utf-8")
         assert done("profiles", tmp_path / "mine.toml", "--toml") == printed
         if name in sensor_names():
-            assert same_instrument(load_sensor(str(tmp_path / "mine.toml")), load_sensor(name))
+            assert same_instrument(Sensor.load(str(tmp_path / "mine.toml")), Sensor.load(name))
 
 
 def test_the_pages_commands_are_understood_and_use_what_was_written_before() -> None:

@@ -7,9 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from beers_deploy.profiles.constant import Limits
 from beers_deploy.profiles.errors import ProfileError
-from beers_deploy.profiles.target import load_target, target_names
-from beers_deploy.profiles.target_limits import CONFIGURATION, TABLES, Limits
+from beers_deploy.profiles.shipped import target_names
+from beers_deploy.profiles.target import TargetProfile
+from beers_deploy.profiles.target_limits import CONFIGURATION, TABLES
 from docs.make.target_file import BUILD, KEYS
 from tests.deploy.command_line import done, refused
 
@@ -59,7 +61,7 @@ def outside(draw: st.DrawFn, limits: Limits) -> float:
 
 def refusal(path: str) -> str:
     with pytest.raises(ProfileError) as caught:
-        load_target(path)
+        TargetProfile.load(path)
     return str(caught.value)
 
 
@@ -93,7 +95,7 @@ def test_every_number_within_the_limits_is_taken(
     real = st.floats(limits.low, limits.high)
     integers = st.integers(int(limits.low), int(limits.high))
     value = float(data.draw(integers if limits.whole else real))
-    profile = load_target(board(tmp_path_factory.mktemp("board"), *place, repr(value)))
+    profile = TargetProfile.load(board(tmp_path_factory.mktemp("board"), *place, repr(value)))
     constants = profile.configuration("C32B3")[1] if place[0] == BUILD else profile.tables[place[0]]
     assert constants[place[1]].value == value
 
@@ -108,9 +110,9 @@ def test_commands_name_file_key_and_value(key: str, value: str, tmp_path: Path) 
         ("profiles", path),
     ):
         message = refused(*words)
-        assert f"my-board.toml [configurations.C32B3] {key} must be an integer" in message
+        assert f"my-board.toml configurations.C32B3.{key} must be an integer" in message
         assert "at least 1 " in message
-        assert f"it is {value}," in message
+        assert f"it is {value}." in message
 
 
 def test_every_key_of_the_reference_has_limits() -> None:
@@ -120,7 +122,7 @@ def test_every_key_of_the_reference_has_limits() -> None:
 
 @pytest.mark.parametrize("name", target_names())
 def test_shipped_targets_state_no_key_without_limits(name: str) -> None:
-    target = load_target(name)
+    target = TargetProfile.load(name)
     for table, keys in target.tables.items():
         if "published" not in table:
             assert {(table, key) for key in keys} <= set(LIMITS)

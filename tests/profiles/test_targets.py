@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 from beers_deploy.cli.commands import app
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.profiles.errors import BeersError, ProfileError
-from beers_deploy.profiles.target import board_names, load_target, target_names
-from beers_deploy.profiles.toml import HERE
+from beers_deploy.profiles.shipped import HERE, board_names, target_names
+from beers_deploy.profiles.target import TargetProfile
 from tests.deploy.command_line import done, refused
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "boards.md").read_text(encoding="utf-8")
@@ -24,7 +24,9 @@ def written(folder: Path, text: str) -> str:
 
 
 def test_the_boards_are_the_targets_with_a_dpu() -> None:
-    assert board_names() == [name for name in target_names() if load_target(name).configurations]
+    assert board_names() == [
+        name for name in target_names() if TargetProfile.load(name).configurations
+    ]
 
 
 def test_the_pages_board_is_the_zcu102_but_for_what_it_states(tmp_path: Path) -> None:
@@ -45,8 +47,8 @@ def test_the_pages_board_is_the_zcu102_but_for_what_it_states(tmp_path: Path) ->
 
 
 def test_the_zcu104_is_the_zcu102_but_for_cores_clock_and_memory() -> None:
-    one = load_target("zcu102")
-    other = load_target("zcu104")
+    one = TargetProfile.load("zcu102")
+    other = TargetProfile.load("zcu104")
     differing = set[tuple[str, str]]()
     for table, constants in one.tables.items():
         if table == "cost":  # Each board's cost table is fitted to its own rates.
@@ -79,7 +81,7 @@ def test_the_zcu104_is_the_zcu102_but_for_cores_clock_and_memory() -> None:
         (
             "[tile]",
             '[activations]\nconv = ["relu"]\n[tile]',
-            ("[activations] conv", "ReLU6", "['relu']"),
+            ("activations.conv", "ReLU6", "['relu']"),
         ),
         ("[tile]", '[activations]\nconf = ["ReLU"]\n[tile]', ("'conf'", "conv")),
         ("[tile]", '[documents]\nmanual = "mine"\n[tile]', ("'manual'", "operators")),

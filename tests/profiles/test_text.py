@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.profiles.errors import BeersError, OptionError, ProfileError, printable
-from beers_deploy.profiles.scene_call import load_scene_call
-from beers_deploy.profiles.sensor_file import load_sensor
-from beers_deploy.profiles.target import load_target
+from beers_deploy.profiles.scene_call import SceneCall
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.profiles.toml import (
     JSON_BYTES,
     QUOTED,
@@ -37,7 +37,7 @@ def test_hostile_toml_is_a_sentence_in_a_moment(name: str, tmp_path: Path) -> No
     path.write_text(BAD_TOML[name])
     with pytest.raises(ValueError, match=r"."):
         read_toml_text(path)
-    for load in (load_sensor, load_target):
+    for load in (Sensor.load, TargetProfile.load):
         with pytest.raises(ProfileError) as caught:
             load(str(path))
         assert str(caught.value).isprintable()
@@ -61,7 +61,7 @@ def test_the_line_that_is_no_toml_is_quoted_wherever_a_user_s_toml_is_read(
 ) -> None:
     path = tmp_path / "mine.toml"
     path.write_bytes(text.encode())
-    for load in (load_sensor, load_target, load_scene_call, limits_of):
+    for load in (Sensor.load, TargetProfile.load, SceneCall.load, limits_of):
         with pytest.raises(BeersError) as caught:
             load(str(path))
         assert line in str(caught.value)

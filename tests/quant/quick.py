@@ -13,7 +13,7 @@ from onnx import numpy_helper
 from onnxruntime.quantization import CalibrationDataReader
 
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.calibration import draw_patches
 from beers_deploy.quant.ends import ONE_CHANNEL, Ends
 from beers_deploy.quant.graph import (
@@ -50,7 +50,7 @@ def patches_of(images: list[np.ndarray]) -> Patches:
 def drawn(count: int, seed: int, scene: int = 1, patch_px: int = 128) -> Patches:
     """Of one drawn scene, through the usual sensors."""
     ground = procedural_scene(900, 960, np.random.default_rng(scene))
-    sensors = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+    sensors = Sensor.load("pleiades-degraded"), Sensor.load("pleiades-reference")
     return draw_patches([ground], *sensors, count, seed, patch_px=patch_px)
 
 

@@ -15,7 +15,7 @@ from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.response import MtfTable
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.calibration import draw_patches, stratified
 from beers_deploy.quant.graph import PLANES, Graph, graph_to_onnx, tensors
 from beers_deploy.quant.quantize import choose_frac_bits
@@ -30,8 +30,8 @@ from beers_deploy.quant.session import (
 )
 from tests.quant.quick import image
 
-VARIABLE = load_sensor("pleiades-variable")
-REFERENCE = load_sensor("pleiades-reference")
+VARIABLE = Sensor.load("pleiades-variable")
+REFERENCE = Sensor.load("pleiades-reference")
 
 
 @pytest.fixture(scope="module")

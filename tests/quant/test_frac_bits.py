@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.profiles.errors import ProfileError
-from beers_deploy.profiles.target import load_target
+from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.core import (
     SHIFTS,
     best_frac_bits,
@@ -50,6 +50,6 @@ def test_the_windows_are_those_of_the_target() -> None:
     """What is built in, for tests and callers without a board, is what the
     shipped profile states.
     """
-    assert target_shifts(load_target("vck190")) == SHIFTS
+    assert target_shifts(TargetProfile.load("vck190")) == SHIFTS
     with pytest.raises(ProfileError, match="shift_"):
-        target_shifts(load_target("host-cpu"))
+        target_shifts(TargetProfile.load("host-cpu"))

@@ -6,7 +6,7 @@ import pytest
 from onnx import helper
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.graph import (
     CORRECTION,
     IMAGE,

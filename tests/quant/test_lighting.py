@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.calibration import Calibration, draw_patches, unseen_patches
 from beers_deploy.quant.lighting import (
     CALIBRATION,
@@ -19,8 +19,8 @@ from beers_deploy.quant.lighting import (
 )
 from beers_deploy.quant.sample_range import range_of
 
-SENSOR = load_sensor("pleiades-degraded")
-REFERENCE = load_sensor("pleiades-reference")
+SENSOR = Sensor.load("pleiades-degraded")
+REFERENCE = Sensor.load("pleiades-reference")
 BY_NAME = {lighting.name: lighting for lighting in JUDGING}
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import onnx
 import pytest
 
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.gate import compare

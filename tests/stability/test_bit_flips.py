@@ -11,8 +11,8 @@ import pytest
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.performance.swath import predict_network
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.sensor_file import load_sensor
-from beers_deploy.profiles.target import TILE_PX
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.quant.calibration import Calibration
 from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.graph import Activation
@@ -43,7 +43,7 @@ pytestmark = pytest.mark.slow
 
 SVG = "{http://www.w3.org/2000/svg}"
 CURVES = f".//{SVG}g[@class='curve']"
-SOURCE = Calibration(load_sensor("pleiades-degraded"), None, patches=2, patch_px=48, seed=3)
+SOURCE = Calibration(Sensor.load("pleiades-degraded"), None, patches=2, patch_px=48, seed=3)
 
 
 @pytest.fixture(scope="module")

@@ -25,8 +25,9 @@ from beers_deploy.model.simulator.sampling import read_scene, sample, scene_spec
 from beers_deploy.model.traditional.pipeline import Chain, restore_strips, restore_traditional
 from beers_deploy.model.training.losses import LossWeights, RestorationLoss
 from beers_deploy.profiles.errors import BeersError
-from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.profiles.sensor_file import REFERENCE, load_sensor
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import REFERENCE
 from beers_deploy.studies.stress.cases import CASES, FULL_DN, Case
 from beers_deploy.studies.stress.checks import FLAT_DN, gain, ringing
 
@@ -48,7 +49,7 @@ def images(case: Case, side_px: int = 32) -> list[np.ndarray]:
 
 def sensor_of(case: Case) -> Instrument:
     """The profile's sensor, with the case's own MTF."""
-    sensor = load_sensor(SENSOR).nominal()
+    sensor = Sensor.load(SENSOR).nominal()
     return replace(
         sensor, mtf_nyquist={"MTF 0.1 %": 0.001, "MTF 60 %": 0.6}.get(case.name, sensor.mtf_nyquist)
     )
@@ -141,7 +142,7 @@ others say.
 
 @named([BY_NAME[name] for name in TRADITIONAL])
 def test_the_traditional_pipeline_is_calm(case: Case) -> None:
-    chain = Chain(sensor_of(case), load_sensor(REFERENCE).nominal(), "fast")
+    chain = Chain(sensor_of(case), Sensor.load(REFERENCE).nominal(), "fast")
     for image in images(case):
         result = restored(image, chain)
         valid = ~np.isnan(image)

@@ -24,7 +24,7 @@ from beers_deploy.model.traditional.nl_bayes import (
 from beers_deploy.model.traditional.noise import Noise
 from beers_deploy.model.traditional.pipeline import Chain, Order, restore_traditional
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from tests.model.traditional.whole import compensate
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -92,7 +92,7 @@ def test_trap_6_a_cut_kernel_is_sharper_than_its_profile() -> None:
 
 def test_trap_8_without_the_clamp_ringing_gives_nan() -> None:
     below = torch.tensor(-50.0)
-    sensor = load_sensor("pleiades-degraded").nominal()
+    sensor = Sensor.load("pleiades-degraded").nominal()
     assert bool((sensor.alpha * below + sensor.beta).sqrt().isnan())
 
 
@@ -125,7 +125,7 @@ def test_trap_13_a_bare_covariance_has_no_factor_and_the_estimate_is_finite(kind
 def test_trap_13_infinity_is_no_missing_pixel() -> None:
     image = torch.full((12, 12), 300.0)
     image[5, 5] = torch.inf
-    sensors = (load_sensor(name).nominal() for name in ("pleiades-degraded", "pleiades-reference"))
+    sensors = (Sensor.load(name).nominal() for name in ("pleiades-degraded", "pleiades-reference"))
     degraded, reference = sensors
     orders: tuple[Order, Order] = ("denoise-first", "deconvolve-first")
     for order in orders:

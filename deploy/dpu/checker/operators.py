@@ -18,8 +18,8 @@ from beers_deploy.dpu.board import SIZED, Dpu
 from beers_deploy.dpu.checker import conv_rules, number_rules, other_rules
 from beers_deploy.dpu.checker.finding import Finding, Rule
 from beers_deploy.dpu.graph import Kind, Operation, Window
-from beers_deploy.profiles.constant import check_keys
 from beers_deploy.profiles.errors import MachineError
+from beers_deploy.profiles.validation import check_keys
 
 CONV: tuple[Rule, ...] = (
     conv_rules.conv_kernel,

@@ -17,7 +17,8 @@ from beers_deploy.dpu.reading import network_of, own_tile_px
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.figures import Check, Figure, Row, predicted, unavailable
-from beers_deploy.profiles.target import TILE_PX, TargetProfile, require_side
+from beers_deploy.profiles.shipped import TILE_PX
+from beers_deploy.profiles.target import TargetProfile, require_side
 from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.graph import refusal
 from beers_deploy.quant.onnx_file import is_quantized, metadata

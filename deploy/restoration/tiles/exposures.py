@@ -9,7 +9,7 @@ import numpy as np
 
 from beers_deploy.model.exposure import choose_factors
 from beers_deploy.profiles.errors import ImageError, ModelError
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.tiling.walk import Tiling
 from beers_deploy.quant.untrusted import times
 from beers_deploy.restoration.plan import Plan

@@ -21,7 +21,7 @@ from beers_deploy.model.consistency import Consistency
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.source import ArraySource, Source
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.untrusted import times
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Plan, Span

@@ -23,7 +23,6 @@ import numpy as np
 from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.results import Table, input_of
 from beers_deploy.studies.characterize.frames import cut_box, open_frames
 from beers_deploy.studies.characterize.instrument import Mtf, measure_mtf, measure_noise, snr_at
@@ -130,7 +129,7 @@ def measured_sensor(
             rows=tuple(measurement.rows()),
             notes=tuple(measurement.notes()),
         )
-        return MeasuredSensor(**vars(load_sensor(str(profile))), table=table), toml
+        return MeasuredSensor(**vars(Sensor.load(str(profile))), table=table), toml
 
 
 def _several(images: Any) -> list[Any]:

@@ -11,8 +11,10 @@ from beers_deploy.model.metrics.noise_line import SPECTRUM
 from beers_deploy.profiles.constant import Status
 from beers_deploy.profiles.errors import printable
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
-from beers_deploy.profiles.sensor import snr_0_bounds
-from beers_deploy.profiles.sensor_file import BLIND, load_sensor, sensor_toml
+from beers_deploy.profiles.instrument import snr_0_bounds
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import sensor_toml
+from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.studies.characterize.frames import Frames
 from beers_deploy.studies.characterize.instrument import AXES, Mtf, Noise, Snr
 
@@ -192,7 +194,7 @@ def _mtf_table(sensor: Measurement, images: str) -> dict[str, object]:
         )
         return {"mtf_nyquist": across, "mtf_nyquist_along": along}
     if not sensor.mtf.curves:
-        middle = load_sensor(BLIND).nominal().mtf_nyquist
+        middle = Sensor.load(BLIND).nominal().mtf_nyquist
         why = "no edge shows it; the middle of the range that networks are trained for"
         return {"mtf_nyquist": _constant(float(f"{middle:.4g}"), "assumed", why)}
     table: dict[str, object] = {"frequency": [float(f) for f in FREQUENCIES]}

@@ -19,8 +19,9 @@ from beers_deploy.model.simulator.acquire import acquire_padded
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import read_scene
 from beers_deploy.network import SensorLike
-from beers_deploy.profiles.sensor import Instrument, Sensor
-from beers_deploy.profiles.sensor_file import reference_beside
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.reference import reference_beside
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.detection.average_precision import (
     Figures,
     Hits,

@@ -21,9 +21,10 @@ from beers_deploy.network import Network
 from beers_deploy.network_files import conditioned, warn_outside
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import OptionError, printable
-from beers_deploy.profiles.sensor import Instrument, Sensor
-from beers_deploy.profiles.sensor_file import BLIND as NOT_KNOWN
-from beers_deploy.profiles.sensor_file import BLIND_PROFILE, load_sensor
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import BLIND as NOT_KNOWN
+from beers_deploy.profiles.shipped import BLIND_PROFILE
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.restoration.method import Restore, network_method
 from beers_deploy.restoration.steps import BOTH, Around, exposures_of
@@ -120,7 +121,7 @@ def method_named(name: str, degraded: Sensor, reference: Sensor, around: Around 
         raise OptionError(
             f"{printable(repr(name))} in `methods` is not a method. Give {METHOD_NAMES}."
         )
-    sensor = load_sensor(other) if other else degraded
+    sensor = Sensor.load(other) if other else degraded
     weights = conditioned(Path(network))
     if weights is None:
         return method_of(name, Network.load(network), sensor, reference, around, degraded.name)
@@ -201,4 +202,4 @@ def profile_of(sensor: Instrument, like: Sensor) -> Sensor:
     }
     # The sensor has alpha and beta: SNRs would have them drawn again.
     noise = {"snr_0": None, "snr_1": None}
-    return replace(like, name="drawn", **constants, **noise, response=sensor.response)  # type: ignore[arg-type]
+    return like.with_fields(name="drawn", **constants, **noise, response=sensor.response)

@@ -17,7 +17,8 @@ from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.training.patches import pair_files
 from beers_deploy.profiles.errors import ImageError, OptionError
-from beers_deploy.profiles.sensor import MAX_DN, Instrument, Sensor
+from beers_deploy.profiles.instrument import MAX_DN, Instrument
+from beers_deploy.profiles.sensor import Sensor
 
 OVERSAMPLINGS = (4, 2)
 

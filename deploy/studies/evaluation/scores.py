@@ -19,7 +19,7 @@ from beers_deploy.model.metrics.fidelity import fidelity_db, ssim
 from beers_deploy.model.metrics.perceptual import Dists, Lpips, find_backbone, not_found
 from beers_deploy.model.progress import steps
 from beers_deploy.profiles.figures import Figure, Row, measured, published, unavailable
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.studies.evaluation.methods import Method
 from beers_deploy.studies.evaluation.pairs import NamedPair
 from beers_deploy.studies.evaluation.targets import snr_name

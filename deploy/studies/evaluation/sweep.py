@@ -18,7 +18,8 @@ from beers_deploy.model.progress import steps
 from beers_deploy.model.raster.images import site_of
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.profiles.figures import Figure, Row, measured
-from beers_deploy.profiles.sensor import Instrument, Sensor, noise_from_snr
+from beers_deploy.profiles.instrument import Instrument, noise_from_snr
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.evaluation.methods import (
     DEGRADED,
     TRADITIONAL,

@@ -29,7 +29,7 @@ from beers_deploy.model.simulator.acquire import NOISE, acquire
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
-from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.studies.evaluation.methods import Method
 
 TARGETS = "targets"

@@ -18,7 +18,8 @@ from beers_deploy.model.metrics.fidelity import psnr_db
 from beers_deploy.model.progress import steps
 from beers_deploy.performance.swath import predict_network
 from beers_deploy.profiles.figures import Row, measured, predicted
-from beers_deploy.profiles.target import TILE_PX, TargetProfile
+from beers_deploy.profiles.shipped import TILE_PX
+from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.calibration import HELD_OUT_SEED, Calibration
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.graph import Activation

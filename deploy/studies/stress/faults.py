@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN, SHIFTS, IntConv, IntCore, op_shifts
 from beers_deploy.quant.graph import PLANES, Activation, channels_of
 from beers_deploy.quant.integer.reference import SOUND, Faults, merged_correction, run_core

@@ -18,7 +18,7 @@ from beers_deploy.performance.timing import interleaved
 from beers_deploy.performance.traditional import drawn_acquisition
 from beers_deploy.profiles.figures import Figure, measured
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import load_sensor, sensor_names
+from beers_deploy.profiles.shipped import sensor_names
 from beers_deploy.quant.calibration import Calibration
 from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.restoration.method import Restore, network_method
@@ -215,7 +215,7 @@ def make_int8(network: Network, scenes: Path | None, sensor: Sensor, seed: int) 
         seed: of every random draw.
     """
     named = network.sensor
-    calibration_sensor = load_sensor(named) if named in sensor_names() else sensor
+    calibration_sensor = Sensor.load(named) if named in sensor_names() else sensor
     patches = Calibration(calibration_sensor, scenes, PATCHES, PATCH_PX, seed)
     result = quantize_model(network.model, patches.drawn, patches.about)
     return Network(result.host, f"{network.name}-int8")

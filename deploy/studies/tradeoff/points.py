@@ -28,7 +28,8 @@ from beers_deploy.performance.swath import Swath, chain_rate, efficiency, energy
 from beers_deploy.profiles.errors import ModelError, OptionError, printable
 from beers_deploy.profiles.figures import Figure, predicted, unavailable
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.target import TILE_PX, TargetProfile
+from beers_deploy.profiles.shipped import TILE_PX
+from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.tiling.walk import Tiling
 
 logger = logging.getLogger(__name__)

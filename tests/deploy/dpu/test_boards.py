@@ -21,7 +21,8 @@ from beers_deploy.dpu.reading import network_of
 from beers_deploy.model.shipped import shipped_names
 from beers_deploy.performance.swath import efficiency, energy
 from beers_deploy.profiles.figures import predicted
-from beers_deploy.profiles.target import board_names, load_target, npu_names
+from beers_deploy.profiles.shipped import board_names, npu_names
+from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.core import SHIFTS, target_shifts
 from beers_deploy.quant.onnx_file import load_onnx
 from tests.deploy.dpu.draws import (
@@ -187,7 +188,7 @@ def test_every_text_names_the_boards_own_dpu(name: str) -> None:
 
 
 def test_a_rule_whose_constants_no_file_states_would_be_dead() -> None:
-    stating = [*DPUS.values(), *(ruled(load_target(name)) for name in npu_names())]
+    stating = [*DPUS.values(), *(ruled(TargetProfile.load(name)) for name in npu_names())]
     assert all(any(applies(rule, dpu) for dpu in stating) for rule in all_rules())
 
 
@@ -202,14 +203,14 @@ def test_a_batch_has_an_image_for_each_batch_handler_of_each_core() -> None:
     }
 
 
-@pytest.mark.parametrize("size", load_target("zcu102").configurations)
+@pytest.mark.parametrize("size", TargetProfile.load("zcu102").configurations)
 @pytest.mark.parametrize("name", ZYNQ)
 def test_a_smaller_dpu_has_a_smaller_array_and_smaller_banks(name: str, size: str) -> None:
     """PG338: the name is the operations of a cycle; banks of the width of the
     channels, 2048 deep.
     """
     dpu = load_dpu(name, size)
-    clock_hz = load_target(name).value("array", "pl_clock_hz")
+    clock_hz = TargetProfile.load(name).value("array", "pl_clock_hz")
     lanes = dpu.input_parallel
     pixels = dpu.whole("array", "pixel_parallel")
     cycle = 2 * lanes * dpu.output_parallel * pixels

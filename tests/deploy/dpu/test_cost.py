@@ -11,7 +11,7 @@ from beers_deploy.dpu.cost.work import BURST_BYTES, Work, count_work
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.performance.swath import predict_network
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.profiles.target import TILE_PX
+from beers_deploy.profiles.shipped import TILE_PX
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
 
 DPU = load_dpu("vck190")

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from onnx import helper, numpy_helper
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.profiles.target import board_names, npu_names
+from beers_deploy.profiles.shipped import board_names, npu_names
 from beers_deploy.quant.domains import INTEGER_OPERATORS, is_foreign, operator_name
 from beers_deploy.quant.graph import refusal
 from beers_deploy.quant.onnx_file import load_onnx

@@ -14,7 +14,7 @@ import beers_deploy as bd
 from beers_deploy.dpu.checker.table import Checked
 from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.variants import Variant
-from beers_deploy.profiles.target import board_names
+from beers_deploy.profiles.shipped import board_names
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import figures_of, valid
 from tests.deploy.dpu.draws import rules_of

@@ -23,8 +23,8 @@ from beers_deploy.performance.swath import Swath, predict_network
 from beers_deploy.performance.tables import frame_row, sweep_rows, within_words
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.sensor_file import load_sensor
-from beers_deploy.profiles.target import board_names, npu_names
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import board_names, npu_names
 from beers_deploy.verbs.verb import parts_of
 from tests.deploy.dpu.graphs import integer_convbeers
 
@@ -176,7 +176,7 @@ def test_bench_accepts_the_host_tasks_of_the_cost_model() -> None:
 def test_the_exposures_of_an_image_are_counted_whatever_the_bits_of_the_sensor(
     network: Path, bits: int, tmp_path: Path
 ) -> None:
-    sensor = load_sensor("pleiades-degraded")
+    sensor = Sensor.load("pleiades-degraded")
     gain = sensor.gain_dn_per_radiance.low * 2 ** (bits - 12)
     sensor = sensor.replace(bits=bits, gain_dn_per_radiance=gain)
     # These pixels are too bright for x4, unless full scale is that of 14 bits.

@@ -13,12 +13,12 @@ from beers_deploy.network import Network, other_precision
 from beers_deploy.performance.host import Timed, host_rows, time_networks
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.target import load_target
+from beers_deploy.profiles.target import TargetProfile
 from tests.deploy.dpu.graphs import float_convbeers, integer_convbeers
 from tests.shipped import shipped_pair
 
 SHORT = {"min_time_s": Constant(0.05, "stated", "test"), "min_runs": Constant(3, "stated", "test")}
-QUICK = replace(load_target("host-cpu"), tables={"measurement": SHORT})
+QUICK = replace(TargetProfile.load("host-cpu"), tables={"measurement": SHORT})
 
 
 def value(row: Row, key: str) -> float:

@@ -11,11 +11,11 @@ import pytest
 from beers_deploy.performance.swath import PAPER_SIZE, Swath, parse_size
 from beers_deploy.performance.tables import processor_row
 from beers_deploy.performance.traditional import CROP_PX, drawn_acquisition, measure_chain
-from beers_deploy.profiles.sensor_file import load_sensor
-from beers_deploy.profiles.target import load_target
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.target import TargetProfile
 from tests.deploy.dpu.graphs import integer_convbeers
 
-SENSORS = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+SENSORS = Sensor.load("pleiades-degraded"), Sensor.load("pleiades-reference")
 SWATH = Swath(*parse_size(PAPER_SIZE))
 
 
@@ -37,7 +37,7 @@ def test_a_drawn_acquisition_is_no_larger_than_the_crops_need() -> None:
 
 
 def test_the_boards_processor_holds_the_papers_run_and_lacks_what_its_file_lacks() -> None:
-    board = load_target("vck190")
+    board = TargetProfile.load("vck190")
     figures = processor_row(SWATH, board).figures
     # The paper publishes 1724 s and 22.5 W for this pipeline on the VCK190's processor.
     low, high = figures["latency"].interval or (0, 0)

@@ -10,7 +10,6 @@ import pytest
 
 import beers_deploy as bd
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.restoration import method
 from beers_deploy.restoration.method import network_method
@@ -28,8 +27,8 @@ from tests.shipped import shipped_pair
 
 Restored = Callable[[np.ndarray], np.ndarray]
 
-SENSOR = load_sensor("pleiades-degraded")
-REFERENCE = load_sensor("pleiades-reference")
+SENSOR = Sensor.load("pleiades-degraded")
+REFERENCE = Sensor.load("pleiades-reference")
 ODD = 131, 97
 TILES_PX = {"float": 23, "int8": 64}
 SMALL_HALOS_PX = {"float": 2, "int8": 8}

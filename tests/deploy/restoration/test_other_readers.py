@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from beers_deploy.profiles.sensor_file import BLIND
+from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.restoration.stac import write_item
 from beers_deploy.verbs.restore import restore
 from tests.model.raster import formats as images

@@ -18,7 +18,6 @@ from beers_deploy.model.raster.reader import open_raster
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.restoration.radiometry import FullScale, full_scale_of
 from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import restored
@@ -33,7 +32,7 @@ def noise(bits: int) -> np.ndarray:
 
 
 def sensor_of_bits(bits: int) -> Sensor:
-    return load_sensor("pleiades-degraded").replace(bits=bits)
+    return Sensor.load("pleiades-degraded").replace(bits=bits)
 
 
 @pytest.fixture

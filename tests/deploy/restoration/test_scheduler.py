@@ -19,7 +19,7 @@ from beers_deploy.cluster import open_cluster
 from beers_deploy.model.progress import Step
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import MachineError
-from beers_deploy.profiles.sensor_file import BLIND
+from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.tiling.walk import tiling_of
 from beers_deploy.verbs.restore import restore

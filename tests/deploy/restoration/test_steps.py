@@ -16,7 +16,7 @@ import tifffile
 from beers_deploy.model.consistency import REACH_PX
 from beers_deploy.profiles.errors import MachineError, OptionError
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import BLIND, load_sensor
+from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.restoration.tiles.rows import HeldRows, NetworkRow
 from beers_deploy.verbs.restore import restore
@@ -26,8 +26,8 @@ from tests.quant.tiling.small_networks import espcn, four_bands
 
 FLOAT = "convbeers-xs"
 INT8 = "convbeers-xs-int8"
-SENSOR = load_sensor("pleiades-degraded")
-NOISY = load_sensor("dior-high")
+SENSOR = Sensor.load("pleiades-degraded")
+NOISY = Sensor.load("dior-high")
 """Its noise allows no factor above 1."""
 SHAPE = 129, 141
 TILES_PX = (57, 100)
@@ -127,7 +127,7 @@ def test_a_dask_array_has_the_full_scale_of_its_sensor(floats: bool) -> None:
     np.testing.assert_array_equal(lazy.compute(scheduler="synchronous"), expected)
 
 
-@pytest.mark.parametrize("sensors", [(SENSOR, NOISY), (load_sensor(BLIND), SENSOR)])
+@pytest.mark.parametrize("sensors", [(SENSOR, NOISY), (Sensor.load(BLIND), SENSOR)])
 def test_each_band_takes_the_steps_of_its_own_sensor(
     sensors: tuple[Sensor, Sensor], tmp_path: Path
 ) -> None:

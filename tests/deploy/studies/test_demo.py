@@ -6,8 +6,7 @@ import pytest
 import tifffile
 
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.target import board_names
-from beers_deploy.profiles.toml import HERE
+from beers_deploy.profiles.shipped import HERE, board_names
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.studies.demo import load_sensors, read_input
 from tests.deploy.command_line import done

@@ -16,7 +16,7 @@ from beers_deploy.model.simulator.acquire import acquire
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import scene_spectrum
-from beers_deploy.profiles.sensor import Instrument, noise_from_snr
+from beers_deploy.profiles.instrument import Instrument, noise_from_snr
 
 RATIO = 4
 GAIN = 10.2375

@@ -10,7 +10,7 @@ from beers_deploy.model.metrics.slanted_edge import edge_mtf, slanted_edge
 from beers_deploy.model.simulator.detector import Draw, detect
 from beers_deploy.model.simulator.mtf import mtf, transfer_function
 from beers_deploy.model.simulator.sampling import sample, scene_spectrum
-from beers_deploy.profiles.sensor import Instrument, noise_from_snr
+from beers_deploy.profiles.instrument import Instrument, noise_from_snr
 
 RATIO = 5
 SCENE_PX = 240

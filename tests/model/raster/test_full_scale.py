@@ -8,7 +8,7 @@ import pytest
 from beers_deploy.model.raster.facts import Extent, extent_of
 from beers_deploy.model.raster.full_scale import UNIT_MAX, settled_scale
 from beers_deploy.profiles.errors import ImageError, OptionError
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.instrument import MAX_DN
 
 
 def settled(kind: str, *largest: float, requested: float | None = None) -> float:

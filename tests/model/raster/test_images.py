@@ -11,9 +11,9 @@ from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.raster.images import image_size_px, list_images, read_pixels, site_of
 from beers_deploy.model.simulator.sampling import read_scene
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 
-SENSOR = load_sensor("pleiades-reference").nominal()
+SENSOR = Sensor.load("pleiades-reference").nominal()
 CAMERAS = {"dji", "img", "image", "dsc", "dscn", "dscf", "fhd", "mos", "gopr", "frame"}
 
 

@@ -11,20 +11,18 @@ from beers_deploy.model.simulator.acquire import without
 from beers_deploy.model.simulator.detector import Draw, add_noise
 from beers_deploy.model.simulator.mtf import Blur, mtf, sensor_transfer
 from beers_deploy.model.simulator.sampling import crop_divisible, sample, scene_spectrum
-from beers_deploy.profiles.effects import Effect, PixelEffect, middle_effect, pixel_effects
+from beers_deploy.profiles.effects import Effect, PixelEffect, pixel_effects, settled
+from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import MtfTable, PointSpread, Response, packed
 from beers_deploy.profiles.scene_call import typical_effects
-from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 
-TYPICAL: dict[str, Effect] = {
-    name: middle_effect(name, table) for name, table in typical_effects().items()
-}
+TYPICAL = settled(typical_effects(), lambda constant: constant.middle)
 
 
 def plain_sensor(**effects: Effect) -> Instrument:
     """The nominal degraded sensor with these effects."""
-    return replace(load_sensor("pleiades-degraded").nominal(), effects=effects)
+    return replace(Sensor.load("pleiades-degraded").nominal(), effects=effects)
 
 
 def before_digitising(

@@ -11,12 +11,12 @@ from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import read_scene, scene_spectrum
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Sensor
 from tests.model.simulator.stages import pixel_means
 
 DEGRADED, REFERENCE = (
-    load_sensor(name).nominal() for name in ("pleiades-degraded", "pleiades-reference")
+    Sensor.load(name).nominal() for name in ("pleiades-degraded", "pleiades-reference")
 )
 QUIET = Instrument(0.07, alpha=0.0, beta=0.0, gain_dn_per_radiance=10.0, bits=16)
 

@@ -30,7 +30,7 @@ from beers_deploy.profiles.effects import (
     Striping,
 )
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.instrument import Instrument
 from tests.model.simulator import stages
 
 NEUTRAL: dict[str, Effect] = {

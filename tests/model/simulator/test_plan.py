@@ -34,8 +34,8 @@ from beers_deploy.profiles.effects import (
     Smear,
     Striping,
 )
+from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import MtfTable
-from beers_deploy.profiles.sensor import Instrument
 from tests.model.simulator import stages
 
 EXAMPLES = int(os.environ.get("BEERS_PLAN_EXAMPLES", "60"))

@@ -6,11 +6,11 @@ from torch import Tensor
 
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.model.traditional.pipeline import Chain
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from tests.model.traditional.test_pipeline import Seen, psnr_db, restored_db, seen_by
 
 CHAIN = Chain(
-    load_sensor("pleiades-degraded").nominal(), load_sensor("pleiades-reference").nominal()
+    Sensor.load("pleiades-degraded").nominal(), Sensor.load("pleiades-reference").nominal()
 )
 
 

@@ -25,14 +25,14 @@ from beers_deploy.model.traditional.pipeline import (
 )
 from beers_deploy.model.traditional.rows import mirrored
 from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.instrument import Instrument, noise_from_snr
 from beers_deploy.profiles.response import PointSpread
-from beers_deploy.profiles.sensor import Instrument, noise_from_snr
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from tests.model.simulator.stages import formula_point, point_spread, with_response
 from tests.model.traditional.whole import compensate
 
-DEGRADED = load_sensor("pleiades-degraded").nominal()
-REFERENCE = load_sensor("pleiades-reference").nominal()
+DEGRADED = Sensor.load("pleiades-degraded").nominal()
+REFERENCE = Sensor.load("pleiades-reference").nominal()
 ORDERS: tuple[Order, ...] = get_args(Order)
 NOISE_FREE = replace(REFERENCE, alpha=0.0, beta=0.0)
 
@@ -163,7 +163,7 @@ def test_the_gain_of_each_sensor_is_its_own(pair: Seen) -> None:
 
 @pytest.mark.parametrize("level", [0.0, 4095.0])
 @pytest.mark.parametrize(
-    "sensor", [DEGRADED, NOISE_FREE, load_sensor("pleiades-variable").nominal()]
+    "sensor", [DEGRADED, NOISE_FREE, Sensor.load("pleiades-variable").nominal()]
 )
 def test_a_black_and_a_saturated_image(level: float, sensor: Instrument) -> None:
     restored = restore_traditional(torch.full((13, 21), level), Chain(sensor, REFERENCE))

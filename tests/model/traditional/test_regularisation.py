@@ -26,7 +26,7 @@ from beers_deploy.model.traditional.regularisation import (
     measure,
 )
 from beers_deploy.profiles.errors import ImageError, OptionError
-from beers_deploy.profiles.sensor import Instrument
+from beers_deploy.profiles.instrument import Instrument
 from tests.model.simulator.stages import formula_point, with_response
 from tests.model.traditional.test_pipeline import (
     DEGRADED,

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from beers_deploy.model.traditional.noise import bias_radiance, destabilise, stabilise
-from beers_deploy.profiles.sensor import Instrument, noise_from_snr
+from beers_deploy.profiles.instrument import Instrument, noise_from_snr
 
 NOMINAL = Instrument(0.07, *noise_from_snr(25, 50, 100, 110), gain_dn_per_radiance=10.2375, bits=12)
 LIMITS = [

@@ -10,7 +10,7 @@ from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene
 from beers_deploy.model.training.patches import PatchRecipe
 from beers_deploy.model.training.source import PatchSource
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 
 
 @cache
@@ -29,10 +29,10 @@ def source(
 ) -> PatchSource:
     """Batches of three, of one variable sensor or of a family of sensors."""
     recipe = PatchRecipe(
-        load_sensor("pleiades-variable"), load_sensor("pleiades-reference"), patch_px=patch_px
+        Sensor.load("pleiades-variable"), Sensor.load("pleiades-reference"), patch_px=patch_px
     )
     if conditioned:
-        recipe = replace(recipe, family=SensorFamily(load_sensor("pleiades-degraded").nominal()))
+        recipe = replace(recipe, family=SensorFamily(Sensor.load("pleiades-degraded").nominal()))
     return PatchSource(
         [scene or small_scene()], recipe, batch=3, seed=seed, rank=rank, workers=workers
     )

@@ -25,11 +25,11 @@ from beers_deploy.model.training.passes import (
     prepare,
 )
 from beers_deploy.profiles.effects import AntiAlias, Offset, Smear
-from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Sensor
 from tests.model.simulator.stages import lopsided_point, with_response
 
-NOMINAL = load_sensor("pleiades-degraded").nominal()
+NOMINAL = Sensor.load("pleiades-degraded").nominal()
 PLAIN = Look(1.0)
 
 

@@ -21,12 +21,12 @@ from beers_deploy.model.training.patches import draw_turn, pair_files, turn
 from beers_deploy.model.training.source import Batch, PatchSource, cut
 from beers_deploy.model.training.stored import StoredPairs
 from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import MtfTable, PointSpread, packed
-from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from tests.model.training.sources import small_scene, source
 
-NOMINAL = load_sensor("pleiades-degraded").nominal()
+NOMINAL = Sensor.load("pleiades-degraded").nominal()
 
 
 def test_the_same_seed_gives_the_same_batches_from_anywhere() -> None:
@@ -93,7 +93,7 @@ def test_a_turned_patch_comes_with_the_sensor_as_it_lies() -> None:
     scene = Scene("noise", 100 + 60 * np.random.default_rng(0).random((420, 480), np.float32))
     recipe = replace(
         source().recipe,
-        family=OneSensor(load_sensor("pleiades-degraded").nominal()),
+        family=OneSensor(Sensor.load("pleiades-degraded").nominal()),
         oversamplings=(2,),
     )
     ways = set()
@@ -149,7 +149,7 @@ def test_dark_patches_are_those_of_a_brighter_sensor_as_a_restoration_shows_them
 def test_a_blind_network_sees_the_axes_of_one_sensor_as_they_are() -> None:
     """Half turns and mirrors only: what is sharper across the track stays so."""
     scene = Scene("noise", 100 + 60 * np.random.default_rng(0).random((420, 480), np.float32))
-    profile = load_sensor("pleiades-degraded")
+    profile = Sensor.load("pleiades-degraded")
     across, along = (replace(profile.mtf_nyquist, value=value) for value in (0.3, 0.03))
     anisotropic = replace(profile, mtf_nyquist=across, mtf_nyquist_along=along)
     recipe = replace(source().recipe, degraded=anisotropic, oversamplings=(2,))
@@ -168,7 +168,7 @@ def test_a_lopsided_blur_is_neither_mirrored_nor_turned() -> None:
         assert draw_turn(generator, True, mirrors=False) == (0, False)
         ways.append(draw_turn(generator, False))
     assert {quarter for quarter, _ in ways[2:]} == {0, 2}
-    nominal = load_sensor("pleiades-degraded").nominal()
+    nominal = Sensor.load("pleiades-degraded").nominal()
     samples = np.zeros((9, 9))
     samples[3:6, 4:8] = 1
     table = MtfTable((0, 0.25, 0.5), (1, 0.5, 0.1), (1, 0.5, 0.1))

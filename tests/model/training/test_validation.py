@@ -7,14 +7,14 @@ from beers_deploy.model.convbeers import ConvBEERS
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.training.run import Validation, split_by_site
 from beers_deploy.model.variants import Variant
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 
 NAMES = (
     [f"village_{k:03d}.jpg" for k in range(30)]
     + [f"forest_{k:03d}.jpg" for k in range(10)]
     + ["dunes.jpg"]
 )
-EYES = load_sensor("pleiades-degraded"), load_sensor("pleiades-reference")
+EYES = Sensor.load("pleiades-degraded"), Sensor.load("pleiades-reference")
 
 
 def test_whole_sites_are_held_out_the_smallest_first_in_any_order() -> None:

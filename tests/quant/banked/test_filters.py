@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from beers_deploy.model.bank import FILTERS, SIDE_PX, UNIT_STEPS, WIDE, Bank, bank_of_vector
 from beers_deploy.model.variants import Kernels
-from beers_deploy.profiles.sensor import MAX_DN
+from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.banked.filters import (
     COPIES,
     IMAGE_STEP_DN,

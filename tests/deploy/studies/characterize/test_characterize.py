@@ -13,8 +13,8 @@ from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.profiles.errors import BeersError, OptionError
-from beers_deploy.profiles.sensor import Instrument, noise_from_snr
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.instrument import Instrument, noise_from_snr
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.characterize import Stated, measure, profile_toml
 from beers_deploy.studies.characterize.frames import Frames, cut_box
 from tests.deploy.command_line import done, refused
@@ -62,7 +62,7 @@ def test_the_profile_is_that_of_the_sensor(raw: tuple[Path, Path], tmp_path: Pat
     figures = tmp_path / "mine.json"
     options = "--bits", 12, "--gain", GAIN, "--gsd", 0.7
     done("characterize", *raw, *options, "--out", out, "--json", figures)
-    profile = load_sensor(str(out))
+    profile = Sensor.load(str(out))
     sensor = profile.nominal()
     assert sensor.response is not None
     none = np.zeros((1, 1))
@@ -137,7 +137,7 @@ def test_without_an_edge_the_mtf_is_assumed_and_said_so(tmp_path: Path) -> None:
         "characterize", tiff(tmp_path, ramp.astype(np.uint16)), "--bits", 12, "--out", out
     )
     assert "the profile's MTF is an assumption" in output
-    profile = load_sensor(str(out))
+    profile = Sensor.load(str(out))
     assert profile.mtf_nyquist.status == "assumed"
     assert profile.snr_pair[1].status == "measured"
 
@@ -145,7 +145,7 @@ def test_without_an_edge_the_mtf_is_assumed_and_said_so(tmp_path: Path) -> None:
 def test_the_mtf_may_be_stated(raw: tuple[Path, Path], tmp_path: Path) -> None:
     out = tmp_path / "mine.toml"
     output = done("characterize", raw[1], "--bits", 12, "--mtf", "0.08,0.04", "--out", out)
-    profile = load_sensor(str(out))
+    profile = Sensor.load(str(out))
     assert profile.nominal().mtf_axes == (0.08, 0.04)
     assert profile.mtf_nyquist.status == "stated"
     assert "assumption" not in output
@@ -318,5 +318,5 @@ def test_the_noise_of_a_bound_is_a_profile_that_loads(
         (tmp_path / "mine.toml").write_text(
             profile_toml(replace(result, snrs=(low, bright))), encoding="utf-8"
         )
-        sensor = load_sensor(str(tmp_path / "mine.toml")).nominal()
+        sensor = Sensor.load(str(tmp_path / "mine.toml")).nominal()
         assert min(sensor.alpha, sensor.beta) >= 0

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from beers_deploy.model.io.pictures import Stretch
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from benchmarks.detector.labelled import synthetic_labelled
 from benchmarks.detector.scenes import CLASSES
 
@@ -106,7 +106,7 @@ def coco(folder: Path) -> Path:
 
 def labelled(folder: Path, count: int) -> Path:
     """Drawn scenes as pictures in sRGB with VOC labels beside them."""
-    full_scale = load_sensor("pleiades-reference").nominal()
+    full_scale = Sensor.load("pleiades-reference").nominal()
     folder.mkdir()
     for number in range(count):
         scene = synthetic_labelled(number, 0, np.arange(len(CLASSES)))

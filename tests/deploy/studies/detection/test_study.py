@@ -11,7 +11,7 @@ from beers_deploy.model.io.pictures import stretch_of
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.sensor_file import load_sensor, reference_for
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.detection.average_precision import find_hits, score_rows, site_weights
 from beers_deploy.studies.detection.boxes import Boxes, iou
 from beers_deploy.studies.detection.detector import Detector
@@ -41,8 +41,8 @@ NAMES = ("ship", "tank")
 
 
 def sensors(name: str = "dior-medium", ratio: int = 3) -> SensorPair:
-    degraded = replace(load_sensor(name), oversampling=Constant(ratio, "assumed", "a test"))
-    return SensorPair(degraded, reference_for(degraded))
+    degraded = replace(Sensor.load(name), oversampling=Constant(ratio, "assumed", "a test"))
+    return SensorPair(degraded, degraded.reference)
 
 
 def scene(

@@ -18,7 +18,7 @@ from beers_deploy.network import Network
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Row, by_table, measured
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.evaluation import targets as targets_module
 from beers_deploy.studies.evaluation.methods import (
     BLIND,
@@ -61,8 +61,8 @@ from beers_deploy.verbs.evaluate import evaluate
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import figures_of, valid
 
-DEGRADED = load_sensor("pleiades-degraded")
-REFERENCE = load_sensor("pleiades-reference")
+DEGRADED = Sensor.load("pleiades-degraded")
+REFERENCE = Sensor.load("pleiades-reference")
 SENSORS = DEGRADED.nominal(), REFERENCE.nominal()
 PLAIN = Instruments({"LPIPS-squeeze": "no weights"})
 

@@ -12,8 +12,8 @@ import tifffile
 
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles.figures import Row, by_table, unavailable
-from beers_deploy.profiles.sensor import Instrument, Sensor
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.method import Restore
 from beers_deploy.studies.evaluation import sweep as module
 from beers_deploy.studies.evaluation import targets as targets_module
@@ -30,8 +30,8 @@ from beers_deploy.studies.evaluation.sweep import (
 from tests.deploy.command_line import done
 from tests.deploy.documents import valid
 
-PROFILE = load_sensor("pleiades-degraded")
-REFERENCE = load_sensor("pleiades-reference")
+PROFILE = Sensor.load("pleiades-degraded")
+REFERENCE = Sensor.load("pleiades-reference")
 NOMINAL = PROFILE.nominal()
 DRIFTED = replace(NOMINAL, mtf_nyquist=0.03)
 DIM = replace(NOMINAL, gain_dn_per_radiance=0.7 * NOMINAL.gain_dn_per_radiance)

@@ -11,8 +11,8 @@ from scipy.ndimage import gaussian_filter
 
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.sensor import Instrument
-from beers_deploy.profiles.sensor_file import load_sensor
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.evaluation import targets as module
 from beers_deploy.studies.evaluation.methods import BLIND, Method, method_named
 from beers_deploy.studies.evaluation.targets import (
@@ -27,8 +27,8 @@ from beers_deploy.studies.evaluation.targets import (
     target_row,
 )
 
-DEGRADED = load_sensor("pleiades-degraded")
-REFERENCE = load_sensor("pleiades-reference")
+DEGRADED = Sensor.load("pleiades-degraded")
+REFERENCE = Sensor.load("pleiades-reference")
 SENSORS = DEGRADED.nominal(), REFERENCE.nominal()
 IDENTITY = Method("identity", lambda dn: dn, BLIND)
 

@@ -18,8 +18,9 @@ from beers_deploy.network import Network
 from beers_deploy.performance.swath import Swath
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import ModelError, OptionError, ProfileError
-from beers_deploy.profiles.sensor_file import load_sensor
-from beers_deploy.profiles.target import TILE_PX, board_names, load_target
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import TILE_PX, board_names
+from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.studies.tradeoff.measure import (
     ROUNDS,
@@ -46,7 +47,7 @@ from tests.deploy.studies.tradeoff.made import DPU
 from tests.model.networks import plain
 
 WHOLE = Swath(13600, 9016)
-SENSOR = load_sensor("pleiades-degraded")
+SENSOR = Sensor.load("pleiades-degraded")
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +138,7 @@ def test_the_fastest_tile_is_a_multiple_of_the_step_and_no_other_is_faster(
 def test_int8_is_compared_on_every_board_and_configuration_in_several_tiles_and_halos(
     variant: Variant,
 ) -> None:
-    boards = [load_target("vck190"), load_target("zcu102")]
+    boards = [TargetProfile.load("vck190"), TargetProfile.load("zcu102")]
     points = network_points(variant, boards, WHOLE)
     assert len({point.name for point in points}) == len(points)
     for board in boards:
@@ -153,7 +154,7 @@ def test_int8_is_compared_on_every_board_and_configuration_in_several_tiles_and_
 
 
 def test_float_and_what_a_board_refuses_have_no_board_and_the_reason(variant: Variant) -> None:
-    board = load_target("vck190")
+    board = TargetProfile.load("vck190")
     (point,) = network_points(replace(variant, precision=FLOAT), [board], WHOLE)
     assert point.board is None
     figures = board_figures(point, WHOLE)

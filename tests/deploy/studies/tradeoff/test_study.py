@@ -13,8 +13,8 @@ from beers_deploy.model.convbeers import save_network
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.variants import Variant as Shape
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.sensor_file import load_sensor, reference_for
-from beers_deploy.profiles.target import board_names
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import board_names
 from beers_deploy.restoration.method import Restore
 from beers_deploy.studies.evaluation.methods import method_named
 from beers_deploy.studies.evaluation.pairs import pairs_of_scenes
@@ -72,11 +72,11 @@ def study(
     scored: list[bool],
 ) -> Iterator[Tradeoff]:
     """A study of the tiny network on all boards, for the paper's swath."""
-    degraded = load_sensor(SENSOR)
+    degraded = Sensor.load(SENSOR)
     asked = Study(
         networks=[str(folder / "narrow.safetensors")],
         boards=boards_of("all"),
-        sensors=(degraded, reference_for(degraded)),
+        sensors=(degraded, degraded.reference),
         scenes=folder / "images",
         lpips=None,
         calibration=folder / "calibration",
@@ -134,8 +134,8 @@ def test_exact_halos_give_one_picture_and_smaller_ones_show_seams(
 def test_the_scores_are_those_of_the_method_that_evaluate_takes(
     folder: Path, study: Tradeoff
 ) -> None:
-    degraded = load_sensor(SENSOR)
-    reference = reference_for(degraded)
+    degraded = Sensor.load(SENSOR)
+    reference = degraded.reference
     restore = method_named(str(folder / "narrow.safetensors"), degraded, reference).restore
     pairs, _ = pairs_of_scenes(folder / "images", degraded, reference, 0)
     instruments = Instruments({})

@@ -1,0 +1,138 @@
+"""A point-spread function as a sensor's file names it: a .npy file next to the profile."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic.dataclasses import dataclass
+
+from beers_deploy.profiles.errors import ProfileError, printable
+from beers_deploy.profiles.response import (
+    KEPT_SIDE,
+    PointSpread,
+    SamplesPerPx,
+    centroid,
+    packed,
+)
+from beers_deploy.profiles.toml import unreadable
+from beers_deploy.profiles.validation import CONFIG, validated
+
+FILE_SIDE = 4096
+"""Samples a side of a file at most."""
+CUT_SHARE = 1e-6
+"""Of the absolute weight: rows and columns at the rim that hold less are cut.
+
+No frequency changes by more than twice as much.
+"""
+OFF_CENTRE_PX = 1.0
+
+
+@dataclass(frozen=True, config=CONFIG)
+class PointSpreadFile:
+    """The keys of [mtf] that state a point-spread function.
+
+    Attributes:
+        psf: path of the .npy file, from the profile's folder.
+        psf_samples_per_px: how many samples, in each direction, make one target pixel.
+    """
+
+    psf: str
+    psf_samples_per_px: SamplesPerPx
+
+    def read(self, label: str, folder: Path) -> PointSpread:
+        """Return the point-spread function, or raise ProfileError where the file holds none.
+
+        Args:
+            label: names the profile in errors.
+            folder: where the profile lies.
+        """
+        if not _lies_within(folder, self.psf):
+            raise ProfileError(
+                f"{label} mtf.psf must be the name of a file in the profile's folder or below it, "
+                f"got {printable(repr(self.psf))}. Copy the file there."
+            )
+        where = f"{label} mtf.psf ({folder / self.psf})"
+        samples = _normalised(where, _read_samples(where, folder / self.psf))
+        shift_px = math.hypot(*centroid(samples)) / self.psf_samples_per_px
+        if shift_px > OFF_CENTRE_PX:
+            raise ProfileError(
+                f"{where} must have its centroid within {OFF_CENTRE_PX:g} target pixel of the "
+                f"middle, but it lies {shift_px:.3g} pixels off. Crop the file around its "
+                "centroid, and subtract its background."
+            )
+        core = _trimmed(samples)
+        height, width = core.shape
+        if max(height, width) > KEPT_SIDE:
+            raise ProfileError(
+                f"{where} must have all but a millionth of its weight within {KEPT_SIDE} x "
+                f"{KEPT_SIDE} samples, but it takes {width} x {height}. Crop it, or sample it "
+                "more coarsely."
+            )
+        fields = {"height": height, "width": width, "samples": packed(core)}
+        fields |= {"samples_per_px": self.psf_samples_per_px}
+        return validated(PointSpread, fields, where)
+
+
+def _lies_within(folder: Path, name: str) -> bool:
+    try:
+        return (folder / name).resolve().is_relative_to(folder.resolve())
+    # A circle of links raises the first, a NUL the second.
+    except (OSError, ValueError):
+        return False
+
+
+def _normalised(where: str, samples: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the samples scaled to a sum of 1, or refuse those that can have none."""
+    finite = bool(np.isfinite(samples).all())
+    # The largest is brought to 1 first, because the sum of finite samples may overflow.
+    samples = samples / max(float(np.abs(samples).max()), 1e-300) if finite else samples
+    total = float(samples.sum())
+    if not finite or total <= 0:
+        fault = f"their sum is {total:g}" if finite else "some are NaN or infinite"
+        raise ProfileError(
+            f"{where} must hold finite samples whose sum is above 0, but {fault}. Correct the "
+            "file; a background must be subtracted first."
+        )
+    return samples / total
+
+
+def _trimmed(samples: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Without the rows and columns at the rim that hold, all together, less than CUT_SHARE of the
+    weight.
+    """
+    weight = np.abs(samples)
+    parts = []
+    for axis in (1, 0):
+        grown = np.cumsum(weight.sum(axis)) / weight.sum()
+        # Two axes with two ends each: every end may lose a quarter of the share.
+        ends = np.searchsorted(grown, (CUT_SHARE / 4, 1 - CUT_SHARE / 4)) + np.array([0, 1])
+        parts.append(slice(*ends))
+    return samples[tuple(parts)]
+
+
+def _read_samples(where: str, path: Path) -> NDArray[np.float64]:
+    """The samples of a .npy file, (H, W)."""
+    reason = unreadable(path) if path.suffix.lower() == ".npy" else f"it ends in {path.suffix!r}"
+    if reason:
+        raise ProfileError(
+            f"{where} cannot be read as a .npy file: {reason}. Check the path, which is relative "
+            "to the profile's folder."
+        )
+    try:
+        # Mapped: nothing is read before its shape is known.
+        samples = np.load(path, mmap_mode="r", allow_pickle=False)
+        if (
+            samples.ndim != 2
+            or samples.dtype.kind not in "iuf"
+            or not 1 <= min(samples.shape) <= max(samples.shape) <= FILE_SIDE
+        ):
+            raise ValueError(f"it is {samples.dtype} of shape {samples.shape}")
+        return np.asarray(samples, np.float64)
+    # The bytes of a damaged file may lead to anything.
+    except Exception as error:
+        reason = printable(str(error)) or type(error).__name__
+        raise ProfileError(
+            f"{where} is not one array of real numbers, (rows, columns), of at most {FILE_SIDE} a "
+            f"side: {reason}. Crop it, leave one plane, and save it with numpy.save."
+        ) from error

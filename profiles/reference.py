@@ -1,0 +1,43 @@
+"""The reference of a sensor: what a restoration aims at, in the sensor's digital numbers."""
+
+import logging
+import os
+
+from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import REFERENCE
+
+logger = logging.getLogger(__name__)
+
+
+def require_same_units(degraded: Sensor, reference: Sensor) -> None:
+    """Refuse a reference that another digitiser made: its images differ from the degraded ones by a
+    factor.
+    """
+    if degraded.units != reference.units:
+        raise ProfileError(
+            f"The sensor profile {reference.name}, the reference of {degraded.name}, must have "
+            f"{describe_units(degraded)}, but it has {describe_units(reference)}. Convert the "
+            "reference to the degraded sensor's units."
+        )
+
+
+def describe_units(profile: Sensor) -> str:
+    """What a digital number of the profile means, in words."""
+    gain, bits, offset_dn = profile.units
+    return f"{gain:g} DN per W/m2/sr/um, {bits:g} bits" + (
+        f", {offset_dn:g} DN of offset" if offset_dn else ""
+    )
+
+
+def reference_beside(degraded: Sensor, named: Sensor | str | os.PathLike[str] | None) -> Sensor:
+    """Return the reference profile that a user names, or the default one, in the digital numbers of
+    `degraded`; log if one that is named states other numbers.
+    """
+    profile = Sensor.load(named or REFERENCE)
+    reference = profile.in_units_of(degraded)
+    if named is not None and reference is not profile:
+        units = f"{describe_units(degraded)}, as {degraded.name} has them"
+        own = describe_units(profile)
+        logger.info("the reference %s (%s) is converted to %s", profile.name, own, units)
+    return reference

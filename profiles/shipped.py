@@ -1,0 +1,68 @@
+"""The shipped profiles by name, and those that stand for a default. Nothing is read or checked
+here, so that `--help` loads neither NumPy nor pydantic.
+"""
+
+import re
+from pathlib import Path
+
+HERE = Path(__file__).parent
+
+REFERENCE = "pleiades-reference"
+"""The shipped profile of the image that restoration aims at, unless another is named."""
+
+BLIND = "blind"
+BLIND_PROFILE = "pleiades-variable"
+"""The name of a sensor that is not known, and the profile in whose ranges it then counts to be."""
+
+DEFAULT_TARGET = "vck190"
+"""The board of the paper: what a command takes where no board is named."""
+
+MODEL_SUFFIX = "-model"
+"""What `bench` adds to a board's name: its figures are of a model of the board."""
+
+TILE_PX = 640
+"""Side of a tile unless somebody asks for another: what the paper's network was given on the board.
+"""
+
+
+def shipped_names(kind: str) -> list[str]:
+    """Return the names of the profiles shipped in `profiles/KIND/`."""
+    return sorted(path.stem for path in (HERE / kind).glob("*.toml"))
+
+
+def profile_path(kind: str, name: str) -> Path:
+    """Return where a profile lies: in `profiles/KIND/`, or where the user's own path says."""
+    return Path(name) if name.endswith(".toml") else HERE / kind / f"{name}.toml"
+
+
+def sensor_names() -> list[str]:
+    """Return the names of the shipped sensors."""
+    return shipped_names("sensors")
+
+
+def scene_names() -> list[str]:
+    """Return the names of the shipped scenes."""
+    return shipped_names("scenes")
+
+
+def target_names() -> list[str]:
+    """Return the names of the shipped targets."""
+    return shipped_names("targets")
+
+
+def board_names() -> list[str]:
+    """Return the names of the shipped targets with a DPU: their files name its manual."""
+    return _targets_with(r"^(base =|operators =)")
+
+
+def npu_names() -> list[str]:
+    """Return the names of the shipped targets with an NPU: it has rules and no cost model."""
+    return _targets_with(r"^\[npu]")
+
+
+def _targets_with(line: str) -> list[str]:
+    return [
+        name
+        for name in target_names()
+        if re.search(line, profile_path("targets", name).read_text(encoding="utf-8"), re.MULTILINE)
+    ]

@@ -1,0 +1,99 @@
+"""Check what a file states with a pydantic type, and say in one sentence what is wrong with it."""
+
+from collections.abc import Collection, Mapping, Sequence
+from difflib import get_close_matches
+from typing import TypeVar
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from beers_deploy.profiles.errors import ProfileError, printable
+
+T = TypeVar("T")
+
+CONFIG = ConfigDict(extra="forbid")
+"""Of every model here: a misspelt key is refused, never ignored."""
+
+EXPECTED = {
+    **dict.fromkeys(("dataclass_type", "dict_type", "mapping_type", "model_type"), "a table"),
+    "string_type": "a text",
+    "tuple_type": "a list",
+}
+"""TOML's words for pydantic's types of errors; of the others pydantic's own message is shown."""
+
+
+def validated(kind: type[T], raw: object, label: str, groups: Mapping[str, str] | None = None) -> T:
+    """Return the value of a type that plain values state.
+
+    Args:
+        kind: any type that pydantic can check.
+        raw: plain values, as TOML and JSON hold them.
+        label: names the file in messages.
+        groups: the dotted key of a field of the type, where it is not its name; "" for a field that
+            only groups tables of the file.
+
+    Raises:
+        ProfileError: the file, the dotted key, what is wrong with its value and what to do.
+    """
+    try:
+        return TypeAdapter(kind).validate_python(raw)
+    except ValidationError as error:
+        raise ProfileError(_sentence(label, error, groups or {})) from None
+
+
+def _sentence(label: str, error: ValidationError, groups: Mapping[str, str]) -> str:
+    """Return the sentence about the likeliest of the faults."""
+
+    def place(path: Sequence[str | int]) -> str:
+        names = [str(name) for name in path if name != "value"]
+        names[:1] = [groups.get(name, name) for name in names[:1]]
+        return f"{label} {'.'.join(filter(None, names))}".rstrip()
+
+    faults = error.errors(include_url=False)
+    missing = {fault["loc"] for fault in faults if fault["type"] == "missing"}
+    for fault in faults:
+        # A misspelt key leaves its right name missing: the first is the likelier fault. Pydantic
+        # has one name of this fault for models, another for dataclasses.
+        if fault["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+            *path, key = fault["loc"]
+            names = [str(other[-1]) for other in missing if [*other[:-1]] == path]
+            return f"{place(path)} has the unknown key {_spelling(str(key), names)}"
+    fault = faults[0]
+    where = place(fault["loc"])
+    if fault["type"] == "missing":
+        return _missing(place(fault["loc"][:-1]), str(fault["loc"][-1]))
+    if fault["type"] == "value_error":
+        return f"{where} {fault['ctx']['error']}"
+    expected = EXPECTED.get(fault["type"], fault["msg"].removeprefix("Input should be "))
+    value = printable(repr(fault["input"]))
+    return f"{where} must be {expected}, got {value}. Correct it; a shipped profile shows how."
+
+
+def check_keys(
+    where: str,
+    raw: Mapping[str, object],
+    required: Collection[str],
+    optional: Collection[str] = (),
+) -> None:
+    """Refuse a table with an unknown key, or without a required one.
+
+    For tables whose keys depend on more than a type.
+    """
+    allowed = sorted({*required, *optional})
+    for key in raw:
+        if key not in allowed:
+            choices = f"it can have the keys {', '.join(allowed)}"
+            raise ProfileError(f"{where} has the unknown key {_spelling(key, allowed, choices)}")
+    for key in sorted({*required} - set(raw)):
+        raise ProfileError(_missing(where, key))
+
+
+def _missing(where: str, key: str) -> str:
+    return f"{where} has no key {key!r}. Add it; a shipped profile shows how."
+
+
+def _spelling(key: str, names: Sequence[str], choices: str = "") -> str:
+    """Return the key, the keys to choose from, and the one that was meant."""
+    stated = "; ".join(filter(None, (printable(repr(key)), choices)))
+    for name in get_close_matches(key, names, 1):
+        return f"{stated}. Write {name!r} (the unit belongs to the name)."
+    return f"{stated}. Remove it or correct its spelling."
