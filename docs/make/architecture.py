@@ -38,11 +38,11 @@ def modules() -> dict[str, Path]:
     return paths
 
 
-def imports_of(path: Path, paths: dict[str, Path], *, late: bool = True) -> set[str]:
-    """The modules of ours that a file imports: anywhere in it, or as it is loaded alone."""
+def imports_of(path: Path, paths: dict[str, Path]) -> set[str]:
+    """Return the modules of ours that a file imports, also inside functions and for types alone."""
     imports = set[str]()
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    for node in ast.walk(tree) if late else tree.body:
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             imports |= {in_folder(alias.name) for alias in node.names}
         if isinstance(node, ast.ImportFrom) and node.module:
