@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from beers_deploy.profiles.constant import Limits
 from beers_deploy.profiles.errors import ProfileError
 from beers_deploy.profiles.shipped import target_names
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.profiles.target_limits import CONFIGURATION, TABLES, Limits
+from beers_deploy.profiles.target_limits import CONFIGURATION, TABLES
 from docs.make.target_file import BUILD, KEYS
 from tests.deploy.command_line import done, refused
 
