@@ -93,13 +93,14 @@ def limits_of(
     if isinstance(given, str | os.PathLike):
         where = str(given)
         try:
-            limits = _named(where, read_toml_text(Path(given)))
+            raw = read_toml_text(Path(given))
         except (OSError, ValueError) as error:
             reason = unreadable(Path(given)) or printable(str(error))
             raise OptionError(
                 f"The limits cannot be read from {where}: {reason}. Give a TOML file with lines "
                 "such as mae = 0.0007."
             ) from error
+        limits = _named(where, raw)
     elif isinstance(given, Mapping):
         limits = _named(where, given)
     else:

@@ -109,7 +109,19 @@ def test_a_gate_on_a_network_gone_wrong_still_writes_json(value: float, tmp_path
     """
     coverage = SampleRange(0, 0, 1, 1, 0)
     spread = Spread(np.ones(1), np.zeros(1), np.zeros(1))
-    result = GateResult(*[value] * 8, patches=1, sample_range=coverage, spread=spread)
+    result = GateResult(
+        value,
+        value,
+        value,
+        value,
+        value,
+        value,
+        value,
+        value,
+        patches=1,
+        sample_range=coverage,
+        spread=spread,
+    )
     checks = tuple(judge(result, Limits(mae=1.0)))
     Table("gate", {}, (), (gate_row(result),), checks).save(tmp_path / "gate.json")
     jsonschema.validate(strictly((tmp_path / "gate.json").read_text()), SCHEMA)

@@ -26,9 +26,10 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.passes import equalize_single as single
-from beers_deploy.quant.passes.equalize import FULL, MOST_CHANNELS, Costs
+from beers_deploy.quant.passes.equalize import FULL, MOST_CHANNELS
 from beers_deploy.quant.passes.equalize_single import SingleTensors, single_ranges
 from beers_deploy.quant.passes.residual_groups import GROUP_FRAC_BITS, single_tensors
+from beers_deploy.quant.passes.trial import Costs
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.simplify.simplify import simplify
 from examples.networks import build, to_onnx

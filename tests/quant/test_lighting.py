@@ -68,8 +68,8 @@ def test_ground_without_light_stays_finite(name: str) -> None:
 
 def test_default_patches_cover_the_range_and_those_of_the_gate_as_well() -> None:
     """As scenes are drawn, 99.9 % of their pixels lie in the lower half of the range."""
-    calibration = Calibration(SENSOR, None, patches=16, patch_px=48, seed=0)
-    for patches in (calibration.drawn, unseen_patches(SENSOR, None, 16, 0)):
+    calibration = Calibration(SENSOR, None, patches=32, patch_px=48, seed=0)
+    for patches in (calibration.drawn, unseen_patches(SENSOR, None, 32, 0)):
         sample_range = range_from(sum(map(histogram, patches.degraded), np.zeros(1)))
         assert sample_range.p99_9 > 0.75
         assert sample_range.p1 < 0.05
@@ -79,7 +79,7 @@ def test_light_changes_nothing_but_the_light() -> None:
     scenes = [procedural_scene(500, 520, np.random.default_rng(1))]
     lit, plain = (
         draw_patches(scenes, SENSOR, REFERENCE, 16, 3, 40, lightings=lightings)
-        for lightings in (JUDGING, ())
+        for lightings in (JUDGING, {})
     )
     ratios = set()
     for one, other in zip(lit.views, plain.views, strict=True):

@@ -27,7 +27,6 @@ from beers_deploy.quant.graph import (
 from beers_deploy.quant.passes.dual_range import with_copies
 from beers_deploy.quant.passes.equalize import (
     FIRST_CROPS,
-    Costs,
     channel_ranges,
     equalize,
     first_guess,
@@ -40,6 +39,7 @@ from beers_deploy.quant.passes.residual_groups import (
     residual_groups,
 )
 from beers_deploy.quant.passes.selection import Passes
+from beers_deploy.quant.passes.trial import Costs
 from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session
