@@ -62,12 +62,6 @@ class Command:
         """True if the command writes results documents: all do but those that return a path."""
         return inspect.signature(self.verb).return_annotation is not Path
 
-    @property
-    def help(self) -> str:
-        """The text above the options: what the verb does."""
-        doc = self.doc
-        return "\n\n".join(filter(None, (doc.short_description, doc.long_description)))
-
 
 @lru_cache
 def parameters_of(verb: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
@@ -98,7 +92,7 @@ def generated(command: Command, run: Callable[..., None]) -> Callable[..., None]
         parameters.append(_keyword(name, hint, default))
     called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     called.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    called.__doc__ = in_options(command.help, command.verb)
+    called.__doc__ = in_options(command.doc.description or "", command.verb)
     return called
 
 
@@ -150,16 +144,13 @@ def read_as(annotation: Any) -> tuple[Any, bool]:
     annotation names first.
     """
     parts = list(parts_of(annotation))
-    repeated = next((part for part in parts if get_origin(part) is SEQUENCE), None)
+    repeated = next((part for part in parts if get_origin(part) is Sequence), None)
     if repeated is not None:
         return read_as(get_args(repeated)[0])[0], True
     for part in parts:
         if get_origin(part) is Literal or part in (bool, int, float, str, Path):
             return part, False
     raise TypeError(f"the command line cannot read {annotation}")
-
-
-SEQUENCE = get_origin(Sequence[str])
 
 
 def spellings_of(parameter: inspect.Parameter) -> list[str]:

@@ -117,7 +117,10 @@ def read_weights(path: Path) -> Weights:
     tensors, header = read_tensors(path)
     try:
         conditioned = _told(header)
-        variant = _variant(header)
+        shape: Any = header["variant"]
+        variant = Variant(int(shape["blocks"]), int(shape["features"]), int(shape.get("scale", 1)))
+        if variant.scale < 1:
+            raise ValueError(f"it states a scale of {variant.scale}")
         # Before a list of the network's is made: a header alone must not take memory.
         if len(tensors) != 4 * variant.blocks + (7 if conditioned else 6):
             raise ValueError(f"it has {len(tensors)} tensors for {variant}")
@@ -176,14 +179,6 @@ def _told(header: Mapping[str, object]) -> bool:
     if kind and header.get("ranges") != {name: list(ends) for name, ends in RANGES.items()}:
         raise ValueError("its ranges of sensors differ from those of this version")
     return kind is not None
-
-
-def _variant(header: Mapping[str, Any]) -> Variant:
-    shape = header["variant"]
-    variant = Variant(int(shape["blocks"]), int(shape["features"]), int(shape.get("scale", 1)))
-    if variant.scale < 1:
-        raise ValueError(f"it states a scale of {variant.scale}")
-    return variant
 
 
 def _check_like(tensors: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> None:
