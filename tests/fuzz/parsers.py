@@ -31,8 +31,7 @@ from beers_deploy.profiles.scene_call import load_scene_call
 from beers_deploy.profiles.sensor_file import load_sensor
 from beers_deploy.profiles.target import load_target
 from beers_deploy.quant.limits import limits_of
-from beers_deploy.restoration.checkpoint import Checkpoint
-from beers_deploy.restoration.journal import FinishedRow, journal_text
+from beers_deploy.restoration.checkpoint import Checkpoint, FinishedRow, journal_text
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.results import Table
 from tests.deploy.dpu.graphs import integer_convbeers
