@@ -62,6 +62,12 @@ class Command:
         """True if the command writes results documents: all do but those that return a path."""
         return inspect.signature(self.verb).return_annotation is not Path
 
+    @property
+    def help(self) -> str:
+        """The text above the options: what the verb does."""
+        # Without a long description the parser leaves an empty line behind the short one.
+        return (self.doc.description or "").strip()
+
 
 @lru_cache
 def parameters_of(verb: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
@@ -92,7 +98,7 @@ def generated(command: Command, run: Callable[..., None]) -> Callable[..., None]
         parameters.append(_keyword(name, hint, default))
     called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     called.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    called.__doc__ = in_options(command.doc.description or "", command.verb)
+    called.__doc__ = in_options(command.help, command.verb)
     return called
 
 

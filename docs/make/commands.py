@@ -58,7 +58,7 @@ def reference() -> str:
 
 def _section(command: Command, lines: Mapping[str, str], once: Collection[str]) -> Iterator[str]:
     example = f"    beers-deploy {command.name} {command.example}"
-    yield f"## {command.name}\n\n{in_options(command.doc.description or '', command.verb)}\n\n{example}\n"
+    yield f"## {command.name}\n\n{in_options(command.help, command.verb)}\n\n{example}\n"
     yield from (line for line in lines.values() if line not in once)
     also = [f"`{label}`" for label, line in lines.items() if line in once]
     yield f"\nAlso {', '.join(also)}.\n" if also else ""
