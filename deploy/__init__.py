@@ -6,8 +6,8 @@ values, and write files only where they are given an output; each is a command t
 
 - `verbs`: one verb a file: signature and docstring are those of the library, the command and its
   help; `cli` makes the commands;
-- `network`: a network as a value; `quantization`, `comparison`, `verdict`, `pairs`, `board`: the
-  steps of the verbs;
+- `network`: a network as a value; `quantization`, `comparison`, `verdict`, `pairs`: the steps of
+  the verbs; `kit`: what a board's engineer gets;
 - `restoration`: images of any size through a network or the traditional pipeline;
 - `dpu`: the checker of operators and the cost model; `performance`: times, predicted and measured;
 - `results`: figures as one table, JSON document and page; `tables` and `report` show them;

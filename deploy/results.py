@@ -128,14 +128,11 @@ class Table:
             if details:
                 shown += rows
             elif name not in self.details:
-                shown += [self._short(row) for row in rows]
+                for row in rows:
+                    figures = {k: v for k, v in row.figures.items() if k not in self.details}
+                    text = {k: v for k, v in row.text.items() if k not in self.details}
+                    shown.append(Row(row.table, row.name, figures, text))
         return {heading: rows for heading, rows in tables.items() if rows}
-
-    def _short(self, row: Row) -> Row:
-        """Return a row without its details."""
-        figures = {key: figure for key, figure in row.figures.items() if key not in self.details}
-        text = {word: words for word, words in row.text.items() if word not in self.details}
-        return Row(row.table, row.name, figures, text)
 
     def print(self, console: Console | None = None, details: bool = False) -> None:
         """Print the tables, checks and notes.

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Iterator, Mapping
 from functools import lru_cache, partial
+from importlib import import_module
 from itertools import pairwise
 from typing import Any, cast
 
@@ -15,44 +16,28 @@ from beers_deploy.cli.generate import Command, generated
 from beers_deploy.cli.run import run
 from beers_deploy.cli.streams import lasting_streams
 from beers_deploy.profiles.errors import CRASHED
-from beers_deploy.verbs.bench import bench
-from beers_deploy.verbs.characterize import characterize
-from beers_deploy.verbs.check import check
-from beers_deploy.verbs.demo import demo
-from beers_deploy.verbs.evaluate import evaluate
-from beers_deploy.verbs.export import export
-from beers_deploy.verbs.gate import gate
-from beers_deploy.verbs.golden import golden
-from beers_deploy.verbs.profiles import profiles
-from beers_deploy.verbs.quantize import quantize
-from beers_deploy.verbs.restore import restore
-from beers_deploy.verbs.simulate import simulate
-from beers_deploy.verbs.stress import stress
-from beers_deploy.verbs.tradeoff import tradeoff
-from beers_deploy.verbs.train import train
 
+EXAMPLES = {
+    "restore": "raw.tif restored.tif",
+    "demo": "--out demo",
+    "export": "--network convbeers-s --out float.onnx",
+    "quantize": "float.onnx --target zcu104 --sensor pleiades-degraded --out int8.onnx",
+    "gate": "float.onnx int8.onnx --max-mae 0.0007",
+    "check": "network.onnx --target zcu102 --dpu B4096",
+    "golden": "int8.onnx --tile 64 --out golden",
+    "bench": "--target vck190-model --size 13600x9016 --dpu C32B3",
+    "evaluate": "--images aerial/ --methods degraded,traditional,convbeers-s --out report/",
+    "tradeoff": "--images aerial/ --out study/ --budget 'latency<=20s'",
+    "stress": "float.onnx int8.onnx --out stability.md",
+    "profiles": "pleiades-degraded",
+    "characterize": "raw1.tif raw2.tif --bits 12 --out my-sensor.toml",
+    "simulate": "--images aerial/ --sensor pleiades-degraded --out pairs",
+    "train": "--variant convbeers-s --images aerial/ --out runs/s --steps 20000",
+}
+"""The verbs that are commands, each with words of a command line."""
 COMMANDS = {
-    command.name: command
-    for command in (
-        Command(restore, "raw.tif restored.tif"),
-        Command(demo, "--out demo"),
-        Command(export, "--network convbeers-s --out float.onnx"),
-        Command(quantize, "float.onnx --target zcu104 --sensor pleiades-degraded --out int8.onnx"),
-        Command(gate, "float.onnx int8.onnx --max-mae 0.0007"),
-        Command(check, "network.onnx --target zcu102 --dpu B4096"),
-        Command(golden, "int8.onnx --tile 64 --out golden"),
-        Command(bench, "--target vck190-model --size 13600x9016 --dpu C32B3"),
-        Command(
-            evaluate,
-            "--images aerial/ --methods degraded,traditional,convbeers-s --out report/",
-        ),
-        Command(tradeoff, "--images aerial/ --out study/ --budget 'latency<=20s'"),
-        Command(stress, "float.onnx int8.onnx --out stability.md"),
-        Command(profiles, "pleiades-degraded"),
-        Command(characterize, "raw1.tif raw2.tif --bits 12 --out my-sensor.toml"),
-        Command(simulate, "--images aerial/ --sensor pleiades-degraded --out pairs"),
-        Command(train, "--variant convbeers-s --images aerial/ --out runs/s --steps 20000"),
-    )
+    name: Command(getattr(import_module(f"beers_deploy.verbs.{name}"), name), example)
+    for name, example in EXAMPLES.items()
 }
 """The commands by name, in the order of the help."""
 

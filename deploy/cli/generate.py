@@ -65,8 +65,8 @@ class Command:
     @property
     def help(self) -> str:
         """The text above the options: what the verb does."""
-        doc = self.doc
-        return "\n\n".join(filter(None, (doc.short_description, doc.long_description)))
+        # Without a long description the parser leaves an empty line behind the short one.
+        return (self.doc.description or "").strip()
 
 
 @lru_cache
@@ -150,16 +150,13 @@ def read_as(annotation: Any) -> tuple[Any, bool]:
     annotation names first.
     """
     parts = list(parts_of(annotation))
-    repeated = next((part for part in parts if get_origin(part) is SEQUENCE), None)
+    repeated = next((part for part in parts if get_origin(part) is Sequence), None)
     if repeated is not None:
         return read_as(get_args(repeated)[0])[0], True
     for part in parts:
         if get_origin(part) is Literal or part in (bool, int, float, str, Path):
             return part, False
     raise TypeError(f"the command line cannot read {annotation}")
-
-
-SEQUENCE = get_origin(Sequence[str])
 
 
 def spellings_of(parameter: inspect.Parameter) -> list[str]:

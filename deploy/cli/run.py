@@ -4,7 +4,7 @@ import logging
 import sys
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -53,6 +53,8 @@ def run(
         raise
     except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - no fault must look like a failed gate
         message, code = ending(error, command)
+        if isinstance(error, BeersError) and options.get("junit") not in (None, STDOUT):
+            _write_junit(command, _given(options), json, message)
         if verbose or code == CRASHED:
             traceback.print_exc()
         typer.echo(f"beers-deploy: {visible(message)}", err=True)
@@ -63,9 +65,27 @@ def run(
         raise typer.Exit(1)
 
 
+def _given(options: dict[str, Any]) -> dict[str, Any]:
+    """Return the options that are on the command line or have a default."""
+    return {name: value for name, value in options.items() if value not in (None, [])}
+
+
+def _write_junit(command: Command, given: dict[str, Any], json: Path | None, message: str) -> None:
+    """Write why a gate could not judge to its JUnit file, if no output is refused.
+
+    The verb itself does so once its parameters are accepted.
+    """
+    from beers_deploy.model.io.files import write_text
+    from beers_deploy.verdict import junit_error
+
+    with suppress(BeersError):
+        require_apart(command.verb, given, json)
+        write_text(given["junit"], junit_error("INT8 gate", message))
+
+
 def _result(command: Command, options: dict[str, Any], json: Path | None) -> Any:
     """Call the verb with the options that are given."""
-    given = {name: value for name, value in options.items() if value not in (None, [])}
+    given = _given(options)
     for parameter in command.parameters:
         needed = marker(parameter, RequiredUnless)
         if needed and parameter.name not in given and not given.get(needed.other):
@@ -91,18 +111,15 @@ def _show(result: Any, command: Command, quiet: bool, verbose: bool) -> None:
     table = table_of(result)
     if table is not None:
         notes = tuple(in_options(note, command.verb) for note in table.notes)
-        rows = tuple(_in_options(row, command) for row in table.rows)
-        replace(table, notes=notes, rows=rows).print(details=verbose)
+        rows = []
+        for row in table.rows:
+            words = {key: in_options(text, command.verb) for key, text in row.text.items()}
+            rows.append(replace(row, text=words))
+        replace(table, notes=notes, rows=tuple(rows)).print(details=verbose)
     elif isinstance(result, str):
         # A terminal must obey nothing in the text of a file.
         for line in result.removesuffix("\n").split("\n"):
             typer.echo(one_line(line))
-
-
-def _in_options(row: Any, command: Command) -> Any:
-    """Return a row whose words name parameters as the command line does."""
-    words = {key: in_options(text, command.verb) for key, text in row.text.items()}
-    return replace(row, text=words)
 
 
 @contextmanager

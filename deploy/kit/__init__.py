@@ -1,5 +1,6 @@
 """What a board's engineer is handed.
 
+- `board`: a board, and the folder that is written for it; `board_file`: the core of a network;
 - `golden`: what every layer must write; `golden_results`: what a board wrote, compared with that;
 - `record`: what a network is, what made it, and what was checked;
 - `host_facts`: what `host` must know of a network;

@@ -51,7 +51,11 @@ def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[st
     outputs = _results(golden, results_folder)
     rows = tuple(_row(golden.core, name, cases) for name, cases in outputs.items())
     wrong = [name for name, cases in outputs.items() if any(case.differs.any() for case in cases)]
-    detail = _first_layer(golden.core, outputs, wrong[0]) if wrong else ""
+    detail = ""
+    if wrong:
+        detail = f"the first to differ is {_layer(golden.core, wrong[0])}"
+        if unseen := _unseen_before(golden.core, wrong[0], outputs):
+            detail += f", {unseen} layers before it were not handed out"
     return Table(
         title=f"{results_folder.name} against {Path(folder).name}",
         inputs=(golden.network, Path(folder) / INDEX),
@@ -119,13 +123,6 @@ def _integers(path: Path, shape: tuple[int, ...], frac_bits: int) -> np.ndarray:
             f"int8, or its values as integer multiples of 2^{-frac_bits}."
         )
     return np.rint(numbers).astype(np.int16)
-
-
-def _first_layer(core: IntCore, outputs: Results, name: str) -> str:
-    """Return in words which layer differs first, and how many before it nobody saw."""
-    unseen = _unseen_before(core, name, outputs)
-    words = f"the first to differ is {_layer(core, name)}"
-    return f"{words}, {unseen} layers before it were not handed out" if unseen else words
 
 
 def _layer(core: IntCore, name: str) -> str:

@@ -14,11 +14,10 @@ import onnx
 import psutil
 
 from beers_deploy.dpu.reading import inputs_of
-from beers_deploy.host_state import cpu_load, resident_bytes
 from beers_deploy.model.consistency import Consistency, Placed
 from beers_deploy.model.processor import require_cores
 from beers_deploy.network import Network, NetworkLike, other_precision
-from beers_deploy.performance.timing import interleaved
+from beers_deploy.performance.timing import cpu_load, interleaved, resident_bytes
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import TargetProfile

@@ -185,9 +185,6 @@ def efficiency(pixels: int, latency: Figure, power: Figure) -> Figure:
     if power.value is None or latency.value is None:
         return unavailable(unit, power.reason or latency.reason)
     value = pixels / latency.value / power.value
-    if "predicted" not in (latency.mode, power.mode):
-        # Only predictions have intervals, so that a quotient without one among its parts has none.
-        return Figure(value, unit, latency.mode, f"{latency.source}; {power.source}")
     fast_s, slow_s = interval_ends(latency)
     low_w, high_w = interval_ends(power)
     # The slowest run at the highest power is the least efficient, and the reverse.

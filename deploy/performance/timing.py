@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
+import psutil
+
 from beers_deploy.profiles.figures import Figure, measured, unavailable
 
 POWERCAP = Path("/sys/class/powercap")
@@ -84,3 +86,15 @@ def interleaved(
         for call, call_samples in zip(calls, samples, strict=True):
             call_samples.append(timed(call)[1:])
     return samples
+
+
+def cpu_load() -> Figure:
+    """Load of all CPUs since the last call in this process, other processes included."""
+    return measured(
+        psutil.cpu_percent(), "%", "all CPUs over the same window, other processes included"
+    )
+
+
+def resident_bytes() -> int:
+    """Resident memory of this process."""
+    return int(psutil.Process().memory_info().rss)

@@ -3,14 +3,13 @@ pixel.
 """
 
 import statistics
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
 
-from beers_deploy.host_state import cpu_load
 from beers_deploy.model.simulator.acquire import MARGIN_PX, simulate_pair
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
@@ -18,7 +17,7 @@ from beers_deploy.model.traditional.pipeline import Chain, restore_traditional
 from beers_deploy.performance.host import conditions_of
 from beers_deploy.performance.swath import Swath, chain_rate, efficiency
 from beers_deploy.performance.tables import TABLE
-from beers_deploy.performance.timing import timed
+from beers_deploy.performance.timing import cpu_load, timed
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted
 from beers_deploy.profiles.sensor import Sensor
 
@@ -67,18 +66,14 @@ def measure_chain(dn: np.ndarray, degraded: Sensor, reference: Sensor) -> ChainT
     restore_traditional(crops[0][:32, :32], chain)
     # The load is measured from one call to the next: this one opens the window of the timed run.
     cpu_load()
-    times_s, _, power = timed(lambda: [_time_s(crop, chain) for crop in crops])
+    times_s, _, power = timed(
+        lambda: [timed(partial(restore_traditional, crop, chain))[1] for crop in crops]
+    )
     per_mpx = [1e6 * time_s / crop.numel() for time_s, crop in zip(times_s, crops, strict=True)]
     height, width = crops[0].shape
     return ChainTime(
         per_mpx, power, conditions_of(torch.get_num_threads()), f"{width} x {height} pixels"
     )
-
-
-def _time_s(dn: torch.Tensor, chain: Chain) -> float:
-    start_s = time.perf_counter()
-    restore_traditional(dn, chain)
-    return time.perf_counter() - start_s
 
 
 def drawn_acquisition(

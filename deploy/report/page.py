@@ -14,7 +14,7 @@ from beers_deploy import __version__
 from beers_deploy.model.io.files import write_text
 from beers_deploy.profiles.errors import visible
 from beers_deploy.profiles.figures import Figure, Row
-from beers_deploy.tables.columns import figures_of, missing, unit_of, words_of
+from beers_deploy.tables.columns import columns_of, missing, words_of
 
 INTERVAL = re.compile(r"\[[^\[\]]*\]")
 
@@ -100,13 +100,13 @@ def _grid(table: Section, *, upright: bool) -> dict[str, object]:
     that fits better.
     """
     rows = list(table.rows)
-    figures = figures_of(rows)
+    figures = columns_of(rows)
     words = words_of(rows)
-    columns = [_head(key, unit_of(key, rows)) for key in figures]
+    columns = [_head(column.name, column.unit) for column in figures]
     columns += [_head(word, word=True) for word in words]
     cells = []
     for row in rows:
-        line = [_cell(row.figures.get(key)) for key in figures]
+        line = [_cell(row.figures.get(column.name)) for column in figures]
         line += [_word(row.text.get(word, "")) for word in words]
         cells.append(line)
     heads = [_head(row.name) for row in rows]

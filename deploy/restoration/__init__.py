@@ -2,21 +2,19 @@
 
 `model.raster` reads an image by rows. It passes, in this order:
 
-    reading      how its pixels are understood, and what is demanded of them
     bands        a sensor, and so a network, for each band
-    plan         how it is cut into tiles, and the memory that takes
-    radiometry   which pixel value is full scale, and who states it
+    plan         how it is cut into tiles; memory: what that takes
+    radiometry   how its pixels are understood: which value is full scale, and who states it
     detectors    faults of detectors; a list of them, whose pixels are replaced
     sensor_check the comparison with its sensor, and whether it is raw at all
-    runtime      the network, on onnxruntime or OpenVINO, here or by the workers of a Dask scheduler
+    runtime      the network, on onnxruntime or OpenVINO, here or by the workers of a `cluster`
     steps        the steps around the network: its exposures, and the consistency step
     prepare      all of these made ready: `NetworkPipeline`
     traditional  the same for the traditional pipeline: `TraditionalPipeline`
     tiles        the one tile loop, for files, arrays and Dask
     outcome      a comparison of the result with the image
     figures      the figures of a run
-    journal      which rows are finished, and their digests
-    checkpoint   the finished rows on the disk, from which a later run can continue
+    checkpoint   the finished rows on the disk and their journal, from which a later run continues
     output       from the finished rows to the TIFF, plain or cloud-optimised
     stac         the STAC item of a cloud-optimised output
     run          all of this for one file: `restore_file`

@@ -3,7 +3,8 @@
 The pixels are those that `restore` writes of the same image in a file.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from importlib import import_module
 from typing import Any
 
@@ -21,47 +22,33 @@ from beers_deploy.model.raster.facts import (
 from beers_deploy.model.raster.source import ArraySource
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.restoration.prepare import NetworkPipeline, Pipeline
-from beers_deploy.restoration.reading import Reading
+from beers_deploy.restoration.radiometry import Reading
 from beers_deploy.restoration.tiles.engine import NAME
 from beers_deploy.restoration.tiles.lazy import restore_lazily
 from beers_deploy.restoration.tiles.rows import gathered
 
 
-@dataclass(frozen=True)
-class Job:
-    """How an array is restored.
-
-    Attributes:
-        pipeline: what restores it.
-        reading: how its pixels are understood.
-        nodata: the value of its missing pixels, besides NaN.
-    """
-
-    pipeline: Pipeline
-    reading: Reading
-    nodata: float | None
-
-
-def restore_array(image: Any, job: Job) -> Any:
+def restore_array(image: Any, reading: Reading, load: Callable[[], Pipeline]) -> Any:
     """Restore an array of any kind, and return the same kind.
 
     Args:
         image: (H, W) or (bands, H, W); of NumPy (masked or not) and torch it is restored at once;
             of Dask the result is lazy. An xarray.DataArray keeps coordinates and attributes.
-        job: how.
+        reading: how its pixels are understood.
+        load: returns what restores it.
     """
     # Arrays of xarray and torch are recognised by their attributes, so that neither is imported.
     if hasattr(image, "coords") and hasattr(image, "dims"):
-        return _restore_labelled(image, job)
+        return _restore_labelled(image, reading, load)
     if hasattr(image, "detach"):
-        restored = _restore(image.detach().cpu().numpy(), job)
+        restored = _restore(image.detach().cpu().numpy(), reading, load)
         return import_module("torch").from_numpy(restored).to(image.device)
     if np.ma.isMaskedArray(image):
-        return _restore_masked(image, job)
-    return _restore(image, job)
+        return _restore_masked(image, reading, load)
+    return _restore(image, reading, load)
 
 
-def _restore_labelled(image: Any, job: Job) -> Any:
+def _restore_labelled(image: Any, reading: Reading, load: Callable[[], Pipeline]) -> Any:
     """An xarray.DataArray; bands may stand behind the rows and columns where their dimension says
     so.
     """
@@ -72,24 +59,23 @@ def _restore_labelled(image: Any, job: Job) -> Any:
             "DataArray."
         )
     own = image.attrs
-    reading = job.reading
     require_raw(NAME, is_restored(str(own.get("TIFFTAG_SOFTWARE", "")), own), reading.force)
     full_scale = own.get("full_scale") if reading.full_scale is None else reading.full_scale
-    nodata = own.get("_FillValue") if job.nodata is None else job.nodata
+    nodata = own.get("_FillValue") if reading.nodata is None else reading.nodata
     dims = image.dims
     bands = next((dim for dim in image.dims if dim in BAND_DIMS), None)
     ordered = image if bands is None or image.ndim != 3 else image.transpose(bands, ...)
     if image.ndim == 3 and bands is None and ordered.shape[-1] <= FEW < min(ordered.shape[:-1]):
         raise _bands_last(ordered.shape, "name the dimension of the bands 'band'.")
-    scaled = replace(reading, full_scale=full_scale)
-    pixels = _restore(ordered.data, replace(job, reading=scaled, nodata=nodata))
+    reading = replace(reading, full_scale=full_scale, nodata=nodata)
+    pixels = _restore(ordered.data, reading, load)
     restored = _labelled(ordered, pixels)
     return restored if restored.ndim != len(dims) else restored.transpose(*dims)
 
 
-def _restore_masked(image: Any, job: Job) -> Any:
+def _restore_masked(image: Any, reading: Reading, load: Callable[[], Pipeline]) -> Any:
     """A masked array, whose masked pixels are missing and stay masked, enlarged with the image."""
-    restored = _restore(image, job)
+    restored = _restore(image, reading, load)
     mask = np.ma.getmaskarray(image)
     scale = restored.shape[-1] // mask.shape[-1]
     mask = mask.repeat(scale, axis=-2).repeat(scale, axis=-1)
@@ -99,28 +85,25 @@ def _restore_masked(image: Any, job: Job) -> Any:
     return np.ma.array(restored, mask=mask)
 
 
-def _restore(image: Any, job: Job) -> Any:
+def _restore(image: Any, reading: Reading, load: Callable[[], Pipeline]) -> Any:
     bands = _bands_first(image)
-    raster = _raster(bands, job.nodata)
-    restored = _restored(image, bands, raster, job)
-    return restored[0] if image.ndim == 2 and len(restored) == 1 else restored
-
-
-def _restored(image: Any, bands: Any, raster: Raster, job: Job) -> Any:
-    """Restore (bands, H, W), lazily if the image is an array of Dask."""
+    raster = _raster(bands, reading.nodata)
     if not hasattr(image, "__dask_graph__"):
-        return _restore_now(bands, raster, job)
-    if np.ma.isMaskedArray(getattr(image, "_meta", None)):
+        restored = _restore_now(bands, raster, reading, load())
+    elif np.ma.isMaskedArray(getattr(image, "_meta", None)):
         raise ImageError(
             "`image` is a masked Dask array, which is not supported. Fill it with "
             "dask.array.ma.filled(image, 0) and give that value as `nodata`, or compute it first."
         )
-    if not isinstance(job.pipeline, NetworkPipeline):
-        raise OptionError(
-            "`method` must be 'network' for a Dask array. Compute the array first, or use a "
-            "network."
-        )
-    return restore_lazily(bands, raster, job.pipeline, job.reading)
+    else:
+        pipeline = load()
+        if not isinstance(pipeline, NetworkPipeline):
+            raise OptionError(
+                "`method` must be 'network' for a Dask array. Compute the array first, or use a "
+                "network."
+            )
+        restored = restore_lazily(bands, raster, pipeline, reading)
+    return restored[0] if image.ndim == 2 and len(restored) == 1 else restored
 
 
 def _labelled(image: Any, pixels: Any) -> Any:
@@ -158,11 +141,13 @@ def _between(places: np.ndarray, count: int) -> np.ndarray | None:
     return np.asarray(places[left] + (at - left) * (places[left + 1] - places[left]))
 
 
-def _restore_now(bands: np.ndarray, raster: Raster, job: Job) -> np.ndarray:
-    work = job.pipeline.prepare(ArraySource(bands, raster), job.reading, NAME)
+def _restore_now(
+    bands: np.ndarray, raster: Raster, reading: Reading, pipeline: Pipeline
+) -> np.ndarray:
+    work = pipeline.prepare(ArraySource(bands, raster), reading, NAME)
     with steps("restoring", work.ticks(0)) as bar:
         pixels, tally = gathered(work.rows(0, bar.advance), work.out_shape, raster.out_dtype)
-    if not job.reading.force:
+    if not reading.force:
         tally.require(name=NAME)
     return pixels
 

@@ -1,10 +1,16 @@
-"""The finished rows of a run on the disk, so that a run that is killed at any moment can go on."""
+"""The finished rows of a run on the disk, so that a run that is killed at any moment can go on.
+
+A run that goes on with `resume` trusts nothing that it finds on the disk. The journal has a digest
+of its own, and each row of tiles is compared with what the journal states of it.
+"""
 
 import hashlib
+import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import asdict, astuple, dataclass
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -14,8 +20,8 @@ import numpy as np
 from beers_deploy.model.io.files import require_regular
 from beers_deploy.model.io.lock import part_folder
 from beers_deploy.model.raster.writer import padded_px
-from beers_deploy.profiles.errors import ImageError, MachineError, OptionError, sizes
-from beers_deploy.restoration.journal import FinishedRow, journal_text, read_journal
+from beers_deploy.profiles.errors import MachineError, OptionError, sizes
+from beers_deploy.profiles.toml import read_json
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.tiles.rows import RestoredRow
 
@@ -24,6 +30,78 @@ COG = "cog.tif"
 """Files of a checkpoint in which the output is written before it is renamed into place."""
 ROWS_FILES = ("journal.json", "journal.new", "rows.raw")
 """Files of a checkpoint; the journal first, because it counts on the rows."""
+
+
+@dataclass(frozen=True)
+class FinishedRow:
+    """One row of tiles that is stored.
+
+    Attributes:
+        rows_px: rows of pixels, the same for each band.
+        size_bytes: of the pixels of all bands.
+        sha256: hex digest of these bytes, band after band.
+        tally: what was seen of these pixels.
+    """
+
+    rows_px: int
+    size_bytes: int
+    sha256: str
+    tally: Tally
+
+
+def journal_text(job: Mapping[str, object], finished: Sequence[FinishedRow]) -> str:
+    """Return the content of a journal.
+
+    Args:
+        job: all that decides the pixels.
+        finished: the stored rows of tiles, from the top.
+    """
+    content = {
+        "job": job,
+        "rows": sum(row.rows_px for row in finished),
+        "finished": [asdict(row) for row in finished],
+    }
+    return json.dumps(content | {"sha256": _digest(content)})
+
+
+def read_journal(path: Path, job: Mapping[str, object]) -> list[FinishedRow]:
+    """Read the finished rows of a journal.
+
+    Args:
+        path: of the journal.
+        job: that it must belong to.
+
+    Raises:
+        ValueError: a damaged journal, or one of another job.
+        LookupError: a journal without one of its keys.
+        TypeError: a value of another type.
+        OSError: a journal that cannot be read.
+    """
+    document: Any = read_json(path)
+    content: dict[str, Any] = dict(document)
+    # `resume` trusts nothing that it finds on the disk: a journal has a digest of its own.
+    if content.pop("sha256") != _digest(content):
+        raise ValueError("damaged")
+    if content["job"] != job:
+        raise ValueError("another job")
+    finished = [
+        FinishedRow(**row | {"tally": Tally(**row["tally"])}) for row in content["finished"]
+    ]
+    if not all(map(_possible, finished)):
+        raise ValueError("impossible counts")
+    return finished
+
+
+def _possible(row: FinishedRow) -> bool:
+    """Return True if counts are integers, and nothing that is counted or summed is below zero."""
+    tally = zip(astuple(row.tally), astuple(Tally()), strict=True)
+    numbers = all(isinstance(value, int | type(zero)) and value >= 0 for value, zero in tally)
+    return numbers and isinstance(row.rows_px, int) and row.rows_px > 0
+
+
+def _digest(content: Mapping[str, object]) -> str:
+    """Return the hex digest of a journal without its own digest."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 class Checkpoint:
@@ -113,14 +191,6 @@ class Checkpoint:
             self.folder / "rows.raw", self.dtype, count, offset=self._offset(band, start)
         )
         return pixels.reshape(-1, self.shape[2])
-
-    def require_known(self, name: str) -> None:
-        """Refuse an image, `name` in messages, that has no pixels with values."""
-        if not self.tally.known:
-            raise ImageError(
-                f"{name} has no pixels with values, only NaN or nodata. Check that it is the right "
-                "file."
-            )
 
     def remove(self) -> None:
         """Throw the rows away; the journal first, so that nothing is left that counts on them."""

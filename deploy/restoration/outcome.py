@@ -197,16 +197,13 @@ class Tally:
     @property
     def spreads(self) -> tuple[float, float]:
         """Standard deviation before and after, in shares of full scale."""
-        squares = (
-            self.before_squared / max(self.compared, 1),
-            self.after_squared / max(self.known, 1),
-        )
+        before, after = self.means
+        before_square = self.before_squared / max(self.compared, 1)
+        after_square = self.after_squared / max(self.known, 1)
         # Rounding may leave the mean square below the square of the mean.
-        before, after = (
-            math.sqrt(max(square - mean**2, 0))
-            for square, mean in zip(squares, self.means, strict=True)
+        return math.sqrt(max(before_square - before**2, 0)), math.sqrt(
+            max(after_square - after**2, 0)
         )
-        return before, after
 
     @property
     def flat(self) -> bool:

@@ -1,7 +1,7 @@
 """From the finished rows of a checkpoint to the restored TIFF, plain or cloud-optimised."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -12,7 +12,7 @@ from beers_deploy.model.io.files import TIFF_SUFFIXES
 from beers_deploy.model.raster.compression import Compression
 from beers_deploy.model.raster.facts import RESTORED_BY
 from beers_deploy.model.raster.source import Source
-from beers_deploy.model.raster.writer import require_equal, write_raster
+from beers_deploy.model.raster.writer import require_equal, write_cog, write_raster
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.quant.onnx_file import metadata
@@ -41,10 +41,6 @@ class Output:
     others: tuple[Path | None, ...] = ()
 
 
-ToCog = Callable[[Path, Path], None]
-"""Writes a TIFF again, cloud-optimised."""
-
-
 def require_tiff_name(path: Path) -> None:
     """Refuse a name under which no program would look for a TIFF."""
     if path.suffix.lower() not in OUT_SUFFIXES:
@@ -65,21 +61,19 @@ def what_was_done(networks: Sequence[Network], scale: FullScale) -> dict[str, st
     """Return the run as an image's metadata: tool, networks in the order of the bands, their
     sensors and full scale.
     """
-    tool = {RESTORED_BY: f"beers-deploy {version('beers-deploy')}"}
-    if not networks:
-        return {
-            **tool,
-            "RESTORED_NETWORK": "none: the traditional pipeline",
-            "RESTORED_FULL_SCALE": scale.words,
-        }
-    entries = [metadata(network.model) for network in networks]
-    return {
-        **tool,
-        "RESTORED_NETWORK_SHA256": ", ".join(network.sha256 for network in networks),
-        "RESTORED_NETWORK": ", ".join(entry.get("variant", "not stated") for entry in entries),
-        "RESTORED_SENSOR": ", ".join(entry.get("sensor", "not stated") for entry in entries),
+    about = {
+        RESTORED_BY: f"beers-deploy {version('beers-deploy')}",
+        "RESTORED_NETWORK": "none: the traditional pipeline",
         "RESTORED_FULL_SCALE": scale.words,
     }
+    if networks:
+        entries = [metadata(network.model) for network in networks]
+        about |= {
+            "RESTORED_NETWORK_SHA256": ", ".join(network.sha256 for network in networks),
+            "RESTORED_NETWORK": ", ".join(entry.get("variant", "not stated") for entry in entries),
+            "RESTORED_SENSOR": ", ".join(entry.get("sensor", "not stated") for entry in entries),
+        }
+    return about
 
 
 class RestoredPixels:
@@ -103,28 +97,25 @@ class RestoredPixels:
 
 
 def write_output(
-    checkpoint: Checkpoint,
-    source: Source,
-    compression: Compression,
-    to_cog: ToCog | None = None,
+    checkpoint: Checkpoint, source: Source, output: Output, about: Mapping[str, str]
 ) -> None:
     """Write the checkpoint's rows to the output, rename it into place, remove the checkpoint.
 
     Args:
         checkpoint: with every row.
         source: the image, whose mask or alpha is copied.
-        compression: of the TIFF; none if it will be cloud-optimised.
-        to_cog: writes the TIFF again, cloud-optimised; None leaves it as it is.
+        output: what is written.
+        about: metadata of a Cloud-Optimised GeoTIFF.
     """
     raster = source.raster.enlarged(checkpoint.shape)
     pixels = RestoredPixels(checkpoint, source)
     fresh = checkpoint.folder / PLAIN
     with checkpoint.disk():
-        write_raster(fresh, raster, pixels, compression)
-        if to_cog is not None:
+        write_raster(fresh, raster, pixels, "none" if output.cog else output.compression)
+        if output.cog:
             plain = fresh
             fresh = checkpoint.folder / COG
-            to_cog(plain, fresh)
+            write_cog(plain, fresh, output.compression, about)
             require_equal(fresh, raster, pixels)
         with fresh.open("r+b") as stream:
             os.fsync(stream.fileno())

@@ -4,20 +4,16 @@ A tile is read with a halo of `halo_px` pixels around what is kept of it. Where 
 network's receptive radius, the result is the whole image's, bit for bit (`quant.tiling`). A network
 with strides is given tiles that begin and end at multiples of its lattice; the last ones reach
 beyond an image that is no multiple of it, which is extended there by copies of its last row and
-column. Whether a run fits into memory is looked at before it begins.
+column.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
-import psutil
-
-from beers_deploy.model.raster.source import Source
 from beers_deploy.network import Network
-from beers_deploy.profiles.errors import MachineError, ModelError, OptionError, printable, sizes
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.quant.tiling.receptive_field import Tiling
+from beers_deploy.profiles.errors import ModelError, OptionError, printable
 
 
 @dataclass(frozen=True)
@@ -265,61 +261,3 @@ def _require_fit(bands: int, halo_px: int, tiling: Tiling) -> None:
             f"network repeat, got {halo_px} px. A halo of {tiling.halo_px} px is exact for this "
             "network."
         )
-
-
-FLOAT_BYTES = np.dtype(np.float32).itemsize
-
-
-def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
-    """Memory that rows of the image will take beyond what is held now.
-
-    Three strips as read: two in work and one on its way. Three rows of tiles in float32, as the
-    network gave them: one waits for the row below it, and one more is begun. Two finished rows, and
-    what the source holds. Once the run has `begun`, the first strip and the source's share are
-    there already. Where pixels may be missing, each has a flag, and one more while flags are made.
-    """
-    raster = source.raster
-    row_px = raster.bands * raster.width_px
-    # `may_miss` adds one byte a pixel: the flag of a missing one.
-    strip_bytes = plan.strip_rows_px * row_px * (raster.dtype.itemsize + raster.may_miss)
-    flags = plan.strip_rows_px * row_px * raster.may_miss
-    source_bytes = 0 if begun else strip_bytes + source.held_bytes(plan.strip_rows_px)
-    bands, _, width_px = plan.out_shape
-    row_values = plan.tile_shape[0] * plan.scale * bands * width_px
-    restored = row_values * (3 * FLOAT_BYTES + 2 * raster.out_dtype.itemsize)
-    return 2 * strip_bytes + flags + restored + source_bytes
-
-
-def check_memory(rows: int, budget_bytes: int | None, bulky: bool) -> int:
-    """The process's peak memory in bytes: what it holds now, and the rows to come.
-
-    Args:
-        rows: bytes that rows of the image will take.
-        budget_bytes: None allows what is free.
-        bulky: most of them for the sake of an image in large strips.
-    """
-    resident_bytes = psutil.Process().memory_info().rss
-    # What this process holds already is not part of what is free.
-    allowed_bytes = budget_bytes or psutil.virtual_memory().available + resident_bytes
-    if resident_bytes + rows <= allowed_bytes:
-        return resident_bytes + rows
-    limit, before, rows_size = sizes(allowed_bytes, resident_bytes, rows)
-    smaller = (
-        "Rewrite the image in tiles (gdal_translate -co TILED=YES)"
-        if bulky
-        else "Use a smaller `tile`"
-    )
-    remedy = (
-        f"{smaller}, or allow more memory"
-        if resident_bytes < allowed_bytes
-        else f"Allow more memory than {before}"
-    )
-    raise MachineError(
-        f"The run may use {limit} of memory, but the process already uses {before}, and rows of "
-        f"the image need {rows_size}. {remedy}."
-    )
-
-
-def is_bulky(source: Source, plan: Plan) -> bool:
-    """Whether most of the memory is for the image's own strips or tiles."""
-    return source.held_bytes(1) > rows_bytes(source, plan) / 2

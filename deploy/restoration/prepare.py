@@ -10,36 +10,27 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
+from itertools import chain
 from typing import Protocol
 
 import onnx
 
-from beers_deploy.cluster import Cluster
 from beers_deploy.model.raster.source import Source
 from beers_deploy.network import Network
 from beers_deploy.profiles.figures import Figure
 from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.restoration.bands import in_order, require_alike
+from beers_deploy.restoration.cluster import Cluster
 from beers_deploy.restoration.detectors.words import warn_of_detectors
 from beers_deploy.restoration.figures import plan_figures, seam_figures
+from beers_deploy.restoration.memory import check_memory, is_bulky, rows_bytes
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.plan import (
-    Plan,
-    Span,
-    Tiles,
-    check_memory,
-    is_bulky,
-    plan_for,
-    rows_bytes,
-)
-from beers_deploy.restoration.radiometry import FullScale, full_scale_of
-from beers_deploy.restoration.reading import Reading
+from beers_deploy.restoration.plan import Plan, Span, Tiles, plan_for
+from beers_deploy.restoration.radiometry import FullScale, Reading, full_scale_of
 from beers_deploy.restoration.runtime import (
     AtFirstCall,
     Engine,
     Infer,
-    Packed,
     infer_on,
     open_runtime,
     tiles_at_once,
@@ -50,7 +41,6 @@ from beers_deploy.restoration.steps import (
     consistency_steps,
     exposed_networks,
     exposures_of,
-    factor_words,
 )
 from beers_deploy.restoration.tiles.engine import Restorer
 from beers_deploy.restoration.tiles.rows import RestoredRow, restore_rows, rows_to_run
@@ -77,6 +67,14 @@ class Restoration(ABC):
         scale: the pixel value that is full scale.
         check: what was seen of the image's sensor.
         check_s: the time that took.
+        out_shape: of the restored image, (bands, H, W).
+        row_ends: the row of the restored image at which each row of tiles ends, where a later run
+            can go on; empty if none can.
+        identity: all that decides the pixels, besides the image and the full scale. Who computes,
+            on how many machines, is no part of it.
+        how: what computes, for the figures of time.
+        text: the run in words.
+        steady_ticks: the number of ticks after which memory is checked again; 0 if it is not.
     """
 
     source: Source
@@ -87,31 +85,12 @@ class Restoration(ABC):
     scale: FullScale
     check: SensorCheck
     check_s: float
-
-    @property
-    @abstractmethod
-    def out_shape(self) -> tuple[int, int, int]:
-        """Of the restored image, (bands, H, W)."""
-
-    @property
-    @abstractmethod
-    def row_ends(self) -> Sequence[int]:
-        """The row of the restored image at which each row of tiles ends, where a later run can go
-        on; empty if none can.
-        """
-
-    @property
-    @abstractmethod
-    def identity(self) -> Mapping[str, object]:
-        """All that decides the pixels, besides the image and the full scale.
-
-        Who computes, on how many machines, is no part of it.
-        """
-
-    @property
-    @abstractmethod
-    def how(self) -> str:
-        """What computes, for the figures of time."""
+    out_shape: tuple[int, int, int]
+    row_ends: Sequence[int] = ()
+    identity: Mapping[str, object]
+    how: str
+    text: Mapping[str, str]
+    steady_ticks: int = 0
 
     @abstractmethod
     def ticks(self, done_px: int) -> int:
@@ -120,11 +99,6 @@ class Restoration(ABC):
     @abstractmethod
     def rows(self, done_px: int, tick: Tick) -> Generator[RestoredRow, None, None]:
         """Restore the rows from `done_px` of the restored image on, in order."""
-
-    @property
-    def steady_ticks(self) -> int:
-        """The number of ticks after which memory is checked again; 0 if it is not."""
-        return 0
 
     def memory_bytes(self) -> int:
         """Return the peak memory of the process, once it grows no more by itself.
@@ -137,17 +111,9 @@ class Restoration(ABC):
     def figures(self, tally: Tally) -> dict[str, Figure]:
         """Return the figures of a run."""
 
-    @abstractmethod
-    def text(self) -> dict[str, str]:
-        """Return the run in words."""
-
 
 class Pipeline(Protocol):
     """What can restore an image."""
-
-    @property
-    def network_paths(self) -> list[Path]:
-        """The files of its networks, which no output may be."""
 
     @property
     def engine(self) -> Engine:
@@ -171,53 +137,16 @@ class NetworkRestoration(Restoration):
     """A network that restores one image.
 
     Attributes:
-        around: which steps around the network are used.
-        engine: what runs it.
         plan: how the image is cut into tiles.
         restorer: what restores a tile.
         at_once: tiles in work at a time.
-        runtime: name and version of what runs the network.
-        consistency: whether the consistency step is taken, in words.
         seams: figures of the error at seams.
     """
 
-    around: Around
-    engine: Engine
     plan: Plan
     restorer: Restorer
     at_once: int
-    runtime: str
-    consistency: str
     seams: Mapping[str, Figure]
-
-    @property
-    def out_shape(self) -> tuple[int, int, int]:
-        """Of the restored image, (bands, H, W)."""
-        return self.plan.out_shape
-
-    @property
-    def row_ends(self) -> Sequence[int]:
-        """The row of the restored image at which each row of tiles ends."""
-        return [row.keep_stop * self.plan.scale for row in self.plan.rows]
-
-    @property
-    def identity(self) -> Mapping[str, object]:
-        """All that decides the pixels, besides the image and the full scale."""
-        factors = [exposures_of(network, self.around) for network in self.networks]
-        return {
-            "model": [network.sha256 for network in self.networks],
-            "exposures": [[other.sha256 for other in others.values()] for others in factors],
-            "factors": [sorted(others) for others in factors],
-            "consistency": bool(self.restorer.consistency),
-            "tile_px": self.plan.tile_px,
-            "halo_px": self.plan.halo_px,
-            "runtime": self.runtime,
-        }
-
-    @property
-    def how(self) -> str:
-        """What computes, for the figures of time."""
-        return self.runtime
 
     def _rows_left(self, done_px: int) -> list[Span]:
         return [row for row in self.plan.rows if row.keep_start * self.plan.scale >= done_px]
@@ -234,11 +163,6 @@ class NetworkRestoration(Restoration):
             self.source, self.plan, self.restorer, rows, lambda: tick(1), self.at_once
         )
 
-    @property
-    def steady_ticks(self) -> int:
-        """The number of tiles after which the runtime takes no more memory."""
-        return RUNS_UNTIL_STEADY * self.at_once
-
     def memory_bytes(self) -> int:
         """Return the peak memory: what the process holds, and the rows to come."""
         needed = rows_bytes(self.source, self.plan, begun=True)
@@ -248,19 +172,11 @@ class NetworkRestoration(Restoration):
     def figures(self, tally: Tally) -> dict[str, Figure]:
         """Return the figures of a run."""
         figures = {**plan_figures(self.plan), **self.seams, **tally.figures}
-        if any(exposures_of(network, self.around) for network in self.networks):
+        if any(len(network.infers) > 1 for network in self.restorer.networks):
             figures |= tally.exposure_figures
         if self.restorer.consistency:
             figures |= tally.consistency_figures
         return figures
-
-    def text(self) -> dict[str, str]:
-        """Return the run in words."""
-        text = {"halo": self.plan.halo_words, "consistency": self.consistency}
-        if words := factor_words(self.networks, self.around):
-            text["exposures"] = words
-        workers = self.engine.scheduler
-        return text | {"runtime": self.runtime} | ({"workers": workers} if workers else {})
 
 
 @dataclass(frozen=True)
@@ -278,11 +194,6 @@ class NetworkPipeline:
     tiles: Tiles = Tiles()  # noqa: RUF009 - frozen
     engine: Engine = Engine()  # noqa: RUF009 - frozen
     around: Around = Around()  # noqa: RUF009 - frozen
-
-    @property
-    def network_paths(self) -> list[Path]:
-        """The files of the networks, which no output may be."""
-        return [network.path for network in self.networks.values() if network.path]
 
     def prepare(
         self, source: Source, reading: Reading, name: str, cluster: Cluster | None = None
@@ -305,6 +216,23 @@ class NetworkPipeline:
         # Values above an assumed full scale show that the assumption is wrong, so they are refused.
         clips = not scale.assumed
         restorer = Restorer(raster, exposed, scale.value, plan.tiling, name, clips, steps)
+        others = [exposures_of(network, self.around) for network in networks]
+        identity = {
+            "model": [network.sha256 for network in networks],
+            "exposures": [[other.sha256 for other in each.values()] for each in others],
+            "factors": [sorted(each) for each in others],
+            "consistency": bool(steps),
+            "tile_px": plan.tile_px,
+            "halo_px": plan.halo_px,
+            "runtime": runtime,
+        }
+        text = {"halo": plan.halo_words, "consistency": words}
+        if any(others):
+            factors = sorted(set(chain([1], *others)))
+            text["exposures"] = ", ".join(f"x{factor}" for factor in factors)
+        text["runtime"] = runtime
+        if self.engine.scheduler:
+            text["workers"] = self.engine.scheduler
         return NetworkRestoration(
             source=source,
             name=name,
@@ -314,20 +242,22 @@ class NetworkPipeline:
             scale=scale,
             check=check,
             check_s=check_s,
-            around=self.around,
-            engine=self.engine,
+            out_shape=plan.out_shape,
+            row_ends=[row.keep_stop * plan.scale for row in plan.rows],
+            identity=identity,
+            how=runtime,
+            text=text,
+            steady_ticks=RUNS_UNTIL_STEADY * at_once,
             plan=plan,
             restorer=restorer,
             at_once=at_once,
-            runtime=runtime,
-            consistency=words,
             seams=seam_figures(source, plan, restorer),
         )
 
 
 def _opener(
     plan: Plan, engine: Engine, networks: Sequence[Network], cluster: Cluster | None
-) -> tuple[Callable[[onnx.ModelProto, bool], Infer], int, str]:
+) -> tuple[Callable[[onnx.ModelProto], Infer], int, str]:
     """Return what makes a network ready to run, how many tiles are in work, and the runtime.
 
     The first network is opened at once, because it tells whether the runtime takes it. Others are
@@ -335,22 +265,20 @@ def _opener(
     """
     threads = 1 if cluster else engine.threads
     at_once = tiles_at_once(threads, plan.tiles)
-    first, runtime = open_runtime(engine.runtime, networks[0].model, threads, at_once)
+    first_model = networks[0].model
+    first, runtime = open_runtime(engine.runtime, first_model, threads, at_once)
     if cluster is None:
 
-        def open_here(model: onnx.ModelProto, at_first_call: bool) -> Infer:
-            if model is networks[0].model:
+        def open_here(model: onnx.ModelProto) -> Infer:
+            if model is first_model:
                 return first
-            if at_first_call:
-                return AtFirstCall(partial(open_runtime, engine.runtime, model, threads, at_once))
-            return open_runtime(engine.runtime, model, threads, at_once)[0]
+            return AtFirstCall(partial(open_runtime, engine.runtime, model, threads, at_once))
 
         return open_here, at_once, runtime
     workers = cluster
 
-    def open_there(model: onnx.ModelProto, at_first_call: bool) -> Infer:  # noqa: ARG001
-        packed = Packed(model.SerializeToString(), engine.runtime, engine.threads or 1)
-        return infer_on(workers, packed)
+    def open_there(model: onnx.ModelProto) -> Infer:
+        return infer_on(workers, engine.packed(model))
 
     # Two rows of tiles are in work: two tiles for each of the cluster's calls keep it busy.
     at_once = max(min(2 * cluster.slots, 2 * plan.row_tiles), 1)

@@ -1,12 +1,12 @@
-"""Which pixel value is full scale, and who says so: the user, the file, the sensor's profile, or
-nobody.
+"""How the pixels of an image are understood: which value is full scale, and who says so: the user,
+the file, the sensor's profile, or nobody.
 
 What nobody states is assumed in sight: 12 bits. Values above a stated full scale are clipped,
 counted and told; above an assumed one they show that the assumption is wrong, and are refused.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -14,6 +14,37 @@ from beers_deploy.model.raster.facts import Extent, Raster
 from beers_deploy.model.raster.full_scale import settled_scale
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.instrument import MAX_DN
+from beers_deploy.profiles.sensor import Sensor
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How the pixels of an image are understood.
+
+    Attributes:
+        sensors: that the user names, by band; under no name where one is for all, empty where none
+            is named.
+        full_scale: the pixel value that is 1.0 to a network; None leaves it to `radiometry`.
+        nodata: the value of an array's missing pixels, besides NaN; a file states its own.
+        strict: whether an image is refused that contradicts its sensor.
+        force: whether an image is accepted that was restored already, an index may lead to tiles
+            outside its folder and at URLs, and any result is written.
+        memory_bytes: budget of this process; None is what is free.
+        fix_detectors: the list of faulty detectors to replace, or 'found'; empty to replace none.
+    """
+
+    sensors: Mapping[str, Sensor] = field(default_factory=dict)
+    full_scale: float | None = None
+    nodata: float | None = None
+    strict: bool = False
+    force: bool = False
+    memory_bytes: int | None = None
+    fix_detectors: str = ""
+
+    @property
+    def sensor_bits(self) -> int | None:
+        """Bits of a digital number, where a sensor is named."""
+        return min((int(sensor.bits.low) for sensor in self.sensors.values()), default=None)
 
 
 @dataclass(frozen=True)

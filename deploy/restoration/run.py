@@ -8,41 +8,33 @@ new one; finished rows stay in the checkpoint where a later run can go on.
 
 import logging
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
-from functools import partial
 from importlib.metadata import version
 from math import prod
 from pathlib import Path
 
-from beers_deploy.cluster import open_cluster
-from beers_deploy.host_state import peak_memory
 from beers_deploy.model.io.files import require_writable
 from beers_deploy.model.io.lock import only_run
-from beers_deploy.model.processor import require_cores
 from beers_deploy.model.progress import held_back, steps
 from beers_deploy.model.raster.facts import require_raw
 from beers_deploy.model.raster.reader import open_raster, require_image_file
 from beers_deploy.model.raster.source import Source, fingerprint, stamps
-from beers_deploy.model.raster.writer import cog_bytes, require_codec, write_cog
+from beers_deploy.model.raster.writer import cog_bytes, require_codec
 from beers_deploy.profiles.errors import BeersError, ImageError, MachineError
 from beers_deploy.profiles.figures import Row, measured
 from beers_deploy.profiles.sensor import numbers_of
 from beers_deploy.restoration.bands import in_order
 from beers_deploy.restoration.checkpoint import Checkpoint
+from beers_deploy.restoration.cluster import open_cluster
 from beers_deploy.restoration.detectors.fault_list import FOUND, FaultList, list_beside, write_list
 from beers_deploy.restoration.detectors.fix import faults_of, fixed
-from beers_deploy.restoration.output import (
-    Output,
-    ToCog,
-    require_tiff_name,
-    what_was_done,
-    write_output,
-)
+from beers_deploy.restoration.memory import peak_memory
+from beers_deploy.restoration.output import Output, require_tiff_name, what_was_done, write_output
 from beers_deploy.restoration.prepare import Pipeline, Restoration
-from beers_deploy.restoration.reading import Reading
+from beers_deploy.restoration.radiometry import Reading
 from beers_deploy.restoration.tiles.rows import RestoredRow
 from beers_deploy.results import Input, Table
 
@@ -75,23 +67,24 @@ class Run(Table):
     time_s: float
 
 
-def restore_file(image: Path, output: Output, pipeline: Pipeline, reading: Reading) -> Run:
+def restore_file(
+    image: Path, output: Output, reading: Reading, load: Callable[[], Pipeline]
+) -> Run:
     """Restore an image file into a TIFF, and return the run's figures.
 
     Args:
         image: a file that `model.raster.reader.open_raster` opens, of any size.
         output: the TIFF, of the type `Raster.out_dtype`, in the scale of the image; larger by the
             network's factor where it has one, and in its place on Earth.
-        pipeline: what restores it.
         reading: how its pixels are understood.
+        load: returns what restores it; called once the image and the output are accepted.
     """
-    started = time.perf_counter()
     out = output.path
-    engine = pipeline.engine
-    if engine.scheduler is None:
-        require_cores("threads", engine.threads)
-    paths = [image, *pipeline.network_paths]
-    with begun(output, reading, paths) as stored, open_cluster(engine.scheduler) as cluster:
+    with ExitStack() as stack:
+        stored = stack.enter_context(begun(image, output, reading))
+        pipeline = load()
+        started = time.perf_counter()
+        cluster = stack.enter_context(open_cluster(pipeline.engine.scheduler))
         before = stamps(stored.files)
         if stored.raster.mask_kind == "alpha":
             logger.info(ALPHA.format(band=stored.raster.bands + 1))
@@ -104,9 +97,8 @@ def restore_file(image: Path, output: Output, pipeline: Pipeline, reading: Readi
             require_unchanged(stored, str(image), before, checkpoint.job["image"])
         # All rows are finished: a stop now would save nothing.
         with held_back():
-            to_cog = _to_cog(output, work)
-            compression = "none" if to_cog else output.compression
-            write_output(checkpoint, work.source, compression, to_cog)
+            about = what_was_done(work.networks, work.scale)
+            write_output(checkpoint, work.source, output, about)
             write_list(faults, list_beside(out, reading.fix_detectors))
     # The sensor check is no part of a restoration, and its time is a figure of its own.
     time_s = time.perf_counter() - started - work.check_s
@@ -141,17 +133,13 @@ def _inputs(work: Restoration) -> list[Input]:
 
 
 @contextmanager
-def begun(output: Output, reading: Reading, inputs: Sequence[Path]) -> Iterator[Source]:
+def begun(image: Path, output: Output, reading: Reading) -> Iterator[Source]:
     """Open the image of the only run on an output, once all that can be checked before is checked.
 
-    Args:
-        output: as of `restore_file`.
-        reading: as of `restore_file`.
-        inputs: the image, then other files that are read.
+    The arguments are those of `restore_file`.
     """
-    image = inputs[0]
     require_image_file(image)
-    require_writable(output.path, inputs=inputs)
+    require_writable(output.path, inputs=[image])
     require_tiff_name(output.path)
     require_codec(output.compression)
     with only_run(output.path), open_raster(image, reading.force) as source:
@@ -189,14 +177,6 @@ def _checkpoint(output: Output, work: Restoration, faults: FaultList) -> Checkpo
             checkpoint.damaged_rows,
         )
     return checkpoint
-
-
-def _to_cog(output: Output, work: Restoration) -> ToCog | None:
-    """Return what writes the output again as a COG, if the user asks for one."""
-    if not output.cog:
-        return None
-    about = what_was_done(work.networks, work.scale)
-    return partial(write_cog, compression=output.compression, about=about)
 
 
 def require_unchanged(
@@ -237,7 +217,11 @@ def _finish_rows(checkpoint: Checkpoint, work: Restoration) -> None:
         # A generator that is closed cancels the tiles that still wait.
         with closing(work.rows(checkpoint.rows, tick)) as finished:
             _write_behind(finished, checkpoint)
-        checkpoint.require_known(work.name)
+        if not checkpoint.tally.known:
+            raise ImageError(
+                f"{work.name} has no pixels with values, only NaN or nodata. Check that it is the "
+                "right file."
+            )
         if not work.reading.force:
             checkpoint.tally.require(work.name)
     for doubt in checkpoint.tally.doubts:
@@ -314,5 +298,6 @@ def _row(
         **work.check.figures,
         **work.figures(checkpoint.tally),
     }
-    text = {**work.scale.text, **work.check.text, **faults.text_of_row, **work.text()}
+    replaced = {"detectors replaced": faults.words} if faults.faults else {}
+    text = {**work.scale.text, **work.check.text, **replaced, **work.text}
     return Row("restore", name, figures, text)

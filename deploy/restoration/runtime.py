@@ -15,12 +15,12 @@ import onnx
 import onnxruntime as ort
 from onnx import helper, numpy_helper
 
-from beers_deploy.cluster import Cluster
 from beers_deploy.model.processor import asked, require_cores
 from beers_deploy.profiles.errors import ModelError, optional, reason_of
 from beers_deploy.quant.kernels import made_exact
 from beers_deploy.quant.onnx_file import is_quantized, parse_onnx
 from beers_deploy.quant.session import open_session, tensors_of
+from beers_deploy.restoration.cluster import Cluster
 
 Runtime = Literal["onnxruntime", "openvino"]
 """The library that runs a network."""
@@ -46,12 +46,21 @@ class Engine:
     threads: int = 0
     scheduler: str | None = None
 
+    def __post_init__(self) -> None:
+        # How many threads a worker of a scheduler may have is not known here.
+        if self.scheduler is None:
+            require_cores("threads", self.threads)
+
+    def packed(self, model: onnx.ModelProto) -> "Packed":
+        """Return a network for a worker, which takes one thread unless the user gives a number."""
+        return Packed(model.SerializeToString(), self.runtime, self.threads or 1)
+
 
 LOWEST = "openvino.lowest_uint8"
 
 
 def open_openvino(model: onnx.ModelProto, threads: int, at_once: int = 1) -> tuple[Infer, str]:
-    """As `open_runtime`."""
+    """Return a network ready to run on OpenVINO; see `open_runtime`."""
     openvino = optional("openvino", "runtime")
     # This fills a table: two threads that are its first callers lock each other up (2026.4).
     openvino.Type.f32.to_dtype()
@@ -203,14 +212,12 @@ class Packed:
     Attributes:
         content: bytes of its ONNX file.
         runtime: what runs it.
-        threads: of the runtime, in all.
-        at_once: how many callers share the threads.
+        threads: of the runtime.
     """
 
     content: bytes
     runtime: Runtime
     threads: int
-    at_once: int = 1
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """As an `Infer`."""
@@ -227,8 +234,7 @@ _opening = Lock()
 @lru_cache(maxsize=NETWORKS_KEPT)
 def _opened(packed: Packed) -> Infer:
     network = parse_onnx(packed.content, "network")
-    infer, _ = open_runtime(packed.runtime, network, packed.threads, packed.at_once)
-    return infer
+    return open_runtime(packed.runtime, network, packed.threads)[0]
 
 
 def infer_on(cluster: Cluster, packed: Packed) -> Infer:

@@ -5,9 +5,8 @@ sensor; the consistency step needs a known sensor, and a network that gives one 
 band for each pixel.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 
 import onnx
 
@@ -52,7 +51,7 @@ def exposed_networks(
     around: Around,
     tiling: Tiling,
     full_scale: float,
-    opened: Callable[[onnx.ModelProto, bool], Infer],
+    opened: Callable[[onnx.ModelProto], Infer],
 ) -> tuple[ExposedNetwork, ...]:
     """Build the network of each band at its exposures.
 
@@ -61,17 +60,17 @@ def exposed_networks(
         around: whether higher exposures are used.
         tiling: how the networks meet an image.
         full_scale: the pixel value that is 1.0 to a network.
-        opened: makes a network ready to run, at its first call if so asked.
+        opened: makes a network ready to run.
     """
     built = []
     for network in networks:
         others = exposures_of(network, around)
-        infers = {factor: opened(other.model, True) for factor, other in others.items()}
+        infers = {factor: opened(other.model) for factor, other in others.items()}
         offset = 0.0
         if network.profile is not None and others:
             offset = offset_of(network.profile, full_scale)
-        first = opened(network.model, False)
-        built.append(ExposedNetwork({1: first, **infers}, tiling.halo_px, offset))
+        infers = {1: opened(network.model), **infers}
+        built.append(ExposedNetwork(infers, tiling.halo_px, offset))
     return tuple(built)
 
 
@@ -117,9 +116,3 @@ def keeps_pixels(tiling: Tiling) -> bool:
 def step_for(sensor: Sensor, full_scale: float) -> Consistency:
     """Build the consistency step for the middle of a sensor's ranges and its reference."""
     return Consistency.of(sensor.nominal(), sensor.reference.nominal(), full_scale)
-
-
-def factor_words(networks: Iterable[Network], around: Around) -> str:
-    """Return the factors that may be used, in words; empty if there is only one."""
-    factors = sorted(set(chain.from_iterable(exposures_of(each, around) for each in networks)))
-    return ", ".join(f"x{factor}" for factor in (1, *factors)) if factors else ""

@@ -6,26 +6,24 @@ and bits, so that the output has the scale of the input. Bands are restored one 
 own sensor.
 """
 
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from beers_deploy.cluster import Cluster
 from beers_deploy.model.progress import Steps, steps
 from beers_deploy.model.raster.source import Source, strips
 from beers_deploy.model.traditional.pipeline import Chain, restore_strips
 from beers_deploy.profiles.figures import Figure
-from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.bands import in_order
+from beers_deploy.restoration.cluster import Cluster
+from beers_deploy.restoration.memory import check_memory
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.plan import Span, check_memory
+from beers_deploy.restoration.plan import Span
 from beers_deploy.restoration.prepare import Restoration, check_sensor
-from beers_deploy.restoration.radiometry import full_scale_of
-from beers_deploy.restoration.reading import Reading
+from beers_deploy.restoration.radiometry import Reading, full_scale_of
 from beers_deploy.restoration.runtime import Engine
 from beers_deploy.restoration.tiles.engine import as_stored, checked_strip
 from beers_deploy.restoration.tiles.rows import RestoredRow
@@ -48,31 +46,9 @@ class TraditionalRestoration(Restoration):
 
     Attributes:
         chains: the pipeline of each band.
-        sensors: the sensor of each band.
     """
 
     chains: tuple[Chain, ...]
-    sensors: tuple[Sensor, ...]
-
-    @property
-    def out_shape(self) -> tuple[int, int, int]:
-        """That of the image."""
-        return self.source.raster.shape
-
-    @property
-    def row_ends(self) -> Sequence[int]:
-        """None."""
-        return ()
-
-    @property
-    def identity(self) -> Mapping[str, object]:
-        """The quality of the pipeline."""
-        return {"quality": self.chains[0].quality}
-
-    @property
-    def how(self) -> str:
-        """The threads of torch."""
-        return f"{torch.get_num_threads()} threads"
 
     def ticks(self, done_px: int) -> int:
         """Return the number of rows."""
@@ -99,11 +75,6 @@ class TraditionalRestoration(Restoration):
     def figures(self, tally: Tally) -> dict[str, Figure]:
         """Return the figures of a run."""
         return dict(tally.figures)
-
-    def text(self) -> dict[str, str]:
-        """Return the run in words."""
-        names = ", ".join(sensor.name for sensor in self.sensors)
-        return {"method": self.method, "sensor": names}
 
     def _to_dn(self, band: int) -> np.float32:
         """Return the digital number of the sensor for a pixel value of 1."""
@@ -176,11 +147,6 @@ class TraditionalPipeline:
     quality: str = "standard"
 
     @property
-    def network_paths(self) -> list[Path]:
-        """None: it has no networks."""
-        return []
-
-    @property
     def engine(self) -> Engine:
         """This process."""
         return Engine()
@@ -217,7 +183,13 @@ class TraditionalPipeline:
             scale=scale,
             check=check,
             check_s=check_s,
+            out_shape=raster.shape,
+            identity={"quality": self.quality},
+            how=f"{torch.get_num_threads()} threads",
+            text={
+                "method": "traditional",
+                "sensor": ", ".join(sensor.name for sensor in sensors),
+            },
             chains=chains,
-            sensors=tuple(sensors),
         )
         return restoration.fitted()

@@ -1,6 +1,7 @@
 """What all outputs of a table share: its columns, their units and modes, and missing figures."""
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
+from dataclasses import dataclass
 from itertools import chain
 
 from beers_deploy.profiles.figures import Figure, Row
@@ -8,52 +9,57 @@ from beers_deploy.profiles.figures import Figure, Row
 LEGEND = "measured here, predicted by a model [interval], published in a document"
 
 
-def figures_of(rows: Sequence[Row]) -> list[str]:
-    """Return the names of the figures that any row has, in their order."""
-    return list(dict.fromkeys(chain.from_iterable(row.figures for row in rows)))
+@dataclass(frozen=True)
+class Column:
+    """One figure of all rows.
+
+    Attributes:
+        name: of the figure.
+        unit: that its figures share; empty if they differ.
+        mode: likewise, of those that have a value.
+    """
+
+    name: str
+    unit: str
+    mode: str
+
+    @property
+    def about(self) -> str:
+        """The unit and the mode that a heading states, separated by a comma."""
+        return ", ".join(filter(None, (self.unit, self.mode)))
+
+    def stated(self, figure: Figure) -> tuple[str, str]:
+        """Return a figure with its unit, and its mode; without what the heading states."""
+        unit = "" if self.unit else figure.unit
+        return " ".join(filter(None, (str(figure), unit))), "" if self.mode else figure.mode
+
+    def text(self, row: Row) -> str:
+        """Return the cell of a row: empty without the figure, a dash without its value."""
+        figure = row.figures.get(self.name)
+        if figure is None or figure.value is None:
+            return "" if figure is None else "-"
+        return " ".join(filter(None, self.stated(figure)))
+
+
+def columns_of(rows: Sequence[Row]) -> list[Column]:
+    """Return a column for each figure that any row has, in their order."""
+    columns = []
+    for name in dict.fromkeys(chain.from_iterable(row.figures for row in rows)):
+        figures = [row.figures[name] for row in rows if name in row.figures]
+        units = {figure.unit for figure in figures}
+        modes = {figure.mode for figure in figures if figure.value is not None}
+        columns.append(Column(name, _common(units), _common(modes)))
+    return columns
+
+
+def _common(words: Set[str]) -> str:
+    """Return the word that all have, if they have one."""
+    return next(iter(words)) if len(words) == 1 else ""
 
 
 def words_of(rows: Sequence[Row]) -> list[str]:
     """Return the names of the words that any row has, in their order."""
     return list(dict.fromkeys(chain.from_iterable(row.text for row in rows)))
-
-
-def unit_of(key: str, rows: Sequence[Row]) -> str:
-    """Return the unit of a column, or nothing if its figures have different units."""
-    units = {row.figures[key].unit for row in rows if key in row.figures}
-    return units.pop() if len(units) == 1 else ""
-
-
-def common_mode(key: str, rows: Sequence[Row]) -> str:
-    """Return the mode of the figures of a column, or nothing if they differ or none is there."""
-    figures = [row.figures[key] for row in rows if key in row.figures]
-    modes = {figure.mode for figure in figures if figure.value is not None}
-    return modes.pop() if len(modes) == 1 else ""
-
-
-def heading_of(key: str, rows: Sequence[Row]) -> str:
-    """Return the unit and the mode that a column's heading states, separated by a comma."""
-    return ", ".join(filter(None, (unit_of(key, rows), common_mode(key, rows))))
-
-
-def cell_text(figure: Figure | None, *, unit: bool, mode: bool) -> str:
-    """Return a figure as text.
-
-    Args:
-        figure: None is an empty cell, a missing value a dash.
-        unit: whether the unit follows, because the heading does not state it.
-        mode: whether the mode follows.
-    """
-    if figure is None:
-        return ""
-    if figure.value is None:
-        return "-"
-    words = [str(figure)]
-    if unit:
-        words.append(figure.unit)
-    if mode:
-        words.append(figure.mode)
-    return " ".join(words)
 
 
 def missing(rows: Sequence[Row]) -> list[str]:

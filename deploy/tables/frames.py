@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from beers_deploy.profiles.errors import OptionError, optional, printable
 from beers_deploy.profiles.figures import Row
-from beers_deploy.tables.columns import figures_of, unit_of, words_of
+from beers_deploy.tables.columns import columns_of, words_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,16 +28,18 @@ def wide_frame(rows: Sequence[Row]) -> "pd.DataFrame":
     has the units.
     """
     pandas = optional("pandas", "to_pandas")
-    columns: dict[str, list[object]] = {}
-    for key in figures_of(rows):
-        columns[key] = [row.figures[key].value if key in row.figures else None for row in rows]
+    columns = columns_of(rows)
+    values: dict[str, list[object]] = {}
+    for column in columns:
+        figures = [row.figures.get(column.name) for row in rows]
+        values[column.name] = [figure and figure.value for figure in figures]
     # As floats, figures that are missing are NaN.
-    frame: pd.DataFrame = pandas.DataFrame(columns, index=_index(rows), dtype=float)
+    frame: pd.DataFrame = pandas.DataFrame(values, index=_index(rows), dtype=float)
     for word in words_of(rows):
         # A word of a figure's name would replace the figure.
-        if word not in columns:
+        if word not in values:
             frame[word] = [row.text.get(word, "") for row in rows]
-    frame.attrs["units"] = {key: unit_of(key, rows) for key in figures_of(rows)}
+    frame.attrs["units"] = {column.name: column.unit for column in columns}
     return frame
 
 
@@ -68,7 +70,7 @@ def tidy_frame(rows: Sequence[Row]) -> "pd.DataFrame":
 
 def bars(rows: Sequence[Row], figure: str | None, ax: "Axes | None") -> "Axes":
     """Draw bars of one figure, each with its interval; see `results.Table.plot`."""
-    names = figures_of(rows)
+    names = [column.name for column in columns_of(rows)]
     if not names:
         raise OptionError("The table has no figures, so there is nothing to plot.")
     if figure not in (None, *names):

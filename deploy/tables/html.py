@@ -5,7 +5,7 @@ from html import escape
 
 from beers_deploy.profiles.errors import visible
 from beers_deploy.profiles.figures import Figure, Row
-from beers_deploy.tables.columns import figures_of, unit_of, words_of
+from beers_deploy.tables.columns import Column, columns_of, words_of
 
 STYLE = "border-bottom: 1px solid; padding: 2px 8px; text-align: left"
 
@@ -15,17 +15,17 @@ def html_table(title: str, rows: Sequence[Row]) -> str:
 
     The mode follows each figure. Its source, or why it is missing, is its tooltip.
     """
-    keys = figures_of(rows)
+    columns = columns_of(rows)
     words = words_of(rows)
     head = [_cell("th", title)]
-    for key in keys:
-        unit = unit_of(key, rows)
-        head.append(_cell("th", f"{key} ({unit})" if unit else key))
+    for column in columns:
+        unit = f" ({column.unit})" if column.unit else ""
+        head.append(_cell("th", f"{column.name}{unit}"))
     head += [_cell("th", word) for word in words]
     lines = []
     for row in rows:
         cells = [_cell("th", row.name)]
-        cells += [_figure(row.figures.get(key), unit_of(key, rows)) for key in keys]
+        cells += [_figure(row.figures.get(column.name), column) for column in columns]
         cells += [_cell("td", row.text.get(word, "")) for word in words]
         lines.append(f"<tr>{''.join(cells)}</tr>")
     header = f"<thead><tr>{''.join(head)}</tr></thead>"
@@ -42,10 +42,10 @@ def _cell(tag: str, text: str, tooltip: str = "") -> str:
     return f'<{tag} style="{STYLE}"{about}>{html_text(text)}</{tag}>'
 
 
-def _figure(figure: Figure | None, unit: str) -> str:
+def _figure(figure: Figure | None, column: Column) -> str:
     if figure is None:
         return _cell("td", "")
     if figure.value is None:
         return _cell("td", "unavailable", figure.reason)
-    own_unit = "" if unit else f" {figure.unit}"
-    return _cell("td", f"{figure}{own_unit} {figure.mode}", figure.source)
+    text, _ = column.stated(figure)
+    return _cell("td", f"{text} {figure.mode}", figure.source)

@@ -5,15 +5,7 @@ from collections.abc import Sequence
 
 from beers_deploy.profiles.errors import one_line
 from beers_deploy.profiles.figures import Row
-from beers_deploy.tables.columns import (
-    cell_text,
-    common_mode,
-    figures_of,
-    heading_of,
-    missing,
-    unit_of,
-    words_of,
-)
+from beers_deploy.tables.columns import columns_of, missing, words_of
 
 MARKUP = re.compile(r"[\\`*_\[\]<>&|]")
 """Characters that Markdown reads as markup within a line or a cell, or as the end of a cell."""
@@ -29,20 +21,15 @@ def markdown_table(rows: Sequence[Row]) -> list[str]:
 
     A heading states the unit and the mode of its column where they are the same in all rows.
     """
-    keys = figures_of(rows)
+    columns = columns_of(rows)
     words = words_of(rows)
-    heads = [""]
-    for key in keys:
-        about = heading_of(key, rows)
-        heads.append(f"{key} ({about})" if about else key)
+    names = (
+        f"{column.name} ({column.about})" if column.about else column.name for column in columns
+    )
+    heads = ["", *names]
     lines = [[*heads, *words], ["---"] * (len(heads) + len(words))]
     for row in rows:
-        cells = [row.name]
-        for key in keys:
-            states_unit = bool(unit_of(key, rows))
-            states_mode = bool(common_mode(key, rows))
-            figure = row.figures.get(key)
-            cells.append(cell_text(figure, unit=not states_unit, mode=not states_mode))
+        cells = [row.name, *(column.text(row) for column in columns)]
         lines.append([*cells, *(row.text.get(word, "") for word in words)])
     texts = [f"| {' | '.join(map(markdown_text, cells))} |" for cells in lines]
     reasons = missing(rows)

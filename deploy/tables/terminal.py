@@ -20,15 +20,8 @@ from rich.table import Table
 from rich.text import Text
 
 from beers_deploy.profiles.errors import one_line
-from beers_deploy.profiles.figures import Figure, Row
-from beers_deploy.tables.columns import (
-    common_mode,
-    figures_of,
-    heading_of,
-    missing,
-    unit_of,
-    words_of,
-)
+from beers_deploy.profiles.figures import Row
+from beers_deploy.tables.columns import Column, columns_of, missing, words_of
 
 COLOURS = {"measured": "green", "predicted": "yellow", "published": "blue"}
 PIPE_WIDTH = 160
@@ -75,7 +68,7 @@ def print_rows(title: str, rows: Iterable[Row], console: Console) -> None:
 
 def _layouts(rows: Sequence[Row]) -> Iterator[Table]:
     """Yield a table in every layout, the best first."""
-    down = len(figures_of(rows)) > len(rows)
+    down = len(columns_of(rows)) > len(rows)
     for by_figure in (down, not down):
         for stacked in (False, True):
             yield _by_figure(rows, stacked) if by_figure else _by_row(rows, stacked)
@@ -102,11 +95,10 @@ def _by_row(rows: Sequence[Row], stacked: bool) -> Table:
     table = _empty()
     columns = [[plain(row.name) for row in rows]]
     _add_words(table, "", columns[0])
-    for key in figures_of(rows):
-        about = heading_of(key, rows)
-        heading = [*_wrapped(key), *_wrapped(f"({about})" if about else "")]
-        states = bool(unit_of(key, rows)), bool(common_mode(key, rows))
-        cells = [_cell(row.figures.get(key), *states, stacked) for row in rows]
+    for column in columns_of(rows):
+        about = f"({column.about})" if column.about else ""
+        heading = [*_wrapped(column.name), *_wrapped(about)]
+        cells = [_cell(row, column, stacked) for row in rows]
         _add_figures(table, heading, cells)
         columns.append(cells)
     for word in words_of(rows):
@@ -121,25 +113,20 @@ def _by_row(rows: Sequence[Row], stacked: bool) -> Table:
 def _by_figure(rows: Sequence[Row], stacked: bool) -> Table:
     """Return a table with a line for each figure; its unit and its mode stand in columns."""
     table = _empty()
-    keys = figures_of(rows)
+    figures = columns_of(rows)
     words = words_of(rows)
-    units = [unit_of(key, rows) for key in keys]
-    modes = [common_mode(key, rows) for key in keys]
     none = [plain("")] * len(words)
     columns = [
-        [plain(name) for name in (*keys, *words)],
-        [*map(plain, units), *none],
-        [*map(plain, modes), *none],
+        [plain(name) for name in (*(column.name for column in figures), *words)],
+        [*(plain(column.unit) for column in figures), *none],
+        [*(plain(column.mode) for column in figures), *none],
     ]
     for heading, cells in zip(("", "unit", "mode"), columns, strict=True):
         _add_words(table, heading, cells)
     for row in rows:
-        figures = [
-            _cell(row.figures.get(key), bool(unit), bool(mode), stacked)
-            for key, unit, mode in zip(keys, units, modes, strict=True)
-        ]
-        _add_figures(table, _wrapped(row.name), figures)
-        columns.append([*figures, *(plain(row.text.get(word, "")) for word in words)])
+        cells = [_cell(row, column, stacked) for column in figures]
+        _add_figures(table, _wrapped(row.name), cells)
+        columns.append([*cells, *(plain(row.text.get(word, "")) for word in words)])
     for line in zip(*columns, strict=True):
         table.add_row(*line)
     return table
@@ -164,20 +151,23 @@ def _wrapped(name: str) -> list[str]:
     return textwrap.wrap(one_line(name), HEADING_WIDTH) or [""]
 
 
-def _cell(figure: Figure | None, states_unit: bool, states_mode: bool, stacked: bool) -> Text:
-    """Return a figure in the colour of its mode; unit and mode follow unless a heading states
-    them.
+def _cell(row: Row, column: Column, stacked: bool) -> Text:
+    """Return the figure of a row in the colour of its mode.
+
+    Args:
+        row: the row.
+        column: says whether unit and mode follow the figure.
+        stacked: whether interval and mode stand below the value.
     """
+    figure = row.figures.get(column.name)
     if figure is None or figure.value is None:
         return Text("" if figure is None else "-")
-    text = str(figure)
+    text, mode = column.stated(figure)
     if stacked:
         text = text.replace(" [", "\n[")
-    if not states_unit and figure.unit:
-        text = f"{text} {figure.unit}"
     shown = Text(text, COLOURS[figure.mode])
-    if not states_mode:
-        shown.append("\n" if stacked else " ").append(figure.mode)
+    if mode:
+        shown.append("\n" if stacked else " ").append(mode)
     return shown
 
 
@@ -189,8 +179,8 @@ def _print_blocks(rows: Sequence[Row], console: Console) -> None:
         block.add_column(min_width=1)
         for _ in range(2):
             block.add_column(overflow="fold")
-        for key, figure in row.figures.items():
-            block.add_row("", plain(key), _cell(figure, False, False, stacked=False))
+        for key in row.figures:
+            block.add_row("", plain(key), _cell(row, Column(key, "", ""), stacked=False))
         for word, words in row.text.items():
             block.add_row("", plain(word), plain(words))
         console.print(block)

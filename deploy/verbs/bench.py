@@ -1,6 +1,7 @@
 """`bench`: time, throughput, power and efficiency, predicted, measured and published."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -18,13 +19,27 @@ from beers_deploy.verbs.parameters import (
     Targets,
     Tiles,
 )
-from beers_deploy.verbs.verb import refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.performance.board import Bench
+    from beers_deploy.performance.swath import Swath
     from beers_deploy.profiles.sensor import Sensor
 
 HOSTS = ("host", "host-cpu")
+OF_BOARDS = [
+    "image",
+    "full_scale",
+    "size",
+    "halo",
+    "dpu",
+    "host_task",
+    "measured",
+    "traditional",
+    "within",
+    "consistency",
+]
+"""Parameters that count for what is predicted of a board."""
 NO_PROXY = "Time on this CPU is no proxy for the DPU: here INT8 may even run slower than float."
 
 
@@ -93,6 +108,8 @@ def bench(
         >>> slow < fast
         True
     """
+    given = partial(changed, bench, locals())
+
     from beers_deploy.dpu.board import boards_of
     from beers_deploy.model.raster.images import read_acquisition
     from beers_deploy.network import Network
@@ -105,33 +122,23 @@ def bench(
     tiles_px = parse_tiles(tile)
     profile = Sensor.load(sensor)
     paths = [None if path is None else Path(path) for path in (image, measured)]
-    given = {
-        "image": image is not None,
-        "full_scale": full_scale is not None,
-        "size": size is not None,
-        "halo": halo != "exact",
-        "dpu": dpu is not None,
-        "host_task": host_task is not None,
-        "measured": measured is not None,
-        "traditional": not traditional,
-        "within": within is not None,
-        "consistency": not consistency,
-    }
     if target in HOSTS:
-        refuse_with("`target` host", **given)
+        refuse_with("`target` host", **given(*OF_BOARDS))
         return _on_this_machine(network, profile, tiles_px, threads)
-    refuse_without("`target` host", threads=threads != 0)
+    refuse_without("`target` host", **given("threads"))
     if image is None:
-        refuse_without("`image`", full_scale=full_scale is not None)
+        refuse_without("`image`", **given("full_scale"))
     else:
-        refuse_with("`image`", size=size is not None)
+        refuse_with("`image`", **given("size"))
     source = Network.load(network, sensor=profile, int8=True)
     # The digests are those of the files that are read from here on.
     inputs = inputs_of(*paths)
     boards = boards_of(target)
     # Next to other boards an NPU is refused below, because nothing can be predicted of it.
     if len(boards) == 1 and boards[0].npu:
-        refuse_with(f"`target` {boards[0].name}, for which nothing is predicted", **given)
+        refuse_with(
+            f"`target` {boards[0].name}, for which nothing is predicted", **given(*OF_BOARDS)
+        )
         return quoted(source, boards[0])
     configurations, corrections = boards_for(boards, dpu, paths[1])
     asked = Question(
@@ -148,7 +155,7 @@ def bench(
     # Only a network that is conditioned on its sensor has exposures.
     table = bench_board(source, asked, dn, profile if source.weights else None)
     if traditional and table.swath is not None:
-        table = _with_traditional(table)
+        table = _with_traditional(table, table.swath)
     require_same(inputs, *paths)
     return replace(table, inputs=(*table.inputs, *inputs))
 
@@ -177,9 +184,8 @@ def _on_this_machine(
     )
 
 
-def _with_traditional(table: "Bench") -> "Bench":
+def _with_traditional(table: "Bench", swath: "Swath") -> "Bench":
     """Return a table with the traditional pipeline, measured on this machine."""
-    assert table.swath is not None  # noqa: S101 - checked by the caller
     try:
         from beers_deploy.performance.traditional import drawn_acquisition, measure_chain
     except ImportError as error:
@@ -190,6 +196,6 @@ def _with_traditional(table: "Bench") -> "Bench":
     from beers_deploy.profiles.shipped import REFERENCE
 
     sensors = Sensor.load(SENSOR), Sensor.load(REFERENCE)
-    dn = drawn_acquisition(table.swath, *sensors) if table.dn is None else table.dn
-    row = measure_chain(dn, *sensors).row(table.swath)
+    dn = drawn_acquisition(swath, *sensors) if table.dn is None else table.dn
+    row = measure_chain(dn, *sensors).row(swath)
     return replace(table, rows=(*table.rows, row))

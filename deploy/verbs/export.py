@@ -1,13 +1,12 @@
 """`export`: weights as a float ONNX file, or an INT8 file for another sensor."""
 
-import logging
 import os
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
-from beers_deploy.model.shipped import INT8, SENSOR, SHIPPED, VARIANT, shipped_weights
-from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.shipped import DEFAULT_TARGET
+from beers_deploy.model.shipped import INT8, SENSOR, VARIANT, shipped_weights
 from beers_deploy.verbs.parameters import (
     InputPath,
     Interval,
@@ -16,14 +15,7 @@ from beers_deploy.verbs.parameters import (
     ShippedOrFile,
     TargetLike,
 )
-from beers_deploy.verbs.verb import refuse_with, refuse_without, verb
-
-if TYPE_CHECKING:
-    import onnx
-
-    from beers_deploy.profiles.target import TargetProfile
-
-logger = logging.getLogger(__name__)
+from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
 
 
 @verb
@@ -69,32 +61,34 @@ def export(
         OptionError: options that do not go together.
         ProfileError: no such sensor or board.
     """
-    from beers_deploy.board_file import require_core_file
+    given = partial(changed, export, locals())
+
+    from beers_deploy.kit.board_file import require_core_file
     from beers_deploy.model.io.files import require_writable
     from beers_deploy.network_files import weights_file
+    from beers_deploy.onnx_export import (
+        conditioned_int8,
+        delta_files,
+        export_float,
+        export_int8,
+        save_delta,
+    )
     from beers_deploy.profiles.target import TargetProfile
     from beers_deploy.quant.onnx_file import require_onnx_name
 
-    given = Path(network)
-    if not (given.suffix or given.exists()):
+    source = Path(network)
+    if not (source.suffix or source.exists()):
         # This refuses names under which nothing is shipped.
-        shipped_weights(given.name.removesuffix(INT8))
-    path = weights_file(given)
+        shipped_weights(source.name.removesuffix(INT8))
+    path = weights_file(source)
     if board_file is None:
-        refuse_without("`board_file`", target=target != DEFAULT_TARGET)
+        refuse_without("`board_file`", **given("target"))
     if path.suffix != ".onnx":
-        refuse_without(
-            "an INT8 `network`",
-            board_file=board_file is not None,
-            delta=delta is not None,
-            apply=apply is not None,
-        )
+        refuse_without("an INT8 `network`", **given("board_file", "delta", "apply"))
     if apply is not None:
-        refuse_with("`apply`", sensor=sensor is not None, delta=delta is not None)
+        refuse_with("`apply`", **given("sensor", "delta"))
     core = None if board_file is None else Path(board_file)
-    deltas: dict[int, Path] = {}
-    if delta is not None:
-        deltas = _delta_files(Path(delta), sensor)
+    deltas = {} if delta is None else delta_files(Path(delta), sensor or SENSOR)
     inputs = [
         path,
         *(Path(each) for each in (apply, sensor) if isinstance(each, str | os.PathLike)),
@@ -104,114 +98,10 @@ def export(
     board = TargetProfile.load(target)
     require_core_file(board, core, tile, inputs)
     if path.suffix != ".onnx":
-        _export_float(path, Path(out), sensor, tile)
+        export_float(path, Path(out), sensor, tile)
         return Path(out)
-    model = _conditioned(path, sensor, None if apply is None else Path(apply))
-    _export_int8(model, Path(out), tile, core, board)
+    model = conditioned_int8(path, sensor or SENSOR, None if apply is None else Path(apply))
+    export_int8(model, Path(out), tile, core, board)
     for factor, file in deltas.items():
-        _save_delta(model, sensor or SENSOR, factor, file)
+        save_delta(model, sensor or SENSOR, factor, file)
     return Path(out)
-
-
-def _export_float(path: Path, out: Path, sensor: SensorLike | None, tile: int | None) -> None:
-    """Write weights as float ONNX, your own after a comparison with torch."""
-    from beers_deploy.float_onnx import about, float_for, to_onnx
-    from beers_deploy.model.io.tensors import is_conditioned, read_conditioned, read_plain
-    from beers_deploy.network_files import warn_outside
-    from beers_deploy.profiles.sensor import Sensor
-    from beers_deploy.quant.onnx_file import save_onnx
-
-    profile = Sensor.load(sensor or SENSOR) if is_conditioned(path) else None
-    if profile is not None:
-        warn_outside(profile, read_conditioned(path).kernels)
-        model = float_for(path, path.stem, profile, tile)
-    elif sensor is not None:
-        raise ModelError(
-            f"{path} holds a network that is for one sensor. Leave `sensor` out, or give weights "
-            "of 'train --conditioned'."
-        )
-    else:
-        weights = read_plain(path)
-        model = to_onnx(weights, about(path.stem, weights.recipe), tile)
-    if path.parent == SHIPPED:
-        save_onnx(model, out)
-        logger.info("wrote %s", out)
-        return
-    # It loads torch, which shipped networks do without.
-    from beers_deploy.parity import require_parity, torch_network
-
-    reference = torch_network(path, profile.nominal() if profile else None)
-    difference = require_parity(reference, model, tile or 97)
-    save_onnx(model, out)
-    logger.info(
-        "wrote %s: largest difference from torch %.2g of full scale (measured)", out, difference
-    )
-
-
-def _conditioned(path: Path, sensor: SensorLike | None, delta: Path | None) -> "onnx.ModelProto":
-    """Return an INT8 network that is conditioned on a sensor, or on that of a delta."""
-    from beers_deploy.network_files import int8_for_delta, int8_for_sensor, warn_outside
-    from beers_deploy.profiles.sensor import Sensor
-    from beers_deploy.quant.banked.family import required_family
-    from beers_deploy.quant.onnx_file import load_onnx
-
-    model = load_onnx(path)
-    if delta is not None:
-        return int8_for_delta(model, delta)
-    profile = Sensor.load(sensor or SENSOR)
-    warn_outside(profile, required_family(model).kernels)
-    return int8_for_sensor(model, profile)
-
-
-def _export_int8(
-    model: "onnx.ModelProto",
-    out: Path,
-    tile: int | None,
-    core_file: Path | None,
-    target: "TargetProfile",
-) -> None:
-    """Write an INT8 network, and its core for a board where one is wanted."""
-    from beers_deploy.board_file import save_core
-    from beers_deploy.float_onnx import require_tile
-    from beers_deploy.network import Network
-    from beers_deploy.quant.encodings import host_model, read_core
-    from beers_deploy.quant.onnx_file import fixed_tile_px, metadata, save_onnx
-
-    core = read_core(model)
-    side_px = tile or fixed_tile_px(model)
-    require_tile(side_px, core.ends.place_px)
-    for_board = Network(model, out.stem).core(target, tile) if core_file else None
-    save_onnx(host_model(core, metadata(model), side_px), out)
-    logger.info("wrote %s", out)
-    if for_board is not None and core_file is not None:
-        save_core(for_board, core_file, target)
-
-
-def _delta_files(delta: Path, sensor: SensorLike | None) -> dict[int, Path]:
-    """Return the deltas to write by factor: the named one at 1, and one for each exposure."""
-    from beers_deploy.model.exposure import factors_for
-    from beers_deploy.profiles.sensor import Sensor
-
-    factors = factors_for(Sensor.load(sensor or SENSOR).nominal())
-    higher = {
-        factor: delta.with_name(f"{delta.stem}-x{factor}{delta.suffix}")
-        for factor in factors
-        if factor > 1
-    }
-    return {1: delta, **higher}
-
-
-def _save_delta(model: "onnx.ModelProto", sensor: SensorLike, factor: int, delta: Path) -> None:
-    """Write the delta of an INT8 network that is conditioned on a sensor, at one exposure."""
-    from beers_deploy.model.exposure import brightened
-    from beers_deploy.model.io.files import whole_file
-    from beers_deploy.network_files import int8_for_sensor
-    from beers_deploy.profiles.sensor import Sensor
-    from beers_deploy.quant.banked.family import delta_of_file
-
-    profile = Sensor.load(sensor)
-    exposed = model if factor == 1 else int8_for_sensor(model, brightened(profile, factor))
-    packed = delta_of_file(exposed)
-    with whole_file(delta) as temporary:
-        temporary.write_bytes(packed)
-    logger.info("wrote %s: %d bytes", delta, len(packed))

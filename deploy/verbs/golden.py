@@ -12,7 +12,7 @@ from beers_deploy.verbs.parameters import (
     OutputFolder,
     TargetLike,
 )
-from beers_deploy.verbs.verb import refuse_with, verb
+from beers_deploy.verbs.verb import changed, refuse_with, verb
 
 if TYPE_CHECKING:
     from beers_deploy.results import Table
@@ -56,12 +56,8 @@ def golden(
     from beers_deploy.kit.golden_results import compare_golden
 
     if compare is not None:
-        refuse_with(
-            "`compare`",
-            out=out is not None,
-            tile=tile is not None,
-            target=target != DEFAULT_TARGET,
-        )
+        given = changed(golden, locals(), "out", "tile", "target")
+        refuse_with("`compare`", **given)
         return compare_golden(compare, str(network))
     if out is None:
         raise OptionError(

@@ -11,7 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
-from annotated_types import Interval
+from annotated_types import Interval as Interval
 
 from beers_deploy.model.processor import SEEDS
 
@@ -113,8 +113,9 @@ Seed = Annotated[int, Interval(ge=0, le=SEEDS)]
 
 if TYPE_CHECKING:
     from beers_deploy.dpu.board import BoardLike
-    from beers_deploy.model.progress import Progress
-    from beers_deploy.network import NetworkLike, SensorLike
+    from beers_deploy.model.progress import Progress as Progress
+    from beers_deploy.network import NetworkLike as NetworkLike
+    from beers_deploy.network import SensorLike as SensorLike
     from beers_deploy.pairs import Pair
     from beers_deploy.profiles.sensor import Sensor
     from beers_deploy.quant.limits import Limits
@@ -122,14 +123,14 @@ if TYPE_CHECKING:
 
     InputPath: TypeAlias = str | os.PathLike[str]
     InputPaths: TypeAlias = InputPath | Sequence[InputPath]
-    LabelledFolder: TypeAlias = str | os.PathLike[str]
-    OutputFile: TypeAlias = str | os.PathLike[str]
-    OutputFolder: TypeAlias = str | os.PathLike[str]
-    RequiredFile: TypeAlias = str | os.PathLike[str]
-    VerdictFile: TypeAlias = str | os.PathLike[str]
-    VerdictFolder: TypeAlias = str | os.PathLike[str]
-    ShippedOrFile: TypeAlias = str | os.PathLike[str]
-    LimitsLike: TypeAlias = Limits | Mapping[str, float] | str | os.PathLike[str]
+    LabelledFolder: TypeAlias = InputPath
+    OutputFile: TypeAlias = InputPath
+    OutputFolder: TypeAlias = InputPath
+    RequiredFile: TypeAlias = InputPath
+    VerdictFile: TypeAlias = InputPath
+    VerdictFolder: TypeAlias = InputPath
+    ShippedOrFile: TypeAlias = InputPath
+    LimitsLike: TypeAlias = Limits | Mapping[str, float] | InputPath
     ProfileName: TypeAlias = str
     TargetLike: TypeAlias = BoardLike
     Targets: TypeAlias = BoardLike | Sequence[BoardLike]
@@ -138,7 +139,7 @@ if TYPE_CHECKING:
     Samples: TypeAlias = Any
     Image: TypeAlias = Any
     Images: TypeAlias = Any
-    Pairs: TypeAlias = Sequence[Pair] | str | os.PathLike[str]
+    Pairs: TypeAlias = Sequence[Pair] | InputPath
     Methods: TypeAlias = str | Sequence[str] | Mapping[str, NetworkLike | Restore]
     Halo: TypeAlias = int | str
     Tiles: TypeAlias = int | str | Sequence[int]
@@ -165,46 +166,3 @@ else:
     TargetLike = Targets = Annotated[str, Completed(target_names, listed=True)]
     Progress = Annotated[object, PythonOnly()]
     Halo = Tiles = Size = Steps = Names = Factors = Methods = Mtf = str
-
-__all__ = [
-    "BandSensors",
-    "Completed",
-    "Edges",
-    "Effects",
-    "Factors",
-    "Halo",
-    "Holds",
-    "Image",
-    "Images",
-    "InputPath",
-    "InputPaths",
-    "Interval",
-    "Labelled",
-    "LabelledFolder",
-    "LimitsLike",
-    "Methods",
-    "Mtf",
-    "Names",
-    "NetworkLike",
-    "Networks",
-    "OutputFile",
-    "OutputFolder",
-    "Pairs",
-    "ProfileName",
-    "Progress",
-    "PythonOnly",
-    "RequiredFile",
-    "RequiredUnless",
-    "Samples",
-    "Seed",
-    "SensorLike",
-    "ShippedOrFile",
-    "Size",
-    "Steps",
-    "TargetLike",
-    "Targets",
-    "Tiles",
-    "VerdictFile",
-    "VerdictFolder",
-    "Written",
-]

@@ -26,7 +26,7 @@ def profiles(name: ProfileName | None = None, *, toml: bool = False) -> "Table |
         OptionError: no such profile.
         ProfileError: a file that is no profile.
     """
-    from beers_deploy.profile_tables import list_of_profiles, table_of_profile, text_of_profile
+    from beers_deploy.shipped_tables import list_of_profiles, table_of_profile, text_of_profile
 
     if name is None:
         refuse_without("`name`", toml=toml)

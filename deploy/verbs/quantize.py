@@ -103,8 +103,8 @@ def quantize(
         >>> bd.quantize(network, samples=samples, target="zcu102").precision
         'int8'
     """
-    from beers_deploy.board_file import require_core_file, save_core
     from beers_deploy.comparison import Data
+    from beers_deploy.kit.board_file import require_core_file, save_core
     from beers_deploy.profiles.sensor import Sensor
     from beers_deploy.profiles.target import TargetProfile
     from beers_deploy.quant.encodings import read_core

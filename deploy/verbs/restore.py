@@ -1,6 +1,8 @@
 """`restore`: a raw image in, the restored one out, of any size."""
 
 import os
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -17,12 +19,12 @@ from beers_deploy.verbs.parameters import (
     Progress,
     PythonOnly,
 )
-from beers_deploy.verbs.verb import refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.restoration.output import Output
-    from beers_deploy.restoration.prepare import Pipeline
-    from beers_deploy.restoration.reading import Reading
+    from beers_deploy.restoration.prepare import NetworkPipeline, Pipeline
+    from beers_deploy.restoration.radiometry import Reading
     from beers_deploy.results import Table
 
 
@@ -122,12 +124,14 @@ def restore(
         >>> bool(pair.psnr(restored) > pair.psnr(pair.degraded))
         True
     """
+    given = partial(changed, restore, locals())
+
     from beers_deploy.model.raster.reader import require_image_file
-    from beers_deploy.restoration.arrays import Job, restore_array
+    from beers_deploy.restoration.arrays import restore_array
     from beers_deploy.restoration.bands import is_unknown, networks_of, sensors_of
     from beers_deploy.restoration.plan import Tiles
     from beers_deploy.restoration.prepare import NetworkPipeline
-    from beers_deploy.restoration.reading import Reading
+    from beers_deploy.restoration.radiometry import Reading
     from beers_deploy.restoration.run import restore_file
     from beers_deploy.restoration.runtime import Engine
     from beers_deploy.restoration.stac import write_item
@@ -136,35 +140,20 @@ def restore(
     if method == "traditional":
         refuse_with(
             "`method` traditional",
-            network=network is not None,
-            tile=tile != TILE_PX,
-            halo=halo != "exact",
-            resume=resume,
-            runtime=runtime != "onnxruntime",
-            threads=threads != 0,
-            scheduler=scheduler is not None,
-            consistency=not consistency,
-            exposure=not exposure,
-            dry_run=dry_run,
+            **given("network", "tile", "halo", "resume", "runtime", "threads", "scheduler"),
+            **given("consistency", "exposure", "dry_run"),
         )
     else:
-        refuse_without("`method` traditional", quality=quality != "standard")
+        refuse_without("`method` traditional", **given("quality"))
     path = _file_of(image)
     if path is None:
         refuse_with(
             "an array",
-            out=out is not None,
-            compression=compression != "zlib",
-            cog=cog,
-            stac=stac is not None,
-            resume=resume,
-            overwrite=overwrite,
-            dry_run=dry_run,
-            fix_detectors=fix_detectors is not None,
-            scheduler=scheduler is not None,
+            **given("out", "compression", "cog", "stac", "resume", "overwrite", "dry_run"),
+            **given("fix_detectors", "scheduler"),
         )
     else:
-        refuse_with("an image file, which states its own", nodata=nodata is not None)
+        refuse_with("an image file, which states its own", **given("nodata"))
         refuse_without("`cog`", stac=stac is not None and not cog)
         require_image_file(path)
     output = None
@@ -176,27 +165,29 @@ def restore(
     reading = Reading(
         sensors={} if unknown else sensors,
         full_scale=full_scale,
+        nodata=nodata,
         strict=strict,
         force=force,
         # A budget of 0 bytes would count as none.
         memory_bytes=None if memory is None else max(int(memory * 1e9), 1),
         fix_detectors=fix_detectors or "",
     )
-    pipeline: Pipeline
-    if method == "traditional":
-        pipeline = _traditional(quality, unknown)
-    else:
-        pipeline = NetworkPipeline(
+    engine = Engine(runtime, threads, scheduler)
+
+    def network_pipeline() -> NetworkPipeline:
+        return NetworkPipeline(
             networks_of(network, sensors, full_scale),
             Tiles(tile, str(halo)),
-            Engine(runtime, threads, scheduler),
+            engine,
             Around(consistency, exposure),
         )
+
+    load = _traditional(quality, unknown) if method == "traditional" else network_pipeline
     if path is None:
-        return restore_array(image, Job(pipeline, reading, nodata))
+        return restore_array(image, reading, load)
     if output is None:
-        return _preview(path, pipeline, reading)
-    run = restore_file(path, output, pipeline, reading)
+        return _preview(path, network_pipeline(), reading)
+    run = restore_file(path, output, reading, load)
     if stac is not None:
         write_item(output.path, Path(stac))
     return run
@@ -211,8 +202,8 @@ def _file_of(image: Any) -> Path | None:
     return Path(image.name) if hasattr(image, "crs") and hasattr(image, "read") else None
 
 
-def _traditional(quality: str, unknown: bool) -> "Pipeline":
-    """Return the traditional pipeline; raise OptionError if the sensor is unknown."""
+def _traditional(quality: str, unknown: bool) -> "Callable[[], Pipeline]":
+    """Return what makes the traditional pipeline; raise OptionError if the sensor is unknown."""
     if unknown:
         raise OptionError(
             "`method` traditional needs `sensor`, the sensor that acquired the image. Name a "
@@ -221,7 +212,7 @@ def _traditional(quality: str, unknown: bool) -> "Pipeline":
     # It loads torch, which is optional.
     from beers_deploy.restoration.traditional import TraditionalPipeline
 
-    return TraditionalPipeline(quality)
+    return partial(TraditionalPipeline, quality)
 
 
 def _output(
@@ -251,15 +242,12 @@ def _output(
     return Output(path, others=(None if stac is None else Path(stac), listed), **how)
 
 
-def _preview(image: Path, pipeline: "Pipeline", reading: "Reading") -> "Table":
+def _preview(image: Path, pipeline: "NetworkPipeline", reading: "Reading") -> "Table":
     """Return what an image is, how it would be cut and how long that would take."""
-    from beers_deploy.dry_run import preview_row
+    from beers_deploy.performance.dry_run import preview_row
     from beers_deploy.profiles.target import TargetProfile
-    from beers_deploy.restoration.prepare import NetworkPipeline
     from beers_deploy.results import Table
 
-    # The traditional pipeline has no plan of tiles, and is refused before.
-    assert isinstance(pipeline, NetworkPipeline)  # noqa: S101
     row = preview_row(image, pipeline, reading, TargetProfile.load(DEFAULT_TARGET))
     # The image has no digest here, because the whole file would be read for it.
     networks = tuple(network.input for network in pipeline.networks.values())

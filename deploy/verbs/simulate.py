@@ -4,6 +4,7 @@ import logging
 import math
 import os
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -22,7 +23,7 @@ from beers_deploy.verbs.parameters import (
     Seed,
     SensorLike,
 )
-from beers_deploy.verbs.verb import refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.model.dataset import DatasetRecipe
@@ -45,10 +46,6 @@ pixels.
 MIN_RATIO = 2
 """Below it the blur's kernel has negative lobes of its own (0.7 % of its peak at 7 %)."""
 
-SIZE_PX = 512
-TOLERANCE_DN = 0.25
-
-
 DATA_SET = Holds("manifest.jsonl", "recipe.json", folders=("degraded", "reference", "parts"))
 
 
@@ -61,14 +58,14 @@ def simulate(
     reference: SensorLike | None = None,
     preset: Literal["paper-variable", "paper-fixed", "paper-test", "dior-medium", "dior-high"]
     | None = None,
-    size: Annotated[int, Interval(ge=1, le=4096), PythonOnly()] = SIZE_PX,
+    size: Annotated[int, Interval(ge=1, le=4096), PythonOnly()] = 512,
     patch: Annotated[int, Interval(ge=8, le=8192)] | None = None,
     oversampling: Annotated[float, Interval(ge=1, le=64)] | None = None,
     scene: InputPath | None = None,
     with_: Effects = (),
     without: Effects = (),
     explain: bool = False,
-    tolerance: Annotated[float, Interval(ge=0)] = TOLERANCE_DN,
+    tolerance: Annotated[float, Interval(ge=0)] = 0.25,
     workers: Annotated[int, Interval(ge=0)] = 0,
     scheduler: str | None = None,
     seed: Seed = 0,
@@ -119,29 +116,24 @@ def simulate(
         >>> degraded.shape, degraded.dtype
         ((96, 96), dtype('uint16'))
     """
+    given = partial(changed, simulate, locals())
+
     from beers_deploy.profiles.scene_call import SceneCall, calling_for, origins
     from beers_deploy.profiles.sensor import Sensor
 
     if out is None:
-        refuse_without(
-            "`out`", resume=resume, workers=workers != 0, scheduler=scheduler is not None
-        )
+        refuse_without("`out`", **given("resume", "workers", "scheduler"))
     else:
-        refuse_with("`out`", explain=explain, size=size != SIZE_PX)
+        refuse_with("`out`", **given("explain", "size"))
     if scheduler is not None:
-        refuse_with("`scheduler`", workers=workers != 0)
+        refuse_with("`scheduler`", **given("workers"))
     usual, patch_px = (SENSOR, None) if preset is None else PRESETS[preset]
     call = None if scene is None else SceneCall.load(os.fspath(scene))
     own = Sensor.load(sensor or usual)
     degraded = calling_for(own, call, with_, without)
     scale = call.radiance_scale.low if call else 1.0
     if out is None and not explain:
-        refuse_without(
-            "`out`",
-            preset=preset is not None,
-            patch=patch is not None,
-            tolerance=tolerance != TOLERANCE_DN,
-        )
+        refuse_without("`out`", **given("preset", "patch", "tolerance"))
         from beers_deploy.pairs import simulated_pair
 
         aim = degraded.reference if reference is None else Sensor.load(reference)
@@ -232,11 +224,11 @@ def _write(
     resume: bool,
 ) -> "Table":
     """Write a data set, and return a table of it."""
-    from beers_deploy.cluster import open_cluster
     from beers_deploy.model.dataset import plan_windows, write_dataset
     from beers_deploy.model.processor import require_cores
     from beers_deploy.model.progress import steps
     from beers_deploy.profiles.figures import Row, measured
+    from beers_deploy.restoration.cluster import open_cluster
     from beers_deploy.results import Table
 
     require_cores("workers", workers)

@@ -3,8 +3,10 @@
 import logging
 import os
 from collections.abc import Sequence
+from functools import partial
+from inspect import signature
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.verbs.parameters import (
@@ -17,7 +19,7 @@ from beers_deploy.verbs.parameters import (
     Seed,
     SensorLike,
 )
-from beers_deploy.verbs.verb import refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
 
 logger = logging.getLogger(__name__)
 
@@ -27,22 +29,8 @@ RANGE = "pleiades-variable"
 FILES = ("checkpoint.safetensors", "log.csv", "validation.csv", "validation.png")
 """What a run leaves in its folder besides the weights."""
 
-DEFAULTS: dict[str, Any] = {
-    "variant": "convbeers-s",
-    "drawn": 0,
-    "steps": 20_000,
-    "batch": 8,
-    "patch": 96,
-    "learning_rate": 1e-3,
-    "l1_weight": 1.0,
-    "lpips_weight": 0.5,
-    "fft_weight": 0.1,
-    "psnr_weight": 0.0,
-    "validate_every": 1000,
-    "seed": 0,
-    "precision": "float32",
-}
-"""What a recipe states in place of these options."""
+BESIDE_RECIPE = {"out", "recipe", "images", "device", "resume", "progress"}
+"""Parameters that a recipe does not state."""
 
 
 @verb
@@ -52,26 +40,26 @@ def train(
     recipe: str | None = None,
     images: InputPaths = (),
     pairs: InputPath | None = None,
-    variant: str = DEFAULTS["variant"],
+    variant: str = "convbeers-s",
     sensor: SensorLike | None = None,
     conditioned: bool = False,
     reference: SensorLike | None = None,
-    drawn: Annotated[int, Interval(ge=0, le=1000)] = DEFAULTS["drawn"],
-    steps: Annotated[int, Interval(ge=1)] = DEFAULTS["steps"],
-    batch: Annotated[int, Interval(ge=1, le=4096)] = DEFAULTS["batch"],
-    patch: Annotated[int, Interval(ge=17, le=2048)] = DEFAULTS["patch"],
-    learning_rate: Annotated[float, Interval(ge=0)] = DEFAULTS["learning_rate"],
-    l1_weight: Annotated[float, Interval(ge=0)] = DEFAULTS["l1_weight"],
-    lpips_weight: Annotated[float, Interval(ge=0)] = DEFAULTS["lpips_weight"],
-    fft_weight: Annotated[float, Interval(ge=0)] = DEFAULTS["fft_weight"],
-    psnr_weight: Annotated[float, Interval(ge=0)] = DEFAULTS["psnr_weight"],
+    drawn: Annotated[int, Interval(ge=0, le=1000)] = 0,
+    steps: Annotated[int, Interval(ge=1)] = 20_000,
+    batch: Annotated[int, Interval(ge=1, le=4096)] = 8,
+    patch: Annotated[int, Interval(ge=17, le=2048)] = 96,
+    learning_rate: Annotated[float, Interval(ge=0)] = 1e-3,
+    l1_weight: Annotated[float, Interval(ge=0)] = 1.0,
+    lpips_weight: Annotated[float, Interval(ge=0)] = 0.5,
+    fft_weight: Annotated[float, Interval(ge=0)] = 0.1,
+    psnr_weight: Annotated[float, Interval(ge=0)] = 0.0,
     lpips: InputPath | None = None,
     start: InputPath | None = None,
     rounding: InputPath | None = None,
-    validate_every: Annotated[int, Interval(ge=0)] = DEFAULTS["validate_every"],
-    seed: Seed = DEFAULTS["seed"],
+    validate_every: Annotated[int, Interval(ge=0)] = 1000,
+    seed: Seed = 0,
     device: str = "cpu",
-    precision: Literal["float32", "bfloat16"] = DEFAULTS["precision"],
+    precision: Literal["float32", "bfloat16"] = "float32",
     resume: bool = False,
     progress: Progress = None,
 ) -> Path:
@@ -126,50 +114,25 @@ def train(
         ProfileError: no such sensor.
         MissingExtraError: torch is not installed.
     """
-    given = {
-        "variant": variant,
-        "drawn": drawn,
-        "steps": steps,
-        "batch": batch,
-        "patch": patch,
-        "learning_rate": learning_rate,
-        "l1_weight": l1_weight,
-        "lpips_weight": lpips_weight,
-        "fft_weight": fft_weight,
-        "psnr_weight": psnr_weight,
-        "validate_every": validate_every,
-        "seed": seed,
-        "precision": precision,
-    }
-    folders = _folders(images)
+    given = partial(changed, train, locals())
+    several = [images] if isinstance(images, str | os.PathLike) else images
+    folders = tuple(map(Path, several))
     if recipe is not None:
-        changed = {name: value != DEFAULTS[name] for name, value in given.items()}
-        changed |= {
-            "pairs": pairs is not None,
-            "sensor": sensor is not None,
-            "conditioned": conditioned,
-            "reference": reference is not None,
-            "lpips": lpips is not None,
-            "start": start is not None,
-            "rounding": rounding is not None,
-        }
-        refuse_with("`recipe`, which states it", **changed)
+        stated = [name for name in signature(train).parameters if name not in BESIDE_RECIPE]
+        refuse_with("`recipe`, which states it", **given(*stated))
         return _make(recipe, folders, Path(out), resume, device)
     if pairs is not None:
-        refuse_with("`pairs`", images=bool(folders), drawn=drawn > 0, conditioned=conditioned)
+        refuse_with("`pairs`", images=bool(folders), **given("drawn", "conditioned"))
     if rounding is not None and not (conditioned and start):
         raise OptionError(
             "`rounding` has no effect without `conditioned` and `start`. Add both, or leave "
             "`rounding` out."
         )
-    if not folders:
-        refuse_without(
-            "`images`",
-            # 0 asks for no validation, which a run without images has none of.
-            validate_every=validate_every not in (0, DEFAULTS["validate_every"]),
-        )
+    # 0 asks for no validation, which a run without images has none of.
+    if not folders and validate_every:
+        refuse_without("`images`", **given("validate_every"))
     if not lpips_weight:
-        refuse_with("`lpips_weight` 0", lpips=lpips is not None)
+        refuse_with("`lpips_weight` 0", **given("lpips"))
     # These load torch.
     from beers_deploy.model.dataset import profiles_for, read_pairs_recipe
     from beers_deploy.model.family import SensorFamily
@@ -228,13 +191,6 @@ def train(
         if worker.first:
             logger.info("wrote %s", run.weights)
     return run.weights
-
-
-def _folders(images: InputPaths) -> tuple[Path, ...]:
-    """Return one folder, or several."""
-    if isinstance(images, str | os.PathLike):
-        return (Path(images),)
-    return tuple(map(Path, images))
 
 
 def _make(name: str, images: Sequence[Path], out: Path, resume: bool, device: str) -> Path:

@@ -128,9 +128,9 @@ def paths_of(function: Callable[..., Any], arguments: Mapping[str, Any]) -> Path
         written = marker(parameters[name], Written)
         if written is None:
             paths.inputs.extend(_paths_in(value))
-            labelled = marker(parameters[name], Labelled)
-            if labelled is not None and value is not None:
-                paths.inputs.extend(_labels_in(Path(value)))
+            if value is not None and marker(parameters[name], Labelled) is not None:
+                below = Path(value).rglob("*")
+                paths.inputs.extend(path for path in below if path.suffix.lower() in LABELS)
         elif value is not None:
             holds = marker(parameters[name], Holds)
             files = [Path(value)] if holds is None else [Path(value) / f for f in holds.files]
@@ -189,12 +189,7 @@ def _paths_in(value: Any) -> list[Path]:
 
 
 LABELS = {".xml", ".txt"}
-"""Suffixes of labels, which lie anywhere below the folder of images."""
-
-
-def _labels_in(folder: Path) -> list[Path]:
-    """Return the labels below a folder: no output may replace one."""
-    return [path for path in folder.rglob("*") if path.suffix.lower() in LABELS]
+"""Suffixes of labels, which lie anywhere below the folder of images: no output may replace one."""
 
 
 Marker = TypeVar("Marker")
@@ -212,6 +207,20 @@ def parts_of(annotation: Any) -> Iterator[Any]:
     if get_origin(annotation) is not Literal:
         for part in get_args(annotation):
             yield from parts_of(part)
+
+
+def changed(
+    function: Callable[..., Any], values: Mapping[str, Any], *names: str
+) -> dict[str, bool]:
+    """Return whether parameters have another value than their default, by name.
+
+    Args:
+        function: the verb.
+        values: of its parameters, by name.
+        names: of the parameters that are asked about.
+    """
+    parameters = signature(function).parameters
+    return {name: bool(values[name] != parameters[name].default) for name in names}
 
 
 def refuse_with(other: str, **given: bool) -> None:

@@ -126,7 +126,7 @@ def _probe(path: Path) -> None:
 
 
 def _part_of(path: Path) -> Path:
-    """Where a file is written before it is whole."""
+    """Return the path at which a file is written before it is whole."""
     return path.with_name(f".{path.name}.{os.getpid()}.part")
 
 

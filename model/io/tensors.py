@@ -17,7 +17,7 @@ from safetensors.numpy import save_file
 
 from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.files import whole_file
-from beers_deploy.model.io.formats import HEAD_BYTES, SAFETENSORS, OtherFormat, other_format
+from beers_deploy.model.io.formats import HEAD_BYTES, SAFETENSORS, other_format
 from beers_deploy.model.variants import Kernels, Variant
 from beers_deploy.profiles.errors import ModelError, printable, reason_of
 from beers_deploy.profiles.toml import parse_json, unreadable
@@ -88,25 +88,18 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
             return {key: np.array(file.get_tensor(key)) for key in file.keys()}, header  # noqa: SIM118 - no mapping
     except (SafetensorError, OSError, ValueError, LookupError, TypeError, RuntimeError) as error:
         name = printable(str(path))
-        if other := _other_format(path):
+        fault = unreadable(path)
+        other = None
+        if fault is None:
+            with path.open("rb") as stream:
+                other = other_format(stream.read(HEAD_BYTES))
+        if other not in (None, SAFETENSORS):
             raise ModelError(
                 f"{name} must hold safetensors weights, but it is {other.name}. {TRAINED}, or an "
                 f"ONNX file of your own network: {other.remedy}."
             ) from error
-        reason = unreadable(path) or reason_of(error)
+        reason = fault or reason_of(error)
         raise ModelError(f"{name} holds no safetensors weights: {reason}. {TRAINED}.") from error
-
-
-def _other_format(path: Path) -> OtherFormat | None:
-    """Return the format of a file whose first bytes are those of another format
-    than safetensors.
-    """
-    try:
-        with path.open("rb") as file:
-            kind = other_format(file.read(HEAD_BYTES))
-    except OSError:
-        return None
-    return None if kind is SAFETENSORS else kind
 
 
 def write_weights(path: Path, weights: Weights) -> None:
@@ -124,7 +117,10 @@ def read_weights(path: Path) -> Weights:
     tensors, header = read_tensors(path)
     try:
         conditioned = _told(header)
-        variant = _variant(header)
+        shape: Any = header["variant"]
+        variant = Variant(int(shape["blocks"]), int(shape["features"]), int(shape.get("scale", 1)))
+        if variant.scale < 1:
+            raise ValueError(f"it states a scale of {variant.scale}")
         # Before a list of the network's is made: a header alone must not take memory.
         if len(tensors) != 4 * variant.blocks + (7 if conditioned else 6):
             raise ValueError(f"it has {len(tensors)} tensors for {variant}")
@@ -183,14 +179,6 @@ def _told(header: Mapping[str, object]) -> bool:
     if kind and header.get("ranges") != {name: list(ends) for name, ends in RANGES.items()}:
         raise ValueError("its ranges of sensors differ from those of this version")
     return kind is not None
-
-
-def _variant(header: Mapping[str, Any]) -> Variant:
-    shape = header["variant"]
-    variant = Variant(int(shape["blocks"]), int(shape["features"]), int(shape.get("scale", 1)))
-    if variant.scale < 1:
-        raise ValueError(f"it states a scale of {variant.scale}")
-    return variant
 
 
 def _check_like(tensors: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> None:

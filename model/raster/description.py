@@ -58,7 +58,16 @@ def raster_of(path: Path, dataset: Any) -> Raster:
         colour=colours[:bands] == list(RGB_BANDS),
         restored=is_restored(tags.get("TIFFTAG_SOFTWARE", ""), tags),
         place=_place(dataset),
-        band_info=tuple(_band_info(dataset, band) for band in range(bands)),
+        band_info=tuple(
+            BandInfo(
+                dataset.descriptions[band] or "",
+                dataset.units[band] or "",
+                dataset.scales[band],
+                dataset.offsets[band],
+                _kept(dataset.tags(band + 1)),
+            )
+            for band in range(bands)
+        ),
         tags=_kept(tags),
     )
 
@@ -148,16 +157,6 @@ def _place(dataset: Any) -> Place:
         gcps=tuple((point.row, point.col, point.x, point.y, point.z or 0.0) for point in points),
         rpcs=tuple(sorted(dataset.tags(ns="RPC").items())),
         area_or_point=dataset.tags().get("AREA_OR_POINT", ""),
-    )
-
-
-def _band_info(dataset: Any, band: int) -> BandInfo:
-    return BandInfo(
-        dataset.descriptions[band] or "",
-        dataset.units[band] or "",
-        dataset.scales[band],
-        dataset.offsets[band],
-        _kept(dataset.tags(band + 1)),
     )
 
 

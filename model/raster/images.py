@@ -1,6 +1,7 @@
 """Read whole images, list those of a folder, and tell frames of one site apart."""
 
 import re
+from math import prod
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,15 @@ def read_pixels(path: Path) -> np.ndarray:
     """
     with open_raster(path) as source:
         raster = source.raster
-        _check_memory(path, raster.bands * raster.height_px * raster.width_px)
+        samples = prod(raster.shape)
+        needed = samples * 4 * WORKING_COPIES
+        free = psutil.virtual_memory().available
+        if needed > free:
+            room, size = sizes(free, needed)
+            raise MachineError(
+                f"{path} has {samples:,} samples, which need about {size}, but there is only "
+                f"{room} of free memory. Cut it into pieces."
+            )
         stored = source.read(0, raster.height_px)
     pixels = np.ma.getdata(stored)
     if raster.dtype.kind == "f" and not np.isfinite(pixels).all():
@@ -63,24 +72,10 @@ def image_size_px(path: Path) -> tuple[int, int]:
         return source.raster.height_px, source.raster.width_px
 
 
-def _check_memory(path: Path, samples: int) -> None:
-    needed = samples * 4 * WORKING_COPIES
-    free = psutil.virtual_memory().available
-    if needed > free:
-        room, size = sizes(free, needed)
-        raise MachineError(
-            f"{path} has {samples:,} samples, which need about {size}, but there is only {room} of "
-            "free memory. Cut it into pieces."
-        )
-
-
 def list_images(folder: Path) -> list[Path]:
     """The image files of a folder, sorted by name."""
-    images = (
-        sorted(p for p in folder.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES)
-        if folder.is_dir()
-        else []
-    )
+    # A folder that does not exist has no files either.
+    images = sorted(path for path in folder.glob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
     if not images:
         fault = "there is no image in it" if folder.is_dir() else "no such folder"
         raise ImageError(

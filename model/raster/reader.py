@@ -134,12 +134,6 @@ def _driver(path: Path) -> str:
     return "ENVI" if suffix == ".img" and has_header else DRIVERS[suffix]
 
 
-def format_name(path: Path) -> str:
-    """Return what messages call the format of a file, by its suffix."""
-    driver = DRIVERS.get(path.suffix.lower(), "raster")
-    return FORMATS.get(driver, driver)
-
-
 def _require_sidecars(path: Path) -> None:
     """Refuse a mask or metadata file beside an image that GDAL would misread or pass over."""
     advice = "Write it again, or remove it."
@@ -209,8 +203,10 @@ def damage_in_a_sentence(path: Path, rows: str = "") -> Iterator[None]:
         if "not recognized as being in a supported file format" in reason:
             reason = "it has another format"
         part = f" in {rows}" if rows else ""
+        driver = DRIVERS.get(path.suffix.lower(), "raster")
+        kind = FORMATS.get(driver, driver)
         raise ImageError(
-            f"{path} is not a readable {format_name(path)}{part}: {reason.rstrip('.')}. {advice}."
+            f"{path} is not a readable {kind}{part}: {reason.rstrip('.')}. {advice}."
         ) from error
 
 

@@ -30,12 +30,7 @@ TILE_PX = 256
 COG_TILE_PX = 512
 
 
-CODECS = {
-    "none": "NONE",
-    "zlib": "DEFLATE",
-    "zstd": "ZSTD",
-    "lzw": "LZW",
-}
+CODECS = {"none": "NONE", "zlib": "DEFLATE", "zstd": "ZSTD", "lzw": "LZW"}
 """GDAL's names of the compressions."""
 LEVELS = {"zlib": {"ZLEVEL": 1}, "zstd": {"ZSTD_LEVEL": 1}}
 """The quickest levels: a noisy image is hardly smaller at higher ones."""
@@ -89,36 +84,46 @@ def write_raster(
         with rasterio.open(path, "w", **_profile(raster, compression)) as file:
             file.update_tags(TIFFTAG_SOFTWARE=software, **dict(raster.tags))
             _describe(file, raster)
-            for band in range(raster.bands):
-                for start, stop in strips(raster.height_px, TILE_PX):
-                    file.write(
-                        pixels.read(band, start, stop), band + 1, window=_window(file, start, stop)
-                    )
-            for start, stop in strips(raster.height_px, TILE_PX) if raster.mask_kind else ():
-                _write_mask(file, raster, pixels.read_mask(start, stop), start, stop)
+            for plane, window, rows in _planes(raster, pixels):
+                if plane == MASK:
+                    file.write_mask(rows, window=window)
+                else:
+                    file.write(rows, plane, window=window)
         require_equal(path, raster, pixels)
 
 
 def require_equal(path: Path, raster: Raster, pixels: Pixels) -> None:
     """Raise OSError if bands, mask or alpha of a TIFF differ from what it was written from."""
     with disk_errors(), gdal(), rasterio.open(path, driver="GTiff") as file:
-        for band in range(raster.bands):
-            for start, stop in strips(raster.height_px, TILE_PX):
-                stored = file.read(band + 1, window=_window(file, start, stop))
-                _require_same(stored, pixels.read(band, start, stop))
-        for start, stop in strips(raster.height_px, TILE_PX) if raster.mask_kind else ():
-            window = _window(file, start, stop)
-            if raster.mask_kind == "alpha":
-                stored = file.read(file.count, window=window)
-            else:
+        for plane, window, rows in _planes(raster, pixels):
+            if plane == MASK:
                 stored = file.dataset_mask(window=window)
-            _require_same(stored, _mask_rows(raster, pixels.read_mask(start, stop)))
+            else:
+                stored = file.read(plane, window=window)
+            # Floats are compared bit for bit, because NaN differs from itself.
+            if stored.tobytes() != rows.tobytes():
+                raise OSError("the file holds other pixels than were written")
 
 
-def _require_same(stored: np.ndarray, written: np.ndarray) -> None:
-    # Floats are compared bit for bit, because NaN differs from itself.
-    if stored.tobytes() != written.tobytes():
-        raise OSError("the file holds other pixels than were written")
+MASK = 0
+"""The number of the mask among the planes of a TIFF, whose bands and alpha count from 1."""
+
+
+def _planes(raster: Raster, pixels: Pixels) -> Iterator[tuple[int, Window, np.ndarray]]:
+    """Yield plane after plane in strips: its number, the window, and the rows as GDAL has them."""
+    planes = list(range(1, raster.bands + 1))
+    if raster.mask_kind:
+        planes.append(MASK if raster.mask_kind == "mask" else raster.bands + 1)
+    for plane in planes:
+        for start, stop in strips(raster.height_px, TILE_PX):
+            window = Window(0, start, raster.width_px, stop - start)
+            if 0 < plane <= raster.bands:
+                rows = pixels.read(plane - 1, start, stop)
+            elif plane == MASK:
+                rows = np.where(pixels.read_mask(start, stop) == 0, 0, 255).astype(np.uint8)
+            else:
+                rows = pixels.read_mask(start, stop).astype(raster.dtype)
+            yield plane, window, rows
 
 
 @contextmanager
@@ -135,20 +140,15 @@ def disk_errors() -> Iterator[None]:
         raise OSError(" ".join(str(error.__cause__ or error).split())) from error
 
 
-def _window(file: Any, start: int, stop: int) -> Window:
-    return Window(0, start, file.width, stop - start)
-
-
 def _profile(raster: Raster, compression: Compression) -> dict[str, Any]:
     """Return the creation options of a TIFF."""
-    has_alpha = raster.mask_kind == "alpha"
     place = raster.place
     points = [GroundControlPoint(row, column, *at) for row, column, *at in place.gcps]
     profile: dict[str, Any] = {
         "driver": "GTiff",
         "width": raster.width_px,
         "height": raster.height_px,
-        "count": raster.bands + has_alpha,
+        "count": raster.bands + (raster.mask_kind == "alpha"),
         "dtype": raster.dtype.name,
         "nodata": raster.nodata,
         "crs": place.crs,
@@ -189,8 +189,7 @@ def _describe(file: Any, raster: Raster) -> None:
 
 def _describe_bands(file: Any, bands: Sequence[BandInfo]) -> None:
     """Write names, units, scales and metadata of the bands; alpha has none."""
-    alpha = [BandInfo()] * (file.count - len(bands))
-    both = [*bands, *alpha]
+    both = [*bands, *[BandInfo()] * (file.count - len(bands))]
     file.descriptions = [band.name or None for band in both]
     if any(band.unit for band in bands):
         file.units = [band.unit for band in both]
@@ -200,21 +199,6 @@ def _describe_bands(file: Any, bands: Sequence[BandInfo]) -> None:
     for number, band in enumerate(bands, 1):
         if band.tags:
             file.update_tags(number, **dict(band.tags))
-
-
-def _write_mask(file: Any, raster: Raster, rows: np.ndarray, start: int, stop: int) -> None:
-    window = _window(file, start, stop)
-    if raster.mask_kind == "alpha":
-        file.write(_mask_rows(raster, rows), file.count, window=window)
-    else:
-        file.write_mask(_mask_rows(raster, rows), window=window)
-
-
-def _mask_rows(raster: Raster, rows: np.ndarray) -> np.ndarray:
-    """Return rows of alpha in the type of the bands, or of a mask as GDAL has it: 0 and 255."""
-    if raster.mask_kind == "alpha":
-        return rows.astype(raster.dtype)
-    return np.where(rows == 0, 0, 255).astype(np.uint8)
 
 
 def write_cog(plain: Path, cog: Path, compression: Compression, about: Mapping[str, str]) -> None:

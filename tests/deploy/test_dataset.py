@@ -14,7 +14,6 @@ import pytest
 import tifffile
 from PIL import Image
 
-from beers_deploy.cluster import open_cluster
 from beers_deploy.model.dataset import (
     CHUNK,
     DatasetRecipe,
@@ -28,6 +27,7 @@ from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.scene_call import SceneCall, calling_for, origins, typical_effects
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import scene_names
+from beers_deploy.restoration.cluster import open_cluster
 from beers_deploy.results import Table
 from beers_deploy.verbs.simulate import simulate
 from tests.deploy.command_line import done, refused

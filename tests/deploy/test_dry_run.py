@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import tifffile
 
-from beers_deploy.dry_run import preview_row
 from beers_deploy.model.raster.reader import GdalSource
 from beers_deploy.network import Network, NetworkLike
+from beers_deploy.performance.dry_run import preview_row
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.restoration.plan import Tiles
 from beers_deploy.restoration.prepare import NetworkPipeline
-from beers_deploy.restoration.reading import Reading
+from beers_deploy.restoration.radiometry import Reading
 from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import done
 from tests.shipped import shipped_pair
@@ -35,13 +35,10 @@ def about(
     network: NetworkLike,
     tile_px: int = 640,
     full_scale: float | None = None,
-    measure: bool = False,
 ) -> Row:
     """Return the facts of an image and of its restoration by a network."""
     pipeline = NetworkPipeline({"": Network.load(network)}, Tiles(tile_px))
-    return preview_row(
-        image, pipeline, Reading(full_scale=full_scale), TargetProfile.load("vck190"), measure
-    )
+    return preview_row(image, pipeline, Reading(full_scale=full_scale), TargetProfile.load("vck190"))
 
 
 def test_it_shows_the_facts_of_the_header(model: Path, tmp_path: Path) -> None:
@@ -55,7 +52,6 @@ def test_it_shows_the_facts_of_the_header(model: Path, tmp_path: Path) -> None:
         == "EPSG:32631, first corner (300000, 4800000), pixels of 0.5 x 0.25"
     )
     assert (row.text["nodata"], row.text["rational polynomials"]) == ("7", "yes")
-    assert row.figures["time here"].mode == "unavailable"
 
 
 def test_of_a_large_image_few_pixels_are_read(
@@ -97,7 +93,7 @@ def test_an_unknown_full_scale_is_reported_as_open(kind: str, model: Path, tmp_p
 
 def test_time_here_is_predicted_from_what_was_timed(model: Path, tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.ones((90, 70), np.uint16))
-    figure = about(tmp_path / "in.tif", model, 23, measure=True).figures["time here"]
+    figure = about(tmp_path / "in.tif", model, 23).figures["time here"]
     assert figure.mode == "predicted"
     assert figure.value is not None
     assert figure.interval is not None

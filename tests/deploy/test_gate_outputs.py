@@ -195,7 +195,8 @@ def test_a_refusal_deletes_an_older_verdict_and_the_junit_file_gives_the_reason(
     file = tmp_path / "file"
     file.touch()
     outputs = ["--json", document, "--junit", junit]
-    for words in (["--max-mae", "nan"], ["--samples", file, "--patches", 2]):
+    before = ["--sensor", ""]
+    for words in (before, ["--max-mae", "nan"], ["--samples", file, "--patches", 2]):
         Table("gate").save(document)
         message = refused("gate", *SMALL[:1], *outputs, *words)
         assert not document.exists()

@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import psutil
 import pytest
 
-from beers_deploy.host_state import peak_memory
 from beers_deploy.model.processor import processor_name
 from beers_deploy.profiles.figures import Figure
+from beers_deploy.restoration.memory import peak_memory
 from beers_deploy.results import host
 
 MEGABYTE = 1_000_000
@@ -25,7 +25,7 @@ def gigabytes(figure: Figure) -> float:
 
 TAKE = """
 import sys
-from beers_deploy.host_state import peak_memory
+from beers_deploy.restoration.memory import peak_memory
 before = peak_memory().value
 block = b"x" * int(sys.argv[1])
 del block
@@ -54,7 +54,7 @@ def test_the_peak_is_this_process_s_own_not_its_parent_s() -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="another way is the only one here")
 def test_every_posix_system_s_way_agrees_with_linux_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
     own = gigabytes(peak_memory())
-    monkeypatch.setattr("beers_deploy.host_state.STATUS", NOWHERE)
+    monkeypatch.setattr("beers_deploy.restoration.memory.STATUS", NOWHERE)
     # The peak may be that of a parent process, which may have held more.
     assert own * 0.95 < gigabytes(peak_memory()) < psutil.virtual_memory().total / 1e9
 
@@ -65,7 +65,7 @@ def test_macos_counts_bytes_and_the_others_kibibytes(
 ) -> None:
     usage = SimpleNamespace(RUSAGE_SELF=0, getrusage=lambda _: SimpleNamespace(ru_maxrss=2_000_000))
     monkeypatch.setitem(sys.modules, "resource", usage)
-    monkeypatch.setattr("beers_deploy.host_state.STATUS", NOWHERE)
+    monkeypatch.setattr("beers_deploy.restoration.memory.STATUS", NOWHERE)
     monkeypatch.setattr(sys, "platform", system)
     assert gigabytes(peak_memory()) == pytest.approx(2e6 * unit_bytes / 1e9)
 
@@ -73,7 +73,7 @@ def test_macos_counts_bytes_and_the_others_kibibytes(
 def test_where_nothing_counts_it_there_is_a_reason_and_no_zero(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("beers_deploy.host_state.STATUS", NOWHERE)
+    monkeypatch.setattr("beers_deploy.restoration.memory.STATUS", NOWHERE)
     monkeypatch.setattr(sys, "platform", "unheard-of")
     monkeypatch.setitem(sys.modules, "resource", None)
     figure = peak_memory()

@@ -30,8 +30,7 @@ from beers_deploy.profiles.figures import Check, Row, measured
 from beers_deploy.profiles.shipped import HERE
 from beers_deploy.profiles.toml import read_json, read_toml_text
 from beers_deploy.quant.onnx_file import load_onnx
-from beers_deploy.restoration.checkpoint import Checkpoint
-from beers_deploy.restoration.journal import FinishedRow, journal_text
+from beers_deploy.restoration.checkpoint import Checkpoint, FinishedRow, journal_text
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.results import Table
 from beers_deploy.verdict import PATCHES, read_baseline, read_document

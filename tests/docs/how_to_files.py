@@ -11,7 +11,7 @@ import numpy as np
 import tifffile
 from PIL import Image
 
-from beers_deploy.board import MEASURE
+from beers_deploy.kit.board import MEASURE
 from beers_deploy.model.convbeers import save_network
 from beers_deploy.model.shipped import SHIPPED
 from beers_deploy.model.simulator.acquire import acquire

@@ -30,8 +30,7 @@ from beers_deploy.profiles.scene_call import SceneCall
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.limits import limits_of
-from beers_deploy.restoration.checkpoint import Checkpoint
-from beers_deploy.restoration.journal import FinishedRow, journal_text
+from beers_deploy.restoration.checkpoint import Checkpoint, FinishedRow, journal_text
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.results import Table
 from beers_deploy.verdict import PATCHES, read_baseline, read_document

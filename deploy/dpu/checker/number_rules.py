@@ -32,9 +32,7 @@ def symmetric(op: Operation, dpu: Dpu) -> Finding | None:
         if not scale.symmetric
         or (scale.integer_type == "int32" and role.startswith(("input", "output")))
     ]
-    return (
-        Finding("; ".join(faults), f"calibrate with a zero point of 0; {AGAIN}") if faults else None
-    )
+    return _reported(faults, f"calibrate with a zero point of 0; {AGAIN}")
 
 
 def int8_alone(op: Operation, dpu: Dpu) -> Finding | None:
@@ -61,9 +59,7 @@ def per_tensor(op: Operation, dpu: Dpu) -> Finding | None:
         for role, scale in op.scales.items()
         if len(scale.scales) != 1
     ]
-    return (
-        Finding("; ".join(faults), f"quantise with one scale a tensor; {AGAIN}") if faults else None
-    )
+    return _reported(faults, f"quantise with one scale a tensor; {AGAIN}")
 
 
 def power_of_two(op: Operation, dpu: Dpu) -> Finding | None:
@@ -76,7 +72,7 @@ def power_of_two(op: Operation, dpu: Dpu) -> Finding | None:
         if scale.frac_bits is None
     ]
     remedy = f"round each scale to 2^-n; {AGAIN}, and so does AMD Quark's XINT8"
-    return Finding("; ".join(faults), remedy) if faults else None
+    return _reported(faults, remedy)
 
 
 def one_format(op: Operation, dpu: Dpu) -> Finding | None:
@@ -86,22 +82,16 @@ def one_format(op: Operation, dpu: Dpu) -> Finding | None:
     faults = [
         f"{role} is {' and '.join(map(_words, formats))}" for role, formats in op.disputed.items()
     ]
-    return (
-        Finding("; ".join(faults), f"give each tensor one scale and zero point; {AGAIN}")
-        if faults
-        else None
-    )
+    return _reported(faults, f"give each tensor one scale and zero point; {AGAIN}")
 
 
 def shift_cut(op: Operation, dpu: Dpu) -> Finding | None:
     """Weight + input - output fractional bits: {numbers[shift_cut]} ({documents[quantiser]})."""
     cut = _cut(op)
     limit = dpu.limit("numbers", "shift_cut")
-    return (
-        None
-        if cut is None or not outside((cut,), limit)
-        else Finding(f"shift_cut {cut}, allowed {limit}", MOVE)
-    )
+    if cut is None or not outside((cut,), limit):
+        return None
+    return Finding(f"shift_cut {cut}, allowed {limit}", MOVE)
 
 
 def shift_bias(op: Operation, dpu: Dpu) -> Finding | None:
@@ -119,11 +109,9 @@ def shift_bias(op: Operation, dpu: Dpu) -> Finding | None:
     low = min(0, cut + 8 - dpu.whole("numbers", "accumulator_bits"))
     high = dpu.whole("numbers", "shift_bias_max")
     shift = product - bias
-    return (
-        None
-        if low <= shift <= high
-        else Finding(f"shift_bias {shift}, allowed {low} to {high}", MOVE)
-    )
+    if low <= shift <= high:
+        return None
+    return Finding(f"shift_bias {shift}, allowed {low} to {high}", MOVE)
 
 
 def bias_width(op: Operation, dpu: Dpu) -> Finding | None:
@@ -187,6 +175,11 @@ def product_frac_bits(op: Operation) -> int | None:
     return None if weight is None or source is None else weight + source
 
 
+def _reported(faults: list[str], remedy: str) -> Finding | None:
+    """Return what to say of faults; nothing where there is none."""
+    return Finding("; ".join(faults), remedy) if faults else None
+
+
 def _frac_bits(op: Operation, role: str) -> int | None:
     scale = op.scales.get(role)
     return scale.frac_bits if scale else None
@@ -230,11 +223,7 @@ def int8_constants(op: Operation, dpu: Dpu) -> Finding | None:
         for role, kind in kinds.items()
         if kind in BYTES and role not in op.scales
     ]
-    return (
-        Finding("; ".join(faults), f"store it as int8 with a scale 2^-n; {AGAIN}")
-        if faults
-        else None
-    )
+    return _reported(faults, f"store it as int8 with a scale 2^-n; {AGAIN}")
 
 
 def int8_bias(op: Operation, dpu: Dpu) -> Finding | None:

@@ -125,17 +125,13 @@ def place(network: SizedGraph, dpu: Dpu) -> Placement:
     # In a float file a cut at an end costs time and no more.
     if not network.quantized:
         parts = _left_to_the_host(network, parts, broken)
-    devices = [_device(part, bool(rules)) for part, rules in zip(parts, broken, strict=True)]
+    devices: list[Device] = []
+    for part, rules in zip(parts, broken, strict=True):
+        on_core: Device = "CPU" if rules else "DPU"
+        devices.append(on_core if part == "dpu-core" else "host")
     subgraphs = _subgraphs(network.operations, devices)
     nodes = tuple(map(PlacedNode, network.operations, parts, devices, broken, subgraphs))
     return Placement(nodes, tuple(_cuts(network, nodes)), "" if network.quantized else FLOAT_NOTE)
-
-
-def _device(part: Part, breaks_rules: bool) -> Device:
-    """Where an operation of a part runs."""
-    if part != "dpu-core":
-        return "host"
-    return "CPU" if breaks_rules else "DPU"
 
 
 def _parts(network: SizedGraph) -> list[Part]:

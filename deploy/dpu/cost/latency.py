@@ -102,7 +102,7 @@ class Prediction:
     @property
     def fps(self) -> float:
         """Images a second, batches back to back, the host working on others beside them."""
-        return self.rate(self.batch_time_s, self.host_s)
+        return self._rate(self.host_s)
 
     @property
     def fps_interval(self) -> Interval:
@@ -110,7 +110,7 @@ class Prediction:
         width.
         """
         # The host at its fastest comes first.
-        fast, slow = (self.rate(self.batch_time_s, host_s) for host_s in self._host_ends_s)
+        fast, slow = map(self._rate, self._host_ends_s)
         return slow / self.spread, fast * self.spread
 
     @property
@@ -152,11 +152,10 @@ class Prediction:
         low_s, high_s = (sum(ends) for ends in zip(self.refused_s, self.step_s, strict=True))
         return rest_s + low_s, rest_s + high_s
 
-    def rate(self, batch_time_s: float, host_s: float) -> float:
-        """Images a second if a batch took that long on the DPU, and an image
-        that long on the host.
-        """
-        return frame_rate(batch_time_s / self.batch, host_s, self.dpu.value("cost", "crowding"))
+    def _rate(self, host_s: float) -> float:
+        """Return images a second if the host takes that long for an image."""
+        dpu_s = self.batch_time_s / self.batch
+        return frame_rate(dpu_s, host_s, self.dpu.value("cost", "crowding"))
 
     @property
     def operations(self) -> int:

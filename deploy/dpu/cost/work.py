@@ -145,7 +145,9 @@ class _Flow:
     """
 
     def __init__(self, operations: Sequence[Operation], dpu: Dpu) -> None:
-        self._kept_bytes = kept_bytes(dpu)
+        # A group of banks is read while another is written.
+        groups = dpu.value("memory", "feature_map_groups") / 2
+        self._kept_bytes = dpu.value("memory", "feature_map_bytes") * groups
         self._lanes = dpu.input_parallel
         self._same: dict[str, str] = {}
         for op in operations:
@@ -164,7 +166,13 @@ class _Flow:
         self._concats = {op.output for op in computing if op.kind == "concat"}
         self._pieces = self._piece_channels(operations)
         sums = [op for op in computing if op.kind in ("add", "mul")]
-        self._passes = {op.output for op in sums if self._is_pass(op)}
+        self._passes = {
+            op.output
+            for op in sums
+            if len(op.inputs) == 2
+            and op.in_shapes[0] == op.in_shapes[1]
+            and not self._fits(op.output)
+        }
         reading = [op for op in computing if op.output in self._passes | self._concats]
         inputs = chain.from_iterable(op.inputs for op in reading)
         self._stored = {self._root(name) for name in inputs}
@@ -223,11 +231,6 @@ class _Flow:
                 pieces |= {self._root(name): shape[0] for name, shape in fed if shape is not None}
         return pieces
 
-    def _is_pass(self, op: Operation) -> bool:
-        return (
-            len(op.inputs) == 2 and op.in_shapes[0] == op.in_shapes[1] and not self._fits(op.output)
-        )
-
     def _fused(self, add: Operation) -> str:
         """The operand of an add that is made last."""
         return max(add.inputs, key=lambda name: self._order.get(self._root(name), -1))
@@ -244,13 +247,6 @@ class _Flow:
 
     def _root(self, name: str) -> str:
         return self._same.get(name, name)
-
-
-def kept_bytes(dpu: Dpu) -> float:
-    """The largest result that stays on the chip: a group of banks is read while
-    another is written.
-    """
-    return dpu.value("memory", "feature_map_bytes") * dpu.value("memory", "feature_map_groups") / 2
 
 
 def _size(shape: Shape | None) -> int:

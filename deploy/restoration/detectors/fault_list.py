@@ -73,11 +73,6 @@ class FaultList:
         ]
         return ", ".join(words) or "none"
 
-    @property
-    def text_of_row(self) -> dict[str, str]:
-        """For a row of results: what was replaced."""
-        return {"detectors replaced": self.words} if self.faults else {}
-
     def mask(self, raster: Raster, start: int, stop: int) -> np.ndarray:
         """Return where pixels of rows `start` to `stop` (excluded) are faulty, bool (bands, rows,
         width).

@@ -124,9 +124,10 @@ class Restorer:
         inner = _within(rows), _within(columns)
         restored = network.restore(window, self.full_scale, inner, self.tiling)
         tally = Tally(tiles=1, runs=restored.runs, brightened=restored.brightened)
-        if missing is None:
-            return Tile(restored.pixels, tally)
-        return Tile(np.where(missing, np.float32(np.nan), restored.pixels), tally)
+        pixels = restored.pixels
+        if missing is not None:
+            pixels = np.where(missing, np.float32(np.nan), pixels)
+        return Tile(pixels, tally)
 
     def finish(
         self,
@@ -158,10 +159,9 @@ class Restorer:
         if self.consistency:
             change = self._change(strip, restored, at, bands, rows, columns)
             pixels = np.clip(network_pixels + change, 0, np.float32(self.full_scale))
-        valid_raw = (
-            None if strip.missing is None else ~strip.missing[strip.kept(bands, rows, columns)]
-        )
-        raw = strip.pixels[strip.kept(bands, rows, columns)].astype(np.float64) / self.full_scale
+        kept = strip.kept(bands, rows, columns)
+        valid_raw = None if strip.missing is None else ~strip.missing[kept]
+        raw = strip.pixels[kept].astype(np.float64) / self.full_scale
         valid = None if missing is None else ~missing
         tally = Tally.of(raw, self._shares(pixels), valid_raw, valid)
         if self.consistency:
@@ -171,9 +171,7 @@ class Restorer:
             tally = tally.changed_from(
                 Tally.of(raw, self._shares(network_pixels), valid_raw, valid), squared
             )
-        result = as_stored(
-            self.raster, pixels if missing is None else np.nan_to_num(pixels), self.full_scale
-        )
+        result = as_stored(self.raster, np.nan_to_num(pixels), self.full_scale)
         if missing is not None:
             result = np.where(
                 missing, self._unrestored(strip, missing, bands, rows, columns), result
@@ -230,10 +228,9 @@ class Restorer:
             return None
         missing = strip.missing[strip.kept(bands, rows, columns)]
         tiling = self.tiling
-        scale = int(self.tiling.scale)
         if tiling.channels_in != tiling.channels_out:
             missing = np.repeat(missing.any(axis=0, keepdims=True), tiling.channels_out, axis=0)
-        return missing.repeat(scale, axis=1).repeat(scale, axis=2) if scale > 1 else missing
+        return _enlarged(missing, int(tiling.scale))
 
     def _unrestored(
         self, strip: Strip, missing: np.ndarray, bands: slice, rows: Span, columns: Span
@@ -242,13 +239,12 @@ class Restorer:
         correspond.
         """
         tiling = self.tiling
-        scale = int(self.tiling.scale)
         if tiling.channels_in != tiling.channels_out:
             none = np.nan if self.raster.out_dtype.kind == "f" else 0
             blank = none if self.raster.nodata is None else self.raster.nodata
             return np.full(missing.shape, blank, self.raster.out_dtype)
         stored = strip.pixels[strip.kept(bands, rows, columns)].astype(self.raster.out_dtype)
-        return stored.repeat(scale, axis=1).repeat(scale, axis=2) if scale > 1 else stored
+        return _enlarged(stored, int(tiling.scale))
 
     def _window(self, strip: Strip, bands: slice, rows: Span, columns: Span) -> np.ndarray:
         """What the network sees of a tile, (bands, h, w): missing pixels filled, extended to the
@@ -293,6 +289,11 @@ class Restorer:
         return filled[
             :, above : above + rows.stop - rows.start, aside : aside + columns.stop - columns.start
         ]
+
+
+def _enlarged(planes: np.ndarray, scale: int) -> np.ndarray:
+    """Return (bands, h, w) with each pixel repeated `scale` times along both sides."""
+    return planes if scale == 1 else planes.repeat(scale, axis=1).repeat(scale, axis=2)
 
 
 def _within(span: Span) -> slice:

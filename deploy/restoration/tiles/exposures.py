@@ -64,9 +64,12 @@ class ExposedNetwork:
         inside = (slice(None), *(slice(part.start * scale, part.stop * scale) for part in kept))
         if len(self.infers) == 1:
             restored = restore_window(window, self.infers[1], full_scale)
-            _require_shape(
-                restored, (tiling.channels_out, *(side * scale for side in window.shape[1:]))
-            )
+            shape = tiling.channels_out, *(side * scale for side in window.shape[1:])
+            if restored.shape != shape:
+                raise ModelError(
+                    f"The network returned a result of {times(restored.shape)}, but its file "
+                    f"states {times(shape)}. Export it for images of any size, or check its sizes."
+                )
             return Exposed(restored[inside], 1, 0)
         image = np.asarray(window[0], np.float32)
         choice = choose_factors(image, self.infers, self.radius_px, full_scale, self.offset)[kept]
@@ -111,14 +114,6 @@ def tiles_by_factor(
         for factor in np.unique(tile_choice).tolist():
             counts[factor] += 1
     return counts
-
-
-def _require_shape(restored: np.ndarray, shape: tuple[int, ...]) -> None:
-    if restored.shape != shape:
-        raise ModelError(
-            f"The network returned a result of {times(restored.shape)}, but its file states "
-            f"{times(shape)}. Export it for images of any size, or check its sizes."
-        )
 
 
 def restore_window(dn: np.ndarray, infer: Infer, full_scale: float = MAX_DN) -> np.ndarray:

@@ -4,59 +4,21 @@ A tile is two tasks: the network on its window, and what stores its pixels, once
 on the tiles that the consistency step reaches.
 """
 
-from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from itertools import product
 from typing import Any
 
 import numpy as np
-import onnx
 
-from beers_deploy.model.consistency import RAW_REACH_PX, REACH_PX
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.plan import Plan, Span, plan_for
 from beers_deploy.restoration.prepare import NetworkPipeline
-from beers_deploy.restoration.radiometry import full_scale_of
-from beers_deploy.restoration.reading import Reading
-from beers_deploy.restoration.runtime import Packed
+from beers_deploy.restoration.radiometry import Reading, full_scale_of
 from beers_deploy.restoration.steps import consistency_steps, exposed_networks
-from beers_deploy.restoration.tiles.engine import NAME, Restorer, checked_strip
-from beers_deploy.restoration.tiles.exposures import ExposedNetwork
-from beers_deploy.restoration.tiles.rows import Steps
-
-
-@dataclass(frozen=True)
-class Task:
-    """What all tiles of a lazy array, or of one band of it, share: Dask's workers get it.
-
-    It holds networks, not their paths: a worker on another machine has no such files.
-
-    Attributes:
-        raster: the image's facts.
-        networks: the network at its exposures.
-        asked: the full scale that the user states; None leaves it to `bits` and each tile's pixels.
-        bits: of the sensor, where the user names its profile.
-        tiling: how the network meets an image.
-        consistency: the consistency step; empty where it is left out.
-    """
-
-    raster: Raster
-    networks: tuple[ExposedNetwork, ...]
-    asked: float | None
-    bits: int | None
-    tiling: Tiling
-    consistency: Steps
-
-    def restorer(self, window: np.ndarray) -> Restorer:
-        """What restores the tiles of a window of pixels (bands, h, w)."""
-        # A dark tile may look like radiances; one tile alone does not prove that the image is.
-        extent = self.raster.extent(window)._replace(whole=True)
-        full_scale = full_scale_of(NAME, self.raster, [extent], self.asked, self.bits).value
-        return Restorer(
-            self.raster, self.networks, full_scale, self.tiling, NAME, consistency=self.consistency
-        )
+from beers_deploy.restoration.tiles.engine import NAME, Restorer, Strip, checked_strip
 
 
 def restore_lazily(bands: Any, raster: Raster, pipeline: NetworkPipeline, reading: Reading) -> Any:
@@ -73,39 +35,35 @@ def restore_lazily(bands: Any, raster: Raster, pipeline: NetworkPipeline, readin
     # The type alone decides the scale at once. Pixels may lead to a refusal later, but not to
     # another scale.
     full_scale = full_scale_of(NAME, raster, (), reading.full_scale, reading.sensor_bits).value
-    engine = pipeline.engine
-
-    def packed(model: onnx.ModelProto, at_first_call: bool) -> Packed:  # noqa: ARG001
-        return Packed(model.SerializeToString(), engine.runtime, engine.threads or 1)
-
     around = pipeline.around
+    packed = pipeline.engine.packed
     exposed = exposed_networks(networks, around, plan.tiling, full_scale, packed)
     steps, _ = consistency_steps(around, reading.sensors, raster, plan.tiling, full_scale)
-    # A window holds one band only, so a task has the network and the step of that band.
-    tasks = [
-        delayed(
-            Task(
-                raster,
-                exposed[band : band + 1],
-                reading.full_scale,
-                reading.sensor_bits,
-                plan.tiling,
-                steps if len(networks) < 2 else steps[band : band + 1],
-            )
+    # A window holds one band only, so its tasks have the network and the step of that band. They
+    # hold networks, not their paths: a worker on another machine has no such files.
+    restorers = [
+        Restorer(
+            raster,
+            exposed[band : band + 1],
+            full_scale,
+            plan.tiling,
+            consistency=steps if len(networks) < 2 else steps[band : band + 1],
         )
         for band in range(len(networks))
     ]
-    reach_px = REACH_PX if steps else 0
-    tile = delayed(restore_tile)
-    finish = delayed(finish_tile)
+    reach_px = restorers[0].reach_px
+    margin_px = restorers[0].margin_px
+    shared = [delayed(restorer) for restorer in restorers]
+    tile = delayed(partial(restore_tile, reading))
+    finish = delayed(partial(finish_tile, reading))
     groups = range(plan.groups)
-    margin_px = max(raster.fill_margin_px(plan.radius_px), RAW_REACH_PX if steps else 0)
     windows = {
         place: _read(bands, plan, margin_px, *place)
         for place in product(groups, plan.rows, plan.columns)
     }
     restored = {
-        place: tile(tasks[place[0] % len(tasks)], *windows[place], *place[1:]) for place in windows
+        place: tile(shared[place[0] % len(shared)], *windows[place], *place[1:])
+        for place in windows
     }
 
     def block(group: int, row: Span, column: Span) -> Any:
@@ -114,7 +72,7 @@ def restore_lazily(bands: Any, raster: Raster, pipeline: NetworkPipeline, readin
         around = [[restored[group, down_tile, tile] for tile in across] for down_tile in down]
         at = down[0].keep_start, across[0].keep_start
         window = windows[group, row, column]
-        finished = finish(tasks[group % len(tasks)], *window, around, at, row, column)
+        finished = finish(shared[group % len(shared)], *window, around, at, row, column)
         sides = ((span.keep_stop - span.keep_start) * plan.scale for span in (row, column))
         return da.from_delayed(finished, (plan.tiling.channels_out, *sides), raster.out_dtype)
 
@@ -143,26 +101,27 @@ def _read(
     count = plan.tiling.channels_in
     pixels = bands[group * count : (group + 1) * count, rows, columns]
     # Both tasks of the tile share this one, so that chunks are read once.
-    return import_module("dask").delayed(_itself)(pixels), rows.start, columns.start
-
-
-def _itself(pixels: np.ndarray) -> np.ndarray:
-    return pixels
+    return import_module("dask").delayed(pixels), rows.start, columns.start
 
 
 def restore_tile(
-    task: Task, window: np.ndarray, top: int, left: int, row: Span, column: Span
+    reading: Reading,
+    restorer: Restorer,
+    window: np.ndarray,
+    top: int,
+    left: int,
+    row: Span,
+    column: Span,
 ) -> np.ndarray:
     """Run the network on one tile: the kept pixels (bands, h, w) float32, of a window that begins
     at (top, left).
     """
-    restorer = task.restorer(window)
-    strip = checked_strip(task.raster, top, window, restorer.full_scale, NAME, left=left)
-    return restorer.tile(strip, 0, row, column).pixels
+    return restorer.tile(_strip(reading, restorer, window, top, left), 0, row, column).pixels
 
 
 def finish_tile(
-    task: Task,
+    reading: Reading,
+    restorer: Restorer,
     window: np.ndarray,
     top: int,
     left: int,
@@ -174,7 +133,8 @@ def finish_tile(
     """Store the kept pixels (bands, h, w) of one tile.
 
     Args:
-        task: what all tiles share.
+        reading: how its pixels are understood.
+        restorer: of its band.
         window: raw pixels, as of `restore_tile`.
         top: row of its first pixel.
         left: its column.
@@ -183,6 +143,14 @@ def finish_tile(
         row: rows of the tile.
         column: its columns.
     """
-    restorer = task.restorer(window)
-    strip = checked_strip(task.raster, top, window, restorer.full_scale, NAME, left=left)
+    strip = _strip(reading, restorer, window, top, left)
     return restorer.finish(strip, np.block(around), at, 0, row, column).pixels
+
+
+def _strip(reading: Reading, restorer: Restorer, window: np.ndarray, top: int, left: int) -> Strip:
+    """Return a window as a strip; refuse pixels that leave the full scale open."""
+    raster = restorer.raster
+    # A dark tile may look like radiances; one tile alone does not prove that the image is.
+    extent = raster.extent(window)._replace(whole=True)
+    full_scale_of(NAME, raster, [extent], reading.full_scale, reading.sensor_bits)
+    return checked_strip(raster, top, window, restorer.full_scale, NAME, left=left)

@@ -58,7 +58,10 @@ class NetworkRow(NamedTuple):
 
 @dataclass
 class HeldRows:
-    """Rows that the network gave, as far up as the next row of tiles to finish needs them."""
+    """Rows that the network gave, as far up as the next row of tiles to finish needs them.
+
+    Rows and columns are those of the restored image.
+    """
 
     top: int = 0
     parts: deque[np.ndarray] = field(default_factory=deque)
@@ -68,14 +71,8 @@ class HeldRows:
         """The row behind the last one."""
         return self.top + int(sum(part.shape[1] for part in self.parts))
 
-    def add(self, row: NetworkRow) -> None:
-        """Hold a row of tiles, which follows the one before."""
-        if not self.parts:
-            self.top = row.span.keep_start
-        self.parts.append(row.pixels)
-
     def window(self, bands: slice, rows: slice, columns: slice) -> np.ndarray:
-        """The pixels (bands, h, w) of some rows and columns of the image."""
+        """Return the pixels (bands, h, w) of some rows and columns."""
         start = self.top
         pieces = list[np.ndarray]()
         for part in self.parts:
@@ -116,20 +113,19 @@ def restore_rows(
     with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(at_once) as pool:
         try:
             waiting = deque[NetworkRow]()
-            buffer = HeldRows()
+            scale = plan.scale
+            buffer = HeldRows(network_rows[0].keep_start * scale)
             for row in _network_rows(source, plan, restorer, network_rows, (reader, pool), tick):
-                if not reach_px:
-                    yield _finished(row, buffer, plan, restorer, pool)
-                    continue
-                buffer.add(row)
+                buffer.parts.append(row.pixels)
                 if first <= row.span.keep_start < rows[-1].keep_stop:
                     waiting.append(row)
-                while waiting and buffer.bottom >= min(
+                while waiting and buffer.bottom >= scale * min(
                     waiting[0].span.keep_stop + reach_px, plan.height_px
                 ):
+                    done_px = waiting[0].span.keep_stop
+                    # A name for the row would keep it in memory while the next is made.
                     yield _finished(waiting.popleft(), buffer, plan, restorer, pool)
-                    next_row = waiting[0].span.keep_start if waiting else buffer.bottom
-                    buffer.forget_above(next_row - reach_px)
+                    buffer.forget_above((done_px - reach_px) * scale)
         finally:
             # Otherwise the tiles of two rows would still be restored after an error.
             pool.shutdown(cancel_futures=True)
@@ -197,21 +193,16 @@ def _finished(
     """Finish a row of tiles, tile by tile, once all that they need is held."""
     count = plan.tiling.channels_out
     reach_px = restorer.reach_px
+    scale = plan.scale
     top = max(row.span.keep_start - reach_px, 0)
-    rows = slice(top, row.span.keep_stop + reach_px)
+    rows = slice(top * scale, (row.span.keep_stop + reach_px) * scale)
 
     def finish(place: tuple[int, Span]) -> Tile:
         group, columns = place
         bands = slice(group * count, (group + 1) * count)
-        # Without the consistency step a tile needs no pixels of the tiles around it.
-        if not reach_px:
-            across = slice(columns.keep_start * plan.scale, columns.keep_stop * plan.scale)
-            at = row.span.keep_start, columns.keep_start
-            return restorer.finish(
-                row.strip, row.pixels[bands, :, across], at, group, row.span, columns
-            )
         left = max(columns.keep_start - reach_px, 0)
-        around = buffer.window(bands, rows, slice(left, columns.keep_stop + reach_px))
+        across = slice(left * scale, (columns.keep_stop + reach_px) * scale)
+        around = buffer.window(bands, rows, across)
         return restorer.finish(row.strip, around, (top, left), group, row.span, columns)
 
     pixels = np.empty(row.pixels.shape, restorer.raster.out_dtype)

@@ -60,7 +60,6 @@ def test_layers_sum_to_the_batch(tmp_path: Path, configuration: str) -> None:
     dpu = load_dpu("vck190", configuration)
     prediction = predict_network(integer_convbeers(tmp_path / "i.onnx", 3, 20), dpu, 177)
     assert math.fsum(layer.time_s for layer in prediction.layers) == prediction.batch_time_s
-    assert prediction.fps == prediction.rate(prediction.batch_time_s, prediction.host_s)
     assert prediction.fps * prediction.batch_time_s < dpu.batch
 
 

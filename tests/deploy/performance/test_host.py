@@ -8,9 +8,9 @@ import numpy as np
 import onnx
 import pytest
 
-from beers_deploy.host_state import cpu_load, resident_bytes
 from beers_deploy.network import Network, other_precision
 from beers_deploy.performance.host import Timed, host_rows, time_networks
+from beers_deploy.performance.timing import cpu_load, resident_bytes
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.target import TargetProfile

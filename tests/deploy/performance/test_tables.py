@@ -65,11 +65,10 @@ def test_published_rows_are_the_papers_and_agree_with_each_other() -> None:
 
 
 def test_efficiency_is_only_as_good_as_its_parts() -> None:
-    time = measured(2.0, "s", "clock")
+    time = predicted(2.0, "s", (1.0, 4.0), "model")
     power = measured(5.0, "W", "counter")
-    assert efficiency(1000, time, power).mode == "measured"
     assert efficiency(1000, time, unavailable("W", "no counter")).reason == "no counter"
-    mixed = efficiency(1000, predicted(2.0, "s", (1.0, 4.0), "model"), power)
+    mixed = efficiency(1000, time, power)
     assert (mixed.mode, mixed.value, mixed.interval) == ("predicted", 100.0, (50.0, 200.0))
 
 

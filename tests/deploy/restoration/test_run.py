@@ -255,7 +255,7 @@ def test_a_budget_that_does_not_suffice_is_refused_before_the_run(
     tifffile.imwrite(tmp_path / "in.tif", noise(1000, 3000), compression="zlib", rowsperstrip=1000)
     # What a process of many tests holds moves by more than the rows of the image.
     memory = SimpleNamespace(memory_info=lambda: SimpleNamespace(rss=100_000_000))
-    monkeypatch.setattr("beers_deploy.restoration.plan.psutil.Process", lambda: memory)
+    monkeypatch.setattr("beers_deploy.restoration.memory.psutil.Process", lambda: memory)
     with pytest.raises(MachineError, match="TILED=YES"):
         restore(
             tmp_path / "in.tif",

@@ -14,14 +14,14 @@ import onnx
 import pytest
 import tifffile
 
-from beers_deploy import cluster
-from beers_deploy.cluster import open_cluster
 from beers_deploy.model.progress import Step
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import MachineError
 from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.tiling.receptive_field import tiling_of
+from beers_deploy.restoration import cluster
+from beers_deploy.restoration.cluster import open_cluster
 from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import noise, stopped_after
 from tests.deploy.two_workers import local_cluster

@@ -18,7 +18,7 @@ from beers_deploy.profiles.errors import MachineError, OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.quant.onnx_file import save_onnx
-from beers_deploy.restoration.tiles.rows import HeldRows, NetworkRow
+from beers_deploy.restoration.tiles.rows import HeldRows
 from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import done
 from tests.deploy.restoration.runs import restored, stopped_after
@@ -336,12 +336,12 @@ def test_few_rows_are_held_of_a_tall_image(model: Path, monkeypatch: pytest.Monk
     within two others.
     """
     most = [0]
-    add = HeldRows.add
+    forget_above = HeldRows.forget_above
 
-    def counting(self: HeldRows, row: NetworkRow) -> None:
-        add(self, row)
+    def counting(self: HeldRows, row: int) -> None:
         most[0] = max(most[0], sum(part.shape[1] for part in self.parts))
+        forget_above(self, row)
 
-    monkeypatch.setattr(HeldRows, "add", counting)
+    monkeypatch.setattr(HeldRows, "forget_above", counting)
     by_array(np.full((800, 9), 900, np.uint16), model, tile=40)
     assert 2 * REACH_PX < most[0] <= 2 * REACH_PX + 3 * 40

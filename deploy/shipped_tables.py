@@ -1,10 +1,11 @@
-"""Sensors, scenes and boards as tables: every constant with its status and its source."""
+"""What is shipped, as tables: sensors, scenes, boards, networks, and the constants of a profile."""
 
 from collections.abc import Mapping
 
+from beers_deploy.model.shipped import INT8, shipped_names
 from beers_deploy.profiles.constant import Constant, Words
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.figures import Figure, Mode, Row
 from beers_deploy.profiles.response import MtfTable
 from beers_deploy.profiles.scene_call import SceneCall
 from beers_deploy.profiles.sensor import Sensor
@@ -12,7 +13,69 @@ from beers_deploy.profiles.sensor_file import TABLES, constant_keys
 from beers_deploy.profiles.shipped import profile_path, scene_names, sensor_names, target_names
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.profiles.toml import read_toml
+from beers_deploy.profiles.target import board_names, load_target, target_names
 from beers_deploy.results import Table
+
+
+def boards() -> Table:
+    """Return the shipped boards with a DPU: its configurations, and where its rules come from.
+
+    Examples:
+        >>> bd.boards().to_pandas().index.to_list()
+        ['kv260', 'vck190', 'vek280', 'zcu102', 'zcu104']
+    """
+    rows = []
+    for board in map(load_target, board_names()):
+        words = {
+            "configurations": ", ".join(board.configurations),
+            "description": board.description,
+        }
+        rows.append(Row("boards", board.name, {}, words))
+    return Table("boards", rows=tuple(rows))
+
+
+def sensors() -> Table:
+    """Return the shipped sensors: contrast at Nyquist, SNR, bits, and what each is.
+
+    Examples:
+        >>> bd.sensors().to_pandas().index.to_list()[2:]
+        ['pleiades-degraded', 'pleiades-reference', 'pleiades-variable']
+    """
+    rows = []
+    for sensor in map(load_sensor, sensor_names()):
+        figures = {"MTF at Nyquist": _figure(sensor.mtf_nyquist, "ratio")}
+        if sensor.snr_1 is not None:
+            figures["SNR"] = _figure(sensor.snr_1, "ratio")
+        figures["bits"] = _figure(sensor.bits, "bit")
+        rows.append(Row("sensors", sensor.name, figures, {"description": sensor.description}))
+    return Table("sensors", rows=tuple(rows))
+
+
+def _figure(constant: Constant, unit: str) -> Figure:
+    """Return a constant as a figure: a range is the interval about its middle."""
+    interval = None if constant.low == constant.high else (constant.low, constant.high)
+    mode: Mode = "measured" if constant.status == "measured" else "published"
+    return Figure(
+        (constant.low + constant.high) / 2,
+        unit,
+        mode,
+        f"{constant.status}: {constant.source}",
+        interval,
+    )
+
+
+def networks() -> Table:
+    """Return the shipped networks, each in float32 and in INT8.
+
+    Examples:
+        >>> "convbeers-s-int8" in bd.networks().to_pandas().index
+        True
+    """
+    rows = []
+    for name in shipped_names():
+        rows.append(Row("networks", name, {}, {"precision": "float32"}))
+        rows.append(Row("networks", f"{name}{INT8}", {}, {"precision": "int8"}))
+    return Table("networks", rows=tuple(rows))
 
 
 def list_of_profiles() -> Table:

@@ -1,10 +1,9 @@
-"""Boards for notebooks, what a board's engineer is handed, and tables of what is shipped."""
+"""A board, and the kit that its engineer is handed."""
 
 import json
 import logging
 import os
 import shutil
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -16,23 +15,21 @@ from beers_deploy.kit.record import require_library, write_record
 from beers_deploy.model.consistency import REACH_PX
 from beers_deploy.model.exposure import HEADROOM
 from beers_deploy.model.io.files import write_text
-from beers_deploy.model.shipped import INT8, shipped_names
 from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.network_files import other_sensor
-from beers_deploy.profiles.constant import Constant
-from beers_deploy.profiles.figures import Figure, Mode, Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND, TILE_PX, board_names, sensor_names
 from beers_deploy.profiles.target import TargetProfile
+from beers_deploy.profiles.sensor_file import BLIND
+from beers_deploy.profiles.target import TILE_PX, TargetProfile
 from beers_deploy.quant.encodings import save_config
 from beers_deploy.quant.session import open_session, tensors_of
-from beers_deploy.results import Table
 from beers_deploy.tables.markdown import markdown_text
 
 logger = logging.getLogger(__name__)
 
 MEASURE, HOST, README = (
-    Path(__file__).parent / "kit" / name for name in ("measure.py", "host.py", "readme.md")
+    Path(__file__).parent / name for name in ("measure.py", "host.py", "readme.md")
 )
 
 
@@ -135,67 +132,3 @@ def _write_example(core: Network, folder: Path) -> None:
     planes = np.random.default_rng(0).integers(-64, 64, shape).astype(kind)
     for name, values in (("input", planes), ("expected", tensors_of(session, None, planes)[0])):
         save_array(folder / f"{name}.npy", values)
-
-
-def boards() -> Table:
-    """The shipped boards with a DPU: its configurations, and where its rules come from.
-
-    Examples:
-        >>> bd.boards().to_pandas().index.to_list()
-        ['kv260', 'vck190', 'vek280', 'zcu102', 'zcu104']
-    """
-    rows = []
-    for name in board_names():
-        board = Board.load(name)
-        words = {
-            "configurations": ", ".join(board.configurations),
-            "description": board.description,
-        }
-        rows.append(Row("boards", name, {}, words))
-    return Table("boards", {}, (), tuple(rows))
-
-
-def sensors() -> Table:
-    """The shipped sensors: contrast at Nyquist, SNR, bits, and what each is.
-
-    Examples:
-        >>> bd.sensors().to_pandas().index.to_list()[2:]
-        ['pleiades-degraded', 'pleiades-reference', 'pleiades-variable']
-    """
-    rows = []
-    for sensor in map(Sensor.load, sensor_names()):
-        figures = {"MTF at Nyquist": _figure(sensor.mtf_nyquist, "ratio")}
-        if sensor.snr_1 is not None:
-            figures["SNR"] = _figure(sensor.snr_1, "ratio")
-        figures["bits"] = _figure(sensor.bits, "bit")
-        rows.append(Row("sensors", sensor.name, figures, {"description": sensor.description}))
-    return Table("sensors", {}, (), tuple(rows))
-
-
-def _figure(constant: Constant, unit: str) -> Figure:
-    """A constant as a figure: a range is the interval about its middle."""
-    interval = None if constant.low == constant.high else (constant.low, constant.high)
-    mode: Mode = "measured" if constant.status == "measured" else "published"
-    return Figure(
-        (constant.low + constant.high) / 2,
-        unit,
-        mode,
-        f"{constant.status}: {constant.source}",
-        interval,
-    )
-
-
-def networks() -> Table:
-    """The shipped networks, each in float32 and in INT8, told the middle of the sensors that they
-    know.
-
-    Examples:
-        >>> "convbeers-s-int8" in bd.networks().to_pandas().index
-        True
-    """
-    names = chain.from_iterable((name, f"{name}{INT8}") for name in shipped_names())
-    rows = [
-        Row("networks", network.name, {}, {"precision": network.precision})
-        for network in map(Network.load, names)
-    ]
-    return Table("networks", {}, (), tuple(rows))

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from statistics import median
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
@@ -26,15 +25,13 @@ from beers_deploy.restoration.detectors.words import warn_of_detectors
 from beers_deploy.restoration.figures import plan_figures
 from beers_deploy.restoration.plan import Plan, plan_for
 from beers_deploy.restoration.prepare import NetworkPipeline
-from beers_deploy.restoration.radiometry import FullScale, full_scale_of
-from beers_deploy.restoration.reading import Reading
+from beers_deploy.restoration.radiometry import FullScale, Reading, full_scale_of
 from beers_deploy.restoration.runtime import Engine, open_runtime, tiles_at_once
 from beers_deploy.restoration.sensor_check import SensorCheck, checked_sensor
 from beers_deploy.restoration.steps import keeps_pixels
 
 HEADER = "the file's own header"
 RUNS = 3
-UNTIMED = "no tile was timed here"
 
 
 def preview_row(
@@ -42,7 +39,6 @@ def preview_row(
     pipeline: NetworkPipeline,
     reading: Reading,
     target: TargetProfile,
-    measure: bool = True,
 ) -> Row:
     """Return the facts of an image and of its restoration.
 
@@ -51,7 +47,6 @@ def preview_row(
         pipeline: that would restore it.
         reading: how its pixels would be understood.
         target: the board whose time is predicted.
-        measure: whether tiles are timed here.
     """
     network = next(iter(pipeline.networks.values()))
     with open_raster(image, reading.force) as source:
@@ -64,38 +59,29 @@ def preview_row(
         if isinstance(scale, FullScale):
             check = checked_sensor(source, reading.sensors, scale.value, str(image), reading.strict)
     plan = plan_for(network, raster.shape, pipeline.tiles)
-    here = unavailable("s", UNTIMED)
-    if measure:
-        here = time_here(network, plan, pipeline.engine)
     figures = {
         "width": measured(raster.width_px, "px", HEADER),
         "height": measured(raster.height_px, "px", HEADER),
         "bands": measured(raster.bands, "1", HEADER),
         **plan_figures(plan),
-        "time here": here,
+        "time here": time_here(network, plan, pipeline.engine),
         f"time on {target.name}": time_on_board(network, plan, target),
         **check.figures,
         **detectors,
     }
     open_scale = {"full scale": "open", "full scale from": str(scale)}
+    missing = [] if raster.nodata is None else [f"{raster.nodata:g}"]
+    if raster.mask_kind:
+        missing.append(f"where its {raster.mask_kind} is 0")
     text = {
         "pixels": str(raster.dtype),
         **(scale.text if isinstance(scale, FullScale) else open_scale),
-    }
-    text |= {
         **place_words(raster),
-        "nodata": missing_words(raster),
+        "nodata": ", ".join(missing) or "none",
         "halo": plan.halo_words,
         **check.text,
     }
     return Row("restore", image.name, figures, text)
-
-
-def missing_words(raster: Raster) -> str:
-    """Which pixels are missing: those of the nodata value, and those that a mask or alpha hides."""
-    hidden = [f"where its {raster.mask_kind} is 0"] if raster.mask_kind else []
-    valued = [] if raster.nodata is None else [f"{raster.nodata:g}"]
-    return ", ".join([*valued, *hidden]) or "none"
 
 
 def known_scale(name: str, raster: Raster, reading: Reading) -> FullScale | str:
@@ -117,7 +103,8 @@ def place_words(raster: Raster) -> Mapping[str, str]:
     place = raster.place
     words = "none"
     if place.crs or place.transform or place.gcps:
-        words = _crs_name(place.crs)
+        code = place.crs.to_epsg() if place.crs else None
+        words = f"EPSG:{code}" if code else "a coordinate system without a code"
     if place.transform:
         corner = place.transform
         words += (
@@ -127,12 +114,6 @@ def place_words(raster: Raster) -> Mapping[str, str]:
     if place.gcps:
         words += f", {len(place.gcps)} ground control points"
     return {"georeference": words, "rational polynomials": "yes" if place.rpcs else "none"}
-
-
-def _crs_name(crs: Any) -> str:
-    """Return the EPSG code of a coordinate system, if it has one."""
-    code = crs.to_epsg() if crs else None
-    return f"EPSG:{code}" if code else "a coordinate system without a code"
 
 
 def time_here(network: Network, plan: Plan, engine: Engine) -> Figure:

@@ -1,0 +1,109 @@
+"""Write networks as ONNX files: weights in float32, and INT8 files for another sensor."""
+
+import logging
+from pathlib import Path
+
+import onnx
+
+from beers_deploy.float_onnx import about, float_for, require_tile, to_onnx
+from beers_deploy.kit.board_file import save_core
+from beers_deploy.model.exposure import brightened, factors_for
+from beers_deploy.model.io.files import whole_file
+from beers_deploy.model.io.tensors import is_conditioned, read_conditioned, read_plain
+from beers_deploy.model.shipped import SENSOR, SHIPPED
+from beers_deploy.network import Network, SensorLike
+from beers_deploy.network_files import int8_for_delta, int8_for_sensor, warn_outside
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.target import TargetProfile
+from beers_deploy.quant.banked.family import delta_of_file, required_family
+from beers_deploy.quant.encodings import host_model, read_core
+from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
+
+logger = logging.getLogger(__name__)
+
+
+def export_float(path: Path, out: Path, sensor: SensorLike | None, tile: int | None) -> None:
+    """Write weights as float ONNX, your own after a comparison with torch.
+
+    Args:
+        path: of the weights.
+        out: file to write.
+        sensor: that conditioned weights are for; pleiades-degraded if None.
+        tile: side in pixels of the one tile that the input is fixed to; None for any size.
+
+    Raises:
+        ModelError: a sensor for weights that are for one sensor.
+    """
+    profile = Sensor.load(sensor or SENSOR) if is_conditioned(path) else None
+    if profile is not None:
+        warn_outside(profile, read_conditioned(path).kernels)
+        model = float_for(path, path.stem, profile, tile)
+    elif sensor is not None:
+        raise ModelError(
+            f"{path} holds a network that is for one sensor. Leave `sensor` out, or give weights "
+            "of 'train --conditioned'."
+        )
+    else:
+        weights = read_plain(path)
+        model = to_onnx(weights, about(path.stem, weights.recipe), tile)
+    if path.parent == SHIPPED:
+        save_onnx(model, out)
+        logger.info("wrote %s", out)
+        return
+    # It loads torch, which shipped networks do without.
+    from beers_deploy.parity import require_parity, torch_network
+
+    reference = torch_network(path, profile.nominal() if profile else None)
+    difference = require_parity(reference, model, tile or 97)
+    save_onnx(model, out)
+    logger.info(
+        "wrote %s: largest difference from torch %.2g of full scale (measured)", out, difference
+    )
+
+
+def conditioned_int8(path: Path, sensor: SensorLike, delta: Path | None) -> onnx.ModelProto:
+    """Return an INT8 network that is conditioned on a sensor, or on that of a delta."""
+    model = load_onnx(path)
+    if delta is not None:
+        return int8_for_delta(model, delta)
+    profile = Sensor.load(sensor)
+    warn_outside(profile, required_family(model).kernels)
+    return int8_for_sensor(model, profile)
+
+
+def export_int8(
+    model: onnx.ModelProto,
+    out: Path,
+    tile: int | None,
+    core_file: Path | None,
+    target: TargetProfile,
+) -> None:
+    """Write an INT8 network, and its core for a board unless `core_file` is None."""
+    core = read_core(model)
+    side_px = tile or fixed_tile_px(model)
+    require_tile(side_px, core.ends.place_px)
+    for_board = Network(model, out.stem).core(target, tile) if core_file else None
+    save_onnx(host_model(core, metadata(model), side_px), out)
+    logger.info("wrote %s", out)
+    if for_board is not None and core_file is not None:
+        save_core(for_board, core_file, target)
+
+
+def delta_files(delta: Path, sensor: SensorLike) -> dict[int, Path]:
+    """Return the deltas to write by factor: the named one at 1, and one for each exposure."""
+    files = {1: delta}
+    for factor in factors_for(Sensor.load(sensor).nominal()):
+        if factor > 1:
+            files[factor] = delta.with_name(f"{delta.stem}-x{factor}{delta.suffix}")
+    return files
+
+
+def save_delta(model: onnx.ModelProto, sensor: SensorLike, factor: int, delta: Path) -> None:
+    """Write the delta of an INT8 network that is conditioned on a sensor, at one exposure."""
+    profile = Sensor.load(sensor)
+    exposed = model if factor == 1 else int8_for_sensor(model, brightened(profile, factor))
+    packed = delta_of_file(exposed)
+    with whole_file(delta) as temporary:
+        temporary.write_bytes(packed)
+    logger.info("wrote %s: %d bytes", delta, len(packed))
