@@ -18,7 +18,6 @@ from beers_deploy.profiles.constant import Constant, Limits, Stated
 from beers_deploy.profiles.effects import Effect, Effects, settled
 from beers_deploy.profiles.errors import ProfileError
 from beers_deploy.profiles.instrument import (
-    MTF_NYQUIST_MAX,
     OFFSET,
     Instrument,
     mtf_limit,
@@ -27,28 +26,24 @@ from beers_deploy.profiles.instrument import (
     with_offset_of,
 )
 from beers_deploy.profiles.response import MtfTable, PointSpread, Response, unpacked
-from beers_deploy.profiles.sensor_file import GROUPS, TABLE_OF, TABLES, sensor_fields, sensor_toml
+from beers_deploy.profiles.sensor_file import (
+    GROUPS,
+    LEAST,
+    MOST,
+    TABLE_OF,
+    TABLES,
+    Contrast,
+    Radiance,
+    Ratio,
+    Variance,
+    sensor_fields,
+    sensor_toml,
+)
 from beers_deploy.profiles.shipped import BLIND, BLIND_PROFILE, REFERENCE, profile_path
 from beers_deploy.profiles.toml import read_toml
 from beers_deploy.profiles.validation import CONFIG, validated
 
 MAX_DRAWS = 10_000
-
-LEAST = 1e-12
-MOST = 1e12
-"""Of any constant that is not 0: beyond lies no instrument, and powers of it no float."""
-
-Contrast = Annotated[
-    Constant,
-    Limits(
-        LEAST,
-        MTF_NYQUIST_MAX,
-        hint="2/pi is the square detector alone; give a ratio, 0.07 for 7 %.",
-    ),
-]
-Ratio = Annotated[Constant, Limits(LEAST, MOST, hint="Give a linear ratio; convert dB first.")]
-Radiance = Annotated[Constant, Limits(LEAST, MOST, single=True, hint="Give it in W/m2/sr/um.")]
-Variance = Annotated[Constant, Limits(0, MOST, hint="The variance of the noise is alpha L + beta.")]
 
 
 def _bright(fields: dict[str, Constant]) -> Constant:
@@ -242,9 +237,7 @@ class Sensor:
 
     @property
     def reference(self) -> "Sensor":
-        """The shipped sensor that a restoration of this one's images aims at, in this one's digital
-        numbers.
-        """
+        """The shipped sensor that a restoration aims at, in this one's digital numbers."""
         return Sensor.load(REFERENCE).in_units_of(self)
 
     def to_radiance(self, pixels: Any) -> Any:
@@ -262,9 +255,7 @@ class Sensor:
         return radiance * gain + offset_dn
 
     def noise(self, radiance: ArrayLike) -> NDArray[np.float64]:
-        """Standard deviation of the noise at some radiances, both in W/m2/sr/um, in the middle of
-        each range.
-        """
+        """Return the noise's standard deviation at radiances, in the middle of each range."""
         alpha, beta = self._middle_noise()
         return np.sqrt(np.maximum(alpha * np.asarray(radiance, np.float64) + beta, 0.0))
 

@@ -5,14 +5,31 @@ text.
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from beers_deploy.profiles.constant import Constant, Stated, Status
+from beers_deploy.profiles.constant import Constant, Limits, Stated, Status
 from beers_deploy.profiles.effects import TABLES as EFFECT_TABLES
 from beers_deploy.profiles.errors import ProfileError, printable
+from beers_deploy.profiles.instrument import MTF_NYQUIST_MAX
 from beers_deploy.profiles.point_spread_file import PointSpreadFile
 from beers_deploy.profiles.response import MtfTable, Response
 from beers_deploy.profiles.validation import check_keys, validated
+
+LEAST = 1e-12
+MOST = 1e12
+"""Of any constant that is not 0: beyond lies no instrument, and powers of it no float."""
+
+Contrast = Annotated[
+    Constant,
+    Limits(
+        LEAST,
+        MTF_NYQUIST_MAX,
+        hint="2/pi is the square detector alone; give a ratio, 0.07 for 7 %.",
+    ),
+]
+Ratio = Annotated[Constant, Limits(LEAST, MOST, hint="Give a linear ratio; convert dB first.")]
+Radiance = Annotated[Constant, Limits(LEAST, MOST, single=True, hint="Give it in W/m2/sr/um.")]
+Variance = Annotated[Constant, Limits(0, MOST, hint="The variance of the noise is alpha L + beta.")]
 
 TABLES: dict[str, tuple[tuple[tuple[str, ...], tuple[str, ...]], ...]] = {
     "grid": ((("gsd_m", "oversampling"), ()),),
