@@ -10,10 +10,15 @@ from beers_deploy.profiles.response import MtfTable
 from beers_deploy.profiles.scene_call import SceneCall
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import TABLES, constant_keys
-from beers_deploy.profiles.shipped import profile_path, scene_names, sensor_names, target_names
+from beers_deploy.profiles.shipped import (
+    board_names,
+    profile_path,
+    scene_names,
+    sensor_names,
+    target_names,
+)
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.profiles.toml import read_toml
-from beers_deploy.profiles.target import board_names, load_target, target_names
 from beers_deploy.results import Table
 
 
@@ -25,7 +30,7 @@ def boards() -> Table:
         ['kv260', 'vck190', 'vek280', 'zcu102', 'zcu104']
     """
     rows = []
-    for board in map(load_target, board_names()):
+    for board in map(TargetProfile.load, board_names()):
         words = {
             "configurations": ", ".join(board.configurations),
             "description": board.description,

@@ -15,7 +15,6 @@ from onnx import TensorProto, helper
 
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.profiles.instrument import Instrument
-from beers_deploy.profiles.instrument import MAX_DN, Instrument
 from beers_deploy.quant.core import IntConv, IntCore, dequantized, rounded_to
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.gate import GateResult, Spread

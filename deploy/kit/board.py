@@ -18,10 +18,8 @@ from beers_deploy.model.io.files import write_text
 from beers_deploy.network import Network, NetworkLike, SensorLike
 from beers_deploy.network_files import other_sensor
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.shipped import BLIND, TILE_PX, board_names, sensor_names
+from beers_deploy.profiles.shipped import BLIND, TILE_PX
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.profiles.sensor_file import BLIND
-from beers_deploy.profiles.target import TILE_PX, TargetProfile
 from beers_deploy.quant.encodings import save_config
 from beers_deploy.quant.session import open_session, tensors_of
 from beers_deploy.tables.markdown import markdown_text

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from beers_deploy.network import Network
+from beers_deploy.profiles.errors import ModelError, OptionError, printable
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.quant.tiling.receptive_field import Tiling
-from beers_deploy.profiles.errors import ModelError, OptionError, printable
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-from beers_deploy.profiles.shipped import DEFAULT_TARGET
 from beers_deploy.model.shipped import INT8, SENSOR, VARIANT, shipped_weights
+from beers_deploy.profiles.shipped import DEFAULT_TARGET
 from beers_deploy.verbs.parameters import (
     InputPath,
     Interval,

@@ -38,7 +38,9 @@ def about(
 ) -> Row:
     """Return the facts of an image and of its restoration by a network."""
     pipeline = NetworkPipeline({"": Network.load(network)}, Tiles(tile_px))
-    return preview_row(image, pipeline, Reading(full_scale=full_scale), TargetProfile.load("vck190"))
+    return preview_row(
+        image, pipeline, Reading(full_scale=full_scale), TargetProfile.load("vck190")
+    )
 
 
 def test_it_shows_the_facts_of_the_header(model: Path, tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from beers_deploy.model.raster.facts import Raster
-from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.plan import Plan, Span, plan_for
 from beers_deploy.restoration.prepare import NetworkPipeline
