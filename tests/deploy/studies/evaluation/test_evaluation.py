@@ -19,7 +19,7 @@ from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Row, by_table, measured
 from beers_deploy.profiles.sensor_file import load_sensor
-from beers_deploy.studies.evaluation import targets as targets_module
+from beers_deploy.studies.evaluation import target_scenes
 from beers_deploy.studies.evaluation.methods import (
     BLIND,
     KNOWN,
@@ -95,7 +95,7 @@ def few_targets(patch: pytest.MonkeyPatch) -> None:
         "ZONE_CONTRASTS": (0.3,),
     }
     for name, value in less.items():
-        patch.setattr(targets_module, name, value)
+        patch.setattr(target_scenes, name, value)
 
 
 IDENTITY = Method("degraded", lambda dn: dn, "blind")
