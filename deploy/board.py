@@ -17,11 +17,11 @@ from beers_deploy.model.consistency import REACH_PX
 from beers_deploy.model.exposure import HEADROOM
 from beers_deploy.model.io.files import write_text
 from beers_deploy.model.shipped import INT8, shipped_names
-from beers_deploy.network import Network, NetworkLike, SensorLike
+from beers_deploy.network import Network, NetworkLike
 from beers_deploy.network_files import other_sensor
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.figures import Figure, Mode, Row
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.sensor_file import BLIND, sensor_names
 from beers_deploy.profiles.target import TILE_PX, TargetProfile, board_names
 from beers_deploy.quant.encodings import save_config

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from beers_deploy.baseline import data_inputs, sensor_input
 from beers_deploy.model.progress import Progress, reporting
 from beers_deploy.model.shipped import INT8, SENSOR, VARIANT, shipped_weights
-from beers_deploy.network import Network, NetworkLike, SensorLike
+from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.quant.gate import METRICS, GateResult, verdict_row
 from beers_deploy.quant.gate import compare as differences_of
 from beers_deploy.quant.onnx_file import faults_named, metadata, require_quantized

@@ -25,7 +25,7 @@ from beers_deploy.network_files import (
 )
 from beers_deploy.profiles.errors import ModelError, optional, reason_of
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.sensor_file import BLIND
 from beers_deploy.profiles.target import DEFAULT_TARGET, TargetProfile
 from beers_deploy.quant.encodings import board_model, read_core, vint8_model
@@ -50,7 +50,6 @@ if TYPE_CHECKING:
     from beers_deploy.quant.quantize import Quantised
 
 NetworkLike = Union["Network", onnx.ModelProto, "torch.nn.Module", str, os.PathLike[str]]
-SensorLike = Sensor | str | os.PathLike[str]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -358,6 +358,10 @@ class Sensor:
         )
 
 
+SensorLike = Sensor | str | os.PathLike[str]
+"""A profile, the name of a shipped one, or a .toml file."""
+
+
 def _with_offset_of(others: Mapping[str, E], own: Mapping[str, E]) -> dict[str, E]:
     """The own effects, but the offset of others."""
     return {name: effect for name, effect in own.items() if name != OFFSET} | {

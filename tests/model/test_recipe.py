@@ -37,7 +37,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recipe = DatasetRecipe(
         tuple(scenes), SEVERE, reference_for(SEVERE), oversampling=2, patch_px=15
     )
-    write_dataset(recipe, here / "out", 1, False, lambda _: None)
+    write_dataset(recipe, here / "out", 1, False)
     return here / "out"
 
 

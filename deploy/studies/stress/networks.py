@@ -19,9 +19,9 @@ from torch.nn.functional import conv2d, pixel_shuffle, pixel_unshuffle
 from beers_deploy.comparison import pair_of
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network as Opened
-from beers_deploy.network import NetworkLike, SensorLike
+from beers_deploy.network import NetworkLike
 from beers_deploy.profiles.errors import BeersError, ModelError
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import read_core
