@@ -25,6 +25,9 @@ from beers_deploy.studies.tradeoff.points import UNITS, Point
 LATENCY = "board latency"
 COSTS = (LATENCY, "board energy", "host p50")
 PSNR = "PSNR"
+FRONT = "front of PSNR against"
+BOARDS = "boards"
+"""What the names of the tables begin with."""
 NAMES: dict[str, tuple[str, str]] = {
     "psnr": (PSNR, "dB"),
     "ssim": ("SSIM", "ratio"),
@@ -198,7 +201,7 @@ def front_rows(front: Sequence[Measured], cost: str, compare: Comparison) -> lis
             figures |= {"PSNR gain": gain, f"{cost} ratio": cost_ratio(point, cheaper, cost)}
             word = verdict(gain)
         text = {"gain over the next cheaper": word}
-        rows.append(Row(f"front of PSNR against {cost}", f"{place}. {point.name}", figures, text))
+        rows.append(Row(f"{FRONT} {cost}", f"{place}. {point.name}", figures, text))
     return rows
 
 

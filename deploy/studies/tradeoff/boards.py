@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from beers_deploy.profiles.figures import Row
 from beers_deploy.studies.tradeoff.advice import (
+    BOARDS,
     Comparison,
     Constraint,
     Measured,
@@ -19,7 +20,6 @@ from beers_deploy.studies.tradeoff.advice import (
     within,
 )
 
-TABLE = "boards"
 VERDICT = "verdict"
 
 
@@ -62,7 +62,7 @@ def board_rows(
         candidates = within(here, asked.constraints, cost)
         if not candidates:
             reasons = [why_not(here, asked.constraints, cost), *refusals(points, board)]
-            rows.append(Row(TABLE, board, {}, {"point": "none", VERDICT: "; ".join(reasons)}))
+            rows.append(Row(BOARDS, board, {}, {"point": "none", VERDICT: "; ".join(reasons)}))
             continue
         if taken is not None and taken.text.get("board") == board:
             best = taken
@@ -73,19 +73,16 @@ def board_rows(
             )
             verdict = _compared(best, taken, cost, asked.compare)
         words = {"point": best.name, VERDICT: verdict}
-        rows.append(Row(TABLE, board, figures_to_compare(best, cost), words))
+        rows.append(Row(BOARDS, board, figures_to_compare(best, cost), words))
     return rows
 
 
 def refusals(points: Sequence[Measured], board: str) -> list[str]:
     """Say which networks a board's DPU refuses, and why."""
-    refused_points = (
-        point for point in points if point.point is not None and point.point.refused_by == board
-    )
     return [
         f"{point.name} does not fit its DPU: {point.point.reason}"
-        for point in refused_points
-        if point.point
+        for point in points
+        if point.point is not None and point.point.refused_by == board
     ]
 
 

@@ -5,7 +5,7 @@ recommendation.
 import logging
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -114,15 +114,9 @@ def benchmark_of(study: Study) -> tuple[Benchmark, list[str]]:
     return Benchmark(pairs, *study.sensors, study.lpips, study.seed), remarks
 
 
-def points_for(study: Study) -> list[Point]:
-    """Return the points of a study; float networks are quantised."""
-    quantize = partial(
-        make_int8,
-        scenes=study.calibration,
-        sensor=study.sensors[0],
-        seed=study.seed,
-    )
-    variants = network_variants(list(study.networks), study.sensors[0], quantize)
+def points_for(study: Study, quantize: Callable[[Network], Network]) -> list[Point]:
+    """Return the points of a study; `quantize` returns the INT8 network of a float one."""
+    variants = network_variants(study.networks, study.sensors[0], quantize)
     return points_of(variants, study.boards, Swath(*study.size))
 
 
@@ -130,7 +124,10 @@ def run_tradeoff(study: Study) -> Tradeoff:
     """Measure every point of a study, and recommend one."""
     # The digests are those of the files that are measured.
     inputs = study.inputs
-    points = points_for(study)
+    quantize = partial(
+        make_int8, scenes=study.calibration, sensor=study.sensors[0], seed=study.seed
+    )
+    points = points_for(study, quantize)
     benchmark, remarks = benchmark_of(study)
     results = _measured(points, benchmark, Swath(*study.size))
     if PAPER_TARGET in study.board_names and study.size == parse_size(PAPER_SIZE):
@@ -163,7 +160,8 @@ PREVIEW_RUNS = 3
 def preview(study: Study) -> Table:
     """Return what a study would measure and about how long that takes, from a crop timed here."""
     benchmark, _ = benchmark_of(study)
-    points = points_for(study)
+    # A float network stands for its INT8 one: to quantise it would take longer than the answer.
+    points = points_for(study, lambda network: network)
     methods = _methods([point.variant for point in points], benchmark)
     first = benchmark.pairs[0]
     side = slice(0, PREVIEW_PX)
@@ -244,12 +242,10 @@ def weigh(
         details=frozenset({"recommended", "boards", "points"}),
         points=points,
         front=front,
-        front_rows=numbered,
         cost=cost,
         best=best,
         line=line,
         boards=tuple(boards),
-        board_rows=by_board,
         constraints=asked.constraints,
         remarks=tuple(remarks),
     )
@@ -296,15 +292,16 @@ def _measured(
 
 
 def _methods(variants: Sequence[Variant], benchmark: Benchmark) -> dict[Variant, Method]:
-    return {variant: _method(variant, benchmark) for variant in dict.fromkeys(variants)}
-
-
-def _method(variant: Variant, benchmark: Benchmark) -> Method:
-    """Return the method of a variant: a network with its exposures, or a traditional one."""
-    degraded = benchmark.degraded
-    if variant.network is None:
-        return method_named(variant.method, degraded, benchmark.reference)
-    return method_of(variant.name, variant.network, degraded, benchmark.reference)
+    """Return the method of each variant: a network with its exposures, or a traditional one."""
+    sensors = benchmark.degraded, benchmark.reference
+    methods = {}
+    for variant in dict.fromkeys(variants):
+        methods[variant] = (
+            method_named(variant.method, *sensors)
+            if variant.network is None
+            else method_of(variant.name, variant.network, *sensors)
+        )
+    return methods
 
 
 def _text(point: Point, method: Method) -> dict[str, str]:
@@ -332,9 +329,8 @@ def _notes(benchmark: Benchmark, boards: Sequence[str]) -> Iterator[str]:
         "pixels are left out."
     )
     yield (
-        "Gains are differences on the same images from the next cheaper point of the front, "
-        "with 95 % bootstrap "
-        "intervals over whole sites; one whose interval holds 0 is not significant."
+        "Gains are differences on the same images from the next cheaper point of the front, with "
+        "95 % bootstrap intervals over whole sites; one whose interval holds 0 is not significant."
     )
     if too_few(sites):
         yield too_few(sites)
