@@ -104,7 +104,7 @@ def stress(
         patches = Calibration(Sensor.load(sensor), scenes, draws, side, seed)
         table = flip_table(subject, patches, TargetProfile.load(target))
         if out is not None:
-            svg = flip_curves_svg({subject.opened[-1].name: table.rows})
+            svg = flip_curves_svg({subject.quantized.source.name: table.rows})
             write_text(Path(out).with_suffix(CURVES), svg)
     else:
         table = battery_table(

@@ -58,13 +58,13 @@ def flip_table(subject: Subject, source: Calibration, board: TargetProfile) -> T
     # A file without an integer core is refused before anything is drawn.
     _ = subject.core
     dpu = dpu_of(board)
-    prediction = predict_network(subject.opened[-1], dpu, TILE_PX)
+    prediction = predict_network(subject.quantized.source, dpu, TILE_PX)
     # So is a board that cannot price the guards.
     dpu.limit("cpu", "clock_ghz")
     target = make_target(subject, source)
     curves = curve_rows(target, source.patches, source.seed)
     return Table(
-        inputs=tuple(network.input for network in subject.opened),
+        inputs=subject.inputs,
         rows=(*curves, *price_rows(target, prediction, dpu)),
         notes=(CURVE_NOTE, GUARD_NOTE),
         headings=HEADINGS,

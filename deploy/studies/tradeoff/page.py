@@ -14,7 +14,8 @@ from beers_deploy.profiles.figures import Row
 from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.report.plots import data_url
 from beers_deploy.results import Table
-from beers_deploy.studies.tradeoff.advice import BOARDS, FRONT, PSNR, Constraint, Measured
+from beers_deploy.studies.tradeoff.advice import Constraint
+from beers_deploy.studies.tradeoff.front import BOARDS, FRONT, PSNR, Measured
 from beers_deploy.studies.tradeoff.plot import CAPTION, draw, plot_svg
 
 if TYPE_CHECKING:

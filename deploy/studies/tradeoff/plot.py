@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.report.plots import LIGHT, SERIES, look, new_figure, set_ticks, svg_of
-from beers_deploy.studies.tradeoff.advice import PSNR, Measured, ends, placed
+from beers_deploy.studies.tradeoff.front import PSNR, Measured, ends, placed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

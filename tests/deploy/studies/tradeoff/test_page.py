@@ -10,8 +10,8 @@ import pytest
 
 from beers_deploy.report.page import render
 from beers_deploy.report.plots import DARK, LIGHT, look
-from beers_deploy.studies.tradeoff.advice import Measured, parse_constraints
-from beers_deploy.studies.tradeoff.boards import Question
+from beers_deploy.studies.tradeoff.advice import Question, parse_constraints
+from beers_deploy.studies.tradeoff.front import Measured
 from beers_deploy.studies.tradeoff.page import Tradeoff, report_of
 from beers_deploy.studies.tradeoff.plot import SIZE_PX, figure_of, plot_svg, series
 from beers_deploy.studies.tradeoff.run import weigh
