@@ -66,22 +66,6 @@ class Evaluation(Table):
     methods: Sequence[Method]
     pairs: Sequence[NamedPair]
 
-    @property
-    def mean(self) -> list[Row]:
-        """A row a method, and the paper's."""
-        return [row for row in self.rows if row.table == "mean"]
-
-    @property
-    def more(self) -> dict[str, list[Row]]:
-        """The tables of other brightness, of targets, by site and of other sensors.
-
-        Those of single images are for the document alone.
-        """
-        tables = by_table(self.rows).items()
-        return {
-            name: rows for name, rows in tables if name != "mean" and not name.startswith("images")
-        }
-
     def report(self, folder: str | os.PathLike[str]) -> Path:
         """Write report.html and pictures into a folder; returns the page's path."""
         page = Path(folder) / "report.html"
@@ -162,7 +146,7 @@ def run_evaluation(plan: Plan) -> Evaluation:
         inputs=tuple(_inputs(plan)),
         rows=every,
         notes=tuple(notes),
-        headings={"mean": "means over all pairs"},
+        headings=HEADINGS,
         # Single images are for the document alone.
         details=frozenset({row.table for row in every if row.table.startswith("images")} | WORDY),
         sensors=sensors,
@@ -171,6 +155,7 @@ def run_evaluation(plan: Plan) -> Evaluation:
     )
 
 
+HEADINGS = {"mean": "means over all pairs"}
 WORDY = frozenset({"sensor"})
 """Words that are shown in detail only."""
 
@@ -308,17 +293,23 @@ def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -
 
 
 def evaluation_report(found: Evaluation, strips: Sequence[Picture]) -> Report:
-    """The page: pictures, means, sites, and the sweep where there was one."""
-    tables = [Section("Means over all pairs", found.mean, MEAN_CAPTION)]
-    for name, rows in found.more.items():
-        tables.append(Section(f"{name[0].upper()}{name[1:]}", rows, caption_of(name)))
-    return Report(found.title, headline(found.mean), tables, strips, (*NOTES, *found.notes))
+    """Return the page: pictures, means, sites, and the sweep where there was one.
+
+    Tables of single images are for the document alone.
+    """
+    tables = []
+    for name, rows in by_table(found.rows).items():
+        if not name.startswith("images"):
+            heading = HEADINGS.get(name, name)
+            title = f"{heading[0].upper()}{heading[1:]}"
+            tables.append(Section(title, rows, caption_of(name)))
+    return Report(found.title, headline(found.rows), tables, strips, (*NOTES, *found.notes))
 
 
 def caption_of(table: str) -> str:
     """Return the sentence that explains a table to its reader."""
     if table.startswith("mean"):
-        return DIMMED_CAPTION
+        return MEAN_CAPTION if table == "mean" else DIMMED_CAPTION
     if table == targets.TARGETS:
         return TARGETS_CAPTION
     return SWEEP_CAPTION if table.startswith("sweep") else SITES_CAPTION
@@ -369,9 +360,10 @@ NOTES = (
 )
 
 
-def headline(mean: Sequence[Row]) -> str:
-    """The best method by mean PSNR, in one sentence."""
-    ours = [row for row in mean if row.figures["PSNR"].mode == "measured"]
+def headline(rows: Sequence[Row]) -> str:
+    """Return a sentence that names the best method by mean PSNR."""
+    means = [row for row in rows if row.table == "mean"]
+    ours = [row for row in means if row.figures["PSNR"].mode == "measured"]
     best = max(ours, key=lambda row: row.figures["PSNR"].value or 0.0)
     degraded = ours[0].figures["PSNR"]
     return (
