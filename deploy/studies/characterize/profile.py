@@ -61,7 +61,7 @@ class Measurement:
     """What was found of a camera.
 
     Attributes:
-        frames: that were looked at.
+        frames: that were measured.
         noise: the line that the SNRs lie on.
         mtf: of each axis the curve that edges show, or why there is none; empty where the user
             states the MTF.

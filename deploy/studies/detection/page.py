@@ -45,7 +45,7 @@ NOTES = (
     ),
     (
         "Share of loss regained: gain over what degradation took; unavailable where that loss "
-        "cannot be told from 0."
+        "is not significant."
     ),
     "The detector is fixed, and was trained for none of the degraded or restored images.",
     "It is shown one panchromatic band in all three, under one stretch for all rows of a scene.",

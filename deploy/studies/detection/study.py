@@ -214,7 +214,7 @@ def labelled_scenes(
     labels: Path | None = None,
     split: str | None = None,
 ) -> tuple[list[LabelledScene], list[str]]:
-    """The labelled pictures of a folder as scenes, read when they are looked at, and sentences on
+    """Return the labelled pictures of a folder as scenes, read when they are used, and sentences on
     what is left out.
 
     Args:

@@ -26,7 +26,7 @@ BY_SIZE = "mAP50 by size"
 """What the names of the tables begin with; the sensor's follows."""
 
 NO_OBJECT = "no object to be found"
-NO_LOSS = "no loss that can be told from 0: the interval of reference less degraded holds it"
+NO_LOSS = "no significant loss: the interval of reference minus degraded contains 0"
 
 GAIN = "gain over degraded"
 LOSS = "loss to reference"
@@ -111,8 +111,8 @@ def verdict(difference: np.ndarray, sites: int) -> str:
 
 
 def _regained(comparison: Comparison, gain: np.ndarray, loss: np.ndarray) -> Figure:
-    """The share of a loss that a gain makes good; unavailable where the loss
-    cannot be told from 0.
+    """Return the share of a loss that a gain makes good; unavailable if the loss is not
+    significant.
     """
     if too_few(comparison.sites):
         return unavailable(PERCENT, too_few(comparison.sites))

@@ -118,7 +118,7 @@ def run_evaluation(plan: Plan) -> Evaluation:
         loaded = [_named(number, pair) for number, pair in enumerate(plan.given)]
     elif plan.folder is not None:
         loaded = read_pairs(plan.folder, nominal.max_dn, read_pairs_recipe(plan.folder))
-        sensor_rows = [_seen(loaded, sensors[0], str(plan.folder), plan.strict)]
+        sensor_rows = [_sensor_row(loaded, sensors[0], str(plan.folder), plan.strict)]
     else:
         loaded, remarks = pairs_of_scenes(plan.scenes, *sensors, seed)
     rows = _compared(methods, loaded, sensors, instruments, seed)
@@ -190,10 +190,10 @@ def _in_order(rows: Iterable[Row]) -> list[Row]:
     return [*means, *tables[targets.TARGETS], *scores.site_rows(tables["images"]), *images]
 
 
-def _seen(pairs: Sequence[NamedPair], sensor: Sensor, name: str, strict: bool) -> Row:
-    """The degraded images held against the sensor that they are said to be from."""
-    # Every n-th pair, n rounded up, so that at most HELD of them are checked.
-    sample = pairs[:: -(-len(pairs) // HELD)]
+def _sensor_row(pairs: Sequence[NamedPair], sensor: Sensor, name: str, strict: bool) -> Row:
+    """Return the row that compares the degraded images with the sensor named for them."""
+    # Every n-th pair, n rounded up, so that at most CHECKED_IMAGES of them are checked.
+    sample = pairs[:: -(-len(pairs) // CHECKED_IMAGES)]
     windows = [pair.degraded[:WINDOW_PX, :WINDOW_PX] for pair in sample]
     check = check_windows(windows, sensor, sensor.nominal().max_dn)
     check.report(name, sensor.name, strict)
@@ -241,8 +241,8 @@ def _method(
 SITES = 4
 CROP_PX = 96
 ZOOM = 2
-HELD = 16
-"""Images at most that are held against the sensor."""
+CHECKED_IMAGES = 16
+"""Images at most that are compared with the sensor."""
 
 
 def chosen_pairs(pairs: Sequence[NamedPair]) -> list[NamedPair]:

@@ -27,7 +27,7 @@ FRONT = "front of PSNR against"
 BOARDS = "boards"
 """What the names of the tables begin with."""
 ALIKE_DB = 0.05
-"""Where the sites are too few for an interval, PSNR within this is not told apart."""
+"""Where the sites are too few for an interval, PSNR within this counts as equal."""
 SIGNIFICANT = "significant"
 NOT_SIGNIFICANT = "not significant"
 TOO_FEW = "too few sites to tell"

@@ -114,7 +114,7 @@ def report_of(study: Tradeoff, svg: str) -> Report:
         points.append(Row("points", point.name, point.figures, words))
     tables = [
         Section("Board by board", study.board_rows, BOARDS_CAPTION),
-        Section("The front, from cheap to dear", study.front_rows, FRONT_CAPTION),
+        Section("The front, from cheap to expensive", study.front_rows, FRONT_CAPTION),
         Section(f"All {len(points)} points", points, POINTS_CAPTION),
     ]
     headline = f"{study.line[0].upper()}{study.line[1:]}."

@@ -36,14 +36,7 @@ RECOMMENDED = "recommended"
 AT_MOST = "\N{LESS-THAN OR EQUAL TO}"
 AT_LEAST = "\N{GREATER-THAN OR EQUAL TO}"
 HOST = "this machine"
-RIGHT = 0.97
-EDGE_PX = 8
-"""Where the axes end as a share of the figure, unless a label needs room; and what is left free at
-the edge, because a browser's font may be wider than the one that was measured.
-"""
 LEGEND_COLUMNS = 2
-LEGEND_ROW = 0.045
-"""Of the legend, the height of a row as a share of the figure."""
 
 CAPTION = (
     "Numbers are those of the front's table; the line is the front, small marks lie below it. The "
@@ -80,29 +73,16 @@ def figure_of(study: "Tradeoff") -> "Figure":
 
     with rc_context({"font.size": TEXT_PX}):
         figure = new_figure(*SIZE_PX)
+        # It makes room for labels below the axes, of which the last one is centred on its tick.
+        figure.set_layout_engine("constrained")
         axes = figure.add_subplot()
         draw(axes, study)
-        names = axes.get_legend_handles_labels()[1]
-        if names:
-            figure.legend(loc="lower center", ncols=LEGEND_COLUMNS)
-        rows = -(-len(names) // LEGEND_COLUMNS)
-        figure.subplots_adjust(left=0.13, right=RIGHT, top=0.95, bottom=0.14 + LEGEND_ROW * rows)
-        _make_room(axes)
+        if axes.get_legend_handles_labels()[1]:
+            figure.legend(loc="outside lower center", ncols=LEGEND_COLUMNS)
+        # The distances between marks are known when the axes have their size.
+        figure.draw_without_rendering()
         _draw_numbers(axes, study)
     return figure
-
-
-def _make_room(axes: "Axes") -> None:
-    """Narrow the axes until the last label below them, which is centred on its tick, ends within
-    the figure.
-    """
-    figure = axes.figure
-    width_px = figure.bbox.width
-    box = axes.get_tightbbox()
-    over_px = box.x1 + EDGE_PX - width_px if box is not None else 0.0
-    if over_px > 0:
-        # A tick label is centred on its tick, so that the last one may pass the edge.
-        figure.subplots_adjust(right=RIGHT - over_px / width_px)
 
 
 def draw(axes: "Axes", study: "Tradeoff") -> None:

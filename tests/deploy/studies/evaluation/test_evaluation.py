@@ -88,7 +88,9 @@ def write_pairs(folder: Path, pairs: list[NamedPair]) -> Path:
 
 def few_targets(patch: pytest.MonkeyPatch) -> None:
     less = {
+        "ANGLES_DEG": (5.0, 8.0),
         "REPEATS": 1,
+        "SIDE_PX": 100,
         "POINTS_A_SIDE": 3,
         "BAR_CONTRASTS": (0.1,),
         "BAR_PERIODS_PX": (2.0,),
