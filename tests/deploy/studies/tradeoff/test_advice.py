@@ -135,8 +135,8 @@ def test_front_rows_compare_each_member_with_the_next_cheaper_one() -> None:
 
 def recommendation(budget: str | None = None, need: str | None = None) -> tuple[str | None, str]:
     """The name of the point to take, and the line that says so."""
-    limits = [parse_constraints(name, text) for name, text in (("budget", budget), ("need", need))]
-    point, line = recommend(family(), Question(*limits, COMPARE))
+    asked = Question(parse_constraints("budget", budget), parse_constraints("need", need), COMPARE)
+    point, line = recommend(family(), asked)
     return point.name if point else None, line
 
 
