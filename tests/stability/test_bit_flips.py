@@ -148,9 +148,6 @@ def test_the_command(pair: list[Path], tmp_path: Path) -> None:
     assert len(picture.findall(CURVES)) == 2 * len(MEMORIES)
 
 
-LITTLE = ["FLOAT", "INT8", "--bit-flips", "--draws", "1", "--side", "32"]
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -164,7 +161,10 @@ LITTLE = ["FLOAT", "INT8", "--bit-flips", "--draws", "1", "--side", "32"]
         (["FLOAT", "INT8", "--bit-flips", "--target", "nobody"], "nobody"),
         (["FLOAT", "INT8", "--bit-flips", "--images", "nowhere"], "nowhere"),
         (["FLOAT", "INT8", "--bit-flips", "--out", "x.svg"], "x.svg"),
-        ([*LITTLE, "--out", "x.md", "--json", "x.svg"], "x.svg is another output"),
+        (
+            ["FLOAT", "INT8", "--bit-flips", "--out", "x.md", "--json", "x.svg"],
+            "x.svg is the path of another output",
+        ),
     ],
 )
 def test_wrong_arguments(
@@ -177,6 +177,7 @@ def test_wrong_arguments(
     monkeypatch.chdir(tmp_path)
     files = {"FLOAT": str(pair[0]), "INT8": str(pair[1])}
     assert message in refused("stress", *(files.get(text, text) for text in arguments))
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_page_is_fresh() -> None:
