@@ -25,6 +25,7 @@ import torch
 from beers_deploy.model.curves import draw_table
 from beers_deploy.model.family import LEAST_ALONG, SensorFamily
 from beers_deploy.model.metrics.fidelity import fidelity_db
+from beers_deploy.model.metrics.instrument import AXES
 from beers_deploy.model.metrics.slanted_edge import slanted_edge
 from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.simulator.acquire import acquire, fitting_oversampling
@@ -36,7 +37,6 @@ from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.characterize import Measurement, Stated, measure, profile_toml
-from beers_deploy.studies.characterize.instrument import AXES
 from beers_deploy.studies.characterize.profile import SHOWN_CPX
 from beers_deploy.studies.evaluation.pairs import simulate_pairs
 
@@ -216,7 +216,7 @@ class Findings:
             print(f"- {error}")
             return None
         for axis in AXES:
-            curve = estimate.mtf.curves.get(axis)
+            curve = estimate.curves.get(axis)
             if curve is None:
                 continue
             for words, frequency in SHOWN_CPX.items():
@@ -228,7 +228,7 @@ class Findings:
             self.snr.append(
                 judged(snr.value, snr.interval, snr.radiance / sensor.noise_sigma(snr.radiance))
             )
-        return estimate if estimate.mtf.curves else None
+        return estimate if estimate.curves else None
 
     def lines(self, name: str) -> Iterator[str]:
         """Rows of the table."""

@@ -24,7 +24,7 @@ from beers_deploy.model.metrics.edge_curve import (
     measure_curve,
 )
 from beers_deploy.model.metrics.edge_search import Edge, edge_in
-from beers_deploy.model.metrics.noise_line import ROUNDING
+from beers_deploy.model.metrics.noise_blocks import ROUNDING
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.metrics.slanted_edge import slanted_edge
 from beers_deploy.model.raster.images import list_images

@@ -3,8 +3,8 @@ often a right one is.
 
     python benchmarks/sensor_check.py --images aerial-test/ [--raw pleiades/] [--acquisitions 40]
 
-Each acquisition draws a sensor and a photograph; the image is held against the right profile, and
-each way to be wrong against the profile that a user would name for it. Textures without edges, and
+Each acquisition draws a sensor and a photograph; the image is compared with the right profile, and
+each way to be wrong with the profile that a user would name for it. Textures without edges, and
 towns, are drawn. Times are of 27 Mpx.
 """
 
@@ -30,7 +30,7 @@ from beers_deploy.model.simulator.sampling import crop_divisible, read_scene
 from beers_deploy.network import Network
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.restoration.sensor_check import SensorCheck, check_source
+from beers_deploy.restoration.sensor_check.check import SensorCheck, check_source
 from beers_deploy.studies.evaluation.methods import profile_of
 
 BASE = Sensor.load("pleiades-degraded")
@@ -39,7 +39,7 @@ SIDE_PX = 2048
 Image = np.ndarray
 
 
-def told(
+def stated(
     sensor: Instrument, mtf: float = 1.0, noise: float = 1.0, gain: float = 1.0, bits: int = 0
 ) -> Sensor:
     """The profile of a sensor, its MTF, noise, gain or bits off by a factor, or so many bits."""
@@ -56,8 +56,8 @@ def told(
 
 
 def restored(image: Image, sensor: Instrument) -> Image:
-    """By the shipped network, told the sensor."""
-    network = Network.load("convbeers-xs-int8", sensor=told(sensor))
+    """By the shipped network, conditioned on the sensor."""
+    network = Network.load("convbeers-xs-int8", sensor=stated(sensor))
     output = network(image[None, None].astype(np.float32) / sensor.max_dn)[0, 0]
     return np.asarray(np.clip(np.rint(output * sensor.max_dn), 0, sensor.max_dn))
 
@@ -73,12 +73,12 @@ def smoothed(image: Image, _: Instrument) -> Image:
 
 
 WRONG: Mapping[str, Callable[[Instrument], Sensor]] = {
-    "MTF a third less": lambda s: told(s, mtf=1 / THIRD),
-    "MTF a third more": lambda s: told(s, mtf=THIRD),
-    "SNR a third less": lambda s: told(s, noise=THIRD),
-    "SNR a third more": lambda s: told(s, noise=1 / THIRD),
-    "gain halved": lambda s: told(s, gain=2.0),
-    "bits wrong, 14": lambda s: told(s, bits=14, gain=4.0),
+    "MTF a third less": lambda s: stated(s, mtf=1 / THIRD),
+    "MTF a third more": lambda s: stated(s, mtf=THIRD),
+    "SNR a third less": lambda s: stated(s, noise=THIRD),
+    "SNR a third more": lambda s: stated(s, noise=1 / THIRD),
+    "gain halved": lambda s: stated(s, gain=2.0),
+    "bits wrong, 14": lambda s: stated(s, bits=14, gain=4.0),
 }
 CHANGED: Mapping[str, Callable[[Image, Instrument], Image]] = {
     "restored": restored,
@@ -93,7 +93,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--images", type=Path, required=True)
-    parser.add_argument("--raw", type=Path, help="a folder of images that are told to be Pleiades'")
+    parser.add_argument("--raw", type=Path, help="a folder of images, checked as Pleiades'")
     parser.add_argument("--acquisitions", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
@@ -101,11 +101,11 @@ def main() -> None:
     for sensor, image, kind in acquisitions(
         arguments.images, arguments.acquisitions, arguments.seed
     ):
-        for name, check in held(image, sensor):
-            counts.setdefault(f"{kind}: {name}", []).append(bool(check.doubts))
-            if name == "right" and check.doubts:
-                print(f"false alarm, {kind}, MTF {sensor.mtf_axes}: {check.doubts}")
-    print("| image and what is told | doubted | of |\n|---|---|---|")
+        for name, check in checks_of(image, sensor):
+            counts.setdefault(f"{kind}: {name}", []).append(bool(check.warnings))
+            if name == "right" and check.warnings:
+                print(f"false alarm, {kind}, MTF {sensor.mtf_axes}: {check.warnings}")
+    print("| image and stated sensor | contradicted | of |\n|---|---|---|")
     for name, flags in sorted(counts.items()):
         print(f"| {name} | {sum(flags)} | {len(flags)} |")
     for path in list_images(arguments.raw) if arguments.raw else ():
@@ -114,14 +114,14 @@ def main() -> None:
     timed(image)
 
 
-def held(image: Image, sensor: Instrument) -> Iterator[tuple[str, SensorCheck]]:
+def checks_of(image: Image, sensor: Instrument) -> Iterator[tuple[str, SensorCheck]]:
     """The checks of one image against what is right, and what is wrong."""
-    yield "right", check(image, told(sensor))
+    yield "right", check(image, stated(sensor))
     for name, profile in WRONG.items():
         wrong = profile(sensor)
         yield name, check(image, wrong, wrong.nominal().max_dn)
     for name, change in CHANGED.items():
-        yield name, check(change(image, sensor).astype(np.uint16), told(sensor))
+        yield name, check(change(image, sensor).astype(np.uint16), stated(sensor))
 
 
 def check(image: Image, sensor: Sensor, full_scale: float = LIKE.max_dn) -> SensorCheck:

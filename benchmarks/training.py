@@ -27,7 +27,7 @@ from beers_deploy.model.family import SensorFamily
 from beers_deploy.model.processor import processor_name
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.training.checkpoint import TrainingRecipe
-from beers_deploy.model.training.looks import VARIED
+from beers_deploy.model.training.looks import Looks
 from beers_deploy.model.training.losses import LossWeights, RestorationLoss
 from beers_deploy.model.training.patches import PatchRecipe
 from beers_deploy.model.training.source import Batch, PatchSource
@@ -98,9 +98,10 @@ def kinds_of_patches() -> dict[str, PatchRecipe]:
     reference = Sensor.load("pleiades-reference")
     plain = PatchRecipe(degraded, reference, PATCH_PX, family=SensorFamily(degraded.nominal()))
     family = SensorFamily(degraded.nominal(), other_curves=0.4)
+    varied = Looks(lit_share=0.4, calm_share=0.3, soft_share=0.3)
     return {
         "ordinary": plain,
-        "varied": replace(plain, family=family, looks=VARIED, noisy_reference=False),
+        "varied": replace(plain, family=family, looks=varied, noisy_reference=False),
     }
 
 

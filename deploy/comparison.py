@@ -12,9 +12,9 @@ from beers_deploy.model.io.files import sha256
 from beers_deploy.model.progress import Progress, reporting
 from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.shipped import INT8, SENSOR, VARIANT, shipped_weights
-from beers_deploy.network import Network, NetworkLike, SensorLike
+from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import OptionError, printable
-from beers_deploy.profiles.sensor import Sensor, numbers_of
+from beers_deploy.profiles.sensor import Sensor, SensorLike, numbers_of
 from beers_deploy.quant.gate import METRICS, GateResult, gate_row
 from beers_deploy.quant.gate import compare as differences_of
 from beers_deploy.quant.onnx_file import faults_named, metadata, require_quantized

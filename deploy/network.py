@@ -25,7 +25,7 @@ from beers_deploy.network_files import (
 )
 from beers_deploy.profiles.errors import ModelError, optional, reason_of
 from beers_deploy.profiles.figures import Row
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.shipped import BLIND, DEFAULT_TARGET
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.domains import OPSET
@@ -51,7 +51,6 @@ if TYPE_CHECKING:
 
 
 NetworkLike = Union["Network", onnx.ModelProto, "torch.nn.Module", str, os.PathLike[str]]
-SensorLike = Sensor | str | os.PathLike[str]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

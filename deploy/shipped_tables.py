@@ -47,7 +47,7 @@ def sensors() -> Table:
         ['pleiades-degraded', 'pleiades-reference', 'pleiades-variable']
     """
     rows = []
-    for sensor in map(load_sensor, sensor_names()):
+    for sensor in map(Sensor.load, sensor_names()):
         figures = {"MTF at Nyquist": _figure(sensor.mtf_nyquist, "ratio")}
         if sensor.snr_1 is not None:
             figures["SNR"] = _figure(sensor.snr_1, "ratio")

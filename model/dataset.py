@@ -9,11 +9,10 @@ which scenes.
 import json
 import logging
 import multiprocessing
-import os
 import shutil
 import sys
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
@@ -25,6 +24,7 @@ import numpy as np
 
 from beers_deploy.model.io.files import sha256, write_text
 from beers_deploy.model.manifest import DIGESTS, ROLES, Line, image_of, line_text, matching_lines
+from beers_deploy.model.progress import steps
 from beers_deploy.model.raster.images import site_of
 from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.model.shipped import SENSOR
@@ -36,14 +36,13 @@ from beers_deploy.model.simulator.sampling import Scene, read_scene, resample
 from beers_deploy.profiles.errors import ImageError, OptionError, reason_of
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.reference import reference_beside, require_same_units
-from beers_deploy.profiles.sensor import Sensor, same_instrument
+from beers_deploy.profiles.sensor import Sensor, SensorLike, same_instrument
 from beers_deploy.profiles.toml import parse_json, read_json
 from beers_deploy.profiles.validation import validated
 
 logger = logging.getLogger(__name__)
 
 DRAWN_SIDE_PX = 3000
-SensorLike = Sensor | str | os.PathLike[str]
 
 
 @dataclass(frozen=True)
@@ -202,7 +201,6 @@ def write_dataset(
     out: Path,
     workers: int,
     resume: bool,
-    tick: Callable[[int], None],
     pool: Executor | None = None,
 ) -> dict[str, float]:
     """Write a dataset of 12-bit TIFF patches and its manifest.
@@ -215,7 +213,6 @@ def write_dataset(
         out: the dataset's folder.
         workers: processes here that make patches, or calls that the pool runs at once.
         resume: whether to go on with a dataset that the folder holds in part.
-        tick: is told how many further patches are done.
         pool: makes them instead of processes here; only this process writes.
 
     Returns:
@@ -229,8 +226,9 @@ def write_dataset(
     lines = _lines_left(recipe, out, windows, parts) if resume else {}
     waiting = {path: [w for w in chunk if w.number not in lines] for path, chunk in parts.items()}
     waiting = {path: chunk for path, chunk in waiting.items() if chunk}
-    tick(len(lines))
     with ExitStack() as stack:
+        bar = stack.enter_context(steps("simulating", len(windows)))
+        bar.advance(len(lines))
         if pool is None and workers > 1 and len(waiting) > 1:
             # A forked copy of a library's threads can hang.
             spawn = multiprocessing.get_context("spawn")
@@ -243,7 +241,7 @@ def write_dataset(
                     write_tiff(image_of(out, role, window.name), dn)
                 lines[window.number] = line_text(out, patch.line)
             write_text(path, "".join(lines[window.number] for window in parts[path]))
-            tick(len(patches))
+            bar.advance(len(patches))
     content = "".join(lines[window.number] for window in windows)
     if not manifest.is_file() or manifest.read_bytes() != content.encode():
         write_text(manifest, content)

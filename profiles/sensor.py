@@ -379,6 +379,10 @@ class Sensor:
         )
 
 
+SensorLike = Sensor | str | os.PathLike[str]
+"""A profile, the name of a shipped one, or a .toml file."""
+
+
 def same_instrument(one: Sensor, other: Sensor) -> bool:
     """Whether two profiles state the same numbers, whatever they are called and wherever the
     numbers come from.

@@ -15,9 +15,9 @@ from beers_deploy.kit.record import require_library, write_record
 from beers_deploy.model.consistency import REACH_PX
 from beers_deploy.model.exposure import HEADROOM
 from beers_deploy.model.io.files import write_text
-from beers_deploy.network import Network, NetworkLike, SensorLike
+from beers_deploy.network import Network, NetworkLike
 from beers_deploy.network_files import other_sensor
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.shipped import BLIND, TILE_PX
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.encodings import save_config

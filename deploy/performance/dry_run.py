@@ -27,7 +27,7 @@ from beers_deploy.restoration.plan import Plan, plan_for
 from beers_deploy.restoration.prepare import NetworkPipeline
 from beers_deploy.restoration.radiometry import FullScale, Reading, full_scale_of
 from beers_deploy.restoration.runtime import Engine, open_runtime, tiles_at_once
-from beers_deploy.restoration.sensor_check import SensorCheck, checked_sensor
+from beers_deploy.restoration.sensor_check.check import SensorCheck, checked_sensor
 from beers_deploy.restoration.steps import keeps_pixels
 
 HEADER = "the file's own header"

@@ -64,9 +64,8 @@ def worst_picture(
     difference = np.abs(in_int8 - in_float)
     cells = [*strip_row(images.values(), stretch_of(in_float)), *error_row([difference], white_dn)]
     caption = (
-        f"MAE {difference.mean():.2f} DN, at most {difference.max():.0f} DN. The images share "
-        "one grey scale; "
-        f"differences: black none, white {white_dn:.0f} DN and more."
+        f"MAE {difference.mean():.2f} DN, at most {difference.max():.0f} DN. The images share one "
+        f"grey scale; differences: black none, white {white_dn:.0f} DN and more."
     )
     picture = np.asarray(grid([*images, "|difference|"], [cells], ZOOM))
     return Picture(f"Patch {number}", picture_url(picture), caption)

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TypeVar
 
 from beers_deploy.model.raster.facts import Raster
-from beers_deploy.network import Network, NetworkLike, SensorLike
+from beers_deploy.network import Network, NetworkLike
 from beers_deploy.network_files import other_sensor
 from beers_deploy.profiles.errors import ModelError, OptionError, printable
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.shipped import BLIND
 
 logger = logging.getLogger(__name__)

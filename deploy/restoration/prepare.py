@@ -35,7 +35,8 @@ from beers_deploy.restoration.runtime import (
     open_runtime,
     tiles_at_once,
 )
-from beers_deploy.restoration.sensor_check import SensorCheck, checked_sensor, restored_already
+from beers_deploy.restoration.sensor_check.check import SensorCheck, checked_sensor
+from beers_deploy.restoration.sensor_check.raw import restored_already
 from beers_deploy.restoration.steps import (
     Around,
     consistency_steps,

@@ -17,7 +17,7 @@ from beers_deploy.model.simulator.acquire import MARGIN_PX, Pair, simulate_pair
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import read_scene
-from beers_deploy.network import Network, SensorLike
+from beers_deploy.network import Network
 from beers_deploy.performance import board as bench_board
 from beers_deploy.performance import tables
 from beers_deploy.performance.swath import Swath, predict_network
@@ -25,7 +25,7 @@ from beers_deploy.performance.traditional import measure_chain
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Row, measured
 from beers_deploy.profiles.instrument import MAX_DN
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.shipped import DEFAULT_TARGET, TILE_PX, board_names
 from beers_deploy.report.page import Picture, Section
 
@@ -44,9 +44,8 @@ INT8 = f"{VARIANT}, INT8"
 REFERENCE = "reference"
 
 SWATH_CAPTION = (
-    "The traditional pipeline is measured on crops of this image and scaled; the paper's rows "
-    "are what it printed "
-    "for another network (16 blocks of 64 features) on its own hardware."
+    "The traditional pipeline is measured on crops of this image and scaled; the paper's rows are "
+    "what it printed for another network (16 blocks of 64 features) on its own hardware."
 )
 GATE_CAPTION = (
     "On simulated patches that calibration did not see; the INT8 network obeys the "

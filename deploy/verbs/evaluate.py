@@ -232,8 +232,9 @@ def _detection(
     """Return what a detector finds in labelled images, degraded and restored."""
     from beers_deploy.profiles.sensor import Sensor
     from beers_deploy.studies.detection.detector import open_detector, parse_classes
+    from beers_deploy.studies.detection.page import write_page
     from beers_deploy.studies.detection.study import labelled_scenes, run_study
-    from beers_deploy.studies.detection.table import detection_table
+    from beers_deploy.studies.detection.tables import detection_table
 
     if images is None:
         raise OptionError("`detector` needs `images`. Give the folder of labelled images.")
@@ -259,4 +260,8 @@ def _detection(
         reference=reference,
         seed=seed,
     )
-    return detection_table(compared, detector, network, scenes, notes, out)
+    table = detection_table(compared, detector, network, scenes, notes)
+    if out is not None:
+        write_page(compared, table, out / PAGE)
+        logger.info("wrote %s", out / PAGE)
+    return table

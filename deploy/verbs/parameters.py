@@ -59,6 +59,19 @@ class Holds:
 
 
 @dataclass(frozen=True)
+class Beside:
+    """Marks an output file next to which a second one of the same stem is written.
+
+    Attributes:
+        suffix: of the second file.
+        when: the name of the parameter that asks for it.
+    """
+
+    suffix: str
+    when: str
+
+
+@dataclass(frozen=True)
 class RequiredUnless:
     """Marks a parameter that the command line must have, unless it has another one.
 
@@ -115,9 +128,9 @@ if TYPE_CHECKING:
     from beers_deploy.dpu.board import BoardLike
     from beers_deploy.model.progress import Progress as Progress
     from beers_deploy.network import NetworkLike as NetworkLike
-    from beers_deploy.network import SensorLike as SensorLike
     from beers_deploy.pairs import Pair
     from beers_deploy.profiles.sensor import Sensor
+    from beers_deploy.profiles.sensor import SensorLike as SensorLike
     from beers_deploy.quant.limits import Limits
     from beers_deploy.restoration.method import Restore
 

@@ -224,20 +224,19 @@ def _write(
     resume: bool,
 ) -> "Table":
     """Write a data set, and return a table of it."""
-    from beers_deploy.model.dataset import plan_windows, write_dataset
+    from beers_deploy.model.dataset import write_dataset
     from beers_deploy.model.processor import require_cores
-    from beers_deploy.model.progress import steps
     from beers_deploy.profiles.figures import Row, measured
     from beers_deploy.restoration.cluster import open_cluster
     from beers_deploy.results import Table
 
     require_cores("workers", workers)
     scenes = [path for path in recipe.scenes if path is not None]
-    with open_cluster(scheduler) as cluster, steps("simulating", len(plan_windows(recipe))) as bar:
+    with open_cluster(scheduler) as cluster:
         # Without a scheduler, the data set starts processes of its own.
         count = cluster.slots if cluster else workers or os.cpu_count() or 1
         pool = cluster.pool if cluster else None
-        summary = write_dataset(recipe, out, count, resume, bar.advance, pool)
+        summary = write_dataset(recipe, out, count, resume, pool)
     rejected = "SNR pairs drawn again because they were physically impossible"
     figures = {
         "pairs": measured(summary["patches"], "pair", "the manifest"),

@@ -1,12 +1,12 @@
 """`stress`: hard cases and bit flips against a network."""
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.shipped import DEFAULT_TARGET
 from beers_deploy.verbs.parameters import (
+    Beside,
     InputPath,
     Interval,
     Names,
@@ -21,9 +21,10 @@ from beers_deploy.verbs.verb import refuse_with, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.results import Table
-    from beers_deploy.studies.stress.networks import Subject
 
 DRAWS = 6
+CURVES = ".svg"
+"""Suffix of the curves, next to the tables."""
 
 
 @verb
@@ -40,7 +41,7 @@ def stress(
     images: InputPath | None = None,
     target: TargetLike = DEFAULT_TARGET,
     seed: Seed = 0,
-    out: OutputFile | None = None,
+    out: Annotated[OutputFile, Beside(CURVES, when="bit_flips")] | None = None,
     progress: Progress = None,
 ) -> "Table":
     """Run hard cases through a network in float32, in INT8, in integers alone and in tiles.
@@ -85,80 +86,30 @@ def stress(
             target=target != DEFAULT_TARGET,
         )
     # These load torch.
-    from beers_deploy.model.io.files import require_writable, write_text
-    from beers_deploy.studies.stress.battery import chosen, markdown
+    from beers_deploy.model.io.files import write_text
+    from beers_deploy.studies.stress.battery import battery_table, chosen
+    from beers_deploy.studies.stress.bit_flips import flip_curves_svg, flip_table
     from beers_deploy.studies.stress.cases import CASES
     from beers_deploy.studies.stress.networks import STAGES, open_subject
 
-    file = None if out is None else Path(out)
-    picture = file.with_name(f"{file.stem}.svg") if file and bit_flips else None
-    # The curves are an output whose name is derived from that of the tables.
-    given = [float_network, int8_network, images]
-    inputs = [Path(each) for each in given if isinstance(each, str | os.PathLike)]
-    require_writable(file, picture, inputs=inputs)
     names = chosen(cases, [case.name for case in CASES], "cases")
     stage_names = chosen(stages, STAGES, "stages")
     subject = open_subject(float_network, int8_network, sensor)
     if bit_flips:
+        from beers_deploy.profiles.sensor import Sensor
+        from beers_deploy.profiles.target import TargetProfile
+        from beers_deploy.quant.samples.simulated import Calibration
+
         scenes = None if images is None else Path(images)
-        table = _bit_flips(subject, sensor, scenes, draws, side, seed, target, picture)
+        patches = Calibration(Sensor.load(sensor), scenes, draws, side, seed)
+        table = flip_table(subject, patches, TargetProfile.load(target))
+        if out is not None:
+            svg = flip_curves_svg({subject.quantized.source.name: table.rows})
+            write_text(Path(out).with_suffix(CURVES), svg)
     else:
-        table = _battery(subject, names, stage_names, side, seed)
-    if file is not None:
-        shown = [row for row in table.rows if row.table not in table.details]
-        write_text(file, markdown(shown))
+        table = battery_table(
+            subject, [case for case in CASES if case.name in names], stage_names, seed, side
+        )
+    if out is not None:
+        write_text(Path(out), table.to_markdown())
     return table
-
-
-def _battery(
-    subject: "Subject", names: list[str], stages: list[str], side_px: int, seed: int
-) -> "Table":
-    """Run hard cases."""
-    from beers_deploy.results import Table
-    from beers_deploy.studies.stress.battery import (
-        TITLES,
-        battery_checks,
-        finding_rows,
-        run_battery,
-        shown_rows,
-        skipped,
-    )
-    from beers_deploy.studies.stress.cases import CASES
-
-    cases = [case for case in CASES if case.name in names]
-    results = run_battery(subject, cases, stages, seed, side_px)
-    return Table(
-        inputs=tuple(network.input for network in subject.opened),
-        rows=(*shown_rows(subject, results), *finding_rows(results)),
-        checks=tuple(battery_checks(subject, results)),
-        notes=tuple(skipped(results)),
-        headings=TITLES,
-        details=frozenset({"findings"}),
-    )
-
-
-def _bit_flips(
-    subject: "Subject",
-    sensor: SensorLike,
-    images: Path | None,
-    draws: int,
-    side_px: int,
-    seed: int,
-    target: TargetLike,
-    picture: Path | None,
-) -> "Table":
-    """Inject bit flips, and draw the curves."""
-    from beers_deploy.model.io.files import write_text
-    from beers_deploy.profiles.sensor import Sensor
-    from beers_deploy.profiles.target import TargetProfile
-    from beers_deploy.quant.samples.simulated import Calibration
-    from beers_deploy.results import Table
-    from beers_deploy.studies.stress.battery import TITLES
-    from beers_deploy.studies.stress.bit_flips import flip_curves_svg, flip_rows
-
-    patches = Calibration(Sensor.load(sensor), images, draws, side_px, seed)
-    rows = flip_rows(subject, patches, TargetProfile.load(target))
-    if picture is not None:
-        write_text(picture, flip_curves_svg({subject.opened[-1].name: rows}))
-    inputs = tuple(network.input for network in subject.opened)
-    return Table(inputs=inputs, rows=tuple(rows), headings=TITLES)

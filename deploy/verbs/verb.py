@@ -15,7 +15,7 @@ from typing import Any, Literal, ParamSpec, TypeVar, cast, get_args, get_origin
 from annotated_types import Interval
 
 from beers_deploy.profiles.errors import BeersError, OptionError, missing_extra
-from beers_deploy.verbs.parameters import Holds, Labelled, Written
+from beers_deploy.verbs.parameters import Beside, Holds, Labelled, Written
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -134,6 +134,9 @@ def paths_of(function: Callable[..., Any], arguments: Mapping[str, Any]) -> Path
         elif value is not None:
             holds = marker(parameters[name], Holds)
             files = [Path(value)] if holds is None else [Path(value) / f for f in holds.files]
+            beside = marker(parameters[name], Beside)
+            if beside is not None and arguments.get(beside.when):
+                files.append(Path(value).with_suffix(beside.suffix))
             paths.outputs.extend(files)
             paths.verdicts.extend(files if written.verdict else [])
             paths.folders.extend([] if holds is None else [Path(value) / f for f in holds.folders])

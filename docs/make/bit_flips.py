@@ -13,7 +13,7 @@ from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.samples.simulated import Calibration
-from beers_deploy.studies.stress.bit_flips import SETS, flip_curves_svg, flip_rows
+from beers_deploy.studies.stress.bit_flips import SETS, flip_curves_svg, flip_table
 from beers_deploy.studies.stress.networks import open_subject
 
 DOCS = Path(__file__).parents[1]
@@ -93,7 +93,9 @@ def table(networks: Mapping[str, Sequence[Row]]) -> Iterator[str]:
 
 if __name__ == "__main__":
     board = TargetProfile.load(BOARD)
-    studies = {variant: flip_rows(open_subject(variant), SOURCE, board) for variant in VARIANTS}
+    studies = {
+        variant: flip_table(open_subject(variant), SOURCE, board).rows for variant in VARIANTS
+    }
     write_text(PAGE, document(studies))
     write_text(PICTURE, flip_curves_svg(studies))
     print(f"wrote {PAGE} and {PICTURE}")

@@ -11,7 +11,7 @@ from pathlib import Path
 from beers_deploy.model.io.files import write_text
 from beers_deploy.model.shipped import VARIANT
 from beers_deploy.studies.stress.battery import (
-    NOTES,
+    LEGEND,
     StageResult,
     battery_rows,
     layer_rows,
@@ -37,7 +37,7 @@ the losses and the metrics.
 
 def document(subject: Subject, results: list[StageResult]) -> str:
     """The whole page as Markdown."""
-    cases = ["## Cases and stages\n", NOTES["battery"], "", *case_lines(results)]
+    cases = ["## Cases and stages\n", LEGEND, "", *case_lines(results)]
     findings = ["## What is found\n", *finding_lines(subject, results)]
     return "\n".join(
         [OPENING, *findings, "", *stage_lines(), "", *limitation_lines(), "", *cases, ""]

@@ -67,21 +67,6 @@ THOROUGH = Effort(step_px=1, cell_px=(4, 2), candidates=6000, fits=400)
 """
 
 
-def find_blurs(
-    image: np.ndarray, noise: Noise, clipped_at: float, effort: Effort = THOROUGH
-) -> list[EdgeBlur]:
-    """The blurs across the near-vertical edges of an image (H, W); transpose it for the
-    near-horizontal ones.
-
-    Args:
-        image: finite values.
-        noise: of the pixels.
-        clipped_at: values from here on are clipped, and so are those from 0 down.
-        effort: how much is tried.
-    """
-    return blurs_of(plain_squares(image, noise, clipped_at, effort), noise)
-
-
 def blurs_of(squares: np.ndarray, noise: Noise) -> list[EdgeBlur]:
     """The blurs of those of the squares (N, S, S) that hold an edge."""
     return [fit for fit in fit_blurs(squares, noise, FOUND) if isinstance(fit, EdgeBlur)]
@@ -94,10 +79,15 @@ def plain_squares(
     effort: Effort,
     roughness: float = MAX_ROUGHNESS,
 ) -> np.ndarray:
-    """The squares (N, S, S), S = 2 * HALF_PX + 1, of an image that may hold an edge; see
-    `find_blurs`.
+    """Return the squares (N, S, S), S = 2 * HALF_PX + 1, of an image that may hold a near-vertical
+    edge.
 
-    Their outer columns scatter by `roughness` of the step at most, beyond noise.
+    Args:
+        image: (H, W), finite values; transpose it for near-horizontal edges.
+        noise: of the pixels.
+        clipped_at: values from here on are clipped, and so are those from 0 down.
+        effort: how much is tried.
+        roughness: largest scatter of a square's outer columns beyond noise, of the step.
     """
     if min(image.shape) <= 2 * MARGIN_PX:
         return np.empty((0, 2 * HALF_PX + 1, 2 * HALF_PX + 1))

@@ -89,11 +89,8 @@ class Limits:
 
 
 FOUND = Limits(30, 0.012)
-POINTED_AT = Limits(10, 0.03)
 ANY = Limits(0, math.inf, math.inf)
-"""For edges found by search among much that is none, for those that a person vouches for, and for
-those known.
-"""
+"""For edges found by search among much that is none, and for those that are edges for certain."""
 
 
 @lru_cache(maxsize=16)
@@ -131,21 +128,6 @@ def _at_distances(lines: np.ndarray, distance: np.ndarray) -> np.ndarray:
     column += np.arange(count)[:, None] * length
     samples = lines.ravel()
     return np.asarray(samples[column] * (1 - share) + samples[column + 1] * share)
-
-
-def edge_response(distance: np.ndarray, gamma: float, shape: float = 0.0) -> np.ndarray:
-    """What a detector sees of a step of 1 at `distance` pixels (any shape) from it, behind a blur
-    of `gamma`.
-
-    `shape` adds a Gaussian part to the blur: MTF(f) = exp(-gamma f - shape f^2) sinc(f).
-    """
-    lines = _at_gammas(np.array([gamma]), shape)
-    return _at_distances(lines, distance.reshape(1, -1)).reshape(distance.shape)
-
-
-def fit_blur(region: np.ndarray, noise: Noise, limits: Limits) -> Fit:
-    """Fit the blur of the one near-vertical edge that crosses a region (H, W); see `fit_blurs`."""
-    return fit_blurs(region[None], noise, limits)[0]
 
 
 def fit_blurs(regions: np.ndarray, noise: Noise, limits: Limits) -> list[Fit]:

@@ -68,6 +68,3 @@ class Looks:
 
 ORDINARY = Looks()
 """Photographs as they are, on days of different light."""
-
-VARIED = Looks(lit_share=0.4, calm_share=0.3, soft_share=0.3)
-"""All that a satellite may see: what networks are trained on."""

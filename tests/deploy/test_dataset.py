@@ -22,6 +22,7 @@ from beers_deploy.model.dataset import (
     write_dataset,
 )
 from beers_deploy.model.manifest import DIGESTS, Line, line_text
+from beers_deploy.model.progress import Step, reporting
 from beers_deploy.profiles.effects import TABLES
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.scene_call import SceneCall, calling_for, origins, typical_effects
@@ -46,7 +47,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def dataset(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The small dataset, to be read."""
     folder = tmp_path_factory.mktemp("made") / "all"
-    write_dataset(small(scene), folder, 1, resume=False, tick=silent)
+    write_dataset(small(scene), folder, 1, resume=False)
     return folder
 
 
@@ -58,10 +59,6 @@ def small(scene: Path, patch_px: int | None = 24) -> DatasetRecipe:
     return DatasetRecipe((scene, scene), VARIABLE, REFERENCE, oversampling=2, patch_px=patch_px)
 
 
-def silent(_: int) -> None:
-    """Report nothing."""
-
-
 def bytes_of(folder: Path) -> dict[str, bytes]:
     return {
         str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()
@@ -71,7 +68,7 @@ def bytes_of(folder: Path) -> dict[str, bytes]:
 @pytest.mark.slow
 def test_the_bytes_do_not_depend_on_the_workers(scene: Path, tmp_path: Path) -> None:
     for workers in (1, 2):
-        write_dataset(small(scene), tmp_path / str(workers), workers, resume=False, tick=silent)
+        write_dataset(small(scene), tmp_path / str(workers), workers, resume=False)
     assert bytes_of(tmp_path / "1") == bytes_of(tmp_path / "2")
 
 
@@ -83,7 +80,7 @@ def test_any_patch_can_be_made_again_alone(scene: Path, dataset: Path) -> None:
 
 
 def test_the_manifest_tells_where_each_patch_comes_from(scene: Path, tmp_path: Path) -> None:
-    summary = write_dataset(small(scene), tmp_path / "d", 1, resume=False, tick=silent)
+    summary = write_dataset(small(scene), tmp_path / "d", 1, resume=False)
     lines = [
         json.loads(line) for line in (tmp_path / "d" / "manifest.jsonl").read_text().splitlines()
     ]
@@ -125,10 +122,10 @@ def test_a_killed_dataset_is_resumed_to_the_same_bytes(scene: Path, tmp_path: Pa
 def test_another_dataset_in_the_folder_is_not_overwritten(scene: Path, dataset: Path) -> None:
     before = bytes_of(dataset)
     with pytest.raises(OptionError, match="Add `resume`"):
-        write_dataset(small(scene), dataset, 1, resume=False, tick=silent)
+        write_dataset(small(scene), dataset, 1, resume=False)
     with pytest.raises(OptionError, match="another dataset"):
-        write_dataset(small(scene, patch_px=32), dataset, 1, resume=True, tick=silent)
-    write_dataset(small(scene), dataset, 1, resume=True, tick=silent)
+        write_dataset(small(scene, patch_px=32), dataset, 1, resume=True)
+    write_dataset(small(scene), dataset, 1, resume=True)
     assert bytes_of(dataset) == before
 
 
@@ -179,7 +176,7 @@ def test_damaged_pairs_of_a_finished_dataset_are_made_again(
     folder = Path(shutil.copytree(dataset, tmp_path / "damaged"))
     damage(folder / name)
     with caplog.at_level(logging.WARNING, "beers_deploy"):
-        write_dataset(small(scene), folder, 1, resume=True, tick=silent)
+        write_dataset(small(scene), folder, 1, resume=True)
     assert bytes_of(folder) == bytes_of(dataset)
     if count:
         assert [message.split(" ")[0] for message in caplog.messages] == [str(count)]
@@ -215,7 +212,7 @@ def test_a_forged_line_with_its_digest_is_made_again(
     FORGED[kind](line)
     (folder / "manifest.jsonl").write_text("".join([line_text(folder, line), *lines[1:]]))
     with caplog.at_level(logging.WARNING, "beers_deploy"):
-        write_dataset(small(scene), folder, 1, resume=True, tick=silent)
+        write_dataset(small(scene), folder, 1, resume=True)
     assert bytes_of(folder) == bytes_of(dataset)
     assert caplog.messages[0].startswith("1 of ")
 
@@ -226,7 +223,7 @@ def test_a_recipe_whose_lines_end_otherwise_is_the_same(
     folder = Path(shutil.copytree(dataset, tmp_path / "other"))
     recipe = folder / "recipe.json"
     recipe.write_bytes(recipe.read_bytes().replace(b"\n", b"\r\n"))
-    write_dataset(small(scene), folder, 1, resume=True, tick=silent)
+    write_dataset(small(scene), folder, 1, resume=True)
     assert bytes_of(folder) == bytes_of(dataset)
 
 
@@ -239,7 +236,7 @@ def test_left_overs_of_a_run_are_deleted_and_nothing_else(
     foreign[0].parent.mkdir()
     for path in (*ours, *foreign):
         path.touch()
-    write_dataset(small(scene), folder, 1, resume=True, tick=silent)
+    write_dataset(small(scene), folder, 1, resume=True)
     assert [path.exists() for path in (*ours, *foreign)] == [False, False, True, True]
 
 
@@ -254,7 +251,7 @@ def test_a_damaged_part_of_an_unfinished_dataset_is_made_again(
     part.write_text("".join(lines[:5]))
     (folder / "manifest.jsonl").unlink()
     damage(part)
-    write_dataset(small(scene), folder, 1, resume=True, tick=silent)
+    write_dataset(small(scene), folder, 1, resume=True)
     assert bytes_of(folder) == bytes_of(dataset)
 
 
@@ -324,33 +321,31 @@ def test_a_scheduler_s_workers_give_the_same_bytes(
 ) -> None:
     recipe = DatasetRecipe((scene, scene), VARIABLE, REFERENCE, oversampling=2, patch_px=12)
     assert len(plan_windows(recipe)) > 2 * CHUNK
-    write_dataset(recipe, tmp_path / "here", 1, resume=False, tick=silent)
-    patches: list[int] = []
-    with open_cluster(scheduler) as cluster:
+    write_dataset(recipe, tmp_path / "here", 1, resume=False)
+    progress: list[Step] = []
+    with open_cluster(scheduler) as cluster, reporting(progress.append):
         assert cluster
-        write_dataset(
-            recipe, tmp_path / "there", cluster.slots, False, patches.append, cluster.pool
-        )
+        write_dataset(recipe, tmp_path / "there", cluster.slots, False, cluster.pool)
     assert bytes_of(tmp_path / "there") == bytes_of(tmp_path / "here")
-    assert sum(patches) == len(plan_windows(recipe))
+    assert progress[-1].done == progress[-1].total == len(plan_windows(recipe))
 
 
 @pytest.mark.slow
 def test_a_dataset_begun_here_is_finished_by_a_scheduler_s_workers(
     scene: Path, scheduler: str, tmp_path: Path
 ) -> None:
-    def stop(patches: int) -> None:
-        if patches:
+    def stop(step: Step) -> None:
+        if step.done:
             raise KeyboardInterrupt
 
     options = ["--images", scene, "--oversampling", "2", "--patch", "8"]
     recipe = DatasetRecipe(
         (scene,), Sensor.load("pleiades-degraded"), REFERENCE, oversampling=2, patch_px=8
     )
-    with pytest.raises(KeyboardInterrupt):
-        write_dataset(recipe, tmp_path / "d", 1, resume=False, tick=stop)
+    with pytest.raises(KeyboardInterrupt), reporting(stop):
+        write_dataset(recipe, tmp_path / "d", 1, resume=False)
     done("simulate", *options, "--out", tmp_path / "d", "--resume", "--scheduler", scheduler)
-    write_dataset(recipe, tmp_path / "whole", 1, resume=False, tick=silent)
+    write_dataset(recipe, tmp_path / "whole", 1, resume=False)
     assert bytes_of(tmp_path / "d") == bytes_of(tmp_path / "whole")
 
 

@@ -31,7 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         Image.fromarray(pixels).save(here / name)
         scenes.append(here / name)
     recipe = DatasetRecipe(tuple(scenes), SEVERE, SEVERE.reference, oversampling=2, patch_px=15)
-    write_dataset(recipe, here / "out", 1, False, lambda _: None)
+    write_dataset(recipe, here / "out", 1, False)
     return here / "out"
 
 

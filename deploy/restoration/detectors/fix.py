@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.model.metrics.detector_lines import Stripes, constant_columns
+from beers_deploy.model.metrics.detector_lines import constant_columns
 from beers_deploy.model.metrics.detector_pixels import PATCH_PX, wrong_pixels
+from beers_deploy.model.metrics.detector_stripes import Stripes
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.source import Source, strips
 from beers_deploy.profiles.errors import ImageError

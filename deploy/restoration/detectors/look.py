@@ -13,16 +13,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from beers_deploy.model.metrics.detector_lines import (
-    Blocks,
-    Stripes,
-    join_blocks,
-    judge_lines,
-    line_up,
-    measure_lines,
-)
+from beers_deploy.model.metrics.detector_lines import Blocks, join_blocks, measure_lines
 from beers_deploy.model.metrics.detector_phases import Pattern, judge_phases, measure_phases
 from beers_deploy.model.metrics.detector_pixels import wrong_pixels
+from beers_deploy.model.metrics.detector_stripes import Stripes, judge_lines
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.source import Source
 
@@ -153,7 +147,7 @@ class _Found:
 
     def judged(self) -> BandFaults:
         """Judge all strips together."""
-        rows = judge_lines(line_up(self._rows), LEAST)
+        rows = judge_lines(join_blocks(self._rows, axis=1), LEAST)
         return BandFaults(
             columns=judge_lines(join_blocks(self._columns), LEAST),
             rows=rows.renumbered(self._row_numbers),

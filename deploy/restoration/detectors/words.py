@@ -4,8 +4,8 @@ import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-from beers_deploy.model.metrics.detector_lines import Stripes
 from beers_deploy.model.metrics.detector_phases import COLOUR, Pattern
+from beers_deploy.model.metrics.detector_stripes import Stripes
 from beers_deploy.model.raster.source import Source
 from beers_deploy.profiles.figures import Figure, measured, unavailable
 from beers_deploy.restoration.detectors.fault_list import FOUND

@@ -2,15 +2,14 @@
 and TOML.
 
 - `frames`: which frames, what one digital number is, where the dark lies
-- `instrument`: noise and MTF, with intervals
-- `profile`: the TOML file
+- `measure`: noise and MTF, with intervals
+- `profile`: figures, sentences, and the TOML file
 
 Gain, ground sampling distance, black level, and bits unless pixels are clipped at full scale, are
 asked for or assumed. Where no edge gives an MTF, the user's word or an assumption stands in its
 place, marked so.
 """
 
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,12 +20,18 @@ from typing import Any
 import numpy as np
 
 from beers_deploy.model.raster.writer import write_tiff
-from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.results import Table, input_of
 from beers_deploy.studies.characterize.frames import cut_box, open_frames
-from beers_deploy.studies.characterize.instrument import Mtf, measure_mtf, measure_noise, snr_at
-from beers_deploy.studies.characterize.profile import PARTS, Measurement, profile_toml
+from beers_deploy.studies.characterize.measure import measure_mtf, measure_noise, snr_at
+from beers_deploy.studies.characterize.profile import (
+    FULL_SCALE_RADIANCE,
+    PARTS,
+    Measurement,
+    Stated,
+    profile_toml,
+)
 
 __all__ = [
     "MeasuredSensor",
@@ -36,35 +41,6 @@ __all__ = [
     "measured_sensor",
     "profile_toml",
 ]
-
-FULL_SCALE_RADIANCE = 400.0
-"""W/m2/sr/um, where no gain is given."""
-
-
-@dataclass(frozen=True)
-class Stated:
-    """What the user says of a camera; None of what pixels are to tell, or what is assumed.
-
-    Attributes:
-        bits: of a digital number.
-        gain: DN per W/m2/sr/um.
-        gsd_m: ground sampling distance.
-        black_level: value of the dark in the files.
-        mtf: contrast at Nyquist across and along the track, instead of a measurement.
-    """
-
-    bits: int | None = None
-    gain: float | None = None
-    gsd_m: float | None = None
-    black_level: float | None = None
-    mtf: tuple[float, float] | None = None
-
-    def __post_init__(self) -> None:
-        for option, value in (("gain", self.gain), ("gsd", self.gsd_m)):
-            if value is not None and not 0 < value < math.inf:
-                raise OptionError(
-                    f"`{option}` must be a finite number above 0, but it is {value:g}."
-                )
 
 
 def measure(
@@ -81,14 +57,10 @@ def measure(
     frames = open_frames(images, stated.bits, stated.black_level)
     regions = {words: cut_box(words, frames) for words in edges}
     noise = measure_noise(frames)
-    mtf = Mtf({}, {})
-    if stated.mtf is None:
-        mtf = measure_mtf(frames, regions, noise.model)
+    mtf = measure_mtf(frames, regions, noise.model) if stated.mtf is None else {}
     gain = stated.gain or frames.full_scale_dn / FULL_SCALE_RADIANCE
     low, high = (snr_at(noise.model, frames.full_scale_dn / part, gain) for part in PARTS)
-    return Measurement(
-        frames, noise, mtf, (low, high), gain, stated.gain is not None, stated.gsd_m, stated.mtf
-    )
+    return Measurement(frames, noise, mtf, (low, high), gain, stated)
 
 
 @dataclass(frozen=True, kw_only=True)

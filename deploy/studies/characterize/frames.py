@@ -38,7 +38,7 @@ class Frames:
         paths: of the images, sorted as given.
         step: stored values are multiples of it; one digital number.
         bits: of a digital number.
-        bits_stated: whether the user said so.
+        bits_stated: whether the user states them.
         black_dn: the digital number of the dark, subtracted from all that is measured.
         darkest_dn: what the darkest pixels have, the black level included.
     """
@@ -147,7 +147,7 @@ def _look(path: Path) -> _Look:
             f"{path} has values in steps of {apart}: {apart - 1} of {apart} values never occur, "
             f"so they are no digital numbers, which have steps of 1. Divide them by {apart}."
         )
-    # Of a constant image nothing can be said.
+    # A constant image does not show its step.
     step = step if apart else 1
     count = int((values == largest).sum())
     below = int((values == largest - step).sum())

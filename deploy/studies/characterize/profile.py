@@ -2,29 +2,60 @@
 file.
 """
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
 from beers_deploy.model.metrics.edge_curve import FREQUENCIES, MtfCurve
-from beers_deploy.model.metrics.noise_line import SPECTRUM
+from beers_deploy.model.metrics.instrument import AXES
+from beers_deploy.model.metrics.noise_blocks import SPECTRUM
+from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.profiles.constant import Status
-from beers_deploy.profiles.errors import printable
+from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.profiles.instrument import snr_0_bounds
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_file import sensor_toml
 from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.studies.characterize.frames import Frames
-from beers_deploy.studies.characterize.instrument import AXES, Mtf, Noise, Snr
+from beers_deploy.studies.characterize.measure import Noise, Snr
 
 PARTS = (16, 4)
-"""Of full scale: the radiances at which SNRs are stated, as those that a network is told of."""
+"""Of full scale: the radiances at which SNRs are stated, as in the profiles of networks."""
 GSD_M = 0.5
 OVERSAMPLING = 4
 SHOWN_CPX = {"at 0.1 cycles per pixel": 0.1, "at 0.25 cycles per pixel": 0.25, "at Nyquist": 0.5}
 MARGIN = 1e-5
 """Of an SNR, by which it stays off the bounds of physics: decimals are rounded."""
+FULL_SCALE_RADIANCE = 400.0
+"""W/m2/sr/um, where no gain is given."""
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What the user states about a camera; None if it is measured or assumed.
+
+    Attributes:
+        bits: of a digital number.
+        gain: DN per W/m2/sr/um.
+        gsd_m: ground sampling distance.
+        black_level: value of the dark in the files.
+        mtf: contrast at Nyquist across and along the track, instead of a measurement.
+    """
+
+    bits: int | None = None
+    gain: float | None = None
+    gsd_m: float | None = None
+    black_level: float | None = None
+    mtf: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        for option, value in (("gain", self.gain), ("gsd", self.gsd_m)):
+            if value is not None and not 0 < value < math.inf:
+                raise OptionError(
+                    f"`{option}` must be a finite number above 0, but it is {value:g}."
+                )
 
 
 @dataclass(frozen=True)
@@ -32,33 +63,34 @@ class Measurement:
     """What was found of a camera.
 
     Attributes:
-        frames: that were looked at.
+        frames: that were measured.
         noise: the line that the SNRs lie on.
-        mtf: curves that edges show; none where the user states the MTF.
+        mtf: of each axis the curve that edges show, or why there is none; empty where the user
+            states the MTF.
         snrs: at two radiances.
         gain: DN per W/m2/sr/um, stated or assumed.
-        gain_stated: whether the user said so.
-        gsd_m: what the user says; None assumes one.
-        stated_mtf: contrast at Nyquist across and along the track, as the user says; None measures.
+        stated: by the user.
     """
 
     frames: Frames
     noise: Noise
-    mtf: Mtf
+    mtf: Mapping[str, MtfCurve | Refusal]
     snrs: tuple[Snr, Snr]
     gain: float
-    gain_stated: bool
-    gsd_m: float | None
-    stated_mtf: tuple[float, float] | None
+    stated: Stated
+
+    @property
+    def curves(self) -> dict[str, MtfCurve]:
+        """The curve of each axis that edges show."""
+        return {axis: curve for axis, curve in self.mtf.items() if isinstance(curve, MtfCurve)}
 
     def rows(self) -> list[Row]:
         """The figures, as commands report them."""
         figures: dict[str, Figure] = {}
         for axis in AXES:
-            curve = self.mtf.curves.get(axis)
-            if curve is None:
-                reason = self.mtf.reasons.get(axis, "the user states it")
-                figures[f"MTF {axis} at Nyquist"] = unavailable("%", reason)
+            curve = self.mtf.get(axis, Refusal("the user states it"))
+            if isinstance(curve, Refusal):
+                figures[f"MTF {axis} at Nyquist"] = unavailable("%", curve.reason)
                 continue
             for words, frequency in SHOWN_CPX.items():
                 value, (low, high) = curve.at(frequency)
@@ -83,8 +115,7 @@ class Measurement:
         if frames.step > 1:
             yield (
                 f"the values are multiples of {frames.step}: they count as {frames.bits}-bit "
-                "numbers; "
-                f"restore these frames with full scale {frames.stored_full_scale}"
+                f"numbers; restore these frames with full scale {frames.stored_full_scale}"
             )
         if frames.hides_black:
             yield (
@@ -94,9 +125,8 @@ class Measurement:
             )
         if not model.white:
             yield (
-                f"the noise is not white: at middle frequencies it is {model.colour:.2f} times "
-                "as strong as at the "
-                f"finest. {_colour_consequence(model.colour)}"
+                f"the noise is not white: at middle frequencies it is {model.colour:.2f} times as "
+                f"strong as at the finest. {_colour_consequence(model.colour)}"
             )
         if model.one_level:
             yield (
@@ -107,16 +137,16 @@ class Measurement:
         yield from self._notes_on_edges()
 
     def _notes_on_edges(self) -> Iterator[str]:
-        for axis, reason in self.mtf.reasons.items():
-            yield f"no MTF {axis} the track: {reason}"
-        for curve in self.mtf.curves.values():
+        for axis, curve in self.mtf.items():
+            if isinstance(curve, Refusal):
+                yield f"no MTF {axis} the track: {curve.reason}"
+        for curve in self.curves.values():
             if curve.contradicting:
                 yield f"these edges differ from the others: {', '.join(curve.contradicting)}"
-        if self.stated_mtf is None and not self.mtf.curves:
+        if self.stated.mtf is None and not self.curves:
             yield (
                 "the profile's MTF is an assumption: state what you know as `mtf`, or point at "
-                "straight edges as "
-                "`edge` FILE:X,Y,WIDTH,HEIGHT"
+                "straight edges as `edge` FILE:X,Y,WIDTH,HEIGHT"
             )
 
 
@@ -125,13 +155,11 @@ def _colour_consequence(colour: float) -> str:
     if colour > 1:
         return (
             "The profile states the stronger part. Filtering or compression after the detector "
-            "causes this: a "
-            "restoration leaves grain of some pixels' size"
+            "causes this: a restoration leaves grain of some pixels' size"
         )
     return (
         "The profile states the stronger part. Unequal readout channels or interference cause "
-        "this: equalise the "
-        "frames first, or a restoration smooths more than it need"
+        "this: equalise the frames first, or a restoration smooths more than it need"
     )
 
 
@@ -156,12 +184,11 @@ def profile_toml(found: Measurement) -> str:
         bits_source += f"; stored in steps of {frames.step}"
     gain_source = (
         f"full scale {frames.full_scale_dn} DN counts as 400 W/m2/sr/um; pixels do not tell the "
-        "gain, and to a "
-        "network only noise over full scale matters"
+        "gain, and to a network only noise over full scale matters"
     )
     tables: dict[str, dict[str, object]] = {
         "grid": {
-            "gsd_m": _given(found.gsd_m, GSD_M, "no pixel depends on it; state it"),
+            "gsd_m": _given(found.stated.gsd_m, GSD_M, "no pixel depends on it; state it"),
             "oversampling": _constant(
                 OVERSAMPLING, "assumed", "for simulations alone: scene pixels a pixel"
             ),
@@ -172,9 +199,7 @@ def profile_toml(found: Measurement) -> str:
             "bits": _constant(
                 frames.bits, "stated" if frames.bits_stated else "measured", bits_source
             ),
-            "gain_dn_per_radiance": _given(
-                found.gain if found.gain_stated else None, found.gain, gain_source
-            ),
+            "gain_dn_per_radiance": _given(found.stated.gain, found.gain, gain_source),
         },
     }
     if frames.black_dn:
@@ -188,21 +213,21 @@ def _mtf_table(sensor: Measurement, images: str) -> dict[str, object]:
     """Measured curves, what the user states, or an assumption; an axis without a curve has the
     other's.
     """
-    if sensor.stated_mtf is not None:
+    if sensor.stated.mtf is not None:
         across, along = (
-            _constant(value, "stated", "given on the command line") for value in sensor.stated_mtf
+            _constant(value, "stated", "given on the command line") for value in sensor.stated.mtf
         )
         return {"mtf_nyquist": across, "mtf_nyquist_along": along}
-    if not sensor.mtf.curves:
+    if not sensor.curves:
         middle = Sensor.load(BLIND).nominal().mtf_nyquist
         why = "no edge shows it; the middle of the range that networks are trained for"
         return {"mtf_nyquist": _constant(float(f"{middle:.4g}"), "assumed", why)}
     table: dict[str, object] = {"frequency": [float(f) for f in FREQUENCIES]}
     # An axis without edges has the curve of the other one, and its source says so.
-    other = next(iter(sensor.mtf.curves))
+    other = next(iter(sensor.curves))
     for axis in AXES:
-        source_axis = axis if axis in sensor.mtf.curves else other
-        curve = sensor.mtf.curves[source_axis]
+        source_axis = axis if axis in sensor.curves else other
+        curve = sensor.curves[source_axis]
         source = f"{_edges(curve)} {source_axis} the track in {images}"
         source += f", 90 % interval {_intervals(curve)}"
         if source_axis != axis:

@@ -5,5 +5,5 @@ with intervals.
 - `boxes`: boxes and the square input of a detector; `detector`: detectors as Ultralytics exports
   them to ONNX;
 - `average_precision`: average precision, precision and recall, with a bootstrap over sites;
-- `study`: the comparison; `tables`: its rows of figures; `table`: the whole; `page`: its page.
+- `study`: the comparison; `tables`: its table of figures; `page`: its page.
 """

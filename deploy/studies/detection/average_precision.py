@@ -4,7 +4,7 @@ Boxes are matched once, in pixels of the scene. Every figure is then a sum over 
 its weight: with weights of 1 the average precision is that of pycocotools, the reference code of
 the COCO evaluation; with the counts of a bootstrap draw it is that of the images drawn (Everingham
 et al., IJCV 111, 2015, section 3.5). A mean average precision is no mean over images, so each draw
-is scored anew.
+is scored again.
 """
 
 import math
@@ -35,7 +35,7 @@ SIZES_PX = {
 ALL = 0
 DRAWS = 1000
 FEW_SITES = 10
-"""Below it the percentiles of a bootstrap are too narrow to be trusted, and it is said."""
+"""Below it the percentiles of a bootstrap are too narrow to be trusted, and a note says so."""
 
 Figures = Mapping[str, np.ndarray]
 """The figures of a row by name, (1 + draws,) each: on all images, then on each draw; NaN where

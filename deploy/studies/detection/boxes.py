@@ -22,7 +22,7 @@ OVERLAP = 0.7
 MOST = 300
 CANDIDATES = 30_000
 """As Ultralytics validates: the grey around an image, the overlap above which the lower scored of
-two boxes goes, the boxes kept of an image, and those looked at, best scores first.
+two boxes goes, the boxes kept of an image, and those compared, best scores first.
 """
 
 
@@ -52,7 +52,7 @@ class Boxes:
         ignored: ArrayLike | None = None,
     ) -> "Boxes":
         """Boxes of any array-like; without scores they are labelled ones, and none is ignored
-        unless it is said.
+        by default.
         """
         array = np.asarray(corners, np.float64).reshape(-1, 4)
         count = len(array)

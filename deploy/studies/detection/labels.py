@@ -153,28 +153,17 @@ def _size_px(one: _File) -> tuple[int, int]:
 def _remarks(truths: Sequence[Boxes], lost: Sequence[str]) -> list[str]:
     empty = sum(not len(truth) for truth in truths)
     ignored = sum(int(truth.ignored.sum()) for truth in truths)
-    first = lost[0] if lost else ""
-    remarks = (
-        (
-            empty,
-            (
-                f"Images without a labelled object, all found there is false: {empty} of "
-                f"{len(truths)}."
-            ),
-        ),
-        (
-            lost,
-            f"Boxes left out, without area inside their image: {len(lost)}, the first in {first}.",
-        ),
-        (
-            ignored,
-            (
-                "Boxes that count neither way, difficult, a crowd or visible by less than 30 %: "
-                f"{ignored}."
-            ),
-        ),
-    )
-    return [sentence for occasion, sentence in remarks if occasion]
+    remarks = []
+    if empty:
+        count = f"{empty} of {len(truths)}"
+        remarks.append(f"Images without a labelled object, all found there is false: {count}.")
+    if lost:
+        count = f"{len(lost)}, the first in {lost[0]}"
+        remarks.append(f"Boxes left out, without area inside their image: {count}.")
+    if ignored:
+        kinds = "difficult, a crowd or visible by less than 30 %"
+        remarks.append(f"Boxes that count neither way, {kinds}: {ignored}.")
+    return remarks
 
 
 def _read_voc_tree(folder: Path, split: str | None) -> list[_File]:

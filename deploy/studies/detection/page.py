@@ -7,9 +7,10 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from beers_deploy.model.io.pictures import grid, picture_url
-from beers_deploy.profiles.figures import Row, by_table
+from beers_deploy.profiles.figures import by_table
 from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.report.plots import SERIES, Curve, curves_svg, data_url
+from beers_deploy.results import Table
 from beers_deploy.studies.detection.average_precision import (
     ALL,
     RECALLS,
@@ -19,7 +20,7 @@ from beers_deploy.studies.detection.average_precision import (
 )
 from beers_deploy.studies.detection.boxes import Boxes
 from beers_deploy.studies.detection.study import REFERENCE, Comparison
-from beers_deploy.studies.detection.tables import BY_SIZE, MAIN, PAPER_NOTES, headline
+from beers_deploy.studies.detection.tables import BY_SIZE, MAIN, PAPER_NOTES
 from beers_deploy.studies.evaluation.methods import DEGRADED
 
 CROP_PX = 88
@@ -40,39 +41,36 @@ CAPTIONS = {
 NOTES = (
     (
         "mAP50: average precision at an overlap of half, mean over classes; mAP50-95: mean over "
-        "0.5 "
-        "to 0.95 (COCO)."
+        "0.5 to 0.95 (COCO)."
     ),
     (
         "Share of loss regained: gain over what degradation took; unavailable where that loss "
-        "cannot be told from 0."
+        "is not significant."
     ),
     "The detector is fixed, and was trained for none of the degraded or restored images.",
     "It is shown one panchromatic band in all three, under one stretch for all rows of a scene.",
 )
 
 
-def write_page(
-    compared: Sequence[Comparison], rows: Sequence[Row], notes: Sequence[str], path: Path
-) -> None:
+def write_page(compared: Sequence[Comparison], table: Table, path: Path) -> None:
     """Write the page of a study, whole or not at all.
 
     Args:
         compared: comparisons of one set of scenes.
-        rows: of all its tables.
-        notes: what a reader must know besides.
+        table: of their figures.
         path: of the page.
     """
     tables = [
-        Section(name, table, CAPTIONS.get(name.split(",")[0], ""))
-        for name, table in by_table(rows).items()
+        Section(name, rows, CAPTIONS.get(name.split(",")[0], ""))
+        for name, rows in by_table(table.rows).items()
     ]
     truths = [acquired.scene.truth for acquired in compared[0].scenes]
     objects = sum(int((~truth.ignored).sum()) for truth in truths)
     title = f"What restoration buys a detector: {objects} objects on {len(truths)} images"
     pictures = [curves(compared), *crops(compared)]
-    sentences = (*notes, *NOTES, *PAPER_NOTES)
-    write_report(Report(title, headline(compared), tables, pictures, sentences), path)
+    # The last note is the headline.
+    *notes, line = table.notes
+    write_report(Report(title, line, tables, pictures, (*notes, *NOTES, *PAPER_NOTES)), path)
 
 
 def curves(compared: Sequence[Comparison]) -> Picture:
@@ -135,11 +133,9 @@ def _picture(compared: Sequence[Comparison], number: int) -> Picture:
     ]
     sensors = " and ".join(comparison.name for comparison in compared)
     caption = (
-        f"Rows: {sensors}. {CROP_PX} pixels of the "
-        "sensor a side, enlarged "
-        f"{ZOOM} times, one display for all. Boxes at the confidence of the table: green found, "
-        "red missed, "
-        "yellow false."
+        f"Rows: {sensors}. {CROP_PX} pixels of the sensor a side, enlarged {ZOOM} times, one "
+        "display for all. Boxes at the confidence of the table: green found, red missed, yellow "
+        "false."
     )
     image = np.asarray(grid(list(compared[0].methods), rows, 1))
     return Picture(

@@ -5,7 +5,7 @@ scene -> acquisition, whole -> restoration -> one display for all rows, stretche
 asks -> detector -> boxes back on the scene -> average precision.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,10 +18,9 @@ from beers_deploy.model.raster.images import site_of
 from beers_deploy.model.simulator.acquire import acquire_padded
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import read_scene
-from beers_deploy.network import SensorLike
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.reference import reference_beside
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.studies.detection.average_precision import (
     Figures,
     Hits,
@@ -167,12 +166,13 @@ def run_study(
         reference: profile of the reference images; None for the default one.
         seed: of every random draw.
     """
-    pairs = [SensorPair(profile, reference_beside(profile, reference)) for profile in sensors]
-    rows = [
-        {name: method_named(name, pair.degraded, pair.reference) for name in methods}
-        for pair in pairs
-    ]
-    return [_compared(detector, scenes, *inputs, seed) for inputs in zip(pairs, rows, strict=True)]
+    cases = []
+    # A method that does not exist is refused before anything is detected.
+    for profile in sensors:
+        pair = SensorPair(profile, reference_beside(profile, reference))
+        rows = {name: method_named(name, pair.degraded, pair.reference) for name in methods}
+        cases.append((pair, rows))
+    return [_compared(detector, scenes, pair, rows, seed) for pair, rows in cases]
 
 
 def _compared(
@@ -202,13 +202,10 @@ def _compared(
 
 def acquired(
     scenes: Sequence[LabelledScene], sensors: SensorPair, seed: int
-) -> "map[AcquiredScene]":
-    """Every scene in front of the sensors, the noise drawn by the seed and the scene's number."""
-    return map(
-        lambda number, scene: AcquiredScene(scene, sensors, Draw(seed, number)),
-        range(len(scenes)),
-        scenes,
-    )
+) -> Iterator[AcquiredScene]:
+    """Yield every scene in front of the sensors, the noise drawn by the seed and its number."""
+    for number, scene in enumerate(scenes):
+        yield AcquiredScene(scene, sensors, Draw(seed, number))
 
 
 def labelled_scenes(
@@ -218,7 +215,7 @@ def labelled_scenes(
     labels: Path | None = None,
     split: str | None = None,
 ) -> tuple[list[LabelledScene], list[str]]:
-    """The labelled pictures of a folder as scenes, read when they are looked at, and sentences on
+    """Return the labelled pictures of a folder as scenes, read when they are used, and sentences on
     what is left out.
 
     Args:
@@ -243,9 +240,6 @@ def _of_file(path: Path, truth: Boxes) -> LabelledScene:
 
 def left_out(labelled: Sequence[str], numbers: np.ndarray) -> list[str]:
     """A sentence on the labelled classes that the detector does not know, where there are such."""
-    names = ", ".join(name for name, number in zip(labelled, numbers, strict=True) if number < 0)
-    if not names:
-        return []
-    return [
-        f"Not known to the detector and left out: {names}. What it finds there counts as false."
-    ]
+    names = [name for name, number in zip(labelled, numbers, strict=True) if number < 0]
+    sentence = f"Not known to the detector and left out: {', '.join(names)}. What it finds there "
+    return [f"{sentence}counts as false."] if names else []

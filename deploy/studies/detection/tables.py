@@ -1,14 +1,18 @@
-"""What a detection study found as rows of figures, with the paper's beside."""
+"""The table of a detection study: its rows of figures, next to the paper's."""
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from math import isnan
+from pathlib import Path
 
 import numpy as np
 
 from beers_deploy.model.metrics.bootstrap import too_few
 from beers_deploy.profiles.figures import Figure, Row, measured, published, unavailable
-from beers_deploy.studies.detection.average_precision import DRAWS, SIZES_PX, interval
-from beers_deploy.studies.detection.study import REFERENCE, Comparison
+from beers_deploy.results import Table
+from beers_deploy.studies.detection.average_precision import DRAWS, SIZES_PX, interval, sites_note
+from beers_deploy.studies.detection.detector import Detector
+from beers_deploy.studies.detection.study import REFERENCE, Comparison, LabelledScene
 from beers_deploy.studies.evaluation.methods import DEGRADED
 
 PERCENT = "%"
@@ -22,16 +26,43 @@ BY_SIZE = "mAP50 by size"
 """What the names of the tables begin with; the sensor's follows."""
 
 NO_OBJECT = "no object to be found"
-NO_LOSS = "no loss that can be told from 0: the interval of reference less degraded holds it"
+NO_LOSS = "no significant loss: the interval of reference minus degraded contains 0"
 
 GAIN = "gain over degraded"
 LOSS = "loss to reference"
 REGAINED = "share of loss regained"
 
 
+def detection_table(
+    compared: Sequence[Comparison],
+    file: Path,
+    detector: Detector,
+    scenes: Sequence[LabelledScene],
+    notes: Sequence[str],
+) -> Table:
+    """Return the figures of a study.
+
+    Args:
+        compared: comparisons under each sensor.
+        file: of the detector.
+        detector: that was shown the scenes.
+        scenes: labelled.
+        notes: what a reader must know of the labels.
+    """
+    rows = (*chain.from_iterable(map(detection_rows, compared)), *paper_rows())
+    remarks = (detector.flag, sites_note(compared[0].sites), *notes, headline(compared))
+    tables = {row.table for row in rows}
+    return Table(
+        inputs=(file, *(scene.path for scene in scenes if scene.path is not None)),
+        rows=rows,
+        notes=tuple(filter(None, remarks)),
+        details=frozenset(name for name in tables if not name.startswith((MAIN, PAPER_TABLE))),
+    )
+
+
 def detection_rows(found: Comparison) -> list[Row]:
-    """The tables of one sensor: the answer, each row at its own confidence, by
-    class and by size.
+    """Return the tables of one sensor: the answer, each row at its own confidence, by class and by
+    size.
     """
     # A class without a labelled object has no average precision.
     labelled = [
@@ -39,18 +70,12 @@ def detection_rows(found: Comparison) -> list[Row]:
     ]
     by_class = {name: f"mAP50 of {name}" for name in labelled}
     by_size = {name: f"mAP50 {name}" for name in list(SIZES_PX)[1:]}
-    return [
-        *(_main_row(found, row) for row in found.methods),
-        *(_own_row(found, row) for row in found.methods),
-        *(
-            Row(f"{BY_CLASS}, {found.name}", row, _values(found, row, by_class))
-            for row in found.methods
-        ),
-        *(
-            Row(f"{BY_SIZE}, {found.name}", row, _values(found, row, by_size))
-            for row in found.methods
-        ),
-    ]
+    rows = [_main_row(found, row) for row in found.methods]
+    rows += [_own_row(found, row) for row in found.methods]
+    for table, keys in ((BY_CLASS, by_class), (BY_SIZE, by_size)):
+        name = f"{table}, {found.name}"
+        rows += [Row(name, row, _values(found, row, keys)) for row in found.methods]
+    return rows
 
 
 def _main_row(comparison: Comparison, row: str) -> Row:
@@ -86,8 +111,8 @@ def verdict(difference: np.ndarray, sites: int) -> str:
 
 
 def _regained(comparison: Comparison, gain: np.ndarray, loss: np.ndarray) -> Figure:
-    """The share of a loss that a gain makes good; unavailable where the loss
-    cannot be told from 0.
+    """Return the share of a loss that a gain makes good; unavailable if the loss is not
+    significant.
     """
     if too_few(comparison.sites):
         return unavailable(PERCENT, too_few(comparison.sites))
@@ -138,21 +163,18 @@ PAPER = {
     "paper: degraded, high": (67.30, 46.29, 63.80, 60.70),
     "paper: restored, high": (72.37, 50.57, 85.03, 66.36),
 }
-"""mAP50, what it calls mAP90, precision and recall, in %."""
+PAPER_COLUMNS = ("mAP50", "mAP90 (sic)", "precision", "recall")
+"""In %; it calls the second one mAP90."""
 
 
 def paper_rows() -> list[Row]:
-    """The paper's table as printed, with what differs."""
-    keys = ("mAP50", "mAP90 (sic)", "precision", "recall")
-    printed = {
-        name: [published(value, PERCENT, SOURCE) for value in values]
-        for name, values in PAPER.items()
-    }
-    words = {"what differs": DIFFERS}
-    return [
-        Row(PAPER_TABLE, name, dict(zip(keys, figures, strict=True)), words)
-        for name, figures in printed.items()
-    ]
+    """Return the paper's table as printed, with what differs."""
+    rows = []
+    for name, values in PAPER.items():
+        figures = [published(value, PERCENT, SOURCE) for value in values]
+        columns = dict(zip(PAPER_COLUMNS, figures, strict=True))
+        rows.append(Row(PAPER_TABLE, name, columns, {"what differs": DIFFERS}))
+    return rows
 
 
 PAPER_NOTES = (

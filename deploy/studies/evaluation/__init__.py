@@ -3,7 +3,8 @@
 - `methods`: what a method is, and the one of a name; `pairs`: degraded and reference images,
   simulated or read;
 - `scores`: figures of one method on pairs;
-- `targets`: its figures on edges, flat fields, points and patterns whose truth is known;
+- `target_scenes`: edges, flat fields, points and patterns whose truth is known; `targets`:
+  figures of one method on them;
 - `run`: an evaluation of several, and its page; `sweep`: the same under other sensors, known as
   they are or wrongly.
 """

@@ -32,10 +32,11 @@ from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.restoration.method import Restore
-from beers_deploy.restoration.sensor_check import WINDOW_PX, held_against
+from beers_deploy.restoration.sensor_check.check import check_windows
+from beers_deploy.restoration.sensor_check.windows import WINDOW_PX
 from beers_deploy.restoration.steps import Around
-from beers_deploy.results import Table
-from beers_deploy.studies.evaluation import scores, targets
+from beers_deploy.results import Input, Table
+from beers_deploy.studies.evaluation import scores, target_scenes, targets
 from beers_deploy.studies.evaluation.methods import (
     Method,
     method_named,
@@ -64,22 +65,6 @@ class Evaluation(Table):
     sensors: tuple[Sensor, Sensor]
     methods: Sequence[Method]
     pairs: Sequence[NamedPair]
-
-    @property
-    def mean(self) -> list[Row]:
-        """A row a method, and the paper's."""
-        return [row for row in self.rows if row.table == "mean"]
-
-    @property
-    def more(self) -> dict[str, list[Row]]:
-        """The tables of other brightness, of targets, by site and of other sensors.
-
-        Those of single images are for the document alone.
-        """
-        tables = by_table(self.rows).items()
-        return {
-            name: rows for name, rows in tables if name != "mean" and not name.startswith("images")
-        }
 
     def report(self, folder: str | os.PathLike[str]) -> Path:
         """Write report.html and pictures into a folder; returns the page's path."""
@@ -133,7 +118,7 @@ def run_evaluation(plan: Plan) -> Evaluation:
         loaded = [_named(number, pair) for number, pair in enumerate(plan.given)]
     elif plan.folder is not None:
         loaded = read_pairs(plan.folder, nominal.max_dn, read_pairs_recipe(plan.folder))
-        sensor_rows = [_seen(loaded, sensors[0], str(plan.folder), plan.strict)]
+        sensor_rows = [_sensor_row(loaded, sensors[0], str(plan.folder), plan.strict)]
     else:
         loaded, remarks = pairs_of_scenes(plan.scenes, *sensors, seed)
     rows = _compared(methods, loaded, sensors, instruments, seed)
@@ -158,10 +143,10 @@ def run_evaluation(plan: Plan) -> Evaluation:
             "methods": ",".join(plan.methods),
             "brightness": ",".join(f"{factor:g}" for factor in plan.factors),
         },
-        inputs=tuple(_inputs(plan.methods, plan.lpips, plan.scenes, plan.folder)),
+        inputs=tuple(_inputs(plan)),
         rows=every,
         notes=tuple(notes),
-        headings={"mean": "means over all pairs"},
+        headings=HEADINGS,
         # Single images are for the document alone.
         details=frozenset({row.table for row in every if row.table.startswith("images")} | WORDY),
         sensors=sensors,
@@ -170,6 +155,7 @@ def run_evaluation(plan: Plan) -> Evaluation:
     )
 
 
+HEADINGS = {"mean": "means over all pairs"}
 WORDY = frozenset({"sensor"})
 """Words that are shown in detail only."""
 
@@ -182,7 +168,7 @@ def _compared(
     seed: int,
 ) -> list[Row]:
     """Return the rows of each method: mean, targets and images."""
-    acquired = targets.acquire_targets(sensors[0].nominal(), sensors[1].nominal(), seed)
+    acquired = target_scenes.acquire_targets(sensors[0].nominal(), sensors[1].nominal(), seed)
     rows = list[Row]()
     for method in methods:
         mean, *images = scores.score(method, pairs, instruments, seed)
@@ -204,30 +190,31 @@ def _in_order(rows: Iterable[Row]) -> list[Row]:
     return [*means, *tables[targets.TARGETS], *scores.site_rows(tables["images"]), *images]
 
 
-def _seen(pairs: Sequence[NamedPair], sensor: Sensor, name: str, strict: bool) -> Row:
-    """The degraded images held against the sensor that they are said to be from."""
-    # Every n-th pair, n rounded up, so that at most HELD of them are checked.
-    sample = pairs[:: -(-len(pairs) // HELD)]
+def _sensor_row(pairs: Sequence[NamedPair], sensor: Sensor, name: str, strict: bool) -> Row:
+    """Return the row that compares the degraded images with the sensor named for them."""
+    # Every n-th pair, n rounded up, so that at most CHECKED_IMAGES of them are checked.
+    sample = pairs[:: -(-len(pairs) // CHECKED_IMAGES)]
     windows = [pair.degraded[:WINDOW_PX, :WINDOW_PX] for pair in sample]
-    comparison = held_against(windows, sensor, sensor.nominal().max_dn)
-    check = comparison.settled(name, sensor.name, strict)
+    check = check_windows(windows, sensor, sensor.nominal().max_dn)
+    check.report(name, sensor.name, strict)
     return Row("sensor of the degraded images", sensor.name, check.figures, check.text)
 
 
-def _inputs(
-    names: Iterable[str], weights: Path | None, scenes: Path | None, pairs: Path | None
-) -> Iterator[Path]:
-    """The files that the figures rest on: networks, weights of LPIPS, scenes or pairs."""
-    paths = [*map(Path, names)]
-    if weights:
-        paths.append(weights)
-    # A name of a method or of a function is no file.
-    yield from (path for path in paths if path.is_file())
-    folders: list[Path] = []
-    if scenes:
-        folders = [scenes]
-    elif pairs:
-        folders = [pairs / "degraded", pairs / "reference"]
+def _inputs(plan: Plan) -> Iterator[Path | Input]:
+    """Yield what the figures rest on: networks, weights of LPIPS, scenes or pairs."""
+    for source in plan.methods.values():
+        if isinstance(source, Network):
+            yield source.input
+        elif isinstance(source, str | os.PathLike):
+            # A shipped name is no file, and NAME@SENSOR names a file with another sensor.
+            file = Path(os.fspath(source).partition("@")[0])
+            if file.is_file():
+                yield file
+    if plan.lpips is not None and plan.lpips.is_file():
+        yield plan.lpips
+    folders = [plan.scenes] if plan.scenes else []
+    if plan.folder:
+        folders = [plan.folder / "degraded", plan.folder / "reference"]
     yield from chain.from_iterable(map(list_images, folders))
 
 
@@ -254,8 +241,8 @@ def _method(
 SITES = 4
 CROP_PX = 96
 ZOOM = 2
-HELD = 16
-"""Images at most that are held against the sensor."""
+CHECKED_IMAGES = 16
+"""Images at most that are compared with the sensor."""
 
 
 def chosen_pairs(pairs: Sequence[NamedPair]) -> list[NamedPair]:
@@ -298,78 +285,72 @@ def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -
         with whole_file(out / f"{pair.site}.png") as temporary:
             Image.fromarray(strip).save(temporary, "PNG", optimize=True)
         caption = (
-            f"{CROP_PX} pixels a side, enlarged {ZOOM} times, one grey scale for all. Below: "
-            "size of the error "
-            f"against the reference, black none, white {white:.0f} DN and more."
+            f"{CROP_PX} pixels a side, enlarged {ZOOM} times, one grey scale for all. Below: size "
+            f"of the error against the reference, black none, white {white:.0f} DN and more."
         )
         strips.append(Picture(pair.site, picture_url(strip), caption))
     return strips
 
 
 def evaluation_report(found: Evaluation, strips: Sequence[Picture]) -> Report:
-    """The page: pictures, means, sites, and the sweep where there was one."""
-    tables = [Section("Means over all pairs", found.mean, MEAN_CAPTION)]
-    for name, rows in found.more.items():
-        tables.append(Section(f"{name[0].upper()}{name[1:]}", rows, caption_of(name)))
-    return Report(found.title, headline(found.mean), tables, strips, (*NOTES, *found.notes))
+    """Return the page: pictures, means, sites, and the sweep where there was one.
+
+    Tables of single images are for the document alone.
+    """
+    tables = []
+    for name, rows in by_table(found.rows).items():
+        if not name.startswith("images"):
+            heading = HEADINGS.get(name, name)
+            title = f"{heading[0].upper()}{heading[1:]}"
+            tables.append(Section(title, rows, caption_of(name)))
+    return Report(found.title, headline(found.rows), tables, strips, (*NOTES, *found.notes))
 
 
 def caption_of(table: str) -> str:
     """Return the sentence that explains a table to its reader."""
     if table.startswith("mean"):
-        return DIMMED_CAPTION
+        return MEAN_CAPTION if table == "mean" else DIMMED_CAPTION
     if table == targets.TARGETS:
         return TARGETS_CAPTION
     return SWEEP_CAPTION if table.startswith("sweep") else SITES_CAPTION
 
 
 MEAN_CAPTION = (
-    "Intervals: 95 % bootstrap over sites for image figures, none below five sites; 90 % for "
-    "the MTF. What a "
-    "method knows of the sensor stands beside it: one that knows it has an advantage that it "
-    "may not have in orbit. "
-    "Inner PSNR leaves out a border on every side. The bias of the mean is the mean of the "
-    "restored inner pixels "
-    "over that of the reference (without noise, where there is one) minus 1; the largest bias "
-    "is that of one image."
+    "Intervals: 95 % bootstrap over sites for image figures, none below five sites; 90 % for the "
+    "MTF. What a method knows of the sensor stands beside it: one that knows it has an advantage "
+    "that it may not have in orbit. Inner PSNR leaves out a border on every side. The bias of the "
+    "mean is the mean of the restored inner pixels over that of the reference (without noise, "
+    "where there is one) minus 1; the largest bias is that of one image."
 )
 DIMMED_CAPTION = (
     "The radiance of the scenes was multiplied by this factor before the sensors acquired them. "
-    "MTF, SNR and targets "
-    "do not depend on it."
+    "MTF, SNR and targets do not depend on it."
 )
 TARGETS_CAPTION = (
-    "Faint things whose truth is known, restored and compared with what the reference sensor "
-    "would acquire without "
-    "noise; 90 % intervals. Flux: the light that a point adds to the restored image in a square of "
-    f"{targets.APERTURE_PX} pixels a side, over what it adds to the reference; 100 % is right. "
-    "'Points of 12 on 20' "
-    "raise the mean radiance of one pixel by 12 W/m2/sr/um on a background of 20. Bars and zone "
-    "plates, on a "
-    f"background of {targets.PATTERN_BACKGROUND:g} W/m2/sr/um: the contrast that is left, as a "
-    "share of the "
-    "reference's; 1 is as the reference, 0 is nothing, below 0 is reversed. Their name has the "
-    "contrast of the scene "
-    "(amplitude over background). Zone plates are measured from "
-    f"{targets.ZONE_BAND[0]} to {targets.ZONE_BAND[1]} cycles per pixel."
+    "Faint things whose truth is known, restored and compared with what the reference sensor would "
+    "acquire without noise; 90 % intervals. Flux: the light that a point adds to the restored "
+    f"image in a square of {targets.APERTURE_PX} pixels a side, over what it adds to the "
+    "reference; 100 % is right. 'Points of 12 on 20' raise the mean radiance of one pixel by 12 "
+    "W/m2/sr/um on a background of 20. Bars and zone plates, on a background of "
+    f"{target_scenes.PATTERN_BACKGROUND:g} W/m2/sr/um: the contrast that is left, as a share of "
+    "the reference's; 1 is as the reference, 0 is nothing, below 0 is reversed. Their name has the "
+    "contrast of the scene (amplitude over background). Zone plates are measured from "
+    f"{target_scenes.ZONE_BAND[0]} to {target_scenes.ZONE_BAND[1]} cycles per pixel."
 )
 SITES_CAPTION = (
-    "PSNR is over full scale and leaves out pixels that clipped in the input or the reference. "
-    "The bias of the mean "
-    "is that of inner pixels against the reference."
+    "PSNR is over full scale and leaves out pixels that clipped in the input or the reference. The "
+    "bias of the mean is that of inner pixels against the reference."
 )
 SWEEP_CAPTION = (
-    "One image of each site. The chain and every network that can know a sensor know that of "
-    "the row, unless it says "
-    "that another one is supposed. Of gains and losses the interval is that of differences on "
-    "the same images."
+    "One image of each site. The chain and every network that can know a sensor know that of the "
+    "row, unless it says that another one is supposed. Of gains and losses the interval is that of "
+    "differences on the same images."
 )
 NOTES = (
     "MTF at Nyquist is measured on restored slanted edges.",
     (
         "SNR is measured in restored flat fields, where nothing is to be seen: a denoiser may "
-        "reach "
-        "any SNR there."
+        "reach any SNR there."
     ),
     (
         "The paper's rows were printed for another test set; its LPIPS network is not stated. They "
@@ -379,9 +360,10 @@ NOTES = (
 )
 
 
-def headline(mean: Sequence[Row]) -> str:
-    """The best method by mean PSNR, in one sentence."""
-    ours = [row for row in mean if row.figures["PSNR"].mode == "measured"]
+def headline(rows: Sequence[Row]) -> str:
+    """Return a sentence that names the best method by mean PSNR."""
+    means = [row for row in rows if row.table == "mean"]
+    ours = [row for row in means if row.figures["PSNR"].mode == "measured"]
     best = max(ours, key=lambda row: row.figures["PSNR"].value or 0.0)
     degraded = ours[0].figures["PSNR"]
     return (

@@ -89,9 +89,8 @@ def inner_note(pairs: Sequence[NamedPair]) -> str:
     if not small:
         return ""
     return (
-        f"Inner pixels leave out {INNER_BORDER_PX} px on every side, and a quarter of the "
-        "shorter side of small "
-        f"images ({small} of {len(pairs)})."
+        f"Inner pixels leave out {INNER_BORDER_PX} px on every side, and a quarter of the shorter "
+        f"side of small images ({small} of {len(pairs)})."
     )
 
 

@@ -35,7 +35,8 @@ from beers_deploy.studies.evaluation.pairs import (
     table_at,
 )
 from beers_deploy.studies.evaluation.scores import NOISE_FREE
-from beers_deploy.studies.evaluation.targets import acquire_edges, restored_mtf
+from beers_deploy.studies.evaluation.target_scenes import acquire_edges
+from beers_deploy.studies.evaluation.targets import restored_mtf
 
 NOMINAL = "nominal"
 """The condition that the others depart from."""

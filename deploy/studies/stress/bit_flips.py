@@ -25,29 +25,51 @@ from beers_deploy.quant.graph import Activation
 from beers_deploy.quant.integer.reference import SOUND
 from beers_deploy.quant.samples.simulated import HELD_OUT_SEED, Calibration
 from beers_deploy.report.plots import Curve, curves_svg
+from beers_deploy.results import Table
 from beers_deploy.studies.stress import faults
 from beers_deploy.studies.stress.networks import Subject
 
 CALIBRATION_PATCHES = 16
 
 
-def flip_rows(subject: Subject, source: Calibration, board: TargetProfile) -> list[Row]:
-    """The rows of the whole study: quality against flips, and what guards cost.
+HEADINGS = {
+    "bit flips": "Quality against bit flips",
+    "guards": "What guards cost on the board",
+}
+CURVE_NOTE = (
+    "PSNR, mean and range over patches and injections; one kind of memory at a time. clamped: "
+    "ReLU6 and the limit of the correction. all guards: scrubbing and triple modular redundancy "
+    "too, before the image; what flips in the weights after that stays for this tile."
+)
+GUARD_NOTE = (
+    "ReLU6 only where calibration stays below 96 units. Three of the guards are the host's time; "
+    "the DPU is busy meanwhile, so nothing is lost while the host has time left."
+)
+
+
+def flip_table(subject: Subject, source: Calibration, board: TargetProfile) -> Table:
+    """Return quality against flips, and what guards cost.
 
     Args:
         subject: with an INT8 network.
         source: of the patches that flips are tried on, one an injection into each kind of memory at
             each rate.
-        board: whose cost model prices the guards.
+        board: whose cost model predicts the cost of the guards.
     """
     # A file without an integer core is refused before anything is drawn.
     _ = subject.core
     dpu = dpu_of(board)
-    prediction = predict_network(subject.opened[-1], dpu, TILE_PX)
+    prediction = predict_network(subject.quantized.source, dpu, TILE_PX)
     # So is a board that cannot price the guards.
     dpu.limit("cpu", "clock_ghz")
     target = make_target(subject, source)
-    return [*curve_rows(target, source.patches, source.seed), *price_rows(target, prediction, dpu)]
+    curves = curve_rows(target, source.patches, source.seed)
+    return Table(
+        inputs=subject.inputs,
+        rows=(*curves, *price_rows(target, prediction, dpu)),
+        notes=(CURVE_NOTE, GUARD_NOTE),
+        headings=HEADINGS,
+    )
 
 
 @dataclass(frozen=True)

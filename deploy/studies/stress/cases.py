@@ -167,11 +167,11 @@ class Case:
 
     Attributes:
         name: short, as in the tables.
-        draw: makes its
+        draw: makes its images.
         pixels: "sound", or what is wrong with them: "missing" (NaN), "infinite", "beyond" 12 bits.
         flat: every pixel of an image is the same: the mean must be kept, there is nothing to
             restore.
-        large: only what must hold of one run is looked at.
+        large: only the checks of one run are made.
     """
 
     name: str

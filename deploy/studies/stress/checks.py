@@ -163,17 +163,15 @@ LIMITATIONS: tuple[Limitation, ...] = (
         ("border",),
         500,
         "At the image's border zero padding looks like a black edge to the network; within its "
-        "receptive radius "
-        "bright flat ground is off, in INT8 more, which clips the correction that float makes "
-        "there.",
+        "receptive radius bright flat ground is off, in INT8 more, which clips the correction that "
+        "float makes there.",
     ),
     Limitation(
         "clipped corrections",
         ("mean error against float",),
         410,
         "int8 holds corrections of about half of full scale at most; where float makes larger "
-        "ones, on full contrast "
-        "between single pixels, INT8 sharpens less.",
+        "ones, on full contrast between single pixels, INT8 sharpens less.",
         stages=("INT8",),
     ),
     Limitation(
@@ -181,8 +179,7 @@ LIMITATIONS: tuple[Limitation, ...] = (
         ("ringing",),
         200,
         "A single pixel unlike all around it is taken for a blurred point and driven beyond its "
-        "value, to black or "
-        "full scale at most.",
+        "value, to black or full scale at most.",
         ("snow", "glint", "hot pixel", "SNR 3"),
     ),
 )

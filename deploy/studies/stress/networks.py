@@ -1,6 +1,4 @@
-"""The pair of networks under test, opened once, and what each stage of the battery looks at on a
-hard case.
-"""
+"""The networks under test, opened once, and the checks of each stage of the battery."""
 
 import math
 import os
@@ -10,7 +8,6 @@ from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
-import onnx
 import onnxruntime as ort
 import torch
 from torch import Tensor
@@ -18,10 +15,9 @@ from torch.nn.functional import conv2d, pixel_shuffle, pixel_unshuffle
 
 from beers_deploy.comparison import pair_of
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.network import Network as Opened
-from beers_deploy.network import NetworkLike, SensorLike
+from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import BeersError, ModelError
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import read_core
@@ -42,6 +38,7 @@ from beers_deploy.quant.tiling.receptive_field import Tiling, tiling_of
 from beers_deploy.restoration.plan import make_plan
 from beers_deploy.restoration.runtime import Infer
 from beers_deploy.restoration.tiles.rows import restore_floats
+from beers_deploy.results import Input
 from beers_deploy.studies.stress import checks
 from beers_deploy.studies.stress.cases import FULL_DN, Case
 
@@ -50,33 +47,33 @@ WHOLE_PX = 4096
 
 
 @dataclass(frozen=True)
-class Network:
-    """A network's file: how it runs, and how far it sees."""
+class Runner:
+    """A network that restores images of any size, on any number of threads."""
 
-    model: onnx.ModelProto
-    _opened: dict[int, ort.InferenceSession] = field(default_factory=dict, init=False, repr=False)
+    source: Network
+    _sessions: dict[int, ort.InferenceSession] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def tiling(self) -> Tiling:
-        """How it meets an image of any size."""
-        return tiling_of(any_size(self.model))
+        """How an image of any size may be cut into tiles."""
+        return tiling_of(any_size(self.source.model))
 
     def extended(self, image: np.ndarray) -> np.ndarray:
-        """An image (N, 1, H, W) with copies of its last row and column, up to what the network
-        takes whole.
+        """Return an image (N, 1, H, W) with its last row and column repeated, up to a size that the
+        network accepts.
         """
         lack = [self.tiling.whole_px(side) - side for side in image.shape[2:]]
         return np.pad(image, ((0, 0), (0, 0), (0, lack[0]), (0, lack[1])), mode="edge")
 
     def infer(self, threads: int = 1) -> Infer:
-        """The network ready to run on so many threads, opened once for each number of them."""
-        if threads not in self._opened:
-            self._opened[threads] = open_session(any_size(self.model), threads)
-        return partial(run, self._opened[threads])
+        """Return the network ready to run on `threads` threads, opened once for each number."""
+        if threads not in self._sessions:
+            self._sessions[threads] = open_session(any_size(self.source.model), threads)
+        return partial(run, self._sessions[threads])
 
     def restore(self, image: np.ndarray, threads: int = 1, tile_px: int = WHOLE_PX) -> np.ndarray:
-        """As `restore` restores digital numbers (H, W) float: tiled, missing pixels kept, clipped,
-        not rounded.
+        """Restore digital numbers (H, W) float as `restore` does: tiled, missing pixels stay,
+        clipped, not rounded.
         """
         plan = make_plan((1, *image.shape), tile_px, self.tiling.halo_px, self.tiling)
         return restore_floats(image, self.infer(threads), plan, FULL_DN)
@@ -84,33 +81,42 @@ class Network:
 
 @dataclass(frozen=True)
 class Subject:
-    """The pair of networks under test.
+    """The networks under test.
 
     Attributes:
         float32: the float one.
         int8: the INT8 one, or None.
-        opened: where they come from.
     """
 
-    float32: Network
-    int8: Network | None
-    opened: tuple[Opened, ...]
+    float32: Runner
+    int8: Runner | None = None
+
+    @property
+    def by_name(self) -> dict[str, Runner]:
+        """The networks that are there, by the name of their precision."""
+        networks = {"float32": self.float32, "INT8": self.int8}
+        return {name: network for name, network in networks.items() if network is not None}
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        """The files of the networks."""
+        return tuple(network.source.input for network in self.by_name.values())
 
     @cached_property
     def graph(self) -> Graph | None:
         """The float network as convolutions and additions alone; None of any other."""
         try:
-            return correction_graph(self.float32.model)
+            return correction_graph(self.float32.source.model)
         except BeersError:
             return None
 
     @cached_property
     def core(self) -> IntCore:
-        """The whole numbers of the INT8 file."""
-        return read_core(self.quantized.model)
+        """The integers of the INT8 file."""
+        return read_core(self.quantized.source.model)
 
     @property
-    def quantized(self) -> Network:
+    def quantized(self) -> Runner:
         """The INT8 network."""
         if self.int8 is None:
             raise ModelError("The INT8 network is missing. Give its file as the second argument.")
@@ -131,24 +137,21 @@ def open_subject(
         sensor: that shipped networks are conditioned on.
     """
     profile = Sensor.load(sensor)
-    opened: tuple[Opened, ...]
     if int8_network is not None or _is_pair(float_network):
-        opened = pair_of(float_network, int8_network, profile)
-        networks = [Network(source.model) for source in opened]
+        subject = Subject(*map(Runner, pair_of(float_network, int8_network, profile)))
     else:
-        floating = Opened.load(float_network, sensor=profile, int8=False)
+        floating = Network.load(float_network, sensor=profile, int8=False)
         require_quantized(floating.model, floating.label, wanted=False)
-        opened = (floating,)
-        networks = [Network(floating.model)]
-    for network in networks:
-        # What cannot be tiled is refused before anything runs.
+        subject = Subject(Runner(floating))
+    for network in subject.by_name.values():
+        # A network that cannot be tiled is refused before anything runs.
         _ = network.tiling
-    return Subject(networks[0], networks[1] if len(networks) > 1 else None, opened)
+    return subject
 
 
 def _is_pair(network: NetworkLike | None) -> bool:
     """Return True if a network stands for a pair: the default one, a shipped name, or an origin."""
-    if isinstance(network, Opened):
+    if isinstance(network, Network):
         return network.origin is not None
     if isinstance(network, str | os.PathLike):
         return not (Path(network).suffix or Path(network).exists())
@@ -226,7 +229,7 @@ def int8(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure
 
 
 def restoration(
-    network: Network, case: Case, image: np.ndarray, gain_dn: float
+    network: Runner, case: Case, image: np.ndarray, gain_dn: float
 ) -> list[checks.Measure]:
     """What must hold of any network on an image (H, W) in DN, by whatever it is run."""
     if case.pixels in ("infinite", "beyond"):
@@ -287,15 +290,12 @@ def tiling(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measu
     pixels.
     """
     measures = []
-    for name, network in [
-        ("float32", subject.float32),
-        *([("INT8", subject.int8)] if subject.int8 else []),
-    ]:
-        plans = [
-            2 * network.tiling.halo_px + core
-            for core in ((LARGE_CORE_PX,) if case.large else CORES_PX)
+    cores_px = (LARGE_CORE_PX,) if case.large else CORES_PX
+    for name, network in subject.by_name.items():
+        ways = [
+            partial(network.restore, image, tile_px=2 * network.tiling.halo_px + core_px)
+            for core_px in cores_px
         ]
-        ways = [partial(network.restore, image, tile_px=tile_px) for tile_px in plans]
         if case.pixels in ("infinite", "beyond"):
             measures += [checks.refused(way) for way in ways]
         else:

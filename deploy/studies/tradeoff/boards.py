@@ -4,47 +4,22 @@ why it has none.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from beers_deploy.profiles.figures import Row
-from beers_deploy.studies.tradeoff.advice import (
+from beers_deploy.studies.tradeoff.advice import Constraint, Question, choose, nearest, within
+from beers_deploy.studies.tradeoff.front import (
+    BOARDS,
     Comparison,
-    Constraint,
     Measured,
-    choose,
-    chosen_cost,
     figures_to_compare,
-    nearest,
     placed,
-    within,
 )
 
-TABLE = "boards"
 VERDICT = "verdict"
 
 
-@dataclass(frozen=True)
-class Question:
-    """What was asked of all boards alike.
-
-    Attributes:
-        budget: what can be afforded.
-        need: what must be reached.
-        compare: tells which of two points is better.
-    """
-
-    budget: Sequence[Constraint]
-    need: Sequence[Constraint]
-    compare: Comparison
-
-    @property
-    def constraints(self) -> list[Constraint]:
-        """Budget and need together."""
-        return [*self.budget, *self.need]
-
-
 def board_rows(
-    points: Sequence[Measured], boards: Sequence[str], taken: Measured | None, asked: Question
+    points: Sequence[Measured], boards: Sequence[str], recommended: Measured | None, asked: Question
 ) -> list[Row]:
     """Return a row for each board: the figures of its best point, and how it compares with the
     recommended one.
@@ -52,40 +27,35 @@ def board_rows(
     Args:
         points: of all boards.
         boards: names, in the order of the rows.
-        taken: the recommended point, None if there is none.
+        recommended: None if there is none.
         asked: budget and need.
     """
-    cost = chosen_cost(points, asked.budget)
+    cost = asked.cost(points)
     rows: list[Row] = []
     for board in boards:
         here = [point for point in points if point.text.get("board") == board]
         candidates = within(here, asked.constraints, cost)
         if not candidates:
             reasons = [why_not(here, asked.constraints, cost), *refusals(points, board)]
-            rows.append(Row(TABLE, board, {}, {"point": "none", VERDICT: "; ".join(reasons)}))
+            rows.append(Row(BOARDS, board, {}, {"point": "none", VERDICT: "; ".join(reasons)}))
             continue
-        if taken is not None and taken.text.get("board") == board:
-            best = taken
+        if recommended is not None and recommended.text.get("board") == board:
+            best = recommended
             verdict = "this is the recommended point"
         else:
-            best, _ = choose(
-                candidates, asked.compare, cheapest=bool(asked.need) and not asked.budget
-            )
-            verdict = _compared(best, taken, cost, asked.compare)
+            best, _ = choose(candidates, asked)
+            verdict = _compared(best, recommended, cost, asked.compare)
         words = {"point": best.name, VERDICT: verdict}
-        rows.append(Row(TABLE, board, figures_to_compare(best, cost), words))
+        rows.append(Row(BOARDS, board, figures_to_compare(best, cost), words))
     return rows
 
 
 def refusals(points: Sequence[Measured], board: str) -> list[str]:
     """Say which networks a board's DPU refuses, and why."""
-    refused_points = (
-        point for point in points if point.point is not None and point.point.refused_by == board
-    )
     return [
         f"{point.name} does not fit its DPU: {point.point.reason}"
-        for point in refused_points
-        if point.point
+        for point in points
+        if point.point is not None and point.point.refused_by == board
     ]
 
 

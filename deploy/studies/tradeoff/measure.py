@@ -1,9 +1,4 @@
-"""What is measured of each variant, once, on the same images; kept in one JSON file from one run to
-the next.
-
-A measurement is kept under the SHA-256 of what it depends on: the inputs and the version of this
-tool.
-"""
+"""Measure each variant once, on the same images, and in tiles the effect of their size and halo."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

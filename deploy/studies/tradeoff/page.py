@@ -14,8 +14,9 @@ from beers_deploy.profiles.figures import Row
 from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.report.plots import data_url
 from beers_deploy.results import Table
-from beers_deploy.studies.tradeoff.advice import PSNR, Constraint, Measured
-from beers_deploy.studies.tradeoff.plot import CAPTION, Drawn, draw, plot_svg
+from beers_deploy.studies.tradeoff.advice import Constraint
+from beers_deploy.studies.tradeoff.front import BOARDS, FRONT, PSNR, Measured
+from beers_deploy.studies.tradeoff.plot import CAPTION, draw, plot_svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,21 +26,17 @@ FILES = ("tradeoff.html", "tradeoff.svg")
 SHOWN_WORDS = ("board", "configuration", "tile", "halo", "sensor")
 
 BOARDS_CAPTION = (
-    "The best point of each board within the budget, chosen as the recommended one is, or why "
-    "no point of that board "
-    "keeps the limits. The difference in PSNR is on the same images."
+    "The best point of each board within the budget, chosen as the recommended one is, or why no "
+    "point of that board keeps the limits. The difference in PSNR is on the same images."
 )
 FRONT_CAPTION = (
     "Of the points on all boards that keep the budget's other limits, none is both cheaper and "
-    "better than one of "
-    "these. A gain is the difference in PSNR on the same images from the next cheaper point, a "
-    "ratio the cost over "
-    "that of the same point."
+    "better than one of these. A gain is the difference in PSNR on the same images from the next "
+    "cheaper point, a ratio the cost over that of the same point."
 )
 POINTS_CAPTION = (
-    "Press a heading to sort by it, again to reverse. A swath on a board is predicted; images "
-    "and times on this "
-    "machine are measured."
+    "Press a heading to sort by it, again to reverse. A swath on a board is predicted; images and "
+    "times on this machine are measured."
 )
 
 
@@ -52,8 +49,6 @@ class Tradeoff(Table):
         boards: the names of all boards that were compared.
         points: all of them, in the order networks, chains, other libraries, the paper's runs.
         front: those on the Pareto front over all boards, sorted by increasing cost.
-        front_rows: the same by number, each with its difference from the next cheaper one.
-        board_rows: for each board its best point within the limits, or why it has none.
         constraints: budget and need.
         cost: the figure that the front is against.
         best: the recommended point; None where none keeps the budget and the need.
@@ -64,8 +59,6 @@ class Tradeoff(Table):
     boards: Sequence[str]
     points: Sequence[Measured]
     front: Sequence[Measured]
-    front_rows: Sequence[Row]
-    board_rows: Sequence[Row]
     constraints: Sequence[Constraint]
     cost: str
     best: Measured | None
@@ -73,24 +66,21 @@ class Tradeoff(Table):
     remarks: Sequence[str]
 
     @property
+    def front_rows(self) -> list[Row]:
+        """The front by number, each point with its difference from the next cheaper one."""
+        return [row for row in self.rows if row.table.startswith(FRONT)]
+
+    @property
+    def board_rows(self) -> list[Row]:
+        """For each board its best point within the limits, or why it has none."""
+        return [row for row in self.rows if row.table == BOARDS]
+
+    @property
     def board(self) -> str:
         """The board of the recommended point; the first board if there is none."""
         # A point of this machine alone has no board among those that were compared.
         name = self.best.text["board"] if self.best else ""
         return name if name in self.boards else self.boards[0]
-
-    @property
-    def drawn(self) -> Drawn:
-        """What the plot shows."""
-        return Drawn(
-            points=self.points,
-            front=self.front,
-            front_rows=self.front_rows,
-            boards=self.boards,
-            constraints=self.constraints,
-            cost=self.cost,
-            best=self.best,
-        )
 
     def plot(self, figure: str | None = None, ax: "Axes | None" = None) -> "Axes":
         """Plot PSNR of every point against its cost, with the front, the recommended point and the
@@ -103,12 +93,12 @@ class Tradeoff(Table):
         if figure is not None:
             return super().plot(figure, ax)
         axes = ax if ax is not None else optional("matplotlib.pyplot", "plot").subplots()[1]
-        draw(axes, self.drawn)
+        draw(axes, self)
         return cast("Axes", axes)
 
     def report(self, folder: str | os.PathLike[str]) -> Path:
         """Write the page and its plot into a folder; returns the page's path."""
-        svg = plot_svg(self.drawn)
+        svg = plot_svg(self)
         page, plot = (Path(folder) / name for name in FILES)
         write_text(plot, svg)
         write_report(report_of(self, svg), page)
@@ -118,18 +108,13 @@ class Tradeoff(Table):
 def report_of(study: Tradeoff, svg: str) -> Report:
     """The page in reading order."""
     picture = Picture(f"{PSNR} against {study.cost}", data_url(svg), CAPTION)
-    points = [
-        Row(
-            "points",
-            point.name,
-            point.figures,
-            {word: point.text.get(word, "") for word in SHOWN_WORDS},
-        )
-        for point in study.points
-    ]
+    points = []
+    for point in study.points:
+        words = {word: point.text.get(word, "") for word in SHOWN_WORDS}
+        points.append(Row("points", point.name, point.figures, words))
     tables = [
         Section("Board by board", study.board_rows, BOARDS_CAPTION),
-        Section("The front, from cheap to dear", study.front_rows, FRONT_CAPTION),
+        Section("The front, from cheap to expensive", study.front_rows, FRONT_CAPTION),
         Section(f"All {len(points)} points", points, POINTS_CAPTION),
     ]
     headline = f"{study.line[0].upper()}{study.line[1:]}."

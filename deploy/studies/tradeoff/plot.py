@@ -8,13 +8,14 @@ import numpy as np
 from markupsafe import Markup
 
 from beers_deploy.model.traditional.peers import PEERS
-from beers_deploy.profiles.figures import Row
 from beers_deploy.report.plots import LIGHT, SERIES, look, new_figure, set_ticks, svg_of
-from beers_deploy.studies.tradeoff.advice import PSNR, Constraint, Measured, ends, placed
+from beers_deploy.studies.tradeoff.front import PSNR, Measured, ends, placed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from beers_deploy.studies.tradeoff.page import Tradeoff
 
 SIZE_PX = (560, 520)
 TEXT_PX = 15
@@ -35,45 +36,14 @@ RECOMMENDED = "recommended"
 AT_MOST = "\N{LESS-THAN OR EQUAL TO}"
 AT_LEAST = "\N{GREATER-THAN OR EQUAL TO}"
 HOST = "this machine"
-RIGHT = 0.97
-EDGE_PX = 8
-"""Where the axes end as a share of the figure, unless a label needs room; and what is left free at
-the edge, because a browser's font may be wider than the one that was measured.
-"""
 LEGEND_COLUMNS = 2
-LEGEND_ROW = 0.045
-"""Of the legend, the height of a row as a share of the figure."""
 
 CAPTION = (
-    "Numbers are those of the front's table; the line is the front, small marks lie below it. "
-    "The ring is around the "
-    "recommended point, dashed lines are the limits of budget and need. Upright bars: 95 % "
-    "interval of the gain in "
-    "PSNR over the next cheaper point of the front. Bars across: interval of the cost."
+    "Numbers are those of the front's table; the line is the front, small marks lie below it. The "
+    "ring is around the recommended point, dashed lines are the limits of budget and need. Upright "
+    "bars: 95 % interval of the gain in PSNR over the next cheaper point of the front. Bars "
+    "across: interval of the cost."
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Drawn:
-    """What the plot shows.
-
-    Attributes:
-        points: of all boards, and of this machine.
-        front: the points on the front, sorted by increasing cost.
-        front_rows: the rows of the front's table.
-        boards: names; of several, each has a marker of its own.
-        constraints: budget and need.
-        cost: the figure on the horizontal axis.
-        best: the recommended point.
-    """
-
-    points: Sequence[Measured]
-    front: Sequence[Measured]
-    front_rows: Sequence[Row]
-    boards: Sequence[str]
-    constraints: Sequence[Constraint]
-    cost: str
-    best: Measured | None
 
 
 @dataclass(frozen=True)
@@ -89,80 +59,67 @@ class Series:
     points: Sequence[Measured]
 
 
-def plot_svg(drawn: Drawn) -> Markup:
+def plot_svg(study: "Tradeoff") -> Markup:
     """Return the plot as an SVG file, with the numbers of the front's members."""
     with look():
         return svg_of(
-            figure_of(drawn), f"{PSNR} against {drawn.cost}; numbers as in the table of the front"
+            figure_of(study), f"{PSNR} against {study.cost}; numbers as in the table of the front"
         )
 
 
-def figure_of(drawn: Drawn) -> "Figure":
+def figure_of(study: "Tradeoff") -> "Figure":
     """Draw the plot; for use within `look`."""
     from matplotlib import rc_context
 
     with rc_context({"font.size": TEXT_PX}):
         figure = new_figure(*SIZE_PX)
+        # It makes room for labels below the axes, of which the last one is centred on its tick.
+        figure.set_layout_engine("constrained")
         axes = figure.add_subplot()
-        draw(axes, drawn)
-        names = axes.get_legend_handles_labels()[1]
-        if names:
-            figure.legend(loc="lower center", ncols=LEGEND_COLUMNS)
-        rows = -(-len(names) // LEGEND_COLUMNS)
-        figure.subplots_adjust(left=0.13, right=RIGHT, top=0.95, bottom=0.14 + LEGEND_ROW * rows)
-        _make_room(axes)
-        _draw_numbers(axes, drawn)
+        draw(axes, study)
+        if axes.get_legend_handles_labels()[1]:
+            figure.legend(loc="outside lower center", ncols=LEGEND_COLUMNS)
+        # The distances between marks are known when the axes have their size.
+        figure.draw_without_rendering()
+        _draw_numbers(axes, study)
     return figure
 
 
-def _make_room(axes: "Axes") -> None:
-    """Narrow the axes until the last label below them, which is centred on its tick, ends within
-    the figure.
-    """
-    figure = axes.figure
-    width_px = figure.bbox.width
-    box = axes.get_tightbbox()
-    over_px = box.x1 + EDGE_PX - width_px if box is not None else 0.0
-    if over_px > 0:
-        # A tick label is centred on its tick, so that the last one may pass the edge.
-        figure.subplots_adjust(right=RIGHT - over_px / width_px)
-
-
-def draw(axes: "Axes", drawn: Drawn) -> None:
+def draw(axes: "Axes", study: "Tradeoff") -> None:
     """Draw points, front, limits and recommended point; the numbers are left to whoever sizes the
     axes.
     """
-    axes.set(xscale="log", xlabel=_label(drawn, drawn.cost), ylabel=_label(drawn, PSNR))
-    groups = list(series(drawn))
+    axes.set(xscale="log", xlabel=_label(study, study.cost), ylabel=_label(study, PSNR))
+    groups = list(series(study))
     for group in groups:
-        _scatter(axes, group, drawn)
-    _draw_front(axes, drawn)
+        _scatter(axes, group, study)
+    _draw_front(axes, study)
     # The points set the range: a limit outside must not widen it.
     axes.margins(0.1)
     axes.autoscale_view()
-    _draw_limits(axes, drawn)
-    _draw_best(axes, drawn)
-    _draw_legend(axes, groups, drawn)
+    _draw_limits(axes, study)
+    _draw_best(axes, study)
+    _draw_legend(axes, groups, study)
     if groups:
         set_ticks(axes.xaxis, 6)
         set_ticks(axes.yaxis, 8)
 
 
-def series(drawn: Drawn) -> Iterator[Series]:
+def series(study: "Tradeoff") -> Iterator[Series]:
     """Yield the points by what they look like: a colour for each network, and of several boards a
     marker for each.
     """
     names: dict[str, int] = {}
     groups: dict[tuple[str, str], list[Measured]] = {}
-    for point in placed(drawn.points, drawn.cost):
+    for point in placed(study.points, study.cost):
         name = _kind(point)
         names.setdefault(name, len(names))
         groups.setdefault((name, point.text["board"]), []).append(point)
     # By the order of names, so that a board has one marker however the boards were listed.
-    places = {board: number for number, board in enumerate([HOST, *sorted(drawn.boards)])}
+    places = {board: number for number, board in enumerate([HOST, *sorted(study.boards)])}
     for (name, board), members in groups.items():
         colour = LIGHT[SERIES[names[name] % len(SERIES)]]
-        number = names[name] if len(drawn.boards) == 1 else places.get(board, 0)
+        number = names[name] if len(study.boards) == 1 else places.get(board, 0)
         yield Series(name, board, colour, MARKERS[number % len(MARKERS)], members)
 
 
@@ -172,11 +129,11 @@ def _kind(point: Measured) -> str:
     return LIBRARIES if point.text["method"] in PEERS else CHAINS
 
 
-def _scatter(axes: "Axes", group: Series, drawn: Drawn) -> None:
+def _scatter(axes: "Axes", group: Series, study: "Tradeoff") -> None:
     # The front's marks come last, so that they lie on top.
     for large in (False, True):
-        points = [point for point in group.points if (point in drawn.front) == large]
-        x, y = _places(points, drawn.cost)
+        points = [point for point in group.points if (point in study.front) == large]
+        x, y = _places(points, study.cost)
         size, alpha = (FRONT_PX2, 1.0) if large else (OTHERS_PX2, PALE)
         style: dict[str, Any] = {
             "c": group.colour,
@@ -191,13 +148,13 @@ def _places(points: Sequence[Measured], cost: str) -> tuple[list[float], list[fl
     return [point.value(cost) for point in points], [point.value(PSNR) for point in points]
 
 
-def _draw_front(axes: "Axes", drawn: Drawn) -> None:
+def _draw_front(axes: "Axes", study: "Tradeoff") -> None:
     # Between two points of the front the cheaper one is the best that can be had.
-    axes.step(*_places(drawn.front, drawn.cost), where="post", color=LIGHT["soft"], lw=1, zorder=1)
-    for point, row in zip(drawn.front, drawn.front_rows, strict=True):
-        x = point.value(drawn.cost)
+    axes.step(*_places(study.front, study.cost), where="post", color=LIGHT["soft"], lw=1, zorder=1)
+    for point, row in zip(study.front, study.front_rows, strict=True):
+        x = point.value(study.cost)
         y = point.value(PSNR)
-        axes.plot(ends(point.figures[drawn.cost]), [y, y], color=LIGHT["line"], lw=2, zorder=0)
+        axes.plot(ends(point.figures[study.cost]), [y, y], color=LIGHT["line"], lw=2, zorder=0)
         gain = row.figures.get("PSNR gain")
         if gain is not None and gain.interval is not None:
             before = y - (gain.value or 0.0)
@@ -210,7 +167,7 @@ def _draw_front(axes: "Axes", drawn: Drawn) -> None:
             )
 
 
-def _draw_limits(axes: "Axes", drawn: Drawn) -> None:
+def _draw_limits(axes: "Axes", study: "Tradeoff") -> None:
     """Draw the limits on cost and PSNR as dashed lines with their words; the axes keep their range
     if one is outside.
 
@@ -218,8 +175,8 @@ def _draw_limits(axes: "Axes", drawn: Drawn) -> None:
     """
     low, high = axes.get_xlim()
     style: dict[str, Any] = {"color": LIGHT["ink"], "lw": 1.2, "ls": "--", "zorder": 1}
-    for limit in drawn.constraints:
-        if limit.key == drawn.cost and low <= limit.limit <= high:
+    for limit in study.constraints:
+        if limit.key == study.cost and low <= limit.limit <= high:
             axes.axvline(limit.limit, **style)
             words = f"{AT_MOST if limit.at_most else AT_LEAST} {limit.in_words(limit.limit)}"
             # The axis is logarithmic: its middle is the geometric mean of its ends.
@@ -237,10 +194,10 @@ def _draw_limits(axes: "Axes", drawn: Drawn) -> None:
             axes.axhline(limit.limit, **style)
 
 
-def _draw_best(axes: "Axes", drawn: Drawn) -> None:
-    if drawn.best is None:
+def _draw_best(axes: "Axes", study: "Tradeoff") -> None:
+    if study.best is None:
         return
-    x, y = _places([drawn.best], drawn.cost)
+    x, y = _places([study.best], study.cost)
     style: dict[str, Any] = {
         "facecolors": "none",
         "edgecolors": LIGHT["ink"],
@@ -250,11 +207,11 @@ def _draw_best(axes: "Axes", drawn: Drawn) -> None:
     axes.scatter(x, y, s=RING_PX2, label=RECOMMENDED, **style)
 
 
-def _draw_legend(axes: "Axes", groups: Sequence[Series], drawn: Drawn) -> None:
+def _draw_legend(axes: "Axes", groups: Sequence[Series], study: "Tradeoff") -> None:
     """Add what the legend names, as marks without a point: networks by colour, and of several
     boards the markers.
     """
-    several = len(drawn.boards) > 1
+    several = len(study.boards) > 1
     networks = {
         group.name: (group.colour, MARKERS[0] if several else group.marker) for group in groups
     }
@@ -263,19 +220,19 @@ def _draw_legend(axes: "Axes", groups: Sequence[Series], drawn: Drawn) -> None:
         axes.scatter([], [], s=FRONT_PX2, c=colour, marker=marker, label=name, linewidths=0)
 
 
-def _draw_numbers(axes: "Axes", drawn: Drawn) -> None:
+def _draw_numbers(axes: "Axes", study: "Tradeoff") -> None:
     """Write the members' numbers next to their marks; one label for neighbours whose marks lie on
     one another.
     """
     groups: list[tuple[int, int, Measured]] = []
-    for number, point in enumerate(drawn.front, 1):
-        if groups and _distance_px(axes, point, groups[-1][2], drawn.cost) < NEAR_PX:
+    for number, point in enumerate(study.front, 1):
+        if groups and _distance_px(axes, point, groups[-1][2], study.cost) < NEAR_PX:
             groups[-1] = (groups[-1][0], number, groups[-1][2])
         else:
             groups.append((number, number, point))
     for first, last, point in groups:
         words = str(first) if first == last else f"{first}\u2013{last}"
-        at = point.value(drawn.cost), point.value(PSNR)
+        at = point.value(study.cost), point.value(PSNR)
         axes.annotate(words, at, (-8, 9), "data", "offset points", ha="right", weight="bold")
 
 
@@ -284,7 +241,7 @@ def _distance_px(axes: "Axes", a: Measured, b: Measured, cost: str) -> float:
     return float(np.hypot(*(ends_px[1] - ends_px[0])))
 
 
-def _label(drawn: Drawn, key: str) -> str:
-    figure = next((point.figures[key] for point in drawn.points if key in point.figures), None)
-    where = f" on {drawn.boards[0]}" if key.startswith("board") and len(drawn.boards) == 1 else ""
+def _label(study: "Tradeoff", key: str) -> str:
+    figure = next((point.figures[key] for point in study.points if key in point.figures), None)
+    where = f" on {study.boards[0]}" if key.startswith("board") and len(study.boards) == 1 else ""
     return f"{key}{where}, {figure.unit}" if figure else key

@@ -175,7 +175,7 @@ def _require_tiles(name: str, tiling: Tiling) -> None:
 def points_of(
     networks: Iterable[Variant], boards: Sequence[TargetProfile], whole: Swath
 ) -> list[Point]:
-    """Where networks, traditional pipelines and other libraries' ways are looked at.
+    """Return where networks, traditional pipelines and other libraries' ways are compared.
 
     Args:
         networks: in float32 and in INT8.

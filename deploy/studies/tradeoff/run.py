@@ -5,7 +5,7 @@ recommendation.
 import logging
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,8 @@ from beers_deploy.results import Input, Table, input_of
 from beers_deploy.studies.evaluation.methods import Method, method_named, method_of
 from beers_deploy.studies.evaluation.pairs import pairs_of_scenes
 from beers_deploy.studies.tradeoff import advice
-from beers_deploy.studies.tradeoff.boards import Question, board_rows, lines
+from beers_deploy.studies.tradeoff.boards import board_rows, lines
+from beers_deploy.studies.tradeoff.front import Comparison, Measured, front_rows, pareto_front
 from beers_deploy.studies.tradeoff.measure import (
     Benchmark,
     Scores,
@@ -114,15 +115,9 @@ def benchmark_of(study: Study) -> tuple[Benchmark, list[str]]:
     return Benchmark(pairs, *study.sensors, study.lpips, study.seed), remarks
 
 
-def points_for(study: Study) -> list[Point]:
-    """Return the points of a study; float networks are quantised."""
-    quantize = partial(
-        make_int8,
-        scenes=study.calibration,
-        sensor=study.sensors[0],
-        seed=study.seed,
-    )
-    variants = network_variants(list(study.networks), study.sensors[0], quantize)
+def points_for(study: Study, quantize: Callable[[Network], Network]) -> list[Point]:
+    """Return the points of a study; `quantize` returns the INT8 network of a float one."""
+    variants = network_variants(study.networks, study.sensors[0], quantize)
     return points_of(variants, study.boards, Swath(*study.size))
 
 
@@ -130,30 +125,24 @@ def run_tradeoff(study: Study) -> Tradeoff:
     """Measure every point of a study, and recommend one."""
     # The digests are those of the files that are measured.
     inputs = study.inputs
-    points = points_for(study)
+    quantize = partial(
+        make_int8, scenes=study.calibration, sensor=study.sensors[0], seed=study.seed
+    )
+    points = points_for(study, quantize)
     benchmark, remarks = benchmark_of(study)
     results = _measured(points, benchmark, Swath(*study.size))
     if PAPER_TARGET in study.board_names and study.size == parse_size(PAPER_SIZE):
         # The rows stand as printed: the paper's images are others.
         for row in published_rows():
             figures = {f"board {key}": figure for key, figure in row.figures.items()}
-            results.append(advice.Measured(row.name, figures, {"board": PAPER_TARGET}))
-    question = Question(study.budget, study.need, advice.Comparison(benchmark.sites, study.seed))
-    arguments = {
-        "images": study.scenes,
-        "calibration": study.calibration,
-        "sensor": study.sensors[0].name,
-        "reference": study.sensors[1].name,
-        "target": ",".join(study.board_names),
-        "network": ",".join(study.names),
-        "size": "x".join(map(str, study.size)),
-        "budget": ",".join(map(str, study.budget)),
-        "need": ",".join(map(str, study.need)),
-        "seed": study.seed,
-    }
+            results.append(Measured(row.name, figures, {"board": PAPER_TARGET}))
+    question = advice.Question(study.budget, study.need, Comparison(benchmark.sites, study.seed))
     notes = (*_notes(benchmark, study.board_names), *remarks)
     table = weigh(results, study.board_names, question, notes)
-    return replace(table, arguments=arguments, inputs=inputs)
+    sensor, reference = study.sensors
+    # The other arguments are recorded as they were given.
+    names = {"sensor": sensor.name, "reference": reference.name, "network": ",".join(study.names)}
+    return replace(table, arguments=names, inputs=inputs)
 
 
 PREVIEW_PX = 256
@@ -163,36 +152,32 @@ PREVIEW_RUNS = 3
 def preview(study: Study) -> Table:
     """Return what a study would measure and about how long that takes, from a crop timed here."""
     benchmark, _ = benchmark_of(study)
-    points = points_for(study)
+    # A float network stands for its INT8 one: to quantise it would take longer than the answer.
+    points = points_for(study, lambda network: network)
     methods = _methods([point.variant for point in points], benchmark)
     first = benchmark.pairs[0]
-    side = slice(0, PREVIEW_PX)
-    crop = replace(
-        first,
-        degraded=first.degraded[side, side],
-        reference=first.reference[side, side],
-        noise_free=None if first.noise_free is None else first.noise_free[side, side],
+    crop = first.degraded[:PREVIEW_PX, :PREVIEW_PX]
+    reference = first.reference[:PREVIEW_PX, :PREVIEW_PX]
+    pair = replace(first, degraded=crop, reference=reference, noise_free=None)
+    small = replace(benchmark, pairs=[pair])
+    times = interleaved(
+        [partial(small.score, method.restore) for method in methods.values()], PREVIEW_RUNS
     )
-    small = replace(benchmark, pairs=[crop])
-    calls = [partial(small.score, method.restore) for method in methods.values()]
-    times = interleaved(calls, PREVIEW_RUNS)
-    pixels = sum(pair.degraded.size for pair in benchmark.pairs)
+    crops = sum(pair.degraded.size for pair in benchmark.pairs) / crop.size
     # A point with seams restores each image twice: in its tiles, and exactly.
-    weights = Counter(point.variant for point in points if point.halo_px is not None)
+    seams = Counter(point.variant for point in points if point.halo_px is not None)
     low_s = high_s = 0.0
     for variant, samples in zip(methods, times, strict=True):
-        per_px = [time_s / crop.degraded.size for time_s, _ in samples]
-        runs = 1 + 2 * weights[variant]
-        low_s += runs * min(per_px) * pixels
-        high_s += runs * max(per_px) * pixels
+        times_s = [time_s for time_s, _ in samples]
+        low_s += (1 + 2 * seams[variant]) * crops * min(times_s)
+        high_s += (1 + 2 * seams[variant]) * crops * max(times_s)
     how = f"{PREVIEW_RUNS} runs of each method on a crop of {PREVIEW_PX} px, times the pixels"
-    counted = "the plan of the study"
+    counts = {"point": len(points), "method": len(methods), "image": len(benchmark.pairs)}
     figures = {
-        "points": measured_figure(len(points), "point", counted),
-        "methods": measured_figure(len(methods), "method", counted),
-        "images": measured_figure(len(benchmark.pairs), "image", counted),
-        "time here": predicted((low_s + high_s) / 2, "s", (low_s, high_s), how),
+        f"{unit}s": measured_figure(count, unit, "the plan of the study")
+        for unit, count in counts.items()
     }
+    figures["time here"] = predicted((low_s + high_s) / 2, "s", (low_s, high_s), how)
     return Table(
         title="what a study of these options measures",
         inputs=study.inputs,
@@ -212,9 +197,9 @@ def _require_different(boards: Sequence[TargetProfile]) -> None:
 
 
 def weigh(
-    points: Sequence[advice.Measured],
+    points: Sequence[Measured],
     boards: Sequence[str],
-    asked: Question,
+    asked: advice.Question,
     remarks: Sequence[str] = (),
 ) -> Tradeoff:
     """Find the front, the recommendation, and what each board offers.
@@ -225,10 +210,10 @@ def weigh(
         asked: budget and need.
         remarks: on the study.
     """
-    cost = advice.chosen_cost(points, asked.budget)
-    best, line = advice.recommend(points, asked.budget, asked.need, asked.compare)
-    front = advice.pareto_front(advice.affordable(points, asked.constraints, cost), cost)
-    numbered = advice.front_rows(front, cost, asked.compare)
+    cost = asked.cost(points)
+    best, line = advice.recommend(points, asked)
+    front = pareto_front(advice.affordable(points, asked.constraints, cost), cost)
+    numbered = front_rows(front, cost, asked.compare)
     by_board = board_rows(points, boards, best, asked)
     name = best.name if best else "none"
     figures = best.figures if best else {}
@@ -244,12 +229,10 @@ def weigh(
         details=frozenset({"recommended", "boards", "points"}),
         points=points,
         front=front,
-        front_rows=numbered,
         cost=cost,
         best=best,
         line=line,
         boards=tuple(boards),
-        board_rows=by_board,
         constraints=asked.constraints,
         remarks=tuple(remarks),
     )
@@ -259,10 +242,10 @@ def _measured(
     points: Sequence[Point],
     benchmark: Benchmark,
     swath: Swath,
-) -> list[advice.Measured]:
+) -> list[Measured]:
     """Return every point with its figures."""
     methods = _methods([point.variant for point in points], benchmark)
-    results = list[advice.Measured]()
+    results = list[Measured]()
     # Points of several boards may cut the images alike.
     scores_of: dict[tuple[Variant, int | None, tuple[int, ...]], list[Scores]] = {}
     with steps("tradeoff", len(points) + 1) as bar:
@@ -274,9 +257,7 @@ def _measured(
                 scores_of[key] = benchmark.scores(point, method.restore)
             scores = scores_of[key]
             figures = benchmark.means(scores)
-            results.append(
-                advice.Measured(point.name, figures, _text(point, method), point, scores)
-            )
+            results.append(Measured(point.name, figures, _text(point, method), point, scores))
             bar.advance(1, point.name)
         host = measure_host(methods, benchmark)
         bar.advance(1, "timed on this machine")
@@ -296,15 +277,16 @@ def _measured(
 
 
 def _methods(variants: Sequence[Variant], benchmark: Benchmark) -> dict[Variant, Method]:
-    return {variant: _method(variant, benchmark) for variant in dict.fromkeys(variants)}
-
-
-def _method(variant: Variant, benchmark: Benchmark) -> Method:
-    """Return the method of a variant: a network with its exposures, or a traditional one."""
-    degraded = benchmark.degraded
-    if variant.network is None:
-        return method_named(variant.method, degraded, benchmark.reference)
-    return method_of(variant.name, variant.network, degraded, benchmark.reference)
+    """Return the method of each variant: a network with its exposures, or a traditional one."""
+    sensors = benchmark.degraded, benchmark.reference
+    methods = {}
+    for variant in dict.fromkeys(variants):
+        methods[variant] = (
+            method_named(variant.method, *sensors)
+            if variant.network is None
+            else method_of(variant.name, variant.network, *sensors)
+        )
+    return methods
 
 
 def _text(point: Point, method: Method) -> dict[str, str]:
@@ -332,9 +314,8 @@ def _notes(benchmark: Benchmark, boards: Sequence[str]) -> Iterator[str]:
         "pixels are left out."
     )
     yield (
-        "Gains are differences on the same images from the next cheaper point of the front, "
-        "with 95 % bootstrap "
-        "intervals over whole sites; one whose interval holds 0 is not significant."
+        "Gains are differences on the same images from the next cheaper point of the front, with "
+        "95 % bootstrap intervals over whole sites; one whose interval holds 0 is not significant."
     )
     if too_few(sites):
         yield too_few(sites)

@@ -10,7 +10,6 @@ import pytest
 
 import beers_deploy as bd
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.restoration import method
 from beers_deploy.restoration.method import network_method
 from beers_deploy.restoration.plan import Tiles, plan_for
@@ -18,7 +17,7 @@ from beers_deploy.restoration.runtime import open_runtime
 from beers_deploy.restoration.steps import Around, step_for
 from beers_deploy.restoration.tiles.rows import restore_dn, restore_floats
 from beers_deploy.studies.evaluation.methods import method_named
-from beers_deploy.studies.stress.networks import Network
+from beers_deploy.studies.stress.networks import Runner
 from beers_deploy.studies.tradeoff.measure import restore_in_tiles
 from beers_deploy.studies.tradeoff.points import FLOAT, INT8, Point, Variant
 from beers_deploy.verbs.restore import restore
@@ -63,7 +62,7 @@ def by_engine(dn: np.ndarray, path: Path, tiles: Tiles, sensor: Sensor | None = 
 
 def exact_ways(path: Path, tile_px: int) -> Mapping[str, Restored]:
     """Return each way with exact seams from digital numbers (H, W) float32 to restored integers."""
-    network = load_onnx(path)
+    runner = Runner(bd.Network.load(path))
     return {
         "evaluate and tradeoff": method_named(
             str(path), SENSOR, REFERENCE, around=Around(consistency=False)
@@ -71,7 +70,7 @@ def exact_ways(path: Path, tile_px: int) -> Mapping[str, Restored]:
         "the library and the demo": lambda dn: np.rint(
             restore(dn, network=path, tile=tile_px, full_scale=4095)
         ),
-        "stress": lambda dn: np.rint(Network(network).restore(dn, tile_px=tile_px)),
+        "stress": lambda dn: np.rint(runner.restore(dn, tile_px=tile_px)),
         "the engine": partial(by_engine, path=path, tiles=Tiles(tile_px)),
     }
 
@@ -116,7 +115,8 @@ def test_floats_are_those_of_restore_unrounded(precision: str, path: Path, tmp_p
     expected = restored(tmp_path, dn, network=path, tile=tile_px)[0]
     assert (expected % 1 > 0).mean() > 0.5
     np.testing.assert_array_equal(restore(dn, network=path, tile=tile_px), expected)
-    np.testing.assert_array_equal(Network(load_onnx(path)).restore(dn, tile_px=tile_px), expected)
+    runner = Runner(bd.Network.load(path))
+    np.testing.assert_array_equal(runner.restore(dn, tile_px=tile_px), expected)
 
 
 @pytest.mark.parametrize("bits", [8, 14])

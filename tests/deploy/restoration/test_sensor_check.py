@@ -13,7 +13,7 @@ import beers_deploy as bd
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.source import ArraySource
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.restoration.sensor_check import SensorCheck, check_source
+from beers_deploy.restoration.sensor_check.check import SensorCheck, check_source
 from tests.deploy.command_line import done, refused
 
 NAME = "pleiades-degraded"
@@ -42,40 +42,40 @@ def check(
 
 def test_the_true_sensor_is_found_again(raw: np.ndarray) -> None:
     result = check(raw)
-    assert result.doubts == ()
+    assert result.warnings == ()
     assert result.text == {"sensor check": "agrees"}
-    low, high = result.figures["SNR seen"].interval or (0, 0)
+    low, high = result.figures["measured SNR"].interval or (0, 0)
     assert 0 < high - low < 0.5 * high
     # Left-justified, and with missing pixels of any value: the same image of the same sensor.
     assert (
-        check(raw * 16, full_scale=16 * 4095).figures["SNR seen"].value
-        == result.figures["SNR seen"].value
+        check(raw * 16, full_scale=16 * 4095).figures["measured SNR"].value
+        == result.figures["measured SNR"].value
     )
     holed = raw.copy()
     holed[100:140, 30:300] = 4000
-    assert check(np.where(holed == 4000, 0, raw), nodata=0).doubts == ()
+    assert check(np.where(holed == 4000, 0, raw), nodata=0).warnings == ()
 
 
 @pytest.mark.parametrize(
     ("numbers", "words"),
     [
-        ({"mtf_nyquist": 0.14}, "MTF .* the profile says 14"),
-        ({"snr_0": 25, "snr_1": 55}, "looks like SNR .*, the profile says"),
-        ({"snr_0": 100, "snr_1": 220}, "looks like SNR .*, the profile says"),
+        ({"mtf_nyquist": 0.14}, "MTF .* but the sensor profile states 14"),
+        ({"snr_0": 25, "snr_1": 55}, "looks like SNR .*, but the sensor profile states"),
+        ({"snr_0": 100, "snr_1": 220}, "looks like SNR .*, but the sensor profile states"),
         ({"gain_dn_per_radiance": 25.0}, "looks like SNR"),
     ],
 )
 def test_another_sensor_is_recognised(
     numbers: dict[str, float], words: str, raw: np.ndarray
 ) -> None:
-    (doubt, *_) = check(raw, SENSOR.replace(**numbers)).doubts
-    assert re.search(words, doubt)
+    (warning, *_) = check(raw, SENSOR.replace(**numbers)).warnings
+    assert re.search(words, warning)
 
 
 def test_pixels_above_the_sensor_s_full_scale_contradict_it(raw: np.ndarray) -> None:
     assert any(
-        "above its full scale, 1023" in doubt
-        for doubt in check(raw, SENSOR.replace(bits=10), 1023).doubts
+        "above its full scale, 1023" in warning
+        for warning in check(raw, SENSOR.replace(bits=10), 1023).warnings
     )
 
 
@@ -85,16 +85,16 @@ def test_each_band_is_compared_with_its_own_sensor(raw: np.ndarray) -> None:
         [SENSOR, SENSOR.replace(snr_0=25, snr_1=55)],
         4095,
     )
-    assert [doubt[:7] for doubt in two.doubts] == ["band 2:"]
-    assert two.figures["band 1: SNR seen"].value == two.figures["band 2: SNR seen"].value
+    assert [warning[:7] for warning in two.warnings] == ["band 2:"]
+    assert two.figures["band 1: measured SNR"].value == two.figures["band 2: measured SNR"].value
 
 
 def test_a_restored_image_holds_no_raw_noise(raw: np.ndarray) -> None:
-    (doubt, *_) = check(bd.restore(raw, network="convbeers-xs-int8", sensor=SENSOR)).doubts
-    assert "restored, resampled or compressed" in doubt
+    (warning, *_) = check(bd.restore(raw, network="convbeers-xs-int8", sensor=SENSOR)).warnings
+    assert "restored, resampled or compressed" in warning
 
 
-def test_what_cannot_be_seen_is_no_contradiction() -> None:
+def test_what_cannot_be_measured_is_no_contradiction() -> None:
     generator = np.random.default_rng(0)
     for image in (
         np.full((300, 200), 900, np.uint16),
@@ -103,7 +103,7 @@ def test_what_cannot_be_seen_is_no_contradiction() -> None:
         generator.integers(400, 500, (19, 23)).astype(np.uint16),
     ):
         result = check(image)
-        assert result.text["sensor check"] in ("cannot be seen", *result.doubts)
+        assert result.text["sensor check"] in ("not measurable", *result.warnings)
         assert all(
             figure.mode == "unavailable" and figure.reason for figure in result.figures.values()
         )

@@ -6,13 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from beers_deploy.model.metrics.detector_lines import (
-    Stripes,
-    constant_columns,
-    join_blocks,
-    judge_lines,
-    measure_lines,
-)
+from beers_deploy.model.metrics.detector_lines import constant_columns, join_blocks, measure_lines
+from beers_deploy.model.metrics.detector_stripes import Stripes, judge_lines
 
 LEAST = 0.003
 SIGMA_PX = {"25 %": 0.53, "15 %": 0.62, "5 %": 0.78}

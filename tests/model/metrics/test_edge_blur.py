@@ -4,8 +4,8 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from beers_deploy.model.metrics.edge_blur import combine, find_blurs
-from beers_deploy.model.metrics.edge_fit import FOUND, HALF_PX, POINTED_AT, EdgeBlur, fit_blur
+from beers_deploy.model.metrics.edge_blur import THOROUGH, blurs_of, combine, plain_squares
+from beers_deploy.model.metrics.edge_fit import FOUND, HALF_PX, EdgeBlur, fit_blurs
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.metrics.slanted_edge import slanted_edge
 from beers_deploy.model.simulator.mtf import Blur, gamma_from_mtf, transfer_function
@@ -19,6 +19,10 @@ SIGMA = 6.0
 
 def noise(values: np.ndarray) -> np.ndarray:
     return np.full(values.shape, SIGMA**2)
+
+
+def find_blurs(image: np.ndarray, clipped_at: float = 4095) -> list[EdgeBlur]:
+    return blurs_of(plain_squares(image, noise, clipped_at, THOROUGH), noise)
 
 
 def blurred(scene: np.ndarray, mtf_nyquist: Blur, smear_px: float = 0.0) -> np.ndarray:
@@ -44,11 +48,8 @@ def square(image: np.ndarray, angle_deg: float, rng: np.random.Generator) -> np.
 
 def edges(mtf_nyquist: float, angle_deg: float, count: int, seed: int = 0) -> list[EdgeBlur]:
     rng = np.random.default_rng(seed)
-    fits = [
-        fit_blur(square(clean(mtf_nyquist, angle_deg), angle_deg, rng), noise, FOUND)
-        for _ in range(count)
-    ]
-    return [fit for fit in fits if isinstance(fit, EdgeBlur)]
+    squares = [square(clean(mtf_nyquist, angle_deg), angle_deg, rng) for _ in range(count)]
+    return blurs_of(np.stack(squares), noise)
 
 
 @pytest.mark.parametrize("mtf_nyquist", [0.02, 0.05, 0.12])
@@ -84,8 +85,8 @@ def board(mtf_nyquist: Blur, lean_deg: float = 8.0, smear_px: float = 0.0) -> np
 @pytest.mark.parametrize("lean_deg", [8.0, 25.0])
 def test_a_board_shows_both_axes(lean_deg: float) -> None:
     image = board((0.12, 0.05), lean_deg)[10:-10, 10:-10]
-    upright = find_blurs(image, noise, 4095)
-    lying = find_blurs(image.T, noise, 4095)
+    upright = find_blurs(image)
+    lying = find_blurs(image.T)
     assert min(len(upright), len(lying)) >= 3
     assert combine(upright, lying).mtf_nyquist == pytest.approx(0.12, rel=0.08)
     assert combine(lying, upright).mtf_nyquist == pytest.approx(0.05, rel=0.08)
@@ -96,7 +97,7 @@ def test_a_curve_that_falls_more_steeply_is_no_higher_at_nyquist() -> None:
     too high there.
     """
     image = board(0.1, smear_px=1.0)[10:-10, 10:-10]
-    smeared = combine(find_blurs(image.T, noise, 4095), find_blurs(image, noise, 4095))
+    smeared = combine(find_blurs(image.T), find_blurs(image))
     true = 0.1 * float(np.sinc(0.5))
     assert smeared.interval[0] <= true <= smeared.interval[1]
     assert smeared.mtf_nyquist == pytest.approx(true, rel=0.1)
@@ -105,9 +106,9 @@ def test_a_curve_that_falls_more_steeply_is_no_higher_at_nyquist() -> None:
 
 def test_clipped_edges_are_left_alone() -> None:
     image = board(0.07)[10:-10, 10:-10]
-    assert find_blurs(image, noise, 4095)
-    assert not find_blurs(image, noise, 1500)
-    assert not find_blurs(image - 500, noise, 4095)
+    assert find_blurs(image)
+    assert not find_blurs(image, 1500)
+    assert not find_blurs(image - 500)
 
 
 def test_a_landscape_has_no_such_edge() -> None:
@@ -119,12 +120,12 @@ def test_a_landscape_has_no_such_edge() -> None:
     scene[:400] = scene[400:800]
     image = blurred(scene, 0.07)
     image = image + SIGMA * np.random.default_rng(2).standard_normal(image.shape)
-    assert len(find_blurs(image, noise, 4095)) + len(find_blurs(image.T, noise, 4095)) == 0
+    assert len(find_blurs(image)) + len(find_blurs(image.T)) == 0
 
 
 def refused(region: np.ndarray) -> str:
     region = region + SIGMA * np.random.default_rng(4).standard_normal(region.shape)
-    outcome = fit_blur(region, noise, POINTED_AT)
+    (outcome,) = fit_blurs(region[None], noise, FOUND)
     assert isinstance(outcome, Refusal), outcome
     return outcome.reason
 

@@ -3,7 +3,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beers_deploy.model.metrics.edge_fit import edge_response
 from beers_deploy.model.metrics.mtf_basis import (
     CORNERS,
     PARTS,
@@ -41,6 +40,14 @@ def test_softening_multiplies_by_an_exponential(losses: list[float], softness_px
     optics = mtf_at(CORNERS[:-1], falling(losses))
     softer = mtf_at(CORNERS[:-1], softened(falling(losses), softness_px))
     assert softer == pytest.approx(optics * np.exp(-softness_px * CORNERS[:-1]), abs=1e-12)
+
+
+def edge_response(distance: np.ndarray, gamma: float) -> np.ndarray:
+    """A step of 1 at 0 behind the profile's MTF: its Fourier integral as a sum."""
+    step = 1 / 64
+    f = (np.arange(8 * 64) + 0.5) * step
+    waves = np.exp(-gamma * f) * np.sinc(f) / (np.pi * f) * step
+    return np.asarray(0.5 + np.sin(2 * np.pi * np.outer(distance, f)) @ waves)
 
 
 @pytest.mark.parametrize("gamma", [2.0, 4.4, 7.0])

@@ -4,13 +4,8 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from beers_deploy.model.metrics.noise_line import (
-    Blocks,
-    NoiseModel,
-    cut_blocks,
-    fit_noise_model,
-    join,
-)
+from beers_deploy.model.metrics.noise_blocks import Blocks, cut_blocks, join
+from beers_deploy.model.metrics.noise_line import NoiseModel, fit_noise_model
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.simulator.acquire import acquire
 from beers_deploy.model.simulator.detector import Draw

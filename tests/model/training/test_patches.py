@@ -16,7 +16,7 @@ from beers_deploy.model.family import RANGES, SensorFamily, noise_over_full_scal
 from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene
-from beers_deploy.model.training.looks import VARIED
+from beers_deploy.model.training.looks import Looks
 from beers_deploy.model.training.patches import draw_turn, pair_files, turn
 from beers_deploy.model.training.source import Batch, PatchSource, cut
 from beers_deploy.model.training.stored import StoredPairs
@@ -125,7 +125,8 @@ def test_dark_patches_are_those_of_a_brighter_sensor_as_a_restoration_shows_them
     factor.
     """
     family = Alike(replace(NOMINAL, alpha=0.0, beta=(100 / 200) ** 2))
-    recipe = replace(source().recipe, family=family, looks=replace(VARIED, lit_share=1.0))
+    looks = Looks(lit_share=1.0, calm_share=0.3, soft_share=0.3)
+    recipe = replace(source().recipe, family=family, looks=looks)
     applied = set()
     for batch in islice(PatchSource([small_scene()], recipe, 3, 0).batches(), 40):
         assert batch.told is not None

@@ -120,8 +120,8 @@ def test_a_box_gives_one_axis_for_both(raw: tuple[Path, Path]) -> None:
     middle = SIDE // RATIO // 2 - 32
     box = f"{raw[0]}:{middle - 11},{middle - 38},30,28"
     result = measure(raw, (box,), Stated(bits=12))
-    assert list(result.mtf.curves) == ["across"]
-    value, (low, high) = result.mtf.curves["across"].at(0.5)
+    assert list(result.curves) == ["across"]
+    value, (low, high) = result.curves["across"].at(0.5)
     assert low <= 0.09 <= high < 2 * low
     assert low <= value <= high
     table = tomllib.loads(profile_toml(result))["mtf"]

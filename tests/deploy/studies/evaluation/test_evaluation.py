@@ -19,7 +19,7 @@ from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Row, by_table, measured
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.studies.evaluation import targets as targets_module
+from beers_deploy.studies.evaluation import target_scenes
 from beers_deploy.studies.evaluation.methods import (
     BLIND,
     KNOWN,
@@ -88,14 +88,16 @@ def write_pairs(folder: Path, pairs: list[NamedPair]) -> Path:
 
 def few_targets(patch: pytest.MonkeyPatch) -> None:
     less = {
+        "ANGLES_DEG": (5.0, 8.0),
         "REPEATS": 1,
+        "SIDE_PX": 100,
         "POINTS_A_SIDE": 3,
         "BAR_CONTRASTS": (0.1,),
         "BAR_PERIODS_PX": (2.0,),
         "ZONE_CONTRASTS": (0.3,),
     }
     for name, value in less.items():
-        patch.setattr(targets_module, name, value)
+        patch.setattr(target_scenes, name, value)
 
 
 IDENTITY = Method("degraded", lambda dn: dn, "blind")

@@ -16,7 +16,7 @@ from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.method import Restore
 from beers_deploy.studies.evaluation import sweep as module
-from beers_deploy.studies.evaluation import targets as targets_module
+from beers_deploy.studies.evaluation import target_scenes
 from beers_deploy.studies.evaluation.methods import BLIND, Method
 from beers_deploy.studies.evaluation.sweep import (
     NOMINAL_KNOWN,
@@ -73,11 +73,11 @@ def half(dn: np.ndarray) -> np.ndarray:
 def quick() -> Iterator[None]:
     """Three conditions, on targets that are small and seen once."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(targets_module, "REPEATS", 1)
-        patch.setattr(targets_module, "ANGLES_DEG", (5.0, 8.0))
-        patch.setattr(targets_module, "SIDE_PX", 100)
-        patch.setattr(targets_module, "POINTS_A_SIDE", 3)
-        patch.setattr(targets_module, "BAR_CONTRASTS", (0.1,))
+        patch.setattr(target_scenes, "REPEATS", 1)
+        patch.setattr(target_scenes, "ANGLES_DEG", (5.0, 8.0))
+        patch.setattr(target_scenes, "SIDE_PX", 100)
+        patch.setattr(target_scenes, "POINTS_A_SIDE", 3)
+        patch.setattr(target_scenes, "BAR_CONTRASTS", (0.1,))
         patch.setattr(module, "conditions", few)
         yield
 

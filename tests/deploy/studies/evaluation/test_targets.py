@@ -13,12 +13,11 @@ from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.studies.evaluation import targets as module
+from beers_deploy.studies.evaluation import target_scenes
 from beers_deploy.studies.evaluation.methods import BLIND, Method, method_named
+from beers_deploy.studies.evaluation.target_scenes import Targets, acquire_targets
 from beers_deploy.studies.evaluation.targets import (
     OF_REFERENCE,
-    Targets,
-    acquire_targets,
     flat_figure,
     flux_name,
     mean_figures,
@@ -37,9 +36,9 @@ IDENTITY = Method("identity", lambda dn: dn, BLIND)
 def quick() -> Iterator[None]:
     """Fewer edges, points and patterns."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "REPEATS", 1)
-        patch.setattr(module, "POINTS_A_SIDE", 3)
-        patch.setattr(module, "BAR_CONTRASTS", (0.1,))
+        patch.setattr(target_scenes, "REPEATS", 1)
+        patch.setattr(target_scenes, "POINTS_A_SIDE", 3)
+        patch.setattr(target_scenes, "BAR_CONTRASTS", (0.1,))
         yield
 
 

@@ -8,7 +8,7 @@ import onnx
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.network import Network
 from beers_deploy.profiles.figures import measured, predicted
-from beers_deploy.studies.tradeoff.advice import Comparison, Measured
+from beers_deploy.studies.tradeoff.front import Comparison, Measured
 from beers_deploy.studies.tradeoff.points import INT8, Point, Variant
 
 SITES = ("a", "a", "b", "c", "d", "e")

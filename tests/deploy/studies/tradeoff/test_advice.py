@@ -13,17 +13,20 @@ from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Figure, measured, predicted, published, unavailable
 from beers_deploy.studies.tradeoff.advice import (
     NAMES,
+    Constraint,
+    Question,
+    parse_constraints,
+    recommend,
+)
+from beers_deploy.studies.tradeoff.front import (
     NOT_SIGNIFICANT,
     SIGNIFICANT,
     TOO_FEW,
     Comparison,
-    Constraint,
     Measured,
     cost_ratio,
     front_rows,
     pareto_front,
-    parse_constraints,
-    recommend,
     significant,
     verdict,
 )
@@ -132,8 +135,8 @@ def test_front_rows_compare_each_member_with_the_next_cheaper_one() -> None:
 
 def recommendation(budget: str | None = None, need: str | None = None) -> tuple[str | None, str]:
     """The name of the point to take, and the line that says so."""
-    limits = [parse_constraints(name, text) for name, text in (("budget", budget), ("need", need))]
-    point, line = recommend(family(), limits[0], limits[1], COMPARE)
+    asked = Question(parse_constraints("budget", budget), parse_constraints("need", need), COMPARE)
+    point, line = recommend(family(), asked)
     return point.name if point else None, line
 
 

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.profiles.figures import unavailable
-from beers_deploy.studies.tradeoff.advice import Measured, parse_constraints
-from beers_deploy.studies.tradeoff.boards import Question
+from beers_deploy.studies.tradeoff.advice import Question, parse_constraints
+from beers_deploy.studies.tradeoff.front import Measured
 from beers_deploy.studies.tradeoff.page import Tradeoff
 from beers_deploy.studies.tradeoff.run import weigh
 from tests.deploy.studies.tradeoff.made import COMPARE, made

@@ -10,8 +10,8 @@ import pytest
 
 from beers_deploy.report.page import render
 from beers_deploy.report.plots import DARK, LIGHT, look
-from beers_deploy.studies.tradeoff.advice import Measured, parse_constraints
-from beers_deploy.studies.tradeoff.boards import Question
+from beers_deploy.studies.tradeoff.advice import Question, parse_constraints
+from beers_deploy.studies.tradeoff.front import Measured
 from beers_deploy.studies.tradeoff.page import Tradeoff, report_of
 from beers_deploy.studies.tradeoff.plot import SIZE_PX, figure_of, plot_svg, series
 from beers_deploy.studies.tradeoff.run import weigh
@@ -34,13 +34,13 @@ def study(
 
 def words_of(result: Tradeoff) -> list[str]:
     """Return the words in a study's plot."""
-    root = ET.fromstring(plot_svg(result.drawn))  # noqa: S314 - our own
+    root = ET.fromstring(plot_svg(result))  # noqa: S314 - our own
     return [text.text or "" for text in root.iter(f"{SVG}text")]
 
 
 def page() -> str:
     result = study()
-    return render(report_of(result, plot_svg(result.drawn)))
+    return render(report_of(result, plot_svg(result)))
 
 
 def test_the_plot_numbers_the_members_of_the_front_and_the_table_names_them() -> None:
@@ -51,7 +51,7 @@ def test_the_plot_numbers_the_members_of_the_front_and_the_table_names_them() ->
 
 
 def test_every_series_has_a_look_of_its_own() -> None:
-    looks = [(line.colour, line.marker) for line in series(study().drawn)]
+    looks = [(line.colour, line.marker) for line in series(study())]
     assert len(set(looks)) == len(looks) == 5
 
 
@@ -63,7 +63,7 @@ def test_of_several_boards_a_network_keeps_its_colour_and_a_board_its_marker() -
     points = [
         replace(point, text={**point.text, "method": point.name.split()[0]}) for point in points
     ]
-    lines = list(series(study(points, boards=("vck190", "zcu104")).drawn))
+    lines = list(series(study(points, boards=("vck190", "zcu104"))))
     assert (
         len({(line.name, line.colour) for line in lines})
         == len({line.colour for line in lines})
@@ -90,7 +90,7 @@ PLACES = [
 def test_every_label_lies_within_the_picture(most_s: float) -> None:
     points = [*family(), made("a network with a rather long name", 44.0, most_s)]
     with look():
-        figure = figure_of(study(points, "latency<=9s").drawn)
+        figure = figure_of(study(points, "latency<=9s"))
         # Both extents are in inches.
         box = figure.get_tightbbox()
         width, height = figure.get_size_inches()

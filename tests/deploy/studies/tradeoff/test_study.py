@@ -19,7 +19,8 @@ from beers_deploy.restoration.method import Restore
 from beers_deploy.studies.evaluation.methods import method_named
 from beers_deploy.studies.evaluation.pairs import pairs_of_scenes
 from beers_deploy.studies.evaluation.scores import Instruments
-from beers_deploy.studies.tradeoff.advice import TOO_FEW, Measured, parse_constraints
+from beers_deploy.studies.tradeoff.advice import parse_constraints
+from beers_deploy.studies.tradeoff.front import TOO_FEW, Measured
 from beers_deploy.studies.tradeoff.measure import (
     SEAM_ERROR,
     Benchmark,

@@ -1,4 +1,4 @@
-"""Noise and MTF of a camera, from its raw frames."""
+"""Noise and MTF of a sensor, from its raw frames (`model.metrics.instrument`)."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -7,34 +7,26 @@ from itertools import pairwise
 
 import numpy as np
 
-from beers_deploy.model.metrics.edge_curve import (
-    MOST_MISSING,
-    WIDEST,
-    MtfCurve,
-    apart,
-    measure_curve,
-    search_curve,
-)
+from beers_deploy.model.metrics.edge_curve import MtfCurve
 from beers_deploy.model.metrics.edge_search import Edge, edge_in, find_edges
-from beers_deploy.model.metrics.noise_line import (
-    Blocks,
-    NoiseModel,
-    cut_blocks,
-    cut_pair,
-    fit_noise_model,
-    join,
+from beers_deploy.model.metrics.instrument import (
+    AXES,
+    above_black,
+    axis_curves,
+    fit_noise,
+    image_blocks,
+    snr,
 )
+from beers_deploy.model.metrics.noise_blocks import Blocks, cut_pair, join
+from beers_deploy.model.metrics.noise_line import NoiseModel
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.progress import steps
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.profiles.response import NYQUIST
-from beers_deploy.restoration.sensor_check import NOISE_KEPT
+from beers_deploy.restoration.sensor_check.comparison import NOISE_FACTOR
 from beers_deploy.studies.characterize.frames import Frames
 
-SEED = 0
-AXES = ("across", "along")
 OWN_LEAK = 0.1
-"""Of the finest detail of one frame, what may be texture where its noise is held against the
+"""Of the finest detail of one frame, what may be texture where its noise is compared with the
 others'.
 """
 STILL_STRUCTURE = 2.0
@@ -43,11 +35,17 @@ STILL_DRIFT = 0.02
 level.
 """
 
+Edges = dict[str, list[Edge]]
+Variance = Callable[[np.ndarray], np.ndarray]
+
 
 @dataclass(frozen=True)
 class Noise:
-    """The noise of frames, above the dark, and whether it comes from pairs of frames of one still
-    scene.
+    """The noise of frames, above the dark.
+
+    Attributes:
+        model: the line.
+        pairs: number of pairs of frames of one still scene that it rests on; 0 if on frames.
     """
 
     model: NoiseModel
@@ -55,40 +53,29 @@ class Noise:
 
 
 def measure_noise(frames: Frames) -> Noise:
-    """Fit the noise line to all frames, or to the differences of those that
-    show one still scene.
-    """
+    """Fit the noise line to all frames, or to the differences of frames of one still scene."""
     frame_blocks = [
-        _above_dark(join([_cut(tile, frames) for tile in frames.tiles(path)]), frames)
+        image_blocks(frames.tiles(path), frames.full_scale_dn, frames.black_dn)
         for path in frames.paths
     ]
     # The difference of two frames of a still scene holds no texture.
-    still = [_above_dark(blocks, frames) for blocks in _still_pairs(frames)]
-    model = fit_noise_model(
-        join(still or frame_blocks), np.random.default_rng(SEED), incomplete=True
-    )
+    still = [above_black(blocks, frames.black_dn) for blocks in _still_pairs(frames)]
+    model = fit_noise(join(still or frame_blocks), incomplete=True)
     if isinstance(model, Refusal):
         raise ImageError(
             f"The noise of {frames.name} cannot be measured: {model.reason}. It is measured on "
             "blurred, raw ground from dark to bright: give more raw images of plain ground, dark "
             "and bright, neither restored nor resampled."
         )
-    if not still:
+    if not still and len(frame_blocks) > 1:
         _require_one_sensor(frames, frame_blocks, math.sqrt(math.prod(model.measured_dn)))
     return Noise(model, len(still))
 
 
-def _cut(pixels: np.ndarray, frames: Frames) -> Blocks:
-    return cut_blocks(pixels, frames.full_scale_dn)
-
-
-def _above_dark(blocks: Blocks, frames: Frames) -> Blocks:
-    """The blocks with their means counted from the black level."""
-    return blocks._replace(mean=np.maximum(blocks.mean - frames.black_dn, 0.0))
-
-
 def _still_pairs(frames: Frames) -> list[Blocks]:
-    """Differences of frames that show the same scene, pixel by pixel: photon transfer."""
+    """Return blocks of the differences of frames that show the same scene, pixel by pixel: photon
+    transfer.
+    """
     # Two frames of a still scene have one level: sorted by it, they are neighbours.
     by_level = sorted(frames.paths, key=lambda path: float(np.median(frames.read(path))))
     differences = []
@@ -112,13 +99,13 @@ def _still_pairs(frames: Frames) -> list[Blocks]:
 
 
 def _require_one_sensor(frames: Frames, frame_blocks: Sequence[Blocks], dn: float) -> None:
-    """Refuse frames whose own noise at a digital number differs: of another gain, or processed."""
-    if len(frame_blocks) == 1:
-        return
+    """Raise ImageError if the frames' own noise at a digital number differs: of another gain, or
+    processed.
+    """
     variances = {}
     for path, blocks in zip(frames.paths, frame_blocks, strict=True):
-        line = fit_noise_model(blocks, np.random.default_rng(SEED), incomplete=True)
-        # A frame whose finest detail may be texture tells too little of its noise.
+        line = fit_noise(blocks, incomplete=True)
+        # A frame whose finest detail may be texture shows too little of its noise.
         if isinstance(line, NoiseModel) and line.leak <= OWN_LEAK:
             variances[path.name] = line.at(dn)
     if not variances:
@@ -126,7 +113,7 @@ def _require_one_sensor(frames: Frames, frame_blocks: Sequence[Blocks], dn: floa
     # The ends of the intervals are compared, so that frames which may be alike pass.
     least = min(variances, key=lambda name: variances[name].interval[1])
     most = max(variances, key=lambda name: variances[name].interval[0])
-    if variances[most].interval[0] > NOISE_KEPT * variances[least].interval[1]:
+    if variances[most].interval[0] > NOISE_FACTOR * variances[least].interval[1]:
         low, high = (f"{variances[name].value:.3g} DN^2 in {name}" for name in (least, most))
         raise ImageError(
             "The `images` must be of one sensor at one setting, but the noise variance at "
@@ -135,18 +122,9 @@ def _require_one_sensor(frames: Frames, frame_blocks: Sequence[Blocks], dn: floa
         )
 
 
-@dataclass(frozen=True)
-class Mtf:
-    """The curve of each axis that edges show, and for each other axis why there is none."""
-
-    curves: dict[str, MtfCurve]
-    reasons: dict[str, str]
-
-
-Variance = Callable[[np.ndarray], np.ndarray]
-
-
-def measure_mtf(frames: Frames, boxes: Mapping[str, np.ndarray], noise: NoiseModel) -> Mtf:
+def measure_mtf(
+    frames: Frames, boxes: Mapping[str, np.ndarray], noise: NoiseModel
+) -> dict[str, MtfCurve | Refusal]:
     """Measure the MTF across (edges near the vertical) and along the track.
 
     Args:
@@ -159,31 +137,14 @@ def measure_mtf(frames: Frames, boxes: Mapping[str, np.ndarray], noise: NoiseMod
     def variance(dn: np.ndarray) -> np.ndarray:
         return noise.total(dn - frames.black_dn)
 
-    edges = _pointed_at(frames, boxes, variance) if boxes else _found(frames, variance)
+    edges = _boxed(frames, boxes, variance) if boxes else _searched(frames, variance)
     # Edges in boxes all count; searched ones count if they are as sharp as the sharpest.
-    measure = measure_curve if boxes else search_curve
-    generator = np.random.default_rng(SEED)
-    curves: dict[str, MtfCurve] = {}
-    reasons: dict[str, str] = {}
-    for axis in AXES:
-        curve = measure(edges[axis], generator)
-        if isinstance(curve, Refusal):
-            reasons[axis] = curve.reason
-        elif curve.missing_edges:
-            reasons[axis] = _too_wide(curve)
-        else:
-            curves[axis] = curve
-    if len(curves) == len(AXES):
-        across, along = (curves[axis] for axis in AXES)
-        curves = {"across": apart(across, along), "along": apart(along, across)}
-    return Mtf(curves, reasons)
+    return axis_curves(edges, searched=not boxes)
 
 
-def _pointed_at(
-    frames: Frames, boxes: Mapping[str, np.ndarray], variance: Variance
-) -> dict[str, list[Edge]]:
-    """The edges in boxes, those near the horizontal turned upright."""
-    edges: dict[str, list[Edge]] = {axis: [] for axis in AXES}
+def _boxed(frames: Frames, boxes: Mapping[str, np.ndarray], variance: Variance) -> Edges:
+    """Return the edges in boxes, those near the horizontal turned upright."""
+    edges: Edges = {axis: [] for axis in AXES}
     for words, region in boxes.items():
         lies = _rise(region.T) > _rise(region)
         # An edge near the horizontal is turned upright, because edges are measured along the rows.
@@ -199,41 +160,22 @@ def _pointed_at(
     return edges
 
 
-def _found(frames: Frames, variance: Variance) -> dict[str, list[Edge]]:
-    """The edges of all frames, those near the horizontal turned upright."""
-    edges: dict[str, list[Edge]] = {axis: [] for axis in AXES}
+def _searched(frames: Frames, variance: Variance) -> Edges:
+    """Return the edges of all frames, those near the horizontal turned upright."""
+    edges: Edges = {axis: [] for axis in AXES}
     with steps("looking for edges", len(frames.paths)) as bar:
         for path in frames.paths:
             for tile in frames.tiles(path):
-                edges["across"] += find_edges(tile, variance, frames.full_scale_dn, path.name)
-                edges["along"] += find_edges(tile.T, variance, frames.full_scale_dn, path.name)
+                for axis, pixels in zip(AXES, (tile, tile.T), strict=True):
+                    edges[axis] += find_edges(pixels, variance, frames.full_scale_dn, path.name)
             bar.advance()
     return edges
 
 
 def _rise(region: np.ndarray) -> float:
-    """How much brighter one side is than the other, along the rows."""
+    """Return how much brighter one side is than the other, along the rows."""
     first, *_, last = np.array_split(region, 3, axis=1)
     return abs(float(last.mean() - first.mean()))
-
-
-def _too_wide(curve: MtfCurve) -> str:
-    """Why a curve is not written, and what would help."""
-    value, (low, high) = curve.at(NYQUIST)
-    count = f"{curve.edges} edge{'' if curve.edges == 1 else 's'}"
-    odd = (
-        f"; these differ from the others: {', '.join(curve.contradicting)}"
-        if curve.contradicting
-        else ""
-    )
-    remedy = f"about {curve.missing_edges} more such edges would do"
-    if curve.missing_edges == MOST_MISSING:
-        remedy = "that is hardly any contrast, and more edges would not help"
-    return (
-        f"{count} leave {value:.2%} [{low:.2%}, {high:.2%}] at Nyquist, wider than a factor of "
-        f"{WIDEST:g}: "
-        f"{remedy}{odd}"
-    )
 
 
 @dataclass(frozen=True)
@@ -247,11 +189,6 @@ class Snr:
 
 
 def snr_at(noise: NoiseModel, dn: float, gain: float) -> Snr:
-    """The SNR at a digital number above the dark, the rounding not in it."""
+    """Return the SNR at a digital number above the dark, without the rounding."""
     variance = noise.at(dn)
-    # The lowest SNR belongs to the highest variance.
-    low, value, high = (
-        dn / math.sqrt(dn2) if dn2 > 0 else math.inf
-        for dn2 in (variance.interval[1], variance.value, variance.interval[0])
-    )
-    return Snr(dn / gain, value, (low, high), variance.extrapolated)
+    return Snr(dn / gain, *snr(dn, variance), variance.extrapolated)

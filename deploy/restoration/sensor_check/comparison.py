@@ -1,0 +1,156 @@
+"""Noise and blur that were measured in an image, compared with those that a sensor profile states.
+
+A measurement contradicts the profile if its 95 % interval lies off by more than a factor
+(`NOISE_FACTOR`, `BLUR_FACTOR`). Texture without edges shows no blur, and a scene without even
+ground shows no noise: then nothing is contradicted.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from beers_deploy.model.metrics.edge_blur import AxisMtf
+from beers_deploy.model.metrics.instrument import AXES, SEED, snr
+from beers_deploy.model.metrics.noise_blocks import ROUNDING, Blocks
+from beers_deploy.model.metrics.noise_line import NoiseModel
+from beers_deploy.model.metrics.refusal import Refusal
+from beers_deploy.model.simulator.mtf import sensor_mtf
+from beers_deploy.profiles.figures import Figure, measured, unavailable
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.response import NYQUIST
+from beers_deploy.profiles.sensor import Sensor
+
+DRAWS = 20
+"""Number of sensors drawn from a profile with ranges."""
+NOISE_FACTOR = 1.25
+BLUR_FACTOR = 1.15
+"""Of the noise's variance, and of the MTF."""
+SMOOTH = 0.45
+QUIET_PERCENT = 10.0
+"""Of the stated noise: less in a tenth of the blocks is the work of a filter.
+
+By chance they hold 0.6 of it.
+"""
+FILTERED = ": restored, resampled or compressed before, or of another gain"
+SNR = "measured SNR"
+
+
+def mtf_name(axis: str) -> str:
+    """Return the name of the figure of the MTF along an axis."""
+    return f"measured MTF {axis}"
+
+
+class StatedSensor(NamedTuple):
+    """What a profile states, in the image's numbers.
+
+    Attributes:
+        instruments: the nominal sensor, and others drawn from the profile's ranges.
+        unit: pixel values per digital number.
+    """
+
+    instruments: Sequence[Instrument]
+    unit: float
+
+    @classmethod
+    def of(cls, sensor: Sensor, clipped_at: float) -> "StatedSensor":
+        """Return what a profile states of an image whose full scale is `clipped_at`."""
+        generator = np.random.default_rng(SEED)
+        nominal = sensor.nominal()
+        samples = (sensor.draw(generator) for _ in range(DRAWS))
+        others = (sample for sample in samples if sample != nominal)
+        return cls([nominal, *others], clipped_at / nominal.max_dn)
+
+    def variances(self, value: np.ndarray | float) -> np.ndarray:
+        """Return the variance of the noise at pixel values, without rounding, of each instrument:
+        (I, ...).
+        """
+        values = np.asarray(value, np.float64)
+        return np.stack([self.variance(instrument, values) for instrument in self.instruments])
+
+    def variance(self, sensor: Instrument, value: np.ndarray) -> np.ndarray:
+        """Return the variance of the noise at pixel values, of one instrument."""
+        gain = sensor.gain_dn_per_radiance
+        radiance = np.maximum(value / self.unit - sensor.offset_dn, 0) / gain
+        return np.asarray((sensor.alpha * radiance + sensor.beta) * (gain * self.unit) ** 2)
+
+    def nominal_noise(self, values: np.ndarray) -> np.ndarray:
+        """Return the variance in the pixels of the nominal sensor, the rounding included."""
+        return self.variance(self.instruments[0], values) + ROUNDING
+
+    def mtf(self, axis: str) -> tuple[float, float]:
+        """Return the least and the most contrast at Nyquist along an axis."""
+        f = np.array([[NYQUIST]]), np.array([[0.0]])
+        fx, fy = f if axis == AXES[0] else f[::-1]
+        contrasts = [
+            abs(complex(sensor_mtf(fx, fy, instrument).item())) for instrument in self.instruments
+        ]
+        return min(contrasts), max(contrasts)
+
+
+def compare_noise(
+    line: NoiseModel | Refusal, blocks: Blocks, stated: StatedSensor
+) -> tuple[Figure, list[str]]:
+    """Return the SNR in the middle of the measured levels, and a sentence if it contradicts the
+    profile.
+    """
+    if isinstance(line, Refusal):
+        return unavailable("ratio", line.reason), _smoothed(blocks, stated)
+    # The geometric mean of the two ends is the middle of the levels that were measured.
+    value = math.sqrt(math.prod(line.measured_dn))
+    variance = line.at(value)
+    expected = stated.variances(value)
+    nominal = stated.instruments[0]
+    signal = max(value - stated.unit * nominal.offset_dn, 0)
+    radiance = signal / (stated.unit * nominal.gain_dn_per_radiance)
+    ratio, interval = snr(signal, variance)
+    stated_snr = signal / math.sqrt(expected[0]) if expected[0] > 0 else math.inf
+    source = (
+        f"at {radiance:.3g} W/m2/sr/um, {line.blocks} blocks of 16 x 16; the sensor profile states "
+        f"{stated_snr:.3g}"
+    )
+    figure = measured(ratio, "ratio", source, interval)
+    low, high = variance.interval
+    if low <= expected.max() * NOISE_FACTOR and high >= expected.min() / NOISE_FACTOR:
+        return figure, _smoothed(blocks, stated)
+    contradiction = (
+        f"noise at {radiance:.3g} W/m2/sr/um looks like SNR {ratio:.3g}, but the sensor profile "
+        f"states {stated_snr:.3g}"
+    )
+    return figure, [f"{contradiction}{FILTERED}" if ratio > stated_snr else contradiction]
+
+
+def _smoothed(blocks: Blocks, stated: StatedSensor) -> list[str]:
+    """Return a sentence if pixels hold less noise than any image of the sensor."""
+    if not blocks.mean.size:
+        return []
+    expected = stated.variances(blocks.mean).min(0)
+    share = float(np.percentile(blocks.fine / (expected + ROUNDING), QUIET_PERCENT))
+    if share > SMOOTH:
+        return []
+    return [f"the image has {share:.0%} of the noise that the sensor profile states{FILTERED}"]
+
+
+def compare_blur(
+    axis: str, blur: AxisMtf | Refusal, stated: StatedSensor
+) -> tuple[Figure, list[str]]:
+    """Return the MTF along an axis, and a sentence if it contradicts the profile."""
+    if isinstance(blur, Refusal):
+        return unavailable("%", blur.reason), []
+    low, high = blur.interval
+    figure = measured(100 * blur.mtf_nyquist, "%", f"{blur.edges} edges", (100 * low, 100 * high))
+    least, most = stated.mtf(axis)
+    # Few and soft edges do not show the shape of the curve, so the MTF by the profile's own shape
+    # must be off as well.
+    if (
+        min(low, blur.nearest) <= most * BLUR_FACTOR
+        and max(high, blur.nearest) >= least / BLUR_FACTOR
+    ):
+        return figure, []
+    bound = most if low > most else least
+    contradiction = (
+        f"MTF {axis} the track looks like {blur.mtf_nyquist:.2%}, but the sensor profile states "
+        f"{bound:.2%}"
+    )
+    return figure, [contradiction]

@@ -1,0 +1,96 @@
+"""The warning that an image of no named sensor looks restored already.
+
+Its noise is compared with that of the quietest sensor in range. Satellite products are mostly
+denoised and sharpened before they are delivered; a network that is not given their sensor takes
+them for images of an average one, and sharpens them a second time.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import onnx
+
+from beers_deploy.model.family import RANGES
+from beers_deploy.model.metrics.instrument import image_blocks
+from beers_deploy.model.metrics.noise_blocks import ROUNDING
+from beers_deploy.model.metrics.noise_line import LEAST
+from beers_deploy.model.raster.source import Source
+from beers_deploy.quant.onnx_file import metadata
+from beers_deploy.restoration.sensor_check.comparison import QUIET_PERCENT
+from beers_deploy.restoration.sensor_check.windows import band_windows, integer_step
+
+FAR_BELOW = 0.4
+"""Of the variance that the quietest sensor has, in a tenth of the blocks: less is no raw image.
+
+Four Pleiades products hold 0.01 to 0.04 of it. Of images simulated by sensors of the range, at 1,
+1/4 and 1/20 of the light, the lowest holds 0.76, and chance alone may leave 0.6. An 11-bit image
+taken for one of 12 bits keeps half of it.
+"""
+OFFSET = 0.01
+"""Of full scale, the largest value of the dark that an image may have."""
+LEAST_EXPECTED = 3 * ROUNDING
+"""Least expected variance: below, rounding to integers hides the noise of a raw image as well."""
+FILLED = 1e-9
+"""Variance of blocks that are constant: filled, and not acquired."""
+
+
+def restored_already(source: Source, networks: Sequence[onnx.ModelProto], full_scale: float) -> str:
+    """Return a sentence if an image of no named sensor looks restored already; else nothing.
+
+    Args:
+        source: the image.
+        networks: that are to restore it; the range is known of networks that state their sensor,
+            "blind" included.
+        full_scale: the pixel value that is 1.0 to them.
+    """
+    if not all(metadata(network).get("sensor") for network in networks):
+        return ""
+    # Satellite products are mostly denoised before delivery: their noise gives them away.
+    shares = [_noise_share(windows, full_scale) for windows in band_windows(source)]
+    quiet = [k for k, share in enumerate(shares, 1) if share is not None and share < FAR_BELOW]
+    if not quiet:
+        return ""
+    least = min(share for share in shares if share is not None)
+    some = "" if len(quiet) == len(shares) else f" in band {', '.join(map(str, quiet))}"
+    return (
+        f"look at the image: it looks restored already{some}, with {least:.0%} of the noise "
+        "variance of the quietest sensor that the network knows at full scale "
+        f"{full_scale:g}; a restoration over-sharpens it: give the raw image, or its own sensor "
+        "or full scale"
+    )
+
+
+def _noise_share(windows: Sequence[np.ndarray], full_scale: float) -> float | None:
+    """Return the noise's variance over the least of any sensor in range, in quiet blocks; None if
+    it cannot be measured.
+
+    Args:
+        windows: (h, w) each, raw values; 0 where pixels are missing.
+        full_scale: the value that is the sensors' largest digital number.
+    """
+    step = integer_step(windows)
+    # Pixels that were scaled have an unknown noise of rounding.
+    if step is None:
+        return None
+    top = full_scale / step
+    blocks = image_blocks((window / step for window in windows), top)
+    expected = _least_variance(blocks.mean, top)
+    judged = (expected >= LEAST_EXPECTED) & (blocks.fine > FILLED)
+    if int(judged.sum()) < LEAST:
+        return None
+    return float(np.percentile(blocks.fine[judged] / (expected[judged] + ROUNDING), QUIET_PERCENT))
+
+
+def _least_variance(values: np.ndarray, full_scale: float) -> np.ndarray:
+    """Return the least variance of the noise at pixel values, of any sensor that the networks were
+    trained for.
+
+    It is stated at 1/16 and at 1/4 of full scale. A straight line through 0 and the first, and a
+    constant from the second on, lie below the noise line of every sensor of the range, also where
+    the dark is above 0.
+    """
+    # The variance of the noise is stated at 1/16 of full scale, hence 16 times the light.
+    light = np.maximum(values / full_scale - OFFSET, 0)
+    dark = RANGES["sigma_dark"][0] ** 2
+    bright = RANGES["sigma_bright"][0] ** 2
+    return np.asarray(full_scale**2 * np.minimum(16 * dark * light, bright))

@@ -1,0 +1,241 @@
+"""The targets of an evaluation, as a sensor acquires them: edges, flat fields, points, bars and
+zone plates.
+
+The random draws of edges come first, so that they are the same without the other targets.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import count, product
+
+import numpy as np
+
+from beers_deploy.model.metrics.slanted_edge import slanted_edge
+from beers_deploy.model.simulator.acquire import NOISE, acquire
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.sampling import scene_spectrum
+from beers_deploy.profiles.instrument import Instrument
+
+OVERSAMPLING = 5
+"""Scene pixels per pixel of all targets but flat fields."""
+
+ANGLES_DEG = (3.0, 5.0, 8.0, 11.0)
+REPEATS = 3
+SIDE_PX = 240
+
+FLAT_PX = 128
+RADIANCES = (10.0, 25.0, 100.0)
+"""Radiances of the flat fields, W/m2/sr/um."""
+
+POINT_BACKGROUNDS = (20.0, 100.0)
+"""W/m2/sr/um."""
+POINT_RADIANCES = (12.0, 40.0, 120.0)
+"""Light of a point, as what it adds to the mean radiance of one pixel, W/m2/sr/um."""
+POINTS_A_SIDE = 6
+POINT_STEP_PX = 48
+
+PATTERN_BACKGROUND = 100.0
+"""W/m2/sr/um."""
+BAR_CONTRASTS = (0.05, 0.10)
+BAR_PERIODS_PX = (2.0, 8 / 3, 3.0)
+"""Contrast is the amplitude of the wave over the background."""
+BARS_PX = 144
+BARS_MEASURED_PX = 64
+"""The side is a multiple of all periods, since scenes wrap around at their borders."""
+
+ZONE_CONTRASTS = (0.08, 0.30)
+ZONE_BAND: tuple[float, float] = (0.35, 0.45)
+"""Spatial frequencies that are measured, cycles per pixel."""
+ZONE_PX = 288
+ZONE_NYQUIST_PX = 96
+"""Side, and the radius at which the pattern reaches half a cycle per pixel and ends."""
+
+Edges = Sequence[tuple[float, np.ndarray]]
+"""Angle in degrees and image of each slanted edge."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points of light on a flat background: the same noise with and without them.
+
+    Attributes:
+        background: radiance in W/m2/sr/um.
+        seen: the image that the degraded sensor acquires, (H, W) digital numbers.
+        flat: the same without points, acquired with the same random draws.
+        wanted: the light of the points alone as the reference sensor sees it without noise, (H, W)
+            digital numbers.
+    """
+
+    background: float
+    seen: np.ndarray
+    flat: np.ndarray
+    wanted: np.ndarray
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """Bars or a zone plate.
+
+    Attributes:
+        name: of the figure.
+        seen: the image that the degraded sensor acquires, (H, W) digital numbers.
+        wanted: the image that the reference sensor acquires without noise, likewise.
+        measured: True where the restored image is compared, (H, W).
+    """
+
+    name: str
+    seen: np.ndarray
+    wanted: np.ndarray
+    measured: np.ndarray
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Acquired targets, (H, W) digital numbers.
+
+    Attributes:
+        sensor: the sensor that acquired them.
+        edges: slanted edges, each with independent noise.
+        flats: radiance in W/m2/sr/um, and the flat field.
+        points: points of light, one image for each background.
+        patterns: bars and zone plates; several of one name are measured together.
+    """
+
+    sensor: Instrument
+    edges: Edges
+    flats: Sequence[tuple[float, np.ndarray]]
+    points: Sequence[Points]
+    patterns: Sequence[Pattern]
+
+
+def acquire_targets(sensor: Instrument, reference: Instrument, seed: int) -> Targets:
+    """Acquire all targets.
+
+    Args:
+        sensor: the sensor of the degraded images.
+        reference: the sensor that is aimed at.
+        seed: seed of the noise and of the places of the points within their pixels.
+    """
+    sensors = sensor, reference.in_units_of(sensor)
+    # The first numbers are those of the edges, which draw their own noise (`acquire_edges`).
+    draws = (Draw(seed, number) for number in count(len(ANGLES_DEG) * REPEATS))
+    flats = []
+    for radiance in RADIANCES:
+        field = np.full((FLAT_PX, FLAT_PX), radiance, np.float32)
+        flats.append((radiance, _acquire(field, sensor, next(draws), ratio=1)))
+    points = [
+        _acquire_points(background, *sensors, next(draws)) for background in POINT_BACKGROUNDS
+    ]
+    scenes = [*_bars(), *_zone_plates()]
+    patterns = [_acquire_pattern(*scene, *sensors, next(draws)) for scene in scenes]
+    return Targets(sensor, acquire_edges(sensor, seed), flats, points, patterns)
+
+
+def _acquire(
+    scene: np.ndarray, sensor: Instrument, draw: Draw, ratio: int = OVERSAMPLING
+) -> np.ndarray:
+    return acquire(
+        scene_spectrum(scene), scene.shape[1], sensor, ratio, draw, "degraded", margin_px=0
+    )
+
+
+def _without_noise(scene: np.ndarray, sensor: Instrument, draw: Draw) -> np.ndarray:
+    spectrum = scene_spectrum(scene)
+    return acquire(
+        spectrum, scene.shape[1], sensor, OVERSAMPLING, draw, "reference", margin_px=0, skip=NOISE
+    )
+
+
+def acquire_edges(sensor: Instrument, seed: int) -> Edges:
+    """Acquire edges at several angles, each with independent noise."""
+    edges = []
+    for number, angle in enumerate(ANGLES_DEG * REPEATS):
+        scene = slanted_edge(SIDE_PX, OVERSAMPLING, angle)
+        edges.append((angle, _acquire(scene, sensor, Draw(seed, number))))
+    return edges
+
+
+def _acquire_points(
+    background: float, sensor: Instrument, reference: Instrument, draw: Draw
+) -> Points:
+    # The same field without points, acquired with the same draws: the difference is their light.
+    flat = np.full((POINTS_A_SIDE * POINT_STEP_PX * OVERSAMPLING,) * 2, background, np.float32)
+    scene = flat.copy()
+    generator = draw.generator("points")
+    for row, column in point_places():
+        # One scene pixel anywhere in its pixel: all phases of the sampling occur.
+        y, x = ((at * POINT_STEP_PX + POINT_STEP_PX // 2) * OVERSAMPLING for at in (row, column))
+        shift_y, shift_x = generator.integers(OVERSAMPLING, size=2)
+        scene[y + shift_y, x + shift_x] += point_radiance(row, column) * OVERSAMPLING**2
+    light = _without_noise(scene, reference, draw) - _without_noise(flat, reference, draw)
+    return Points(background, _acquire(scene, sensor, draw), _acquire(flat, sensor, draw), light)
+
+
+def point_places() -> list[tuple[int, int]]:
+    """Return row and column of each point."""
+    return [divmod(number, POINTS_A_SIDE) for number in range(POINTS_A_SIDE**2)]
+
+
+def point_radiance(row: int, column: int) -> float:
+    """Return the light of the point in a row and column, W/m2/sr/um."""
+    return POINT_RADIANCES[(row + column) % len(POINT_RADIANCES)]
+
+
+def _bars() -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Return the bars, each across and along the track: name, contrast (S, S) in scene pixels and
+    the mask (H, W) of measured pixels.
+    """
+    middle = np.zeros((BARS_PX, BARS_PX), bool)
+    place = slice((BARS_PX - BARS_MEASURED_PX) // 2, (BARS_PX + BARS_MEASURED_PX) // 2)
+    middle[place, place] = True
+    bars = []
+    for contrast, period_px in product(BAR_CONTRASTS, BAR_PERIODS_PX):
+        # The crests lie on the centres of pixels: otherwise bars of a period of 2 px would be lost
+        # in the sampling.
+        wave = np.cos(2 * math.pi * _places_px(BARS_PX) / period_px)
+        across = np.broadcast_to(contrast * wave, (wave.size, wave.size))
+        name = f"bars of {contrast:.0%}, period {period_px:.3g} px"
+        bars += [(name, across, middle), (name, across.T, middle)]
+    return bars
+
+
+def _zone_plates() -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Return zone plates, cos(pi / 2 r^2 / R): r / 2R cycles per pixel at the radius r."""
+    frequency = _radius_px(ZONE_PX, 1) / (2 * ZONE_NYQUIST_PX)
+    ring = (frequency >= ZONE_BAND[0]) & (frequency <= ZONE_BAND[1])
+    radius_px = _radius_px(ZONE_PX, OVERSAMPLING)
+    # It ends at the radius where it reaches Nyquist: beyond it the sampling would alias.
+    chirp = np.cos(math.pi / 2 * radius_px**2 / ZONE_NYQUIST_PX) * (radius_px < ZONE_NYQUIST_PX)
+    return [
+        (f"zone plate of {contrast:.0%}", contrast * chirp, ring) for contrast in ZONE_CONTRASTS
+    ]
+
+
+def _places_px(side_px: int, ratio: int = OVERSAMPLING) -> np.ndarray:
+    """Return where the scene pixels of a side lie, in pixels: 0 is the centre
+    of the first pixel.
+    """
+    return (np.arange(side_px * ratio) - (ratio - 1) / 2) / ratio
+
+
+def _radius_px(side_px: int, ratio: int) -> np.ndarray:
+    """Return the distance of every scene pixel from the middle, (side_px *
+    ratio,) * 2, in pixels.
+    """
+    place = _places_px(side_px, ratio) - (side_px - 1) / 2
+    return np.hypot(place[:, None], place)
+
+
+def _acquire_pattern(
+    name: str,
+    contrast: np.ndarray,
+    mask: np.ndarray,
+    sensor: Instrument,
+    reference: Instrument,
+    draw: Draw,
+) -> Pattern:
+    scene = (PATTERN_BACKGROUND * (1 + contrast)).astype(np.float32)
+    return Pattern(
+        name, _acquire(scene, sensor, draw), _without_noise(scene, reference, draw), mask
+    )

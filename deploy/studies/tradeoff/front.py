@@ -1,0 +1,196 @@
+"""Compare operating points: the front of quality against cost, and paired differences.
+
+Points of all boards are compared in one list, and ties are broken by the points' own figures and
+names. So the order in which boards were named changes nothing.
+
+Two points are compared on the same images: by the bootstrap interval, over whole sites, of the mean
+difference of their scores. Their own intervals show how images differ, which the points share.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from beers_deploy.model.metrics.bootstrap import site_interval
+from beers_deploy.network import Network
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.figures import Figure, Row, measured, predicted
+from beers_deploy.studies.tradeoff.measure import Scores
+from beers_deploy.studies.tradeoff.points import Point
+
+LATENCY = "board latency"
+COSTS = (LATENCY, "board energy", "host p50")
+PSNR = "PSNR"
+FRONT = "front of PSNR against"
+BOARDS = "boards"
+"""What the names of the tables begin with."""
+ALIKE_DB = 0.05
+"""Where the sites are too few for an interval, PSNR within this counts as equal."""
+SIGNIFICANT = "significant"
+NOT_SIGNIFICANT = "not significant"
+TOO_FEW = "too few sites to tell"
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A point with all its figures.
+
+    Attributes:
+        name: of the point; of a published run, as it is printed.
+        figures: by name; unavailable ones with the reason.
+        text: words beside them.
+        point: None of a published run.
+        images: scores of each image, in the order of the pairs; empty where there are none.
+    """
+
+    name: str
+    figures: dict[str, Figure]
+    text: Mapping[str, str]
+    point: Point | None = None
+    images: Sequence[Scores] = field(default=(), repr=False)
+
+    def value(self, key: str) -> float:
+        """A figure's value; NaN where there is none to compare: a published one was found on other
+        images.
+        """
+        figure = self.figures.get(key)
+        if figure is None or figure.value is None or figure.mode == "published":
+            return math.nan
+        return figure.value
+
+    @property
+    def network(self) -> Network:
+        """The network that restores here."""
+        if self.point is None or self.point.variant.network is None:
+            raise OptionError(f"The point {self.name} has no network. Choose a point of a network.")
+        return self.point.variant.network
+
+
+def placed(points: Iterable[Measured], cost: str) -> list[Measured]:
+    """Return the points that have both a cost and a PSNR to compare, sorted by increasing cost."""
+    comparable = (
+        point for point in points if not math.isnan(point.value(cost) + point.value(PSNR))
+    )
+    return sorted(comparable, key=lambda point: _rank(point, cost))
+
+
+def _rank(point: Measured, cost: str) -> tuple[float, float, float, str]:
+    """Return the sort key of a point: its cost, then what breaks ties without regard to the order
+    of the points.
+    """
+    latency_s = point.value(LATENCY)
+    return (
+        point.value(cost),
+        -point.value(PSNR),
+        math.inf if math.isnan(latency_s) else latency_s,
+        point.name,
+    )
+
+
+def pareto_front(points: Sequence[Measured], cost: str) -> list[Measured]:
+    """Return the Pareto-optimal points by value, sorted by increasing cost."""
+    front: list[Measured] = []
+    for point in placed(points, cost):
+        if not front or point.value(PSNR) > front[-1].value(PSNR):
+            front.append(point)
+    return front
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Compares points by their scores on the same images.
+
+    Attributes:
+        sites: of the images, in their order.
+        seed: of the bootstrap.
+    """
+
+    sites: Sequence[str]
+    seed: int
+
+    def difference(self, a: Measured, b: Measured) -> Figure:
+        """The PSNR of `a` less that of `b`, with the interval of the paired difference; none below
+        five sites.
+        """
+        # Differences on the same images: how the images differ from one another drops out.
+        pairs = zip(a.images, b.images, strict=True)
+        differences = [(x[PSNR] or 0.0) - (y[PSNR] or 0.0) for x, y in pairs]
+        # The same pictures are equal on however few sites: no bootstrap is needed to tell.
+        if not any(differences):
+            return measured(0.0, "dB", "the same pictures", (0.0, 0.0))
+        interval, words = site_interval(differences, self.sites, np.random.default_rng(self.seed))
+        source = f"PSNR less that of {b.name} on the same images, {words}"
+        return measured(a.value(PSNR) - b.value(PSNR), "dB", source, interval)
+
+
+def significant(difference: Figure) -> bool:
+    """Whether the whole interval is above 0; by value, beyond ALIKE_DB, where there is none."""
+    if difference.interval is None:
+        return (difference.value or 0.0) > ALIKE_DB
+    return difference.interval[0] > 0
+
+
+def verdict(difference: Figure) -> str:
+    """In words: not significant where the interval holds 0."""
+    if difference.interval is None:
+        return TOO_FEW
+    low, high = difference.interval
+    return NOT_SIGNIFICANT if low <= 0 <= high else SIGNIFICANT
+
+
+def cost_ratio(a: Measured, b: Measured, cost: str) -> Figure:
+    """Return the cost of `a` divided by that of `b`, with an interval.
+
+    Two predictions of one board share most of their error: the interval of a ratio of latencies is
+    the board's `pair_width`, and nothing where only the count of tiles differs. Predictions of two
+    boards share none of it.
+    """
+    value = a.value(cost) / b.value(cost)
+    source = f"{cost} over that of {b.name}"
+    if cost.startswith("host"):
+        return measured(value, "x", f"{source}, medians of interleaved runs")
+    a_low, a_high = ends(a.figures[cost])
+    b_low, b_high = ends(b.figures[cost])
+    interval = (a_low / b_high, a_high / b_low)
+    first = a.point
+    second = b.point
+    if first and second and first.dpu and second.dpu:
+        width = first.dpu.target.tables["cost"].get("pair_width")
+        # Points that differ in the halo alone differ in the count of tiles, which is no estimate.
+        if replace(first, halo_px=second.halo_px) == second:
+            interval = value, value
+        # Two predictions of one board share most of their error.
+        elif cost == LATENCY and width is not None and first.board == second.board:
+            interval = value * math.exp(-width.low), value * math.exp(width.low)
+    return predicted(value, "x", interval, source)
+
+
+def ends(figure: Figure) -> tuple[float, float]:
+    """The interval, or the value twice where it has none."""
+    return figure.interval or (figure.value or 0.0, figure.value or 0.0)
+
+
+def front_rows(front: Sequence[Measured], cost: str, compare: Comparison) -> list[Row]:
+    """Return a front's members by number, each with its difference from the next cheaper one."""
+    rows: list[Row] = []
+    for place, point in enumerate(front, 1):
+        figures = figures_to_compare(point, cost)
+        word = "cheapest"
+        if rows:
+            cheaper = front[place - 2]
+            gain = compare.difference(point, cheaper)
+            figures |= {"PSNR gain": gain, f"{cost} ratio": cost_ratio(point, cheaper, cost)}
+            word = verdict(gain)
+        text = {"gain over the next cheaper": word}
+        rows.append(Row(f"{FRONT} {cost}", f"{place}. {point.name}", figures, text))
+    return rows
+
+
+def figures_to_compare(point: Measured, cost: str) -> dict[str, Figure]:
+    """Return the figures by which points are compared: PSNR, the cost, and power and energy of a
+    board.
+    """
+    keys = dict.fromkeys((PSNR, cost, "board power", "board energy"))
+    return {key: point.figures[key] for key in keys if key in point.figures}

@@ -1,0 +1,311 @@
+"""Find lines of another gain and dead lines among the measured lines of single detectors.
+
+A scene cannot look like them: the optics spread a line over several pixels. Every test here
+compares a line with its neighbours, asks for the share that blurred light would have given them,
+and weighs the difference with the noise and texture around.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from beers_deploy.model.metrics.detector_lines import REACH, Blocks
+
+PARITY_LINES = 63
+"""Lines over which alternate lines are averaged; their pattern is `Phases`, and no gain of single
+lines.
+"""
+SIGNIFICANT = 6.0
+"""Standard errors. Noise of 40 000 lines reaches it once in 10 000 images."""
+CLEAR = 12.0
+"""Standard errors within one block from which a part of a line is judged alone."""
+SURE = 1.0
+"""Standard errors by which a part of a line is alone."""
+ASKEW = 0.3
+"""Of a line's deviation, by how much the lines around may depart from what a single one leaves
+there.
+"""
+PART = 0.02
+"""Least gain of a part of a line."""
+AGREE = 0.75
+"""Share of the blocks in which a line must be off to the same side."""
+ISOLATED = 0.75
+LEAST_ISOLATED = 0.55
+"""Least isolation of a line that is measured well, and of any: 1 for a detector.
+
+Of a thin bright line it is 0.70, 0.46, 0.27 and 0.02 where the MTF at Nyquist is 30, 20, 15 and 10
+% (a Gaussian centred on a pixel).
+"""
+SPREAD_SIGNIFICANT = 4.0
+"""Standard errors of the covariance from which the spread of all lines is significant."""
+LEVELS = 1.3
+"""Ratio of the levels of blocks from which gains are told from offsets."""
+LINES = 16
+"""Lines from which their spread can be told."""
+WHITE = -0.35
+"""Correlation of neighbouring second differences: -2/3 for independent detectors; it was above -0.1
+for scenes.
+"""
+MAD = 1.4826
+"""Standard deviation of Gaussian numbers over their median absolute deviation."""
+MAD_ERROR = 2.33
+"""Relative standard error of a variance by the median absolute deviation of N numbers, times
+sqrt(N).
+"""
+SECOND = 1.5
+"""Variance of second differences x - (left + right) / 2 of independent numbers of variance 1."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A single line that is off.
+
+    Attributes:
+        index: of the line.
+        gain: its deviation from its neighbours over the level around.
+        error: standard error of that.
+    """
+
+    index: int
+    gain: float
+    error: float
+
+
+@dataclass(frozen=True)
+class Stripes:
+    """What the lines of one direction show.
+
+    Attributes:
+        spread: standard deviation of the lines' gains without noise, over the level; None if it
+            cannot be seen.
+        spread_error: its standard error.
+        seen: whether the spread is significant, and of independent lines.
+        off: single lines that are off, the largest deviation first.
+        dead: lines that are constant where their neighbours are not.
+        grows_with_level: True for gains, False for offsets; None where the levels do not tell.
+    """
+
+    spread: float | None = None
+    spread_error: float = 0.0
+    seen: bool = False
+    off: tuple[Line, ...] = ()
+    dead: tuple[int, ...] = ()
+    grows_with_level: bool | None = None
+
+    def renumbered(self, numbers: Sequence[int]) -> "Stripes":
+        """Return the same with the line of index i called `numbers[i]`."""
+        off = tuple(replace(line, index=numbers[line.index]) for line in self.off)
+        return replace(self, off=off, dead=tuple(sorted({numbers[index] for index in self.dead})))
+
+
+def judge_lines(blocks: Blocks, least: float) -> Stripes:
+    """Say what lines show that were measured in blocks.
+
+    Args:
+        blocks: of all lines.
+        least: the gain that matters, over the level.
+    """
+    measurable = np.isfinite(blocks.second) & np.isfinite(blocks.level)
+    # A dead line is constant in all blocks where anything is known of it.
+    unknown = ~(measurable | blocks.constant)
+    dead = np.flatnonzero((blocks.constant | unknown).all(0) & blocks.constant.any(0))
+    usable = measurable.any(1)
+    if not usable.any():
+        return Stripes(dead=tuple(dead.tolist()))
+    level = blocks.level[usable]
+    gains = blocks.second[usable] / level
+    errors = blocks.error[usable] / level
+    # Blocks without scatter have the error 0, by which weights would be divided.
+    errors = np.maximum(errors, 1e-6)
+    gains = _without_parity(gains)
+    mean, error = _combined(gains, errors)
+    spread, spread_error, significant = _spread(gains, errors)
+    off = _single(mean, error, gains, errors, least)
+    return Stripes(
+        spread=spread,
+        spread_error=spread_error,
+        seen=significant and spread is not None and spread - spread_error > least,
+        off=tuple(line for line in off if line.index not in set(dead.tolist())),
+        dead=tuple(dead.tolist()),
+        grows_with_level=_grows(gains, errors, level),
+    )
+
+
+def _without_parity(gains: np.ndarray) -> np.ndarray:
+    """Return (blocks, lines) without what alternate lines have in common nearby."""
+    sign = 1 - 2.0 * (np.arange(gains.shape[1]) % 2)
+    size = min(PARITY_LINES, gains.shape[1])
+    bound = 3 * np.nanmedian(np.abs(gains), axis=1, keepdims=True)
+    alternating = np.clip(np.nan_to_num(gains) * sign, -bound, bound)
+    shared = uniform_filter1d(alternating, size, axis=1, mode="nearest")
+    return np.asarray(gains - shared * sign)
+
+
+def _combined(gains: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean over blocks and its standard error, widened where the blocks contradict each
+    other.
+    """
+    weights = np.where(np.isfinite(gains), 1 / np.square(errors), 0)
+    total = weights.sum(0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.nansum(weights * gains, axis=0) / total
+        free = np.maximum((weights > 0).sum(0) - 1, 1)
+        scatter = np.nansum(weights * np.square(gains - mean), axis=0) / free
+        # Blocks that contradict each other widen the error. Those that agree by chance do not
+        # narrow it.
+        return mean, np.sqrt(np.maximum(scatter, 1) / total)
+
+
+def _spread(gains: np.ndarray, errors: np.ndarray) -> tuple[float | None, float, bool]:
+    """Return the standard deviation of independent lines' gains, its error, and whether it is
+    significant.
+
+    Two halves of the blocks share the detectors, but neither noise nor scene. Their covariance is
+    robust: a quarter of the difference between the variances of sum and difference, by median
+    absolute deviations.
+    """
+    if len(gains) < 2:
+        return None, 0.0, False
+    first, _ = _combined(gains[::2], errors[::2])
+    other, _ = _combined(gains[1::2], errors[1::2])
+    both = np.isfinite(first) & np.isfinite(other)
+    if both.sum() < LINES:
+        return None, 0.0, False
+    covariance, error = _covariance(first[both], other[both])
+    spread = float(np.sqrt(max(covariance, 0) / SECOND))
+    # Constant lines have no error.
+    if error == 0:
+        return spread, 0.0, False
+    pairs = both[:-1] & both[1:]
+    crossed = ((first[:-1], other[1:]), (other[:-1], first[1:]))
+    next_one = np.mean([_covariance(left[pairs], right[pairs])[0] for left, right in crossed])
+    spread_error = float(error / (2 * SECOND * max(spread, np.sqrt(error / SECOND))))
+    significant = covariance > SPREAD_SIGNIFICANT * error and next_one < WHITE * covariance
+    return spread, spread_error, bool(significant)
+
+
+def _covariance(first: np.ndarray, other: np.ndarray) -> tuple[float, float]:
+    """Return a robust covariance (Gnanadesikan and Kettenring 1972) and its standard error."""
+    of_sum, of_difference = (
+        np.square(MAD * np.median(np.abs(values))) for values in (first + other, first - other)
+    )
+    # Second differences of neighbouring lines are no independent numbers: half as many count.
+    error = MAD_ERROR * np.hypot(of_sum, of_difference) / 4 / np.sqrt(max(len(first) / 2, 1))
+    return float(of_sum - of_difference) / 4, float(error)
+
+
+def _single(
+    mean: np.ndarray, error: np.ndarray, gains: np.ndarray, errors: np.ndarray, least: float
+) -> list[Line]:
+    """Return the lines that are off alone, the largest deviation first."""
+    with np.errstate(invalid="ignore"):
+        counts = np.isfinite(gains).sum(0)
+        like = np.abs(gains - mean) < np.maximum(3 * errors, np.abs(mean) / 2)
+        agree = (like & (np.sign(gains) == np.sign(mean))).sum(0) >= AGREE * np.maximum(counts, 2)
+        off = (
+            (np.abs(mean) > np.maximum(least, SIGNIFICANT * error))
+            & agree
+            & _alone(mean, error, -1.0)
+        )
+    # A line that is off in some blocks only is described by its largest deviation.
+    farthest = np.argmax(np.abs(np.nan_to_num(gains)), axis=0)
+    largest = np.where(off, mean, np.take_along_axis(gains, farthest[None], axis=0)[0])
+    numbers = set[int]()
+    lines = []
+    for index in sorted(
+        np.flatnonzero(off | _partly(gains, errors)), key=lambda index: -abs(largest[index])
+    ):
+        # The neighbours of a line that is off are off by half of it, to the other side.
+        if not numbers & {index - 1, index + 1}:
+            numbers.add(int(index))
+            lines.append(Line(int(index), float(largest[index]), float(error[index])))
+    return lines
+
+
+def _partly(gains: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """Return which lines are off in some of the blocks, such as a hot column below its hot pixel.
+
+    Most blocks say nothing of such a line, so that light must be excluded in each of the others.
+    """
+    with np.errstate(invalid="ignore"):
+        clear = np.abs(gains) > np.maximum(CLEAR * errors, PART)
+    isolated = clear & np.array(
+        [
+            _alone(block_gains, block_errors, SURE)
+            for block_gains, block_errors in zip(gains, errors, strict=True)
+        ]
+    )
+    return np.asarray((isolated.sum(0) >= 2) & (4 * isolated.sum(0) >= 3 * clear.sum(0)))
+
+
+def _alone(second: np.ndarray, error: np.ndarray, margin: float) -> np.ndarray:
+    """Return which lines are alone with their deviation, by so many standard errors more than
+    `ISOLATED`.
+
+    The second differences around a single line of gain g are (0, -g/2, g, -g/2, 0), and those of a
+    blurred bright line fall off over five lines: with r and q, the sums over the next lines and the
+    ones after them over -g, the isolation r - q is 1 for a detector.
+    """
+    padded = np.pad(second, REACH, constant_values=np.nan)
+    count = len(second)
+    around = [
+        padded[REACH + step : REACH + step + count] for step in range(-REACH, REACH + 1) if step
+    ]
+    expected = np.array(
+        [-1 / 2 if abs(step) == 1 else 0.0 for step in range(-REACH, REACH + 1) if step]
+    )
+    beside = np.array(around)
+    near = beside[2] + beside[3]
+    far = beside[1] + beside[4]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        isolation = (far - near) / second
+        isolation_error = 2 * error / np.abs(second)
+        slack = np.maximum(ASKEW * np.abs(second), 3 * error)
+        like = np.all(np.abs(beside - expected[:, None] * second) < slack, axis=0)
+        largest = np.all(np.abs(second) > np.abs(beside), axis=0)
+        least = np.maximum(ISOLATED + margin * isolation_error, LEAST_ISOLATED)
+        return np.asarray(like & largest & (isolation > least))
+
+
+def _grows(gains: np.ndarray, errors: np.ndarray, level: np.ndarray) -> bool | None:
+    """Say whether the pattern of lines grows with the level; None where blocks of other levels do
+    not tell.
+
+    The pattern of the other blocks is fitted to each block. Over the level, gains fit all blocks
+    alike, and offsets fall as 1 / level: the slope of the logarithms is 0 or -1.
+    """
+    fits, fit_errors = (
+        np.array(numbers)
+        for numbers in zip(*map(partial(_fit, gains, errors), range(len(gains))), strict=True)
+    )
+    levels = np.nanmean(level, axis=1)
+    use = (fits > 0) & np.isfinite(fit_errors)
+    if use.sum() < 3 or np.ptp(np.log(levels[use])) < np.log(LEVELS):
+        return None
+    x = np.log(levels[use])
+    y = np.log(fits[use])
+    weights = np.square(fits[use] / fit_errors[use])
+    x, y = (axis - np.average(axis, weights=weights) for axis in (x, y))
+    power = float((weights * x * x).sum())
+    slope = float((weights * x * y).sum()) / power
+    residual = float((weights * np.square(y - slope * x)).sum()) / (len(x) - 2)
+    error = float(np.sqrt(max(residual, 1) / power))
+    # The slope is 0 for gains and -1 for offsets: the middle between them decides.
+    return None if abs(slope + 1 / 2) < 3 * error else slope > -1 / 2
+
+
+def _fit(gains: np.ndarray, errors: np.ndarray, number: int) -> tuple[float, float]:
+    """Return by what factor the pattern of the other blocks fits one block, and the standard error
+    of that.
+    """
+    others, _ = _combined(np.delete(gains, number, 0), np.delete(errors, number, 0))
+    pattern = np.nan_to_num(others)
+    power = float(np.square(pattern).sum())
+    if power == 0:
+        return 0.0, np.inf
+    noise = float(np.sqrt(np.square(pattern * np.nan_to_num(errors[number])).sum()))
+    factor = float((pattern * np.nan_to_num(gains[number])).sum()) / power
+    return factor, noise / power if noise else np.inf

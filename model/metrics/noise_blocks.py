@@ -1,0 +1,139 @@
+"""Blocks of an image by the energy of their waves: slow ones are structure, the finest are noise.
+
+The blur of an instrument leaves next to no texture in the corners of the spectrum, beyond 0.55
+cycles per pixel, and noise is white.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+SIDE_PX = 16
+PART_BLOCKS = 4
+SLOW = 0.2
+MIDDLE = 0.5
+FINE = 0.55
+"""Cycles per pixel."""
+SPECTRUM = (0.3, 0.4, 0.5, 0.55, 0.6, 0.65, 0.7071)
+"""Ends of the bands in which noise is shown, cycles per pixel; the last is the corner of the
+spectrum.
+"""
+ROUNDING = 1 / 12
+"""Variance that rounding to whole digital numbers adds, DN^2."""
+
+
+class Blocks(NamedTuple):
+    """N blocks of 16 x 16 pixels, less a plane each.
+
+    Attributes:
+        mean: (N,) in DN.
+        structure: (N,) mean square of the waves up to 0.2 cycles per pixel, for white noise its
+            variance in DN^2.
+        middle: (N,) that of the waves from 0.5 to 0.55.
+        fine: (N,) that of the waves beyond.
+        spectrum: (N, 6) that of the waves between the frequencies of SPECTRUM.
+        part: (N,) which part of which image a block lies in.
+    """
+
+    mean: np.ndarray
+    structure: np.ndarray
+    middle: np.ndarray
+    fine: np.ndarray
+    spectrum: np.ndarray
+    part: np.ndarray
+
+    def only(self, chosen: np.ndarray) -> "Blocks":
+        """The blocks that `chosen`, bool or indices, picks."""
+        return Blocks(*(column[chosen] for column in self))
+
+    def noise(self, fit: np.ndarray) -> np.ndarray:
+        """Variance (N,) that a line (alpha, beta, ...) gives each block, that
+        of rounding at least.
+        """
+        return np.asarray(np.maximum(fit[0] * self.mean + fit[1], ROUNDING))
+
+
+def join(images: Sequence[Blocks]) -> Blocks:
+    """The blocks of several images as one; their parts stay apart."""
+    starts = np.cumsum([0] + [int(b.part.max(initial=-1)) + 1 for b in images])
+    renumbered = [b._replace(part=b.part + start) for b, start in zip(images, starts, strict=False)]
+    return Blocks(*(np.concatenate(column) for column in zip(*renumbered, strict=True)))
+
+
+def cut_blocks(image: np.ndarray, clipped_at: float) -> Blocks:
+    """Cut (H, W) digital numbers into blocks side by side, without those with a pixel at 0 or at
+    `clipped_at`.
+    """
+    pixels, part = _side_by_side(image)
+    sound = ((pixels > 0) & (pixels < clipped_at)).all((1, 2))
+    pixels = pixels[sound]
+    return _measured(pixels.mean((1, 2)), pixels, part[sound])
+
+
+def cut_pair(first: np.ndarray, second: np.ndarray, clipped_at: float) -> Blocks:
+    """Blocks of the noise alone, of two images (H, W) of one still scene: their difference over the
+    root of 2.
+
+    This is photon transfer: the scene cancels, and so does what every detector does always.
+    """
+    ones, part = _side_by_side(first)
+    others, _ = _side_by_side(second)
+    low = np.minimum(ones, others).min((1, 2))
+    high = np.maximum(ones, others).max((1, 2))
+    sound = (low > 0) & (high < clipped_at)
+    ones = ones[sound]
+    others = others[sound]
+    return _measured((ones + others).mean((1, 2)) / 2, (ones - others) / math.sqrt(2), part[sound])
+
+
+def _side_by_side(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the blocks (N, S, S) of an image, and the part that each lies in."""
+    rows = image.shape[0] // SIDE_PX
+    columns = image.shape[1] // SIDE_PX
+    pixels = np.asarray(image[: rows * SIDE_PX, : columns * SIDE_PX], np.float64)
+    pixels = (
+        pixels.reshape(rows, SIDE_PX, columns, SIDE_PX).swapaxes(1, 2).reshape(-1, SIDE_PX, SIDE_PX)
+    )
+    across = columns // PART_BLOCKS + 1
+    part = np.arange(rows)[:, None] // PART_BLOCKS * across + np.arange(columns) // PART_BLOCKS
+    return pixels, part.ravel()
+
+
+def _measured(mean: np.ndarray, pixels: np.ndarray, part: np.ndarray) -> Blocks:
+    """Return blocks (N, S, S) with these means and parts by the energies of their bands."""
+    # Not by matrix products: the threads of BLAS wait for each other longer than these small sums
+    # take.
+    bands = np.einsum("nk,kb->bn", _energies(pixels).reshape(-1, SIDE_PX**2), _band_means())
+    slow, middle, fine, *spectrum = bands
+    return Blocks(mean, slow, middle, fine, np.stack(spectrum, axis=1), part)
+
+
+def _energies(pixels: np.ndarray) -> np.ndarray:
+    """Squared cosine coefficients (N, S, S) of blocks less their planes."""
+    # Imported here, and SciPy below: who measures no sensor need not wait for it.
+    from scipy.fft import dctn
+
+    ramp = np.arange(SIDE_PX) - (SIDE_PX - 1) / 2
+    residuals = pixels - pixels.mean((1, 2), keepdims=True)
+    down, across = (
+        (residuals.sum(axis) * ramp).sum(1) / (SIDE_PX * (ramp**2).sum()) for axis in (2, 1)
+    )
+    residuals -= down[:, None, None] * ramp[:, None] + across[:, None, None] * ramp
+    coefficients = dctn(residuals, axes=(1, 2), norm="ortho", overwrite_x=True)
+    return np.asarray(np.square(coefficients, out=coefficients))
+
+
+@cache
+def _band_means() -> np.ndarray:
+    """Return the weights (S * S, 9) that average the energies of slow, middle and fine waves and of
+    SPECTRUM.
+    """
+    place = np.arange(SIDE_PX)
+    frequency = np.hypot(place[:, None], place).ravel() / (2 * SIDE_PX)
+    bands = ((1.5 / (2 * SIDE_PX), SLOW), (MIDDLE, FINE), (FINE, 1.0), *pairwise(SPECTRUM))
+    weights = np.stack([(frequency > low) & (frequency <= high) for low, high in bands], axis=1)
+    return np.asarray(weights / weights.sum(0))
