@@ -90,7 +90,9 @@ def shown(figure: Figure | None, key: str, interval: bool) -> str:
         digits = DIGITS_OF_BIAS
     elif figure["unit"] == "ratio" and figure["value"] > 2:
         digits = 0
-    numbers = [f"{number:.{digits}f}" for number in (figure["value"], *(figure.get("interval") or ()))]
+    numbers = [
+        f"{number:.{digits}f}" for number in (figure["value"], *(figure.get("interval") or ()))
+    ]
     if interval and len(numbers) > 1:
         return f"{numbers[0]} [{', '.join(numbers[1:])}]"
     return numbers[0]
