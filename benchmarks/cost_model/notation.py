@@ -142,14 +142,16 @@ class Library:
 
     def _run(self, builder: Builder, lines: Sequence[str], names: dict[str, Any]) -> Tensor:
         """Take the steps of some lines, and return their last x."""
+        result: Tensor
         for line in lines:
             name, equals, steps = line.partition(" = ")
-            result: Tensor = names["x"]
+            result = names["x"]
             names["ch"] = result.channels
             for step in (steps if equals else line).split("|"):
                 result = self._step(builder, result, step.strip(), names)
             names[name if equals else "x"] = result
-        return names["x"]
+        result = names["x"]
+        return result
 
     def _step(self, builder: Builder, x: Tensor, step: str, names: dict[str, Any]) -> Tensor:
         if isinstance(kept := names.get(step), Tensor):
