@@ -59,7 +59,8 @@ def acquired(
 
 def as_source(image: np.ndarray) -> ArraySource:
     """Return an image (H, W) as the checks read it."""
-    return ArraySource(image[None], Raster(1, *image.shape, image.dtype))
+    height_px, width_px = image.shape
+    return ArraySource(image[None], Raster(1, height_px, width_px, image.dtype))
 
 
 def texture(generator: np.random.Generator, side_px: int = 1024) -> np.ndarray:

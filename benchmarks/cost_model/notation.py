@@ -95,7 +95,7 @@ HEADER = ("family", "host", "gop", "source", "image")
 class Block:
     """Lines under a name, and its parameters with the text of their defaults."""
 
-    parameters: Mapping[str, str]
+    parameters: dict[str, str]
     lines: list[str] = field(default_factory=list)
 
 
