@@ -59,7 +59,8 @@ def quark(python: Path, adaround_steps: int, network: Small, out: Path) -> None:
     samples = network.path.with_suffix(".npy")
     np.save(samples, network.samples.images)
     script = Path(__file__).with_name("quark_child.py")
-    command = [python.absolute(), script, network.path, samples, out, str(adaround_steps)]
+    files = (script, network.path, samples, out)
+    command = [str(python.absolute()), *map(str, files), str(adaround_steps)]
     # Quark writes files into its working folder.
     subprocess.run(command, check=True, capture_output=True, cwd=out.parent)  # noqa: S603
 
