@@ -9,12 +9,8 @@ Markdown table; samples that judge were seen by neither training nor calibration
 """
 
 import argparse
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
-from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import onnx
 
@@ -22,14 +18,14 @@ from beers_deploy.model.shipped import SENSOR, shipped_names, shipped_weights
 from beers_deploy.network_files import Conditioned, int8_for_sensor
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.gate import compare
-from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.passes.selection import ALL, Passes
 from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.samples.own import samples_of
 from beers_deploy.quant.samples.simulated import unseen_patches
-from beers_deploy.quant.session import open_any_size, open_session, result_of
+from beers_deploy.quant.session import open_any_size
 from beers_deploy.quantization import family_model
-from benchmarks.small_networks import NETWORKS, SIDE_PX, Drawn, losses, save, slug, trained
+from benchmarks.small_networks import NETWORKS, Small, folder_of, names_in, options, prepared
 
 Loss = Callable[[Passes], float]
 """Quantises a network with these passes; the mean loss of PSNR in dB."""
@@ -62,24 +58,17 @@ def row(loss_of: Loss, behind_bank: bool = False) -> list[str]:
     return cells
 
 
-def small(name: str, arguments: argparse.Namespace, folder: Path) -> Loss:
-    """Return the loss of a small network, which is trained unless the folder has it."""
-    kind, _ = NETWORKS[name]
-    path = folder / f"{slug(name)}.onnx"
-    if not path.exists():
-        side_px = SIDE_PX[kind] // (2 if kind == "espcn" else 1)
-        save(trained(name, arguments.images, arguments.steps), side_px, path)
-    model = load_onnx(path)
-    samples = samples_of(model, Drawn.of(kind, arguments.images, 5, arguments.batches).images)
+def small(network: Small) -> Loss:
+    """Return the loss of a small network."""
+    model = load_onnx(network.path)
+    samples = samples_of(model, network.samples.images)
     assert samples is not None  # noqa: S101 - some were given
     patches = samples.drawn
-    held = Drawn.of(kind, arguments.held_out, 6, arguments.batches)
-    in_float = partial(result_of, open_session(model))
+    int8 = network.path.with_suffix(".int8.onnx")
 
     def loss_of(passes: Passes) -> float:
-        host = quantize_model(model, patches, {}, passes=passes).host
-        in_int8 = partial(result_of, open_session(host))
-        return float(losses(in_float, in_int8, held).mean())
+        save_onnx(quantize_model(model, patches, {}, passes=passes).host, int8)
+        return float(network.losses_db(int8).mean())
 
     return loss_of
 
@@ -102,27 +91,13 @@ def shipped(name: str, arguments: argparse.Namespace) -> Loss:
 
 def main() -> None:
     """Print a row a network, as each is done."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--images", type=Path, help="folder of photographs to train on")
-    parser.add_argument("--held-out", type=Path, help="folder of photographs to judge on")
-    parser.add_argument("--steps", type=int, default=1500, help="of training a small network")
-    parser.add_argument("--batches", type=int, default=8, help="of eight samples each")
-    parser.add_argument("--only", default="", help="networks whose names this expression finds")
-    parser.add_argument("--keep", type=Path, help="folder of the small networks")
-    arguments = parser.parse_args()
-    names = [*NETWORKS, *shipped_names()]
+    arguments = options(__doc__).parse_args()
     print(f"| network | all | {' | '.join(field.name for field in fields(Passes))} |")
     print("|---" * (len(fields(Passes)) + 2) + "|")
-    with TemporaryDirectory() as temporary:
-        folder = arguments.keep or Path(temporary)
-        folder.mkdir(parents=True, exist_ok=True)
-        for name in names:
-            if not re.search(arguments.only, name):
-                continue
+    with folder_of(arguments) as folder:
+        for name in names_in(arguments, *shipped_names()):
             if name in NETWORKS:
-                cells = row(small(name, arguments, folder))
+                cells = row(small(prepared(name, arguments, folder)))
             else:
                 cells = row(shipped(name, arguments), behind_bank=True)
             print(f"| {name} | {' | '.join(cells)} |", flush=True)

@@ -1,5 +1,5 @@
-"""What makes code hard to own, counted: tokens, density, packed statements, comments, helpers with
-one caller, and how often an option is described.
+"""What makes code hard to own, counted: tokens, density, packed statements, comments, and helpers
+with one caller.
 
     python benchmarks/counts.py [--check]
 
@@ -11,12 +11,10 @@ have risen above the limits below; whoever lowers them lowers the limits as well
 import argparse
 import ast
 import io
-import re
 import sys
 import tokenize
 from collections import Counter
 from collections.abc import Iterator
-from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -42,7 +40,7 @@ PAIRED_LIMITS = {"source": 1, "tests": 1}
 
 
 class Counts(NamedTuple):
-    """Of one part of the project."""
+    """Sums over one part of the project."""
 
     tokens: int
     lines: int
@@ -70,7 +68,6 @@ def main() -> None:
     print(f"|---|{'---|' * len(counts)}")
     for measure, values in table(counts).items():
         print(f"| {measure} | {' | '.join(values)} |")
-    print(f"\ndescriptions of an option, in the mean: {descriptions_an_option():.1f}")
     sentences = list(over(counts))
     for sentence in sentences:
         print(sentence, file=sys.stderr)
@@ -95,50 +92,42 @@ def table(counts: dict[str, Counts]) -> dict[str, list[str]]:
 def over(counts: dict[str, Counts]) -> Iterator[str]:
     """Return a sentence for each limit that is passed."""
     for name, limit in DENSITY_LIMITS.items():
-        if round(counts[name].density, 2) > limit:
-            yield (
-                f"{name}: {counts[name].density:.2f} tokens a line, {limit:.2f} at most: "
-                "write statements out"
-            )
-    for name, limit in PAIRED_LIMITS.items():
-        if counts[name].paired_assignments > limit:
-            yield (
-                f"{name}: {counts[name].paired_assignments} paired assignments, {limit} at "
-                "most: one a line"
-            )
+        density = round(counts[name].density, 2)
+        if density > limit:
+            yield f"{name}: {density} tokens a line, {limit:.2f} at most: write statements out"
+    for name, most in PAIRED_LIMITS.items():
+        count = counts[name].paired_assignments
+        if count > most:
+            yield f"{name}: {count} paired assignments, {most} at most: one a line"
 
 
 def counted(folders: tuple[str, ...]) -> Counts:
     """Count all Python files below some folders of the project."""
-    paths = list[Path]()
+    nodes = list[ast.AST]()
+    totals = Counter[str]()
     for folder in folders:
-        paths += sorted((ROOT / folder).rglob("*.py"))
-    texts = [path.read_text(encoding="utf-8") for path in paths]
-    trees = [ast.parse(text) for text in texts]
-    tokens, lines, comments = map(
-        sum, zip(*(measured(*pair) for pair in zip(texts, trees, strict=True)), strict=True)
-    )
-    nodes = list(chain.from_iterable(map(ast.walk, trees)))
+        for path in (ROOT / folder).rglob("*.py"):
+            text = path.read_text(encoding="utf-8")
+            tree = ast.parse(text)
+            nodes += ast.walk(tree)
+            totals += measured(text, tree)
     return Counts(
-        tokens=tokens,
-        lines=lines,
-        comments=comments,
-        paired_assignments=sum(is_paired(node) for node in nodes),
-        nested_conditionals=sum(is_nested_conditional(node) for node in nodes),
+        **totals,
+        paired_assignments=sum(map(is_paired, nodes)),
+        nested_conditionals=sum(map(is_nested_conditional, nodes)),
         double_comprehensions=sum(len(getattr(node, "generators", ())) > 1 for node in nodes),
         lone_helpers=lone_helpers(nodes),
     )
 
 
-def measured(text: str, tree: ast.AST) -> tuple[int, int, int]:
+def measured(text: str, tree: ast.AST) -> Counter[str]:
     """Return tokens, lines and comments of a file."""
     strings = docstring_places(tree)
-    tokens = 0
-    comments = 0
+    totals = Counter(lines=text.count("\n"), comments=0, tokens=0)
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
-        comments += token.type == tokenize.COMMENT
-        tokens += token.type not in LAYOUT and token.start not in strings
-    return tokens, text.count("\n"), comments
+        totals["comments"] += token.type == tokenize.COMMENT
+        totals["tokens"] += token.type not in LAYOUT and token.start not in strings
+    return totals
 
 
 def docstring_places(tree: ast.AST) -> set[tuple[int, int]]:
@@ -149,14 +138,14 @@ def docstring_places(tree: ast.AST) -> set[tuple[int, int]]:
 
 
 def is_paired(node: ast.AST) -> bool:
-    """Whether a statement assigns several values that are written out to several names."""
+    """Return True if a statement assigns several values that are written out to several names."""
     if not isinstance(node, ast.Assign) or not isinstance(node.value, ast.Tuple):
         return False
     return any(isinstance(target, ast.Tuple) for target in node.targets)
 
 
 def is_nested_conditional(node: ast.AST) -> bool:
-    """Whether an expression with `if` has another one in it."""
+    """Return True if an expression with `if` has another one in it."""
     return isinstance(node, ast.IfExp) and any(
         isinstance(part, ast.IfExp) for part in ast.walk(node) if part is not node
     )
@@ -164,51 +153,11 @@ def is_nested_conditional(node: ast.AST) -> bool:
 
 def lone_helpers(nodes: list[ast.AST]) -> int:
     """Return how many private functions are named once besides where they are defined."""
-    functions = (node for node in nodes if isinstance(node, ast.FunctionDef))
-    private = [
-        node.name
-        for node in functions
-        if node.name.startswith("_") and not node.name.endswith("__")
-    ]
+    functions = (node.name for node in nodes if isinstance(node, ast.FunctionDef))
+    private = Counter(name for name in functions if name.startswith("_") and name[-2:] != "__")
     mentions = Counter(node.id for node in nodes if isinstance(node, ast.Name))
     mentions += Counter(node.attr for node in nodes if isinstance(node, ast.Attribute))
-    return sum(mentions[name] == 1 for name, count in Counter(private).items() if count == 1)
-
-
-def descriptions_an_option() -> float:
-    """Return how often a parameter of a verb is described, in the mean.
-
-    Counted are the lines of `Args:` in the docstrings of verbs, and of other functions that have
-    their names.
-    """
-    functions = functions_of(nodes_below(ROOT / "deploy"))
-    options = {function.name: options_of(function) for function in functions if is_verb(function)}
-    descriptions = 0
-    for function in functions:
-        named = re.findall(r"^ +(\w+): ", ast.get_docstring(function) or "", re.MULTILINE)
-        descriptions += len(set(named) & options.get(function.name, set()))
-    return descriptions / sum(map(len, options.values()))
-
-
-def is_verb(function: ast.FunctionDef) -> bool:
-    """Return True if a function is decorated as a verb."""
-    return "verb" in map(ast.unparse, function.decorator_list)
-
-
-def options_of(verb: ast.FunctionDef) -> set[str]:
-    """Return the names of the parameters of a verb."""
-    return {each.arg for each in (*verb.args.args, *verb.args.kwonlyargs)}
-
-
-def nodes_below(folder: Path) -> list[ast.AST]:
-    """Return every node of the Python files below a folder."""
-    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in sorted(folder.rglob("*.py"))]
-    return list(chain.from_iterable(map(ast.walk, trees)))
-
-
-def functions_of(nodes: list[ast.AST]) -> list[ast.FunctionDef]:
-    """Return the functions among some nodes."""
-    return [node for node in nodes if isinstance(node, ast.FunctionDef)]
+    return sum(mentions[name] == 1 for name, count in private.items() if count == 1)
 
 
 if __name__ == "__main__":

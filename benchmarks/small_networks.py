@@ -1,24 +1,18 @@
-"""What INT8 costs eleven small networks that are trained briefly, next to AMD Quark.
+"""Eleven small networks, trained briefly: what `benchmarks.int8_peers` and `benchmarks.ablation`
+quantise.
 
-    python -m benchmarks.small_networks --images aerial-train/ --held-out aerial-test/ \
-        --quark-python quark/bin/python
-
-Prints a Markdown table: what PSNR is lost on samples that neither training nor calibration saw, in
-the mean and on the worst sample. With --tuned, also once our integers are fine-tuned on more
-samples, and Quark's weights are rounded by AdaRound. The samples are those of `examples.samples`,
-the environment of Quark that of `int8_peers.py`. Trained networks stay in the folder of --keep,
-where a later run finds them.
+What each learns from stands in `examples.samples`.
 """
 
 import argparse
 import re
-import sys
-import time
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -26,16 +20,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from beers_deploy import quantize
 from beers_deploy.model.metrics.fidelity import psnr_db
-from beers_deploy.quant.ends import ends_of
-from beers_deploy.quant.graph import read_network
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
-from benchmarks.int8_peers import OURS, QUARK, Peered, Restore, Way, print_lines, quantize_in_child
+from beers_deploy.quant.session import open_session, result_of
 from examples.networks import ESPCN, DnCNN
 from examples.samples import batches_of
 
-SIDE_PX = {"dncnn": 64, "espcn": 64}
+SIDE_PX = 64
 SEPARABLE = 32
 DENSE = 16
 """Features of networks with depthwise convolutions, and of those without."""
@@ -45,11 +36,6 @@ FAST = 5e-3
 """Samples of a step, and learning rates: of all networks, and of those that the image itself passes
 through.
 """
-TUNED = Way("beers-deploy, fine-tuned", False, OURS)
-MORE = 8
-"""Quantised and fine-tuned, in this process, on so many times the samples."""
-ADAROUND_STEPS = "1000"
-"""A layer's, Quark's own default."""
 
 
 def conv(
@@ -162,7 +148,7 @@ class Drawn:
     """Samples: images (K, C, H, W) in [0, 1], and their references."""
 
     images: np.ndarray
-    wanted: np.ndarray
+    references: np.ndarray
 
     @classmethod
     def of(cls, kind: str, folder: Path | None, seed: int, batches: int) -> "Drawn":
@@ -211,107 +197,70 @@ def save(network: nn.Module, side_px: int, path: Path) -> None:
     save_onnx(load_onnx(path), path)
 
 
-def losses(in_float: Restore, in_int8: Restore, held_out: Drawn) -> np.ndarray:
-    """Return what each sample loses, (K,): dB of PSNR."""
-    values = []
-    for image, reference in zip(held_out.images, held_out.wanted, strict=True):
-        results = [run(image[None]) for run in (in_float, in_int8)]
-        scores = [psnr_db(np.clip(result, 0, 1), reference[None], 1.0) for result in results]
-        values.append(scores[0] - scores[1])
-    return np.array(values)
+@dataclass(frozen=True)
+class Small:
+    """A trained network: its file, samples to calibrate on, and samples that judge it."""
+
+    path: Path
+    samples: Drawn
+    held_out: Drawn
+
+    def losses_db(self, int8: Path) -> np.ndarray:
+        """Return the PSNR that each held-out sample loses in INT8, (K,)."""
+        sessions = [open_session(load_onnx(path)) for path in (self.path, int8)]
+        values = []
+        for image, reference in zip(self.held_out.images, self.held_out.references, strict=True):
+            results = [result_of(session, image[None]) for session in sessions]
+            in_float, in_int8 = (
+                psnr_db(np.clip(result, 0, 1), reference[None], 1.0) for result in results
+            )
+            values.append(in_float - in_int8)
+        return np.array(values)
 
 
-def cells(
-    name: str, way: Way, python: str, folder: Path, samples: dict[bool, Drawn], held_out: Drawn
-) -> str:
-    """What a way loses: the mean, and the worst sample's.
+def options(text: str | None) -> argparse.ArgumentParser:
+    """Return the options that all scripts over these networks have."""
+    parser = argparse.ArgumentParser(
+        description=text, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--images", type=Path, help="folder of scenes; drawn ones if none")
+    parser.add_argument("--held-out", type=Path, help="folder of scenes to judge on")
+    parser.add_argument("--steps", type=int, default=1500, help="of the training")
+    parser.add_argument("--batches", type=int, default=8, help="of eight samples each")
+    parser.add_argument("--only", default="", help="networks whose names this expression matches")
+    parser.add_argument("--keep", type=Path, help="folder in which the trained networks stay")
+    return parser
 
-    `samples[True]` is what it tunes on.
-    """
+
+@contextmanager
+def folder_of(arguments: argparse.Namespace) -> Iterator[Path]:
+    """Yield the folder of --keep, or a temporary one."""
+    with TemporaryDirectory() as temporary:
+        folder = (arguments.keep or Path(temporary)).resolve()
+        folder.mkdir(parents=True, exist_ok=True)
+        yield folder
+
+
+def prepared(name: str, arguments: argparse.Namespace, folder: Path) -> Small:
+    """Train a network unless the folder has it, and draw its samples."""
+    kind, _ = NETWORKS[name]
     path = folder / f"{slug(name)}.onnx"
-    model = load_onnx(path)
-    network = Peered(model, ends_of(read_network(model)))
-    patches = path.with_suffix(".npy")
-    out = path.with_suffix(f".{slug(way.name)}.onnx")
-    if way is TUNED:
-        seconds = fine_tune(path, samples[True], out)
-    else:
-        np.save(patches, samples[False].images)
-        seconds, _ = quantize_in_child(way, {False: (path, patches)}, out, python)
-    sample_losses = losses(network.runner(path), network.runner(out), held_out)
-    print(name, way.name, f"{seconds:.0f} s", file=sys.stderr)
-    return f"{sample_losses.mean():.2f}, {sample_losses.max():.2f}"
+    if not path.exists():
+        # ESPCN doubles the size, so its images have half the side of its references.
+        side_px = SIDE_PX // (2 if kind == "espcn" else 1)
+        save(trained(name, arguments.images, arguments.steps), side_px, path)
+    return Small(
+        path,
+        Drawn.of(kind, arguments.images, 5, arguments.batches),
+        Drawn.of(kind, arguments.held_out, 6, arguments.batches),
+    )
 
 
-def fine_tune(path: Path, tuning: Drawn, out: Path) -> float:
-    """Quantise and fine-tune a network; return the processor time in seconds."""
-    begun = time.process_time()
-    samples = tuning.images, tuning.wanted
-    save_onnx(quantize(path, samples=samples, finetune="auto", progress=False).model, out)
-    return time.process_time() - begun
+def names_in(arguments: argparse.Namespace, *more: str) -> list[str]:
+    """Return the names of the networks, and of some more, that --only matches."""
+    return [name for name in (*NETWORKS, *more) if re.search(arguments.only, name)]
 
 
 def slug(name: str) -> str:
-    """For the name of a file."""
+    """Return a name for a file."""
     return name.lower().replace(",", "").replace(" ", "-")
-
-
-def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
-    """Line by line, as each network is judged."""
-    ours = [Way("beers-deploy", False, OURS, ("ours",))]
-    quark = [Way("Quark XINT8", False, QUARK, (), ("0",))]
-    if arguments.tuned:
-        ours.append(TUNED)
-        quark.append(Way("Quark XINT8, AdaRound", False, QUARK, (), (ADAROUND_STEPS,)))
-    ways = [(way, sys.executable) for way in ours]
-    if arguments.quark_python:
-        ways += [(way, arguments.quark_python) for way in quark]
-    yield f"| network | {' | '.join(way.name for way, _ in ways)} |"
-    yield "|---" * (len(ways) + 1) + "|"
-    for name, (kind, _) in NETWORKS.items():
-        if not re.search(arguments.only, name):
-            continue
-        path = folder / f"{slug(name)}.onnx"
-        # ESPCN doubles the size, so its images have half the side of its references.
-        if not path.exists():
-            save(
-                trained(name, arguments.images, arguments.steps),
-                SIDE_PX[kind] // (2 if kind == "espcn" else 1),
-                path,
-            )
-        samples = {False: Drawn.of(kind, arguments.images, 5, arguments.batches)}
-        if arguments.tuned:
-            samples[True] = Drawn.of(kind, arguments.images, 5, MORE * arguments.batches)
-        held_out = Drawn.of(kind, arguments.held_out, 6, arguments.batches)
-        columns = [cells(name, way, python, folder, samples, held_out) for way, python in ways]
-        yield f"| {name} | {' | '.join(columns)} |"
-
-
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--images", type=Path, help="folder of scenes to train and calibrate on; drawn ones if none"
-    )
-    parser.add_argument(
-        "--held-out", type=Path, help="folder of scenes to judge on; drawn ones if none"
-    )
-    parser.add_argument("--steps", type=int, default=1500)
-    parser.add_argument(
-        "--batches", type=int, default=8, help="of eight samples: to calibrate on, and to judge on"
-    )
-    parser.add_argument("--tuned", action="store_true", help="fine-tune as well; minutes a network")
-    parser.add_argument(
-        "--quark-python", help="interpreter of the environment that AMD Quark is installed in"
-    )
-    parser.add_argument(
-        "--only", default="", help="networks whose names this regular expression finds"
-    )
-    parser.add_argument("--keep", type=Path, help="folder for the networks")
-    print_lines(table, parser.parse_args())
-
-
-if __name__ == "__main__":
-    main()

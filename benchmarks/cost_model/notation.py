@@ -46,18 +46,15 @@ read whole. Batch norms and activations behind a convolution are fused into it a
 Every file knows the blocks of all files.
 """
 
-import ast
-import operator
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 from beers_deploy.dpu.cost.model import Task
-from benchmarks.cost_model.builder import Builder, Size, Tensor, Written
-
-Value = Tensor | Size
+from benchmarks.cost_model.builder import Builder, Tensor, Written
 
 STEPS: Mapping[str, Callable[..., Tensor]] = {
     "conv": Builder.conv,
@@ -80,13 +77,6 @@ STEPS: Mapping[str, Callable[..., Tensor]] = {
     "hswish": lambda builder, x: builder.activation(x, "HardSwish"),
     "out": Builder.out,
 }
-FLAGS = ("valid", "ceil")
-SIGNS: Mapping[type[ast.operator], Callable[[int, int], int]] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.floordiv,
-}
 KINDS = {
     "images": "image-to-image",
     "segmentation": "segmentation",
@@ -96,24 +86,26 @@ KINDS = {
     "inceptions": "classifiers",
 }
 """What the networks of a file do."""
+SIZE = re.compile(r"\b(\d+)x(\d+)\b")
+FLAG = re.compile(r"\b(valid|ceil)\b")
 HEADER = ("family", "host", "gop", "source", "image")
 
 
 @dataclass
 class Block:
-    """Lines under a name, each with its place; parameters with the text of their defaults."""
+    """Lines under a name, and its parameters with the text of their defaults."""
 
-    parameters: Mapping[str, str | None]
-    lines: list[tuple[str, str]] = field(default_factory=list)
+    parameters: dict[str, str]
+    lines: list[str] = field(default_factory=list)
 
 
 @dataclass
 class Entry:
-    """A network of a file: what it does, its header, and its lines, each with its place."""
+    """A network of a file: what it does, its header and its lines."""
 
-    kind: str = ""
+    kind: str
     header: dict[str, str] = field(default_factory=dict)
-    lines: list[tuple[str, str]] = field(default_factory=list)
+    lines: list[str] = field(default_factory=list)
 
     @property
     def family(self) -> str:
@@ -135,137 +127,74 @@ class Entry:
 class Library:
     """The blocks and networks of some files."""
 
-    blocks: Mapping[str, Block]
-    networks: Mapping[str, Entry]
+    blocks: dict[str, Block] = field(default_factory=dict)
+    networks: dict[str, Entry] = field(default_factory=dict)
 
     def write(self, name: str) -> Written:
-        """One network, layer by layer.
+        """Return one network, layer by layer.
 
         Raises:
-            ValueError: a line that cannot be understood, or shapes that do not fit; it names file
-                and line.
+            ValueError: shapes do not fit.
         """
         entry = self.networks[name]
-        scope = _Scope(self.blocks, Builder(*map(int, entry.header["image"].split())), {})
-        for place, line in entry.lines:
-            try:
-                scope.run(line)
-            except (
-                ArithmeticError,
-                AssertionError,
-                LookupError,
-                SyntaxError,
-                TypeError,
-                ValueError,
-            ) as error:
-                raise ValueError(f"{place}: {line} ({error})") from error
-        return scope.builder.written(scope.x)
+        builder = Builder(*map(int, entry.header["image"].split()))
+        return builder.written(self._run(builder, entry.lines, {"x": builder.image}))
+
+    def _run(self, builder: Builder, lines: Sequence[str], names: dict[str, Any]) -> Tensor:
+        """Take the steps of some lines, and return their last x."""
+        result: Tensor
+        for line in lines:
+            name, equals, steps = line.partition(" = ")
+            result = names["x"]
+            names["ch"] = result.channels
+            for step in (steps if equals else line).split("|"):
+                result = self._step(builder, result, step.strip(), names)
+            names[name if equals else "x"] = result
+        result = names["x"]
+        return result
+
+    def _step(self, builder: Builder, x: Tensor, step: str, names: dict[str, Any]) -> Tensor:
+        if isinstance(kept := names.get(step), Tensor):
+            return kept
+        step, _, times = step.partition(" *")
+        word, *texts = step.split()
+        for _ in range(_value(times or "1", names)):
+            if word in STEPS:
+                call = FLAG.sub(r"\1=1", ", ".join(texts))
+                x = _value(f"step({call})", {**names, "step": partial(STEPS[word], builder, x)})
+            else:
+                block = self.blocks[word]
+                arguments = block.parameters | dict(zip(block.parameters, texts, strict=False))
+                values = {key: _value(text, names) for key, text in arguments.items()}
+                x = self._run(builder, block.lines, {**values, "x": x})
+        return x
+
+
+def _value(text: str, names: Mapping[str, Any]) -> Any:
+    """Evaluate a number, a size or a kept result: expressions of Python, but for 1x7 and `/`."""
+    python = SIZE.sub(r"(\1, \2)", text).replace("/", "//")
+    return eval(python, {}, dict(names))  # noqa: S307 - files of this folder
 
 
 def read_library(paths: Sequence[Path]) -> Library:
-    """The blocks and networks of `.net` files."""
-    blocks: dict[str, Block] = {}
-    networks: dict[str, Entry] = {}
-    target: Block | Entry = Entry()
+    """Read the blocks and networks of `.net` files."""
+    library = Library()
+    target: Block | Entry = Block({})
     for path in paths:
-        for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+        for text in path.read_text(encoding="utf-8").splitlines():
             line = text.partition("#")[0].rstrip()
             kind, _, rest = line.strip().partition(" ")
             if not line:
                 continue
             if line[0].isspace():
-                if isinstance(target, Entry) and kind in HEADER and kind not in target.header:
+                if isinstance(target, Entry) and kind in HEADER:
                     target.header[kind] = rest.strip()
                 else:
-                    target.lines.append((f"{path.name}, line {number}", line.strip()))
+                    target.lines.append(line.strip())
             elif kind == "block":
                 name, *parameters = rest.split()
                 pairs = (parameter.partition("=") for parameter in parameters)
-                target = blocks[name] = Block({key: default or None for key, _, default in pairs})
+                target = library.blocks[name] = Block({key: text for key, _, text in pairs})
             else:
-                target = networks[rest.strip()] = Entry(KINDS[path.stem])
-    return Library(blocks, networks)
-
-
-class _Scope:
-    """A network or a block while its lines are read."""
-
-    def __init__(
-        self, blocks: Mapping[str, Block], builder: Builder, names: Mapping[str, Value]
-    ) -> None:
-        self.blocks = blocks
-        self.builder = builder
-        self.names: dict[str, Value] = {"x": builder.image, **names}
-
-    @property
-    def x(self) -> Tensor:
-        """Where a line starts."""
-        tensor = self.names["x"]
-        assert isinstance(tensor, Tensor)  # noqa: S101 - x is kept by `run` alone
-        return tensor
-
-    def run(self, line: str) -> None:
-        """Take all steps of a line."""
-        name, equals, steps = line.partition(" = ")
-        result = self.x
-        self.names["ch"] = result.channels
-        for step in (steps if equals else line).split("|"):
-            result = self._step(result, step.split())
-        self.names[name if equals else "x"] = result
-
-    def _step(self, x: Tensor, words: list[str]) -> Tensor:
-        times = self._number(words.pop()[1:]) if words[-1].startswith("*") else 1
-        if len(words) == 1 and isinstance(tensor := self.names.get(words[0]), Tensor):
-            return tensor
-        for _ in range(times):
-            x = self._call(x, words[0], words[1:])
-        return x
-
-    def _call(self, x: Tensor, word: str, arguments: list[str]) -> Tensor:
-        if word in STEPS:
-            options = [text.partition("=") for text in arguments if "=" in text or text in FLAGS]
-            values = [
-                self._value(text) for text in arguments if "=" not in text and text not in FLAGS
-            ]
-            return STEPS[word](
-                self.builder, x, *values, **{k: self._number(text or "1") for k, _, text in options}
-            )
-        block = self.blocks[word]
-        texts = {**block.parameters, **dict(zip(block.parameters, arguments, strict=False))}
-        scope = _Scope(
-            self.blocks,
-            self.builder,
-            {**{k: self._value(str(v)) for k, v in texts.items()}, "x": x},
-        )
-        for _, line in block.lines:
-            scope.run(line)
-        return scope.x
-
-    def _value(self, text: str) -> Value:
-        """A kept result, a size or a number."""
-        if text in self.names:
-            return self.names[text]
-        height, times, width = text.partition("x")
-        if times and height.isdecimal() and width.isdecimal():
-            return int(height), int(width)
-        return self._number(text)
-
-    def _number(self, text: str) -> int:
-        return self._evaluate(ast.parse(text, mode="eval").body)
-
-    def _evaluate(self, node: ast.expr) -> int:
-        """A whole number, a name of one, or a sum, difference, product or exact
-        quotient of such.
-        """
-        if isinstance(node, ast.BinOp):
-            left = self._evaluate(node.left)
-            right = self._evaluate(node.right)
-            if isinstance(node.op, ast.Div) and left % right:
-                raise ValueError(f"{left} / {right} is not exact")
-            return SIGNS[type(node.op)](left, right)
-        value: object = (
-            self.names.get(node.id) if isinstance(node, ast.Name) else ast.literal_eval(node)
-        )
-        if not isinstance(value, int):
-            raise ValueError(f"no number: {ast.unparse(node)}")
-        return value
+                target = library.networks[rest.strip()] = Entry(KINDS[path.stem])
+    return library

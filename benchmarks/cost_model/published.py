@@ -103,13 +103,13 @@ def host_cores(board: str) -> int:
 
 
 @cache
-def published_cases(board: str, *, slower: bool = False) -> tuple[Case, ...]:
-    """The published rates of a board, or those of its SLOWER releases; one case a network and
-    configuration.
+def published_cases(board: str) -> tuple[Case, ...]:
+    """Return the published rates of a board, without those of its SLOWER releases; one case a
+    network and configuration.
     """
     cases = defaultdict(list)
     for rate in published_rates():
-        if rate["board"] == board and (rate["release"] in SLOWER.get(board, ())) is slower:
+        if rate["board"] == board and rate["release"] not in SLOWER.get(board, ()):
             cases[rate["network"], rate["configuration"]].append(rate)
     return tuple(
         network_case(

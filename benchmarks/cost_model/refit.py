@@ -18,18 +18,15 @@ import numpy as np
 from beers_deploy.dpu.cost.latency import WIDTHS
 from benchmarks.cost_model.fit import fit, rounded
 from benchmarks.cost_model.notation import KINDS
-from benchmarks.cost_model.published import NETWORKS, SLOWER, boards, written
+from benchmarks.cost_model.published import NETWORKS, boards, written
 from benchmarks.cost_model.validation import (
     Nested,
     by_network,
     coverage,
     nested,
-    one_thread,
     outside_width,
-    owner_errors,
     pair_width,
     rank_correlation,
-    transferred,
 )
 
 TARGETS = Path(__file__).parents[2] / "profiles" / "targets"
@@ -169,26 +166,6 @@ def by_kind() -> Iterator[tuple[object, ...]]:
             )
 
 
-def owners() -> Iterator[tuple[object, ...]]:
-    """What one run of an owner's board leaves of the error on other families."""
-    yield "board of the owner", "no run", "one run", "one run, wholly believed"
-    for board in boards():
-        yield board, *map(_percent, owner_errors(board))
-    for board, releases in SLOWER.items():
-        yield f"{board}, {' and '.join(releases)}", *map(_percent, owner_errors(board, slower=True))
-
-
-def others() -> Iterator[tuple[object, ...]]:
-    """Rates of one thread, and boards predicted with the ZCU102's constants."""
-    yield "what", "networks", "median", "mean", "largest"
-    for board in boards():
-        off = by_network(*one_thread(board))
-        yield f"{board}, one thread", len(off), *_spread(off)
-    for board in ("zcu104", "kv260"):
-        off = by_network(*transferred("zcu102", board))
-        yield f"{board}, the ZCU102's constants", len(off), *_spread(off)
-
-
 def _spread(off: np.ndarray) -> list[str]:
     return [_percent(float(value)) for value in (np.median(off), off.mean(), off.max())]
 
@@ -223,8 +200,6 @@ def main() -> int:
     print(f"{'not as fitted' if check else 'rewritten'}: {', '.join(stale) or 'none'}\n")
     print(table(accuracy()))
     print(table(by_kind()))
-    print(table(others()))
-    print(table(owners()))
     return int(check and bool(stale))
 
 

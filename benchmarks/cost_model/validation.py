@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from scipy.stats import binom, spearmanr
 
 from beers_deploy.dpu.cost.model import Array, Constants, Regime, Structure, regime_of
-from beers_deploy.dpu.cost.own_runs import SCATTER
 from beers_deploy.profiles.target import TargetProfile
 from benchmarks.cost_model.fit import Cases, fit
 from benchmarks.cost_model.published import boards, host_cores, published_cases
@@ -102,20 +101,15 @@ def nested(board: str) -> Nested:
 
 
 @cache
-def chosen(board: str, left_out: str = "", *, seen: bool = True) -> float:
+def chosen(board: str, left_out: str = "") -> float:
     """The crowding of least mean error over the boards of a board's processor, all families but
     one.
 
     Args:
         board: its name.
         left_out: a family.
-        seen: whether the board's own rates count.
     """
-    similar = [
-        other
-        for other in boards()
-        if host_cores(other) == host_cores(board) and (seen or other != board)
-    ]
+    similar = [other for other in boards() if host_cores(other) == host_cores(board)]
     scores = [
         np.mean([_trial(other, crowding).score(left_out) for other in similar])
         for crowding in CROWDINGS
@@ -301,58 +295,3 @@ def rank_correlation(validation: Nested) -> float:
     """Spearman's: does the model put networks in the right order."""
     errors = np.array([row.error for row in validation.rows])
     return float(spearmanr(validation.cases.observed, validation.cases.observed + errors).statistic)
-
-
-def one_thread(board: str) -> tuple[list[str], list[Array]]:
-    """Names and ln(predicted / published) of rates with one thread, each family left out."""
-    trial = _trial(board, chosen(board))
-    names = []
-    errors = []
-    for family in trial.names:
-        tested = trial.cases.only(trial.cases.families == family)
-        single = tested.residuals(trial.fit_without({family}))[len(tested.rows) :]
-        for row, error in zip(tested.rows, single, strict=True):
-            if row.fps_single:
-                names.append(row.network)
-                errors.append(np.array([error]))
-    return names, errors
-
-
-def owner_errors(board: str, *, slower: bool = False) -> list[float]:
-    """Mean |predicted / published - 1| with no run of an owner, with one, and with one that is
-    wholly believed.
-
-    Each case in turn is the owner's run and corrects all others of its part (DPU or host), each
-    family predicted without itself; only other families count. `slower` takes an owner whose board
-    has one of SLOWER's images.
-    """
-    trial = _trial(board, chosen(board))
-    cases = Cases(published_cases(board, slower=slower), trial.cases.structure)
-    errors = np.zeros(len(cases.rows))
-    on_host = np.zeros(len(cases.rows), dtype=bool)
-    for name in dict.fromkeys(cases.families):
-        mine = cases.families == name
-        constants = trial.fit_without({name})
-        errors[mine] = cases.only(mine).errors(constants)
-        on_host[mine] = [kind == "host" for kind in regimes_of(cases.only(mine), constants)]
-    # A run of an owner corrects only cases of its own part, the DPU's or the host's.
-    owners = errors[:, None] * (on_host[:, None] == on_host)
-    others = cases.families[:, None] != cases.families
-    return [
-        float(np.abs(np.expm1(errors - share * owners))[others].mean())
-        for share in (0, 1 / (1 + SCATTER), 1)
-    ]
-
-
-def transferred(source: str, target: str) -> tuple[list[str], list[Array]]:
-    """Names and errors of a board's cases with constants fitted to another's rates, without the
-    family of each.
-    """
-    crowding = chosen(target, seen=False)
-    cases = _trial(target, crowding).cases
-    trial = _trial(source, crowding)
-    errors = np.zeros(len(cases.rows))
-    for name in dict.fromkeys(cases.families):
-        mine = cases.families == name
-        errors[mine] = cases.only(mine).errors(trial.fit_without({name}))
-    return [row.network for row in cases.rows], [np.array([error]) for error in errors]

@@ -8,6 +8,7 @@ version survives. A test keeps the list true to the code.
 """
 
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -16,10 +17,8 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from shutil import copyfile
-from xml.etree import ElementTree as ET
 
 from beers_deploy.model.progress import steps
 
@@ -28,6 +27,7 @@ LIST = ROOT / "docs" / "explanation" / "mutations.toml"
 TARGET = ROOT / "docs" / "explanation" / "mutations.md"
 SUITE = "tests/stability"
 PROBE_FILE = "test_copy.py"
+FAILED = re.compile(r"^(?:FAILED|ERROR) \S+/(\w+\.py::\w+)", re.MULTILINE)
 PROBE = """
 from pathlib import Path
 import beers_deploy
@@ -102,52 +102,41 @@ def repository_copy() -> Iterator[Path]:
         yield copy
 
 
-def failures_of(copy: Path, mutation: Mutation, *selection: str) -> Failures:
+def failures_of(copy: Path, mutation: Mutation) -> Failures:
     """Break the copy, run its stability tests, put it right again."""
     file = copy / mutation.file
     original = file.read_text(encoding="utf-8")
     file.write_text(broken(original, mutation), encoding="utf-8")
     try:
-        return failures(copy, *selection)
+        return failures(copy)
     finally:
         file.write_text(original, encoding="utf-8")
 
 
-def failures(copy: Path, *selection: str) -> Failures:
-    """The tests of the copy that fail, in the files that the list names.
+def failures(copy: Path) -> Failures:
+    """Return the tests of the copy that fail, in the files that the list names.
 
     Raises:
         SystemExit: they could not be run, or ran somebody else's code.
     """
-    report = copy / "report.xml"
-    options = ["-n", "0", "-p", "no:cacheprovider", "--tb=no", "--hypothesis-seed=0"]
-    options += [f"--junitxml={report}", *selection]
-    environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
-    names = chain.from_iterable(mutation.tests for mutation in MUTATIONS)
-    test_files = {name.partition("::")[0] for name in names}
-    files = [f"{SUITE}/{name}" for name in sorted({PROBE_FILE, *test_files})]
-    command = [sys.executable, "-m", "pytest", *files, *options]
+    names = set[str]().union(*(mutation.tests for mutation in MUTATIONS))
+    files = {name.partition("::")[0] for name in names}
+    paths = [f"{SUITE}/{name}" for name in sorted({PROBE_FILE, *files})]
+    options = ["-n0", "-pno:cacheprovider", "--tb=no", "-q", "-rfE", "--hypothesis-seed=0"]
     process = subprocess.run(  # noqa: S603
-        command, cwd=copy, env=environment, capture_output=True, text=True, check=False
+        [sys.executable, "-m", "pytest", *paths, *options],
+        cwd=copy,
+        env={**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if process.returncode not in (0, 1):
         raise SystemExit(process.stdout + process.stderr)
-    tests = read_report(report.read_text(encoding="utf-8"))
+    tests = Counter(FAILED.findall(process.stdout))
     if any(name.startswith(PROBE_FILE) for name in tests):
         raise SystemExit(f"not the code of {copy} is what runs there")
     return tests
-
-
-def read_report(text: str) -> Failures:
-    """Failures in a report of pytest's."""
-    cases = [*ET.fromstring(text).iter("testcase")]  # noqa: S314 - pytest wrote it a moment ago
-    failed = [
-        case for case in cases if case.find("failure") is not None or case.find("error") is not None
-    ]
-    return Counter(
-        f"{case.attrib['classname'].rpartition('.')[2]}.py::{case.attrib['name'].partition('[')[0]}"
-        for case in failed
-    )
 
 
 def document(failures_by: Mapping[str, Failures]) -> str:

@@ -13,9 +13,8 @@ whose name is WORDS, a colon and the document's name of it.
 
 import re
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -54,82 +53,49 @@ def tables_of(path: Path) -> dict[str, list[Row]]:
 
 
 def filled(tables: Mapping[str, list[Row]], match: re.Match[str]) -> str:
-    """A marked table made anew, or as it stands where the document has none of that name."""
+    """Return a marked table with the figures of a document, or as it is if no document has it."""
     name = match["name"]
     if name not in tables:
         return match[0]
     columns = [cell.strip() for cell in match["table"].split("\n")[0].strip("| ").split("|")]
     kind = name.rpartition(": ")[2]
     by_method = kind.startswith("mean") or kind == "targets"
-    table = mean_table(tables[name], columns) if by_method else plain_table(tables[name], columns)
-    return f"{match[1]}{table}{match[4]}"
-
-
-def mean_table(rows: Iterable[Row], columns: list[str]) -> str:
-    """Return a table with a row for each method and the columns that the page wants, without the
-    paper's rows.
-    """
-    ours = [row for row in rows if not row["name"].startswith("paper")]
-    names = chain.from_iterable(row["figures"] for row in ours)
-    titles = {key: f"{key} {unit(ours, key)}".replace(" ratio", "") for key in names}
-    keys = []
-    for title in columns:
-        keys += [key for key in titles if titles[key] == title]
-    head = ["method", "sensor", *(titles[key] for key in keys)]
-    lines = []
-    for row in ours:
-        figures = [
-            shown(row["figures"].get(key), digits=DIGITS_OF_BIAS if "bias" in key else None)
-            for key in keys
-        ]
-        lines.append([row["name"], row["text"]["sensor"], *figures])
-    return markdown(head, lines)
-
-
-def plain_table(rows: list[Row], columns: list[str]) -> str:
-    """A row a line, a column for each figure that the page wants; intervals of
-    differences alone.
-    """
-    names = dict.fromkeys(chain.from_iterable(row["figures"] for row in rows))
-    keys = [key for key in names if key in columns]
-    differences = "gain" in rows[0]["table"] or "lost" in rows[0]["table"]
-    cells = ([shown(row["figures"].get(key), differences) for key in keys] for row in rows)
-    return markdown(
-        ["", *keys], [[row["name"], *line] for row, line in zip(rows, cells, strict=True)]
+    # Intervals of single figures would fill a table of conditions: there only differences have them.
+    intervals = by_method or "gain" in kind or "lost" in kind
+    rows = [row for row in tables[name] if not row["name"].startswith("paper")]
+    keys = dict[str, str]()
+    for row in rows:
+        for key, figure in row["figures"].items():
+            title = f"{key} {figure['unit']}".replace(" ratio", "") if by_method else key
+            keys.setdefault(title, key)
+    titles = [title for title in columns if title in keys]
+    lines = [["method", "sensor", *titles] if by_method else ["", *titles]]
+    lines.append(["---"] * len(lines[0]))
+    for row in rows:
+        cells = [shown(row["figures"].get(keys[title]), keys[title], intervals) for title in titles]
+        sensor = [row["text"]["sensor"]] if by_method else []
+        lines.append([row["name"], *sensor, *cells])
+    texts = (
+        f"|{'|'.join(line)}|" if "---" in line else f"| {' | '.join(line)} |" for line in lines
     )
+    return "\n".join([match[1].rstrip("\n"), *texts, match[4]])
 
 
-def unit(rows: Iterable[Row], key: str) -> str:
-    """The unit of a figure, in the first row that has it."""
-    return next((str(row["figures"][key]["unit"]) for row in rows if key in row["figures"]), "")
-
-
-def shown(figure: Figure | None, interval: bool = True, digits: int | None = None) -> str:
-    """A figure as the page writes it, with its interval where there is one."""
+def shown(figure: Figure | None, key: str, interval: bool) -> str:
+    """Return a figure as the page writes it, with its interval if asked for."""
     if figure is None or figure.get("value") is None:
         return str(figure["source"]) if figure and figure.get("unit") == "" else "-"
-    if digits is None:
-        digits = (
-            0
-            if figure["unit"] == "ratio" and figure["value"] > 2
-            else DIGITS.get(figure["unit"], 2)
-        )
-    text = f"{figure['value']:.{digits}f}"
-    ends = figure.get("interval")
-    return f"{text} [{ends[0]:.{digits}f}, {ends[1]:.{digits}f}]" if ends and interval else text
-
-
-def markdown(head: list[str], lines: Iterable[list[str]]) -> str:
-    """A table in Markdown."""
-    rule = "|".join("---" for _ in head)
-    return "".join(
-        f"{line}\n"
-        for line in (
-            f"| {' | '.join(head)} |",
-            f"|{rule}|",
-            *(f"| {' | '.join(x)} |" for x in lines),
-        )
-    )
+    digits = DIGITS.get(figure["unit"], 2)
+    if "bias" in key:
+        digits = DIGITS_OF_BIAS
+    elif figure["unit"] == "ratio" and figure["value"] > 2:
+        digits = 0
+    numbers = [
+        f"{number:.{digits}f}" for number in (figure["value"], *(figure.get("interval") or ()))
+    ]
+    if interval and len(numbers) > 1:
+        return f"{numbers[0]} [{', '.join(numbers[1:])}]"
+    return numbers[0]
 
 
 if __name__ == "__main__":

@@ -15,7 +15,8 @@ whose power falls as S / r^2. The power of natural scenes falls approximately so
   = mean over the frequencies of |H|^2 |D|^2 / r^2, H is the transfer of the sensor, and D that of a
   difference of neighbours (|D|^2 is the mean of both axes).
 4. epsilon = a (N / S)^p, and at most 0.33 sigma / L, the root of the mean of v over the mean
-  radiance. The constants a and p are fitted by `benchmarks/traditional_epsilon.py`.
+  radiance. The constants a and p were fitted by
+  `git show 793b3353:benchmarks/traditional_epsilon.py`.
 
 A change of the gain, which scales radiance and noise together, leaves epsilon as it is.
 """

@@ -8,12 +8,7 @@ from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import predict
 from beers_deploy.dpu.cost.model import Constants, Structure
-from beers_deploy.model.traditional.nl_bayes import QUALITIES
-from beers_deploy.profiles.shipped import board_names
-from beers_deploy.profiles.target import TargetProfile
 from benchmarks.cost_model.builder import Builder
-from benchmarks.cost_model.chain_time import BOUND_BY, HEIGHT_PX, WIDTH_PX, Rates, s_per_mpx
-from benchmarks.cost_model.chain_work import UNITS, chain_work
 from benchmarks.cost_model.fit import Cases, fit, rounded
 from benchmarks.cost_model.published import (
     NETWORKS,
@@ -107,41 +102,3 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
     b = Builder(8, 8, 4)
     with pytest.raises(ValueError, match="shapes differ"):
         b.add(b.conv(b.image, 8), b.image)
-
-
-# Of one core of a Zen 4 server, and the pipeline's CPU time on it for 256 x 256.
-MEASURED = Rates(
-    {
-        "box sums": 4.71e10,
-        "group products": 3.38e10,
-        "factorisations": 2.84e9,
-        "selection": 8.21e7,
-        "transforms": 1.44e10,
-        "passes": 4.68e10,
-        "strided": 5.24e9,
-        "gathers": 9.74e9,
-        "calls": 4.27e5,
-    },
-    {"products": 9.00e10, "integers": 4.70e9, "memory": 4.68e10},
-)
-MEASURED_S = 0.470
-MEASURED_PX = 256
-
-
-@pytest.mark.parametrize("board", board_names())
-def test_the_stored_time_of_the_pipeline_is_what_the_model_says(board: str) -> None:
-    """Of rates measured on another day: within a fifth at each end."""
-    target = TargetProfile.load(board)
-    quality = QUALITIES["standard"]
-    explained = (
-        math.fsum(MEASURED.times_s(chain_work(MEASURED_PX, MEASURED_PX, quality)).values())
-        / MEASURED_S
-    )
-    times_s = MEASURED.times_s(chain_work(HEIGHT_PX, WIDTH_PX, quality))
-    shares = {
-        kind: explained * time_s / math.fsum(times_s.values()) for kind, time_s in times_s.items()
-    }
-    assert set(shares) == set(UNITS) == set(BOUND_BY)
-    ends = s_per_mpx(1e6 * MEASURED_S / MEASURED_PX**2, shares, MEASURED, target)
-    stored = target.constant("cpu", "chain_s_per_mpx")
-    assert ends == pytest.approx((stored.low, stored.high), rel=0.2)

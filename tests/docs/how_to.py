@@ -55,18 +55,16 @@ SHORTER = {
     r"--out board\.json": "--out processor.json",
     r"(beers-deploy gate)": r"\1 --patches 4",
     r"(training\.py .*)$": r"\1 --steps 4",
-    r"(characterize\.py .*)--sensors 10": r"\1--sensors 1",
-    r"(edge_curves\.py .*)--repeats 3": r"\1--repeats 1",
+    r"(benchmarks\.characterize .*)--sensors 10": r"\1--sensors 1",
     r"raw1\.tif:412,300,28,34": "raw1.tif:114,82,28,34",
     r"raw1\.tif:440,330,34,28": "raw1.tif:140,114,34,28",
-    r"(formats\.py)": r"\1 --size 320x256",
     r"IMAGE OUT": "raw.tif restored.tif",
     r"(beers-deploy evaluate)": r"\1 --methods degraded",
 }
 """Patterns in a command, and what stands there instead so that a test takes seconds."""
 
 NEEDED = {
-    r"\.jp2|\.vrt|\.XML|--cog|bands\.tif|formats\.py": "rasterio",
+    r"\.jp2|\.vrt|\.XML|--cog|bands\.tif": "rasterio",
     r"--stac": "pystac",
     r"rio cogeo": "rio_cogeo",
 }

@@ -10,8 +10,7 @@ from PIL import Image
 
 from beers_deploy.model.io.pictures import Stretch
 from beers_deploy.profiles.sensor import Sensor
-from benchmarks.detector.labelled import synthetic_labelled
-from benchmarks.detector.scenes import CLASSES
+from benchmarks.detector.demonstration import synthetic_labelled
 
 Object = tuple[str, float, float, float, float]
 """A name, then left, top, right and bottom in continuous px."""
@@ -109,7 +108,7 @@ def labelled(folder: Path, count: int) -> Path:
     full_scale = Sensor.load("pleiades-reference").nominal()
     folder.mkdir()
     for number in range(count):
-        scene = synthetic_labelled(number, 0, np.arange(len(CLASSES)))
+        scene = synthetic_labelled(number, 0)
         picture = Stretch(0, 4095 / full_scale.gain_dn_per_radiance).to_srgb(
             scene.radiance(full_scale)
         )
