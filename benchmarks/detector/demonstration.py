@@ -16,10 +16,9 @@ from beers_deploy.studies.detection.detector import open_detector
 from beers_deploy.studies.detection.study import LabelledScene, run_study
 from beers_deploy.studies.detection.table import detection_table
 from beers_deploy.studies.evaluation.methods import DEGRADED
+from benchmarks.detector.network import DETECTOR
 from benchmarks.detector.scenes import synthetic_scene
 
-DETECTOR = Path(__file__).with_name("detector.onnx")
-"""The small detector, trained: it finds vehicles, ships, aircraft and tanks of synthetic scenes."""
 SIDE_PX = 768
 """Of a synthetic scene: 256 pixels a side of a sensor that makes one of three, the input of the
 small detector.

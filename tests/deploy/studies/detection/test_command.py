@@ -10,7 +10,7 @@ from beers_deploy.profiles.errors import OptionError
 from beers_deploy.studies.detection.tables import PAPER_TABLE, paper_rows
 from beers_deploy.verbs.evaluate import evaluate
 from benchmarks.detector import demonstration
-from benchmarks.detector.demonstration import DETECTOR
+from benchmarks.detector.network import DETECTOR
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 from tests.deploy.studies.detection.folders import Object, dior, labelled, voc
