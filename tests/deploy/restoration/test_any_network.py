@@ -40,22 +40,22 @@ def saved(model: onnx.ModelProto, folder: Path) -> Path:
     return folder / "models" / "network.onnx"
 
 
-@pytest.fixture(
-    params=[
-        float_unet,
-        plain_int8_unet,
-        espcn,
-        ffdnet,
-        half_resolution,
-        int8_half_resolution,
-        four_bands,
-        partial(four_bands, 2),
-    ],
-    ids=str,
-)
+NETWORKS: dict[str, Callable[[], onnx.ModelProto]] = {
+    "U-Net": float_unet,
+    "INT8 U-Net": plain_int8_unet,
+    "ESPCN": espcn,
+    "FFDNet": ffdnet,
+    "half resolution": half_resolution,
+    "INT8 half resolution": int8_half_resolution,
+    "4 bands": four_bands,
+    "4 bands to 2": partial(four_bands, 2),
+}
+
+
+@pytest.fixture(params=NETWORKS)
 def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """Return the file of a network."""
-    return saved(request.param(), tmp_path)
+    return saved(NETWORKS[request.param](), tmp_path)
 
 
 def noise(path: Path, size: tuple[int, int] = SIZE) -> np.ndarray:
@@ -120,7 +120,7 @@ def test_one_lattice_less_of_halo_shows_seams(path: Path, tmp_path: Path) -> Non
 
 
 SOME = pytest.mark.parametrize(
-    "path", [espcn, int8_half_resolution, partial(four_bands, 2)], indirect=True, ids=str
+    "path", ["ESPCN", "INT8 half resolution", "4 bands to 2"], indirect=True
 )
 """Larger results, strides, and several bands."""
 
