@@ -5,9 +5,15 @@ from typer.testing import CliRunner
 from beers_deploy.cli.commands import app
 
 
-def done(*words: object, code: int = 0) -> str:
-    """Run a command, check its exit code, and return its output."""
-    result = CliRunner().invoke(app, [str(word) for word in words])
+def done(command: object, *words: object, code: int = 0) -> str:
+    """Run a command, check its exit code, and return its output.
+
+    Args:
+        command: its words, of which none contains a blank.
+        words: more of them.
+        code: expected at its end.
+    """
+    result = CliRunner().invoke(app, [*str(command).split(), *map(str, words)])
     assert result.exit_code == code, result.output
     return result.output
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 
@@ -55,6 +55,7 @@ def rendered(markdown: str) -> str:
     return str(MarkdownIt("commonmark").enable(["table", "strikethrough"]).render(markdown))
 
 
+@settings(max_examples=25)
 @given(st.text(), st.text())
 @example(HOSTILE, HOSTILE)
 def test_a_check_is_one_row_of_plain_text_and_one_annotation(
@@ -78,6 +79,7 @@ def test_a_check_is_one_row_of_plain_text_and_one_annotation(
     assert line.count("\n") == 1
 
 
+@settings(max_examples=40)
 @given(st.text(alphabet=st.characters(exclude_categories=["Cs"])))
 @example(HOSTILE)
 @example("````")

@@ -31,7 +31,7 @@ from beers_deploy.profiles.shipped import scene_names
 from beers_deploy.restoration.cluster import open_cluster
 from beers_deploy.results import Table
 from beers_deploy.verbs.simulate import simulate
-from tests.deploy.command_line import done, refused
+from tests.deploy.command_line import refused
 from tests.deploy.two_workers import local_cluster
 
 
@@ -79,17 +79,14 @@ def test_any_patch_can_be_made_again_alone(scene: Path, dataset: Path) -> None:
         np.testing.assert_array_equal(dn, tifffile.imread(dataset / role / f"{window.name}.tif"))
 
 
-def test_the_manifest_tells_where_each_patch_comes_from(scene: Path, tmp_path: Path) -> None:
-    summary = write_dataset(small(scene), tmp_path / "d", 1, resume=False)
-    lines = [
-        json.loads(line) for line in (tmp_path / "d" / "manifest.jsonl").read_text().splitlines()
-    ]
-    assert len(lines) == summary["patches"] == len(plan_windows(small(scene)))
+def test_the_manifest_tells_where_each_patch_comes_from(scene: Path, dataset: Path) -> None:
+    lines = [json.loads(line) for line in (dataset / "manifest.jsonl").read_text().splitlines()]
+    assert len(lines) == len(plan_windows(small(scene)))
     assert [line["number"] for line in lines] == list(range(len(lines)))
     assert len({line["degraded"]["sensor"]["mtf_nyquist"] for line in lines}) == len(lines)
     for line in lines:
         for role in ("degraded", "reference"):
-            dn = tifffile.imread(tmp_path / "d" / role / f"{line['name']}.tif")
+            dn = tifffile.imread(dataset / role / f"{line['name']}.tif")
             assert dn.shape == (24, 24)
             assert dn.dtype == np.uint16
             assert dn.max() <= 4095
@@ -98,7 +95,7 @@ def test_the_manifest_tells_where_each_patch_comes_from(scene: Path, tmp_path: P
 
 @pytest.mark.slow
 def test_a_killed_dataset_is_resumed_to_the_same_bytes(scene: Path, tmp_path: Path) -> None:
-    options = ["--images", str(scene), "--oversampling", "2", "--patch", "8", "--workers", "1"]
+    options = f"--images {scene} --oversampling 2 --patch 8 --workers 1".split()
     unbroken, killed = (tmp_path / name for name in ("whole", "killed"))
     command = [
         sys.executable,
@@ -166,11 +163,7 @@ DAMAGES: dict[str, tuple[str, Callable[[Path], None], int]] = {
 
 @pytest.mark.parametrize("kind", DAMAGES)
 def test_damaged_pairs_of_a_finished_dataset_are_made_again(
-    kind: str,
-    scene: Path,
-    dataset: Path,
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
+    kind: str, scene: Path, dataset: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     name, damage, count = DAMAGES[kind]
     folder = Path(shutil.copytree(dataset, tmp_path / "damaged"))
@@ -199,11 +192,7 @@ FORGED: dict[str, Callable[[Line], object]] = {
 
 @pytest.mark.parametrize("kind", FORGED)
 def test_a_forged_line_with_its_digest_is_made_again(
-    kind: str,
-    scene: Path,
-    dataset: Path,
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
+    kind: str, scene: Path, dataset: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = Path(shutil.copytree(dataset, tmp_path / "forged"))
     lines = (folder / "manifest.jsonl").read_text().splitlines(keepends=True)
@@ -215,16 +204,6 @@ def test_a_forged_line_with_its_digest_is_made_again(
         write_dataset(small(scene), folder, 1, resume=True)
     assert bytes_of(folder) == bytes_of(dataset)
     assert caplog.messages[0].startswith("1 of ")
-
-
-def test_a_recipe_whose_lines_end_otherwise_is_the_same(
-    scene: Path, dataset: Path, tmp_path: Path
-) -> None:
-    folder = Path(shutil.copytree(dataset, tmp_path / "other"))
-    recipe = folder / "recipe.json"
-    recipe.write_bytes(recipe.read_bytes().replace(b"\n", b"\r\n"))
-    write_dataset(small(scene), folder, 1, resume=True)
-    assert bytes_of(folder) == bytes_of(dataset)
 
 
 def test_left_overs_of_a_run_are_deleted_and_nothing_else(
@@ -240,7 +219,7 @@ def test_left_overs_of_a_run_are_deleted_and_nothing_else(
     assert [path.exists() for path in (*ours, *foreign)] == [False, False, True, True]
 
 
-@pytest.mark.parametrize("damage", [flip, cut, Path.unlink])
+@pytest.mark.parametrize("damage", [flip, Path.unlink])
 def test_a_damaged_part_of_an_unfinished_dataset_is_made_again(
     damage: Callable[[Path], None], scene: Path, dataset: Path, tmp_path: Path
 ) -> None:
@@ -330,35 +309,9 @@ def test_a_scheduler_s_workers_give_the_same_bytes(
     assert progress[-1].done == progress[-1].total == len(plan_windows(recipe))
 
 
-@pytest.mark.slow
-def test_a_dataset_begun_here_is_finished_by_a_scheduler_s_workers(
-    scene: Path, scheduler: str, tmp_path: Path
-) -> None:
-    def stop(step: Step) -> None:
-        if step.done:
-            raise KeyboardInterrupt
-
-    options = ["--images", scene, "--oversampling", "2", "--patch", "8"]
-    recipe = DatasetRecipe(
-        (scene,), Sensor.load("pleiades-degraded"), REFERENCE, oversampling=2, patch_px=8
-    )
-    with pytest.raises(KeyboardInterrupt), reporting(stop):
-        write_dataset(recipe, tmp_path / "d", 1, resume=False)
-    done("simulate", *options, "--out", tmp_path / "d", "--resume", "--scheduler", scheduler)
-    write_dataset(recipe, tmp_path / "whole", 1, resume=False)
-    assert bytes_of(tmp_path / "d") == bytes_of(tmp_path / "whole")
-
-
 def test_a_scene_that_cannot_be_read_there_is_one_sentence(scene: Path, tmp_path: Path) -> None:
     with pytest.raises(ImageError, match="no such file"):
         make_patches(small(tmp_path / "gone.png"), plan_windows(small(scene))[:1])
-
-
-def test_workers_and_a_scheduler_do_not_go_together(scene: Path, tmp_path: Path) -> None:
-    both = ("--workers", "2", "--scheduler", "host:8786")
-    message = refused("simulate", "--images", scene, "--out", tmp_path / "d", *both)
-    assert "--workers has no effect with --scheduler" in message
-    assert not (tmp_path / "d").exists()
 
 
 def test_a_folder_of_scenes_becomes_a_dataset_and_the_table_counts_its_pairs(
@@ -392,27 +345,21 @@ def test_the_explanation_has_each_effect_with_its_origin_and_writes_nothing(
     assert words["striping"]["from"] == "scene haze-over-sea"
     assert words["mtf"]["from"] == "sensor pleiades-degraded"
     assert all(text["decision"] and text["why"] for text in words.values())
-    bounds = [row.figures["bound"] for row in table.rows if row.figures]
-    assert {bound.unit for bound in bounds} == {"DN"}
-    assert all((bound.value or 0) >= 0 for bound in bounds)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--explain", "--out", "d"], "--explain has no effect with --out"),
-        (["--explain", "--resume"], "--resume has no effect without --out"),
-        (["--explain", "--workers", "2"], "--workers has no effect without --out"),
-        ([], "--out is missing. Give it, or add --explain"),
-        (["--images", "none", "--out", "d"], "no such file"),
+        ("", "--out is missing. Give it, or add --explain"),
+        ("--images none --out d", "no such file"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(
-    options: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    options: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert words in refused("simulate", *options)
+    assert words in refused(f"simulate {options}")
     assert list(tmp_path.iterdir()) == []
 
 

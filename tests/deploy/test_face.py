@@ -14,14 +14,12 @@ import onnx
 import pytest
 import tifffile
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
 import beers_deploy as bd
-from beers_deploy.model.progress import Step
 from beers_deploy.profiles.sensor import numbers_of
 from beers_deploy.profiles.shipped import board_names, sensor_names
 from beers_deploy.results import SCHEMA_PATH
-from beers_deploy.studies.tradeoff.page import Tradeoff
-from tests.deploy.studies.tradeoff.small import small_studies
 
 SMALL = "convbeers-xs"
 
@@ -88,7 +86,7 @@ def test_another_number_of_a_sensor_keeps_the_others() -> None:
     assert sharper.noise([0.0, 100.0]) == pytest.approx([0.1, 0.21**0.5])
     assert sharper.snr_0 is None
     assert sharper.gsd_m == sensor.gsd_m
-    np.testing.assert_allclose(sensor.to_radiance(sensor.to_dn(np.array([3.0, 70.0]))), [3, 70])
+    assert_allclose(sensor.to_radiance(sensor.to_dn(np.array([3.0, 70.0]))), [3, 70])
 
 
 def test_values_are_copied_and_compared(tiny: bd.Network) -> None:
@@ -102,7 +100,7 @@ def test_a_module_computes_as_in_torch(tiny: bd.Network) -> None:
     images = np.random.default_rng(1).random((2, 1, 19, 23), np.float32)
     with torch.inference_mode():
         expected = Tiny()(torch.from_numpy(images)).numpy()
-    np.testing.assert_allclose(tiny(images), expected, atol=1e-6)
+    assert_allclose(tiny(images), expected, atol=1e-6)
     assert (tiny.precision, tiny.tiling.halo_px) == ("float32", 2)
 
 
@@ -110,7 +108,7 @@ def test_a_network_is_whatever_holds_one(tiny: bd.Network, tmp_path: Path) -> No
     path = tiny.save(tmp_path / "tiny.onnx")
     for source in (str(path), path, onnx.load(path), tiny):
         network = bd.Network.load(source)
-        np.testing.assert_array_equal(network(np.ones((1, 1, 9, 9))), tiny(np.ones((1, 1, 9, 9))))
+        assert_array_equal(network(np.ones((1, 1, 9, 9))), tiny(np.ones((1, 1, 9, 9))))
 
 
 def test_int8_knows_its_float_network_and_its_layers(tiny: bd.Network, int8: bd.Network) -> None:
@@ -130,20 +128,19 @@ def test_the_gate_says_which_samples_calibration_saw(int8: bd.Network, samples: 
         bd.gate(int8, samples=samples, limits={"mae": 1e-9}).raise_if_failed()
 
 
-@pytest.mark.parametrize("kind", ["array", "tuple", "list", "batches", "file"])
+@pytest.mark.parametrize("kind", ["tuple", "list", "batches", "file"])
 def test_samples_of_any_kind_are_the_same(
     kind: str, tiny: bd.Network, int8: bd.Network, samples: np.ndarray, tmp_path: Path
 ) -> None:
     np.save(tmp_path / "samples.npy", samples)
     forms: dict[str, Any] = {
-        "array": torch.from_numpy(samples),
         "tuple": (samples, samples),
         "list": list(samples),
         "batches": [[batch] for batch in (samples[:3], torch.from_numpy(samples[3:]))],
         "file": str(tmp_path / "samples.npy"),
     }
     network = bd.quantize(tiny, samples=forms[kind], target="zcu102", progress=False)
-    np.testing.assert_array_equal(network(samples), int8(samples))
+    assert_array_equal(network(samples), int8(samples))
 
 
 def test_a_board_runs_a_network_at_a_predicted_speed(int8: bd.Network) -> None:
@@ -223,8 +220,8 @@ def test_tensors_and_masked_arrays_are_returned_as_such(raw: np.ndarray) -> None
         filled = np.where(masked.mask, pixels.dtype.type(fill), pixels)
         nodata = None if fill != fill else fill
         expected_pixels = bd.restore(filled, network=SMALL, nodata=nodata)
-        np.testing.assert_array_equal(restored.mask, masked.mask)
-        np.testing.assert_array_equal(restored.compressed(), expected_pixels[~masked.mask])
+        assert_array_equal(restored.mask, masked.mask)
+        assert_array_equal(restored.compressed(), expected_pixels[~masked.mask])
 
 
 def test_the_bands_of_xarray_are_found_by_name(raw: np.ndarray) -> None:
@@ -236,27 +233,11 @@ def test_the_bands_of_xarray_are_found_by_name(raw: np.ndarray) -> None:
     )
     restored = bd.restore(last, network=SMALL)
     assert restored.dims == last.dims
-    np.testing.assert_array_equal(restored.transpose("band", "y", "x").values, expected)
+    assert_array_equal(restored.transpose("band", "y", "x").values, expected)
     scaled = xarray.DataArray(
         (raw // 16).astype(np.uint8), dims=("y", "x"), attrs={"full_scale": 255}
     )
     assert bd.restore(scaled, network=SMALL).dtype == np.uint8
-
-
-def test_the_traditional_pipeline_restores_arrays_as_files(raw: np.ndarray, tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "raw.tif", raw)
-    steps: list[Step] = []
-    run = bd.restore(
-        tmp_path / "raw.tif",
-        tmp_path / "r.tif",
-        method="traditional",
-        sensor="pleiades-degraded",
-        progress=steps.append,
-    )
-    assert steps[-1].done == steps[-1].total == len(raw)
-    assert run.time_s > 0
-    array = bd.restore(raw, method="traditional", sensor="pleiades-degraded")
-    np.testing.assert_array_equal(array, tifffile.imread(run.path))
 
 
 def test_a_file_needs_an_output(raw: np.ndarray, tmp_path: Path) -> None:
@@ -279,10 +260,6 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
     "no such sensor": (lambda raw: bd.restore(raw, sensor="none"), "'none'.*dior-high"),
     "no such network": (lambda raw: bd.restore(raw, network="none"), "a shipped network"),
     "no network": (lambda _: bd.Network.load(3), r"torch.nn.Module"),  # type: ignore[arg-type]
-    "a network of no use": (
-        lambda raw: bd.restore(raw, network=SMALL, method="traditional"),
-        "`network` has no effect with `method` traditional",
-    ),
     "a tile of no use": (
         lambda raw: bd.restore(raw, tile=64, method="traditional"),
         "`tile` has no effect with `method` traditional",
@@ -290,10 +267,6 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
     "a COG of an array": (
         lambda raw: bd.restore(raw, cog=True),
         "`cog` has no effect with an array",
-    ),
-    "a resumption of no use": (
-        lambda _: bd.restore("raw.tif", "a.tif", method="traditional", resume=True),
-        "`resume` has no effect with `method` traditional",
     ),
     "no method": (
         lambda _: bd.restore("raw.tif", "a.tif", method="x"),  # type: ignore[arg-type]
@@ -316,12 +289,10 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
         "INT8 network of Tiny is missing.*`int8_network`",
     ),
     "no shipped pair": (lambda _: bd.gate("convbeers-m"), "no shipped weights 'convbeers-m'"),
-    "no limit": (lambda _: bd.gate(SMALL, limits={"maee": 1}), "named mae"),
     "images and samples": (
         lambda raw: bd.gate(SMALL, samples=raw[None, None] / 4095, images="scenes"),
         "`images` has no effect with `samples`",
     ),
-    "no DPU": (lambda _: bd.check(f"{SMALL}-int8", target="host-cpu"), "'host-cpu' has no DPU"),
     "no board": (lambda _: bd.bench(SMALL, target="none"), "'none'.*vck190"),
     "no pairs": (
         lambda raw: bd.quantize(Tiny(), samples=(raw[None, None], raw[None, None].repeat(2, 0))),
@@ -338,10 +309,7 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
     "no samples": (lambda raw: bd.quantize(Tiny(), samples={"image": raw}), "or a path"),
     "no swath": (lambda _: bd.bench(SMALL, size=(0, 0)), r"`size` .*\(0, 0\)"),
     "no size": (lambda _: bd.simulate(size=0), "`size` must be from 1 to 4096"),
-    "other sizes": (
-        lambda raw: simulated(size=48).psnr(raw),
-        r"`image` has the shape \(61, 83\)",
-    ),
+    "other sizes": (lambda raw: simulated(size=48).psnr(raw), r"`image` has the shape \(61, 83\)"),
     "no figure": (lambda _: bd.sensors().plot("x"), "`figure` must be one of MTF.*'x'"),
     "no number": (lambda _: bd.Sensor.load("blind").replace(mtf=1), "mtf_nyquist"),
 }
@@ -357,35 +325,6 @@ def test_bad_input_is_one_sentence_and_the_class_that_one_expects(
     assert isinstance(caught.value, bd.BeersError)
     assert "--" not in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.slow
-def test_from_raw_images_to_a_kit(tmp_path: Path) -> None:
-    sensor = bd.Sensor.load("pleiades-degraded")
-    raws = [simulated(sensor=sensor, size=1200, seed=0).degraded]
-    estimated = bd.characterize(raws, bits=12, progress=False)
-    assert estimated.mtf_nyquist.low == pytest.approx(0.07, abs=0.02)
-    assert estimated.table is not None
-    low, high = estimated.table.rows[0].figures["MTF across at Nyquist"].interval or (0, 0)
-    assert low < 7 < high
-    with small_studies():
-        study = bd.tradeoff(
-            network=[SMALL],
-            sensor=estimated,
-            target="zcu104",
-            budget="latency<=60s",
-            progress=False,
-        )
-    assert isinstance(study, Tradeoff)
-    assert study.best is not None
-    assert study.plot().get_xlabel().startswith("board latency")
-    assert "recommended" in str(study)
-    assert (
-        study.report(tmp_path / "study").read_text(encoding="utf-8").startswith("<!doctype html>")
-    )
-    assert (
-        bd.Board.load("zcu104").kit(study.best.network, tmp_path / "kit") / "core.onnx"
-    ).is_file()
 
 
 WITHOUT_EXTRAS = """
@@ -408,8 +347,8 @@ int8 = bd.quantize("tiny.onnx", samples=samples, progress=False)
 assert bd.gate(int8, samples=samples, limits={"mae": 0.01}) and bd.check(int8)
 assert any("needs the package torch" in note for note in bd.bench(int8).notes)
 assert bd.restore(image, network="convbeers-xs-int8").shape == (40, 50)
+assert bd.restore(image, network="convbeers-xs", sensor="pleiades-degraded").shape == (40, 50)
 assert bd.simulate(size=48).degraded.shape == (48, 48)
-assert bd.quantize("tiny.onnx", patches=1, patch=48, progress=False).layers
 for call, extra in (
     (lambda: bd.quantize("tiny.onnx", samples=samples, finetune=1, progress=False), "torch"),
     (lambda: bd.evaluate(methods="degraded"), "torch"),

@@ -1,8 +1,6 @@
 """The gate catches faults of quantised files, and a CI job can read its verdict."""
 
-import json
 import math
-import runpy
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +20,6 @@ from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.profiles.figures import Bound, Check
 from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.limits import BREAKABLE, Limits, judge, limits_of
 from beers_deploy.quant.onnx_file import (
@@ -36,7 +33,7 @@ from beers_deploy.quant.onnx_file import (
 from beers_deploy.quant.samples.own import CALIBRATED_ON, digest_of
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session
-from beers_deploy.quant.structure import Relus, count_relus, rounded_tensors, saturated_shares
+from beers_deploy.quant.structure import Relus, saturated_shares
 from beers_deploy.results import Table
 from beers_deploy.verdict import file_checks, junit_text
 from tests.deploy.command_line import done, refused
@@ -237,29 +234,6 @@ def test_a_job_can_read_the_verdict() -> None:
     assert [case.find("failure") is not None for case in suite] == [False, True, True, False]
 
 
-def test_the_action_s_summary_is_a_table_whatever_a_stranger_s_name_holds(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("GITHUB_OUTPUT", "GITHUB_STEP_SUMMARY"):
-        monkeypatch.setenv(name, str(tmp_path / name))
-    figures = {"MAE": {"value": 6e-4}, "PSNR drop": {"value": None}}
-    document = {
-        "verdict": "failed",
-        "rows": [{"figures": figures}],
-        "checks": [check.to_json() for check in CHECKS],
-    }
-    (tmp_path / "gate.json").write_text(json.dumps(document))
-    runpy.run_path(str(ROOT / ".github" / "verdict.py"))["main"](
-        1, tmp_path / "gate.json", tmp_path / "none"
-    )
-    assert (tmp_path / "GITHUB_OUTPUT").read_text() == "verdict=failed\nmae=0.0006\n"
-    _, title, _, *lines = (tmp_path / "GITHUB_STEP_SUMMARY").read_text().splitlines()
-    assert title == "## INT8 gate: failed"
-    assert lines[2] == "| MAE | 0.0006 | at most 0.0008 of full scale | ok |  |"
-    assert {line.count("|") for line in lines} == {6}
-    assert "<" not in "".join(lines)
-
-
 def test_the_last_line_names_what_failed_and_nothing_else() -> None:
     assert Table(command="gate", checks=tuple(CHECKS[:1])).verdict == "gate passed, all 1 checks"
     text = Table(command="gate", checks=tuple(CHECKS)).verdict
@@ -291,12 +265,9 @@ def test_the_number_decides(value: float, limit: float, bound: Bound, expected: 
 def test_options_that_do_not_go_together_are_refused(tmp_path: Path) -> None:
     (tmp_path / "float.onnx").touch()
     (tmp_path / "gate.toml").write_text("mae = 0.01\nmae_growth = 1.0001\n")
-    assert "INT8 network of float.onnx" in refused("gate", tmp_path / "float.onnx")
-    assert "--junit" in refused("gate", "--junit", "-")
-    assert "'mae_growth' needs a --baseline" in refused("gate", "--limits", tmp_path / "gate.toml")
-
-
-ROOT = Path(__file__).resolve().parents[2]
+    assert "INT8 network of float.onnx" in refused(f"gate {tmp_path}/float.onnx")
+    assert "--junit" in refused("gate --junit -")
+    assert "'mae_growth' needs a --baseline" in refused(f"gate --limits {tmp_path}/gate.toml")
 
 
 def test_the_judged_file_does_not_choose_its_judges(model: Path) -> None:
@@ -345,10 +316,9 @@ def test_samples_without_contrast_judge_nothing() -> None:
 SMALL = "convbeers-xs"
 
 
-@pytest.mark.parametrize("factor", [2, 0])
-def test_a_baseline_shows_a_wrong_bias_in_nearly_any_layer(factor: int, unseen: Patches) -> None:
-    """A bias off by one scale, or lost, may hide below a limit on the MAE, seldom in a twentieth of
-    what it was.
+def test_a_baseline_shows_a_wrong_bias_in_nearly_any_layer(unseen: Patches) -> None:
+    """A bias off by one scale may hide below a limit on the MAE, seldom in a twentieth of what it
+    was.
 
     The two that are left out add nothing but where a copy is rounded.
     """
@@ -361,41 +331,10 @@ def test_a_baseline_shows_a_wrong_bias_in_nearly_any_layer(factor: int, unseen: 
     assert len(names) == 11
     hidden = set()
     for name in names:
-        model = changed(intact, name, lambda bias: bias * factor)
+        model = changed(intact, name, lambda bias: bias * 2)
         checks = judge(compare(session, open_session(model), unseen), Limits(), before)
         hidden |= {name.removesuffix(".bias")} if all(check.passed for check in checks) else set()
-    assert hidden == {"body.2.second", "body.3.second"} | ({"body.3.first"} if factor else set())
-
-
-def as_nodes(model: onnx.ModelProto) -> onnx.ModelProto:
-    """The same network, its constants held by nodes."""
-    constants = [
-        onnx.helper.make_node("Constant", [], [t.name], name=f"of.{t.name}", value=t)
-        for t in model.graph.initializer
-    ]
-    nodes = [*constants, *model.graph.node]
-    del model.graph.initializer[:], model.graph.node[:]
-    model.graph.node.extend(nodes)
-    return model
-
-
-def test_constants_may_be_nodes() -> None:
-    by_initializers = onnx.load(shipped_pair("convbeers-xs")[1])
-    by_nodes = as_nodes(onnx.load(shipped_pair("convbeers-xs")[1]))
-    assert count_relus(by_nodes) == count_relus(by_initializers) == Relus(4, 0)
-    assert [t.name for t in rounded_tensors(by_nodes)] == [
-        t.name for t in rounded_tensors(by_initializers)
-    ]
-    assert read_core(by_nodes).frac_bits == read_core(by_initializers).frac_bits
-
-
-@pytest.mark.parametrize("explicit", [["x", "zero"], ["zero", "x"]])
-def test_a_relu_is_the_larger_of_zero_whatever_comes_first(explicit: list[str]) -> None:
-    w = GraphWriter()
-    w.constant("zero", np.zeros((), np.float32))
-    w.node("Max", "y", explicit)
-    ends = [image_info("x", 1, None)], [image_info("y", 1, None)]
-    assert count_relus(make_model(w.graph("g", *ends), {})) == Relus(1, 0)
+    assert hidden == {"body.2.second", "body.3.second", "body.3.first"}
 
 
 def test_results_that_are_never_below_zero_need_no_relu() -> None:
@@ -446,12 +385,12 @@ def test_samples_without_references_tell_no_loss_and_cannot_keep_a_limit_on_it(
     samples = tmp_path / "samples.npy"
     limits = tmp_path / "limits.toml"
     np.save(samples, np.random.default_rng(0).uniform(0.1, 0.9, (2, 1, 40, 40)).astype(np.float32))
-    command = ["gate", *shipped_pair("convbeers-xs"), "--samples", samples, "--max-mae", "0.1"]
-    output = done(*command)
+    command = f"gate convbeers-xs --samples {samples} --max-mae 0.1"
+    output = done(command)
     assert "gate passed" in output
     assert "nan" not in output.lower()
     limits.write_text("psnr_drop_db = 0.25\n", encoding="utf-8")
-    message = refused(*command, "--limits", limits)
+    message = refused(f"{command} --limits {limits}")
     assert "--samples must have references for the limit 'psnr_drop_db'" in message
 
 
@@ -460,19 +399,13 @@ def test_references_that_do_not_fit_are_refused_and_the_sample_is_named(tmp_path
     path = tmp_path / "s.npz"
     limits = tmp_path / "limits.toml"
     limits.write_text("mae = 0.1\npsnr_drop_db = 20\n", encoding="utf-8")
-    command = ["gate", *shipped_pair(SMALL), "--samples", path, "--limits", limits]
+    command = f"gate {SMALL} --samples {path}"
     np.savez(path, image=image, reference=image * 4095)
-    message = refused(*command)
-    assert "reference of s.npz[0]" in message
-    assert "[0, 1]" in message
+    assert "reference of s.npz[0]" in refused(f"{command} --limits {limits}")
     np.savez(path, image=image, reference=image[..., :20])
-    message = refused(*command)
+    message = refused(f"{command} --limits {limits}")
     assert "s.npz[0] must have a reference of the size" in message
     assert "the limit 'psnr_drop_db'" in message
     assert "1 x 40 x 20" in message
     # Without a limit on the PSNR drop no check needs the references.
-    assert "gate passed" in done(*command[:-2], "--max-mae", 0.1)
-    assert "'PSNR' is not one of 'psnr'" in refused(*command, "--metric", "PSNR")
-    mixed = [(image[:1], image[:1]), (image[1:], image[1:, ..., :20])]
-    with pytest.raises(ImageError, match=r"samples\[1\] must have a reference of the size"):
-        bd.compare(SMALL, samples=mixed)
+    assert "gate passed" in done(f"{command} --max-mae 0.1")

@@ -9,6 +9,7 @@ import io
 import json
 import logging
 import re
+from collections.abc import Callable
 from html.parser import HTMLParser
 from itertools import chain
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import pytest
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 from rich.console import Console
@@ -40,6 +41,13 @@ HOSTILE = (
     "[red]r[/red] [/b] &lt;"
 )
 TEXT = st.text(alphabet=st.characters(exclude_categories=["Cs"]))
+
+
+def any_text(test: Callable[[str], None]) -> Callable[[], None]:
+    """Run a test on any text, and on one that holds every trick."""
+    return settings(max_examples=40)(given(TEXT)(example(HOSTILE)(test)))
+
+
 HEAD = {"html", "head", "meta", "title", "style", "body", "script"}
 TABLES = {
     "h1",
@@ -92,8 +100,7 @@ class Tags(HTMLParser):
         self.words.append(data)
 
 
-@given(TEXT)
-@example(HOSTILE)
+@any_text
 def test_a_page_has_the_text_and_no_tag_of_it(text: str) -> None:
     picture = Picture(text, "data:,", text)
     html = render(
@@ -106,8 +113,7 @@ def test_a_page_has_the_text_and_no_tag_of_it(text: str) -> None:
     assert visible(text).strip() in "".join(parsed.words)
 
 
-@given(TEXT)
-@example(HOSTILE)
+@any_text
 def test_a_notebook_has_the_text_and_no_tag_of_it(text: str) -> None:
     table = Table("check", {}, (), tuple(rows_with(text)), notes=(text,))
     assert shown_alike(table._repr_html_())
@@ -115,8 +121,7 @@ def test_a_notebook_has_the_text_and_no_tag_of_it(text: str) -> None:
     assert repr(table).isprintable()
 
 
-@given(TEXT)
-@example(HOSTILE)
+@any_text
 def test_a_terminal_has_each_line_of_ours_and_no_other(text: str) -> None:
     outputs = []
     for words in (text, "plain"):
@@ -128,8 +133,7 @@ def test_a_terminal_has_each_line_of_ours_and_no_other(text: str) -> None:
     assert outputs[0].count("\n") == outputs[1].count("\n")
 
 
-@given(TEXT)
-@example(HOSTILE)
+@any_text
 def test_a_record_of_the_log_is_one_line(text: str) -> None:
     stream = io.StringIO()
     with pytest.MonkeyPatch.context() as patch:
@@ -139,8 +143,7 @@ def test_a_record_of_the_log_is_one_line(text: str) -> None:
     assert stream.getvalue() == f"wrote {one_line(text)}\n"
 
 
-@given(TEXT)
-@example(HOSTILE)
+@any_text
 def test_progress_is_one_line_without_markup(text: str) -> None:
     stream = io.StringIO()
     with pytest.MonkeyPatch.context() as patch:
@@ -165,8 +168,7 @@ def test_progress_is_one_line_without_markup(text: str) -> None:
     assert terminal.getvalue().startswith(shown), "a name in brackets is no markup"
 
 
-@given(TEXT)
-@example(HOSTILE)
+@any_text
 def test_a_cell_of_markdown_is_one_cell_of_plain_text(text: str) -> None:
     lines = markdown_table([Row("t", text, {"size": measured(1.5, "px", "here")}, {"word": text})])
     html = MarkdownIt("commonmark").enable(["table", "strikethrough"]).render("\n".join(lines))
@@ -194,8 +196,7 @@ def document(text: str) -> tuple[Table, dict[str, Any]]:
     return table, record
 
 
-@given(TEXT)
-@example(HOSTILE)
+@any_text
 def test_a_record_has_the_text_of_a_network_s_metadata_escaped(text: str) -> None:
     table, record = document(text)
     html = render(_page(table, record))
@@ -203,8 +204,7 @@ def test_a_record_has_the_text_of_a_network_s_metadata_escaped(text: str) -> Non
     assert Tags(html).tags <= TAGS
 
 
-@given(TEXT)
-@example(HOSTILE)
+@any_text
 def test_a_bill_of_materials_has_names_on_one_line(text: str) -> None:
     pytest.importorskip("cyclonedx")
     _, record = document(text)
@@ -217,8 +217,7 @@ def test_a_bill_of_materials_has_names_on_one_line(text: str) -> None:
     assert all(entry["value"].isprintable() for entry in component["properties"])
 
 
-@given(TEXT)
-@example(HOSTILE)
+@any_text
 def test_a_drawing_has_the_text_as_words(text: str) -> None:
     pytest.importorskip("matplotlib")
     with look():

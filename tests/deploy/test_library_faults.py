@@ -15,13 +15,7 @@ from beers_deploy.cli.commands import COMMANDS
 from beers_deploy.cli.run import ending
 from beers_deploy.model.processor import int8_adds_exactly
 from beers_deploy.model.raster.writer import require_codec
-from beers_deploy.profiles.errors import (
-    CODE_FAULTS,
-    CRASHED,
-    ModelError,
-    OptionError,
-    printable,
-)
+from beers_deploy.profiles.errors import CODE_FAULTS, CRASHED, ModelError, OptionError, printable
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.untrusted import contradictions
@@ -39,7 +33,7 @@ def test_an_argument_that_rasterio_does_not_accept(
         raise TypeError("open() got an unexpected keyword argument")
 
     monkeypatch.setattr(rasterio, "open", of_the_future)
-    message = done("restore", tmp_path / "raw.tif", "--dry-run", code=CRASHED)
+    message = done(f"restore {tmp_path}/raw.tif --dry-run", code=CRASHED)
     assert "unexpected keyword argument" in message
     assert "whole image" not in message
 
@@ -83,7 +77,7 @@ def test_a_run_of_onnxruntime_that_fails_is_no_fault_of_the_file(
     monkeypatch.setattr(onnxruntime.InferenceSession, "run", moved)
     int8_adds_exactly.cache_clear()
     try:
-        message = done("gate", "convbeers-xs", "--patches", 1, code=CRASHED)
+        message = done("gate convbeers-xs --patches 1", code=CRASHED)
     finally:
         int8_adds_exactly.cache_clear()
     assert "This is a fault of this program" in message

@@ -1,8 +1,6 @@
 """Shipped networks by name, conditioned on any sensor, in float32 and in INT8."""
 
 import logging
-import subprocess
-import sys
 from collections import Counter
 from importlib import import_module
 from pathlib import Path
@@ -64,13 +62,11 @@ def test_int8_is_calibrated_once_and_then_conditioned_on_any_sensor(
 ) -> None:
     monkeypatch.setattr(calibrate, "PATCHES", 3)
     monkeypatch.chdir(tmp_path)
-    done("quantize", conditioned, "--sensor", SENSOR, "--patches", "1", "--out", "base.onnx")
+    done(f"quantize {conditioned} --sensor {SENSOR} --patches 1 --out base.onnx")
     base = load_onnx(Path("base.onnx"))
     sensor = own_sensor(tmp_path, ("value = 0.07", "value = 0.05"))
-    words = ["export", "--network", "base.onnx", "--out"]
-    mine = [*words, "mine.onnx", "--sensor", str(sensor), "--delta", "mine.delta"]
-    done(*mine)
-    done(*words, "applied.onnx", "--apply", "mine.delta")
+    done(f"export --network base.onnx --out mine.onnx --sensor {sensor} --delta mine.delta")
+    done("export --network base.onnx --out applied.onnx --apply mine.delta")
     assert Path("applied.onnx").read_bytes() == Path("mine.onnx").read_bytes()
     assert Path("mine.delta").stat().st_size < 3000
     other = load_onnx(Path("mine.onnx"))
@@ -128,45 +124,13 @@ def test_a_value_outside_the_training_is_reported_each_time(
         assert message.startswith(sentence)
 
 
-@pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-xs-int8"])
-def test_restoring_for_a_sensor_needs_no_torch_and_depends_on_the_sensor(
-    name: str, tmp_path: Path
-) -> None:
-    """Filters are computed without the packages that training needs."""
-    dn = np.random.default_rng(0).integers(200, 1800, (37, 41)).astype(np.uint16)
-    tifffile.imwrite(tmp_path / "in.tif", dn)
-    sensor = own_sensor(tmp_path, ("value = 0.07", "value = 0.05"))
-    words = [
-        "restore",
-        str(tmp_path / "in.tif"),
-        "out.tif",
-        "--network",
-        name,
-        "--sensor",
-        str(sensor),
-    ]
-    call = f"app({words!r}, standalone_mode=False)"
-    code = (
-        f"import sys; from beers_deploy.cli.commands import app; {call}; "
-        "print({'torch', 'skimage'} & set(sys.modules))"
-    )
-    process = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
-    assert process.stdout.splitlines()[-1] == "set()"
-    other = [*words[:2], str(tmp_path / "other.tif"), *words[3:5], "--sensor", SENSOR]
-    done(*other)
-    restored = [tifffile.imread(tmp_path / name).astype(int) for name in ("out.tif", "other.tif")]
-    assert np.abs(restored[0] - restored[1]).max() > 5
-
-
 def test_a_network_that_is_made_for_one_sensor_refuses_a_sensor_for_each_band(
     tmp_path: Path,
 ) -> None:
     tifffile.imwrite(tmp_path / "in.tif", np.full((2, 20, 30), 900, np.uint16))
     words = ["--network", shipped_pair("convbeers-xs")[0], "--sensor", f"B0={SENSOR},B1={SENSOR}"]
     assert "Give one sensor for all bands" in refused(
-        "restore", tmp_path / "in.tif", tmp_path / "out.tif", *words
+        f"restore {tmp_path}/in.tif {tmp_path}/out.tif", *words
     )
     assert not (tmp_path / "out.tif").exists()
 
@@ -195,36 +159,6 @@ def test_none_is_the_default_network() -> None:
     assert Network.load(None) == Network.load(f"{VARIANT}{INT8}")
 
 
-def test_commands_accept_the_name(tmp_path: Path) -> None:
-    tifffile.imwrite(
-        tmp_path / "in.tif",
-        np.random.default_rng(0).integers(200, 1800, (37, 41)).astype(np.uint16),
-    )
-    for model in ("convbeers-xs-int8", str(shipped_pair("convbeers-xs", "blind")[1])):
-        out = tmp_path / f"{len(model)}.tif"
-        output = done("restore", tmp_path / "in.tif", out, "--network", model)
-        assert ("network: convbeers-xs-int8, for an unknown sensor" in output) == (
-            model == "convbeers-xs-int8"
-        )
-    first, second = (
-        tifffile.imread(path) for path in tmp_path.glob("*.tif") if path.name != "in.tif"
-    )
-    np.testing.assert_array_equal(first, second)
-    output = refused("restore", tmp_path / "in.tif", tmp_path / "x.tif", "--network", "huge")
-    assert "a shipped network (convbeers, convbeers-half" in output
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        ["check", "convbeers-xs", "--tile", "64"],
-        ["stress", "convbeers-xs", "convbeers-xs-int8", "--cases", "1 x 1", "--stages", "INT8"],
-    ],
-)
-def test_check_and_stress_accept_the_name(command: list[str]) -> None:
-    assert f"{command[0]} passed" in done(*command)
-
-
 def test_one_name_stands_for_a_shipped_pair() -> None:
     for floating, int8 in (
         ("convbeers-xs", None),
@@ -241,21 +175,21 @@ def test_one_name_stands_for_a_shipped_pair() -> None:
 def test_export_writes_a_shipped_networks_integers_for_the_host_and_the_board(
     tmp_path: Path,
 ) -> None:
-    done("export", "--network", "convbeers-xs", "--out", tmp_path / "net.onnx")
+    done(f"export --network convbeers-xs --out {tmp_path}/net.onnx")
     assert metadata(load_onnx(tmp_path / "net.onnx"))["variant"] == "convbeers-xs"
     host = str(tmp_path / "int8.onnx")
     board = str(tmp_path / "core.onnx")
-    network = ("--network", "convbeers-half-xs-int8", "--sensor", "blind")
-    done("export", *network, "--tile", "64", "--out", host, "--board-file", board)
+    network = "--network convbeers-half-xs-int8 --sensor blind"
+    done(f"export --tile 64 --out {host} --board-file {board} {network}")
     assert metadata(load_onnx(Path(host)))["sensor"] == "blind"
     for path in (host, board):
-        done("check", path)
+        done(f"check {path}")
 
 
 def test_a_tile_that_a_network_cannot_rearrange_is_refused(tmp_path: Path) -> None:
     out = tmp_path / "x.onnx"
-    words = ("--network", "convbeers-half-xs-int8", "--tile", "65", "--out", out)
-    assert "--tile must be a multiple of 2 px" in refused("export", *words)
+    words = f"--network convbeers-half-xs-int8 --tile 65 --out {out}"
+    assert "--tile must be a multiple of 2 px" in refused(f"export {words}")
     assert not out.exists()
 
 

@@ -26,8 +26,6 @@ from tests.model.networks import plain
 
 pytestmark = pytest.mark.slow
 
-runner = CliRunner()
-
 ROOT = Path(__file__).resolve().parents[2]
 needs_filters = pytest.mark.skipif(
     sys.platform != "linux" or platform.machine() not in SOCKET_CALL,
@@ -49,13 +47,25 @@ def no_sockets(monkeypatch: pytest.MonkeyPatch) -> list[tuple[object, ...]]:
     return attempts
 
 
-def done(*arguments: object) -> None:
-    result = runner.invoke(app, [str(argument) for argument in arguments])
-    # The gate ends with 1 for so small a network.
-    assert result.exit_code in (0, 1), result.output
+COMMANDS = """
+profiles
+export --network w.safetensors --out f.onnx
+quantize f.onnx --out i.onnx --images scenes --patches 2 --patch 32
+gate f.onnx i.onnx --images scenes --patches 2 --json gate.json
+check i.onnx --tile 64
+bench i.onnx --size 300x200 --tile 64 --no-traditional
+restore raw.tif out.tif --network i.onnx
+gate f.onnx i.onnx --images scenes --patches 2 --baseline gate.json
+evaluate --images scenes --methods degraded,i.onnx
+simulate --scene haze-over-sea --explain
+simulate --patch 32 --workers 1 --out pairs
+train --variant convbeers-xs --drawn 1 --steps 2 --batch 1 --patch 32 --validate-every 0 --lpips-weight 0 --out run
+"""  # noqa: E501 - commands, one a line
 
 
-def test_the_chain_opens_no_socket(tmp_path: Path, no_sockets: list[tuple[object, ...]]) -> None:
+def test_the_chain_opens_no_socket(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_sockets: list[tuple[object, ...]]
+) -> None:
     weights = tmp_path / "w.safetensors"
     scenes = tmp_path / "scenes"
     save_network(weights, plain(Variant(1, 4)), {"degraded": "pleiades-degraded"})
@@ -63,25 +73,14 @@ def test_the_chain_opens_no_socket(tmp_path: Path, no_sockets: list[tuple[object
     rng = np.random.default_rng(0)
     tifffile.imwrite(scenes / "a.tif", rng.integers(200, 1800, (700, 700)).astype(np.uint16))
     tifffile.imwrite(tmp_path / "raw.tif", rng.integers(200, 1800, (37, 61)).astype(np.uint16))
-    flt = tmp_path / "f.onnx"
-    int8 = tmp_path / "i.onnx"
-    figures = tmp_path / "gate.json"
-    done("profiles")
-    done("export", "--network", weights, "--out", flt)
-    done("quantize", flt, "--out", int8, "--images", scenes, "--patches", 2, "--patch", 32)
-    done("gate", flt, int8, "--images", scenes, "--patches", 2, "--json", figures)
-    done("check", int8, "--tile", 64)
-    done("bench", int8, "--size", "300x200", "--tile", 64, "--no-traditional")
-    done("restore", tmp_path / "raw.tif", tmp_path / "out.tif", "--network", int8)
-    done("gate", flt, int8, "--images", scenes, "--patches", 2, "--baseline", figures)
-    done("evaluate", "--images", scenes, "--methods", f"degraded,{int8}")
-    done("simulate", "--scene", "haze-over-sea", "--explain")
-    done("simulate", "--patch", 32, "--workers", 1, "--out", tmp_path / "pairs")
-    tiny = ("--steps", 2, "--batch", 1, "--patch", 32, "--validate-every", 0, "--lpips-weight", 0)
-    done("train", "--variant", "convbeers-xs", "--drawn", 1, *tiny, "--out", tmp_path / "run")
-    assert (tmp_path / "run" / "convbeers-xs.safetensors").is_file()
-    assert json.loads(figures.read_text())["command"] == "gate"
-    assert tifffile.imread(tmp_path / "out.tif").shape == (37, 61)
+    monkeypatch.chdir(tmp_path)
+    for command in COMMANDS.strip().splitlines():
+        result = CliRunner().invoke(app, command.split())
+        # The gate ends with 1 for so small a network.
+        assert result.exit_code in (0, 1), result.output
+    assert Path("run/convbeers-xs.safetensors").is_file()
+    assert json.loads(Path("gate.json").read_text())["command"] == "gate"
+    assert tifffile.imread("out.tif").shape == (37, 61)
     assert no_sockets == []
 
 

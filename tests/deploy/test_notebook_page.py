@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from numpy.testing import assert_array_equal
 
 import beers_deploy as bd
 from beers_deploy.profiles.shipped import BLIND, profile_path
@@ -61,7 +62,7 @@ def test_the_page_gives_what_the_command_gives(
     restore(Path("raw.tif"), Path("expected.tif"), network=shipped_pair(sensor=BLIND)[1])
     expected = tifffile.imread("expected.tif")
     with rasterio.open("restored.tif") as ours, rasterio.open("expected.tif") as theirs:
-        np.testing.assert_array_equal(ours.read(1), expected)
+        assert_array_equal(ours.read(1), expected)
         assert (ours.crs, ours.transform, ours.nodata) == (
             theirs.crs,
             theirs.transform,
@@ -72,6 +73,6 @@ def test_the_page_gives_what_the_command_gives(
     psnrs_db = [names["pair"].psnr(names["images"][name]) for name in ("raw", "chain", "network")]
     assert psnrs_db == sorted(psnrs_db)
     assert list(names["table"].columns[:1]) == ["tiles"]
-    np.testing.assert_array_equal(names["corner"].values, expected[:200, :200])
-    np.testing.assert_array_equal(names["whole"][0], expected)
-    np.testing.assert_array_equal(tifffile.imread(names["run"].path), expected)
+    assert_array_equal(names["corner"].values, expected[:200, :200])
+    assert_array_equal(names["whole"][0], expected)
+    assert_array_equal(tifffile.imread(names["run"].path), expected)

@@ -12,7 +12,6 @@ from beers_deploy.profiles.figures import (
     Figure,
     Row,
     measured,
-    number,
     predicted,
     published,
     unavailable,
@@ -63,20 +62,6 @@ def test_inputs_are_named_by_their_digest(tmp_path: Path) -> None:
     inputs = Table("test", {}, (tmp_path / "model.onnx",), (row,)).to_dict()["inputs"]
     digest = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
     assert inputs == [{"name": "model.onnx", "sha256": digest}]
-
-
-@pytest.mark.parametrize(
-    ("value", "digits", "text"),
-    [
-        (98965, 12, "98,965"),
-        (571991.3, 3, "572,000"),
-        (0.07258, 3, "0.0726"),
-        (36.161, 4, "36.16"),
-        (0, 4, "0"),
-    ],
-)
-def test_numbers_read_well(value: float, digits: int, text: str) -> None:
-    assert number(value, digits) == text
 
 
 def strictly(text: str) -> object:

@@ -1,16 +1,13 @@
 import io
-import re
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from rich.cells import cell_len
 from rich.console import Console
 
-from beers_deploy.profiles.errors import visible
 from beers_deploy.profiles.figures import (
     DIGITS,
-    Figure,
     Row,
     measured,
     number,
@@ -20,7 +17,7 @@ from beers_deploy.profiles.figures import (
 )
 from beers_deploy.results import Table
 from beers_deploy.tables.columns import LEGEND
-from beers_deploy.tables.terminal import PIPE_WIDTH, default_console, print_rows
+from beers_deploy.tables.terminal import PIPE_WIDTH, default_console
 
 TALL = [
     Row(
@@ -76,20 +73,6 @@ def test_every_figure_of_a_wide_row_is_read_at_80_columns() -> None:
         )
 
 
-@pytest.mark.parametrize("width", [70, 80, 120, 200])
-@pytest.mark.parametrize("count", [3, 9])
-def test_no_number_of_many_rows_is_cut_or_broken(width: int, count: int) -> None:
-    figures = {f"figure {k}": predicted(913_456, "px", (503_456, 1_660_123), "m") for k in range(8)}
-    rows = [
-        Row("t", f"vck190 C32B{k}, tiles of 640", figures, {"range": "outside"})
-        for k in range(count)
-    ]
-    text = shown(rows, width)
-    assert "\u2026" not in text
-    assert text.count("913,000 ") == text.count("1,660,000]") == 8 * count
-    assert all(text.count(f"C32B{k}") == 1 for k in range(count))
-
-
 @given(st.integers(40, 200))
 def test_long_names_give_way_before_a_figure_is_cut(width: int) -> None:
     """Names are wrapped, and the figures next to them are wide: each has its interval and mode."""
@@ -108,25 +91,6 @@ def test_a_missing_figure_is_a_dash_with_its_reason_once() -> None:
     text = shown(rows, 80)
     assert text.count("no counter") == 1
     assert "0" not in text.replace(LEGEND, "")
-
-
-@pytest.mark.parametrize(
-    "word", ["\x1b[31mred", "\x9b31m", "\u202egnp.exe", "[red]red[/red]", "a[/b]", "\r"]
-)
-def test_what_a_file_says_is_shown_and_not_obeyed(word: str) -> None:
-    """By a terminal of colours, which prints escapes of its own."""
-    figure = measured(1.5, "px", "here")
-    stream = io.StringIO()
-    rows = [Row("t", word, {"size": figure, word: unavailable(word, word)}, {word: word})] * 2
-    for shape in (rows, rows[:1]):
-        print_rows(
-            word,
-            shape,
-            Console(file=stream, width=PIPE_WIDTH, force_terminal=True, color_system="standard"),
-        )
-    text = re.sub(r"\x1b\[(0|1|2|3|3[0-9]|1;3[0-9]|2;3[0-9])?m", "", stream.getvalue())
-    assert set("\x1b\x9b\u202e\r").isdisjoint(text)
-    assert text.count(visible(word)) >= 10
 
 
 def test_a_tag_is_a_word_and_no_unit() -> None:
@@ -155,26 +119,6 @@ def test_a_table_of_words_needs_no_legend() -> None:
 def test_a_pipe_is_wide_enough_for_whole_tables(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "20")
     assert default_console().width == PIPE_WIDTH
-
-
-FIGURES = st.one_of(
-    st.builds(lambda v: measured(v, "s", "here"), st.floats(-1e9, 1e9)),
-    st.builds(lambda v: predicted(v, "W", (v - 1, v + 1), "model"), st.floats(0, 1e7)),
-    st.builds(lambda v: published(v, "dB", "paper"), st.floats(0, 100)),
-    st.just(unavailable("J", "no [red]counter[/red]")),
-)
-
-
-@settings(max_examples=25)
-@given(
-    st.lists(
-        st.dictionaries(st.text(min_size=1, max_size=9), FIGURES, max_size=4),
-        min_size=1,
-        max_size=4,
-    )
-)
-def test_any_rows_print_at_80_columns(figures: list[dict[str, Figure]]) -> None:
-    shown([Row("t", f"row [{k}]", row) for k, row in enumerate(figures)], 80)
 
 
 @given(st.floats(-1e9, 1e9), st.sampled_from(sorted(set(DIGITS.values()))))

@@ -3,9 +3,7 @@ no matter.
 """
 
 import hashlib
-import io
 import json
-import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,93 +12,28 @@ import numpy as np
 import pytest
 import tifffile
 import torch
-from typer.testing import CliRunner
 
-from beers_deploy.dpu.board import load_dpu
-from beers_deploy.model.convbeers import arrays, load_network
+from beers_deploy.model.convbeers import arrays
 from beers_deploy.model.dataset import _read_summary
 from beers_deploy.model.io.lock import part_folder
 from beers_deploy.model.io.tensors import read_tensors as read_weights
 from beers_deploy.model.io.tensors import write_tensors
-from beers_deploy.model.metrics.perceptual import read_tensors
 from beers_deploy.model.raster.images import read_pixels
 from beers_deploy.model.training.run import Log
-from beers_deploy.profiles.errors import BeersError, ModelError, OptionError, ProfileError
-from beers_deploy.profiles.figures import Check, Row, measured
-from beers_deploy.profiles.shipped import HERE
+from beers_deploy.profiles.errors import BeersError, ModelError, OptionError
 from beers_deploy.profiles.toml import read_json, read_toml_text
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.restoration.checkpoint import Checkpoint, FinishedRow, journal_text
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.results import Table
-from beers_deploy.verdict import PATCHES, read_baseline, read_document
 from tests.deploy.command_line import refused
 from tests.fuzz.networks import checkpoint_seeds, go_on
 from tests.fuzz.parsers import JOB, SHAPE
-
-runner = CliRunner()
-
-
-def document(path: Path, value: object, name: str = "int8") -> Path:
-    """Results with one figure of any value."""
-    arguments = dict.fromkeys(PATCHES)
-    row = Row("gate", name, {"MAE": measured(1.0, "", "here")})
-    check = Check("MAE", 0.5, 2.0, "of full scale")
-    content = Table("gate", arguments, (), (row,), (check,)).to_dict()
-    path.write_text(
-        json.dumps(content).replace('"value": 1.0', f'"value": {value}'), encoding="utf-8"
-    )
-    return path
-
-
-@pytest.mark.parametrize(
-    "value", ["NaN", "Infinity", "1e999", "1" + "0" * 400, "9" * 5000, "[" * 100_000]
-)
-def test_figures_that_are_no_numbers_are_refused(value: str, tmp_path: Path) -> None:
-    path = document(tmp_path / "a.json", value)
-    with pytest.raises(OptionError, match=r"a\.json"):
-        read_baseline(path, dict.fromkeys(PATCHES))
-
-
-def test_a_name_that_no_terminal_prints_is_refused(tmp_path: Path) -> None:
-    path = document(tmp_path / "a.json", 1.0)
-    path.write_text(path.read_text().replace("int8", "\\ud800"))
-    with pytest.raises(OptionError):
-        read_document(path)
-
-
-def test_a_deep_header_is_refused(tmp_path: Path) -> None:
-    content = json.dumps({"__metadata__": {"variant": "[" * 50_000}}).encode()
-    (tmp_path / "w.safetensors").write_bytes(len(content).to_bytes(8, "little") + content)
-    with pytest.raises(ModelError, match="nesting"):
-        load_network(tmp_path / "w.safetensors")
 
 
 def test_a_name_too_long_for_the_disk_is_a_sentence(tmp_path: Path) -> None:
     for reader, name in ((load_onnx, "a" * 5000 + ".onnx"), (read_pixels, "a" * 5000 + ".tif")):
         with pytest.raises(BeersError, match="too long"):
             reader(tmp_path / name)
-
-
-@pytest.mark.parametrize(
-    ("line", "replacement"),
-    [
-        ("\ncpb = {", "\ncpbb = {"),
-        ("\nbatch_handlers = { value = 3,", "\nbatch_handlers = { value = 0,"),
-        ("\nweight_banks = {", "\nmine = 0\nweight_banks = {"),
-    ],
-)
-def test_a_target_with_constants_that_no_board_has_is_refused(
-    line: str, replacement: str, tmp_path: Path
-) -> None:
-    shipped = (HERE / "targets" / "vck190.toml").read_text(encoding="utf-8")
-    assert line in shipped
-    path = tmp_path / "mine.toml"
-    path.write_text(shipped)
-    load_dpu(str(path))
-    path.write_text(shipped.replace(line, replacement))
-    with pytest.raises(ProfileError, match="board can have"):
-        load_dpu(str(path))
 
 
 Spoil = Callable[[dict[str, torch.Tensor]], object]
@@ -114,9 +47,7 @@ Spoil = Callable[[dict[str, torch.Tensor]], object]
         lambda t: t.update({"average.tail.bias": torch.zeros(7)}),
         lambda t: t.update({"moment.tail.bias.exp_avg": torch.zeros(3, 1)}),
         lambda t: t.pop("moment.tail.bias.exp_avg"),
-        lambda t: t.update({"moment.tail.bias.mine": torch.zeros(1)}),
         lambda t: t.update({"moment.tail.bias.step": torch.tensor(0.0)}),
-        lambda t: t.update({"moment.tail.bias.step": torch.tensor(-1e9)}),
         lambda t: t.update({"moment.tail.bias.step": torch.tensor(11.0)}),
         lambda t: t.update({"moment.tail.bias.exp_avg_sq": torch.full((1,), -1.0)}),
         lambda t: t.update({"moment.nobody.step": torch.zeros(())}),
@@ -135,22 +66,6 @@ def test_a_spoilt_checkpoint_is_refused(spoil: Spoil, tmp_path: Path) -> None:
         go_on(path)
 
 
-def archive(path: Path, content: bytes) -> Path:
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
-        file.writestr("a.npy", content)
-    return path
-
-
-def test_an_array_larger_than_its_archive_is_refused(tmp_path: Path) -> None:
-    stream = io.BytesIO()
-    np.save(stream, np.ones((2, 3), np.float32))
-    assert read_tensors(archive(tmp_path / "a.npz", stream.getvalue()), ["a"])["a"].shape == (2, 3)
-    description: dict[str, object] = {"descr": "<f4", "fortran_order": False, "shape": (1 << 40,)}
-    np.lib.format.write_array_header_1_0(head := io.BytesIO(), description)
-    with pytest.raises(ModelError, match="arrays"):
-        read_tensors(archive(tmp_path / "b.npz", head.getvalue() + bytes(24)), ["a"])
-
-
 def stored_rows(rows_px: int = 4, **counts: int) -> tuple[bytes, FinishedRow]:
     """Return rows of pixels as a checkpoint stores them, and their line in its journal."""
     pixels = np.arange(rows_px * SHAPE[2], dtype=np.uint16).tobytes()
@@ -166,10 +81,6 @@ ENDS = (4, SHAPE[1])
 @pytest.mark.parametrize(
     "journal",
     [
-        "[]",
-        "3",
-        "",
-        "[" * 10_000,
         json.dumps({"job": JOB, "rows": 4, "known": 32}),
         journal_text({"job": 1}, [stored_rows()[1]]),
         journal_text(JOB, [stored_rows(known=-5)[1]]),
@@ -254,6 +165,6 @@ def test_a_mark_at_the_beginning_of_a_text_is_no_part_of_it(tmp_path: Path) -> N
 @pytest.mark.parametrize("name", ["out.png", "out.jpg", "out", "out.tif.gz"])
 def test_no_tiff_is_written_under_another_name(name: str, tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "raw.tif", np.full((20, 20), 500, np.uint16))
-    message = refused("restore", tmp_path / "raw.tif", tmp_path / name)
+    message = refused(f"restore {tmp_path}/raw.tif {tmp_path}/{name}")
     assert f"such as restored.tif, got {name}" in message
     assert not (tmp_path / name).exists()

@@ -1,6 +1,5 @@
 """The parameters of all commands, with what they say of paths, and values for them."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from inspect import Parameter
 from pathlib import Path
@@ -116,8 +115,3 @@ def options(command: str) -> dict[str, Option]:
     return {
         parameter.name: Option(command, parameter) for parameter in COMMANDS[command].parameters
     }
-
-
-def every_option() -> Iterator[Option]:
-    for command in COMMANDS:
-        yield from options(command).values()

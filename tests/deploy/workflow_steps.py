@@ -22,7 +22,7 @@ ACTION = ROOT / "action.yml"
 
 EXPRESSION = re.compile(r"\$\{\{ (.+?) \}\}")
 IS_EMPTY = re.compile(r"([\w.-]+) == ''")
-BASH = ("bash", "--noprofile", "--norc", "-eo", "pipefail", "-c")
+BASH = ["bash", "--noprofile", "--norc", "-eo", "pipefail", "-c"]
 """As GitHub runs `shell: bash`."""
 
 SHORT = {"quantize": "--patches 2 --patch 32", "gate": "--patches 2"}

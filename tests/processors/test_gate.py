@@ -14,7 +14,7 @@ def gate(scenes: Path, *pair: object, code: int = 0) -> str:
     """The command's words on one patch of 128 x 128: emulated float networks
     take seconds for each.
     """
-    return done("gate", *pair, "--images", scenes, "--patches", 1, code=code)
+    return done(f"gate --images {scenes} --patches 1", *pair, code=code)
 
 
 @pytest.mark.parametrize("name", ["convbeers-xs", "convbeers-s"])

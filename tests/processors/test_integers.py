@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
 from beers_deploy.quant.encodings import board_model, host_model
@@ -43,12 +44,10 @@ def test_both_encodings_are_the_integer_reference(
     planes = shipped.core.ends.split(pixels)
     tensors, _ = run_core(shipped.core, planes, half_even=True)
     restored = np.clip(pixels + merged_correction(shipped.core, tensors), 0, 1)
-    np.testing.assert_array_equal(
-        run(open_session(shipped.host, optimise=optimise), pixels), restored
-    )
+    assert_array_equal(run(open_session(shipped.host, optimise=optimise), pixels), restored)
     feed = {PLANES: planes.astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
     by_board = open_session(shipped.board, optimise=optimise).run(None, feed)[0]
-    np.testing.assert_array_equal(by_board, correction(shipped.core, planes, half_even=True))
+    assert_array_equal(by_board, correction(shipped.core, planes, half_even=True))
 
 
 def test_every_layer_is_that_of_the_integer_reference(shipped: Encodings) -> None:
@@ -98,11 +97,11 @@ def test_the_largest_products_are_added_exactly(seed: int, channels: int) -> Non
     restored = np.clip(pixels + expected, 0, 1)
     feed = {PLANES: split(pixels).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
     for optimise in (True, False):
-        np.testing.assert_array_equal(
+        assert_array_equal(
             run(open_session(host_model(core, {}), optimise=optimise), pixels), restored
         )
         by_board = open_session(board_model(core, {}), optimise=optimise).run(None, feed)[0]
-        np.testing.assert_array_equal(by_board, expected)
+        assert_array_equal(by_board, expected)
 
 
 def saturating_sums(values: np.ndarray, weights: np.ndarray) -> np.ndarray:

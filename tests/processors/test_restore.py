@@ -53,16 +53,7 @@ PLAIN = ("--no-consistency", "--no-exposure")
 def test_the_command_writes_the_same_pixels(tmp_path: Path) -> None:
     dn = raw(70, 41)
     tifffile.imwrite(tmp_path / "raw.tif", dn)
-    done(
-        "restore",
-        tmp_path / "raw.tif",
-        tmp_path / "restored.tif",
-        "--tile",
-        64,
-        "--sensor",
-        SENSOR,
-        *PLAIN,
-    )
+    done(f"restore {tmp_path}/raw.tif {tmp_path}/restored.tif --tile 64 --sensor {SENSOR}", *PLAIN)
     np.testing.assert_array_equal(
         tifffile.imread(tmp_path / "restored.tif"), by_reference(dn, "convbeers-s")
     )

@@ -19,7 +19,7 @@ from packaging.requirements import Requirement
 from tests.deploy.dpu.graphs import Sketch
 
 ROOT = Path(__file__).resolve().parents[2]
-PROJECT = (
+PROJECT = [
     "deploy",
     "model",
     "profiles",
@@ -29,7 +29,7 @@ PROJECT = (
     "MANIFEST.in",
     "README.md",
     "LICENSE",
-)
+]
 SIDE_PX = 96
 SCENE_PX = 400
 SAMPLES = 4
@@ -113,40 +113,25 @@ def weighted(
     return sketch.node("Conv", source, weight, pads=[1] * 4)
 
 
+COMMANDS = """
+--help
+restore --help
+restore raw.tif float32.tif --network convbeers-xs --sensor pleiades-degraded
+restore raw.tif int8.tif --network convbeers-xs-int8 --sensor pleiades-degraded
+simulate --images scene.tif --sensor pleiades-degraded --out pairs
+quantize float.onnx --samples samples.npy --out int8.onnx
+gate float.onnx int8.onnx --samples samples.npy --json gate.json
+check int8.onnx --tile 64
+bench int8.onnx --size 200x100 --tile 64 --no-traditional
+"""
+
+
 def run_main_commands(python: Path, folder: Path) -> None:
-    def done(*words: str) -> None:
-        command = [str(python), "-m", "beers_deploy", *words]
+    for line in COMMANDS.strip().splitlines():
+        command = [str(python), "-m", "beers_deploy", *line.split()]
         ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         # A verdict on so small a network may be negative.
-        assert ran.returncode in (0, 1), (
-            f"{' '.join(words)}\n{ran.stdout[-2000:]}{ran.stderr[-2000:]}"
-        )
-
-    done("--help")
-    done("restore", "--help")
-    done(
-        "restore",
-        "raw.tif",
-        "float32.tif",
-        "--network",
-        "convbeers-xs",
-        "--sensor",
-        "pleiades-degraded",
-    )
-    done(
-        "restore",
-        "raw.tif",
-        "int8.tif",
-        "--network",
-        "convbeers-xs-int8",
-        "--sensor",
-        "pleiades-degraded",
-    )
-    done("simulate", "--images", "scene.tif", "--sensor", "pleiades-degraded", "--out", "pairs")
-    done("quantize", "float.onnx", "--samples", "samples.npy", "--out", "int8.onnx")
-    done("gate", "float.onnx", "int8.onnx", "--samples", "samples.npy", "--json", "gate.json")
-    done("check", "int8.onnx", "--tile", "64")
-    done("bench", "int8.onnx", "--size", "200x100", "--tile", "64", "--no-traditional")
+        assert ran.returncode in (0, 1), f"{line}\n{ran.stdout[-2000:]}{ran.stderr[-2000:]}"
 
 
 @pytest.mark.slow

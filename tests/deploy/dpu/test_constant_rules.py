@@ -85,9 +85,6 @@ def test_a_bias_passes_where_some_shift_makes_it_int8(values: list[int], shift: 
         ([127 << 16, -128 << 16, 0, 0], set()),
         # A shift of 16 is the largest, and with it the value is 128.
         ([64 << 17, 0, 0, 0], {"int32 bias"}),
-        ([129, 1, 0, 0], {"int32 bias"}),
-        ([127, 1, 0, 0], set()),
-        (np.random.default_rng(0).integers(-(2**30), 2**30, 4).tolist(), {"int32 bias"}),
     ],
 )
 def test_the_bias_of_an_integer_kernel_is_looked_at(
@@ -106,7 +103,7 @@ def test_the_shipped_files_keep_every_rule(name: str) -> None:
     assert rules(onnx.load_model(shipped_pair(name)[1])) == set()
 
 
-@pytest.mark.parametrize("spread", [0.001, 0.1, 3.0])
+@pytest.mark.parametrize("spread", [0.1, 3.0])
 def test_what_quantize_writes_of_random_networks_keeps_every_rule(spread: float) -> None:
     """In both encodings, biases small and large beside the products."""
     network = quantized(spread)

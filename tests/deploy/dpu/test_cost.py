@@ -6,7 +6,6 @@ import pytest
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import Prediction, counted_power, layer_energy_j
-from beers_deploy.dpu.cost.model import LARGE_MAP_BYTES, regime_of
 from beers_deploy.dpu.cost.work import BURST_BYTES, Work, count_work
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.performance.swath import predict_network
@@ -267,12 +266,6 @@ def test_a_task_that_is_stated_takes_the_place_of_what_the_file_tells(tmp_path: 
     assert (copied.task, ranked.task) == ("copy", "sort")
     assert ranked.host_s > copied.host_s
     assert ranked.batch_time_s == copied.batch_time_s
-
-
-def test_regimes() -> None:
-    assert regime_of(host_bound=True, map_bytes=1e9) == "host"
-    assert regime_of(host_bound=False, map_bytes=LARGE_MAP_BYTES) == "small maps"
-    assert regime_of(host_bound=False, map_bytes=LARGE_MAP_BYTES + 1) == "large maps"
 
 
 def test_latency_is_that_of_one_core_and_one_thread(tmp_path: Path) -> None:

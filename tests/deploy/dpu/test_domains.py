@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
-import tifffile
 from hypothesis import given
 from hypothesis import strategies as st
-from onnx import helper, numpy_helper
+from onnx import helper
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.shipped import board_names, npu_names
@@ -18,7 +17,7 @@ from beers_deploy.quant.domains import INTEGER_OPERATORS, is_foreign, operator_n
 from beers_deploy.quant.graph import refusal
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.verbs.check import check
-from tests.deploy.command_line import done, refused
+from tests.deploy.command_line import done
 from tests.deploy.dpu.graphs import Sketch
 
 BOARDS = [*board_names(), *npu_names()]
@@ -89,44 +88,11 @@ def with_function(path: Path, domain: str) -> Path:
 @pytest.mark.parametrize("domain", ["local", ""])
 def test_a_function_of_the_file_is_no_operator_of_onnx(domain: str, tmp_path: Path) -> None:
     path = with_function(tmp_path / "a.onnx", domain)
-    output = done("check", path, "--tile", "64", code=1)
+    output = done(f"check {path} --tile 64", code=1)
     assert f"{domain}::Relu" in output
     message = refused_by_load(path)
     assert f"Relu of {domain!r}, a function" in message
     assert "inline its functions" in message
-
-
-def test_a_constant_of_another_domain_is_not_dropped(tmp_path: Path) -> None:
-    sketch = Sketch(8)
-    half = helper.make_node(
-        "Constant",
-        [],
-        ["half"],
-        domain="my.ops",
-        value=numpy_helper.from_array(np.array(0.5, np.float32)),
-    )
-    sketch.nodes.append(half)
-    path = sketch.save(
-        tmp_path / "a.onnx", sketch.conv(sketch.node("Mul", sketch.conv("image"), "half"))
-    )
-    model = onnx.load_model(path)
-    model.opset_import.append(helper.make_opsetid("my.ops", 1))
-    onnx.save_model(model, path)
-    assert "my.ops::Constant" in done("check", path, "--tile", "64", code=1)
-
-
-@pytest.mark.parametrize("command", ["quantize", "restore", "gate"])
-def test_commands_refuse_it_in_one_sentence(command: str, tmp_path: Path) -> None:
-    path = network(tmp_path / "a.onnx", "between", "my.ops")
-    tifffile.imwrite(tmp_path / "in.tif", np.full((40, 40), 900, np.uint16))
-    words = {
-        "quantize": (path, "--out", tmp_path / "out.onnx"),
-        "restore": (tmp_path / "in.tif", tmp_path / "out.tif", "--network", path),
-        "gate": (path, path),
-    }
-    message = refused(command, *words[command])
-    assert "of 'my.ops'" in message
-    assert "xport the network with operators of ONNX itself." in message
 
 
 def test_onnxruntimes_optimised_file_names_the_remedy(tmp_path: Path) -> None:

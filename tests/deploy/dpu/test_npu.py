@@ -109,7 +109,7 @@ def mixed(s: QdqSketch, x: str) -> str:
 
 def test_what_is_legal_but_worth_knowing_is_a_note(tmp_path: Path) -> None:
     path = written(tmp_path / "n.onnx", mixed)
-    output = done("check", path, "--target", "vek385", "--json", tmp_path / "o.json")
+    output = done(f"check {path} --target vek385 --json {tmp_path}/o.json")
     rows = valid(tmp_path / "o.json")["rows"]
     devices = {row["text"]["device"] for row in rows if row["table"] == "nodes"}
     by_default = "float, BF16 by the compiler's default"
@@ -133,12 +133,10 @@ def test_no_limit_of_a_dpu_is_applied(tmp_path: Path) -> None:
 
 def test_nothing_is_predicted_and_what_is_published_is_quoted(tmp_path: Path) -> None:
     assert "The target 'vek385' has no DPU" in refused(
-        "tradeoff", "--target", "vek385", "--out", tmp_path / "study"
+        f"tradeoff --target vek385 --out {tmp_path}/study"
     )
-    assert "--dpu cannot be 'C32B3' for vek385" in refused(
-        "check", "--target", "vek385", "--dpu", "C32B3"
-    )
-    done("bench", "convbeers-xs", "--target", "vek385", "--json", tmp_path / "o.json")
+    assert "--dpu cannot be 'C32B3' for vek385" in refused("check --target vek385 --dpu C32B3")
+    done(f"bench convbeers-xs --target vek385 --json {tmp_path}/o.json")
     own, *quoted = valid(tmp_path / "o.json")["rows"]
     assert {figure["mode"] for figure in own["figures"].values()} == {"unavailable"}
     figures = [(figure["mode"], figure["value"]) for figure in figures_of(quoted)]
@@ -149,12 +147,11 @@ def test_quantize_writes_vint8_and_the_configuration_of_the_compiler(tmp_path: P
     network, samples, core = (tmp_path / name for name in ("f.onnx", "s.npy", "core.onnx"))
     onnx.save(to_onnx(plain(Variant(blocks=1, features=4), seed=3), {}), network)
     np.save(samples, np.random.default_rng(0).random((4, 1, 48, 48), np.float32))
-    files = ["--samples", samples, "--out", tmp_path / "i.onnx"]
-    words = ["quantize", network, *files, "--target", "vek385"]
-    assert "--tile" in refused(*words, "--board-file", core)
-    assert "--board-file" in refused(*words, "--tile", 33)
-    done(*words, "--board-file", core, "--tile", 33)
-    assert "check passed" in done("check", core, "--target", "vek385")
+    command = f"quantize {network} --samples {samples} --out {tmp_path}/i.onnx --target vek385"
+    assert "--tile" in refused(f"{command} --board-file {core}")
+    assert "--board-file" in refused(f"{command} --tile 33")
+    done(f"{command} --board-file {core} --tile 33")
+    assert "check passed" in done(f"check {core} --target vek385")
     config = json.loads((tmp_path / "vitisai_config.json").read_text(encoding="utf-8"))
     assert config["passes"][1]["vaiml_config"] == {"device": "ve2-xc2ve3858", "optimize_level": 2}
     checks = bd.gate(network, tmp_path / "i.onnx", target="vek385", samples=samples).checks
@@ -162,11 +159,11 @@ def test_quantize_writes_vint8_and_the_configuration_of_the_compiler(tmp_path: P
 
 
 def test_export_writes_vint8_of_a_shipped_network(tmp_path: Path) -> None:
-    files = ["--network", "convbeers-half-xs-int8", "--out", tmp_path / "i.onnx"]
-    words = ["export", *files, "--target", "vek385"]
-    core = ["--board-file", tmp_path / "core.onnx"]
-    assert "--board-file" in refused(*words)
-    assert "--tile" in refused(*words, *core)
-    assert "multiple of 2" in refused(*words, *core, "--tile", 63)
-    done(*words, *core, "--tile", 62)
-    assert "check passed" in done("check", tmp_path / "core.onnx", "--target", "vek385")
+    core = tmp_path / "core.onnx"
+    network = f"--network convbeers-half-xs-int8 --out {tmp_path}/i.onnx"
+    assert "--board-file" in refused(f"export {network} --target vek385")
+    command = f"export {network} --target vek385 --board-file {core}"
+    assert "--tile" in refused(command)
+    assert "multiple of 2" in refused(f"{command} --tile 63")
+    done(f"{command} --tile 62")
+    assert "check passed" in done(f"check {core} --target vek385")

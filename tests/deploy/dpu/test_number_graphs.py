@@ -10,13 +10,9 @@ import numpy as np
 import pytest
 
 from beers_deploy.dpu.board import load_dpu
-from beers_deploy.dpu.checker import number_rules
-from beers_deploy.dpu.checker.finding import Rule
 from beers_deploy.dpu.checker.number_rules import AGAIN, MOVE
 from beers_deploy.dpu.checker.placement import place
-from beers_deploy.dpu.graph import Operation
 from beers_deploy.dpu.reading import read_network
-from beers_deploy.quant.graph.quantized import Scale
 from tests.deploy.dpu.graphs import QdqSketch
 
 DPU = load_dpu("vck190")
@@ -136,31 +132,3 @@ def test_weights_that_other_nodes_compute_are_refused(tmp_path: Path) -> None:
         )
 
     assert AGAIN in remedies(tmp_path / "n.onnx", draw)["int8 constants"]
-
-
-def test_only_a_bias_may_be_int32() -> None:
-    for role, legal in (("bias", True), ("input 0", False), ("output", False)):
-        op = Operation(
-            "op", "Conv", "conv", ("in",), ("out",), scales={role: Scale((0.5,), (0,), "int32")}
-        )
-        assert (number_rules.symmetric(op, DPU) is None) == legal
-
-
-@pytest.mark.parametrize(
-    ("rule", "scale", "legal"),
-    [
-        (number_rules.symmetric, Scale((0.5,), (128,), "uint8"), True),
-        (number_rules.symmetric, Scale((0.5,), (0,), "uint8"), False),
-        (number_rules.symmetric, Scale((0.5,), (3,), "int8"), False),
-        (number_rules.symmetric, Scale((0.5,), (0,), "int16"), False),
-        (number_rules.per_tensor, Scale((0.5, 0.25), (0, 0), "int8"), False),
-        (number_rules.power_of_two, Scale((0.5,), (0,), "int8"), True),
-        (number_rules.power_of_two, Scale((0.3,), (0,), "int8"), False),
-        (number_rules.power_of_two, Scale((0.0,), (0,), "int8"), False),
-        (number_rules.power_of_two, Scale((float("inf"),), (0,), "int8"), False),
-        (number_rules.power_of_two, Scale((float("nan"),), (0,), "int8"), False),
-    ],
-)
-def test_formats(rule: Rule, scale: Scale, legal: bool) -> None:
-    op = Operation("op", "Conv", "conv", ("in",), ("out",), integer=True, scales={"weight": scale})
-    assert (rule(op, DPU) is None) == legal

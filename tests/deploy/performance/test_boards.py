@@ -19,8 +19,8 @@ from beers_deploy.dpu.cost.model import TASKS
 from beers_deploy.model.raster.images import read_acquisition
 from beers_deploy.network import Network
 from beers_deploy.performance.board import Bench, Question, bench_board, boards_for
-from beers_deploy.performance.swath import Swath, predict_network
-from beers_deploy.performance.tables import frame_row, sweep_rows, within_words
+from beers_deploy.performance.swath import Swath
+from beers_deploy.performance.tables import sweep_rows, within_words
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
@@ -82,13 +82,6 @@ def test_all_boards_stand_in_one_table_with_their_processors_and_the_papers_rows
     assert sum(name.startswith("paper") for name in names(result.rows)) == 2
 
 
-@pytest.mark.slow
-def test_the_papers_rows_stand_beside_its_own_board_alone(network: Path) -> None:
-    result = bench(network, "kv260")
-    assert not any(name.startswith("paper") for name in names(result.rows))
-    assert any("kv260" in name for name in names(result.rows))
-
-
 def test_the_smallest_dpu_that_meets_a_time_is_named(network: Path) -> None:
     boards = [load_dpu("vck190", name) for name in ("C32B1", "C32B3", "C32B6")]
     rows = sweep_rows(network, Swath(3000, 2600, 128, 5), boards, [256, 128])
@@ -118,20 +111,6 @@ def test_a_network_that_is_not_tiled_is_predicted_by_the_frame(classifier: Path)
         bench(classifier, size="300x260")
 
 
-def test_a_frame_need_not_be_square(tmp_path: Path, classifier: Path) -> None:
-    model = onnx.load(classifier)
-    for side, size in zip(
-        model.graph.input[0].type.tensor_type.shape.dim[2:], (32, 96), strict=True
-    ):
-        side.dim_value = size
-    onnx.save(model, tmp_path / "wide.onnx")
-    dpu = load_dpu("vck190", None)
-    square, wide = (
-        frame_row(predict_network(path, dpu, None)) for path in (classifier, tmp_path / "wide.onnx")
-    )
-    assert (wide.figures["work"].value or 0) > 2.5 * (square.figures["work"].value or 0)
-
-
 @pytest.mark.parametrize("target", ["all", "kv260,vck190"])
 def test_one_configuration_or_runs_of_several_boards_are_refused(
     target: str, network: Path, tmp_path: Path
@@ -147,23 +126,6 @@ def test_an_npu_is_refused_next_to_boards_that_are_predicted(npu: str, network: 
     for target in (f"{npu},vck190", f"vck190,{npu}"):
         with pytest.raises(OptionError, match=f"target '{npu}' has no DPU"):
             bench(network, target)
-
-
-@pytest.mark.slow
-def test_a_stated_task_of_the_host_is_that_of_every_row(classifier: Path, network: Path) -> None:
-    result = bench(classifier, "all", size=None, host_task="softmax")
-    frames = [row for row in result.rows if row.table == "frames"]
-    assert {row.text["host's task"] for row in frames} == {"softmax"}
-    plain, ranked = (
-        [row for row in bench(network, host_task=task).rows if "one-thread latency" in row.figures]
-        for task in (None, "sort")
-    )
-    for before, after in zip(plain, ranked, strict=True):
-        assert (
-            (after.figures["one-thread latency"].value or 0)
-            > (before.figures["one-thread latency"].value or 0)
-            > 0
-        )
 
 
 def test_bench_accepts_the_host_tasks_of_the_cost_model() -> None:

@@ -5,16 +5,15 @@ from mmap import mmap
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
 
 from beers_deploy.network import Network, other_precision
-from beers_deploy.performance.host import Timed, host_rows, time_networks
+from beers_deploy.performance.host import host_rows
 from beers_deploy.performance.timing import cpu_load, resident_bytes
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.target import TargetProfile
-from tests.deploy.dpu.graphs import float_convbeers, integer_convbeers
+from tests.deploy.dpu.graphs import float_convbeers
 from tests.shipped import shipped_pair
 
 SHORT = {"min_time_s": Constant(0.05, "stated", "test"), "min_runs": Constant(3, "stated", "test")}
@@ -39,14 +38,6 @@ def test_float_and_int8_are_interleaved() -> None:
     for row in rows:
         modes = {figure.mode for key, figure in row.figures.items() if key != "power"}
         assert modes <= {"measured", "unavailable"}
-
-
-def test_turns_last_for_the_minimum_time_and_count(tmp_path: Path) -> None:
-    model = onnx.load_model(integer_convbeers(tmp_path / "i.onnx", 1, 8))
-    runs = [Timed("one", model), Timed("other", model)]
-    time_networks(runs, 24, 1, min_time_s=0.05, min_runs=7)
-    assert len(runs[0].times_s) == len(runs[1].times_s) >= 7
-    assert min(sum(run.times_s) for run in runs) >= 0.05
 
 
 def test_the_other_precision_is_a_shipped_network_of_the_same_variant() -> None:

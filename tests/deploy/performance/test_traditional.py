@@ -1,9 +1,6 @@
 """The traditional pipeline: measured here on crops, stored for a board's processor."""
 
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +10,6 @@ from beers_deploy.performance.tables import processor_row
 from beers_deploy.performance.traditional import CROP_PX, drawn_acquisition, measure_chain
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import TargetProfile
-from tests.deploy.dpu.graphs import integer_convbeers
 
 SENSORS = Sensor.load("pleiades-degraded"), Sensor.load("pleiades-reference")
 SWATH = Swath(*parse_size(PAPER_SIZE))
@@ -48,17 +44,3 @@ def test_the_boards_processor_holds_the_papers_run_and_lacks_what_its_file_lacks
     )
     row = processor_row(SWATH, replace(board, tables={}))
     assert "chain_s_per_mpx" in row.figures["latency"].reason
-
-
-@pytest.mark.slow
-def test_a_prediction_does_not_wait_for_torch(tmp_path: Path) -> None:
-    model = integer_convbeers(tmp_path / "net.onnx", 1, 8)
-    code = (
-        "import sys\nfrom beers_deploy.cli.commands import app\n"
-        f"app(['bench', {str(model)!r}, '--no-traditional'], standalone_mode=False)\n"
-        "sys.exit('torch' in sys.modules)"
-    )
-    process = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False
-    )
-    assert (process.returncode, "throughput" in process.stdout) == (0, True), process.stderr

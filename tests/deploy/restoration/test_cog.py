@@ -9,6 +9,7 @@ import pytest
 import rasterio
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 from beers_deploy.model.io.files import sha256
 from beers_deploy.model.raster.compression import Compression
@@ -23,7 +24,7 @@ cogeo: Any = pytest.importorskip("rio_cogeo")
 
 def both(folder: Path, pixels: np.ndarray, network: Path, **options: Any) -> tuple[Path, Path]:
     """Return the plain output and the cloud-optimised one of an image."""
-    image = images.write_tiff(folder / "in.tif", pixels)
+    image = images.write_tiff(folder / "in.tif", pixels, nodata=0)
     restore(image, folder / "plain.tif", network=network, **options)
     restore(image, folder / "cog.tif", network=network, cog=True, **options)
     assert sorted(path.name for path in folder.iterdir()) == ["cog.tif", "in.tif", "plain.tif"]
@@ -34,7 +35,8 @@ def both(folder: Path, pixels: np.ndarray, network: Path, **options: Any) -> tup
 def test_it_is_valid_and_holds_the_same(
     compression: Compression, model: Path, tmp_path: Path
 ) -> None:
-    pixels = np.tile(images.digital_numbers(), (1, 4, 5))
+    pixels = np.tile(np.maximum(images.digital_numbers(), 1), (1, 4, 5))
+    pixels[:, 30:60, 20:90] = 0
     if compression == "none":
         pixels = pixels.astype(np.float32)
     plain, cog = both(tmp_path, pixels, model)
@@ -43,10 +45,10 @@ def test_it_is_valid_and_holds_the_same(
     valid, errors, warnings = cogeo.cog_validate(cog, strict=True)
     assert (valid, errors, warnings) == (True, [], [])
     with rasterio.open(plain) as before, rasterio.open(cog) as after:
-        np.testing.assert_array_equal(after.read(), before.read())
-        np.testing.assert_allclose(
-            after.transform, images.profile()["transform"], rtol=0, atol=1e-9
-        )
+        assert_array_equal(after.read(), before.read())
+        assert after.nodata == 0
+        assert_array_equal(after.read() == 0, pixels == 0)
+        assert_allclose(after.transform, images.profile()["transform"], rtol=0, atol=1e-9)
         assert after.crs == rasterio.CRS.from_epsg(32631)
         assert (after.descriptions, after.scales) == (("B0", "B1"), (0.1, 0.2))
         assert after.overviews(1) == [2]
@@ -69,16 +71,6 @@ def test_it_records_what_was_done(tmp_path: Path) -> None:
     assert tags["RESTORED_SENSOR"] == "pleiades-degraded"
     assert tags["RESTORED_FULL_SCALE"] == "4095 (assumed: 12 bits)"
     assert tags["RESTORED_BY"].startswith("beers-deploy ")
-
-
-def test_missing_pixels_are_kept(model: Path, tmp_path: Path) -> None:
-    pixels = np.maximum(images.digital_numbers(), 1)
-    pixels[:, 30:60, 20:90] = 0
-    image = images.write_tiff(tmp_path / "in.tif", pixels, nodata=0)
-    restore(image, tmp_path / "out.tif", network=model, tile=64, cog=True)
-    with rasterio.open(tmp_path / "out.tif") as file:
-        assert file.nodata == 0
-        np.testing.assert_array_equal(file.read() == 0, pixels == 0)
 
 
 def test_a_run_stopped_while_it_is_written_goes_on(
@@ -108,7 +100,7 @@ def test_a_run_stopped_while_it_is_written_goes_on(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["expected.tif", "in.tif", "out.tif"]
 
 
-@settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(height=st.integers(1, 700), width=st.integers(1, 700))
 @example(height=600, width=1)
 def test_it_is_valid_at_any_size(height: int, width: int, model: Path, tmp_path: Path) -> None:
@@ -118,7 +110,7 @@ def test_it_is_valid_at_any_size(height: int, width: int, model: Path, tmp_path:
     assert cogeo.cog_validate(tmp_path / "out.tif")[0]
 
 
-@pytest.mark.parametrize("shape", [(1, 150, 118), (2, 520, 90), (2, 90, 1700), (3, 1100, 700)])
+@pytest.mark.parametrize("shape", [(1, 150, 118), (2, 520, 90), (2, 90, 1700)])
 def test_all_that_is_on_the_disk_at_a_time_is_checked_before_the_run(
     shape: tuple[int, int, int], model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

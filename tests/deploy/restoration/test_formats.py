@@ -1,12 +1,11 @@
 """Formats that GDAL reads give the same pixels and the same place on Earth as a TIFF."""
 
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
-import tifffile
+from numpy.testing import assert_allclose
 
 from beers_deploy.model.raster.reader import open_raster
 from beers_deploy.model.raster.source import fingerprint
@@ -14,32 +13,6 @@ from beers_deploy.profiles.errors import BeersError, ImageError
 from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import refused
 from tests.model.raster import formats as images
-
-PLACED = ["a.tif", "cog.tif", "a.jp2", "a.vrt", "a.img", "DIM.XML"]
-"""Without NITF, which stores the corners of an image to a tenth of a pixel."""
-
-
-def test_the_restored_pixels_are_the_same_from_every_format(model: Path, tmp_path: Path) -> None:
-    pixels = images.digital_numbers()
-    results = []
-    for name, write in images.FORMATS.items():
-        folder = tmp_path / name
-        folder.mkdir()
-        restore(write(folder / name, pixels), folder / "out.tif", network=model, tile=64)
-        results.append(tifffile.imread(folder / "out.tif"))
-    for result in results[1:]:
-        np.testing.assert_array_equal(result, results[0])
-
-
-@pytest.mark.parametrize("name", PLACED)
-def test_the_place_on_earth_is_kept(name: str, model: Path, tmp_path: Path) -> None:
-    image = images.FORMATS[name](tmp_path / name, images.digital_numbers())
-    restore(image, tmp_path / "out.tif", network=model)
-    with rasterio.open(image) as before, rasterio.open(tmp_path / "out.tif") as after:
-        np.testing.assert_allclose(
-            after.transform, images.profile()["transform"], rtol=0, atol=1e-9
-        )
-        assert after.crs == before.crs == rasterio.CRS.from_epsg(32631)
 
 
 @pytest.mark.parametrize("cog", [False, True])
@@ -55,54 +28,9 @@ def test_polynomials_bits_and_gains_of_a_dimap_are_kept(
         before_rpcs = before.rpcs.to_dict()
         # A DIMAP's model states its errors in other terms than GeoTIFF's tag.
         for key in before_rpcs.keys() - {"err_bias", "err_rand"}:
-            np.testing.assert_allclose(after_rpcs[key], before_rpcs[key], rtol=0, atol=1e-9)
+            assert_allclose(after_rpcs[key], before_rpcs[key], rtol=0, atol=1e-9)
         assert [after.tags(band)["RADIANCE_GAIN"] for band in (1, 2)] == ["9.0", "9.1"]
         assert [after.tags(band)["RADIANCE_BIAS"] for band in (1, 2)] == ["0.0", "0.1"]
-
-
-def test_names_and_gains_of_bands_are_kept(model: Path, tmp_path: Path) -> None:
-    more = "<Description>B0</Description><Offset>-0.5</Offset><Scale>0.25</Scale>"
-    image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers(), more)
-    restore(image, tmp_path / "out.tif", network=model)
-    with rasterio.open(tmp_path / "out.tif") as after:
-        assert after.descriptions == ("B0", "B0")
-        assert (after.scales, after.offsets) == ((0.25, 0.25), (-0.5, -0.5))
-
-
-def test_ground_control_points_are_kept(model: Path, tmp_path: Path) -> None:
-    points = "".join(
-        f'<GCP Id="{k}" Pixel="{17 * k}" Line="{9 * k * k}" X="{k / 3!r}" Y="{45 - k / 7!r}" '
-        'Z="0"/>'
-        for k in range(5)
-    )
-    image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers())
-    text = image.read_text()
-    place = text[text.index("<SRS>") : text.index("</GeoTransform>") + len("</GeoTransform>")]
-    image.write_text(text.replace(place, f'<GCPList Projection="EPSG:4326">{points}</GCPList>'))
-    restore(image, tmp_path / "out.tif", network=model)
-    with rasterio.open(image) as before, rasterio.open(tmp_path / "out.tif") as after:
-        assert before.gcps[1] == after.gcps[1] == rasterio.CRS.from_epsg(4326)
-        points_of = [[(p.col, p.row, p.x, p.y) for p in file.gcps[0]] for file in (before, after)]
-    assert len(points_of[0]) == 5
-    np.testing.assert_allclose(points_of[1], points_of[0], rtol=0, atol=1e-9)
-
-
-def test_missing_pixels_stay_missing(model: Path, tmp_path: Path) -> None:
-    pixels = np.maximum(images.digital_numbers(), 1)
-    pixels[:, 20:70, 30:90] = 0
-    paths = [
-        images.write_tiff(tmp_path / "a.tif", pixels, nodata=0),
-        images.write(tmp_path / "a.img", pixels, "HFA", nodata=0),
-        images.write_vrt(tmp_path / "a.vrt", pixels, "<NoDataValue>0</NoDataValue>"),
-    ]
-    # The nodata value is in the file itself, so GDAL wrote no sidecar.
-    assert not list(tmp_path.glob("*.img.aux.xml"))
-    for image in paths:
-        restore(image, tmp_path / f"{image.name}.tif", network=model, tile=64)
-    first, *rest = (tifffile.imread(tmp_path / f"{image.name}.tif") for image in paths)
-    np.testing.assert_array_equal(first == 0, pixels == 0)
-    for other in rest:
-        np.testing.assert_array_equal(other, first)
 
 
 def not_restored(image: Path, out: Path, model: Path, error: type[BeersError], *words: str) -> None:
@@ -142,11 +70,8 @@ def test_a_tile_is_no_output(model: Path, tmp_path: Path) -> None:
     before = tile.read_bytes()
     with pytest.raises(BeersError, match="an input of this run"):
         restore(image, tile, network=model, overwrite=True)
-    for words in (
-        ["restore", str(image), str(out), "--json", str(tile)],
-        ["restore", str(image), "--dry-run", "--json", str(tile)],
-    ):
-        assert tile.name in refused(*words)
+    for words in (out, "--dry-run"):
+        assert tile.name in refused(f"restore {image} {words} --json {tile}")
         assert tile.read_bytes() == before
 
 
@@ -158,43 +83,3 @@ def test_a_changed_tile_makes_another_image(tmp_path: Path) -> None:
         tmp_path / "R64C80.jp2", np.zeros((2, images.HEIGHT - 64, images.WIDTH - 80), np.uint16)
     )
     assert fingerprint(source.files) != before
-
-
-def test_alpha_and_masks_of_gdal_s_formats_are_missing_pixels(tmp_path: Path) -> None:
-    pixels = images.digital_numbers(bands=2)
-    hidden = np.zeros((images.HEIGHT, images.WIDTH), bool)
-    hidden[30:50, 40:] = True
-    pixels[1] = np.where(hidden, 0, 4095)
-    images.write_jp2(
-        tmp_path / "alpha.jp2", pixels, NBITS=12, PHOTOMETRIC="MINISBLACK", ALPHA="YES"
-    )
-    images.write_jp2(tmp_path / "beside.jp2", pixels[:1], NBITS=12)
-    images.write_mask(tmp_path / "beside.jp2", ~hidden)
-    for name, mask_kind in (("alpha.jp2", "alpha"), ("beside.jp2", "mask")):
-        with open_raster(tmp_path / name) as source:
-            rows = source.read(20, 60)
-            assert (source.raster.bands, source.raster.mask_kind) == (1, mask_kind)
-            np.testing.assert_array_equal(np.ma.getdata(rows)[0], pixels[0, 20:60])
-            np.testing.assert_array_equal(source.raster.missing(rows)[0], hidden[20:60])
-
-
-def test_a_cog_keeps_mask_and_alpha(model: Path, tmp_path: Path) -> None:
-    pixels = images.digital_numbers(bands=1)[0]
-    hidden = np.zeros((images.HEIGHT, images.WIDTH), bool)
-    hidden[30:50, 40:] = True
-    tifffile.imwrite(tmp_path / "mask.tif", pixels)
-    planes = np.stack([pixels, ~hidden * 4095]).astype(np.uint16)
-    tifffile.imwrite(
-        tmp_path / "alpha.tif",
-        planes,
-        photometric="minisblack",
-        planarconfig="separate",
-        extrasamples=[2],
-    )
-    images.write_mask(tmp_path / "mask.tif", ~hidden)
-    for name in ("mask", "alpha"):
-        out = tmp_path / "out.tif"
-        restore(tmp_path / f"{name}.tif", out, network=model, cog=True, overwrite=True)
-        with warnings.catch_warnings(action="ignore"), rasterio.open(out) as file:
-            np.testing.assert_array_equal(file.dataset_mask() == 0, hidden)
-            np.testing.assert_array_equal(file.read(1)[hidden], pixels[hidden])

@@ -89,16 +89,6 @@ def test_a_folder_that_never_comes_is_one_sentence(
         pass
 
 
-def test_rows_outlive_the_lock(tmp_path: Path) -> None:
-    folder = tmp_path / ".out.part"
-    with only_run(tmp_path / "out"):
-        (folder / "rows.raw").touch()
-    assert [p.name for p in folder.iterdir()] == ["rows.raw"]
-    with only_run(tmp_path / "out"):
-        (folder / "rows.raw").unlink()
-    assert not folder.exists()
-
-
 def test_new_folders_above_go_with_it_unless_something_was_written_there(tmp_path: Path) -> None:
     out = tmp_path / "new" / "below" / "out"
     with pytest.raises(ZeroDivisionError), only_run(out):

@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 import beers_deploy as bd
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration import method
-from beers_deploy.restoration.method import network_method
 from beers_deploy.restoration.plan import Tiles, plan_for
 from beers_deploy.restoration.runtime import open_runtime
 from beers_deploy.restoration.steps import Around, step_for
-from beers_deploy.restoration.tiles.rows import restore_dn, restore_floats
+from beers_deploy.restoration.tiles.rows import restore_dn
 from beers_deploy.studies.evaluation.methods import method_named
 from beers_deploy.studies.stress.networks import Runner
 from beers_deploy.studies.tradeoff.measure import restore_in_tiles
@@ -82,9 +82,9 @@ def test_with_exact_seams_every_command_gives_the_pixels_of_restore(
     tile_px = TILES_PX[precision]
     expected = restored(tmp_path, pixels, network=path, tile=tile_px)[0]
     assert (expected != pixels).mean() > 0.5
-    np.testing.assert_array_equal(restore(pixels, network=path, tile=tile_px), expected)
+    assert_array_equal(restore(pixels, network=path, tile=tile_px), expected)
     for name, way in exact_ways(path, tile_px).items():
-        np.testing.assert_array_equal(way(pixels.astype(np.float32)), expected, err_msg=name)
+        assert_array_equal(way(pixels.astype(np.float32)), expected, err_msg=name)
 
 
 def test_with_a_halo_below_the_radius_they_have_the_same_seams(
@@ -99,37 +99,11 @@ def test_with_a_halo_below_the_radius_they_have_the_same_seams(
     assert (expected != exact).any()
     dn = pixels.astype(np.float32)
     result = restore(pixels, **options, halo=halo_px)
-    np.testing.assert_array_equal(result, expected)
+    assert_array_equal(result, expected)
     # A trade-off study scores an operating point whose halo is below the network's radius this way.
     variant = Variant(path.stem, FLOAT if precision == "float" else INT8, bd.Network.load(path))
     point = Point(variant, tile_px=tile_px, halo_px=halo_px)
     by_tradeoff = restore_in_tiles(point, SENSOR, REFERENCE)
-    np.testing.assert_array_equal(by_tradeoff(dn), expected)
+    assert_array_equal(by_tradeoff(dn), expected)
     tiles = Tiles(tile_px, str(halo_px))
-    np.testing.assert_array_equal(by_engine(dn, path, tiles, SENSOR), expected)
-
-
-def test_floats_are_those_of_restore_unrounded(precision: str, path: Path, tmp_path: Path) -> None:
-    dn = np.minimum(image() + np.float32(0.37), np.float32(4095))
-    tile_px = TILES_PX[precision]
-    expected = restored(tmp_path, dn, network=path, tile=tile_px)[0]
-    assert (expected % 1 > 0).mean() > 0.5
-    np.testing.assert_array_equal(restore(dn, network=path, tile=tile_px), expected)
-    runner = Runner(bd.Network.load(path))
-    np.testing.assert_array_equal(runner.restore(dn, tile_px=tile_px), expected)
-
-
-@pytest.mark.parametrize("bits", [8, 14])
-def test_a_sensor_of_other_bits_has_its_own_full_scale(
-    bits: int, model: Path, tmp_path: Path
-) -> None:
-    max_dn = (1 << bits) - 1
-    dn = np.random.default_rng(3).integers(0, max_dn + 1, ODD).astype(np.uint16)
-    network = bd.Network.load(model)
-    expected = restored(tmp_path, dn, network=model, tile=23, full_scale=max_dn)[0]
-    evaluated = network_method(network.model, max_dn)(dn.astype(np.float32))
-    np.testing.assert_array_equal(evaluated, expected)
-    infer, _ = open_runtime("onnxruntime", network.model, threads=0)
-    plan = plan_for(network, (1, *ODD), Tiles(23))
-    # `evaluate` rounds to integers as `restore` does, restore_floats does not.
-    assert np.abs(restore_floats(dn, infer, plan, max_dn) - evaluated).max() <= 0.5
+    assert_array_equal(by_engine(dn, path, tiles, SENSOR), expected)

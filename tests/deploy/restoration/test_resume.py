@@ -18,10 +18,12 @@ import pytest
 import tifffile
 
 from beers_deploy.cli.run import INTERRUPTED
+from beers_deploy.model.io.lock import part_folder
 from beers_deploy.profiles.errors import MachineError, OptionError
 from beers_deploy.restoration.output import RestoredPixels
 from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import begin, noise, stop_after, stopped_after, until
+from tests.model.raster import formats as images
 
 pytestmark = pytest.mark.slow
 
@@ -42,8 +44,8 @@ def expected(image: Path, model: Path, tmp_path: Path) -> bytes:
     return (tmp_path / "expected.tif").read_bytes()
 
 
-def resume_options(model: Path) -> list[object]:
-    return ["--network", model, "--tile", TILE_PX, "--resume"]
+def resume_options(model: Path) -> list[str]:
+    return f"--network {model} --tile {TILE_PX} --resume".split()
 
 
 def test_killed_at_random_moments_it_is_resumed_to_the_same_bytes(
@@ -99,18 +101,6 @@ def test_finished_rows_are_not_restored_again(
     assert out.read_bytes() == expected
 
 
-def test_another_image_of_the_same_name_is_not_mixed_in(
-    image: Path, model: Path, tmp_path: Path
-) -> None:
-    with stopped_after(50):
-        restore(image, tmp_path / "out.tif", network=model, tile=TILE_PX)
-    tifffile.imwrite(image, np.zeros((900, 260), np.uint16), tile=(16, 16))
-    with pytest.raises(OptionError, match="the image"):
-        restore(image, tmp_path / "out.tif", network=model, tile=TILE_PX, resume=True)
-    restore(image, tmp_path / "out.tif", network=model, tile=TILE_PX)
-    assert tifffile.imread(tmp_path / "out.tif").max() < 4095
-
-
 @pytest.mark.parametrize("calls", [0, 4, 1000])
 def test_a_full_disk_is_an_error_of_one_line_and_loses_no_finished_row(
     calls: int,
@@ -151,3 +141,30 @@ def test_a_swath_that_the_disk_cannot_hold_is_refused_first(
     with pytest.raises(MachineError, match="free"):
         restore(image, tmp_path / "out.tif", network=model, tile=TILE_PX)
     assert [p.name for p in tmp_path.iterdir()] == ["in.tif"]
+
+
+@pytest.mark.parametrize("name", ["a.jp2", "a.vrt", "DIM.XML"])
+def test_killed_among_its_rows_and_at_its_cog_it_is_resumed_to_the_same_bytes(
+    name: str, model: Path, tmp_path: Path
+) -> None:
+    image = images.FORMATS[name](tmp_path / name, images.digital_numbers())
+    out = tmp_path / "out.tif"
+    restore(image, tmp_path / "expected.tif", network=model, tile=16, threads=1, cog=True)
+    expected = (tmp_path / "expected.tif").read_bytes()
+    before = {path.name for path in tmp_path.iterdir()}
+    out.write_bytes(b"old")
+    words = f"--network {model} --tile 16 --cog --resume".split()
+    # The journal is there when some rows are finished, the TIFF when all rows are.
+    for sign in ("journal.json", "out.tif"):
+        running = begin(image, out, *words)
+        while running.poll() is None and not (part_folder(out) / sign).exists():
+            time.sleep(0.001)
+        running.kill()
+        output, _ = running.communicate()
+        assert running.returncode < 0 or (sign == "out.tif" and not running.returncode), output
+        assert out.read_bytes() in (b"old", expected)
+    last = begin(image, out, *words)
+    output, _ = last.communicate(timeout=120)
+    assert last.returncode == 0, output
+    assert out.read_bytes() == expected
+    assert {path.name for path in tmp_path.iterdir()} == before | {"out.tif"}

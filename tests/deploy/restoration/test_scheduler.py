@@ -227,7 +227,7 @@ app(sys.argv[1:])
 
 def test_restores_where_torch_is_not_installed(image: Path, scheduler: str, tmp_path: Path) -> None:
     out = tmp_path / "out.tif"
-    options = ("--network", "convbeers-xs-int8", "--scheduler", scheduler)
+    options = f"--network convbeers-xs-int8 --scheduler {scheduler}".split()
     words = ("restore", str(image), str(out), *options)
     process = subprocess.run(
         [sys.executable, "-c", WITHOUT_TORCH, *words], capture_output=True, text=True, check=False

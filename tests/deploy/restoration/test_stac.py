@@ -16,7 +16,7 @@ pystac: Any = pytest.importorskip("pystac")
 
 def restored_item(image: Path, item: Path, model: Path) -> dict[str, Any]:
     out = image.with_name("out.tif")
-    done("restore", image, out, "--network", model, "--cog", "--stac", item)
+    done(f"restore {image} {out} --network {model} --cog --stac {item}")
     content: dict[str, Any] = json.loads(item.read_text())
     return content
 
@@ -50,12 +50,8 @@ def test_an_item_needs_a_cog_and_its_package(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    outputs = (tmp_path / "out.tif", "--stac", tmp_path / "i.json")
-    words = ("restore", image, *outputs, "--network", model)
+    command = f"restore {image} {tmp_path}/out.tif --stac {tmp_path}/i.json --network {model}"
     monkeypatch.setitem(sys.modules, "pystac", None)
-    for more, sentence in (
-        ([], "--stac has no effect without --cog"),
-        (["--cog"], "beers-deploy[stac]"),
-    ):
-        assert sentence in refused(*words, *more)
-        assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]
+    assert "--stac has no effect without --cog" in refused(command)
+    assert "beers-deploy[stac]" in refused(f"{command} --cog")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]
