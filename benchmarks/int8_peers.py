@@ -44,8 +44,8 @@ from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.network import Network
 from beers_deploy.profiles.sensor_file import load_sensor, reference_for
 from beers_deploy.quant.calibration import HELD_OUT_SEED, draw_patches
-from beers_deploy.quant.ends import Ends, ends_of
 from beers_deploy.quant.graph import CORRECTION, PLANES, graph_to_onnx, read_network, read_planes
+from beers_deploy.quant.host_part import HostPart, Plain
 from beers_deploy.quant.samples import Pair, samples_of
 from beers_deploy.quant.session import open_session, planes_of, result_of
 
@@ -85,13 +85,13 @@ class Peered:
     """A float network, and the host's part around its graph as we quantise it."""
 
     model: onnx.ModelProto
-    ends: Ends
+    host_part: HostPart
 
     def written(self, plain: Path, core: Path) -> None:
         """The network as it came, and its graph rewritten: planes in, the correction out."""
         onnx.save(self.model, plain)
         graph = read_planes(read_network(self.model).graph)
-        onnx.save(graph_to_onnx(graph, [CORRECTION], self.ends.planes * self.ends.channels), core)
+        onnx.save(graph_to_onnx(graph, [CORRECTION], self.host_part.planes), core)
 
     def runner(self, path: Path) -> Restore:
         """A file as a function of images (1, C, H, W): one that reads planes
@@ -100,8 +100,8 @@ class Peered:
         session = open_session(onnx.load(path))
         if session.get_inputs()[0].name != PLANES:
             return lambda image: result_of(session, image)
-        return lambda image: self.ends.finished(
-            image, result_of(session, planes_of(image, self.ends))
+        return lambda image: self.host_part.finish(
+            image, result_of(session, planes_of(image, self.host_part))
         )
 
 
@@ -256,7 +256,7 @@ def _simulated(images: Path | None, sensor: str, count: int, seed: int) -> list[
 def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
     """Line by line, as each way ends."""
     model = read_float(arguments.float or shipped_weights(arguments.variant))
-    network = Peered(model, ends_of(read_network(model)))
+    network = Peered(model, HostPart.of(read_network(model), Plain()))
     calibration, held_out = drawn(model, arguments)
     images = np.concatenate([image for image, _ in calibration])
     files = {
@@ -265,7 +265,7 @@ def table(arguments: argparse.Namespace, folder: Path) -> Iterator[str]:
     }
     network.written(files[False][0], files[True][0])
     np.save(files[False][1], images)
-    np.save(files[True][1], planes_of(images, network.ends))
+    np.save(files[True][1], planes_of(images, network.host_part))
     in_float = network.runner(files[False][0])
     yield f"| {' | '.join(COLUMNS)} |"
     yield "|---" * len(COLUMNS) + "|"

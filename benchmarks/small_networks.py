@@ -28,8 +28,8 @@ from torch.nn import functional
 
 from beers_deploy import quantize
 from beers_deploy.model.metrics.fidelity import psnr_db
-from beers_deploy.quant.ends import ends_of
 from beers_deploy.quant.graph import read_network
+from beers_deploy.quant.host_part import HostPart, Plain
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from benchmarks.int8_peers import OURS, QUARK, Peered, Restore, Way, print_lines, quantize_in_child
 from examples.networks import ESPCN, DnCNN
@@ -230,7 +230,7 @@ def cells(
     """
     path = folder / f"{slug(name)}.onnx"
     model = load_onnx(path)
-    network = Peered(model, ends_of(read_network(model)))
+    network = Peered(model, HostPart.of(read_network(model), Plain()))
     patches = path.with_suffix(".npy")
     out = path.with_suffix(f".{slug(way.name)}.onnx")
     if way is TUNED:

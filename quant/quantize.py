@@ -23,7 +23,6 @@ from beers_deploy.quant.core import (
     unclipped_frac_bits,
 )
 from beers_deploy.quant.encodings import host_model
-from beers_deploy.quant.ends import GAIN, ONE_CHANNEL, Ends, ends_of
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
@@ -37,6 +36,7 @@ from beers_deploy.quant.graph import (
     tensors,
     tied,
 )
+from beers_deploy.quant.host_part import ONE_CHANNEL, DualRange, HostPart, OffsetWindows, Plain
 from beers_deploy.quant.onnx_file import fixed_tile_px, metadata
 from beers_deploy.quant.passes.equalise import (
     FULL,
@@ -55,12 +55,11 @@ from beers_deploy.quant.passes.stream import (
     STREAM_FRAC_BITS,
     Stream,
     exceeds_six,
+    in_copies,
     lone_tensors,
     streams,
     takes_gains,
-    two_gains,
     window_offsets,
-    windowed,
 )
 from beers_deploy.quant.sample_range import KEY as CALIBRATION_RANGE
 from beers_deploy.quant.sample_range import range_of
@@ -88,10 +87,6 @@ LEAST_CHANGE = 1e-4
 decide alone.
 """
 
-FINER = GAIN.bit_length() - 1
-"""Fractional bits by which a window is finer than the result's own scale."""
-
-
 PASSES = "fine_planes, least_squares, shared_residual_scale, equalise, dual_gain"
 """What a file says was done beyond rounding each tensor: see `quant.passes`, `quant.graph` and
 `quant.core`.
@@ -117,7 +112,7 @@ class Plan:
     """
 
     graph: Graph
-    ends: Ends
+    host_part: HostPart
     streams: list[Stream]
     chain: Chain
     shifts: Shifts
@@ -130,19 +125,19 @@ class Plan:
         Itself where something is added to the result, or no convolution writes it, or one of too
         many channels.
         """
-        alone = self.ends.gains == 1 and not self.ends.adds_image
+        alone = self.host_part.decoding.copies == 1 and not self.host_part.adds_image
         finer = self.passes.dual_range and takes_gains(self.graph)
         # One convolution of the DPU has to write the coarse copy and a window at the least.
-        if not (alone and finer and self.ends.outputs <= MAX_CHANNELS // 2):
+        if not (alone and finer and self.host_part.outputs <= MAX_CHANNELS // 2):
             return self
         low = np.array(np.inf)
         high = np.array(-np.inf)
-        for (result,) in values_of(self.graph, [CORRECTION], images, self.ends):
+        for (result,) in values_of(self.graph, [CORRECTION], images, self.host_part):
             low = np.minimum(low, result[0].min((1, 2)))
             high = np.maximum(high, result[0].max((1, 2)))
-        offsets = window_offsets(low, high, 2.0 ** -(frac_bits + FINER))
+        offsets = window_offsets(low, high, 2.0 ** -(frac_bits + OffsetWindows.finer_bits))
         windows = tuple(tuple(float(offset) for offset in window) for window in offsets)
-        return replace(self, ends=replace(self.ends, offsets=windows))
+        return replace(self, host_part=replace(self.host_part, decoding=OffsetWindows(windows)))
 
     def without_large_sums(self, frac_bits: Mapping[str, int]) -> "Plan":
         """Without the streams in which sums exceed a ReLU6's six, where int8 could not end for
@@ -153,32 +148,27 @@ class Plan:
         ]
         if len(within) == len(self.streams):
             return self
-        return replace(self, streams=within, chain=_chain(self.graph, self.ends, within))
+        return replace(self, streams=within, chain=_chain(self.graph, self.host_part, within))
 
     def ended(self, graph: Graph) -> Graph:
         """The graph with windows or two gains where the result has them."""
-        if self.ends.offsets:
-            return windowed(graph, np.array(self.ends.offsets))
-        return two_gains(graph) if self.ends.gains == 2 else graph
+        return in_copies(graph, self.host_part.decoding)
 
     def core(self, final: Graph, frac_bits: Mapping[str, int]) -> IntCore:
         """The integer core of a graph, ended, whose tensors have these least-squares scales."""
         shared = [*chain.from_iterable(self.streams), *self.chain.tensors]
         scales = {**frac_bits, **dict.fromkeys(shared, STREAM_FRAC_BITS)}
         # A coarse copy holds what a finer scale clips.
-        if self.ends.offsets:
-            scales[CORRECTION] += FINER
-        elif self.ends.gains == 2:
-            scales[CORRECTION] += 1
+        scales[CORRECTION] += self.host_part.decoding.finer_bits
         assert set(tensors(final)) <= set(scales)  # noqa: S101
-        return build_core(final, scales, self.shifts, self.ends)
+        return build_core(final, scales, self.shifts, self.host_part)
 
 
-def _chain(graph: Graph, ends: Ends, streams: list[Stream]) -> Chain:
+def _chain(graph: Graph, host_part: HostPart, streams: list[Stream]) -> Chain:
     """What is levelled besides these streams: nothing where there are some, and no depthwise
     convolutions.
     """
-    widths = channels_of(graph, {PLANES: ends.planes * ends.channels})
+    widths = channels_of(graph, {PLANES: host_part.planes})
     depthwise = any(isinstance(op, Conv) and op.groups > 1 for op in graph)
     # Beside a stream, levelling made no dense network for one sensor better: see `passes.level`.
     alone = lone_tensors(graph) if depthwise or not streams else []
@@ -214,9 +204,9 @@ def quantize_model(
     network = read_network(model)
     graph = read_planes(network.graph)
     finer = passes.dual_range and network.adds_image and takes_gains(graph)
-    ends = ends_of(network, 2 if finer else 1)
+    host_part = HostPart.of(network, DualRange() if finer else Plain())
     equalised = streams(graph)
-    plan = Plan(graph, ends, equalised, _chain(graph, ends, equalised), shifts, passes)
+    plan = Plan(graph, host_part, equalised, _chain(graph, host_part, equalised), shifts, passes)
     core, final = rounded(plan, patches.degraded)
     if tuning:
         # Imported here because it needs torch, which no other step does.
@@ -237,7 +227,10 @@ def quantize_model(
 
 
 def choose_frac_bits(
-    graph: Graph, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL, least_squares: bool = True
+    graph: Graph,
+    images: Iterable[np.ndarray],
+    host_part: HostPart = ONE_CHANNEL,
+    least_squares: bool = True,
 ) -> dict[str, int]:
     """Least-squares scale of every tensor of a plane-reading graph over images (1, C, H, W) in [0,
     1].
@@ -260,13 +253,13 @@ def choose_frac_bits(
         return np.stack([join(of_each[groups == group], axis=0) for group in groups])
 
     largest = np.zeros(len(names))
-    for results in values_of(graph, names, images, ends):
+    for results in values_of(graph, names, images, host_part):
         largest = np.maximum(largest, [float(np.abs(r).max()) for r in results])
     first = [unclipped_frac_bits(m) for m in together(largest, np.max)]
     if not least_squares:
         return {PLANES: PLANES_FRAC_BITS, **dict(zip(names, first, strict=True))}
     errors = np.zeros((len(names), CANDIDATES))
-    for results in values_of(graph, names, images, ends):
+    for results in values_of(graph, names, images, host_part):
         errors += [_errors(r[0], f) for r, f in zip(results, first, strict=True)]
     moves = np.argmin(together(errors, np.sum), axis=1)
     best = {name: f + int(move) for name, f, move in zip(names, first, moves, strict=True)}
@@ -284,7 +277,7 @@ def _errors(tensor: np.ndarray, first: int) -> np.ndarray:
 def rounded(plan: Plan, images: Remade[np.ndarray]) -> tuple[IntCore, Graph]:
     """A plan's graph in whole numbers, and the float graph that was rounded."""
     step("scale of each tensor")
-    frac_bits = choose_frac_bits(plan.graph, images, plan.ends, plan.passes.least_squares)
+    frac_bits = choose_frac_bits(plan.graph, images, plan.host_part, plan.passes.least_squares)
     plan = plan.without_large_sums(frac_bits).with_windows(frac_bits[CORRECTION], images)
     final = plan.ended(_balanced(plan, frac_bits, images))
     return plan.core(final, frac_bits), final
@@ -294,7 +287,7 @@ def _balanced(plan: Plan, frac_bits: dict[str, int], images: Remade[np.ndarray])
     """The plan's graph, its streams equalised and its chain levelled."""
     if not (plan.streams or plan.chain.tensors):
         return plan.graph
-    targets = search_targets(plan.graph, plan.ends, images)
+    targets = search_targets(plan.graph, plan.host_part, images)
 
     def trial(candidate: Graph) -> Costs:
         core = plan.core(plan.ended(candidate), frac_bits)
@@ -313,19 +306,19 @@ def _levelled(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray]
     calibration sees.
     """
     step(f"equalising the channels of {len(plan.chain.tensors)} tensors")
-    ranges = chain_ranges(graph, plan.chain, images, plan.ends)
+    ranges = chain_ranges(graph, plan.chain, images, plan.host_part)
     factors = level(graph, plan.chain, ranges, np.ones(len(ranges)), trial)
     graph = plan.chain.scaled(graph, factors)
-    if not plan.ends.offsets:
+    if not plan.host_part.decoding.offsets:
         return graph
     # Here the image itself is in the tensors, with nothing on the host to make up for a clip.
-    largest = largest_values(graph, plan.chain, images, plan.ends)
+    largest = largest_values(graph, plan.chain, images, plan.host_part)
     return plan.chain.scaled(graph, FULL / np.maximum(largest, FULL))
 
 
 def _equalised(graph: Graph, plan: Plan, trial: Trial, images: Remade[np.ndarray]) -> Graph:
     """Stream after stream, the others levelled by a first guess until their turn comes."""
-    ranges = [channel_ranges(plan.graph, stream, images, plan.ends) for stream in plan.streams]
+    ranges = [channel_ranges(plan.graph, stream, images, plan.host_part) for stream in plan.streams]
     for stream, stream_ranges in list(zip(plan.streams, ranges, strict=True))[1:]:
         graph = equalise(graph, stream, first_guess(stream_ranges, LEVELLING[0], 1.0))
     for number, stream in enumerate(plan.streams):
@@ -344,17 +337,17 @@ Targets = list[tuple[np.ndarray, np.ndarray]]
 """Degraded crops (1, C, h, w) and what the float network makes of them, clipped to [0, 1]."""
 
 
-def search_targets(graph: Graph, ends: Ends, images: Remade[np.ndarray]) -> Targets:
+def search_targets(graph: Graph, host_part: HostPart, images: Remade[np.ndarray]) -> Targets:
     """Of all crops of the images, those with the largest corrections, and others of all sizes.
 
     Only their sizes are kept; the images of the chosen are made once more.
     """
-    session = open_session(graph_to_onnx(graph, [CORRECTION], ends.planes * ends.channels))
+    session = open_session(graph_to_onnx(graph, [CORRECTION], host_part.planes))
     halo_px = 0 if halo_of(graph) is not None else None
 
     def restored(crop: np.ndarray) -> np.ndarray:
-        (correction,) = next(tensor_values(session, [CORRECTION], crop, halo_px, ends))
-        return ends.finished(crop, correction)
+        (correction,) = next(tensor_values(session, [CORRECTION], crop, halo_px, host_part))
+        return host_part.finish(crop, correction)
 
     def size(crop: np.ndarray) -> float:
         result = restored(crop)

@@ -152,14 +152,14 @@ def _conditioned(path: Path, sensor: SensorLike | None, delta: Path | None) -> "
     """Return an INT8 network that is conditioned on a sensor, or on that of a delta."""
     from beers_deploy.network_files import int8_for_delta, int8_for_sensor, warn_outside
     from beers_deploy.profiles.sensor import Sensor
-    from beers_deploy.quant.banked.family import required_family
     from beers_deploy.quant.onnx_file import load_onnx
+    from beers_deploy.quant.sensor_bank.conditioned import required_conditioned_core
 
     model = load_onnx(path)
     if delta is not None:
         return int8_for_delta(model, delta)
     profile = Sensor.load(sensor or SENSOR)
-    warn_outside(profile, required_family(model).kernels)
+    warn_outside(profile, required_conditioned_core(model).kernels)
     return int8_for_sensor(model, profile)
 
 
@@ -179,7 +179,7 @@ def _export_int8(
 
     core = read_core(model)
     side_px = tile or fixed_tile_px(model)
-    require_tile(side_px, core.ends.place_px)
+    require_tile(side_px, core.host_part.place_px)
     for_board = Network(model, out.stem).core(target, tile) if core_file else None
     save_onnx(host_model(core, metadata(model), side_px), out)
     logger.info("wrote %s", out)
@@ -207,7 +207,7 @@ def _save_delta(model: "onnx.ModelProto", sensor: SensorLike, factor: int, delta
     from beers_deploy.model.io.files import whole_file
     from beers_deploy.network_files import int8_for_sensor
     from beers_deploy.profiles.sensor import Sensor
-    from beers_deploy.quant.banked.family import delta_of_file
+    from beers_deploy.quant.sensor_bank.conditioned import delta_of_file
 
     profile = Sensor.load(sensor)
     exposed = model if factor == 1 else int8_for_sensor(model, brightened(profile, factor))

@@ -12,7 +12,6 @@ from beers_deploy.quant.graph.network import Network, channels_of, check_network
 from beers_deploy.quant.graph.operations import (
     COARSE_MAX,
     CORRECTION,
-    COUNT,
     IMAGE,
     PLANES,
     PLANES_FRAC_BITS,
@@ -33,7 +32,6 @@ from beers_deploy.quant.graph.operations import (
     Window,
     read_planes,
     same,
-    split,
     tensors,
     tied,
     ties_scales,
@@ -50,7 +48,6 @@ from beers_deploy.quant.graph.writer import graph_to_onnx
 __all__ = [
     "COARSE_MAX",
     "CORRECTION",
-    "COUNT",
     "IMAGE",
     "PLANES",
     "PLANES_FRAC_BITS",
@@ -80,7 +77,6 @@ __all__ = [
     "read_planes",
     "refusal",
     "same",
-    "split",
     "tensors",
     "tied",
     "ties_scales",

@@ -16,8 +16,8 @@ import numpy as np
 
 from beers_deploy.model.progress import steps
 from beers_deploy.quant.core import INT8_MAX
-from beers_deploy.quant.ends import ONE_CHANNEL, Ends
 from beers_deploy.quant.graph import Activation, Conv, Graph
+from beers_deploy.quant.host_part import ONE_CHANNEL, HostPart
 from beers_deploy.quant.passes.stream import STREAM_FRAC_BITS, Stream
 from beers_deploy.quant.session import values_of
 
@@ -104,13 +104,13 @@ def _scaled(op: Conv, factors: np.ndarray, stream: Stream) -> Conv:
 
 
 def channel_ranges(
-    graph: Graph, stream: Stream, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL
+    graph: Graph, stream: Stream, images: Iterable[np.ndarray], host_part: HostPart = ONE_CHANNEL
 ) -> np.ndarray:
     """(C,) range of each stream channel over images (1, C', H, W), the widest of all the stream's
     tensors.
     """
     names = sorted(stream)
-    tiles = channel_sizes(graph, names, images, ends)
+    tiles = channel_sizes(graph, names, images, host_part)
     means = {
         name: np.mean(sizes, axis=0)
         for name, sizes in zip(names, zip(*tiles, strict=True), strict=True)
@@ -126,24 +126,28 @@ def channel_sizes(
     graph: Graph,
     names: list[str],
     images: Iterable[np.ndarray],
-    ends: Ends = ONE_CHANNEL,
+    host_part: HostPart = ONE_CHANNEL,
     quantile: float = QUANTILE,
 ) -> Iterator[list[np.ndarray]]:
     """A quantile of each channel's sizes, (C,) of each of the named tensors, for every tile of the
     images.
     """
-    for results in values_of(graph, names, images, ends):
+    for results in values_of(graph, names, images, host_part):
         sizes = [np.abs(r[0]).reshape(r.shape[1], -1) for r in results]
         yield [np.quantile(size, quantile, axis=1).astype(np.float64) for size in sizes]
 
 
 def largest_sizes(
-    graph: Graph, names: list[str], images: Iterable[np.ndarray], ends: Ends, quantile: float = 1.0
+    graph: Graph,
+    names: list[str],
+    images: Iterable[np.ndarray],
+    host_part: HostPart,
+    quantile: float = 1.0,
 ) -> list[np.ndarray]:
     """As `channel_sizes`, of the tile where each channel is largest."""
     return [
         np.max(sizes, axis=0)
-        for sizes in zip(*channel_sizes(graph, names, images, ends, quantile), strict=True)
+        for sizes in zip(*channel_sizes(graph, names, images, host_part, quantile), strict=True)
     ]
 
 

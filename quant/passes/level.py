@@ -20,8 +20,8 @@ from itertools import product
 import numpy as np
 
 from beers_deploy.model.progress import steps
-from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import Conv, Graph
+from beers_deploy.quant.host_part import HostPart
 from beers_deploy.quant.passes.equalise import (
     MOST_CHANNELS,
     QUANTILE,
@@ -102,20 +102,24 @@ class Chain:
 
 
 def chain_ranges(
-    graph: Graph, chain: Chain, images: Iterable[np.ndarray], ends: Ends, quantile: float = QUANTILE
+    graph: Graph,
+    chain: Chain,
+    images: Iterable[np.ndarray],
+    host_part: HostPart,
+    quantile: float = QUANTILE,
 ) -> np.ndarray:
     """Return the range of every channel over images (1, C, H, W), which most tiles keep."""
-    tiles = channel_sizes(graph, list(chain.tensors), images, ends, quantile)
+    tiles = channel_sizes(graph, list(chain.tensors), images, host_part, quantile)
     by_tensor = zip(*tiles, strict=True)
     # The widest tile would cost a DnCNN 1.4 dB instead of 0.6: see TILES.
     return np.concatenate([above_dead(np.quantile(sizes, TILES, axis=0)) for sizes in by_tensor])
 
 
 def largest_values(
-    graph: Graph, chain: Chain, images: Iterable[np.ndarray], ends: Ends
+    graph: Graph, chain: Chain, images: Iterable[np.ndarray], host_part: HostPart
 ) -> np.ndarray:
     """Return the largest size of every channel over images (1, C, H, W)."""
-    sizes = largest_sizes(graph, list(chain.tensors), images, ends)
+    sizes = largest_sizes(graph, list(chain.tensors), images, host_part)
     return np.concatenate(list(map(above_dead, sizes)))
 
 

@@ -12,7 +12,6 @@ from itertools import accumulate, chain, repeat
 import numpy as np
 
 from beers_deploy.quant.core import INT8_MAX
-from beers_deploy.quant.ends import FINE_MAX, GAIN
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
@@ -28,6 +27,7 @@ from beers_deploy.quant.graph import (
     channels_of,
 )
 from beers_deploy.quant.graph.operations import SIX, united
+from beers_deploy.quant.host_part import FINE_MAX, OutputDecoding
 
 STREAM_FRAC_BITS = 8
 """Any would do: `equalise` scales the stream to it."""
@@ -138,30 +138,22 @@ def _passes_factors(graph: Graph, stream: Stream) -> bool:
     )
 
 
-def two_gains(graph: Graph) -> Graph:
-    """The graph whose last convolution writes its channels twice: fine, and coarse by GAIN.
+def in_copies(graph: Graph, decoding: OutputDecoding) -> Graph:
+    """Return the graph whose last convolution writes the copies that the host decodes.
 
-    Any other last operation stays as it is, and so does one with an activation that factors do not
-    pass.
+    Args:
+        graph: if there are several copies, one for which `takes_gains` is True.
+        decoding: the host's.
     """
-    return _in_copies(graph, [(1, 0.0), (GAIN, 0.0)]) if takes_gains(graph) else graph
-
-
-def windowed(graph: Graph, offsets: np.ndarray) -> Graph:
-    """The graph whose last convolution writes its channels coarse by GAIN, then less each of the
-    offsets (W, C).
-    """
-    return _in_copies(graph, [(GAIN, 0.0), *((1, offset) for offset in offsets)])
-
-
-def _in_copies(graph: Graph, copies: Sequence[tuple[int, np.ndarray | float]]) -> Graph:
-    """The graph whose last convolution writes its channels once for each gain and offset: coarser,
-    and less that.
-    """
+    if decoding.copies == 1:
+        return graph
     *before, last = graph
     assert isinstance(last, Conv)  # noqa: S101 - takes_gains has seen to it
-    weight = np.concatenate([last.weight / gain for gain, _ in copies])
-    bias = np.concatenate([last.bias / gain - offset for gain, offset in copies])
+    weight = np.concatenate([last.weight / gain for gain in decoding.gains])
+    bias = np.concatenate([last.bias / gain for gain in decoding.gains]).astype(np.float64)
+    # The host adds the offsets of the last copies, so these copies are written without them.
+    offsets = np.ravel(decoding.offsets)
+    bias[len(bias) - len(offsets) :] -= offsets
     return (*before, replace(last, weight=weight.astype(np.float32), bias=bias.astype(np.float32)))
 
 

@@ -1,13 +1,12 @@
-"""INT8 once for every sensor: a body behind a bank is calibrated over the family of sensors, and
-told its own later.
+"""An INT8 network behind a bank, calibrated over a range of sensors and conditioned on one later.
 
     planes -> bank 7 x 7 (the sensor's) -> head, blocks, end, tail -> correction, fine and coarse
                                         -> analytic restoration, in four copies
 
-All weights and scales behind the bank are one for the family. What the body reads and makes of a
-sensor is finer by its gain (`Bank.gain`), so its biases are multiplied with that, and the unit is
-divided by it: ReLU and sums pass a factor on. A sensor's filters, its unit and the biases are
-written in milliseconds; the host adds both results, times the unit, to the image.
+All weights and scales behind the bank are the same for every sensor. What the body reads and
+computes is finer by the sensor's gain (`Bank.gain`), so its biases are multiplied with that, and
+the unit of the result is divided by it: ReLU and sums pass a positive factor on. The filters of a
+sensor, its unit and the biases are computed in milliseconds.
 """
 
 import json
@@ -23,56 +22,60 @@ from numpy.typing import NDArray
 from beers_deploy.model.bank import Bank
 from beers_deploy.model.variants import SENSOR_VALUES, Kernels
 from beers_deploy.profiles.errors import ModelError, printable
-from beers_deploy.quant.banked.filters import BITS, whole_bank
 from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, Shifts, quantize_bias
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import PLANES, Op
+from beers_deploy.quant.host_part import BankSum
 from beers_deploy.quant.onnx_file import metadata
+from beers_deploy.quant.sensor_bank.filters import BITS, integer_bank
 from beers_deploy.quant.untrusted import contradictions
 
 WEIGHTS = "weights_sha256"
-"""In the metadata of an INT8 network behind a bank: the SHA-256 of its float weights."""
-FAMILY = "family"
-"""In the metadata of an INT8 file: what tells it another sensor."""
+"""The key of the SHA-256 of the float weights, in the metadata of an INT8 network behind a bank."""
+SENSOR_BIASES = "family"
+"""The key of `ConditionedCore.biases`, in the same metadata."""
 
 BANK = "bank"
-"""The tensor between a sensor's filters and what is the same for all."""
+"""The tensor between a sensor's filters and the layers that are the same for all."""
 
 
 @dataclass(frozen=True)
-class Family:
-    """A network behind a bank in whole numbers, for the middle of the family, and what tells it
-    another sensor.
+class ConditionedCore:
+    """The core of a network behind a bank, and what it needs for another sensor.
 
     Attributes:
-        core: it begins with the bank.
-        biases: of the body's convolutions, by name, at a gain of 1: (O, 1), and of those that read
-            the bank (O, 5), the bias for the middle of the family and what each of a sensor's
-            values adds.
+        core: for the middle of the range of sensors, or for the sensor of the file that it is from.
+        biases: of the convolutions behind the bank, by name, at a gain of 1: (O, 1), and for those
+            that read the bank (O, 5), the bias for the middle of the range and what each value of a
+            sensor vector adds.
         shifts: the windows of the target.
-        kernels: of the banks that it stands behind.
     """
 
     core: IntCore
     biases: Mapping[str, np.ndarray]
     shifts: Shifts = SHIFTS
-    kernels: Kernels = "fitted"
+
+    @property
+    def kernels(self) -> Kernels:
+        """The kind of the bank's kernels."""
+        # Only behind fitted kernels does the analytic restoration have a coarse copy.
+        return "fitted" if self.core.host_part.decoding == BankSum(1) else "cut"
 
     def for_sensor(self, bank: Bank, vector: Sequence[float]) -> IntCore:
-        """The core for one sensor, of its bank and its sensor vector (4,)."""
+        """Return the core for one sensor, from its bank and its sensor vector (4,)."""
         gain = bank.gain
         # ReLU and sums pass a positive factor on, so of the body only biases grow.
         values = gain * np.array([1.0, *vector])
         ops = tuple(self._conditioned(op, bank, values) for op in self.core.ops)
         # The host takes the gain off again; in float32, as its file stores the unit.
         unit = float(np.float32(bank.unit / gain))
-        return replace(self.core, ops=ops, ends=replace(self.core.ends, unit=unit))
+        return replace(self.core, ops=ops, host_part=replace(self.core.host_part, unit=unit))
 
     def _conditioned(
         self, op: IntConv | Op, bank: Bank, values: NDArray[np.float64]
     ) -> IntConv | Op:
         if isinstance(op, IntConv) and op.input == PLANES:
-            return bank_layer(bank, self.core.ends.place_px, self.shifts, self.kernels)
+            return bank_layer(bank, self.core.host_part.place_px, self.shifts, self.kernels)
         if not (isinstance(op, IntConv) and op.name in self.biases):
             return op
         terms = self.biases[op.name]
@@ -81,66 +84,66 @@ class Family:
         bias, bits = quantize_bias(terms @ values[: terms.shape[1]], product, self.shifts)
         return replace(op, bias=bias, bias_frac_bits=bits)
 
-    def to_words(self) -> str:
-        """The biases as JSON, for a file's metadata."""
+    def biases_to_json(self) -> str:
+        """Return the biases as JSON, for the metadata of a file."""
         return json.dumps({name: values.tolist() for name, values in self.biases.items()})
 
 
-def family_of(model: onnx.ModelProto) -> Family | None:
-    """What an INT8 file of a network behind a bank says of other sensors; None
-    of any other file.
+def conditioned_core(model: onnx.ModelProto) -> ConditionedCore | None:
+    """Read the conditioned core of an INT8 file; None if the file has none.
+
+    Raises:
+        ModelError: a damaged file.
     """
-    words = metadata(model).get(FAMILY)
-    if words is None:
+    text = metadata(model).get(SENSOR_BIASES)
+    if text is None:
         return None
     with contradictions("the INT8 network"):
         core = read_core(model)
-        record = json.loads(words)
+        record = json.loads(text)
         biases = {str(name): np.array(values, np.float64) for name, values in record.items()}
-        body = {op.name: op for op in core.convolutions if op.name in biases}
         # The file is not trusted: its biases must fit its own convolutions.
         shapes = {
-            name: (len(op.bias), 1 + SENSOR_VALUES * (op.input == BANK))
-            for name, op in body.items()
+            op.name: (len(op.bias), 1 + SENSOR_VALUES * (op.input == BANK))
+            for op in core.convolutions
+            if op.name in biases
         }
         if {name: values.shape for name, values in biases.items()} != shapes:
             raise ValueError("the biases do not fit its convolutions")
-        # Only behind fitted kernels does the analytic restoration have a coarse copy.
-        return Family(core, biases, kernels="fitted" if core.ends.wide else "cut")
+        return ConditionedCore(core, biases)
 
 
-def required_family(model: onnx.ModelProto) -> Family:
-    """As `family_of`, of a file that must be such a network's."""
-    family = family_of(model)
-    if family is None:
+def required_conditioned_core(model: onnx.ModelProto) -> ConditionedCore:
+    """Read the conditioned core of an INT8 file, or raise ModelError if the file has none."""
+    conditioned = conditioned_core(model)
+    if conditioned is None:
         raise ModelError(
             "The INT8 network cannot be conditioned on a sensor. Make one that can with "
             "'beers-deploy quantize', from weights that 'beers-deploy train --conditioned' wrote."
         )
-    return family
+    return conditioned
 
 
 def bank_layer(bank: Bank, scale: int, shifts: Shifts, kernels: Kernels) -> IntConv:
-    """The first convolution of a network of that scale, for one sensor."""
-    integers = whole_bank(bank, scale, bank.gain, kernels)
+    """Return the first convolution of a network of that scale, for one sensor."""
+    integers = integer_bank(bank, scale, bank.gain, kernels)
     # The offsets put each copy of a result at another place of a rounding step.
     bias = quantize_bias(integers.offsets * 2.0**-BITS, integers.frac_bits + BITS, shifts)
     return IntConv("bank", PLANES, BANK, integers.weight, integers.frac_bits, *bias)
 
 
 def delta_of_file(model: onnx.ModelProto) -> bytes:
-    """What its sensor has changed in an INT8 file of a network behind a bank: `with_delta` changes
-    it in another's.
+    """Return what the sensor of an INT8 file has changed in it, for `with_delta`.
 
-    A line of JSON and the int8 numbers of each convolution that it names, in their order, all of it
-    compressed.
+    It is a line of JSON and the int8 numbers of each convolution that the line names, compressed.
     """
-    family = required_family(model)
-    ops = [op for op in family.core.convolutions if op.input == PLANES or op.name in family.biases]
+    conditioned = required_conditioned_core(model)
+    core = conditioned.core
+    ops = [op for op in core.convolutions if op.input == PLANES or op.name in conditioned.biases]
     bits = {op.name: [op.weight_frac_bits, op.bias_frac_bits] for op in ops}
     header = {
         "sensor": metadata(model).get("sensor", ""),
-        "unit": family.core.ends.unit,
+        "unit": core.host_part.unit,
         "bits": bits,
     }
     arrays = chain.from_iterable(map(_numbers, ops))
@@ -151,9 +154,7 @@ def delta_of_file(model: onnx.ModelProto) -> bytes:
 
 
 def _numbers(op: IntConv) -> list[np.ndarray]:
-    """What a sensor changes in a convolution that it changes: of the bank all of it, of others the
-    bias.
-    """
+    """Return the arrays of a convolution that depend on the sensor."""
     return [op.weight, op.bias] if op.input == PLANES else [op.bias]
 
 
@@ -186,8 +187,8 @@ def with_delta(core: IntCore, delta: bytes, where: str = "The delta") -> tuple[I
         # A network of the same names and smaller layers takes fewer bytes.
         if len(remainder):
             raise ValueError(f"{len(remainder)} bytes too many")
-        ends = replace(core.ends, unit=float(header["unit"]))
-        return replace(core, ops=tuple(ops), ends=ends), str(header["sensor"])
+        host_part = replace(core.host_part, unit=float(header["unit"]))
+        return replace(core, ops=tuple(ops), host_part=host_part), str(header["sensor"])
     except (
         zlib.error,
         AttributeError,
@@ -209,13 +210,11 @@ def with_delta(core: IntCore, delta: bytes, where: str = "The delta") -> tuple[I
 
 
 LARGEST_DELTA = 1 << 20
-"""Bytes that one is unpacked to."""
+"""In bytes, of the unpacked content."""
 
 
 def _patched(op: IntConv, bits: tuple[int, ...], numbers: np.ndarray) -> tuple[IntConv, np.ndarray]:
-    """A convolution with the first of these numbers in the place of its own, and the numbers after
-    them.
-    """
+    """Return a convolution with the first of these numbers, and the numbers after them."""
     arrays = list[np.ndarray]()
     for values in _numbers(op):
         arrays.append(numbers[: values.size].reshape(values.shape))
