@@ -38,7 +38,7 @@ def host_part_to_json(part: HostPart) -> dict[str, Any]:
         "banked": part.encoding == BANK_SLICES,
         "gains": 1 if decoding.offsets else len(decoding.gains),
         "offsets": decoding.offsets,
-        "wide": isinstance(decoding, BankSum) and decoding.coarse_copies == 1,
+        "wide": decoding == BankSum(coarse_copies=1),
     }
 
 
@@ -76,5 +76,5 @@ def _decoding(record: Mapping[str, Any]) -> OutputDecoding:
         return OffsetWindows(offsets)
     # Files of earlier versions do not state `wide`, because they have no coarse copy.
     if record.get("banked"):
-        return BankSum(int(bool(record.get("wide"))))
+        return BankSum(coarse_copies=int(bool(record.get("wide"))))
     return DualRange() if int(record["gains"]) == 2 else Plain()

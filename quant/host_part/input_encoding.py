@@ -1,7 +1,7 @@
 """How an image in [0, 1] becomes the int8 planes that the integer core reads."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,34 +12,6 @@ from beers_deploy.quant.host_part.writer import HostWriter
 
 ENCODED = "host_front.planes"
 """The tensor of the planes in float, before they are stored as uint8."""
-
-
-class InputEncoding(Protocol):
-    """Encodes each channel of an image as int8 planes."""
-
-    @property
-    def planes(self) -> int:
-        """The number of planes of each channel."""
-
-    @property
-    def margin_px(self) -> int:
-        """The number of pixels by which the image must at least be mirrored beyond its borders."""
-
-    @property
-    def limits(self) -> tuple[list[int], list[int]]:
-        """The smallest and the largest integer of each plane of a channel, over all images."""
-
-    def encode(self, image: np.ndarray) -> np.ndarray:
-        """Encode an image (N, C, H, W) in [0, 1] as planes (N, planes C, H, W) int8.
-
-        All channels of a plane come before the next plane.
-        """
-
-    def write(self, w: HostWriter, image: str) -> None:
-        """Write the nodes that encode the tensor `image` as `ENCODED`."""
-
-    def constants(self) -> dict[str, int] | None:
-        """Return the constants that a kit's `host.py` encodes with; None if it does not."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +27,7 @@ class BitSlices:
         middle: the DN that is encoded as 0.
         coarse_planes: how often the coarse plane comes. Two of them share the weights of a filter,
             which then reach twice as far as int8 does.
-        margin_px: see `InputEncoding`.
+        margin_px: the pixels by which the image must at least be mirrored beyond its borders.
     """
 
     step: int = STEP
@@ -71,13 +43,16 @@ class BitSlices:
 
     @property
     def limits(self) -> tuple[list[int], list[int]]:
-        """The smallest and the largest integer of each plane, tried on every DN."""
+        """The smallest and the largest integer of each plane of a channel, tried on every DN."""
         every_dn = np.arange(MAX_DN + 1, dtype=np.float32)[None, None, None] / np.float32(MAX_DN)
         planes = self.encode(every_dn)[0, :, 0]
         return planes.min(1).tolist(), planes.max(1).tolist()
 
     def encode(self, image: np.ndarray) -> np.ndarray:
-        """Encode an image (N, C, H, W) in [0, 1] as planes (N, planes C, H, W) int8."""
+        """Encode an image (N, C, H, W) in [0, 1] as planes (N, planes C, H, W) int8.
+
+        All channels of a plane come before the next plane.
+        """
         dn = np.clip(np.rint(image * np.float32(MAX_DN)), 0, MAX_DN) - self.middle
         # Full scale rounds to 128 steps, one more than int8 holds, so the remainder holds more.
         coarse = np.minimum(np.rint(dn / self.step), COARSE_MAX)
@@ -86,7 +61,7 @@ class BitSlices:
         return np.concatenate(planes, axis=1).astype(np.int8)
 
     def write(self, w: HostWriter, image: str) -> None:
-        """Write the nodes that encode the tensor `image`."""
+        """Write the nodes that encode the tensor `image` as `ENCODED`."""
         max_dn = w.scalar("max_dn", MAX_DN)
         scaled = w.node("Mul", "host_front.scale", [image, max_dn])
         whole = w.node("Round", "host_front.round", [scaled])
@@ -105,7 +80,7 @@ class BitSlices:
         part = w.node("Round", "host_front.quarter", [parts])
         w.node("Concat", ENCODED, [*[coarse] * self.coarse_planes, remainder, part], axis=1)
 
-    def constants(self) -> dict[str, int] | None:
+    def constants(self) -> dict[str, int]:
         """Return the constants that a kit's `host.py` encodes with."""
         return {
             "step": self.step,
@@ -143,6 +118,9 @@ class Direct:
         )
         w.node("Round", ENCODED, [scaled])
 
-    def constants(self) -> dict[str, int] | None:
+    def constants(self) -> None:
         """Return None: no kit has a core without the layers in front of it."""
-        return None
+        return
+
+
+InputEncoding = BitSlices | Direct

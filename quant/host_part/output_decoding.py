@@ -4,8 +4,6 @@ int8 has 256 steps. A copy that is finer by `GAIN` has smaller rounding errors b
 so a coarse copy takes its place where it is clipped. The channels of a result are ordered by copy.
 """
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,8 +24,9 @@ Offsets = tuple[tuple[float, ...], ...]
 Constants = dict[str, object]
 
 
-class OutputDecoding(ABC):
-    """Decodes a result of the core. Without overrides: of one copy, which is the value.
+@dataclass(frozen=True)
+class Plain:
+    """One copy, which is the value. The decodings of several copies derive from it.
 
     Attributes:
         offsets: (windows, C) what the host adds to each of the last copies, in the result's unit.
@@ -51,16 +50,15 @@ class OutputDecoding(ABC):
         """Return which channels no other copy replaces, so that a clipped value there is lost."""
         return slice(None)
 
-    def with_bias_errors(self, errors: np.ndarray) -> "OutputDecoding":  # noqa: ARG002 - as above
+    def with_bias_errors(self, errors: np.ndarray) -> "Plain":  # noqa: ARG002 - as above
         """Return a decoding that adds errors of int8 biases (copies C,), if it adds offsets."""
         return self
 
-    @abstractmethod
-    def decode(self, result: np.ndarray, scale: float) -> np.ndarray:
+    def decode(self, result: np.ndarray, scale: float) -> np.ndarray:  # noqa: ARG002 - as above
         """Decode a result (N, copies C, H, W) float32, multiples of `scale`, as (N, C, H, W)."""
+        return result
 
-    @abstractmethod
-    def write(self, w: HostWriter, feeds: list[str], outputs: int, scale: float) -> None:
+    def write(self, w: HostWriter, feeds: list[str], outputs: int, scale: float) -> None:  # noqa: ARG002 - as above
         """Write the nodes that decode a result as `DECODED`.
 
         Args:
@@ -69,34 +67,22 @@ class OutputDecoding(ABC):
             outputs: the number of decoded channels.
             scale: the value of one unit of the result.
         """
-
-    @abstractmethod
-    def constants(self, scale: float) -> Constants:
-        """Return the constants that a kit's `host.py` decodes with."""
-
-
-@dataclass(frozen=True)
-class Plain(OutputDecoding):
-    """One copy, which is the value."""
-
-    def decode(self, result: np.ndarray, scale: float) -> np.ndarray:  # noqa: ARG002 - as above
-        """Return the result."""
-        return result
-
-    def write(self, w: HostWriter, feeds: list[str], outputs: int, scale: float) -> None:  # noqa: ARG002 - as above
-        """Write the node that turns a result into float."""
         w.node("DequantizeLinear", DECODED, feeds)
 
     def constants(self, scale: float) -> Constants:  # noqa: ARG002 - as above
-        """Return the name of the decoding."""
+        """Return the constants that a kit's `host.py` decodes with."""
         return {"decoding": "plain"}
 
 
+OutputDecoding = Plain
+
+
 @dataclass(frozen=True)
-class DualRange(OutputDecoding):
+class DualRange(Plain):
     """A fine copy for nearly all pixels, then a coarse one for the strongest edges."""
 
     finer_bits = 1
+    _chosen = DECODED
 
     @property
     def gains(self) -> tuple[int, ...]:
@@ -114,29 +100,16 @@ class DualRange(OutputDecoding):
 
     def write(self, w: HostWriter, feeds: list[str], outputs: int, scale: float) -> None:
         """Write the nodes that choose the fine or the coarse copy."""
-        self._write_choice(w, feeds, outputs, scale, [], DECODED)
-
-    def _write_choice(
-        self,
-        w: HostWriter,
-        feeds: list[str],
-        outputs: int,
-        scale: float,
-        others: Sequence[str],
-        output: str,
-    ) -> None:
-        """Write the nodes that split the copies, the others behind these two, and choose one."""
         both = w.node("DequantizeLinear", "host_back.both", feeds)
         name = "one_each" if outputs == 1 else "channels_each"
-        sizes = w.constant(name, np.full(self.copies, outputs))
-        fine = "host_back.fine"
-        coarse = "host_back.coarse"
-        w.split(both, sizes, [fine, coarse, *others])
-        wide = w.node("Mul", "host_back.wide", [coarse, w.scalar("gain", GAIN)])
-        size = w.node("Abs", "host_back.size", [fine])
+        analytic = [f"host_back.analytic_{k}" for k in range(self.copies - 2)]
+        names = ["host_back.fine", "host_back.coarse", *analytic]
+        w.split(both, w.constant(name, np.full(self.copies, outputs)), names)
+        wide = w.node("Mul", "host_back.wide", ["host_back.coarse", w.scalar("gain", GAIN)])
+        size = w.node("Abs", "host_back.size", ["host_back.fine"])
         limit = w.scalar("fine_max", _fine_limit(scale))
         fits = w.node("LessOrEqual", "host_back.fits", [size, limit])
-        w.node("Where", output, [fits, fine, wide])
+        w.node("Where", self._chosen, [fits, "host_back.fine", wide])
 
     def constants(self, scale: float) -> Constants:
         """Return the limit of the fine copy, and the gain of the coarse one."""
@@ -144,10 +117,9 @@ class DualRange(OutputDecoding):
 
 
 @dataclass(frozen=True)
-class OffsetWindows(OutputDecoding):
+class OffsetWindows(Plain):
     """A coarse copy, then fine ones less an offset each: windows side by side over the range."""
 
-    offsets: Offsets
     finer_bits = GAIN.bit_length() - 1
 
     @property
@@ -209,6 +181,7 @@ class BankSum(DualRange):
     """
 
     coarse_copies: int = 0
+    _chosen = "host_back.chosen"
 
     @property
     def copies(self) -> int:
@@ -241,8 +214,8 @@ class BankSum(DualRange):
 
     def write(self, w: HostWriter, feeds: list[str], outputs: int, scale: float) -> None:
         """Write the nodes that add the correction and the analytic restoration."""
+        super().write(w, feeds, outputs, scale)
         analytic = [f"host_back.analytic_{k}" for k in range(ANALYTIC_COPIES)]
-        self._write_choice(w, feeds, outputs, scale, analytic, "host_back.chosen")
         fine_sum = w.node("Sum", "host_back.analytic", analytic[: self.fine_copies])
         gain = w.scalar("analytic_gain", self._fine_gain(scale))
         added = w.node("Mul", "host_back.added", [fine_sum, gain])
@@ -253,7 +226,7 @@ class BankSum(DualRange):
             coarse_gain = w.scalar("coarse_gain", self._coarse_gain(scale))
             far = w.node("Mul", "host_back.far", [analytic[-1], coarse_gain])
             added = w.node("Where", "host_back.reached", [fits, added, far])
-        w.node("Add", DECODED, ["host_back.chosen", added])
+        w.node("Add", DECODED, [self._chosen, added])
 
     def constants(self, scale: float) -> Constants:
         """Return the constants of the dual range, and those of the analytic copies."""

@@ -74,7 +74,7 @@ def _assembled(body: IntCore, bank: Bank, scale: int, shifts: Shifts, kernels: K
     joined = Concat("joined", (BODY, ANALYTIC), CORRECTION)
     # A concat has one scale for its inputs and its output.
     frac_bits = dict(body.frac_bits) | {BANK: BITS, BODY: result, ANALYTIC: result}
-    decoding = BankSum(coarse_copies(kernels))
+    decoding = BankSum(coarse_copies=coarse_copies(kernels))
     host_part = replace(bank_host_part(scale, decoding), unit=float(np.float32(bank.unit)))
     analytic = _analytic(scale, result, shifts, decoding, len(channels(kernels)))
     ops = (bank_layer(bank, scale, shifts, kernels), *behind_bank, analytic, joined)

@@ -28,7 +28,7 @@ from beers_deploy.quant.graph import PLANES, Op
 from beers_deploy.quant.host_part import BankSum
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.quant.sensor_bank.filters import BITS, integer_bank
-from beers_deploy.quant.untrusted import contradictions
+from beers_deploy.quant.untrusted import DAMAGE, contradictions
 
 WEIGHTS = "weights_sha256"
 """The key of the SHA-256 of the float weights, in the metadata of an INT8 network behind a bank."""
@@ -59,7 +59,7 @@ class ConditionedCore:
     def kernels(self) -> Kernels:
         """The kind of the bank's kernels."""
         # Only behind fitted kernels does the analytic restoration have a coarse copy.
-        return "fitted" if self.core.host_part.decoding == BankSum(1) else "cut"
+        return "fitted" if self.core.host_part.decoding == BankSum(coarse_copies=1) else "cut"
 
     def for_sensor(self, bank: Bank, vector: Sequence[float]) -> IntCore:
         """Return the core for one sensor, from its bank and its sensor vector (4,)."""
@@ -189,14 +189,7 @@ def with_delta(core: IntCore, delta: bytes, where: str = "The delta") -> tuple[I
             raise ValueError(f"{len(remainder)} bytes too many")
         host_part = replace(core.host_part, unit=float(header["unit"]))
         return replace(core, ops=tuple(ops), host_part=host_part), str(header["sensor"])
-    except (
-        zlib.error,
-        AttributeError,
-        LookupError,
-        RecursionError,
-        TypeError,
-        ValueError,
-    ) as error:
+    except (zlib.error, *DAMAGE) as error:
         reason = printable(" ".join(f"{type(error).__name__}: {error}".split()))
         fault = (
             "is damaged"
