@@ -26,13 +26,11 @@ SHUFFLES = ("front", "back", "last")
 def host_part_to_json(part: HostPart) -> dict[str, Any]:
     """Return the host's part as values that JSON has."""
     decoding = part.decoding
-    shuffles = {name: [asdict(shuffle) for shuffle in getattr(part, name)] for name in SHUFFLES}
+    record = asdict(part)
+    # Encoding and decoding are described by the flags that the first files had.
+    del record["encoding"], record["decoding"]
     return {
-        **shuffles,
-        "channels": part.channels,
-        "outputs": part.outputs,
-        "adds_image": part.adds_image,
-        "unit": part.unit,
+        **record,
         "planes": part.encoding.planes,
         "direct": isinstance(part.encoding, Direct),
         "banked": part.encoding == BANK_SLICES,

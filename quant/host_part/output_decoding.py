@@ -105,11 +105,11 @@ class DualRange(Plain):
         analytic = [f"host_back.analytic_{k}" for k in range(self.copies - 2)]
         names = ["host_back.fine", "host_back.coarse", *analytic]
         w.split(both, w.constant(name, np.full(self.copies, outputs)), names)
-        wide = w.node("Mul", "host_back.wide", ["host_back.coarse", w.scalar("gain", GAIN)])
-        size = w.node("Abs", "host_back.size", ["host_back.fine"])
+        wide = w.node("Mul", "host_back.wide", [names[1], w.scalar("gain", GAIN)])
+        size = w.node("Abs", "host_back.size", names[:1])
         limit = w.scalar("fine_max", _fine_limit(scale))
         fits = w.node("LessOrEqual", "host_back.fits", [size, limit])
-        w.node("Where", self._chosen, [fits, "host_back.fine", wide])
+        w.node("Where", self._chosen, [fits, names[0], wide])
 
     def constants(self, scale: float) -> Constants:
         """Return the limit of the fine copy, and the gain of the coarse one."""
