@@ -13,7 +13,7 @@ import json
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from io import BytesIO
 
 import numpy as np
 import onnx
@@ -139,23 +139,19 @@ def delta_of_file(model: onnx.ModelProto) -> bytes:
     """
     conditioned = required_conditioned_core(model)
     core = conditioned.core
-    ops = [op for op in core.convolutions if op.input == PLANES or op.name in conditioned.biases]
-    bits = {op.name: [op.weight_frac_bits, op.bias_frac_bits] for op in ops}
-    header = {
-        "sensor": metadata(model).get("sensor", ""),
-        "unit": core.host_part.unit,
-        "bits": bits,
-    }
-    arrays = chain.from_iterable(map(_numbers, ops))
+    bits = dict[str, tuple[int, int]]()
+    arrays = list[np.ndarray]()
+    for op in core.convolutions:
+        if op.input == PLANES or op.name in conditioned.biases:
+            bits[op.name] = (op.weight_frac_bits, op.bias_frac_bits)
+            # Only the bank's weights depend on the sensor.
+            arrays += [op.weight, op.bias] if op.input == PLANES else [op.bias]
+    unit = core.host_part.unit
+    header = {"sensor": metadata(model).get("sensor", ""), "unit": unit, "bits": bits}
     numbers = b"".join(values.astype(np.int8).tobytes() for values in arrays)
     # JSON without indent holds no line break, so the first one in a delta ends its header.
     line = json.dumps(header, separators=(",", ":")).encode()
     return zlib.compress(line + b"\n" + numbers, 9)
-
-
-def _numbers(op: IntConv) -> list[np.ndarray]:
-    """Return the arrays of a convolution that depend on the sensor."""
-    return [op.weight, op.bias] if op.input == PLANES else [op.bias]
 
 
 def with_delta(core: IntCore, delta: bytes, where: str = "The delta") -> tuple[IntCore, str]:
@@ -174,19 +170,25 @@ def with_delta(core: IntCore, delta: bytes, where: str = "The delta") -> tuple[I
         content = zlib.decompressobj().decompress(delta, LARGEST_DELTA)
         line, _, numbers = content.partition(b"\n")
         header = json.loads(line)
-        remainder = np.frombuffer(numbers, np.int8)
+        stream = BytesIO(numbers)
+        bits = dict(header["bits"])
         ops = list[IntConv | Op]()
-        convolutions = {op.name: op for op in core.convolutions}
-        bits_of = {
-            convolutions[name].name: tuple(map(int, bits)) for name, bits in header["bits"].items()
-        }
         for op in core.ops:
-            if isinstance(op, IntConv) and op.name in bits_of:
-                op, remainder = _patched(op, bits_of[op.name], remainder)
+            if isinstance(op, IntConv) and op.name in bits:
+                weight_bits, bias_bits = map(int, bits.pop(op.name))
+                op = replace(
+                    op,
+                    weight=_read_like(op.weight, stream) if op.input == PLANES else op.weight,
+                    bias=_read_like(op.bias, stream),
+                    weight_frac_bits=weight_bits,
+                    bias_frac_bits=bias_bits,
+                )
             ops.append(op)
+        if bits:
+            raise KeyError(*bits)
         # A network of the same names and smaller layers takes fewer bytes.
-        if len(remainder):
-            raise ValueError(f"{len(remainder)} bytes too many")
+        if stream.read(1):
+            raise ValueError("too many bytes")
         host_part = replace(core.host_part, unit=float(header["unit"]))
         return replace(core, ops=tuple(ops), host_part=host_part), str(header["sensor"])
     except (zlib.error, *DAMAGE) as error:
@@ -206,15 +208,6 @@ LARGEST_DELTA = 1 << 20
 """In bytes, of the unpacked content."""
 
 
-def _patched(op: IntConv, bits: tuple[int, ...], numbers: np.ndarray) -> tuple[IntConv, np.ndarray]:
-    """Return a convolution with the first of these numbers, and the numbers after them."""
-    arrays = list[np.ndarray]()
-    for values in _numbers(op):
-        arrays.append(numbers[: values.size].reshape(values.shape))
-        numbers = numbers[values.size :]
-    weight_bits, bias_bits = bits
-    # Weights come first, and only the bank's depend on the sensor.
-    weight = arrays[0] if len(arrays) > 1 else op.weight
-    return replace(
-        op, weight=weight, bias=arrays[-1], weight_frac_bits=weight_bits, bias_frac_bits=bias_bits
-    ), numbers
+def _read_like(values: np.ndarray, stream: BytesIO) -> np.ndarray:
+    """Read int8 numbers of the shape of `values`, or raise ValueError if there are too few."""
+    return np.frombuffer(stream.read(values.size), np.int8).reshape(values.shape)
