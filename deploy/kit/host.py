@@ -90,7 +90,7 @@ def bank_sum(fine: np.ndarray, coarse: np.ndarray, *analytic: np.ndarray) -> np.
     return np.asarray(dual_range(fine, coarse) + added)
 
 
-DECODINGS = {
+DECODINGS: dict[str, Any] = {
     "plain": plain,
     "dual range": dual_range,
     "offset windows": offset_windows,

@@ -15,9 +15,7 @@ from beers_deploy.quant.host_part.description import host_part_from_json, host_p
 from beers_deploy.quant.host_part.input_encoding import (
     BANK_SLICES,
     IMAGE_SLICES,
-    BitSlices,
     Direct,
-    InputEncoding,
 )
 from beers_deploy.quant.host_part.output_decoding import (
     ANALYTIC_COPIES,
@@ -41,12 +39,10 @@ __all__ = [
     "ONE_CHANNEL",
     "ZERO",
     "BankSum",
-    "BitSlices",
     "Direct",
     "DualRange",
     "HostPart",
     "HostWriter",
-    "InputEncoding",
     "OffsetWindows",
     "OutputDecoding",
     "Plain",
