@@ -88,7 +88,7 @@ def tuning_step(core: IntCore) -> Callable[[], None]:
     samples = []
     for _ in range(PATCHES):
         image = generator.random((1, 1, SIDE_PX, SIDE_PX)).astype(np.float32)
-        planes = torch.from_numpy(core.ends.split(image).astype(np.float32)).to(
+        planes = torch.from_numpy(core.host_part.encode(image).astype(np.float32)).to(
             memory_format=torch.channels_last
         )
         samples.append(Sample(image, planes, torch.zeros(1, 1, SIDE_PX, SIDE_PX), None, 1.0))

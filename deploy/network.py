@@ -190,7 +190,7 @@ class Network:
         """
         core = read_core(self.model)
         side_px = tile or fixed_tile_px(self.model)
-        require_tile(side_px, core.ends.place_px)
+        require_tile(side_px, core.host_part.place_px)
         write = vint8_model if TargetProfile.load(board).npu else board_model
         return Network(write(core, metadata(self.model), side_px), f"{self.name}-core")
 

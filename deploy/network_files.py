@@ -28,9 +28,9 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND, BLIND_PROFILE
 from beers_deploy.profiles.toml import unreadable
-from beers_deploy.quant.banked.family import required_family, with_delta
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata
+from beers_deploy.quant.sensor_bank.conditioned import required_conditioned_core, with_delta
 
 logger = logging.getLogger(__name__)
 
@@ -133,10 +133,10 @@ def int8_for_sensor(
         sensor: of which the middle of each range is taken.
         more: metadata to add.
     """
-    family = required_family(model)
+    stored = required_conditioned_core(model)
     instrument = sensor.nominal()
-    core = family.for_sensor(
-        network_bank(instrument, family.kernels), sensor_vector(instrument).values
+    core = stored.for_sensor(
+        network_bank(instrument, stored.kernels), sensor_vector(instrument).values
     )
     return host_model(
         core, {**metadata(model), "sensor": sensor.name, **(more or {})}, fixed_tile_px(model)
@@ -154,5 +154,5 @@ def int8_for_delta(model: onnx.ModelProto, delta: Path) -> onnx.ModelProto:
             f"The delta {delta} cannot be read: {unreadable(delta) or error}. Give a file that "
             "'export --delta' wrote."
         ) from error
-    core, name = with_delta(required_family(model).core, packed, str(delta))
+    core, name = with_delta(required_conditioned_core(model).core, packed, str(delta))
     return host_model(core, {**metadata(model), "sensor": name}, fixed_tile_px(model))

@@ -16,9 +16,9 @@ from beers_deploy.network_files import int8_for_delta, int8_for_sensor, warn_out
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.quant.banked.family import delta_of_file, required_family
 from beers_deploy.quant.encodings import host_model, read_core
 from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
+from beers_deploy.quant.sensor_bank.conditioned import delta_of_file, required_conditioned_core
 
 logger = logging.getLogger(__name__)
 
@@ -68,7 +68,7 @@ def conditioned_int8(path: Path, sensor: SensorLike, delta: Path | None) -> onnx
     if delta is not None:
         return int8_for_delta(model, delta)
     profile = Sensor.load(sensor)
-    warn_outside(profile, required_family(model).kernels)
+    warn_outside(profile, required_conditioned_core(model).kernels)
     return int8_for_sensor(model, profile)
 
 
@@ -82,7 +82,7 @@ def export_int8(
     """Write an INT8 network, and its core for a board unless `core_file` is None."""
     core = read_core(model)
     side_px = tile or fixed_tile_px(model)
-    require_tile(side_px, core.ends.place_px)
+    require_tile(side_px, core.host_part.place_px)
     for_board = Network(model, out.stem).core(target, tile) if core_file else None
     save_onnx(host_model(core, metadata(model), side_px), out)
     logger.info("wrote %s", out)

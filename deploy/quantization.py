@@ -22,7 +22,6 @@ from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import REFERENCE, board_names, npu_names
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.quant.banked.family import FAMILY, WEIGHTS, required_family
 from beers_deploy.quant.core import SHIFTS, Shifts, target_shifts
 from beers_deploy.quant.encodings import host_model, read_core
 from beers_deploy.quant.gate import GateResult, compare, gate_row
@@ -37,6 +36,11 @@ from beers_deploy.quant.sensitivity import (
     layer_error_rows,
     sizes_row,
     worst_row,
+)
+from beers_deploy.quant.sensor_bank.conditioned import (
+    SENSOR_BIASES,
+    WEIGHTS,
+    required_conditioned_core,
 )
 from beers_deploy.quant.session import open_any_size
 from beers_deploy.quant.untrusted import contradictions
@@ -87,19 +91,19 @@ def quantized(
         OptionError: samples or fine-tuning of a network that is conditioned on its sensor.
         ImageError: samples that the network does not accept.
     """
-    banked = conditioned(Path(network)) if isinstance(network, str | os.PathLike) else None
+    weights = conditioned(Path(network)) if isinstance(network, str | os.PathLike) else None
     steps = steps_of(finetune)
-    if banked and (steps != 0 or data.samples is not None):
+    if weights and (steps != 0 or data.samples is not None):
         unfit = "`finetune`" if data.samples is None else "`samples`"
         raise OptionError(
-            f"{unfit} cannot be combined with {banked.name}, because a network conditioned on a "
+            f"{unfit} cannot be combined with {weights.name}, because a network conditioned on a "
             f"sensor is calibrated over the whole family of sensors at once. Leave {unfit} out."
         )
     origin = Network.load(network, sensor=data.sensor)
     require_quantized(origin.model, origin.label, wanted=False)
     with faults_named(origin.label):
-        if banked:
-            int8 = quantize_conditioned(banked, origin, data.simulated, data.sensor, target)
+        if weights:
+            int8 = quantize_conditioned(weights, origin, data.simulated, data.sensor, target)
             return int8, None
         # Samples in memory may be given one after the other, so they are read only here.
         source = data.own(origin) or data.simulated
@@ -216,7 +220,7 @@ def rounding_of(int8: Path, weights: Path) -> "Rounding":
     import torch
 
     from beers_deploy.model.convbeers import Rounding
-    from beers_deploy.quant.banked.calibrate import map_steps
+    from beers_deploy.quant.sensor_bank.calibrate import map_steps
 
     model = load_onnx(int8)
     tensors = read_conditioned(weights)
@@ -226,7 +230,7 @@ def rounding_of(int8: Path, weights: Path) -> "Rounding":
             "'beers-deploy quantize'."
         )
     with contradictions(str(int8)):
-        step_sizes = map_steps(required_family(model), tensors)
+        step_sizes = map_steps(required_conditioned_core(model), tensors)
     stream, *inner = (torch.from_numpy(np.float32(steps))[:, None, None] for steps in step_sizes)
     return Rounding(stream, tuple(inner))
 
@@ -251,7 +255,7 @@ def family_model(
     """
     # This loads SciPy, which samples of one's own do without.
     from beers_deploy.model.simulator.procedural import load_scenes
-    from beers_deploy.quant.banked.calibrate import family_images, quantize_family
+    from beers_deploy.quant.sensor_bank.calibrate import bank_images, quantize_behind_bank
 
     weights = read_conditioned(network.weights)
     aim = Sensor.load(REFERENCE).nominal()
@@ -262,14 +266,14 @@ def family_model(
         photographs = list(chain.from_iterable(load_scenes(folder, aim, seed) for folder in images))
         scenes = photographs + scenes * max(len(photographs) // len(scenes), 1)
     with progress(f"calibrating {network.name} over the family of sensors"):
-        family_patches = family_images(scenes, scale, seed, weights.kernels)
+        patches = bank_images(scenes, scale, seed, weights.kernels)
         middle = bank_of_vector((0.0,) * len(RANGES), weights.kernels)
-        family = quantize_family(weights, middle, family_patches, shifts, passes)
+        quantized = quantize_behind_bank(weights, middle, patches, shifts, passes)
     description = {
         "variant": network.name,
         "reference": REFERENCE,
         "precision": "int8 legal",
         "calibration_seed": str(seed),
     }
-    description |= {FAMILY: family.to_words(), WEIGHTS: sha256(network.weights)}
-    return host_model(family.core, description)
+    description |= {SENSOR_BIASES: quantized.biases_to_json(), WEIGHTS: sha256(network.weights)}
+    return host_model(quantized.core, description)

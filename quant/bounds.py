@@ -7,13 +7,9 @@ from itertools import product
 
 import numpy as np
 
-from beers_deploy.quant.banked.filters import PLANE_ENDS
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
 from beers_deploy.quant.graph import (
-    COARSE_MAX,
     PLANES,
-    QUARTER,
-    STEP,
     Add,
     AveragePool,
     Concat,
@@ -23,10 +19,6 @@ from beers_deploy.quant.graph import (
     Shuffle,
 )
 from beers_deploy.quant.integer.arithmetic import activated, activation_table, mean_factor
-
-# `split` caps the coarse plane at 127, so the remainder of the brightest values reaches 31.
-PLANE_LOW = np.array([0, -STEP // 2, -STEP // 2 // QUARTER])
-PLANE_HIGH = np.array([COARSE_MAX, STEP - 1, STEP // QUARTER])
 
 Range = tuple[np.ndarray, np.ndarray]
 """Smallest and largest whole number of each channel."""
@@ -62,12 +54,9 @@ def layer_bounds(core: IntCore) -> list[LayerBound]:
 
 
 def _planes(core: IntCore) -> Range:
-    count = core.ends.planes
-    channels = core.ends.channels
-    if core.ends.banked:
-        low, high = (np.array(ends) for ends in PLANE_ENDS)
-        return low.repeat(channels), high.repeat(channels)
-    return PLANE_LOW[:count].repeat(channels), PLANE_HIGH[:count].repeat(channels)
+    low, high = core.host_part.encoding.limits
+    channels = core.host_part.channels
+    return np.repeat(low, channels), np.repeat(high, channels)
 
 
 Accumulated = tuple[np.ndarray, np.ndarray, int]

@@ -12,7 +12,6 @@ import numpy as np
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import (
     PLANES,
     Activation,
@@ -25,6 +24,7 @@ from beers_deploy.quant.graph import (
     ties_scales,
 )
 from beers_deploy.quant.graph.operations import SIX, OneInput
+from beers_deploy.quant.host_part import ONE_CHANNEL, HostPart
 
 INT8_MIN = -128
 INT8_MAX = 127
@@ -145,7 +145,7 @@ class IntCore:
 
     ops: tuple[IntConv | Op, ...]
     frac_bits: Mapping[str, int]
-    ends: Ends = field(default_factory=Ends)
+    host_part: HostPart = ONE_CHANNEL
 
     def scale(self, tensor: str) -> float:
         """The value of one unit of a tensor, 2^-n."""
@@ -172,7 +172,10 @@ def rounded_to(values: np.ndarray, frac_bits: int) -> np.ndarray:
 
 
 def build_core(
-    graph: Graph, frac_bits: Mapping[str, int], shifts: Shifts = SHIFTS, ends: Ends | None = None
+    graph: Graph,
+    frac_bits: Mapping[str, int],
+    shifts: Shifts = SHIFTS,
+    host_part: HostPart = ONE_CHANNEL,
 ) -> IntCore:
     """Quantise the weights of a graph, and move scales that the DPU's shifts cannot reach.
 
@@ -180,12 +183,12 @@ def build_core(
         graph: a plane-reading graph.
         frac_bits: the least-squares number of fractional bits of every activation.
         shifts: the windows of the target.
-        ends: what the host does around; by default an image of one channel and a correction of it.
+        host_part: of the core.
     """
     legal = dict(frac_bits)
     # Each round starts from the scales that the one before has moved.
     for _ in range(ROUNDS):
-        core = _in_one_round(graph, legal, shifts, ends or Ends())
+        core = _in_one_round(graph, legal, shifts, host_part)
         faults = shift_faults(core, shifts)
         if not faults:
             return _with_biases_left(core, graph)
@@ -196,17 +199,18 @@ def build_core(
 
 
 def _with_biases_left(core: IntCore, graph: Graph) -> IntCore:
-    """What rounding the last bias leaves is known, and where a result comes in windows the host
-    adds it.
-    """
+    """Return the core whose host adds the rounding error of the last biases, if it adds offsets."""
     last = graph[-1]
     rounded = core.ops[-1]
-    if not (core.ends.offsets and isinstance(last, Conv) and isinstance(rounded, IntConv)):
+    if not (isinstance(last, Conv) and isinstance(rounded, IntConv)):
         return core
-    return replace(core, ends=core.ends.moved(last.bias - rounded.float_bias))
+    decoding = core.host_part.decoding.with_bias_errors(last.bias - rounded.float_bias)
+    return replace(core, host_part=replace(core.host_part, decoding=decoding))
 
 
-def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts, ends: Ends) -> IntCore:
+def _in_one_round(
+    graph: Graph, frac_bits: dict[str, int], shifts: Shifts, host_part: HostPart
+) -> IntCore:
     """Every operation within reach of the scales before it, which it may move."""
     ops: list[IntConv | Op] = []
     for op in graph:
@@ -222,7 +226,7 @@ def _in_one_round(graph: Graph, frac_bits: dict[str, int], shifts: Shifts, ends:
         elif ties_scales(op):
             _tie(op, frac_bits)
         ops.append(op)
-    return IntCore(tuple(ops), dict(frac_bits), ends)
+    return IntCore(tuple(ops), dict(frac_bits), host_part)
 
 
 def _quantize_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts) -> IntConv:

@@ -22,7 +22,6 @@ import onnx
 from beers_deploy.model.progress import step
 from beers_deploy.quant.core import SHIFTS, IntCore, Shifts, build_core
 from beers_deploy.quant.encodings import host_model
-from beers_deploy.quant.ends import Ends, ends_of
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
@@ -33,9 +32,9 @@ from beers_deploy.quant.graph import (
     read_planes,
     tensors,
 )
+from beers_deploy.quant.host_part import DualRange, HostPart, Plain
 from beers_deploy.quant.onnx_file import fixed_tile_px, metadata
 from beers_deploy.quant.passes.dual_range import (
-    FINER,
     can_write_copies,
     with_copies,
     with_windows,
@@ -91,7 +90,7 @@ class Plan:
 
     Attributes:
         graph: that reads the planes, in float.
-        ends: the host's part.
+        host_part: the host's part.
         groups: residual groups, each of one scale.
         singles: what is equalized in addition to the groups, or where there are none.
         shifts: the windows of the target.
@@ -99,7 +98,7 @@ class Plan:
     """
 
     graph: Graph
-    ends: Ends
+    host_part: HostPart
     groups: list[ResidualGroup]
     singles: SingleTensors
     shifts: Shifts
@@ -111,13 +110,10 @@ class Plan:
         shared = [*chain.from_iterable(self.groups), *self.singles.tensors]
         scales = {**frac_bits, **dict.fromkeys(shared, GROUP_FRAC_BITS)}
         # A coarse copy holds what a finer scale clips.
-        if self.ends.offsets:
-            scales[CORRECTION] += FINER
-        elif self.ends.gains == 2:
-            scales[CORRECTION] += 1
-        final = with_copies(candidate, self.ends)
+        scales[CORRECTION] += self.host_part.decoding.finer_bits
+        final = with_copies(candidate, self.host_part.decoding)
         assert set(tensors(final)) <= set(scales)  # noqa: S101
-        return build_core(final, scales, self.shifts, self.ends)
+        return build_core(final, scales, self.shifts, self.host_part)
 
 
 def quantize_model(
@@ -148,11 +144,11 @@ def quantize_model(
     # 1.
     network = read_network(model)
     graph = read_planes(network.graph)
-    two_gains = passes.dual_range and network.adds_image and can_write_copies(graph)
-    ends = ends_of(network, 2 if two_gains else 1)
+    dual_range = passes.dual_range and network.adds_image and can_write_copies(graph)
+    host_part = HostPart.of(network, DualRange() if dual_range else Plain())
     # 2.
     groups = residual_groups(graph)
-    plan = Plan(graph, ends, groups, _singles(graph, ends, groups), shifts, passes)
+    plan = Plan(graph, host_part, groups, _singles(graph, host_part, groups), shifts, passes)
     # 3. to 7.
     core, final = rounded(plan, patches.degraded)
     about = {
@@ -173,14 +169,14 @@ def quantize_model(
     return Quantized(host_model(core, about, fixed_tile_px(model)), core, final)
 
 
-def _singles(graph: Graph, ends: Ends, groups: list[ResidualGroup]) -> SingleTensors:
+def _singles(graph: Graph, host_part: HostPart, groups: list[ResidualGroup]) -> SingleTensors:
     """Return what is equalized in addition to these groups: nothing where there are some, and no
     depthwise convolutions.
     """
     depthwise = any(isinstance(op, Conv) and op.groups > 1 for op in graph)
     # Next to a group this made no dense network for one sensor better: see `equalize_single`.
     names = single_tensors(graph) if depthwise or not groups else []
-    widths = channels_of(graph, {PLANES: ends.planes * ends.channels})
+    widths = channels_of(graph, {PLANES: host_part.planes})
     return SingleTensors(tuple(names), tuple(widths[name] for name in names))
 
 
@@ -190,19 +186,19 @@ def rounded(plan: Plan, images: Sequence[np.ndarray]) -> tuple[IntCore, Graph]:
     """
     # 3.
     step("scale of each tensor")
-    frac_bits = choose_frac_bits(plan.graph, images, plan.ends, plan.passes.least_squares)
+    frac_bits = choose_frac_bits(plan.graph, images, plan.host_part, plan.passes.least_squares)
     # 4. ReLU6 becomes the end of int8, which sums beyond six would be clipped by as well.
     groups = [group for group in plan.groups if not exceeds_six(plan.graph, group, frac_bits)]
     if len(groups) < len(plan.groups):
-        plan = replace(plan, groups=groups, singles=_singles(plan.graph, plan.ends, groups))
+        plan = replace(plan, groups=groups, singles=_singles(plan.graph, plan.host_part, groups))
     # 5.
     if plan.passes.dual_range:
-        ends = with_windows(plan.graph, plan.ends, frac_bits[CORRECTION], images)
-        plan = replace(plan, ends=ends)
+        host_part = with_windows(plan.graph, plan.host_part, frac_bits[CORRECTION], images)
+        plan = replace(plan, host_part=host_part)
     # 6.
     graph = plan.graph
     if plan.groups or plan.singles.tensors:
-        targets = search_targets(graph, plan.ends, images)
+        targets = search_targets(graph, plan.host_part, images)
 
         def trial(candidate: Graph) -> Costs:
             return crop_costs(host_model(plan.core(candidate, frac_bits), {}), targets)
@@ -211,14 +207,14 @@ def rounded(plan: Plan, images: Sequence[np.ndarray]) -> tuple[IntCore, Graph]:
         graph = _equalized_groups(graph, plan, trial, images)
         graph = _equalized_singles(graph, plan, trial, images)
     # 7.
-    return plan.core(graph, frac_bits), with_copies(graph, plan.ends)
+    return plan.core(graph, frac_bits), with_copies(graph, plan.host_part.decoding)
 
 
 def _equalized_groups(
     graph: Graph, plan: Plan, trial: Trial, images: Sequence[np.ndarray]
 ) -> Graph:
     """Equalize group after group, the others by a first guess until their turn comes."""
-    ranges = [channel_ranges(plan.graph, group, images, plan.ends) for group in plan.groups]
+    ranges = [channel_ranges(plan.graph, group, images, plan.host_part) for group in plan.groups]
     guesses = [first_guess(group_ranges, GAMMAS[0], 1.0) for group_ranges in ranges]
     for group, guess in list(zip(plan.groups, guesses, strict=True))[1:]:
         graph = equalize(graph, group, guess)
@@ -244,11 +240,11 @@ def _equalized_singles(
     if not plan.singles.tensors:
         return graph
     step(f"equalising the channels of {len(plan.singles.tensors)} tensors")
-    ranges = single_ranges(graph, plan.singles, images, plan.ends)
+    ranges = single_ranges(graph, plan.singles, images, plan.host_part)
     factors = equalize_single(graph, plan.singles, ranges, np.ones(len(ranges)), trial)
     graph = plan.singles.scaled(graph, factors)
-    if not plan.ends.offsets:
+    if not plan.host_part.decoding.offsets:
         return graph
     # Here the image itself is in the tensors, with nothing on the host to make up for a clip.
-    largest = largest_values(graph, plan.singles, images, plan.ends)
+    largest = largest_values(graph, plan.singles, images, plan.host_part)
     return plan.singles.scaled(graph, FULL / np.maximum(largest, FULL))

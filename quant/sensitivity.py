@@ -127,7 +127,7 @@ def layer_errors(
         if isinstance(op, Conv) and isinstance(int_op, IntConv)
     )
     names = tensors((*graph, *twins))
-    width = core.ends.planes * core.ends.channels
+    width = core.host_part.planes
     halo_px = None if halo_of(graph) is None else 0
     float_session = open_session(graph_to_onnx((*graph, *twins), names, width))
     int8_session = open_session(host_model(core, {}))
@@ -140,25 +140,25 @@ def layer_errors(
     together = Loss()
     scale = core.scale(CORRECTION)
     for crop in crops:
-        (values,) = tensor_values(float_session, names, crop, halo_px, core.ends)
+        (values,) = tensor_values(float_session, names, crop, halo_px, core.host_part)
         float_values = dict(zip(names, values, strict=True))
-        restored = core.ends.restored(crop, float_values[CORRECTION], scale)
-        offset = crop if core.ends.adds_image else 0.0
+        restored = core.host_part.restore(crop, float_values[CORRECTION], scale)
+        offset = crop if core.host_part.adds_image else 0.0
         for op, layer in zip(graph, layers, strict=True):
             result = _in_int8(op, core, float_values)
             expected = float_values[op.output]
             # Of two gains one is coarse and the other clipped, so they count together.
             if op.output == CORRECTION:
-                result = core.ends.merge(result, scale)
-                expected = core.ends.whole(expected)
+                result = core.host_part.decode(result, scale)
+                expected = core.host_part.unrounded(expected)
             layer.alone.add(result, expected)
             # The next layer's bias makes up for a mean error.
             result = result - (result - expected).mean((2, 3), keepdims=True)
             if op.output == CORRECTION:
-                image = core.ends.finished(crop, result)
+                image = core.host_part.finish(crop, result)
             else:
-                feed = {PLANES: planes_of(crop, core.ends), op.output: result}
-                image = core.ends.restored(crop, rests[op.output].run(None, feed)[0], scale)
+                feed = {PLANES: planes_of(crop, core.host_part), op.output: result}
+                image = core.host_part.restore(crop, rests[op.output].run(None, feed)[0], scale)
             layer.network.add(image, restored, offset)
         together.add(result_of(int8_session, crop), restored, offset)
     return layers, together
@@ -283,7 +283,7 @@ def losses(
     costliest = _costliest(layers or layer_error_rows(result, patches))
     names = ", ".join(f"{name} ({share:.0f} %)" for name, share in costliest)
     add = ""
-    if not result.core.ends.adds_image:
+    if not result.core.host_part.adds_image:
         add = ", or a network that ends with a global add, of which INT8 errs less"
     return f"{message}: most of it in {names}; try `finetune` auto{add}"
 

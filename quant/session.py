@@ -14,7 +14,6 @@ import onnxruntime as ort
 
 from beers_deploy.model.processor import int8_adds_exactly
 from beers_deploy.profiles.errors import CODE_FAULTS, ModelError, printable, reason_of
-from beers_deploy.quant.ends import ONE_CHANNEL, Ends
 from beers_deploy.quant.graph import (
     PLANES,
     PLANES_FRAC_BITS,
@@ -28,6 +27,7 @@ from beers_deploy.quant.graph import (
     same,
 )
 from beers_deploy.quant.graph.writer import graph_to_onnx
+from beers_deploy.quant.host_part import ONE_CHANNEL, HostPart
 from beers_deploy.quant.kernels import filled, made_exact
 from beers_deploy.quant.onnx_file import any_size, fixed_tile_px, is_quantized, load_onnx
 from beers_deploy.quant.untrusted import contradictions, times
@@ -160,7 +160,7 @@ def tensor_values(
     names: list[str],
     image: np.ndarray,
     halo_px: int | None,
-    ends: Ends = ONE_CHANNEL,
+    host_part: HostPart = ONE_CHANNEL,
 ) -> Iterator[list[np.ndarray]]:
     """Yield the named tensors (1, C, h, w) of a plane-reading float network for an image
     (1, C', H, W), tile by tile.
@@ -175,7 +175,7 @@ def tensor_values(
         before = min(left, around_px)
         # A slice ends at the image's own border, where the network pads with zeros as it would.
         with_halo = image[..., top - above : bottom + around_px, left - before : right + around_px]
-        values = session.run(names, {PLANES: planes_of(with_halo, ends)})
+        values = session.run(names, {PLANES: planes_of(with_halo, host_part)})
         if halo_px is not None:
             inner = ..., slice(above, above + bottom - top), slice(before, before + right - left)
             values = [result[inner] for result in values]
@@ -184,17 +184,17 @@ def tensor_values(
 
 
 def values_of(
-    graph: Graph, names: list[str], images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL
+    graph: Graph, names: list[str], images: Iterable[np.ndarray], host_part: HostPart = ONE_CHANNEL
 ) -> Iterator[list[np.ndarray]]:
     """Yield the same of a plane-reading float graph, for every tile of every image."""
-    session = open_session(graph_to_onnx(graph, names, ends.planes * ends.channels))
+    session = open_session(graph_to_onnx(graph, names, host_part.planes))
     for image in images:
-        yield from tensor_values(session, names, image, halo_of(graph), ends)
+        yield from tensor_values(session, names, image, halo_of(graph), host_part)
 
 
-def planes_of(image: np.ndarray, ends: Ends = ONE_CHANNEL) -> np.ndarray:
+def planes_of(image: np.ndarray, host_part: HostPart = ONE_CHANNEL) -> np.ndarray:
     """Return the planes (N, P, H, W) float32 of an image (N, C, H, W) in [0, 1]."""
-    return ends.split(image).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)
+    return host_part.encode(image).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)
 
 
 def halo_of(graph: Graph) -> int | None:

@@ -19,10 +19,10 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.figures import Check
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import encoding_faults, read_core
-from beers_deploy.quant.ends import ZERO, Ends
 from beers_deploy.quant.float_parts import float_layers_check
 from beers_deploy.quant.graph import CORRECTION
 from beers_deploy.quant.graph.quantized import Scale, stated
+from beers_deploy.quant.host_part import ONE_CHANNEL, ZERO
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx_file import any_size, with_outputs
 from beers_deploy.quant.session import open_any_size, open_session, result_of, tensors_of
@@ -107,7 +107,8 @@ def _own_core(model: onnx.ModelProto) -> IntCore | None:
 
 
 def _rounded(graph: OnnxGraph, core: IntCore | None) -> list[Rounded]:
-    coarse = _coarse(core.ends) if core else slice(None)
+    host_part = core.host_part if core else ONE_CHANNEL
+    counted = host_part.decoding.never_replaced(host_part.outputs)
     read_as = {
         node.outputs[0]: node.inputs[0]
         for node in graph.nodes
@@ -129,18 +130,9 @@ def _rounded(graph: OnnxGraph, core: IntCore | None) -> list[Rounded]:
             and node.inputs[0] not in graph.constants
         ):
             tensors.append(
-                Rounded(name, scale, name in relus, coarse if name == CORRECTION else slice(None))
+                Rounded(name, scale, name in relus, counted if name == CORRECTION else slice(None))
             )
     return tensors
-
-
-def _coarse(ends: Ends) -> slice:
-    """The correction's coarse channels, as `quant.ends` lays them out; all where there are no finer
-    ones.
-    """
-    if ends.offsets:
-        return slice(0, ends.outputs)
-    return slice(ends.outputs, None) if ends.gains == 2 else slice(None)
 
 
 @dataclass(frozen=True)

@@ -66,8 +66,8 @@ def write_golden(
     half_even = bool(TargetProfile.load(target).npu)
     names = files_of(core)
     generator = np.random.default_rng(0)
-    images = _images(network, core.ends.image_channels, tile, generator)
-    planes = {case: core.ends.split(image) for case, image in images.items()}
+    images = _images(network, core.host_part.image_channels, tile, generator)
+    planes = {case: core.host_part.encode(image) for case, image in images.items()}
     planes[EXTREMES] = generator.choice(np.array([-128, 127], np.int8), planes["noise"].shape)
     _remove_older(folder)
     digests = dict[str, dict[str, str]]()
@@ -279,7 +279,7 @@ def _index(path: Path) -> tuple[dict[str, dict[str, str]], bool]:
 def _planes(path: Path, core: IntCore) -> np.ndarray:
     """Read the planes that a core reads, (N, C, H, W) int8."""
     planes = read_array(path)
-    channels = core.ends.planes * core.ends.channels
+    channels = core.host_part.planes
     if (
         planes.dtype != np.int8
         or planes.ndim != 4

@@ -8,8 +8,8 @@ in `cores`.
 1. Each tile goes to one core or several (`factors`, `exposed`): core.onnx restores the tile as it
   is. Where host.json has exposures, core-x4.onnx restores the dark pixels of a tile that was
   multiplied by 4, and so on.
-2. Around a core (`restored`), the host splits the tile into int8 planes and adds the core's result
-  to the tile.
+2. Around a core (`restored`), the host encodes the tile as int8 planes, decodes the core's result
+  and adds it to the tile.
 3. After the last tile, the consistency step (`consistent`) makes the restored image agree with the
   raw one at low spatial frequencies, if host.json has its weights.
 """
@@ -37,61 +37,75 @@ UNITS = {1: S["unit"], **{int(factor): unit for factor, unit in S["exposures"].i
 
 
 def shuffled(x: np.ndarray, r: int, up: bool) -> np.ndarray:
-    """Pixels (1, C, H, W) into r^2 times the channels; `up`, back."""
+    """Move pixels (1, C, H, W) into r^2 times the channels; `up`, back."""
     _, c, h, w = x.shape
     if up:
-        return (
-            x.reshape(c // r**2, r, r, h, w)
-            .transpose(0, 3, 1, 4, 2)
-            .reshape(1, c // r**2, h * r, w * r)
-        )
-    return (
-        x.reshape(c, h // r, r, w // r, r)
-        .transpose(0, 2, 4, 1, 3)
-        .reshape(1, c * r**2, h // r, w // r)
-    )
+        c = c // r**2
+        return x.reshape(c, r, r, h, w).transpose(0, 3, 1, 4, 2).reshape(1, c, h * r, w * r)
+    h = h // r
+    w = w // r
+    return x.reshape(c, h, r, w, r).transpose(0, 2, 4, 1, 3).reshape(1, c * r**2, h, w)
+
+
+def encoded(image: np.ndarray) -> np.ndarray:
+    """Encode a tile as the core's planes, in multiples of 1/128: coarse steps, remainder, part."""
+    wide = np.pad(image, ((0, 0), (0, 0), *[(S["border_px"],) * 2] * 2), "reflect")
+    places = shuffled(wide, S["front"], up=False)
+    dn = np.clip(np.rint(places * F(4095)), 0, F(4095)) - F(S["middle"])
+    coarse = np.minimum(np.rint(dn * F(1 / S["step"])), F(127))
+    rest = dn - coarse * F(S["step"])
+    parts = np.rint(rest * F(1 / S["part"]))
+    return np.concatenate([coarse] * S["coarse_planes"] + [rest, parts], 1) / F(128)
+
+
+def plain(value: np.ndarray) -> np.ndarray:
+    """Return the only copy of a result."""
+    return value
+
+
+def fits(fine: np.ndarray) -> np.ndarray:
+    """Return where a fine copy is not clipped."""
+    return np.asarray(np.abs(fine) <= F(S["fine_max"]))
+
+
+def dual_range(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
+    """Choose the fine copy where it is not clipped, else the coarse one."""
+    return np.where(fits(fine), fine, coarse * F(S["gain"]))
+
+
+def offset_windows(coarse: np.ndarray, *windows: np.ndarray) -> np.ndarray:
+    """Choose the last window that holds a value, and the coarse copy where none does."""
+    value = coarse * F(S["gain"])
+    for window, offset in zip(windows, S["offsets"]):  # noqa: B905 - a board's Python may be old
+        value = np.where(fits(window), window + np.array(offset, F)[:, None, None], value)
+    return value
+
+
+def bank_sum(fine: np.ndarray, coarse: np.ndarray, *analytic: np.ndarray) -> np.ndarray:
+    """Add the correction and the copies of the analytic restoration."""
+    added = np.sum(analytic[: S["fine_copies"]], 0) * F(S["fine_gain"])
+    # The last copy may be a coarse one, for values at which the others are clipped.
+    if S["coarse_gain"]:
+        added = np.where(fits(analytic[0]), added, analytic[-1] * F(S["coarse_gain"]))
+    return np.asarray(dual_range(fine, coarse) + added)
+
+
+DECODINGS: dict[str, Any] = {
+    "plain": plain,
+    "dual range": dual_range,
+    "offset windows": offset_windows,
+    "bank sum": bank_sum,
+}
+"""How the copies that a core writes of each channel become one value, by the name in host.json."""
 
 
 def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
-    """A tile (1, C, h, w): planes in whole multiples of 1/128 to the core, its result merged, added
-    and clipped.
-    """
-    wide = np.pad(image, ((0, 0), (0, 0), *[(S["border_px"],) * 2] * 2), "reflect")
-    dn = np.clip(np.rint(shuffled(wide, S["front"], up=False) * F(4095)), 0, F(4095)) - F(
-        S["middle"]
-    )
-    coarse = np.minimum(np.rint(dn * F(1 / S["step"])), F(127))
-    rest = dn - coarse * F(S["step"])
-    result = run(
-        np.concatenate([coarse] * S["coarse"] + [rest, np.rint(rest * F(1 / S["part"]))], 1)
-        / F(128)
-    )
-    value, *others = np.split(result, S["copies"], 1)
-    # Copies with offsets: a coarse result, and windows that hold the values within them finely.
-    if S["offsets"]:
-        value = value * F(8)
-        for window, offset in zip(others, S["offsets"]):  # noqa: B905 - a board's Python may be old
-            value = np.where(
-                np.abs(window) <= F(S["fine_max"]),
-                window + np.array(offset, F)[:, None, None],
-                value,
-            )
-    # Other copies: the fine result, the coarse one, and those of the analytic restoration.
-    elif others:
-        value = np.where(np.abs(value) <= F(S["fine_max"]), value, others[0] * F(8))
-        if others[1:]:
-            fine = others[1 : 1 + S["fine_copies"]]
-            added = np.sum(fine, 0) * F(S["analytic"])
-            # The last copy reaches farther, for values that the others clip.
-            if S["coarse_analytic"]:
-                added = np.where(
-                    np.abs(fine[0]) <= F(S["fine_max"]), added, others[-1] * F(S["coarse_analytic"])
-                )
-            value = value + added
-    value = shuffled(value, S["back"], up=True) * F(unit)
-    return shuffled(
-        np.asarray(np.clip(image + value, 0, 1) if S["adds_image"] else value), S["last"], up=True
-    )
+    """Restore a tile (1, C, h, w) by one core: encode it, decode the result, add both and clip."""
+    copies = np.split(run(encoded(image)), S["copies"], 1)
+    value = shuffled(DECODINGS[S["decoding"]](*copies), S["back"], up=True) * F(unit)
+    if S["adds_image"]:
+        value = np.clip(image + value, 0, 1)
+    return shuffled(value, S["last"], up=True)
 
 
 def exposed(factor: int, image: np.ndarray, run: Any) -> np.ndarray:

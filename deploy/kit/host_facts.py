@@ -10,10 +10,8 @@ from beers_deploy.network import Network
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND
-from beers_deploy.quant.banked.filters import MIDDLE_DN, PART, STEP_DN
 from beers_deploy.quant.encodings import read_core
-from beers_deploy.quant.ends import FINE_MAX
-from beers_deploy.quant.graph import CORRECTION, QUARTER, STEP
+from beers_deploy.quant.graph import CORRECTION
 from beers_deploy.restoration.steps import keeps_pixels
 
 UNIT = "unit"
@@ -62,39 +60,35 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
             than in `host.py`.
     """
     core = read_core(network.model)
-    ends = core.ends
-    outputs = {"back": (ends.back, ends.outputs), "last": (ends.last, ends.outputs)}
-    shuffles = {"front": (ends.front, ends.channels), **outputs}
-    if ends.direct:
+    part = core.host_part
+    encoding = part.encoding.constants()
+    if encoding is None:
         return None
-    for moves, channels in shuffles.values():
-        # Of one band ONNX's order of the channels is that of torch, which host.py takes.
-        plain = all(move.columns_first or channels == move.block**2 for move in moves)
-        if not plain or len(moves) > 1:
+    blocks = {}
+    for name, moves, channels in (
+        ("front", part.front, part.channels),
+        ("back", part.back, part.outputs),
+        ("last", part.last, part.outputs),
+    ):
+        # Of one band ONNX's order of the channels is that of torch, which host.py has.
+        same_order = all(move.columns_first or channels == move.block**2 for move in moves)
+        if not same_order or len(moves) > 1:
             return None
+        blocks[name] = moves[0].block if moves else 1
     tiling = network.tiling
-    scale = core.scale(CORRECTION)
-    step, part, middle = (STEP_DN, PART, MIDDLE_DN) if ends.banked else (STEP, QUARTER, 0)
     return {
-        **{name: moves[0].block if moves else 1 for name, (moves, _) in shuffles.items()},
+        **blocks,
+        **encoding,
+        **part.decoding.constants(core.scale(CORRECTION)),
+        "copies": part.decoding.copies,
+        "border_px": part.border_px,
+        "adds_image": part.adds_image,
+        UNIT: part.unit,
         "tile_px": tile_px,
         "halo_px": tiling.halo_px,
         "lattice_px": tiling.lattice_px,
         "scale": int(tiling.scale),
         "bands": tiling.channels_out,
-        "border_px": ends.border_px,
-        "step": step,
-        "part": part,
-        "middle": middle,
-        "coarse": 2 if ends.banked else 1,
-        "copies": ends.copies,
-        "offsets": ends.offsets,
-        "fine_max": (FINE_MAX + 0.5) * scale,
-        "analytic": ends.analytic_gain(scale),
-        "fine_copies": ends.fine_copies,
-        "coarse_analytic": ends.coarse_gain(scale),
-        UNIT: ends.unit,
-        "adds_image": ends.adds_image,
     }
 
 
@@ -121,19 +115,12 @@ def consistency_facts(network: Network, sensor: Sensor) -> Facts | None:
     """Return the weights of the consistency step for pixels that are shares of full scale.
 
     Returns:
-        None where no sensor is known, or where the network makes other pixels or bands: `restore`
-            leaves the step
-        out there too.
+        None if no sensor is known, or if the network changes the grid of pixels or bands: `restore`
+            leaves the step out there too.
     """
     tiling = network.tiling
     if sensor.name == BLIND or not keeps_pixels(tiling):
         return None
     step = Consistency.of(sensor.nominal(), sensor.reference.nominal(), full_scale=1.0)
-    arrays = {
-        "rows": step.rows,
-        "columns": step.columns,
-        "far": step.far,
-        "means": step.means,
-        "excess": step.excess,
-    }
-    return {name: values.tolist() for name, values in arrays.items()}
+    names = ("rows", "columns", "far", "means", "excess")
+    return {name: getattr(step, name).tolist() for name in names}

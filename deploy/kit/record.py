@@ -21,9 +21,9 @@ from beers_deploy.network_files import int8_for_sensor
 from beers_deploy.profiles.errors import ModelError, one_line, optional, printable
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.quant.banked.family import FAMILY, WEIGHTS, family_of
 from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.onnx_file import load_onnx, metadata
+from beers_deploy.quant.sensor_bank.conditioned import SENSOR_BIASES, WEIGHTS, conditioned_core
 from beers_deploy.report.page import Report, Section, render
 from beers_deploy.results import Table
 
@@ -40,7 +40,7 @@ LIMITATIONS = (
         "judged."
     ),
 )
-BULKY = {KEY, FAMILY}
+BULKY = {KEY, SENSOR_BIASES}
 """Of what a file says of itself: numbers, not words."""
 
 
@@ -113,7 +113,7 @@ def _has_family(network: Network) -> bool:
     it on none.
     """
     try:
-        return family_of(network.model) is not None
+        return conditioned_core(network.model) is not None
     except ModelError:
         return False
 

@@ -19,9 +19,9 @@ from beers_deploy.model.io.files import write_text
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings.description import BORDER_PX, KEY, PLACE_PX, described_core
-from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Add, Conv, Op, Pointwise
 from beers_deploy.quant.graph.writer import onnx_weight, write_float
+from beers_deploy.quant.host_part import HostPart
 from beers_deploy.quant.onnx.graph import constants
 from beers_deploy.quant.onnx_file import (
     GraphWriter,
@@ -42,8 +42,7 @@ def board_model(
     Where the host moves pixels into channels first, the file says of how many pixels a place of the
     planes is.
 
-    The correction's channels come several times where it has gains or windows:
-    `quant.ends.Ends.merge` makes one.
+    The correction's channels come in the copies that `HostPart.decode` turns into one value.
     """
     writer = BoardWriter()
     writer.quantized("planes.dequantised", PLANES, core.frac_bits[PLANES])
@@ -52,24 +51,24 @@ def board_model(
         output = f"{op.output}.float"
         writer.operation(op, feeds, output)
         writer.quantized(op.output, output, core.frac_bits[op.output])
-    return _core_file(writer, core.ends, about, tile_px)
+    return _core_file(writer, core.host_part, about, tile_px)
 
 
 def _core_file(
-    writer: GraphWriter, ends: Ends, about: dict[str, str], tile_px: int | None
+    writer: GraphWriter, host_part: HostPart, about: dict[str, str], tile_px: int | None
 ) -> onnx.ModelProto:
-    read_px = tile_px and (tile_px + 2 * ends.border_px) // ends.place_px
-    size = image_info(PLANES, ends.planes * ends.channels, read_px)
-    result = image_info(
-        CORRECTION, ends.copies * ends.outputs, tile_px and tile_px // ends.correction_px
-    )
+    read_px = tile_px and (tile_px + 2 * host_part.border_px) // host_part.place_px
+    size = image_info(PLANES, host_part.planes, read_px)
+    written = host_part.decoding.copies * host_part.outputs
+    written_px = tile_px and tile_px // host_part.correction_px
+    result = image_info(CORRECTION, written, written_px)
     # A result that the image is not added to may have another size than the image.
-    if not ends.adds_image:
+    if not host_part.adds_image:
         sides = result.type.tensor_type.shape.dim[2:]
         for side, name in zip(sides, ("rows", "columns"), strict=True):
             side.dim_param = name
-    places = {PLACE_PX: str(ends.place_px)} if ends.place_px > 1 else {}
-    places |= {BORDER_PX: str(ends.border_px)} if ends.border_px else {}
+    places = {PLACE_PX: str(host_part.place_px)} if host_part.place_px > 1 else {}
+    places |= {BORDER_PX: str(host_part.border_px)} if host_part.border_px else {}
     # This file is the core itself, so it needs no description of one.
     entries = {key: words for key, words in about.items() if key != KEY}
     return make_model(writer.graph("convbeers-core", [size], [result]), entries | places)
@@ -153,7 +152,7 @@ def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> on
     for op, _ in parts:
         writer.operation(op, [writer.read(name) for name in op.inputs], writer.source(op.output))
     writer.read(CORRECTION, CORRECTION)
-    model = _core_file(writer, core.ends, about, side_px)
+    model = _core_file(writer, core.host_part, about, side_px)
     # The compiler of an NPU takes stated sizes alone, of inner tensors too.
     return shape_inference.infer_shapes(model, strict_mode=True)
 

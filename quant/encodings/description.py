@@ -15,7 +15,6 @@ import numpy as np
 
 from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.core import IntConv, IntCore
-from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import (
     Activation,
     Add,
@@ -29,6 +28,7 @@ from beers_deploy.quant.graph import (
     Shuffle,
     Window,
 )
+from beers_deploy.quant.host_part import host_part_from_json, host_part_to_json
 from beers_deploy.quant.untrusted import DAMAGE
 
 KEY = "core"
@@ -42,8 +42,8 @@ said.
 """
 LARGEST = 1 << 16
 """Channels, windows, strides and factors of whatever a DPU runs are smaller still."""
-FLAGS = ("adds_image", "banked", "unit", "direct", "wide")
-"""What a description may state of the host's part besides counts, shuffles and offsets."""
+HOST_PART = "ends"
+"""The key of the host's part in the description."""
 KINDS: dict[str, type] = {
     kind.__name__: kind
     for kind in (IntConv, Add, Mul, Concat, MaxPool, AveragePool, Resize, Shuffle, Pointwise)
@@ -54,7 +54,12 @@ def describe(core: IntCore) -> str:
     """The core as JSON, without its arrays."""
     ops = [{"kind": type(op).__name__, **_plain(op)} for op in core.ops]
     return json.dumps(
-        {"ops": ops, "frac_bits": dict(core.frac_bits), "ends": asdict(core.ends)}, sort_keys=True
+        {
+            "ops": ops,
+            "frac_bits": dict(core.frac_bits),
+            HOST_PART: host_part_to_json(core.host_part),
+        },
+        sort_keys=True,
     )
 
 
@@ -84,18 +89,10 @@ def described_core(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
 def _described(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
     description = json.loads(text)
     # Offsets are values, which may be of any size; every other number is bounded.
-    _require_small({**description, "ends": {**description["ends"], "offsets": []}})
+    _require_small({**description, HOST_PART: {**description[HOST_PART], "offsets": []}})
     frac_bits = {str(name): int(bits) for name, bits in description["frac_bits"].items()}
     ops = tuple(_op(dict(op), frac_bits, constants) for op in description["ops"])
-    ends = description["ends"]
-    shuffles = {
-        key: tuple(Shuffle(**shuffle) for shuffle in ends[key]) for key in ("front", "back", "last")
-    }
-    offsets = tuple(tuple(float(offset) for offset in window) for window in ends["offsets"])
-    counts = {key: int(ends[key]) for key in ("channels", "planes", "gains", "outputs")}
-    others = {key: ends[key] for key in FLAGS if key in ends}
-    host = Ends(**{**counts, **shuffles, **others, "offsets": offsets})
-    return IntCore(ops, frac_bits, host)
+    return IntCore(ops, frac_bits, host_part_from_json(description[HOST_PART]))
 
 
 def _require_small(value: object) -> None:

@@ -11,6 +11,7 @@ What is read back is written again, so that any node or constant which differs f
 ask for is a fault.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -22,7 +23,6 @@ from onnx import TensorProto
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
 from beers_deploy.quant.encodings.description import KEY, describe, described_core, phases
-from beers_deploy.quant.ends import ZERO, HostWriter, write_back, write_front
 from beers_deploy.quant.graph import (
     CORRECTION,
     IMAGE,
@@ -41,6 +41,7 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
 from beers_deploy.quant.graph.writer import window_attributes, write_float, write_shuffle
+from beers_deploy.quant.host_part import ZERO, HostWriter
 from beers_deploy.quant.integer.arithmetic import (
     activation_table,
     bilinear_weights,
@@ -61,25 +62,26 @@ def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None)
     network gives.
     """
     writer = HostWriter()
-    write_front(writer, core.ends)
+    core.host_part.write_front(writer)
     for op in core.ops:
         _WRITERS[type(op)](writer, core, op)
     feeds = [CORRECTION, writer.unit(core.frac_bits[CORRECTION]), writer.zero_point()]
-    write_back(writer, core.ends, feeds, core.scale(CORRECTION))
+    core.host_part.write_back(writer, feeds, core.scale(CORRECTION))
     graph = writer.graph(
         "convbeers-int8",
-        [image_info(IMAGE, core.ends.image_channels, tile_px)],
+        [image_info(IMAGE, core.host_part.image_channels, tile_px)],
         [_result(core, tile_px)],
     )
     return make_model(graph, {**about, KEY: describe(core)}, microsoft=True)
 
 
 def _result(core: IntCore, tile_px: int | None) -> onnx.ValueInfoProto:
-    ends = core.ends
-    if ends.adds_image and not ends.last:
-        return image_info("restored", ends.image_channels, tile_px)
-    shuffled = int(np.prod([shuffle.block**2 for shuffle in (*ends.back, *ends.last)], initial=1))
-    sizes: list[str | int | None] = ["N", ends.outputs // shuffled, "rows", "columns"]
+    host_part = core.host_part
+    if host_part.adds_image and not host_part.last:
+        return image_info("restored", host_part.image_channels, tile_px)
+    shuffles = (*host_part.back, *host_part.last)
+    squares = math.prod(shuffle.block**2 for shuffle in shuffles)
+    sizes: list[str | int | None] = ["N", host_part.outputs // squares, "rows", "columns"]
     return onnx.helper.make_tensor_value_info("restored", TensorProto.FLOAT, sizes)
 
 
@@ -219,14 +221,15 @@ def _average_pool(w: HostWriter, core: IntCore, op: AveragePool) -> None:
     assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
     factor, shift = mean_factor(op.kernel)
     weight = np.full((1, 1, *op.kernel), factor)
-    _weighted(w, core, op, (op.input, op.output), weight, shift, op.window)
+    _weighted(w, core, op, op.input, op.output, weight, shift, op.window)
 
 
 def _weighted(
     w: HostWriter,
     core: IntCore,
     op: AveragePool | Resize,
-    ends: tuple[str, str],
+    source: str,
+    output: str,
     weight: np.ndarray,
     shift: int,
     window: Window,
@@ -234,13 +237,19 @@ def _weighted(
     """Weights (K, 1, kh, kw) for each channel: a depthwise convolution whose result has its input's
     scale.
     """
-    channels = channels_of(core.ops, {PLANES: core.ends.planes * core.ends.channels})[op.input]
+    channels = channels_of(core.ops, {PLANES: core.host_part.planes})[op.input]
     unit = w.unit(core.frac_bits[op.input])
     weight = np.tile(weight.astype(np.int8), (channels, 1, 1, 1))
-    feeds = [ends[0], unit, w.zero_point(), w.constant(f"{op.name}.weight", weight), w.unit(shift)]
+    feeds = [
+        source,
+        unit,
+        w.zero_point(),
+        w.constant(f"{op.name}.weight", weight),
+        w.unit(shift),
+    ]
     feeds += [_weight_zero(w, op.name), unit, w.zero_point()]
     attributes = {**window_attributes(window), "kernel_shape": list(weight.shape[2:])}
-    w.node("QLinearConv", ends[1], feeds, name=op.name, group=channels, **attributes)
+    w.node("QLinearConv", output, feeds, name=op.name, group=channels, **attributes)
 
 
 def _resize(w: HostWriter, core: IntCore, op: Resize) -> None:
@@ -253,7 +262,7 @@ def _resize(w: HostWriter, core: IntCore, op: Resize) -> None:
     # Half-pixel centres read one pixel beyond the border, where ONNX's Resize repeats the edge.
     pads = w.constant("edge_pads", np.array([0, 0, 1, 1, 0, 0, 1, 1]))
     w.node("Pad", wide, [op.input, pads], mode="edge")
-    _weighted(w, core, op, (wide, phased), weight[:, None], shift, Window())
+    _weighted(w, core, op, wide, phased, weight[:, None], shift, Window())
     write_shuffle(w, Shuffle(f"{op.name}.shuffle", phased, op.output, op.factor), phased, op.output)
 
 

@@ -11,7 +11,6 @@
 from beers_deploy.quant.graph.operations import (
     COARSE_MAX,
     CORRECTION,
-    COUNT,
     IMAGE,
     PLANES,
     PLANES_FRAC_BITS,
@@ -31,7 +30,6 @@ from beers_deploy.quant.graph.operations import (
     Shuffle,
     read_planes,
     same,
-    split,
     tensors,
     tied,
     ties_scales,
@@ -45,7 +43,6 @@ from beers_deploy.quant.onnx.window import Window
 __all__ = [
     "COARSE_MAX",
     "CORRECTION",
-    "COUNT",
     "IMAGE",
     "PLANES",
     "PLANES_FRAC_BITS",
@@ -75,7 +72,6 @@ __all__ = [
     "read_planes",
     "refusal",
     "same",
-    "split",
     "tensors",
     "tied",
     "ties_scales",

@@ -286,19 +286,8 @@ alone read them.
 STEP = 32
 COARSE_MAX = 127
 QUARTER = 4
-COUNT = 3
 PLANES_FRAC_BITS = 7
 """The planes' scale is 2^-7: coarse 127 stands for about 1, the full scale."""
-
-
-def split(image: np.ndarray, count: int = COUNT) -> np.ndarray:
-    """(N, C, H, W) float32 in [0, 1] to the planes (N, count C, H, W) int8."""
-    dn = np.clip(np.rint(image * np.float32(MAX_DN)), 0, MAX_DN)
-    # The largest digital number, 4095, rounds to 128 steps, one more than int8 holds.
-    coarse = np.minimum(np.rint(dn / STEP), COARSE_MAX)
-    remainder = dn - STEP * coarse
-    planes = [coarse, remainder, np.rint(remainder / QUARTER)]
-    return np.concatenate(planes[:count], axis=1).astype(np.int8)
 
 
 def read_planes(graph: Graph) -> Graph:

@@ -19,7 +19,6 @@ import onnx
 
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
-from beers_deploy.quant.ends import ZERO
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
@@ -33,6 +32,7 @@ from beers_deploy.quant.graph import (
     Resize,
     Shuffle,
 )
+from beers_deploy.quant.host_part import ZERO
 from beers_deploy.quant.integer.arithmetic import (
     activated,
     activation_table,
@@ -129,7 +129,9 @@ def correction(core: IntCore, planes: np.ndarray, half_even: bool = False) -> np
 def merged_correction(core: IntCore, tensors: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the correction (N, C, H, W) of full scale as the host reads it from the tensors."""
     scale = core.scale(CORRECTION)
-    return core.ends.merge((tensors[CORRECTION] * np.float32(scale)).astype(np.float32), scale)
+    return core.host_part.decode(
+        (tensors[CORRECTION] * np.float32(scale)).astype(np.float32), scale
+    )
 
 
 Sums = tuple[np.ndarray, int, float, int]
@@ -276,8 +278,8 @@ def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreem
         with_outputs(any_size(host), dict.fromkeys(names, onnx.TensorProto.UINT8))
     )
     stored = session.run(names, {session.get_inputs()[0].name: image})
-    up, reports = run_core(core, core.ends.split(image))
-    even, _ = run_core(core, core.ends.split(image), half_even=True)
+    up, reports = run_core(core, core.host_part.encode(image))
+    even, _ = run_core(core, core.host_part.encode(image), half_even=True)
     layers = []
     for name, report, runtime in zip(names, reports, stored, strict=True):
         difference = np.abs(up[name] - even[name])
@@ -301,10 +303,10 @@ def integer_rows(
     layers = [_layer_row(list(same), source) for same in by_layer]
     session = open_any_size(model)
     results = [
-        [core.ends.finished(crop, result) for result in (one.up, one.even)]
+        [core.host_part.finish(crop, result) for result in (one.up, one.even)]
         for crop, one in zip(patches, agreements, strict=True)
     ]
-    in_float = [core.ends.clipped(result_of(session, crop)) for crop in patches]
+    in_float = [core.host_part.clip(result_of(session, crop)) for crop in patches]
     return (*layers, _rounding_row(in_float, results, source))
 
 

@@ -21,7 +21,6 @@ import torch
 from torch.nn import functional
 
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
-from beers_deploy.quant.ends import GAIN, Ends
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
@@ -37,6 +36,7 @@ from beers_deploy.quant.graph import (
     Window,
 )
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
+from beers_deploy.quant.host_part import HostPart, OutputDecoding
 from beers_deploy.quant.integer.arithmetic import (
     activation_table,
     bilinear_weights,
@@ -73,12 +73,14 @@ class TrainableCore(torch.nn.Module):
         """Start the parameters at the core's integers."""
         super().__init__()
         self._core = core
-        self._convs = [_one_copy(op, core.ends) for op in core.convolutions]
+        self._convs = [_one_copy(op, core.host_part) for op in core.convolutions]
         self.weights = torch.nn.ParameterList(torch.tensor(op.weight).float() for op in self._convs)
         self.biases = torch.nn.ParameterList(torch.tensor(op.bias).float() for op in self._convs)
-        if core.ends.offsets:
+        if core.host_part.decoding.offsets:
             # The host adds a window's offset in float, so this bias need not be an integer.
-            self.biases[-1].data.copy_(torch.from_numpy(_window_bias(self._convs[-1], core.ends)))
+            self.biases[-1].data.copy_(
+                torch.from_numpy(_window_bias(self._convs[-1], core.host_part.decoding))
+            )
 
     def core(self) -> IntCore:
         """Return the core with its weights and biases as they stand, in integers."""
@@ -89,14 +91,14 @@ class TrainableCore(torch.nn.Module):
             for op, weight, bias in zip(self._convs, weights, biases, strict=True)
         }
         ops = [trained.get(op.name, op) for op in self._core.ops]
-        ends = self._core.ends
+        host_part = self._core.host_part
         last = self._core.ops[-1]
-        if ends.copies > 1 and isinstance(last, IntConv):
+        if host_part.decoding.copies > 1 and isinstance(last, IntConv):
             one = trained[last.name]
             # int8 need not hold a window's bias with its offset, so it is taken in float.
-            bias = self.biases[-1].detach().numpy() if ends.offsets else one.bias
-            ops[-1], ends = _all_copies(last, ends, one.weight, bias)
-        return replace(self._core, ops=tuple(ops), ends=ends)
+            bias = self.biases[-1].detach().numpy() if host_part.decoding.offsets else one.bias
+            ops[-1], host_part = _all_copies(last, host_part, one.weight, bias)
+        return replace(self._core, ops=tuple(ops), host_part=host_part)
 
     def forward(self, planes: Tensor) -> Tensor:
         """Return the one correction (N, C, H, W) for int8 planes (N, P, H, W), both in float32."""
@@ -118,18 +120,18 @@ class TrainableCore(torch.nn.Module):
 
     def _convolved(self, op: IntConv, weight: Tensor, bias: Tensor, image: Tensor) -> Tensor:
         """Return a convolution's result from its parameters and its input."""
-        ends = self._core.ends
+        decoding = self._core.host_part.decoding
         frac_bits = self._core.frac_bits[op.output]
         # Scaled parameters give sums in the result's unit, which saves a pass over the sums. The
         # factors are powers of two, so float32 stays exact.
         unit = 2.0 ** (frac_bits - op.weight_frac_bits - self._core.frac_bits[op.input])
         bias_unit = 2.0 ** (frac_bits - op.bias_frac_bits)
-        if op.output == CORRECTION and ends.copies > 1:
+        if op.output == CORRECTION and decoding.copies > 1:
             return _products(
                 op,
                 image,
                 to_int8(weight) * unit,
-                (bias if ends.offsets else to_int8(bias)) * bias_unit,
+                (bias if decoding.offsets else to_int8(bias)) * bias_unit,
             )
         # The lift that makes ties round up costs nothing in the bias.
         bias = to_int8(bias) * bias_unit + _lift(op.activation) * unit
@@ -272,49 +274,50 @@ _OPERATIONS: Mapping[type, Callable[..., Tensor]] = MappingProxyType(
 )
 
 
-def _one_copy(op: IntConv, ends: Ends) -> IntConv:
+def _one_copy(op: IntConv, host_part: HostPart) -> IntConv:
     """Return the first fine copy of a convolution that writes copies; any other as it is."""
-    if op.output != CORRECTION or ends.copies == 1:
+    if op.output != CORRECTION or host_part.decoding.copies == 1:
         return op
-    first = ends.outputs if ends.offsets else 0
+    first = host_part.outputs * host_part.decoding.gains.index(1)
     return replace(
         op,
-        weight=op.weight[first : first + ends.outputs],
-        bias=op.bias[first : first + ends.outputs],
+        weight=op.weight[first : first + host_part.outputs],
+        bias=op.bias[first : first + host_part.outputs],
     )
 
 
 def _all_copies(
-    last: IntConv, ends: Ends, weight: np.ndarray, bias: np.ndarray
-) -> tuple[IntConv, Ends]:
+    last: IntConv, host_part: HostPart, weight: np.ndarray, bias: np.ndarray
+) -> tuple[IntConv, HostPart]:
     """Move all copies as one was trained, the coarse one by an eighth; a window's bias moves the
     host's offsets.
 
     Args:
         last: the convolution that writes the copies, as it was.
-        ends: of the core, as they were.
+        host_part: of the core, as it was.
         weight: of the copy that was trained, (O, I, kh, kw) in integers.
         bias: of that copy, (O,), in integers; of a window in units of its scale with the
             offset.
     """
-    one = _one_copy(last, ends)
-    # Windows come behind the coarse copy, but of two gains the fine one comes first.
-    coarse = np.arange(ends.copies) == (0 if ends.offsets else 1)
-    shares = np.where(coarse, 1 / GAIN, 1)
+    one = _one_copy(last, host_part)
+    decoding = host_part.decoding
+    shares = 1 / np.array(decoding.gains)
     weights = _moved(last.weight, shares, weight.astype(float) - one.weight)
-    if not ends.offsets:
+    if not decoding.offsets:
         biases = _moved(last.bias, shares, bias.astype(float) - one.bias)
-        return replace(last, weight=weights, bias=biases), ends
+        return replace(last, weight=weights, bias=biases), host_part
     # A window's bias stays: the host adds the change in float, which int8 would round.
-    change = bias - _window_bias(one, ends)
-    offsets = np.array(ends.offsets) + change * 2.0**-one.bias_frac_bits
-    ends = replace(ends, offsets=tuple(tuple(map(float, window)) for window in offsets))
-    return replace(last, weight=weights, bias=_moved(last.bias, coarse / GAIN, change)), ends
+    change = bias - _window_bias(one, decoding)
+    errors = np.tile(change * 2.0**-one.bias_frac_bits, decoding.copies)
+    host_part = replace(host_part, decoding=decoding.with_bias_errors(errors))
+    coarse_shares = np.where(shares < 1, shares, 0)
+    return replace(last, weight=weights, bias=_moved(last.bias, coarse_shares, change)), host_part
 
 
-def _window_bias(one: IntConv, ends: Ends) -> np.ndarray:
+def _window_bias(one: IntConv, decoding: OutputDecoding) -> np.ndarray:
     """Return what the DPU and the host add to a result in windows, (O,) in units of the bias."""
-    return np.asarray(one.bias + np.array(ends.offsets[0]) * 2.0**one.bias_frac_bits, np.float32)
+    offset = np.array(decoding.offsets[0])
+    return np.asarray(one.bias + offset * 2.0**one.bias_frac_bits, np.float32)
 
 
 def _moved(copies: np.ndarray, shares: np.ndarray, move: np.ndarray) -> np.ndarray:

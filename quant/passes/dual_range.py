@@ -13,15 +13,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from beers_deploy.quant.ends import FINE_MAX, GAIN, Ends
 from beers_deploy.quant.graph import CORRECTION, Activation, Conv, Graph
+from beers_deploy.quant.host_part import FINE_MAX, HostPart, OffsetWindows, OutputDecoding
 from beers_deploy.quant.session import values_of
 
 MAX_WINDOWS = 8
 MAX_CHANNELS = 4096
 """That a convolution of the DPU writes."""
-FINER = GAIN.bit_length() - 1
-"""Fractional bits by which a window is finer than the result's own scale."""
 
 
 def can_write_copies(graph: Graph) -> bool:
@@ -30,43 +28,48 @@ def can_write_copies(graph: Graph) -> bool:
     return isinstance(last, Conv) and last.activation is Activation.none and last.groups == 1
 
 
-def with_copies(graph: Graph, ends: Ends) -> Graph:
-    """Return the graph whose last convolution writes the copies that the host reads."""
-    if ends.offsets:
-        # 2. The host merges the coarse copy first, then the windows in their order.
-        copies = [(GAIN, 0.0), *((1, offset) for offset in np.array(ends.offsets))]
-    elif ends.gains == 2 and can_write_copies(graph):
-        # 1. Here the fine copy comes first.
-        copies = [(1, 0.0), (GAIN, 0.0)]
-    else:
+def with_copies(graph: Graph, decoding: OutputDecoding) -> Graph:
+    """Return the graph whose last convolution writes the copies that the host decodes.
+
+    Args:
+        graph: plane-reading; if there are several copies, `can_write_copies` is True for it.
+        decoding: the host's.
+    """
+    if decoding.copies == 1:
         return graph
     *before, last = graph
     assert isinstance(last, Conv)  # noqa: S101 - can_write_copies has seen to it
-    weight = np.concatenate([last.weight / gain for gain, _ in copies])
-    bias = np.concatenate([last.bias / gain - offset for gain, offset in copies])
+    weight = np.concatenate([last.weight / gain for gain in decoding.gains])
+    bias = np.concatenate([last.bias / gain for gain in decoding.gains]).astype(np.float64)
+    # 2. The host adds the offsets of the windows, which come last, so they are written without.
+    offsets = np.ravel(decoding.offsets)
+    bias[len(bias) - len(offsets) :] -= offsets
     return (*before, replace(last, weight=weight.astype(np.float32), bias=bias.astype(np.float32)))
 
 
-def with_windows(graph: Graph, ends: Ends, frac_bits: int, images: Iterable[np.ndarray]) -> Ends:
+def with_windows(
+    graph: Graph, host_part: HostPart, frac_bits: int, images: Iterable[np.ndarray]
+) -> HostPart:
     """Return the host part with windows over all that the result is in float, if it takes any.
 
     Args:
         graph: plane-reading, in float.
-        ends: its host part.
+        host_part: of the network.
         frac_bits: of the result's own scale, than which windows are finer by GAIN.
         images: (1, C, H, W) that the result's range is measured on.
     """
-    plain = ends.gains == 1 and not ends.adds_image
+    plain = host_part.decoding.copies == 1 and not host_part.adds_image
     # 3. One convolution of the DPU has to write the coarse copy and a window at the least.
-    if not (plain and can_write_copies(graph) and ends.outputs <= MAX_CHANNELS // 2):
-        return ends
+    if not (plain and can_write_copies(graph) and host_part.outputs <= MAX_CHANNELS // 2):
+        return host_part
     low = np.array(np.inf)
     high = np.array(-np.inf)
-    for (result,) in values_of(graph, [CORRECTION], images, ends):
+    for (result,) in values_of(graph, [CORRECTION], images, host_part):
         low = np.minimum(low, result[0].min((1, 2)))
         high = np.maximum(high, result[0].max((1, 2)))
-    offsets = window_offsets(low, high, 2.0 ** -(frac_bits + FINER))
-    return replace(ends, offsets=tuple(tuple(map(float, window)) for window in offsets))
+    offsets = window_offsets(low, high, 2.0 ** -(frac_bits + OffsetWindows.finer_bits))
+    windows = tuple(tuple(map(float, window)) for window in offsets)
+    return replace(host_part, decoding=OffsetWindows(windows))
 
 
 def window_offsets(low: np.ndarray, high: np.ndarray, unit: float) -> np.ndarray:

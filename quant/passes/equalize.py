@@ -18,8 +18,8 @@ import numpy as np
 
 from beers_deploy.model.progress import steps
 from beers_deploy.quant.core import INT8_MAX
-from beers_deploy.quant.ends import ONE_CHANNEL, Ends
 from beers_deploy.quant.graph import Activation, Conv, Graph
+from beers_deploy.quant.host_part import ONE_CHANNEL, HostPart
 from beers_deploy.quant.passes.residual_groups import GROUP_FRAC_BITS, ResidualGroup
 from beers_deploy.quant.passes.trial import Costs, Trial
 from beers_deploy.quant.session import values_of
@@ -91,13 +91,16 @@ def _scaled(op: Conv, factors: np.ndarray, group: ResidualGroup) -> Conv:
 
 
 def channel_ranges(
-    graph: Graph, group: ResidualGroup, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL
+    graph: Graph,
+    group: ResidualGroup,
+    images: Iterable[np.ndarray],
+    host_part: HostPart = ONE_CHANNEL,
 ) -> np.ndarray:
     """Return the range of each channel, (C,), over images (1, C', H, W): the widest of all the
     group's tensors.
     """
     names = sorted(group)
-    tiles = channel_sizes(graph, names, images, ends)
+    tiles = channel_sizes(graph, names, images, host_part)
     means = {
         name: np.mean(sizes, axis=0)
         for name, sizes in zip(names, zip(*tiles, strict=True), strict=True)
@@ -113,11 +116,11 @@ def channel_sizes(
     graph: Graph,
     names: list[str],
     images: Iterable[np.ndarray],
-    ends: Ends = ONE_CHANNEL,
+    host_part: HostPart = ONE_CHANNEL,
     quantile: float = QUANTILE,
 ) -> Iterator[list[np.ndarray]]:
     """Yield a quantile of each channel's sizes, (C,) a tensor, for every tile of the images."""
-    for results in values_of(graph, names, images, ends):
+    for results in values_of(graph, names, images, host_part):
         sizes = [np.abs(r[0]).reshape(r.shape[1], -1) for r in results]
         yield [np.quantile(size, quantile, axis=1).astype(np.float64) for size in sizes]
 

@@ -25,8 +25,8 @@ from itertools import product
 import numpy as np
 
 from beers_deploy.model.progress import steps
-from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import Conv, Graph
+from beers_deploy.quant.host_part import HostPart
 from beers_deploy.quant.passes.equalize import (
     MOST_CHANNELS,
     QUANTILE,
@@ -102,29 +102,29 @@ class SingleTensors:
 
 
 def single_ranges(
-    graph: Graph, singles: SingleTensors, images: Iterable[np.ndarray], ends: Ends
+    graph: Graph, singles: SingleTensors, images: Iterable[np.ndarray], host_part: HostPart
 ) -> np.ndarray:
     """Return the range of every channel over images (1, C, H, W), which most tiles keep."""
-    return _over_tiles(graph, singles, images, ends, QUANTILE, TILES)
+    return _over_tiles(graph, singles, images, host_part, QUANTILE, TILES)
 
 
 def largest_values(
-    graph: Graph, singles: SingleTensors, images: Iterable[np.ndarray], ends: Ends
+    graph: Graph, singles: SingleTensors, images: Iterable[np.ndarray], host_part: HostPart
 ) -> np.ndarray:
     """Return the largest size of every channel over images (1, C, H, W)."""
-    return _over_tiles(graph, singles, images, ends, 1.0, 1.0)
+    return _over_tiles(graph, singles, images, host_part, 1.0, 1.0)
 
 
 def _over_tiles(
     graph: Graph,
     singles: SingleTensors,
     images: Iterable[np.ndarray],
-    ends: Ends,
+    host_part: HostPart,
     quantile: float,
     tiles: float,
 ) -> np.ndarray:
     """Return a quantile over the tiles of a quantile of each channel's sizes in a tile."""
-    sizes = channel_sizes(graph, list(singles.tensors), images, ends, quantile)
+    sizes = channel_sizes(graph, list(singles.tensors), images, host_part, quantile)
     by_tensor = zip(*sizes, strict=True)
     return np.concatenate([above_dead(np.quantile(each, tiles, axis=0)) for each in by_tensor])
 

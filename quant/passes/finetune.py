@@ -23,8 +23,8 @@ from beers_deploy.model.progress import step
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import host_model
-from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import CORRECTION, Graph, graph_to_onnx
+from beers_deploy.quant.host_part import HostPart
 from beers_deploy.quant.integer.trainable import Tensor, TrainableCore
 from beers_deploy.quant.samples.patches import Pair
 from beers_deploy.quant.session import open_session, result_of, tensor_values
@@ -99,7 +99,7 @@ def finetune(core: IntCore, full: Graph, tuning: Tuning) -> tuple[IntCore, int]:
         tuning: on what, how long, how fast.
     """
     # 1.
-    samples = list(_samples(core.ends, full, tuning.pairs))
+    samples = list(_samples(core.host_part, full, tuning.pairs))
     # Too few samples to hold one out are trained on and judged by.
     held_out = (samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or samples)[:MOST_HELD_OUT]
     training = [sample for k, sample in enumerate(samples) if (k + 1) % HELD_OUT_EVERY] or samples
@@ -159,19 +159,19 @@ def descend(
 def loss_of(core: IntCore, samples: Sequence[Sample]) -> float:
     """Return the mean error of a core, as the host computes it, beyond the float network's own."""
     # Samples are corrections, so the host must stop once it has merged gains or windows.
-    ends = replace(core.ends, back=(), adds_image=False, last=())
-    session = open_session(host_model(replace(core, ends=ends), {}))
+    host_part = replace(core.host_part, back=(), adds_image=False, last=())
+    session = open_session(host_model(replace(core, host_part=host_part), {}))
     errors = [float(s.error(torch.from_numpy(result_of(session, s.image)))) for s in samples]
     # The float network errs from a reference as well, and no integers can be blamed for that.
     in_float = [float(sample.error(sample.floats)) for sample in samples]
     return float(np.mean(errors)) - float(np.mean(in_float))
 
 
-def _samples(ends: Ends, full: Graph, pairs: Sequence[Pair]) -> Iterator[Sample]:
-    session = open_session(graph_to_onnx(full, [CORRECTION], ends.planes * ends.channels))
+def _samples(host_part: HostPart, full: Graph, pairs: Sequence[Pair]) -> Iterator[Sample]:
+    session = open_session(graph_to_onnx(full, [CORRECTION], host_part.planes))
     for image, reference in pairs:
-        ((floats,),) = tensor_values(session, [CORRECTION], image, None, ends)
-        planes = torch.from_numpy(ends.split(image).astype(np.float32)).to(
+        ((floats,),) = tensor_values(session, [CORRECTION], image, None, host_part)
+        planes = torch.from_numpy(host_part.encode(image).astype(np.float32)).to(
             memory_format=torch.channels_last
         )
         result = torch.from_numpy(floats)
@@ -179,13 +179,13 @@ def _samples(ends: Ends, full: Graph, pairs: Sequence[Pair]) -> Iterator[Sample]
             yield Sample(image, planes, result, None, 1.0)
             continue
         size = times(reference.shape)
-        expected = times(ends.finished(image, floats).shape)
+        expected = times(host_part.finish(image, floats).shape)
         if size != expected:
             raise ImageError(
                 f"A reference has the size {size}, but the network's result has {expected}. Give "
                 "references of the size of the results."
             )
-        target = torch.from_numpy(ends.correction_of(image, reference))
+        target = torch.from_numpy(host_part.correction_of(image, reference))
         # Over the float network's own error, dark and busy patches count alike.
         weight = 1 / max(float(_inner_error(result, target)), LEAST_ERROR)
         yield Sample(image, planes, result, target, weight)

@@ -12,20 +12,23 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from beers_deploy.quant.core import CANDIDATES, squared_errors, unclipped_frac_bits
-from beers_deploy.quant.ends import ONE_CHANNEL, Ends
 from beers_deploy.quant.graph import PLANES, PLANES_FRAC_BITS, Graph, tensors, tied
+from beers_deploy.quant.host_part import ONE_CHANNEL, HostPart
 from beers_deploy.quant.session import values_of
 
 
 def choose_frac_bits(
-    graph: Graph, images: Iterable[np.ndarray], ends: Ends = ONE_CHANNEL, least_squares: bool = True
+    graph: Graph,
+    images: Iterable[np.ndarray],
+    host_part: HostPart = ONE_CHANNEL,
+    least_squares: bool = True,
 ) -> dict[str, int]:
     """Return the fractional bits of every tensor of a plane-reading graph.
 
     Args:
         graph: in float.
         images: (1, C, H, W) in [0, 1], which are passed over twice.
-        ends: the graph's host part.
+        host_part: the graph's host part.
         least_squares: whether finer scales are tried; without, nothing is clipped.
     """
     names = tensors(graph)
@@ -40,13 +43,13 @@ def choose_frac_bits(
 
     # 1.
     largest = np.zeros(len(names))
-    for results in values_of(graph, names, images, ends):
+    for results in values_of(graph, names, images, host_part):
         largest = np.maximum(largest, [float(np.abs(r).max()) for r in results])
     best = np.array([unclipped_frac_bits(m) for m in together(largest, np.max)])
     if least_squares:
         # 2.
         errors = np.zeros((len(names), CANDIDATES))
-        for results in values_of(graph, names, images, ends):
+        for results in values_of(graph, names, images, host_part):
             errors += [_errors(r[0], int(f)) for r, f in zip(results, best, strict=True)]
         # 3.
         best = best + np.argmin(together(errors, np.sum), axis=1)

@@ -12,8 +12,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import onnx
 
-from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import CORRECTION, Graph, graph_to_onnx
+from beers_deploy.quant.host_part import HostPart
 from beers_deploy.quant.session import (
     TILE_PX,
     crops,
@@ -40,17 +40,17 @@ Targets = list[tuple[np.ndarray, np.ndarray]]
 """Degraded crops (1, C, h, w) and their float results, clipped to [0, 1]."""
 
 
-def search_targets(graph: Graph, ends: Ends, images: Sequence[np.ndarray]) -> Targets:
+def search_targets(graph: Graph, host_part: HostPart, images: Sequence[np.ndarray]) -> Targets:
     """Return the crops with the largest corrections, and others of all sizes.
 
     Only the sizes of corrections are stored; the images of the chosen are simulated once more.
     """
-    session = open_session(graph_to_onnx(graph, [CORRECTION], ends.planes * ends.channels))
+    session = open_session(graph_to_onnx(graph, [CORRECTION], host_part.planes))
     halo_px = 0 if halo_of(graph) is not None else None
 
     def restored(crop: np.ndarray) -> np.ndarray:
-        (correction,) = next(tensor_values(session, [CORRECTION], crop, halo_px, ends))
-        return ends.finished(crop, correction)
+        (correction,) = next(tensor_values(session, [CORRECTION], crop, halo_px, host_part))
+        return host_part.finish(crop, correction)
 
     def size(crop: np.ndarray) -> float:
         result = restored(crop)

@@ -20,9 +20,9 @@ from beers_deploy.cli.generate import in_options
 from beers_deploy.kit.record import bill_of, record_of, write_record
 from beers_deploy.network import Network
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.quant.banked.family import FAMILY, WEIGHTS
 from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
 from beers_deploy.quant.samples.own import CALIBRATED_ON
+from beers_deploy.quant.sensor_bank.conditioned import SENSOR_BIASES, WEIGHTS
 from beers_deploy.results import Table
 from beers_deploy.verbs.gate import gate
 from tests.deploy.command_line import done, refused
@@ -175,7 +175,7 @@ def test_claims_of_the_file_are_shown_as_claims(pair: tuple[Path, Path], tmp_pat
         "sha256": "0" * 64,
         "name": "convbeers-gold",
         CALIBRATED_ON: "deadbeef cafe",
-        FAMILY: "garbage",
+        SENSOR_BIASES: "garbage",
         "sensor": "s" * 100_000,
     }
     model = load_onnx(pair[1])

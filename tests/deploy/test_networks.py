@@ -26,9 +26,9 @@ from beers_deploy.network_files import int8_for_sensor, weights_file
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import Sensor, numbers_of
 from beers_deploy.profiles.shipped import BLIND, BLIND_PROFILE
-from beers_deploy.quant.banked import calibrate
-from beers_deploy.quant.banked.family import WEIGHTS
 from beers_deploy.quant.onnx_file import load_onnx, metadata
+from beers_deploy.quant.sensor_bank import calibrate
+from beers_deploy.quant.sensor_bank.conditioned import WEIGHTS
 from tests.deploy.command_line import done, refused
 from tests.profiles.own_sensor import own_sensor
 from tests.shipped import shipped_pair

@@ -10,7 +10,8 @@ from numpy.testing import assert_array_equal
 
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
 from beers_deploy.quant.encodings import board_model, host_model
-from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, Activation, same, split
+from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, Activation, same
+from beers_deploy.quant.host_part import IMAGE_SLICES
 from beers_deploy.quant.integer.reference import agreement, correction, merged_correction, run_core
 from beers_deploy.quant.session import open_session, run
 from tests.processors.conftest import Encodings
@@ -41,7 +42,7 @@ def test_both_encodings_are_the_integer_reference(
     shape: tuple[int, int], draw: Draw, optimise: bool, shipped: Encodings
 ) -> None:
     pixels = image(draw, shape)
-    planes = shipped.core.ends.split(pixels)
+    planes = shipped.core.host_part.encode(pixels)
     tensors, _ = run_core(shipped.core, planes, half_even=True)
     restored = np.clip(pixels + merged_correction(shipped.core, tensors), 0, 1)
     assert_array_equal(run(open_session(shipped.host, optimise=optimise), pixels), restored)
@@ -92,10 +93,12 @@ def harsh_core(seed: int, channels: int) -> IntCore:
 def test_the_largest_products_are_added_exactly(seed: int, channels: int) -> None:
     core = harsh_core(seed, channels)
     pixels = image(edges, (13, 21), seed)
-    expected = correction(core, split(pixels), half_even=True)
+    expected = correction(core, IMAGE_SLICES.encode(pixels), half_even=True)
     assert len(np.unique(expected)) > 40
     restored = np.clip(pixels + expected, 0, 1)
-    feed = {PLANES: split(pixels).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
+    feed = {
+        PLANES: IMAGE_SLICES.encode(pixels).astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)
+    }
     for optimise in (True, False):
         assert_array_equal(
             run(open_session(host_model(core, {}), optimise=optimise), pixels), restored
@@ -120,7 +123,9 @@ def test_saturated_sums_would_show() -> None:
         core = harsh_core(seed, 16)
         last = core.ops[-1]
         assert isinstance(last, IntConv)
-        tensors, _ = run_core(core, split(image(edges, (13, 21), seed)), half_even=True)
+        tensors, _ = run_core(
+            core, IMAGE_SLICES.encode(image(edges, (13, 21), seed)), half_even=True
+        )
         # One tap over all channels is what one dot product of a kernel adds.
         weights = last.weight[0, :, 1, 1].astype(np.int64)
         # The host's file stores activations as UINT8, 128 above their value.

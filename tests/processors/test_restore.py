@@ -29,7 +29,7 @@ def by_reference(dn: np.ndarray, name: str) -> np.ndarray:
     """Restore digital numbers (H, W) by integers alone."""
     core = read_core(load_onnx(shipped_pair(name)[1]))
     image = (dn.astype(np.float32) / MAX_DN)[None, None]
-    tensors, _ = run_core(core, core.ends.split(image), half_even=True)
+    tensors, _ = run_core(core, core.host_part.encode(image), half_even=True)
     restored = np.clip(image + merged_correction(core, tensors), 0, 1)[0, 0] * MAX_DN
     return np.asarray(np.rint(restored), np.uint16)
 

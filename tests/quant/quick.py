@@ -14,7 +14,6 @@ from onnxruntime.quantization import CalibrationDataReader
 
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.quant.ends import ONE_CHANNEL, Ends
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
@@ -25,6 +24,7 @@ from beers_deploy.quant.graph import (
     graph_to_onnx,
     same,
 )
+from beers_deploy.quant.host_part import ONE_CHANNEL, HostPart
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.samples.patches import Patches
@@ -69,11 +69,11 @@ def with_relu6(size: float) -> Graph:
 
 
 def in_float(
-    graph: Graph, image: np.ndarray, ends: Ends = ONE_CHANNEL, name: str = CORRECTION
+    graph: Graph, image: np.ndarray, host_part: HostPart = ONE_CHANNEL, name: str = CORRECTION
 ) -> np.ndarray:
     """What a plane-reading float graph makes of an image, or another of its tensors."""
-    session = open_session(graph_to_onnx(graph, [name], ends.planes * ends.channels))
-    return np.asarray(session.run(None, {PLANES: planes_of(image, ends)})[0])
+    session = open_session(graph_to_onnx(graph, [name], host_part.planes))
+    return np.asarray(session.run(None, {PLANES: planes_of(image, host_part)})[0])
 
 
 def behind_conv(write: Callable[[GraphWriter], object]) -> onnx.ModelProto:

@@ -9,7 +9,7 @@ import pytest
 
 from beers_deploy.model.shipped import SHIPPED
 from beers_deploy.quant.encodings import read_core
-from beers_deploy.quant.graph import split
+from beers_deploy.quant.host_part import IMAGE_SLICES
 from beers_deploy.quant.integer.reference import agreement, merged_correction, run_core
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.quantize import Quantized
@@ -28,7 +28,7 @@ def test_every_layer_of_a_new_file_is_equal(quantized: Quantized) -> None:
 def test_every_layer_of_a_shipped_file_is_equal(path: Path) -> None:
     model = load_onnx(path)
     core = read_core(model)
-    height, width = (size - size % core.ends.place_px for size in IMAGE.shape[2:])
+    height, width = (size - size % core.host_part.place_px for size in IMAGE.shape[2:])
     layers = agreement(core, model, IMAGE[:1, :, :height, :width])
     assert {layer.unequal for layer in layers.layers} == {0.0}
     assert (layers.up != layers.even).any()
@@ -45,7 +45,10 @@ def test_a_layer_that_computes_something_else_is_found(quantized: Quantized) -> 
 
 def test_what_the_rule_moves_is_counted(quantized: Quantized) -> None:
     layers = agreement(quantized.core, quantized.host, IMAGE)
-    up, even = (run_core(quantized.core, split(IMAGE), half_even=rule)[0] for rule in (False, True))
+    up, even = (
+        run_core(quantized.core, IMAGE_SLICES.encode(IMAGE), half_even=rule)[0]
+        for rule in (False, True)
+    )
     for layer, op in zip(layers.layers, quantized.core.ops, strict=True):
         difference = up[op.output] - even[op.output]
         assert layer.moved == pytest.approx(np.count_nonzero(difference) / difference.size)

@@ -70,7 +70,7 @@ def quantized(name: str) -> Quantized:
 def test_int8_stays_near_float(name: str) -> None:
     int8 = quantized(name)
     image = images(name)[1]
-    expected = int8.core.ends.clipped(result_of(open_session(float_network(name)), image))
+    expected = int8.core.host_part.clip(result_of(open_session(float_network(name)), image))
     actual = result_of(open_session(int8.host), image)
     assert actual.shape == expected.shape
     assert np.abs(actual - expected).mean() < 0.15 * max(float(expected.std()), 0.05)
@@ -83,19 +83,19 @@ def test_the_integer_reference_is_the_runtime_bit_for_bit(name: str) -> None:
     layers = agreement(int8.core, int8.host, image)
     assert [layer.report.name for layer in layers.layers if layer.unequal] == []
     result = result_of(open_session(int8.host), image)
-    np.testing.assert_array_equal(int8.core.ends.finished(image, layers.even), result)
+    np.testing.assert_array_equal(int8.core.host_part.finish(image, layers.even), result)
 
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_what_is_trained_computes_the_reference_s_whole_numbers(name: str) -> None:
     int8 = quantized(name)
-    hold_to_reference(moved(int8.core), int8.core.ends.split(images(name, 4)[3]))
+    hold_to_reference(moved(int8.core), int8.core.host_part.encode(images(name, 4)[3]))
 
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_no_image_leaves_the_proven_bounds(name: str) -> None:
     core = quantized(name).core
-    tensors, reports = run_core(core, core.ends.split(np.round(images(name)[0])))
+    tensors, reports = run_core(core, core.host_part.encode(np.round(images(name)[0])))
     for op, bound, report in zip(core.ops, layer_bounds(core), reports, strict=True):
         assert max(bound.low, INT8_MIN) <= tensors[op.output].min(), op.name
         assert tensors[op.output].max() <= min(bound.high, INT8_MAX), op.name
@@ -114,7 +114,7 @@ def test_a_file_is_read_back_as_the_core_it_was_written_from(name: str) -> None:
             other.groups,
             other.activation,
         )
-    planes = int8.core.ends.split(images(name)[0])
+    planes = int8.core.host_part.encode(images(name)[0])
     np.testing.assert_array_equal(
         run_core(core, planes)[0]["correction"], run_core(int8.core, planes)[0]["correction"]
     )

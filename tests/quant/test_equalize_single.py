@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.quant.core import build_core
-from beers_deploy.quant.ends import Ends, ends_of
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import (
     CORRECTION,
@@ -22,8 +21,8 @@ from beers_deploy.quant.graph import (
     channels_of,
     read_network,
     read_planes,
-    split,
 )
+from beers_deploy.quant.host_part import IMAGE_SLICES, HostPart, Plain
 from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.passes import equalize_single as single
 from beers_deploy.quant.passes.equalize import FULL, MOST_CHANNELS
@@ -36,17 +35,17 @@ from examples.networks import build, to_onnx
 from tests.quant.quick import in_float, patches_of, quickly, with_relu6
 
 
-def read(name: str) -> tuple[onnx.ModelProto, Graph, Ends, SingleTensors]:
+def read(name: str) -> tuple[onnx.ModelProto, Graph, HostPart, SingleTensors]:
     model = simplify(to_onnx(name, build(name, torch.Generator().manual_seed(0))), name)
     network = read_network(model)
     graph = read_planes(network.graph)
-    ends = ends_of(network)
-    widths = channels_of(graph, {PLANES: ends.planes * ends.channels})
+    host_part = HostPart.of(network, Plain())
+    widths = channels_of(graph, {PLANES: host_part.planes})
     alone = single_tensors(graph)
     return (
         model,
         graph,
-        ends,
+        host_part,
         SingleTensors(tuple(alone), tuple(widths[tensor] for tensor in alone)),
     )
 
@@ -57,17 +56,17 @@ def images(count: int = 3, side_px: int = 40) -> list[np.ndarray]:
     return [wave.astype(np.float32)[None, None] for wave in waves]
 
 
-def correction(graph: Graph, ends: Ends) -> np.ndarray:
-    return in_float(graph, images()[1], ends)
+def correction(graph: Graph, host_part: HostPart) -> np.ndarray:
+    return in_float(graph, images()[1], host_part)
 
 
 @pytest.mark.parametrize("name", ["dncnn", "espcn", "unet", "segment", "mobile"])
 def test_equalizing_leaves_the_float_network_as_it_was(name: str) -> None:
-    _, graph, ends, singles = read(name)
+    _, graph, host_part, singles = read(name)
     factors = np.random.default_rng(1).uniform(0.2, 5, sum(singles.widths))
-    expected = correction(graph, ends)
+    expected = correction(graph, host_part)
     np.testing.assert_allclose(
-        correction(singles.scaled(graph, factors), ends),
+        correction(singles.scaled(graph, factors), host_part),
         expected,
         atol=2e-5 * np.abs(expected).max(),
     )
@@ -92,20 +91,20 @@ def test_what_others_read_or_factors_do_not_pass_is_left_alone() -> None:
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 1.0, 3.0]))
 def test_relu6_is_the_end_of_int8_whatever_the_factors(seed: int, size: float) -> None:
     graph = with_relu6(size)
-    ends = Ends()
+    host_part = HostPart()
     singles = SingleTensors(tuple(single_tensors(graph)), (5, 5, 4))
     assert singles.tensors == ("a", "b", "c")
     scaled = singles.scaled(graph, np.random.default_rng(seed).lognormal(-2, 1, 14))
-    expected = correction(graph, ends)
+    expected = correction(graph, host_part)
     np.testing.assert_allclose(
-        correction(scaled, ends), expected, atol=2e-5 * np.abs(expected).max()
+        correction(scaled, host_part), expected, atol=2e-5 * np.abs(expected).max()
     )
     core = build_core(
         scaled, {PLANES: PLANES_FRAC_BITS, CORRECTION: 4} | dict.fromkeys("abc", GROUP_FRAC_BITS)
     )
     kinds = [op.activation for op in core.convolutions]
     assert kinds == [Activation.relu] * 3 + [Activation.none]
-    tensors, _ = run_core(core, split(images()[0]))
+    tensors, _ = run_core(core, IMAGE_SLICES.encode(images()[0]))
     for op in scaled[:-1]:
         assert isinstance(op, Conv)
         assert (
@@ -134,8 +133,8 @@ class Bowl:
 @pytest.mark.parametrize("most", [MOST_CHANNELS, 10])
 def test_the_search_never_ends_above_its_start(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(single, "MOST_CHANNELS", most)
-    _, graph, ends, singles = read("espcn")
-    ranges = single_ranges(graph, singles, images(), ends)
+    _, graph, host_part, singles = read("espcn")
+    ranges = single_ranges(graph, singles, images(), host_part)
     trial = Bowl(graph)
     for start in (
         np.ones(sum(singles.widths)),
@@ -165,8 +164,8 @@ def test_what_calibration_sees_is_not_clipped_where_the_image_itself_passes(
     )
     model, _, _, singles = read("espcn")
     int8 = quickly(model, patches_of(images()))
-    assert int8.core.ends.offsets
-    largest = single.largest_values(int8.graph, singles, images(), int8.core.ends)
+    assert int8.core.host_part.decoding.offsets
+    largest = single.largest_values(int8.graph, singles, images(), int8.core.host_part)
     assert largest.max() <= FULL * (1 + 1e-5)
 
 

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from beers_deploy.model.progress import Step, progress, reporting
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.quant.core import IntConv, IntCore, build_core, shift_faults
-from beers_deploy.quant.ends import Ends
 from beers_deploy.quant.graph import (
     CORRECTION,
     PLANES,
@@ -33,6 +32,7 @@ from beers_deploy.quant.graph import (
     correction_graph,
     read_planes,
 )
+from beers_deploy.quant.host_part import HostPart
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.integer.trainable import TrainableCore
 from beers_deploy.quant.passes.finetune import BORDER_PX, Sample, Tuning, finetune
@@ -56,8 +56,8 @@ def error(core: IntCore, patches: Patches) -> float:
     """Mean squared difference of the correction from the one that restores wholly."""
     errors = []
     for degraded, reference in patches.pairs:
-        tensors, _ = run_core(core, core.ends.split(degraded))
-        expected = core.ends.correction_of(degraded, reference)
+        tensors, _ = run_core(core, core.host_part.encode(degraded))
+        expected = core.host_part.correction_of(degraded, reference)
         errors.append(float(np.square(merged_correction(core, tensors) - expected).mean()))
     return float(np.mean(errors))
 
@@ -76,7 +76,7 @@ def difference(core: IntCore, other: IntCore, patches: Patches) -> float:
     """Mean squared difference between two cores' corrections."""
     results = [
         [
-            merged_correction(variant, run_core(variant, variant.ends.split(image))[0])
+            merged_correction(variant, run_core(variant, variant.host_part.encode(image))[0])
             for image in patches.degraded
         ]
         for variant in (core, other)
@@ -227,7 +227,9 @@ def test_slopes_pass_roundings_and_stop_where_int8_ends(
     quantized: Quantized, patches: Patches
 ) -> None:
     trainable = TrainableCore(quantized.core)
-    planes = torch.from_numpy(quantized.core.ends.split(patches.degraded[0]).astype(np.float32))
+    planes = torch.from_numpy(
+        quantized.core.host_part.encode(patches.degraded[0]).astype(np.float32)
+    )
     trainable(planes).square().mean().backward()
     assert all(bool(weight.grad.abs().max() > 0) for weight in trainable.weights)
     with torch.no_grad():
@@ -250,9 +252,9 @@ def test_the_correction_of_a_result_makes_it(
     back = tuple(
         Shuffle(f"s{k}", "a", "b", block, True, order) for k, (block, order) in enumerate(backs)
     )
-    ends = Ends(back=back, adds_image=adds)
+    host_part = HostPart(back=back, adds_image=adds)
     image, result = (generator.random((1, 1, 36, 72)).astype(np.float32) for _ in range(2))
-    result_again = ends.finished(image, ends.correction_of(image, result))
+    result_again = host_part.finish(image, host_part.correction_of(image, result))
     np.testing.assert_allclose(result_again, result, atol=2e-7)
 
 

@@ -17,8 +17,8 @@ from beers_deploy.quant.graph import (
     Resize,
     correction_graph,
     read_network,
-    split,
 )
+from beers_deploy.quant.host_part import IMAGE_SLICES
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from beers_deploy.quant.session import open_session, result_of
 from tests.quant.quick import behind_conv, copied
@@ -26,10 +26,13 @@ from tests.quant.quick import behind_conv, copied
 
 def test_no_digital_number_is_lost_in_planes_nor_wrapped() -> None:
     dn = np.arange(MAX_DN + 1, dtype=np.float32).reshape(1, 1, 64, 64)
-    planes = split(dn / np.float32(MAX_DN)).astype(np.int32)
+    planes = IMAGE_SLICES.encode(dn / np.float32(MAX_DN)).astype(np.int32)
     np.testing.assert_array_equal(STEP * planes[:, :1] + planes[:, 1:2], dn.astype(np.int32))
     assert np.abs(QUARTER * planes[:, 2:] - planes[:, 1:2]).max() <= QUARTER / 2
-    low, high = (split(np.full((1, 1, 1, 1), v, np.float32)).ravel().tolist() for v in (-3.0, 7.0))
+    low, high = (
+        IMAGE_SLICES.encode(np.full((1, 1, 1, 1), v, np.float32)).ravel().tolist()
+        for v in (-3.0, 7.0)
+    )
     assert low == [0, 0, 0]
     assert STEP * high[0] + high[1] == MAX_DN
 

@@ -9,7 +9,8 @@ import pytest
 
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings import board_model
-from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, Activation, Add, split
+from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, Activation, Add
+from beers_deploy.quant.host_part import IMAGE_SLICES
 from beers_deploy.quant.integer.reference import correction, run_core
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.session import open_session
@@ -26,7 +27,7 @@ def test_it_equals_the_runtime_bit_for_bit_under_the_runtime_s_rounding(
     shape: tuple[int, int], quantized: Quantized
 ) -> None:
     for seed in range(3):
-        planes = split(image(*shape, seed))
+        planes = IMAGE_SLICES.encode(image(*shape, seed))
         np.testing.assert_array_equal(
             correction(quantized.core, planes, half_even=True), by_runtime(quantized, planes)
         )
@@ -34,7 +35,7 @@ def test_it_equals_the_runtime_bit_for_bit_under_the_runtime_s_rounding(
 
 def test_under_the_dpu_s_rounding_it_differs_by_halves_alone(quantized: Quantized) -> None:
     """The first layer's differences are its ties, one unit up; later layers carry them on."""
-    planes = split(image())
+    planes = IMAGE_SLICES.encode(image())
     up, reports = run_core(quantized.core, planes)
     even, _ = run_core(quantized.core, planes, half_even=True)
     first = quantized.core.ops[0].output

@@ -215,7 +215,7 @@ def test_shipped_networks_are_those_of_the_integer_reference(path: Path, optimis
     core = read_core(model)
     images = generator.random((1, 1, 37, 53)), generator.integers(0, 2, (1, 1, 24, 41))
     for image in (pixels.astype(np.float32) for pixels in images):
-        tensors, _ = run_core(core, core.ends.split(image), half_even=True)
+        tensors, _ = run_core(core, core.host_part.encode(image), half_even=True)
         expected = np.clip(image + merged_correction(core, tensors), 0, 1)
         assert np.array_equal(run(open_session(model, 1, optimise, exact=True), image), expected)
 

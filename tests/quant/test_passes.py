@@ -9,7 +9,6 @@ import pytest
 
 from beers_deploy.model.progress import Step, progress, reporting
 from beers_deploy.quant.core import SHIFTS, IntConv, op_shifts
-from beers_deploy.quant.ends import FINE_MAX, GAIN, Ends
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import (
     CORRECTION,
@@ -24,6 +23,7 @@ from beers_deploy.quant.graph import (
     Window,
     graph_to_onnx,
 )
+from beers_deploy.quant.host_part import FINE_MAX, GAIN, DualRange, Plain
 from beers_deploy.quant.passes.dual_range import with_copies
 from beers_deploy.quant.passes.equalize import (
     FIRST_CROPS,
@@ -234,7 +234,7 @@ def test_a_shared_residual_scale_adds_without_rounding(quantized: Quantized) -> 
 
 
 def test_the_second_gain_is_the_same_correction_coarser(graph: Graph) -> None:
-    both = correction(with_copies(graph, Ends(gains=2)))
+    both = correction(with_copies(graph, DualRange()))
     assert both.shape[1] == 2
     np.testing.assert_allclose(both[:, 1:] * GAIN, correction(graph), atol=1e-6)
 
@@ -243,13 +243,12 @@ def test_the_fine_gain_is_believed_until_its_end() -> None:
     scale = 2.0**-11
     fine = np.array([0, 126, -126, 127, -127, -128]) * scale
     coarse = np.array([50, 51, 52, 53, -54, -55]) * scale
-    merged = Ends(gains=2).merge(np.stack([fine, coarse]).astype(np.float32)[None, :, None], scale)[
-        0, 0, 0
-    ]
-    np.testing.assert_array_equal(merged / scale, [0, 126, -126, 53 * GAIN, -54 * GAIN, -55 * GAIN])
+    copies = np.stack([fine, coarse]).astype(np.float32)[None, :, None]
+    values = DualRange().decode(copies, scale)[0, 0, 0]
+    np.testing.assert_array_equal(values / scale, [0, 126, -126, 53 * GAIN, -54 * GAIN, -55 * GAIN])
     assert FINE_MAX == 126
     one = np.full((1, 1, 2, 2), 127 * scale, np.float32)
-    assert Ends().merge(one, scale) is one
+    assert Plain().decode(one, scale) is one
 
 
 def test_all_passes_lose_far_less_than_none(

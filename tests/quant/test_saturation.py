@@ -90,7 +90,7 @@ def test_the_shipped_file_saturates_as_the_integer_reference_says() -> None:
     harsh = np.where(IMAGE > 0.5, 1.0, 0.0).astype(np.float32)
     shares = saturated_shares(model, [harsh])
     core = read_core(model)
-    _, reports = run_core(core, core.ends.split(harsh), half_even=True)
+    _, reports = run_core(core, core.host_part.encode(harsh), half_even=True)
     outputs = {op.name: op.output for op in core.ops}
     expected = {outputs[r.name]: r.saturated for r in reports if outputs[r.name] != CORRECTION}
     plain = {name: share for name, share in shares.items() if name in expected}

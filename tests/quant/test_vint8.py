@@ -82,10 +82,10 @@ def test_the_host_files_bits(
     for optimise in (True, False):
         result = open_session(model, optimise=optimise).run(None, {PLANES: planes_of(image)})[0]
         np.testing.assert_array_equal(
-            result, correction(core, core.ends.split(image), half_even=True)
+            result, correction(core, core.host_part.encode(image), half_even=True)
         )
         by_host = run(open_session(host, optimise=optimise), image)
-        np.testing.assert_array_equal(core.ends.finished(image, result), by_host)
+        np.testing.assert_array_equal(core.host_part.finish(image, result), by_host)
 
 
 @NETWORKS

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from beers_deploy.quant.core import IntCore
-from beers_deploy.quant.ends import FINE_MAX
 from beers_deploy.quant.graph import CORRECTION
+from beers_deploy.quant.host_part import FINE_MAX
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.integer.trainable import TrainableCore
 
@@ -31,18 +31,17 @@ def hold_to_reference(trainable: TrainableCore, planes: np.ndarray) -> None:
     with torch.no_grad():
         tensors = trainable.tensors(torch.from_numpy(planes.astype(np.float32)))
         result = trainable(torch.from_numpy(planes.astype(np.float32))).numpy()
-    ends = core.ends
+    decoding = core.host_part.decoding
     correction = merged_correction(core, expected)
     for name, values in expected.items():
-        if name != CORRECTION or ends.copies == 1:
+        if name != CORRECTION or decoding.copies == 1:
             np.testing.assert_array_equal(tensors[name].numpy(), values, err_msg=name)
-    if ends.copies == 1:
+    if decoding.copies == 1:
         np.testing.assert_allclose(result, correction, rtol=1e-6)
         return
-    sizes = np.split(np.abs(expected[CORRECTION]), ends.copies, axis=1)
-    # All windows but the first are fine copies; of two gains, the first is the fine one.
-    fine_copies = sizes[1:] if ends.offsets else sizes[:1]
+    sizes = np.split(np.abs(expected[CORRECTION]), decoding.copies, axis=1)
+    fine_copies = [size for size, gain in zip(sizes, decoding.gains, strict=True) if gain == 1]
     fine = np.min(fine_copies, axis=0) <= FINE_MAX
-    # Windows hold every value in a fine copy. Two gains hold only small values there.
-    assert fine.any() or not ends.offsets
+    # Windows hold every value in a fine copy. A dual range holds only small values there.
+    assert fine.any() or not decoding.offsets
     assert np.abs(result - correction)[fine].max(initial=0) <= 0.501 * core.scale(CORRECTION)

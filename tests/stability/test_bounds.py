@@ -11,8 +11,8 @@ from beers_deploy.model.shipped import SHIPPED
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.encodings import board_model, read_core
-from beers_deploy.quant.ends import Ends
-from beers_deploy.quant.graph import CORRECTION, split
+from beers_deploy.quant.graph import CORRECTION
+from beers_deploy.quant.host_part import IMAGE_SLICES, DualRange
 from beers_deploy.quant.integer.reference import INT32_BITS, correction, run_core
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.quantize import Quantized
@@ -27,7 +27,7 @@ def images(seed: int, shape: tuple[int, int], binary: bool) -> np.ndarray:
 def test_no_image_leaves_the_integer_bounds(quantized: Quantized) -> None:
     bounds = {bound.name: bound for bound in layer_bounds(quantized.core)}
     for seed in range(6):
-        planes = split(images(seed, (17, 23), seed % 2 == 0).astype(np.float32))
+        planes = IMAGE_SLICES.encode(images(seed, (17, 23), seed % 2 == 0).astype(np.float32))
         for report in run_core(quantized.core, planes)[1]:
             bound = bounds[report.name]
             assert report.peak_bits <= bound.bits < INT32_BITS
@@ -52,8 +52,8 @@ def test_shipped_accumulators_cannot_overflow(path: Path) -> None:
 def test_a_core_is_read_back_from_its_file(quantized: Quantized) -> None:
     core = read_core(quantized.host)
     image = images(3, (19, 26), False).astype(np.float32)
-    merged = Ends(gains=2).merge(
-        correction(core, split(image), half_even=True), core.scale(CORRECTION)
+    merged = DualRange().decode(
+        correction(core, IMAGE_SLICES.encode(image), half_even=True), core.scale(CORRECTION)
     )
     np.testing.assert_array_equal(
         np.clip(image + merged, 0, 1), run(open_session(quantized.host), image)

@@ -16,8 +16,8 @@ from beers_deploy.model.traditional.compensate import compensation_gain
 from beers_deploy.profiles.response import NYQUIST
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings import board_model, host_model
-from beers_deploy.quant.ends import Ends
-from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS, split
+from beers_deploy.quant.graph import CORRECTION, PLANES, PLANES_FRAC_BITS
+from beers_deploy.quant.host_part import IMAGE_SLICES, DualRange
 from beers_deploy.quant.integer.reference import correction
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.session import open_session, run
@@ -79,9 +79,9 @@ def test_both_files_hold_every_bias_at_its_scale(
     generator = np.random.default_rng(seed)
     core = biased(quantized.core, generator)
     image = generator.uniform(0.3, 0.7, (1, 1, *shape)).astype(np.float32)
-    planes = split(image)
+    planes = IMAGE_SLICES.encode(image)
     expected = correction(core, planes, half_even=True)
-    restored = np.clip(image + Ends(gains=2).merge(expected, core.scale(CORRECTION)), 0, 1)
+    restored = np.clip(image + DualRange().decode(expected, core.scale(CORRECTION)), 0, 1)
     np.testing.assert_array_equal(run(open_session(host_model(core, {})), image), restored)
     feed = {PLANES: planes.astype(np.float32) * np.float32(2.0**-PLANES_FRAC_BITS)}
     np.testing.assert_array_equal(open_session(board_model(core, {})).run(None, feed)[0], expected)

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.core import IntConv, IntCore
-from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, split
+from beers_deploy.quant.graph import CORRECTION, PLANES, Activation
+from beers_deploy.quant.host_part import IMAGE_SLICES
 from beers_deploy.quant.integer.reference import SOUND, Faults, merged_correction, run_core
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.studies.stress.faults import (
@@ -84,7 +85,7 @@ def test_the_stored_bias_is_int8_and_the_network_the_same(quantized: Quantized) 
     assert weight_bits(stored) == 8 * sum(
         op.weight.size + op.bias.size for op in stored.convolutions
     )
-    planes = split(image())
+    planes = IMAGE_SLICES.encode(image())
     before = run_core(quantized.core, planes)[0]
     after = run_core(stored, planes)[0]
     for name in before:
@@ -123,7 +124,7 @@ def test_numbers_that_the_board_could_not_store_are_refused(quantized: Quantized
 
 
 def test_maps_have_the_channels_that_run(quantized: Quantized) -> None:
-    tensors, _ = run_core(quantized.core, split(image()))
+    tensors, _ = run_core(quantized.core, IMAGE_SLICES.encode(image()))
     assert {name: tensor.shape[1] for name, tensor in tensors.items()} == map_channels(
         quantized.core
     )
@@ -131,13 +132,13 @@ def test_maps_have_the_channels_that_run(quantized: Quantized) -> None:
 
 @pytest.fixture(scope="module")
 def guards(core: IntCore) -> Guards:
-    return learn_guards(core, [split(image(seed=seed)) for seed in range(3)])
+    return learn_guards(core, [IMAGE_SLICES.encode(image(seed=seed)) for seed in range(3)])
 
 
 def test_calibration_patches_pass_untouched(core: IntCore, guards: Guards) -> None:
     for seed in range(3):
         bare, clamped = (
-            run_core(core, split(image(seed=seed)), faults=f)[0]
+            run_core(core, IMAGE_SLICES.encode(image(seed=seed)), faults=f)[0]
             for f in (SOUND, guarded(SOUND, guards))
         )
         np.testing.assert_array_equal(bare[CORRECTION], clamped[CORRECTION])
@@ -149,7 +150,7 @@ def test_bounds_are_the_next_ones_that_hold_what_was_seen(core: IntCore) -> None
     """A dark image leaves room below 96 units; a bright one fills int8, and such a ReLU gets no
     bound.
     """
-    dark = [split(0.1 * image(seed=seed)) for seed in range(2)]
+    dark = [IMAGE_SLICES.encode(0.1 * image(seed=seed)) for seed in range(2)]
     guards = learn_guards(core, dark)
     runs = [run_core(core, planes)[0] for planes in dark]
     assert guards.relu6
@@ -167,7 +168,8 @@ def test_a_clamped_result_keeps_its_bound_whatever_the_weights(core: IntCore) ->
     )
     injected = flip_weights(core, 2000, np.random.default_rng(0))
     bare, clamped = (
-        run_core(injected, split(image(seed=9)), faults=f)[0] for f in (SOUND, guarded(SOUND, some))
+        run_core(injected, IMAGE_SLICES.encode(image(seed=9)), faults=f)[0]
+        for f in (SOUND, guarded(SOUND, some))
     )
     assert max(int(bare[name].max()) for name in some.relu6) > 24
     assert max(int(clamped[name].max()) for name in some.relu6) == 24
@@ -181,7 +183,9 @@ def test_faults_enter_memory_after_the_clamp(core: IntCore) -> None:
     faults = Faults(
         {}, lambda target, tensor: np.full_like(tensor, 127) if target == name else tensor
     )
-    tensors, _ = run_core(core, split(image()), faults=guarded(faults, Guards({name: 3}, 1.0, {})))
+    tensors, _ = run_core(
+        core, IMAGE_SLICES.encode(image()), faults=guarded(faults, Guards({name: 3}, 1.0, {}))
+    )
     assert (tensors[name] == 127).all()
 
 
@@ -209,7 +213,7 @@ def test_two_copies_of_three_decide(core: IntCore) -> None:
 
 def test_a_wrong_shift_is_used(core: IntCore) -> None:
     shifts = shifts_of(core)
-    planes = split(image(seed=2))
+    planes = IMAGE_SLICES.encode(image(seed=2))
     faultless = run_core(core, planes)[0][CORRECTION]
     np.testing.assert_array_equal(
         run_core(core, planes, faults=Faults(shifts))[0][CORRECTION], faultless

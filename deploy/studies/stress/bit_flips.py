@@ -95,7 +95,7 @@ def make_target(subject: Subject, source: Calibration) -> FaultTarget:
     calibration = replace(source, patches=CALIBRATION_PATCHES)
     held_out = replace(source, seed=source.seed + HELD_OUT_SEED)
     guards = faults.learn_guards(
-        core, (core.ends.split(image) for image in calibration.drawn.degraded)
+        core, (core.host_part.encode(image) for image in calibration.drawn.degraded)
     )
     return FaultTarget(core, guards, list(held_out.drawn.pairs))
 
@@ -190,7 +190,8 @@ def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Ro
     # The rate is fitted for one core.
     rate = Constants.of(dpu).host_in_bytes_per_s * dpu.whole("cpu", "cores")
     clock_hz = 1e9 * dpu.limit("cpu", "clock_ghz").low
-    limit_s = INSTRUCTIONS * target.core.ends.gains * TILE_PX**2 / AT_ONCE / clock_hz
+    copies = len(target.core.host_part.decoding.gains)
+    limit_s = INSTRUCTIONS * copies * TILE_PX**2 / AT_ONCE / clock_hz
     scrubbing_s = faults.weight_bits(target.core) / faults.INT8_BITS / rate
     copies_s = 3 * len(faults.shifts_of(target.core)) / rate
     spread = exp(dpu.value("cost", "width_outside"))

@@ -126,7 +126,7 @@ def with_ops(core: IntCore, others: Mapping[str, IntConv]) -> IntCore:
 
 def map_channels(core: IntCore) -> dict[str, int]:
     """Channels of every tensor that the core reads or writes."""
-    return channels_of(core.ops, {PLANES: core.ends.planes * core.ends.channels})
+    return channels_of(core.ops, {PLANES: core.host_part.planes})
 
 
 def shifts_of(core: IntCore) -> Shifts:
@@ -252,10 +252,11 @@ def restored(injected: Injected, guards: Guards | None = None) -> np.ndarray:
     correction on.
     """
     faults = guarded(injected.faults, guards) if guards else injected.faults
-    tensors, _ = run_core(injected.core, injected.core.ends.split(injected.image), faults=faults)
-    correction = merged_correction(injected.core, tensors)
+    core = injected.core
+    tensors, _ = run_core(core, core.host_part.encode(injected.image), faults=faults)
+    correction = merged_correction(core, tensors)
     correction = guards.limit(correction) if guards else correction
-    return np.asarray(injected.core.ends.finished(injected.image, correction), np.float32)
+    return np.asarray(core.host_part.finish(injected.image, correction), np.float32)
 
 
 def _weights(
@@ -284,7 +285,7 @@ def _maps(
     """Faults enter every tensor once, between the operation that writes it and
     those that read it.
     """
-    places = image[0, 0].size // core.ends.place_px**2
+    places = image[0, 0].size // core.host_part.place_px**2
     channels = map_channels(core)
     counts = {
         name: flip_count(INT8_BITS * places * n, per_megabit, generator)

@@ -257,12 +257,13 @@ def reference(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Me
     if case.pixels != "sound":
         return []
     crop = network.extended(_fractions(image[:CROP_PX, :CROP_PX]))
-    planes = core.ends.split(crop)
+    planes = core.host_part.encode(crop)
     # onnxruntime rounds ties to even, and the DPU rounds them up.
     even, reports = run_core(core, planes, half_even=True)
     up, _ = run_core(core, planes)
     by_rule, on_board = (
-        core.ends.finished(crop, merged_correction(core, tensors))[0, 0] for tensors in (even, up)
+        core.host_part.finish(crop, merged_correction(core, tensors))[0, 0]
+        for tensors in (even, up)
     )
     # A peak above its proof would mean that the proof is wrong, not the network.
     over = max(report.peak_bits - report.proven_bits for report in reports)

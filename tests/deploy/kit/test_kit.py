@@ -28,13 +28,13 @@ from beers_deploy.model.exposure import HEADROOM, choose_factors, factors_for
 from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import OptionError, ProfileError
-from beers_deploy.quant.banked.calibrate import bank_results, quantize_family
 from beers_deploy.quant.encodings import host_model
+from beers_deploy.quant.sensor_bank.calibrate import bank_results, quantize_behind_bank
 from tests.deploy.command_line import done
 from tests.deploy.kit.test_golden import network
 from tests.model.networks import behind_a_bank
 from tests.profiles.own_sensor import edited, own_sensor
-from tests.quant.banked.test_filters import textured
+from tests.quant.sensor_bank.test_filters import textured
 
 BARE = """
 import sys
@@ -55,7 +55,7 @@ def behind_fitted_kernels() -> bd.Network:
     weights = Weights(arrays(net.state_dict()), net.variant, {}, conditioned=True)
     middle = bank_of_vector((0.0,) * 4)
     results = [bank_results(textured(48, 48, k), middle, (0.0,) * 4, 2) for k in range(2)]
-    family = quantize_family(weights, middle, results)
+    family = quantize_behind_bank(weights, middle, results)
     return bd.Network.load(host_model(family.core, {}))
 
 

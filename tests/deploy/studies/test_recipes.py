@@ -10,8 +10,8 @@ from PIL import Image
 
 from beers_deploy.model.io.tensors import read_conditioned, read_tensors
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.quant.banked.family import required_family
 from beers_deploy.quant.onnx_file import load_onnx
+from beers_deploy.quant.sensor_bank.conditioned import required_conditioned_core
 from tests.deploy.command_line import done, refused
 
 RECIPE = """
@@ -63,7 +63,7 @@ def image_options(folders: list[Path]) -> list[str]:
 def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes(
     folders: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("beers_deploy.quant.banked.calibrate.PATCHES", 6)
+    monkeypatch.setattr("beers_deploy.quant.sensor_bank.calibrate.PATCHES", 6)
     recipe = tmp_path / "own.toml"
     out = tmp_path / "run"
     recipe.write_text(RECIPE)
@@ -73,7 +73,7 @@ def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes
     first = [(out / name).read_bytes() for name in names]
     weights = read_conditioned(out / names[0])
     assert weights.kernels == "fitted"
-    assert required_family(load_onnx(out / names[1])).kernels == "fitted"
+    assert required_conditioned_core(load_onnx(out / names[1])).kernels == "fitted"
     card = (out / names[2]).read_text()
     assert RECIPE.strip() in card
     assert "- Drawn for a test, CC0 1.0" in card

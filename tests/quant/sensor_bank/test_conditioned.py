@@ -1,4 +1,4 @@
-"""INT8 once for a family of sensors: near the float network for each, and alike but for what a
+"""INT8 once for a conditioned of sensors: near the float network for each, and alike but for what a
 sensor changes.
 """
 
@@ -17,24 +17,24 @@ from beers_deploy.model.convbeers import BankedConvBEERS, Rounding, initialise
 from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.banked.calibrate import bank_results, map_steps, quantize_family
-from beers_deploy.quant.banked.family import (
-    FAMILY,
-    Family,
-    delta_of_file,
-    family_of,
-    required_family,
-    with_delta,
-)
-from beers_deploy.quant.banked.filters import channels
 from beers_deploy.quant.bounds import layer_bounds
 from beers_deploy.quant.core import IntConv, IntCore, shift_faults
 from beers_deploy.quant.encodings import board_model, encoding_faults, host_model, read_core
 from beers_deploy.quant.integer.reference import merged_correction, run_core
+from beers_deploy.quant.sensor_bank.calibrate import bank_results, map_steps, quantize_behind_bank
+from beers_deploy.quant.sensor_bank.conditioned import (
+    SENSOR_BIASES,
+    ConditionedCore,
+    conditioned_core,
+    delta_of_file,
+    required_conditioned_core,
+    with_delta,
+)
+from beers_deploy.quant.sensor_bank.filters import channels
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from tests.model.networks import told_of
-from tests.quant.banked.test_filters import textured
+from tests.quant.sensor_bank.test_filters import textured
 
 SENSORS = [
     (0.2, 0.1, -0.3, -0.2),
@@ -61,7 +61,7 @@ def weights_of(network: BankedConvBEERS) -> Weights:
 
 
 @pytest.fixture(scope="module", params=[1, 2])
-def pair(request: pytest.FixtureRequest) -> tuple[BankedConvBEERS, Family]:
+def pair(request: pytest.FixtureRequest) -> "Pair":
     float_network = network(request.param)
     scale = int(request.param)
     images = [
@@ -69,18 +69,25 @@ def pair(request: pytest.FixtureRequest) -> tuple[BankedConvBEERS, Family]:
         for k, vector in enumerate(SENSORS)
     ]
     middle = bank_of_vector((0.0, 0.0, 0.0, 0.0))
-    return float_network, quantize_family(weights_of(float_network), middle, images)
+    return float_network, quantize_behind_bank(weights_of(float_network), middle, images)
 
 
-def core_of(family: Family, vector: tuple[float, ...]) -> IntCore:
-    return family.for_sensor(bank_of_vector(vector), vector)
+Pair = tuple[BankedConvBEERS, ConditionedCore]
+
+
+def core_of(conditioned: ConditionedCore, vector: tuple[float, ...]) -> IntCore:
+    return conditioned.for_sensor(bank_of_vector(vector), vector)
+
+
+def about(conditioned: ConditionedCore) -> dict[str, str]:
+    return {SENSOR_BIASES: conditioned.biases_to_json()}
 
 
 @pytest.mark.parametrize("vector", SENSORS)
 def test_int8_is_near_the_float_network_for_every_sensor(
-    pair: tuple[BankedConvBEERS, Family], vector: tuple[float, ...]
+    pair: Pair, vector: tuple[float, ...]
 ) -> None:
-    float_network, family = pair
+    float_network, conditioned = pair
     # The texture stays within eight units of the quietest sensor, where INT8 ends.
     image = 0.3 + 0.3 * textured(46, 58, 9)
     with torch.inference_mode():
@@ -89,7 +96,7 @@ def test_int8_is_near_the_float_network_for_every_sensor(
             .clamp(0, 1)
             .numpy()
         )
-    actual = run(open_session(host_model(core_of(family, vector), {})), image)
+    actual = run(open_session(host_model(core_of(conditioned, vector), {})), image)
     unit = bank_of_vector(vector).unit
     assert np.sqrt(np.square(actual - expected).mean()) < 0.05 * unit
     assert np.sqrt(np.square(image - expected).mean()) > 0.1 * unit
@@ -97,12 +104,12 @@ def test_int8_is_near_the_float_network_for_every_sensor(
 
 @pytest.mark.parametrize("vector", SENSORS)
 def test_points_and_saturated_edges_are_corrected_as_far_as_in_float(
-    pair: tuple[BankedConvBEERS, Family], vector: tuple[float, ...]
+    pair: Pair, vector: tuple[float, ...]
 ) -> None:
     """Also where the fine copies of the analytic restoration end, which they do behind blurred
     sensors.
     """
-    float_network, family = pair
+    float_network, conditioned = pair
     image = np.full((1, 1, 46, 58), 0.1, np.float32)
     image[..., 10:30, 20:40] = 1.0
     image[..., 38, 8] = 0.5
@@ -112,7 +119,7 @@ def test_points_and_saturated_edges_are_corrected_as_far_as_in_float(
             .clamp(0, 1)
             .numpy()
         )
-    actual = run(open_session(host_model(core_of(family, vector), {})), image)
+    actual = run(open_session(host_model(core_of(conditioned, vector), {})), image)
     bank = bank_of_vector(vector)
     most = np.abs(expected - image).max()
     reach = LARGEST * bank.unit / bank.gain
@@ -123,20 +130,20 @@ def test_points_and_saturated_edges_are_corrected_as_far_as_in_float(
 
 @pytest.mark.parametrize("vector", SENSORS)
 def test_a_float_network_rounded_as_its_file_errs_as_that_does(
-    pair: tuple[BankedConvBEERS, Family], vector: tuple[float, ...]
+    pair: Pair, vector: tuple[float, ...]
 ) -> None:
-    float_network, family = pair
+    float_network, conditioned = pair
     image = 0.3 + 0.3 * textured(46, 58, 9)
     condition = told_of(torch.tensor([vector]))
     stream, *inner = (
         torch.from_numpy(values)[:, None, None]
-        for values in map_steps(family, weights_of(float_network))
+        for values in map_steps(conditioned, weights_of(float_network))
     )
     with torch.inference_mode():
         plain = float_network(torch.from_numpy(image), condition)
         steps = Rounding(stream, tuple(inner)).steps(condition.gains)
         rounded = float_network(torch.from_numpy(image), condition, steps=steps)
-    file = run(open_session(host_model(core_of(family, vector), {})), image)
+    file = run(open_session(host_model(core_of(conditioned, vector), {})), image)
     errors = file - plain.clamp(0, 1).numpy(), (rounded - plain).numpy()
     ratio = np.linalg.norm(errors[1]) / np.linalg.norm(errors[0])
     # Only the file rounds weights, the bank and the last sum, so the ratio is not 1.
@@ -144,17 +151,19 @@ def test_a_float_network_rounded_as_its_file_errs_as_that_does(
 
 
 def test_the_steps_of_maps_turn_float_weights_into_the_files(
-    pair: tuple[BankedConvBEERS, Family],
+    pair: Pair,
 ) -> None:
-    float_network, family = pair
-    stream, *inner = map_steps(family, weights_of(float_network))
-    convolutions = {op.name: op for op in family.core.convolutions}
+    float_network, conditioned = pair
+    stream, *inner = map_steps(conditioned, weights_of(float_network))
+    convolutions = {op.name: op for op in conditioned.core.convolutions}
     # These layers were not used to find the steps.
     for k, read_steps in enumerate(inner):
         op = convolutions[f"body.{k}.second"]
         weight = float_network.state_dict()[f"body.{k}.second.weight"].numpy()
         bits = (
-            op.weight_frac_bits + family.core.frac_bits[op.input] - family.core.frac_bits[op.output]
+            op.weight_frac_bits
+            + conditioned.core.frac_bits[op.input]
+            - conditioned.core.frac_bits[op.output]
         )
         expected = (weight * (read_steps * 2.0**bits / stream[:, None])[:, :, None, None]).clip(
             -128, 127
@@ -164,24 +173,24 @@ def test_the_steps_of_maps_turn_float_weights_into_the_files(
 
 
 def test_the_file_is_what_its_integers_ask_for_and_the_reference_gives_the_same(
-    pair: tuple[BankedConvBEERS, Family],
+    pair: Pair,
 ) -> None:
     core = core_of(pair[1], SENSORS[0])
     image = textured(30, 34, 5)
     file = host_model(core, {"precision": "int8 legal"})
     assert encoding_faults(file) == []
     core_again = read_core(file)
-    tensors, _ = run_core(core_again, core_again.ends.split(image), half_even=True)
-    mine = core_again.ends.finished(image, merged_correction(core_again, tensors))
+    tensors, _ = run_core(core_again, core_again.host_part.encode(image), half_even=True)
+    mine = core_again.host_part.finish(image, merged_correction(core_again, tensors))
     np.testing.assert_allclose(mine, run(open_session(file), image), atol=1e-7)
 
 
 def test_a_sensor_changes_the_first_layer_biases_and_the_unit_alone(
-    pair: tuple[BankedConvBEERS, Family],
+    pair: Pair,
 ) -> None:
     first, second = (core_of(pair[1], vector) for vector in SENSORS[:2])
     assert first.frac_bits == second.frac_bits
-    assert first.ends.unit != second.ends.unit
+    assert first.host_part.unit != second.host_part.unit
     for one, other in zip(first.ops, second.ops, strict=True):
         if isinstance(one, IntConv) and isinstance(other, IntConv):
             assert np.array_equal(one.weight, other.weight) == (one.name != "bank")
@@ -194,7 +203,9 @@ def test_a_sensor_changes_the_first_layer_biases_and_the_unit_alone(
 
 @pytest.mark.parametrize("vector", SENSORS)
 def test_a_body_finer_by_its_gain_makes_what_it_makes_at_a_gain_of_one(
-    pair: tuple[BankedConvBEERS, Family], vector: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
+    pair: Pair,
+    vector: tuple[float, ...],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Far from int8's ends, but for rounding: the image, filters and biases agree on the gain."""
     image = 0.4 + 0.02 * textured(46, 58, 3)
@@ -206,31 +217,37 @@ def test_a_body_finer_by_its_gain_makes_what_it_makes_at_a_gain_of_one(
     assert bank.gain == 1
 
 
-def test_the_file_of_any_sensor_can_be_told_another(pair: tuple[BankedConvBEERS, Family]) -> None:
-    family = pair[1]
+def test_the_file_of_any_sensor_can_be_told_another(
+    pair: Pair,
+) -> None:
+    conditioned = pair[1]
     first, second = (
-        host_model(core_of(family, vector), {FAMILY: family.to_words()}) for vector in SENSORS[:2]
+        host_model(core_of(conditioned, vector), {SENSOR_BIASES: conditioned.biases_to_json()})
+        for vector in SENSORS[:2]
     )
-    stored_family = family_of(first)
-    assert stored_family is not None
-    rebuilt = host_model(core_of(stored_family, SENSORS[1]), {FAMILY: stored_family.to_words()})
+    stored = conditioned_core(first)
+    assert stored is not None
+    rebuilt = host_model(core_of(stored, SENSORS[1]), {SENSOR_BIASES: stored.biases_to_json()})
     assert rebuilt.SerializeToString(deterministic=True) == second.SerializeToString(
         deterministic=True
     )
 
 
 def test_a_delta_makes_any_sensors_file_that_sensors_to_the_byte(
-    pair: tuple[BankedConvBEERS, Family],
+    pair: Pair,
 ) -> None:
-    family = pair[1]
+    conditioned = pair[1]
     first, second = (
-        host_model(core_of(family, vector), {FAMILY: family.to_words(), "sensor": str(k)})
+        host_model(
+            core_of(conditioned, vector),
+            {SENSOR_BIASES: conditioned.biases_to_json(), "sensor": str(k)},
+        )
         for k, vector in enumerate(SENSORS[:2])
     )
     delta = delta_of_file(second)
     assert len(delta) < 3000
-    core, name = with_delta(required_family(first).core, delta)
-    rebuilt = host_model(core, {FAMILY: family.to_words(), "sensor": name})
+    core, name = with_delta(required_conditioned_core(first).core, delta)
+    rebuilt = host_model(core, {**about(conditioned), "sensor": name})
     assert rebuilt.SerializeToString(deterministic=True) == second.SerializeToString(
         deterministic=True
     )
@@ -239,33 +256,37 @@ def test_a_delta_makes_any_sensors_file_that_sensors_to_the_byte(
 @pytest.mark.parametrize(
     "change", [lambda d: d[:-9], lambda d: d[:0], lambda d: b"x" + d, lambda d: d[:40] + d[41:]]
 )
-def test_a_damaged_delta_is_one_sentence(
-    pair: tuple[BankedConvBEERS, Family], change: Callable[[bytes], bytes]
-) -> None:
-    file = host_model(core_of(pair[1], SENSORS[1]), {FAMILY: pair[1].to_words()})
+def test_a_damaged_delta_is_one_sentence(pair: Pair, change: Callable[[bytes], bytes]) -> None:
+    file = host_model(core_of(pair[1], SENSORS[1]), about(pair[1]))
     with pytest.raises(
         ModelError,
         match=r"^The delta (is damaged|belongs to another network).*--delta",
     ):
-        with_delta(required_family(file).core, change(delta_of_file(file)))
+        with_delta(required_conditioned_core(file).core, change(delta_of_file(file)))
 
 
-def test_a_delta_of_another_network_is_refused(pair: tuple[BankedConvBEERS, Family]) -> None:
-    file = host_model(core_of(pair[1], SENSORS[1]), {FAMILY: pair[1].to_words()})
-    other = replace(required_family(file).core, ops=required_family(file).core.ops[1:])
+def test_a_delta_of_another_network_is_refused(
+    pair: Pair,
+) -> None:
+    file = host_model(core_of(pair[1], SENSORS[1]), about(pair[1]))
+    other = replace(
+        required_conditioned_core(file).core, ops=required_conditioned_core(file).core.ops[1:]
+    )
     with pytest.raises(ModelError, match="KeyError"):
         with_delta(other, delta_of_file(file))
 
 
-def test_words_of_another_network_are_refused(pair: tuple[BankedConvBEERS, Family]) -> None:
+def test_words_of_another_network_are_refused(
+    pair: Pair,
+) -> None:
     core = core_of(pair[1], SENSORS[0])
-    assert family_of(host_model(core, {})) is None
+    assert conditioned_core(host_model(core, {})) is None
     for words in ("[]", '{"head": [[0, 0, 0, 0, 0]]}', '{"other": []}', "{"):
         with pytest.raises(ModelError, match="the INT8 network"):
-            family_of(host_model(core, {FAMILY: words}))
+            conditioned_core(host_model(core, {SENSOR_BIASES: words}))
 
 
-def test_tiles_give_the_whole_images_result(pair: tuple[BankedConvBEERS, Family]) -> None:
+def test_tiles_give_the_whole_images_result(pair: Pair) -> None:
     """Mirrored borders reach no farther inside than the halo."""
     file = host_model(core_of(pair[1], SENSORS[1]), {})
     image = textured(96, 80, 6)
@@ -286,30 +307,32 @@ def test_tiles_give_the_whole_images_result(pair: tuple[BankedConvBEERS, Family]
         np.testing.assert_array_equal(core_rows, at_once[..., top:bottom, left:right])
 
 
-def test_no_image_leaves_the_bounds_that_are_proven(pair: tuple[BankedConvBEERS, Family]) -> None:
+def test_no_image_leaves_the_bounds_that_are_proven(
+    pair: Pair,
+) -> None:
     core = core_of(pair[1], SENSORS[3])
     bounds = {bound.name: bound for bound in layer_bounds(core)}
     checkerboard = (np.indices((24, 28)).sum(0) % 2).astype(np.float32)[None, None]
     for image in (checkerboard, textured(24, 28, 4), np.ones_like(checkerboard)):
-        tensors, reports = run_core(core, core.ends.split(image))
+        tensors, reports = run_core(core, core.host_part.encode(image))
         for op, report in zip(core.ops, reports, strict=True):
             assert report.peak_bits <= bounds[op.name].bits + 1e-9
             assert np.clip(bounds[op.name].low, -128, 127) <= tensors[op.output].min()
             assert tensors[op.output].max() <= np.clip(bounds[op.name].high, -128, 127)
 
 
-def test_the_dpu_runs_all_of_it(pair: tuple[BankedConvBEERS, Family]) -> None:
+def test_the_dpu_runs_all_of_it(pair: Pair) -> None:
     core = core_of(pair[1], SENSORS[2])
     assert shift_faults(core) == []
     board = board_model(core, {}, 64)
     placed = place(network_of(board, 64), load_dpu("vck190", "C32B6"))
     assert [node.op.name for node in placed.nodes if node.broken] == []
     size = board.graph.input[0].type.tensor_type.shape.dim[2].dim_value
-    assert size == (70 if core.ends.place_px == 1 else 36)
+    assert size == (70 if core.host_part.place_px == 1 else 36)
 
 
 def test_the_first_layer_writes_whole_groups_of_sixteen_channels(
-    pair: tuple[BankedConvBEERS, Family],
+    pair: Pair,
 ) -> None:
     first = core_of(pair[1], SENSORS[0]).convolutions[0]
     assert len(first.weight) == 16 * pair[0].variant.pixels

@@ -10,19 +10,17 @@ from hypothesis import strategies as st
 from beers_deploy.model.bank import FILTERS, SIDE_PX, UNIT_STEPS, WIDE, Bank, bank_of_vector
 from beers_deploy.model.variants import Kernels
 from beers_deploy.profiles.instrument import MAX_DN
-from beers_deploy.quant.banked.filters import (
+from beers_deploy.quant.graph import Window
+from beers_deploy.quant.host_part import BANK_SLICES
+from beers_deploy.quant.integer.arithmetic import convolve
+from beers_deploy.quant.sensor_bank.filters import (
     COPIES,
     IMAGE_STEP_DN,
-    MIDDLE_DN,
     PART,
-    PLANE_ENDS,
     STEP_DN,
     channels,
-    split_planes,
-    whole_bank,
+    integer_bank,
 )
-from beers_deploy.quant.graph import Window
-from beers_deploy.quant.integer.arithmetic import convolve
 
 VECTOR = st.tuples(*[st.floats(-1, 1)] * 4)
 
@@ -34,8 +32,8 @@ def sums(image: np.ndarray, own: Bank) -> np.ndarray:
     """What the first convolution makes of an image (1, 1, H, W), in steps, before anything is
     rounded or added.
     """
-    bank = whole_bank(own, 1, own.gain)
-    return convolve(split_planes(image), bank.weight, Window()) / 2.0**bank.frac_bits
+    bank = integer_bank(own, 1, own.gain)
+    return convolve(BANK_SLICES.encode(image), bank.weight, Window()) / 2.0**bank.frac_bits
 
 
 def textured(rows: int, columns: int, seed: int = 0) -> np.ndarray:
@@ -62,12 +60,14 @@ def textured(rows: int, columns: int, seed: int = 0) -> np.ndarray:
 @example(MAX_DN)
 @given(st.integers(0, MAX_DN))
 def test_the_planes_hold_every_number(dn: int) -> None:
-    planes = split_planes(np.full((1, 1, 1, 1), dn / MAX_DN, np.float32))[0, :, 0, 0].astype(int)
+    planes = BANK_SLICES.encode(np.full((1, 1, 1, 1), dn / MAX_DN, np.float32))[0, :, 0, 0].astype(
+        int
+    )
     coarse, coarse_copy, remainder, part = planes
     assert coarse == coarse_copy
-    assert (planes >= PLANE_ENDS[0]).all()
-    assert (planes <= PLANE_ENDS[1]).all()
-    assert MIDDLE_DN + STEP_DN * coarse + remainder == dn
+    assert (planes >= BANK_SLICES.limits[0]).all()
+    assert (planes <= BANK_SLICES.limits[1]).all()
+    assert BANK_SLICES.middle + STEP_DN * coarse + remainder == dn
     assert abs(PART * part - remainder) <= PART / 2
 
 
@@ -80,7 +80,7 @@ def test_flat_ground_leaves_nothing_but_its_own_brightness(
     own = bank_of_vector(vector)
     response = sums(flat, own)[0, :, 0, 0]
     np.testing.assert_array_equal(response[COPIES[0] :], 0)
-    assert abs(response[0] - (dn - MIDDLE_DN) * own.gain / IMAGE_STEP_DN) <= 0.5 * own.gain
+    assert abs(response[0] - (dn - BANK_SLICES.middle) * own.gain / IMAGE_STEP_DN) <= 0.5 * own.gain
 
 
 @settings(max_examples=15)
@@ -88,7 +88,7 @@ def test_flat_ground_leaves_nothing_but_its_own_brightness(
 def test_the_weights_are_int8_and_near_the_filters(vector: tuple[float, ...]) -> None:
     own = bank_of_vector(vector)
     gain = own.gain
-    bank = whole_bank(own, 1, gain)
+    bank = integer_bank(own, 1, gain)
     coarse_pair = bank.weight[:, :2].astype(int)
     # No finer scale would hold the weights, and none of them is clipped.
     assert 62 <= np.abs(coarse_pair).max() < 127
@@ -138,10 +138,10 @@ def test_copies_are_rounded_at_places_spread_over_a_step() -> None:
 def test_at_half_resolution_the_same_filters_meet_the_same_pixels() -> None:
     own = bank_of_vector((0.3, -0.4, 0.1, 0.2))
     image = textured(32, 36)
-    fine = whole_bank(own, 1, 1)
-    coarse = whole_bank(own, 2, 1)
+    fine = integer_bank(own, 1, 1)
+    coarse = integer_bank(own, 2, 1)
     assert fine.frac_bits == coarse.frac_bits
-    planes = split_planes(image)
+    planes = BANK_SLICES.encode(image)
     blocks = planes.reshape(1, 4, 16, 2, 18, 2).transpose(0, 1, 3, 5, 2, 4).reshape(1, 16, 16, 18)
     # The result is that of places 2 to 13.
     actual = convolve(blocks, coarse.weight, Window())

@@ -1,0 +1,78 @@
+"""The host's part as JSON, in the metadata of an INT8 file: read from it, and written to it."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from beers_deploy.quant.graph import Shuffle
+from beers_deploy.quant.host_part.input_encoding import (
+    BANK_SLICES,
+    IMAGE_SLICES,
+    Direct,
+    InputEncoding,
+)
+from beers_deploy.quant.host_part.output_decoding import (
+    BankSum,
+    DualRange,
+    OffsetWindows,
+    OutputDecoding,
+    Plain,
+)
+from beers_deploy.quant.host_part.part import HostPart
+
+SHUFFLES = ("front", "back", "last")
+
+
+def host_part_to_json(part: HostPart) -> dict[str, Any]:
+    """Return the host's part as values that JSON has."""
+    decoding = part.decoding
+    record = asdict(part)
+    # Encoding and decoding are described by the flags that the first files had.
+    del record["encoding"], record["decoding"]
+    return {
+        **record,
+        "planes": part.encoding.planes,
+        "direct": isinstance(part.encoding, Direct),
+        "banked": part.encoding == BANK_SLICES,
+        "gains": 1 if decoding.offsets else len(decoding.gains),
+        "offsets": decoding.offsets,
+        "wide": decoding == BankSum(coarse_copies=1),
+    }
+
+
+def host_part_from_json(record: Mapping[str, Any]) -> HostPart:
+    """Return the host's part that `host_part_to_json` described.
+
+    Raises:
+        LookupError, TypeError, ValueError: a damaged description.
+    """
+    shuffles = {name: tuple(Shuffle(**shuffle) for shuffle in record[name]) for name in SHUFFLES}
+    encoding = _encoding(record)
+    # The file is not trusted: its core must read the planes that the host makes.
+    if int(record["planes"]) != encoding.planes:
+        raise ValueError(f"{record['planes']} planes of each channel instead of {encoding.planes}")
+    return HostPart(
+        channels=int(record["channels"]),
+        outputs=int(record["outputs"]),
+        **shuffles,
+        adds_image=bool(record.get("adds_image", True)),
+        unit=float(record.get("unit", 1.0)),
+        encoding=encoding,
+        decoding=_decoding(record),
+    )
+
+
+def _encoding(record: Mapping[str, Any]) -> InputEncoding:
+    if record.get("direct"):
+        return Direct()
+    return BANK_SLICES if record.get("banked") else IMAGE_SLICES
+
+
+def _decoding(record: Mapping[str, Any]) -> OutputDecoding:
+    offsets = tuple(tuple(map(float, window)) for window in record["offsets"])
+    if offsets:
+        return OffsetWindows(offsets)
+    # Files of earlier versions do not state `wide`, because they have no coarse copy.
+    if record.get("banked"):
+        return BankSum(coarse_copies=int(bool(record.get("wide"))))
+    return DualRange() if int(record["gains"]) == 2 else Plain()

@@ -1,0 +1,126 @@
+"""How an image in [0, 1] becomes the int8 planes that the integer core reads."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from beers_deploy.model.bank import SIDE_PX
+from beers_deploy.profiles.instrument import MAX_DN
+from beers_deploy.quant.graph import COARSE_MAX, PLANES_FRAC_BITS, QUARTER, STEP
+from beers_deploy.quant.host_part.writer import HostWriter
+
+ENCODED = "host_front.planes"
+"""The tensor of the planes in float, before they are stored as uint8."""
+
+
+@dataclass(frozen=True)
+class BitSlices:
+    """Encodes a digital number (DN) of 12 bits as a coarse plane, its remainder, and a part of it.
+
+    DN - middle = step coarse + remainder, and the last plane is the remainder / part, rounded: with
+    it the weights of a convolution have finer steps.
+
+    Attributes:
+        step: the DN of one coarse step.
+        part: the divisor of the remainder in the last plane.
+        middle: the DN that is encoded as 0.
+        coarse_planes: how often the coarse plane comes. Two of them share the weights of a filter,
+            which then reach twice as far as int8 does.
+        margin_px: the pixels by which the image must at least be mirrored beyond its borders.
+    """
+
+    step: int = STEP
+    part: int = QUARTER
+    middle: int = 0
+    coarse_planes: int = 1
+    margin_px: int = 0
+
+    @property
+    def planes(self) -> int:
+        """The number of planes of each channel."""
+        return self.coarse_planes + 2
+
+    @property
+    def limits(self) -> tuple[list[int], list[int]]:
+        """The smallest and the largest integer of each plane of a channel, tried on every DN."""
+        every_dn = np.arange(MAX_DN + 1, dtype=np.float32)[None, None, None] / np.float32(MAX_DN)
+        planes = self.encode(every_dn)[0, :, 0]
+        return planes.min(1).tolist(), planes.max(1).tolist()
+
+    def encode(self, image: np.ndarray) -> np.ndarray:
+        """Encode an image (N, C, H, W) in [0, 1] as planes (N, planes C, H, W) int8.
+
+        All channels of a plane come before the next plane.
+        """
+        dn = np.clip(np.rint(image * np.float32(MAX_DN)), 0, MAX_DN) - self.middle
+        # Full scale rounds to 128 steps, one more than int8 holds, so the remainder holds more.
+        coarse = np.minimum(np.rint(dn / self.step), COARSE_MAX)
+        remainder = dn - self.step * coarse
+        planes = [*[coarse] * self.coarse_planes, remainder, np.rint(remainder / self.part)]
+        return np.concatenate(planes, axis=1).astype(np.int8)
+
+    def write(self, w: HostWriter, image: str) -> None:
+        """Write the nodes that encode the tensor `image` as `ENCODED`."""
+        max_dn = w.scalar("max_dn", MAX_DN)
+        scaled = w.node("Mul", "host_front.scale", [image, max_dn])
+        whole = w.node("Round", "host_front.round", [scaled])
+        dn = w.node("Clip", "host_front.dn", [whole, w.scalar("zero", 0), max_dn])
+        if self.middle:
+            dn = w.node("Sub", "host_front.centred", [dn, w.scalar("middle", self.middle)])
+        steps = w.node("Mul", "host_front.steps", [dn, w.scalar("one_step", 1 / self.step)])
+        rounded = w.node("Round", "host_front.whole_steps", [steps])
+        most = w.scalar("coarse_max", COARSE_MAX)
+        coarse = w.node("Min", "host_front.coarse", [rounded, most])
+        step = w.scalar("step", self.step)
+        coarse_dn = w.node("Mul", "host_front.coarse_dn", [coarse, step])
+        remainder = w.node("Sub", "host_front.remainder", [dn, coarse_dn])
+        one_part = w.scalar("one_quarter", 1 / self.part)
+        parts = w.node("Mul", "host_front.quarters", [remainder, one_part])
+        part = w.node("Round", "host_front.quarter", [parts])
+        w.node("Concat", ENCODED, [*[coarse] * self.coarse_planes, remainder, part], axis=1)
+
+    def constants(self) -> dict[str, int]:
+        """Return the constants that a kit's `host.py` encodes with."""
+        return {
+            "step": self.step,
+            "part": self.part,
+            "middle": self.middle,
+            "coarse_planes": self.coarse_planes,
+        }
+
+
+IMAGE_SLICES = BitSlices()
+"""Of a network that reads the image itself: 0 stays 0, as its zero padding is."""
+BANK_SLICES = BitSlices(16, 2, 2048, 2, SIDE_PX // 2)
+"""Of a sensor's bank, whose filters sum to 0: about the middle of the range, the steps are half as
+large. Zeros around the image would look like a black edge to the filters, so it is mirrored.
+"""
+
+
+@dataclass(frozen=True)
+class Direct:
+    """Stores an image that consists of planes already, in multiples of 1/128: a bank's results."""
+
+    planes: ClassVar[int] = 1
+    margin_px: ClassVar[int] = 0
+    limits: ClassVar[tuple[list[int], list[int]]] = [-128], [127]
+
+    def encode(self, image: np.ndarray) -> np.ndarray:
+        """Store multiples of 1/128 (N, C, H, W) as int8."""
+        # These are multiples of 1/128 already: rounding removes float error only.
+        return np.clip(np.rint(image * 2.0**PLANES_FRAC_BITS), -128, 127).astype(np.int8)
+
+    def write(self, w: HostWriter, image: str) -> None:
+        """Write the nodes that store the tensor `image`."""
+        scaled = w.node(
+            "Mul", "host_front.scale", [image, w.scalar("units", 2.0**PLANES_FRAC_BITS)]
+        )
+        w.node("Round", ENCODED, [scaled])
+
+    def constants(self) -> None:
+        """Return None: no kit has a core without the layers in front of it."""
+        return
+
+
+InputEncoding = BitSlices | Direct

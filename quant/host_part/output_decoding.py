@@ -1,0 +1,254 @@
+"""How the copies that the integer core writes of each channel become one value.
+
+int8 has 256 steps. A copy that is finer by `GAIN` has smaller rounding errors but a smaller range,
+so a coarse copy takes its place where it is clipped. The channels of a result are ordered by copy.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beers_deploy.model.bank import UNIT_STEPS, WIDE
+from beers_deploy.quant.host_part.writer import HostWriter
+
+GAIN = 8
+"""By how much a coarse copy is coarser than a fine one."""
+FINE_MAX = 126
+"""The largest integer of a fine copy that counts: 127 may be a clipped value."""
+ANALYTIC_COPIES = 4
+"""Of the analytic restoration, in the result of a network behind a bank."""
+DECODED = "host_back.correction"
+"""The tensor of the decoded values."""
+
+Offsets = tuple[tuple[float, ...], ...]
+Constants = dict[str, object]
+
+
+@dataclass(frozen=True)
+class Plain:
+    """One copy, which is the value. The decodings of several copies derive from it.
+
+    Attributes:
+        offsets: (windows, C) what the host adds to each of the last copies, in the result's unit.
+        finer_bits: fractional bits that a fine copy has in addition to those of a single one.
+    """
+
+    offsets: Offsets = ()
+    finer_bits = 0
+
+    @property
+    def gains(self) -> tuple[int, ...]:
+        """What the host multiplies each copy with that the last convolution writes."""
+        return (1,)
+
+    @property
+    def copies(self) -> int:
+        """How often the core writes each channel."""
+        return len(self.gains)
+
+    def never_replaced(self, outputs: int) -> slice:  # noqa: ARG002 - other decodings use it
+        """Return which channels no other copy replaces, so that a clipped value there is lost."""
+        return slice(None)
+
+    def with_bias_errors(self, errors: np.ndarray) -> "Plain":  # noqa: ARG002 - as above
+        """Return a decoding that adds errors of int8 biases (copies C,), if it adds offsets."""
+        return self
+
+    def decode(self, result: np.ndarray, scale: float) -> np.ndarray:  # noqa: ARG002 - as above
+        """Decode a result (N, copies C, H, W) float32, multiples of `scale`, as (N, C, H, W)."""
+        return result
+
+    def write(self, w: HostWriter, feeds: list[str], outputs: int, scale: float) -> None:  # noqa: ARG002 - as above
+        """Write the nodes that decode a result as `DECODED`.
+
+        Args:
+            w: gets the nodes.
+            feeds: the names of the result in uint8, of its scale and of its zero point.
+            outputs: the number of decoded channels.
+            scale: the value of one unit of the result.
+        """
+        w.node("DequantizeLinear", DECODED, feeds)
+
+    def constants(self, scale: float) -> Constants:  # noqa: ARG002 - as above
+        """Return the constants that a kit's `host.py` decodes with."""
+        return {"decoding": "plain"}
+
+
+OutputDecoding = Plain
+
+
+@dataclass(frozen=True)
+class DualRange(Plain):
+    """A fine copy for nearly all pixels, then a coarse one for the strongest edges."""
+
+    finer_bits = 1
+    _chosen = DECODED
+
+    @property
+    def gains(self) -> tuple[int, ...]:
+        """What the host multiplies each copy with."""
+        return (1, GAIN)
+
+    def never_replaced(self, outputs: int) -> slice:
+        """Return all channels behind the fine copy."""
+        return slice(outputs, None)
+
+    def decode(self, result: np.ndarray, scale: float) -> np.ndarray:
+        """Choose the fine copy where it is not clipped, else the coarse one."""
+        fine, coarse = np.split(result, self.copies, axis=1)
+        return _in_dual_range(fine, coarse, scale)
+
+    def write(self, w: HostWriter, feeds: list[str], outputs: int, scale: float) -> None:
+        """Write the nodes that choose the fine or the coarse copy."""
+        both = w.node("DequantizeLinear", "host_back.both", feeds)
+        name = "one_each" if outputs == 1 else "channels_each"
+        analytic = [f"host_back.analytic_{k}" for k in range(self.copies - 2)]
+        names = ["host_back.fine", "host_back.coarse", *analytic]
+        w.split(both, w.constant(name, np.full(self.copies, outputs)), names)
+        wide = w.node("Mul", "host_back.wide", [names[1], w.scalar("gain", GAIN)])
+        size = w.node("Abs", "host_back.size", names[:1])
+        limit = w.scalar("fine_max", _fine_limit(scale))
+        fits = w.node("LessOrEqual", "host_back.fits", [size, limit])
+        w.node("Where", self._chosen, [fits, names[0], wide])
+
+    def constants(self, scale: float) -> Constants:
+        """Return the limit of the fine copy, and the gain of the coarse one."""
+        return {"decoding": "dual range", "fine_max": _fine_limit(scale), "gain": GAIN}
+
+
+@dataclass(frozen=True)
+class OffsetWindows(Plain):
+    """A coarse copy, then fine ones less an offset each: windows side by side over the range."""
+
+    finer_bits = GAIN.bit_length() - 1
+
+    @property
+    def gains(self) -> tuple[int, ...]:
+        """What the host multiplies each copy with."""
+        return (GAIN, *[1] * len(self.offsets))
+
+    def never_replaced(self, outputs: int) -> slice:
+        """Return the channels of the coarse copy."""
+        return slice(outputs)
+
+    def with_bias_errors(self, errors: np.ndarray) -> "OffsetWindows":
+        """Return a decoding with the errors of the fine copies in its offsets."""
+        # The coarse copy comes first, and the host adds no offset to it.
+        fine = errors.reshape(self.copies, -1)[1:]
+        return OffsetWindows(tuple(map(tuple, (np.array(self.offsets) + fine).tolist())))
+
+    def decode(self, result: np.ndarray, scale: float) -> np.ndarray:
+        """Choose the last window that holds a value, and the coarse copy where none does."""
+        coarse, *windows = np.split(result, self.copies, axis=1)
+        value = coarse * np.float32(GAIN)
+        for window, offset in zip(windows, np.array(self.offsets, np.float32), strict=True):
+            value = np.where(_is_fine(window, scale), window + offset[:, None, None], value)
+        return value
+
+    def write(self, w: HostWriter, feeds: list[str], outputs: int, scale: float) -> None:
+        """Write the nodes that choose the last window that holds a value."""
+        every = w.node("DequantizeLinear", "host_back.all", feeds)
+        names = [f"host_back.window_{k}" for k in range(self.copies)]
+        sizes = w.constant("channels_each", np.full(self.copies, outputs))
+        w.split(every, sizes, names)
+        value = w.node("Mul", "host_back.wide", [names[0], w.scalar("gain", GAIN)])
+        limit = w.scalar("fine_max", _fine_limit(scale))
+        for k, (name, offset) in enumerate(zip(names[1:], self.offsets, strict=True)):
+            added = w.constant(f"offset_{k}", np.array(offset, np.float32)[None, :, None, None])
+            size = w.node("Abs", f"{name}.size", [name])
+            inside = w.node("LessOrEqual", f"{name}.inside", [size, limit])
+            moved = w.node("Add", f"{name}.value", [name, added])
+            result = DECODED if k + 1 == len(self.offsets) else f"{name}.chosen"
+            value = w.node("Where", result, [inside, moved, value])
+
+    def constants(self, scale: float) -> Constants:
+        """Return the limit of the fine copies, the gain of the coarse one, and the offsets."""
+        return {
+            "decoding": "offset windows",
+            "fine_max": _fine_limit(scale),
+            "gain": GAIN,
+            "offsets": self.offsets,
+        }
+
+
+@dataclass(frozen=True)
+class BankSum(DualRange):
+    """The correction in dual range, plus the sum of copies of a bank's analytic restoration.
+
+    Attributes:
+        coarse_copies: 1 if the last analytic copy is coarse by `WIDE`, for values at which the
+            others are clipped, else 0.
+    """
+
+    coarse_copies: int = 0
+    _chosen = "host_back.chosen"
+
+    @property
+    def copies(self) -> int:
+        """How often the core writes each channel."""
+        return len(self.gains) + ANALYTIC_COPIES
+
+    @property
+    def fine_copies(self) -> int:
+        """The number of fine analytic copies."""
+        return ANALYTIC_COPIES - self.coarse_copies
+
+    def _fine_gain(self, scale: float) -> float:
+        """Return the factor of the sum of the fine analytic copies."""
+        # The copies have steps of their own, whatever scale the core states for its result.
+        return 1 / (UNIT_STEPS * self.fine_copies * scale)
+
+    def _coarse_gain(self, scale: float) -> float:
+        """Return the factor of the coarse analytic copy; 0 if there is none."""
+        return self.coarse_copies * WIDE / (UNIT_STEPS * scale)
+
+    def decode(self, result: np.ndarray, scale: float) -> np.ndarray:
+        """Add the correction and the analytic restoration."""
+        fine, coarse, *analytic = np.split(result, self.copies, axis=1)
+        fine_sum = np.sum(analytic[: self.fine_copies], 0) * np.float32(self._fine_gain(scale))
+        if self.coarse_copies:
+            # The fine copies differ by at most one step, so one of them tells for all.
+            coarse_value = analytic[-1] * np.float32(self._coarse_gain(scale))
+            fine_sum = np.where(_is_fine(analytic[0], scale), fine_sum, coarse_value)
+        return np.asarray(_in_dual_range(fine, coarse, scale) + fine_sum)
+
+    def write(self, w: HostWriter, feeds: list[str], outputs: int, scale: float) -> None:
+        """Write the nodes that add the correction and the analytic restoration."""
+        super().write(w, feeds, outputs, scale)
+        analytic = [f"host_back.analytic_{k}" for k in range(ANALYTIC_COPIES)]
+        fine_sum = w.node("Sum", "host_back.analytic", analytic[: self.fine_copies])
+        gain = w.scalar("analytic_gain", self._fine_gain(scale))
+        added = w.node("Mul", "host_back.added", [fine_sum, gain])
+        if self.coarse_copies:
+            size = w.node("Abs", "host_back.analytic_size", [analytic[0]])
+            limit = w.scalar("analytic_max", _fine_limit(scale))
+            fits = w.node("LessOrEqual", "host_back.analytic_fits", [size, limit])
+            coarse_gain = w.scalar("coarse_gain", self._coarse_gain(scale))
+            far = w.node("Mul", "host_back.far", [analytic[-1], coarse_gain])
+            added = w.node("Where", "host_back.reached", [fits, added, far])
+        w.node("Add", DECODED, [self._chosen, added])
+
+    def constants(self, scale: float) -> Constants:
+        """Return the constants of the dual range, and those of the analytic copies."""
+        return {
+            **super().constants(scale),
+            "decoding": "bank sum",
+            "fine_copies": self.fine_copies,
+            "fine_gain": self._fine_gain(scale),
+            "coarse_gain": self._coarse_gain(scale),
+        }
+
+
+def _fine_limit(scale: float) -> float:
+    """Return the largest value of a fine copy that counts; half a unit keeps float error out."""
+    return (FINE_MAX + 0.5) * scale
+
+
+def _is_fine(copy: np.ndarray, scale: float) -> np.ndarray:
+    """Return where a fine copy is not clipped."""
+    return np.asarray(np.abs(copy) <= np.float32(_fine_limit(scale)))
+
+
+def _in_dual_range(fine: np.ndarray, coarse: np.ndarray, scale: float) -> np.ndarray:
+    """Choose the fine copy where it is not clipped, else the coarse one."""
+    return np.where(_is_fine(fine, scale), fine, coarse * np.float32(GAIN))

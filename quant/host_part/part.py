@@ -1,0 +1,184 @@
+"""The host's part of an INT8 network: both sides of the integer core, in NumPy and as ONNX nodes.
+
+image -> pixel unshuffle -> encoding -> core -> decoding -> pixel shuffle -> + image
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from onnx import TensorProto
+
+from beers_deploy.quant.graph import (
+    CORRECTION,
+    IMAGE,
+    PLANES,
+    Shuffle,
+    SplitNetwork,
+    channels_of,
+)
+from beers_deploy.quant.graph.writer import write_shuffle
+from beers_deploy.quant.host_part.input_encoding import ENCODED, IMAGE_SLICES, InputEncoding
+from beers_deploy.quant.host_part.output_decoding import DECODED, OutputDecoding, Plain
+from beers_deploy.quant.host_part.writer import ZERO, HostWriter
+
+
+@dataclass(frozen=True)
+class HostPart:
+    """The host's part of an INT8 network.
+
+    Attributes:
+        channels: of the image behind `front`.
+        outputs: channels of the decoded result.
+        front: pixel unshuffles of the image.
+        back: pixel shuffles of the decoded result.
+        adds_image: if True, the image is added to the result, and the sum clipped to [0, 1].
+        last: pixel shuffles of the sum.
+        unit: the share of full scale that is 1 in the decoded result.
+        encoding: of the image for the core.
+        decoding: of the core's result.
+    """
+
+    channels: int = 1
+    outputs: int = 1
+    front: tuple[Shuffle, ...] = ()
+    back: tuple[Shuffle, ...] = ()
+    adds_image: bool = True
+    last: tuple[Shuffle, ...] = ()
+    unit: float = 1.0
+    encoding: InputEncoding = IMAGE_SLICES
+    decoding: OutputDecoding = field(default_factory=Plain)
+
+    @classmethod
+    def of(cls, network: SplitNetwork, decoding: OutputDecoding) -> "HostPart":
+        """Return the host's part of a float network that reads the image, for a decoding."""
+        channels = network.core_channels
+        return cls(
+            channels,
+            channels_of(network.graph, {IMAGE: channels})[CORRECTION],
+            network.front,
+            network.back,
+            network.adds_image,
+            network.last,
+            decoding=decoding,
+        )
+
+    @property
+    def planes(self) -> int:
+        """The number of int8 planes that the core reads."""
+        return self.encoding.planes * self.channels
+
+    @property
+    def border_px(self) -> int:
+        """The number of pixels by which the image is mirrored beyond its borders."""
+        # Rounded up, so that pixel unshuffling divides the image into the same places as before.
+        return -(-self.encoding.margin_px // self.place_px) * self.place_px
+
+    @property
+    def image_channels(self) -> int:
+        """The number of channels of the image in front of `front`."""
+        return self.channels // self.place_px**2
+
+    @property
+    def place_px(self) -> int:
+        """The side in pixels of the square of the image that is one place of the core's planes."""
+        return math.prod(shuffle.block for shuffle in self.front)
+
+    @property
+    def correction_px(self) -> int:
+        """The side in pixels of the square of the sum that is one place of the core's result."""
+        return math.prod(shuffle.block for shuffle in self.back)
+
+    def encode(self, image: np.ndarray) -> np.ndarray:
+        """Encode an image (N, C, H, W) in [0, 1] as the core's planes, int8."""
+        if self.border_px:
+            image = np.pad(image, ((0, 0), (0, 0), *[(self.border_px,) * 2] * 2), "reflect")
+        for shuffle in self.front:
+            image = shuffle(image)
+        return self.encoding.encode(image)
+
+    def decode(self, result: np.ndarray, scale: float) -> np.ndarray:
+        """Decode the core's result, multiples of `scale`, in shares of full scale (N, C, H, W)."""
+        return np.asarray(self.decoding.decode(result, scale) * np.float32(self.unit))
+
+    def unrounded(self, result: np.ndarray) -> np.ndarray:
+        """Decode a float result (N, copies C, H, W), in which no copy is rounded or clipped."""
+        return result[:, : self.outputs] * np.float32(self.decoding.gains[0])
+
+    def restore(self, image: np.ndarray, result: np.ndarray, scale: float) -> np.ndarray:
+        """Return the restored image of an image (N, C, H, W) and the core's result."""
+        return self.finish(image, self.decode(result, scale))
+
+    def finish(self, image: np.ndarray, decoded: np.ndarray) -> np.ndarray:
+        """Return the restored image of an image (N, C, H, W) and a decoded result."""
+        result = decoded
+        for shuffle in self.back:
+            result = shuffle(result)
+        result = self.clip(image + result) if self.adds_image else result
+        for shuffle in self.last:
+            result = shuffle(result)
+        return result
+
+    def correction_of(self, image: np.ndarray, restored: np.ndarray) -> np.ndarray:
+        """Return the decoded result from which `finish` makes this restored image, if not clipped.
+
+        It is the inverse of `finish`, from its last step to its first.
+        """
+        result = restored
+        for shuffle in reversed(self.last):
+            result = shuffle.inverse(result)
+        result = result - image if self.adds_image else result
+        for shuffle in reversed(self.back):
+            result = shuffle.inverse(result)
+        return np.ascontiguousarray(result)
+
+    def clip(self, result: np.ndarray) -> np.ndarray:
+        """Clip a float network's result to [0, 1] if the host clips its own."""
+        return np.clip(result, 0, 1) if self.adds_image else result
+
+    def write_front(self, w: HostWriter) -> None:
+        """Write the nodes in front of the core, from the image to planes in uint8."""
+        image = IMAGE
+        channels = self.image_channels
+        if self.border_px:
+            around = w.constant("border_px", np.array([0, 0, self.border_px, self.border_px] * 2))
+            image = w.node("Pad", "host_front.widened", [image, around], mode="reflect")
+        for k, shuffle in enumerate(self.front):
+            write_shuffle(w, shuffle, image, f"host_front.shuffled_{k}", channels)
+            image = f"host_front.shuffled_{k}"
+            channels = channels * shuffle.block**2
+        self.encoding.write(w, image)
+        w.node("Add", "host_front.offset", [ENCODED, w.scalar("offset", ZERO)])
+        w.node("Cast", PLANES, ["host_front.offset"], to=TensorProto.UINT8)
+
+    def write_back(self, w: HostWriter, feeds: list[str], scale: float) -> None:
+        """Write the nodes behind the core, from its result to `restored`.
+
+        Args:
+            w: gets the nodes.
+            feeds: the names of the result in uint8, of its scale and of its zero point.
+            scale: the value of one unit of the result.
+        """
+        self.decoding.write(w, feeds, self.outputs, scale)
+        result = DECODED
+        for k, shuffle in enumerate(self.back):
+            write_shuffle(w, shuffle, result, f"host_back.shuffled_{k}")
+            result = f"host_back.shuffled_{k}"
+        if self.unit != 1:
+            result = w.node("Mul", "host_back.in_units", [result, w.scalar("unit", self.unit)])
+        if not self.adds_image:
+            # The file's output is named `restored`, whatever the node in front of it.
+            w.node("Identity", "restored", [result], name="host_back.result")
+            return
+        w.node("Add", "host_back.add", [IMAGE, result])
+        limits = [w.scalar("zero", 0), w.scalar("one", 1)]
+        name = "host_back.clipped" if self.last else "restored"
+        w.node("Clip", name, ["host_back.add", *limits], name="host_back.clip")
+        for k, shuffle in enumerate(self.last):
+            result = name
+            name = "restored" if k + 1 == len(self.last) else f"host_back.last_{k}"
+            write_shuffle(w, shuffle, result, name)
+
+
+ONE_CHANNEL = HostPart()
+"""Of an image of one channel, to which the core's plain result is added."""

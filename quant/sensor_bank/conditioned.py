@@ -1,0 +1,213 @@
+"""An INT8 network behind a bank, calibrated over a range of sensors and conditioned on one later.
+
+    planes -> bank 7 x 7 (the sensor's) -> head, blocks, end, tail -> correction, fine and coarse
+                                        -> analytic restoration, in four copies
+
+All weights and scales behind the bank are the same for every sensor. What the body reads and
+computes is finer by the sensor's gain (`Bank.gain`), so its biases are multiplied with that, and
+the unit of the result is divided by it: ReLU and sums pass a positive factor on. The filters of a
+sensor, its unit and the biases are computed in milliseconds.
+"""
+
+import json
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from io import BytesIO
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+
+from beers_deploy.model.bank import Bank
+from beers_deploy.model.variants import SENSOR_VALUES, Kernels
+from beers_deploy.profiles.errors import ModelError, printable
+from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, Shifts, quantize_bias
+from beers_deploy.quant.encodings import read_core
+from beers_deploy.quant.graph import PLANES, Op
+from beers_deploy.quant.host_part import BankSum
+from beers_deploy.quant.onnx_file import metadata
+from beers_deploy.quant.sensor_bank.filters import BITS, integer_bank
+from beers_deploy.quant.untrusted import DAMAGE, contradictions
+
+WEIGHTS = "weights_sha256"
+"""The key of the SHA-256 of the float weights, in the metadata of an INT8 network behind a bank."""
+SENSOR_BIASES = "family"
+"""The key of `ConditionedCore.biases`, in the same metadata."""
+
+BANK = "bank"
+"""The tensor between a sensor's filters and the layers that are the same for all."""
+
+
+@dataclass(frozen=True)
+class ConditionedCore:
+    """The core of a network behind a bank, and what it needs for another sensor.
+
+    Attributes:
+        core: for the middle of the range of sensors, or for the sensor of the file that it is from.
+        biases: of the convolutions behind the bank, by name, at a gain of 1: (O, 1), and for those
+            that read the bank (O, 5), the bias for the middle of the range and what each value of a
+            sensor vector adds.
+        shifts: the windows of the target.
+    """
+
+    core: IntCore
+    biases: Mapping[str, np.ndarray]
+    shifts: Shifts = SHIFTS
+
+    @property
+    def kernels(self) -> Kernels:
+        """The kind of the bank's kernels."""
+        # Only behind fitted kernels does the analytic restoration have a coarse copy.
+        return "fitted" if self.core.host_part.decoding == BankSum(coarse_copies=1) else "cut"
+
+    def for_sensor(self, bank: Bank, vector: Sequence[float]) -> IntCore:
+        """Return the core for one sensor, from its bank and its sensor vector (4,)."""
+        gain = bank.gain
+        # ReLU and sums pass a positive factor on, so of the body only biases grow.
+        values = gain * np.array([1.0, *vector])
+        ops = tuple(self._conditioned(op, bank, values) for op in self.core.ops)
+        # The host takes the gain off again; in float32, as its file stores the unit.
+        unit = float(np.float32(bank.unit / gain))
+        return replace(self.core, ops=ops, host_part=replace(self.core.host_part, unit=unit))
+
+    def _conditioned(
+        self, op: IntConv | Op, bank: Bank, values: NDArray[np.float64]
+    ) -> IntConv | Op:
+        if isinstance(op, IntConv) and op.input == PLANES:
+            return bank_layer(bank, self.core.host_part.place_px, self.shifts, self.kernels)
+        if not (isinstance(op, IntConv) and op.name in self.biases):
+            return op
+        terms = self.biases[op.name]
+        product = op.weight_frac_bits + self.core.frac_bits[op.input]
+        # Only the convolution behind the bank has a term for each of the sensor's values.
+        bias, bits = quantize_bias(terms @ values[: terms.shape[1]], product, self.shifts)
+        return replace(op, bias=bias, bias_frac_bits=bits)
+
+    def biases_to_json(self) -> str:
+        """Return the biases as JSON, for the metadata of a file."""
+        return json.dumps({name: values.tolist() for name, values in self.biases.items()})
+
+
+def conditioned_core(model: onnx.ModelProto) -> ConditionedCore | None:
+    """Read the conditioned core of an INT8 file; None if the file has none.
+
+    Raises:
+        ModelError: a damaged file.
+    """
+    text = metadata(model).get(SENSOR_BIASES)
+    if text is None:
+        return None
+    with contradictions("the INT8 network"):
+        core = read_core(model)
+        record = json.loads(text)
+        biases = {str(name): np.array(values, np.float64) for name, values in record.items()}
+        # The file is not trusted: its biases must fit its own convolutions.
+        shapes = {
+            op.name: (len(op.bias), 1 + SENSOR_VALUES * (op.input == BANK))
+            for op in core.convolutions
+            if op.name in biases
+        }
+        if {name: values.shape for name, values in biases.items()} != shapes:
+            raise ValueError("the biases do not fit its convolutions")
+        return ConditionedCore(core, biases)
+
+
+def required_conditioned_core(model: onnx.ModelProto) -> ConditionedCore:
+    """Read the conditioned core of an INT8 file, or raise ModelError if the file has none."""
+    conditioned = conditioned_core(model)
+    if conditioned is None:
+        raise ModelError(
+            "The INT8 network cannot be conditioned on a sensor. Make one that can with "
+            "'beers-deploy quantize', from weights that 'beers-deploy train --conditioned' wrote."
+        )
+    return conditioned
+
+
+def bank_layer(bank: Bank, scale: int, shifts: Shifts, kernels: Kernels) -> IntConv:
+    """Return the first convolution of a network of that scale, for one sensor."""
+    integers = integer_bank(bank, scale, bank.gain, kernels)
+    # The offsets put each copy of a result at another place of a rounding step.
+    bias = quantize_bias(integers.offsets * 2.0**-BITS, integers.frac_bits + BITS, shifts)
+    return IntConv("bank", PLANES, BANK, integers.weight, integers.frac_bits, *bias)
+
+
+def delta_of_file(model: onnx.ModelProto) -> bytes:
+    """Return what the sensor of an INT8 file has changed in it, for `with_delta`.
+
+    It is a line of JSON and the int8 numbers of each convolution that the line names, compressed.
+    """
+    conditioned = required_conditioned_core(model)
+    core = conditioned.core
+    bits = dict[str, tuple[int, int]]()
+    arrays = list[np.ndarray]()
+    for op in core.convolutions:
+        if op.input == PLANES or op.name in conditioned.biases:
+            bits[op.name] = (op.weight_frac_bits, op.bias_frac_bits)
+            # Only the bank's weights depend on the sensor.
+            arrays += [op.weight, op.bias] if op.input == PLANES else [op.bias]
+    unit = core.host_part.unit
+    header = {"sensor": metadata(model).get("sensor", ""), "unit": unit, "bits": bits}
+    numbers = b"".join(values.astype(np.int8).tobytes() for values in arrays)
+    # JSON without indent holds no line break, so the first one in a delta ends its header.
+    line = json.dumps(header, separators=(",", ":")).encode()
+    return zlib.compress(line + b"\n" + numbers, 9)
+
+
+def with_delta(core: IntCore, delta: bytes, where: str = "The delta") -> tuple[IntCore, str]:
+    """Return a core conditioned on the sensor of a delta, and that sensor's name.
+
+    Args:
+        core: of the network that the delta was made for.
+        delta: its bytes.
+        where: what messages call it, at their beginning.
+
+    Raises:
+        ModelError: damaged bytes, or a delta of another network.
+    """
+    try:
+        # The limit keeps a small delta from being unpacked to any size.
+        content = zlib.decompressobj().decompress(delta, LARGEST_DELTA)
+        line, _, numbers = content.partition(b"\n")
+        header = json.loads(line)
+        stream = BytesIO(numbers)
+        bits = dict(header["bits"])
+        ops = list[IntConv | Op]()
+        for op in core.ops:
+            if isinstance(op, IntConv) and op.name in bits:
+                weight_bits, bias_bits = map(int, bits.pop(op.name))
+                op = replace(
+                    op,
+                    weight=_read_like(op.weight, stream) if op.input == PLANES else op.weight,
+                    bias=_read_like(op.bias, stream),
+                    weight_frac_bits=weight_bits,
+                    bias_frac_bits=bias_bits,
+                )
+            ops.append(op)
+        if bits:
+            raise KeyError(*bits)
+        # A network of the same names and smaller layers takes fewer bytes.
+        if stream.read(1):
+            raise ValueError("too many bytes")
+        host_part = replace(core.host_part, unit=float(header["unit"]))
+        return replace(core, ops=tuple(ops), host_part=host_part), str(header["sensor"])
+    except (zlib.error, *DAMAGE) as error:
+        reason = printable(" ".join(f"{type(error).__name__}: {error}".split()))
+        fault = (
+            "is damaged"
+            if isinstance(error, zlib.error)
+            else f"belongs to another network ({reason})"
+        )
+        raise ModelError(
+            f"{where} {fault}. Give a file that 'beers-deploy export --delta' wrote for the same "
+            "network."
+        ) from error
+
+
+LARGEST_DELTA = 1 << 20
+"""In bytes, of the unpacked content."""
+
+
+def _read_like(values: np.ndarray, stream: BytesIO) -> np.ndarray:
+    """Read int8 numbers of the shape of `values`, or raise ValueError if there are too few."""
+    return np.frombuffer(stream.read(values.size), np.int8).reshape(values.shape)

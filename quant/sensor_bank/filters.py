@@ -1,0 +1,186 @@
+"""The integer bank of a sensor: the first convolution of an INT8 network, from the sensor alone.
+
+The image enters in the planes of `host_part.BANK_SLICES`: steps of 16 digital numbers (DN) about
+the middle, twice, their remainder, and half of that for finer weights. The first two share a
+filter's weights, which may therefore be twice as large: half the rounding error. Weights are
+rounded so that they sum to exactly 0, because flat ground must give 0, and so that their errors lie
+where natural images have little energy.
+
+The results of the filters are int8 in steps of 1/24 of a unit of a sensor whose noise is
+`model.bank.SIGMA`. A sensor's own steps are the same share of full scale, within limits
+(`Bank.gain`): the strongest edges are a share of full scale, not of noise, so that noisy sensors
+can have finer steps in their units. Each result comes in several copies, rounded at other places of
+a step: together they are more precise than one. The image itself comes in steps of 32 / gain, about
+the middle.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beers_deploy.model.bank import FILTERS, SIDE_PX, UNIT_STEPS, WIDE, Bank, in_places
+from beers_deploy.model.variants import Kernels
+from beers_deploy.profiles.instrument import MAX_DN
+from beers_deploy.quant.host_part import BANK_SLICES
+
+STEP_DN = BANK_SLICES.step
+PART = BANK_SLICES.part
+IMAGE_STEP_DN = 32
+
+BITS = 7
+"""Fractional bits that a result is stated to have: int8 then stands for -1 to 1, which is 5.3 units
+or half of full scale.
+"""
+
+LARGEST = 2 * 124
+"""Of the sum of two coarse weights before they are rounded: the corrections that make weights sum
+to 0 and copies complete each other still fit int8.
+"""
+
+COPIES = (1, 2, 7)
+"""Of the image, of each filter, and of the analytic restoration: 16 channels for each pixel of a
+place.
+"""
+
+GRID_BITS = 16
+"""Fractional bits of the numbers that weights are fitted with: weights are below 2^8, a covariance
+is at most 1, and 49 products are added, so that float64 holds all sums exactly.
+"""
+
+REACH_PX = 30.0
+"""The correlation of pixels of natural images falls to 1 / e within this distance."""
+
+
+@dataclass(frozen=True)
+class IntegerBank:
+    """The first convolution in integers.
+
+    Attributes:
+        weight: (O, 4 S^2, k, k) int8 for the planes of an image, all of one kind together.
+        frac_bits: by which a sum of products is shifted to become int8.
+        offsets: (O,) what each channel adds before it is rounded, in steps.
+    """
+
+    weight: NDArray[np.int8]
+    frac_bits: int
+    offsets: NDArray[np.float64]
+
+
+def coarse_copies(kernels: Kernels) -> int:
+    """Return how many copies of the analytic restoration are coarse by `WIDE`.
+
+    Behind fitted kernels it is the last one, for values at which the others are clipped.
+    """
+    return int(kernels == "fitted")
+
+
+def channels(kernels: Kernels = "fitted") -> list[tuple[int, float]]:
+    """Return the index of the kernel and the offset in steps of each output, for one pixel."""
+    coarse = coarse_copies(kernels)
+    copies = [COPIES[0], *[COPIES[1]] * FILTERS, COPIES[2] - coarse, coarse]
+    outputs = list[tuple[int, float]]()
+    for kernel, count in enumerate(copies):
+        outputs += [(kernel, offset) for offset in spread_over_a_step(count)]
+    return outputs
+
+
+def spread_over_a_step(count: int) -> list[float]:
+    """Return the offsets of `count` copies before they are rounded, in steps; their mean is 0."""
+    return [(k + 0.5) / count - 0.5 for k in range(count)]
+
+
+def integer_bank(bank: Bank, scale: int, gain: float, kernels: Kernels = "fitted") -> IntegerBank:
+    """Quantise a bank for a network of that scale, in steps finer by `gain`."""
+    steps = np.concatenate([bank.kernels, bank.kernels[-1:] / WIDE])
+    # The kernels multiply shares of full scale, but the planes hold digital numbers.
+    steps *= gain * UNIT_STEPS / MAX_DN
+    # The image comes in steps of its own.
+    steps[0] *= MAX_DN / UNIT_STEPS / IMAGE_STEP_DN
+    # A tensor has one scale, which the largest of all coarse weights sets.
+    frac_bits = int(np.floor(np.log2(LARGEST / np.abs(STEP_DN * steps).max())))
+    exact = steps * 2.0**frac_bits
+    residual = np.zeros_like(exact)
+    weights = list[NDArray[np.int64]]()
+    # Each further copy of a kernel makes up for the rounding errors of those before it.
+    for kernel, _ in channels(kernels):
+        weight = _of_filter(exact[kernel] + residual[kernel]) if kernel else _of_image(exact[0])
+        weights.append(weight)
+        # The two coarse planes carry nearly all of a number; the others only the remainder.
+        residual[kernel] += exact[kernel] - (weight[0] + weight[1]) / STEP_DN
+    by_plane = np.stack(weights).astype(np.float64)
+    planes = [in_places(by_plane[:, plane], scale) for plane in range(BANK_SLICES.planes)]
+    offsets = [offset for _, offset in channels(kernels)]
+    return IntegerBank(
+        np.concatenate(planes, 1).astype(np.int8), frac_bits, np.repeat(offsets, scale**2)
+    )
+
+
+def _of_image(kernel: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return weights (4, 7, 7) for the image in its own steps, from the coarse planes only."""
+    none = np.zeros(kernel.shape, np.int64)
+    coarse = np.rint(STEP_DN * kernel).astype(np.int64)
+    return np.stack([*_halves(coarse), none, none])
+
+
+def _halves(weight: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return two integers of each weight, which add up to it."""
+    # The coarse plane comes twice, so a weight of twice int8's size fits.
+    return weight // 2, weight - weight // 2
+
+
+def _of_filter(kernel: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return weights (4, 7, 7) for a kernel (7, 7) of sum 0 that multiplies digital numbers."""
+    coarse = shaped(STEP_DN * kernel.ravel())
+    # The last plane holds half of the remainder, so this grid is twice as fine.
+    fine = shaped(PART * kernel.ravel())
+    # Their sum is 0, so the number of odd weights is even.
+    odd = np.flatnonzero(fine % PART)
+    parts = np.zeros_like(fine)
+    # One up, one down: the weights of each plane sum to 0, and flat ground gives 0.
+    parts[odd[::2]] = 1
+    parts[odd[1::2]] = -1
+    weight = np.stack([*_halves(coarse), (fine - parts) // PART, parts])
+    return weight.reshape(BANK_SLICES.planes, *kernel.shape)
+
+
+def shaped(values: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Round values (49,) to integers of sum 0 whose errors natural images hardly show.
+
+    The error is e^T C e, with C the covariance of natural images. From the nearest integers, made
+    to sum to 0, one is raised and another lowered as long as that lowers the error. All sums are
+    exact, so that every processor finds the same integers.
+    """
+    exact = _on_grid(values)
+    weight = np.rint(exact)
+    # The weights that were rounded furthest in the direction of the excess give up one each.
+    while (excess := int(weight.sum())) != 0:
+        error = (weight - exact) * np.sign(excess)
+        weight[np.argsort(-error, kind="stable")[: abs(excess)]] -= np.sign(excess)
+    slope = COVARIANCE @ (weight - exact)
+    curve = np.diag(COVARIANCE)
+    pair = curve[:, None] + curve[None, :] - 2 * COVARIANCE
+    while True:
+        # By how much e^T C e changes when the row's weight is raised and the column's lowered.
+        change = 2 * (slope[:, None] - slope[None, :]) + pair
+        np.fill_diagonal(change, 0)
+        up, down = np.unravel_index(np.argmin(change), change.shape)
+        if change[up, down] >= 0:
+            return np.asarray(weight.astype(np.int64))
+        weight[up] += 1
+        weight[down] -= 1
+        slope += COVARIANCE[up] - COVARIANCE[down]
+
+
+def _covariance() -> NDArray[np.float64]:
+    places = np.indices((SIDE_PX, SIDE_PX)).reshape(2, -1).T
+    distance = np.linalg.norm(places[:, None] - places[None, :], axis=-1)
+    return _on_grid(np.exp(-distance / REACH_PX))
+
+
+def _on_grid(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Round to so few bits that sums of 49 products are exact in float64, in any order."""
+    return np.asarray(np.rint(np.ldexp(values, GRID_BITS)) / 2**GRID_BITS)
+
+
+COVARIANCE = _covariance()
