@@ -19,7 +19,7 @@ import beers_deploy as bd
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.restoration.sensor_check import check_source
+from beers_deploy.restoration.sensor_check.check import check_source
 from beers_deploy.studies.evaluation.methods import profile_of
 from benchmarks.acquisitions import acquired, as_source, draw_sensor, photographs, texture
 

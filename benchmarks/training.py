@@ -20,7 +20,7 @@ from beers_deploy.model.family import SensorFamily
 from beers_deploy.model.processor import processor_name
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.training.checkpoint import TrainingRecipe
-from beers_deploy.model.training.looks import VARIED
+from beers_deploy.model.training.looks import Looks
 from beers_deploy.model.training.losses import LossWeights
 from beers_deploy.model.training.patches import PatchRecipe
 from beers_deploy.model.training.source import Batch, PatchSource
@@ -40,7 +40,12 @@ def patch_recipes() -> dict[str, PatchRecipe]:
     varied = replace(family, other_curves=0.4)
     return {
         "of photographs": plain,
-        "varied": replace(plain, family=varied, looks=VARIED, noisy_reference=False),
+        "varied": replace(
+            plain,
+            family=varied,
+            looks=Looks(lit_share=0.4, calm_share=0.3, soft_share=0.3),
+            noisy_reference=False,
+        ),
     }
 
 

@@ -11,10 +11,10 @@ from beers_deploy.model.exposure import brightened, factors_for
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.tensors import is_conditioned, read_conditioned, read_plain
 from beers_deploy.model.shipped import SENSOR, SHIPPED
-from beers_deploy.network import Network, SensorLike
+from beers_deploy.network import Network
 from beers_deploy.network_files import int8_for_delta, int8_for_sensor, warn_outside
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.encodings import host_model, read_core
 from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx

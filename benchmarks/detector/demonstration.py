@@ -13,8 +13,9 @@ import numpy as np
 
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.detection.detector import open_detector
+from beers_deploy.studies.detection.page import write_page
 from beers_deploy.studies.detection.study import LabelledScene, run_study
-from beers_deploy.studies.detection.table import detection_table
+from beers_deploy.studies.detection.tables import detection_table
 from beers_deploy.studies.evaluation.methods import DEGRADED
 from benchmarks.detector.network import DETECTOR
 from benchmarks.detector.scenes import synthetic_scene
@@ -53,7 +54,9 @@ def main() -> None:
     methods = [DEGRADED, *arguments.methods.split(",")]
     compared = run_study(detector, scenes, sensors, methods, seed=arguments.seed)
     notes = [f"The {len(scenes)} scenes are synthetic, each a site of its own: no photographs."]
-    table = detection_table(compared, DETECTOR, detector, scenes, notes, arguments.out)
+    table = detection_table(compared, DETECTOR, detector, scenes, notes)
+    if arguments.out is not None:
+        write_page(compared, table, arguments.out / "report.html")
     table.print()
     if arguments.json is not None:
         replace(table, command="demonstration", arguments=vars(arguments)).save(arguments.json)

@@ -17,6 +17,7 @@ from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.gate import Spread
 from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, save_onnx
+from beers_deploy.quant.sensitivity import kind_of_error
 from beers_deploy.quantization import steps_of
 from beers_deploy.report.plots import FONT_PX, MOST_BARS, bins, histogram_url
 from tests.deploy.command_line import done
