@@ -88,11 +88,11 @@ def main() -> None:
             for name, make in PROFILES.items():
                 other = make(sensor)
                 check = check_source(as_source(image), [other], other.nominal().max_dn)
-                warnings[f"{kind} | {name}"] += bool(check.doubts)
+                warnings[f"{kind} | {name}"] += bool(check.warnings)
             for name, pixels in changed(image, sensor):
                 other_image = np.rint(pixels).astype(np.uint16)
                 check = check_source(as_source(other_image), [profile(sensor)], sensor.max_dn)
-                warnings[f"{kind} | {name}"] += bool(check.doubts)
+                warnings[f"{kind} | {name}"] += bool(check.warnings)
     print(f"| image | stated or done | warnings in {arguments.acquisitions} |\n|---|---|---|")
     for name, count in warnings.items():
         print(f"| {name} | {count} |")

@@ -38,12 +38,13 @@ def patch_recipes() -> dict[str, PatchRecipe]:
     family = SensorFamily(sensors[0].nominal())
     plain = PatchRecipe(*sensors, PATCH_PX, family=family)
     varied = replace(family, other_curves=0.4)
+    looks = Looks(lit_share=0.4, calm_share=0.3, soft_share=0.3)
     return {
         "of photographs": plain,
         "varied": replace(
             plain,
             family=varied,
-            looks=Looks(lit_share=0.4, calm_share=0.3, soft_share=0.3),
+            looks=looks,
             noisy_reference=False,
         ),
     }

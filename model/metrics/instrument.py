@@ -142,7 +142,7 @@ def axis_curves(
     generator = np.random.default_rng(SEED)
     across, along = (_narrow(measure(edges[axis], generator)) for axis in AXES)
     if isinstance(across, MtfCurve) and isinstance(along, MtfCurve):
-        across, along = apart(across, along), apart(along, across)
+        return {"across": apart(across, along), "along": apart(along, across)}
     return {"across": across, "along": along}
 
 

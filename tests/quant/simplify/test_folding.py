@@ -77,7 +77,8 @@ def test_what_works_on_each_channel_is_folded_into_convolutions(parts: list[str]
     tensors = ["x", *(f"t{k}" for k in range(1, len(parts))), "y"]
     model = made([PARTS[part](*tensors[k : k + 2]) for k, part in enumerate(parts)])
     short = simplify(model, "a.onnx")
-    (before,), (after,) = results(model), results(short)
+    (before,) = results(model)
+    (after,) = results(short)
     np.testing.assert_allclose(after, before, rtol=0, atol=1e-5 * max(np.abs(before).max(), 1))
     kind = {tensor: n.op_type for n in short.graph.node for tensor in n.output}
     assert "BatchNormalization" not in kind.values()
