@@ -218,9 +218,10 @@ def write_dataset(
     Returns:
         patches, and the share of drawn SNR pairs that were impossible and drawn again.
     """
+    # First of all, so that a scene that cannot be read is refused before anything is written.
+    windows = plan_windows(recipe)
     _check_folder(recipe, out, resume)
     _remove_left_overs(out)
-    windows = plan_windows(recipe)
     manifest = out / "manifest.jsonl"
     parts = {out / "parts" / f"{chunk[0].number:08d}.jsonl": chunk for chunk in _chunks(windows)}
     lines = _lines_left(recipe, out, windows, parts) if resume else {}

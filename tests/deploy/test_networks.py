@@ -127,7 +127,8 @@ def test_a_value_outside_the_training_is_reported_each_time(
 def test_a_network_that_is_made_for_one_sensor_refuses_a_sensor_for_each_band(
     tmp_path: Path,
 ) -> None:
-    tifffile.imwrite(tmp_path / "in.tif", np.full((2, 20, 30), 900, np.uint16))
+    bands = np.full((2, 20, 30), 900, np.uint16)
+    tifffile.imwrite(tmp_path / "in.tif", bands, planarconfig="separate", photometric="minisblack")
     words = ["--network", shipped_pair("convbeers-xs")[0], "--sensor", f"B0={SENSOR},B1={SENSOR}"]
     assert "Give one sensor for all bands" in refused(
         f"restore {tmp_path}/in.tif {tmp_path}/out.tif", *words

@@ -2,20 +2,20 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from markupsafe import Markup
 
 from beers_deploy.model.traditional.peers import PEERS
+from beers_deploy.profiles.figures import Row
 from beers_deploy.report.plots import LIGHT, SERIES, look, new_figure, set_ticks, svg_of
+from beers_deploy.studies.tradeoff.advice import Constraint
 from beers_deploy.studies.tradeoff.front import PSNR, Measured, ends, placed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from beers_deploy.studies.tradeoff.page import Tradeoff
 
 SIZE_PX = (560, 520)
 TEXT_PX = 15
@@ -59,7 +59,26 @@ class Series:
     points: Sequence[Measured]
 
 
-def plot_svg(study: "Tradeoff") -> Markup:
+class Plotted(Protocol):
+    """What a plot shows of a trade-off, with the meanings of `page.Tradeoff`."""
+
+    @property
+    def boards(self) -> Sequence[str]: ...  # noqa: D102 - see there
+    @property
+    def points(self) -> Sequence[Measured]: ...  # noqa: D102
+    @property
+    def front(self) -> Sequence[Measured]: ...  # noqa: D102
+    @property
+    def front_rows(self) -> Sequence[Row]: ...  # noqa: D102
+    @property
+    def constraints(self) -> Sequence[Constraint]: ...  # noqa: D102
+    @property
+    def cost(self) -> str: ...  # noqa: D102
+    @property
+    def best(self) -> Measured | None: ...  # noqa: D102
+
+
+def plot_svg(study: Plotted) -> Markup:
     """Return the plot as an SVG file, with the numbers of the front's members."""
     with look():
         return svg_of(
@@ -67,7 +86,7 @@ def plot_svg(study: "Tradeoff") -> Markup:
         )
 
 
-def figure_of(study: "Tradeoff") -> "Figure":
+def figure_of(study: Plotted) -> "Figure":
     """Draw the plot; for use within `look`."""
     from matplotlib import rc_context
 
@@ -85,7 +104,7 @@ def figure_of(study: "Tradeoff") -> "Figure":
     return figure
 
 
-def draw(axes: "Axes", study: "Tradeoff") -> None:
+def draw(axes: "Axes", study: Plotted) -> None:
     """Draw points, front, limits and recommended point; the numbers are left to whoever sizes the
     axes.
     """
@@ -105,7 +124,7 @@ def draw(axes: "Axes", study: "Tradeoff") -> None:
         set_ticks(axes.yaxis, 8)
 
 
-def series(study: "Tradeoff") -> Iterator[Series]:
+def series(study: Plotted) -> Iterator[Series]:
     """Yield the points by what they look like: a colour for each network, and of several boards a
     marker for each.
     """
@@ -129,7 +148,7 @@ def _kind(point: Measured) -> str:
     return LIBRARIES if point.text["method"] in PEERS else CHAINS
 
 
-def _scatter(axes: "Axes", group: Series, study: "Tradeoff") -> None:
+def _scatter(axes: "Axes", group: Series, study: Plotted) -> None:
     # The front's marks come last, so that they lie on top.
     for large in (False, True):
         points = [point for point in group.points if (point in study.front) == large]
@@ -148,7 +167,7 @@ def _places(points: Sequence[Measured], cost: str) -> tuple[list[float], list[fl
     return [point.value(cost) for point in points], [point.value(PSNR) for point in points]
 
 
-def _draw_front(axes: "Axes", study: "Tradeoff") -> None:
+def _draw_front(axes: "Axes", study: Plotted) -> None:
     # Between two points of the front the cheaper one is the best that can be had.
     axes.step(*_places(study.front, study.cost), where="post", color=LIGHT["soft"], lw=1, zorder=1)
     for point, row in zip(study.front, study.front_rows, strict=True):
@@ -167,7 +186,7 @@ def _draw_front(axes: "Axes", study: "Tradeoff") -> None:
             )
 
 
-def _draw_limits(axes: "Axes", study: "Tradeoff") -> None:
+def _draw_limits(axes: "Axes", study: Plotted) -> None:
     """Draw the limits on cost and PSNR as dashed lines with their words; the axes keep their range
     if one is outside.
 
@@ -194,7 +213,7 @@ def _draw_limits(axes: "Axes", study: "Tradeoff") -> None:
             axes.axhline(limit.limit, **style)
 
 
-def _draw_best(axes: "Axes", study: "Tradeoff") -> None:
+def _draw_best(axes: "Axes", study: Plotted) -> None:
     if study.best is None:
         return
     x, y = _places([study.best], study.cost)
@@ -207,7 +226,7 @@ def _draw_best(axes: "Axes", study: "Tradeoff") -> None:
     axes.scatter(x, y, s=RING_PX2, label=RECOMMENDED, **style)
 
 
-def _draw_legend(axes: "Axes", groups: Sequence[Series], study: "Tradeoff") -> None:
+def _draw_legend(axes: "Axes", groups: Sequence[Series], study: Plotted) -> None:
     """Add what the legend names, as marks without a point: networks by colour, and of several
     boards the markers.
     """
@@ -220,7 +239,7 @@ def _draw_legend(axes: "Axes", groups: Sequence[Series], study: "Tradeoff") -> N
         axes.scatter([], [], s=FRONT_PX2, c=colour, marker=marker, label=name, linewidths=0)
 
 
-def _draw_numbers(axes: "Axes", study: "Tradeoff") -> None:
+def _draw_numbers(axes: "Axes", study: Plotted) -> None:
     """Write the members' numbers next to their marks; one label for neighbours whose marks lie on
     one another.
     """
@@ -241,7 +260,7 @@ def _distance_px(axes: "Axes", a: Measured, b: Measured, cost: str) -> float:
     return float(np.hypot(*(ends_px[1] - ends_px[0])))
 
 
-def _label(study: "Tradeoff", key: str) -> str:
+def _label(study: Plotted, key: str) -> str:
     figure = next((point.figures[key] for point in study.points if key in point.figures), None)
     where = f" on {study.boards[0]}" if key.startswith("board") and len(study.boards) == 1 else ""
     return f"{key}{where}, {figure.unit}" if figure else key
