@@ -26,18 +26,16 @@ network loses less in INT8.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, pad, pixel_shuffle, pixel_unshuffle
 
-from beers_deploy.model.bank import FILTERS, LARGEST, SIDE_PX, WIDE, Bank, bank_of_vector, in_places
+from beers_deploy.model.bank import FILTERS, LARGEST, SIDE_PX, WIDE, Bank, bank_of_vector
 from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.io.tensors import Weights, read_weights, write_weights
 from beers_deploy.model.variants import BANK_PLANES, SENSOR_VALUES, Kernels, Variant
-from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.instrument import Instrument
 
 
@@ -289,93 +287,6 @@ def initialise(network: Network, generator: torch.Generator) -> None:
                 module.weight.normal_(0.0, scale * (2 / fan_in) ** 0.5, generator=generator)
                 if module.bias is not None:
                     module.bias.zero_()
-
-
-N = TypeVar("N", bound=Network)
-
-
-def grow(network: N, variant: Variant, generator: torch.Generator) -> N:
-    """A network of `variant` with the outputs of `network`, up to rounding; the same size is
-    copied.
-
-    Features are copied, and their weights shared out among the copies (Net2Net, Chen et al. 2016).
-    Added blocks lie evenly between the others; their second convolution is zero, so that each hands
-    on what it is given until it has learnt something. At a larger scale each feature becomes one
-    for each pixel of a place (see `_coarser`).
-    """
-    sources = _sources(network.variant, variant)
-    large = type(network)(variant)
-    initialise(large, generator)
-    weights = large.state_dict()
-    small = network.state_dict()
-    factor = variant.scale // network.variant.scale
-    for name, source in sources.items():
-        weight = weights[f"{name}.weight"]
-        bias = weights[f"{name}.bias"]
-        if source is not None:
-            coarse = _coarser(small[f"{source}.weight"], factor)
-            weight.copy_(_widened(coarse, weight.shape, generator))
-            bias.copy_(_repeated(small[f"{source}.bias"], bias.shape, factor))
-        elif name.endswith("second"):
-            # An added block hands on its input until it has learnt something.
-            weight.zero_()
-    # The head's bias is linear in the sensor vector, so that its weights grow with the features.
-    if isinstance(large, BankedConvBEERS):
-        large.bias.weight.data.copy_(
-            _repeated(small["bias.weight"], large.bias.weight.shape, factor)
-        )
-    return large
-
-
-def _sources(small: Variant, large: Variant) -> dict[str, str | None]:
-    """The convolution of the small network that each of the large one's is made from; None for an
-    added one.
-    """
-    factor = large.scale // small.scale
-    fits = small.scale in (1, large.scale) and large.features % (small.features * factor**2) == 0
-    if large.blocks < small.blocks or not fits:
-        raise ModelError(
-            f"The weights to start from must have at most {large.blocks} blocks, and features that "
-            f"divide {large.features} at scale {large.scale}, but they have {small.blocks} blocks "
-            f"of {small.features} features at scale {small.scale}. Start from a smaller network."
-        )
-    places = [block * large.blocks // small.blocks for block in range(small.blocks)]
-    origins = {f"body.{place}.": f"body.{block}." for block, place in enumerate(places)}
-    sources: dict[str, str | None] = {}
-    for name in large.convolutions:
-        stem, _, layer = name.rpartition(".")
-        prefix = origins.get(f"{stem}.")
-        sources[name] = name if not stem else prefix and prefix + layer
-    return sources
-
-
-def _repeated(rows: Tensor, shape: Sequence[int], factor: int) -> Tensor:
-    """A row for each feature, (F, ...), to those of the large network."""
-    coarse = rows.repeat_interleave(factor**2, 0)
-    return coarse.repeat(shape[0] // len(coarse), *[1] * (rows.ndim - 1))
-
-
-def _coarser(weight: Tensor, factor: int) -> Tensor:
-    """(O, I, 3, 3) to (O S^2, I S^2, 3, 3): the same convolution where S x S places are the
-    channels of one.
-    """
-    outputs, inputs = weight.shape[:2]
-    places = factor**2
-    coarse = torch.from_numpy(in_places(weight.flatten(0, 1).double().numpy(), factor)).to(weight)
-    by_feature = coarse.view(outputs, inputs, places, places, 3, 3).transpose(1, 2)
-    return by_feature.reshape(outputs * places, inputs * places, 3, 3)
-
-
-def _widened(weight: Tensor, channels: Sequence[int], generator: torch.Generator) -> Tensor:
-    """(O, I, kh, kw) to as many `channels`: copies along both, divided among the copies of an
-    input.
-    """
-    copies_out = channels[0] // weight.shape[0]
-    copies_in = channels[1] // weight.shape[1]
-    shares = torch.rand(channels[0], copies_in, weight.shape[1], 1, 1, generator=generator) + 0.5
-    shares = shares / shares.sum(1, keepdim=True)
-    copies = weight.repeat(copies_out, 1, 1, 1).unsqueeze(1) * shares
-    return copies.reshape(channels[0], channels[1], *weight.shape[2:])
 
 
 def vector_tensor(sensor: Instrument) -> Tensor:

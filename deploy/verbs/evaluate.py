@@ -207,7 +207,7 @@ def _sensors(
     given: "Sequence[Pair] | None",
 ) -> "tuple[Sensor, Sensor]":
     """Return the sensors of the degraded and of the reference images."""
-    from beers_deploy.model.dataset import profiles_for, read_pairs_recipe
+    from beers_deploy.model.pairs_recipe import profiles_for, read_pairs_recipe
 
     if given and sensor is None:
         # Simulated pairs know the sensors that made them.

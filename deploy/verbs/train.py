@@ -134,9 +134,9 @@ def train(
     if not lpips_weight:
         refuse_with("`lpips_weight` 0", **given("lpips"))
     # These load torch.
-    from beers_deploy.model.dataset import profiles_for, read_pairs_recipe
     from beers_deploy.model.family import SensorFamily
     from beers_deploy.model.io.files import require_writable, sha256
+    from beers_deploy.model.pairs_recipe import profiles_for, read_pairs_recipe
     from beers_deploy.model.training.checkpoint import TrainingRecipe
     from beers_deploy.model.training.losses import LossWeights
     from beers_deploy.model.training.patches import PatchRecipe

@@ -19,9 +19,10 @@ from beers_deploy.dpu.cost.work import count_work
 from beers_deploy.dpu.graph import SizedGraph
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.model.convbeers import BankedConvBEERS, load_network
-from beers_deploy.model.dataset import _read_summary, read_pairs_recipe
+from beers_deploy.model.dataset import _read_summary
 from beers_deploy.model.io.lock import part_folder
 from beers_deploy.model.metrics.perceptual import read_tensors
+from beers_deploy.model.pairs_recipe import read_pairs_recipe
 from beers_deploy.model.raster.images import read_pixels
 from beers_deploy.model.training.run import Log
 from beers_deploy.profiles.figures import Check, Row, measured, predicted, unavailable

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.model.dataset import PairsRecipe
+from beers_deploy.model.pairs_recipe import PairsRecipe
 from beers_deploy.model.raster.images import read_acquisition, site_of
 from beers_deploy.model.simulator import acquire
 from beers_deploy.model.simulator.detector import Draw

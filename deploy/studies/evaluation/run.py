@@ -14,7 +14,6 @@ from typing import cast
 import numpy as np
 from PIL import Image
 
-from beers_deploy.model.dataset import read_pairs_recipe
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.pictures import (
     busiest_windows,
@@ -25,6 +24,7 @@ from beers_deploy.model.io.pictures import (
     strip_row,
 )
 from beers_deploy.model.metrics.bootstrap import too_few
+from beers_deploy.model.pairs_recipe import read_pairs_recipe
 from beers_deploy.model.raster.images import list_images
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.pairs import Pair

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, N, grow
+from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS
+from beers_deploy.model.training.grow import N, grow
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import ModelError
 from tests.model.networks import plain, told_of

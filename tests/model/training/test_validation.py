@@ -5,7 +5,7 @@ import pytest
 
 from beers_deploy.model.convbeers import ConvBEERS
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.model.training.run import Validation, split_by_site
+from beers_deploy.model.training.validation import Validation, split_by_site
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.sensor import Sensor
 

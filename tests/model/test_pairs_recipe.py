@@ -9,7 +9,8 @@ import pytest
 import tifffile
 from PIL import Image
 
-from beers_deploy.model.dataset import DatasetRecipe, profiles_for, read_pairs_recipe, write_dataset
+from beers_deploy.model.dataset import DatasetRecipe, write_dataset
+from beers_deploy.model.pairs_recipe import profiles_for, read_pairs_recipe
 from beers_deploy.profiles.errors import OptionError, ProfileError
 from beers_deploy.profiles.sensor import Sensor, same_instrument
 from beers_deploy.profiles.shipped import sensor_names

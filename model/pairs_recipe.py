@@ -1,0 +1,81 @@
+"""Read the recipe next to a folder of pairs: the sensors that made them, and their scenes."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from beers_deploy.model.raster.images import site_of
+from beers_deploy.model.shipped import SENSOR
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.reference import reference_beside
+from beers_deploy.profiles.sensor import Sensor, SensorLike, same_instrument
+from beers_deploy.profiles.toml import read_json
+from beers_deploy.profiles.validation import validated
+
+
+@dataclass(frozen=True)
+class PairsRecipe:
+    """The sensors that made a folder of pairs, and the scenes that they saw."""
+
+    degraded: Sensor
+    reference: Sensor
+    # File names in their order, None for a drawn scene.
+    scenes: tuple[str | None, ...]
+
+    def site(self, stem: str) -> str:
+        """The site of the pair NUMBER-SCENE or NUMBER-SCENE-PATCH: two frames of a site, or two
+        patches, are one.
+
+        A drawn scene is a site of its own.
+        """
+        number = stem.split("-", 1)[0]
+        is_number = number.isdecimal() and int(number) < len(self.scenes)
+        scene = self.scenes[int(number)] if is_number else stem
+        return f"{number}-drawn" if scene is None else site_of(scene)
+
+
+def read_pairs_recipe(folder: Path) -> PairsRecipe | None:
+    """The recipe beside a folder's pairs; None where there is none."""
+    path = folder / "recipe.json"
+    if not path.exists():
+        return None
+    try:
+        raw: Any = read_json(path)
+        scenes = tuple(str(s["name"]) if "sha256" in s else None for s in raw["scenes"])
+        sensors = {role: dict(raw[role]) for role in ("degraded", "reference")}
+    except (LookupError, OSError, TypeError, ValueError) as error:
+        raise OptionError(
+            f"{path} is not the recipe of a dataset. Simulate the pairs again, or remove the file "
+            "and give `sensor`."
+        ) from error
+    profiles = {role: validated(Sensor, raw, f"{path} {role}") for role, raw in sensors.items()}
+    return PairsRecipe(profiles["degraded"], profiles["reference"], scenes)
+
+
+def profiles_for(
+    sensor: SensorLike | None,
+    reference: SensorLike | None,
+    recipe: PairsRecipe | None,
+) -> tuple[Sensor, Sensor]:
+    """The profiles of degraded and reference images: the recipe's where there is one, else those
+    named.
+    """
+    if recipe is None:
+        degraded = Sensor.load(sensor or SENSOR)
+        return degraded, reference_beside(degraded, reference)
+    sensor_profile = Sensor.load(sensor) if sensor else None
+    # A dataset's images are in the degraded sensor's units: so is its reference.
+    reference_profile = None
+    if reference:
+        reference_profile = Sensor.load(reference).in_units_of(recipe.degraded)
+    _require_made_by("sensor", sensor_profile, recipe.degraded)
+    _require_made_by("reference", reference_profile, recipe.reference)
+    return recipe.degraded, recipe.reference
+
+
+def _require_made_by(option: str, profile: Sensor | None, of_recipe: Sensor) -> None:
+    if profile is not None and not same_instrument(profile, of_recipe):
+        raise OptionError(
+            f"`{option}` must be the sensor that made the pairs, {of_recipe.name} with the numbers "
+            f"in recipe.json, but it is {profile.name} with other numbers. Leave it out."
+        )
