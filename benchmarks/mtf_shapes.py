@@ -7,15 +7,15 @@ the inner PSNR against the reference without noise.
 """
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 import beers_deploy as bd
 from beers_deploy.model.curves import FREQUENCIES, Curve, pupil_contrast
-from beers_deploy.profiles.response import NYQUIST, MtfTable
+from beers_deploy.profiles.response import NYQUIST, MtfTable, Response
 from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import axes_of
 
 FIGURE = "inner PSNR, reference without noise"
 CONTRAST = 0.07
@@ -46,13 +46,14 @@ def main() -> None:
     parser.add_argument("--images", type=Path, required=True)
     parser.add_argument("--networks", default="convbeers-s-int8")
     arguments = parser.parse_args()
+    sensor = Sensor.load("pleiades-degraded")
     for name, contrasts in curves().items():
         values = tuple(contrasts.tolist())
-        response = MtfTable(tuple(FREQUENCIES.tolist()), values, values)
+        response: Response = MtfTable(tuple(FREQUENCIES.tolist()), values, values)
         table = bd.evaluate(
             methods=f"traditional,{arguments.networks}",
             images=arguments.images,
-            sensor=replace(Sensor.load("pleiades-degraded"), response=response),
+            sensor=sensor.with_fields(response=response, **axes_of(response, "stated", name)),
         )
         for row in table.rows:
             # The published rows of the paper lack this figure.

@@ -2,7 +2,7 @@
 
 It imports nothing of ours, and offers no names of its own, so that `--help` loads no NumPy.
 
-- `sensor`, `scene_call`: instruments and scenes, each a pydantic model with its short TOML file;
+- `sensor`, `scene_call`: sensors and scenes, each a pydantic model with its short TOML file;
   `sensor_file`: the tables of a sensor's file; `reference`: what a restoration aims at;
 - `instrument`, `effects`, `response`: the physics: noise, effects, and a blur that is known by a
   table or a point-spread function; `point_spread_file`: the latter as a .npy file;

@@ -152,5 +152,7 @@ class Limits:
 
     def __str__(self) -> str:
         kind = "an integer" if self.whole else "a number"
-        least = "above 0" if 0 < self.low <= NEARLY_0 else f"of at least {self.low:g}"
+        least = f"of at least {self.low:g}"
+        if 0 < self.low <= NEARLY_0:
+            least = f"above 0 (at least {self.low:g})"
         return f"{kind} {least} and at most {self.high:g}"

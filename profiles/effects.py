@@ -305,7 +305,7 @@ def _table_type(effect: type[Effect]) -> Any:
     return Annotated[model, AfterValidator(dict)]
 
 
-_OPTIONAL: Any = {name: (_table_type(effect) | None, None) for name, effect in TABLES.items()}
+_OPTIONAL: Any = {name: (_table_type(effect), None) for name, effect in TABLES.items()}
 AnyEffects = create_model("Effects", __config__=CONFIG, **_OPTIONAL)
 
 

@@ -16,7 +16,7 @@ from pydantic.dataclasses import dataclass
 
 from beers_deploy.profiles.constant import Constant, Limits, Stated
 from beers_deploy.profiles.effects import Effect, Effects, settled
-from beers_deploy.profiles.errors import ProfileError
+from beers_deploy.profiles.errors import ProfileError, printable
 from beers_deploy.profiles.instrument import (
     OFFSET,
     Instrument,
@@ -58,8 +58,13 @@ def _dark(fields: dict[str, Constant]) -> Constant:
 
 def _response(raw: object) -> object:
     """Read a response from JSON, where its keys say which of the two it is."""
-    if not isinstance(raw, Mapping):
+    if raw is None or isinstance(raw, MtfTable | PointSpread):
         return raw
+    if not isinstance(raw, Mapping):
+        raise ValueError(
+            f"must be a table of contrasts or a point-spread function, got {printable(repr(raw))}. "
+            "Generate the file again."
+        )
     return TypeAdapter(PointSpread if "samples" in raw else MtfTable).validate_python(raw)
 
 
@@ -144,7 +149,7 @@ class Sensor:
         if self.response:
             raise ValueError(
                 f"must have no table antialias, because the {self.response} already includes the "
-                "filter. Remove the table."
+                "filter. Remove the table, or the effect from the scene or the option that adds it."
             )
         sigma = self.effects["antialias"]["sigma_px"]
         limit = mtf_limit(sigma.high)
@@ -229,7 +234,8 @@ class Sensor:
         # A response settles the contrasts at Nyquist, so that it goes if they are replaced.
         if numbers.keys() & {"mtf_nyquist", "mtf_nyquist_along"}:
             fields["response"] = None
-        return self.with_fields(**fields, **numbers)
+        # Numbers of both ways at once are left to the check of the noise.
+        return self.with_fields(**{**fields, **numbers})
 
     def with_fields(self, **fields: object) -> "Sensor":
         """Return this sensor with other fields, checked like those of a file."""

@@ -95,7 +95,9 @@ def _spelling(key: str, names: Sequence[str], choices: str = "") -> str:
     """Return the key, the keys to choose from, and the one that was meant."""
     stated = "; ".join(filter(None, (printable(repr(key)), choices)))
     # Most often the unit or the second half of a name is left out.
-    begun = [name for name in names if name.startswith(f"{key}_")]
-    for name in [*begun, *get_close_matches(key, names)][:1]:
-        return f"{stated}. Write {name!r} (the unit belongs to the name)."
+    for name in names:
+        if name.startswith(f"{key}_"):
+            return f"{stated}. Write {name!r} (the unit belongs to the name)."
+    for name in get_close_matches(key, names, 1):
+        return f"{stated}. Write {name!r}."
     return f"{stated}. Remove it or correct its spelling."

@@ -139,7 +139,7 @@ class IntConv(OneInput):
 
 @dataclass(frozen=True)
 class IntCore:
-    """Operations in order, convolutions in whole numbers; the scale of every tensor; and the host's
+    """Operations in order, convolutions in integers; the scale of every tensor; and the host's
     part around.
     """
 
@@ -250,8 +250,9 @@ def _quantize_conv(op: Conv, frac_bits: dict[str, int], shifts: Shifts) -> IntCo
 
 
 def _activation(op: Conv, frac_bits: int) -> Activation:
-    """Of whole numbers: ReLU6 is ReLU where int8 ends no later than the six, as it does once
-    `equalize` scaled.
+    """Return the activation of integers.
+
+    ReLU6 is ReLU where int8 ends no later than the six, as it does once `equalize` has scaled.
     """
     ends_first = op.ceiling is not None or INT8_MAX * 2.0**-frac_bits <= SIX
     return Activation.relu if op.activation is Activation.relu6 and ends_first else op.activation

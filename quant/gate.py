@@ -141,6 +141,11 @@ class GateResult:
     contrast: float = math.nan
 
     @property
+    def metric_unit(self) -> str:
+        """The unit of the user's metric."""
+        return METRICS[self.metric].unit
+
+    @property
     def metric_loss(self) -> float:
         """What INT8 loses by the user's metric: above 0 it is worse than float."""
         lost = self.metric_float - self.metric_int8
@@ -324,7 +329,7 @@ def gate_row(result: GateResult, shares: Mapping[str, float] | None = None) -> R
         "PSNR INT8": (result.psnr_int8_db, "dB"),
     }
     if result.metric:
-        unit = METRICS[result.metric].unit
+        unit = result.metric_unit
         entries[f"{result.metric} float"] = (result.metric_float, unit)
         entries[f"{result.metric} INT8"] = (result.metric_int8, unit)
         entries[f"{result.metric} lost"] = (result.metric_loss, unit)

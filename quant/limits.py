@@ -7,12 +7,15 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.figures import Check
 from beers_deploy.profiles.toml import read_toml_text, unreadable
-from beers_deploy.quant.gate import METRICS, SCALE, GateResult
+
+if TYPE_CHECKING:
+    # `bd.Limits` must not load a runtime.
+    from beers_deploy.quant.gate import GateResult
 
 # Of 17 tampered files this stopped 15, all that cost more than 0.03 dB.
 MAE_GROWTH = 1.05
@@ -152,7 +155,7 @@ AT_LEAST = "PSNR float-INT8"
 
 
 def judge(
-    result: GateResult,
+    result: "GateResult",
     limits: Limits,
     baseline_mae: float | None = None,
     shares: Mapping[str, float] | None = None,
@@ -167,8 +170,8 @@ def judge(
             no limit is kept where nothing is 8-bit.
     """
     figures: list[tuple[str, float, float | None, str, str]] = [
-        ("MAE", result.mae, limits.mae, SCALE, ""),
-        ("99.9th percentile", result.p999, limits.p999, SCALE, ""),
+        ("MAE", result.mae, limits.mae, "of full scale", ""),
+        ("99.9th percentile", result.p999, limits.p999, "of full scale", ""),
         ("std / MAE", result.std_over_mae, limits.std_over_mae, "ratio", ""),
         ("PSNR drop", result.drop_db, limits.psnr_drop_db, "dB", ""),
     ]
@@ -178,16 +181,15 @@ def judge(
         share = result.drop_db / result.gain_db
         figures.append(("PSNR drop over gain", share, limits.drop_share, "ratio", gained))
     if result.metric:
-        unit = METRICS[result.metric].unit
         name = f"{result.metric} lost"
-        figures.append((name, result.metric_loss, limits.metric_loss, unit, ""))
+        figures.append((name, result.metric_loss, limits.metric_loss, result.metric_unit, ""))
     least_db = limits.min_psnr_float_int8_db
     figures.append((AT_LEAST, result.psnr_between_db, least_db, "dB", ""))
     if baseline_mae is not None:
         growth = MAE_GROWTH if limits.mae_growth is None else limits.mae_growth
         allowed = growth * baseline_mae
         detail = f"the baseline has {baseline_mae:.4g}"
-        figures.append(("MAE against the baseline", result.mae, allowed, SCALE, detail))
+        figures.append(("MAE against the baseline", result.mae, allowed, "of full scale", detail))
     if shares is not None:
         worst = max(shares, key=lambda layer: shares[layer], default="any layer: none is 8-bit")
         share = shares.get(worst, math.nan)

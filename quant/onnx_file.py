@@ -54,7 +54,7 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
 
     Raises:
         ModelError: missing, empty, not ONNX, of weights that are not finite, or not to be trusted
-            (see `quant.untrusted`).
+            (see `quant.untrusted` and `quant.onnx.runnable`).
     """
     try:
         content = read_whole(path, FILE_BYTES)

@@ -70,9 +70,7 @@ if TYPE_CHECKING:
     from beers_deploy.quant.passes.finetune import Tuning
 
 PASSES = "fine_planes, least_squares, shared_residual_scale, equalise, dual_gain"
-"""What a file records as done beyond rounding each tensor: see `quant.passes`, `quant.graph` and
-`quant.core`.
-"""
+"""What a file records as done beyond rounding each tensor, in the words of the first files."""
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ its encoding.
 Saturation: whatever a node rounds to 8 bits is looked at, in any encoding (integer kernels or QDQ),
 as the graph is written; what lies beyond the ends is clipped, and lost. Two ends are no loss: the
 lower one where it stands for zero or where a ReLU reads it, for that is the ReLU, and those of the
-fine gain, which the coarse one is there for (`quant.passes.dual_range`). ReLUs are counted because
+fine copy, which the coarse one is there for (`quant.passes.dual_range`). ReLUs are counted because
 quantisers have been seen to drop them without a word.
 """
 
@@ -43,7 +43,7 @@ class Rounded:
 
     Attributes:
         low_is_relu: whether what is clipped at the lower end would have become zero anyway.
-        counted: which channels count: of a result in gains or windows the coarse ones, which hold
+        counted: which channels count: of a result in several copies the coarse ones, which hold
             what others clip.
     """
 

@@ -7,6 +7,7 @@ also its kind, and the ranges of sensors that it was trained for.
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -91,7 +92,7 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
         fault = unreadable(path)
         other = None
         if fault is None:
-            with path.open("rb") as stream:
+            with suppress(OSError), path.open("rb") as stream:
                 other = other_format(stream.read(HEAD_BYTES))
         if other not in (None, SAFETENSORS):
             raise ModelError(

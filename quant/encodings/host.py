@@ -303,7 +303,7 @@ def read_core(model: onnx.ModelProto) -> IntCore:
 
 
 def encoding_faults(model: onnx.ModelProto) -> list[str] | None:
-    """Where a file of `quantize` is not what its integers ask for: the host's ends, ReLUs, a
+    """Where a file of `quantize` is not what its integers ask for: the host's part, ReLUs, a
     reader's scale.
 
     None for a file that does not describe its integers and does not state that `quantize` wrote it.

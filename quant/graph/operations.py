@@ -82,7 +82,7 @@ class Op(Protocol):
 
 @runtime_checkable
 class HasWeight(Op, Protocol):
-    """A convolution, in float or in whole numbers."""
+    """A convolution, in float or in integers."""
 
     @property
     def weight(self) -> np.ndarray:

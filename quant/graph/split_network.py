@@ -234,7 +234,7 @@ def add_channels(widths: dict[str, int], ops: Iterable[Op]) -> None:
 
 
 def _width(op: Op, widths: list[int]) -> int:
-    if isinstance(op, HasWeight):  # in float or in whole numbers
+    if isinstance(op, HasWeight):  # in float or in integers
         if widths[0] != op.weight.shape[1] * op.groups:
             raise unsupported(
                 f"{op.name} needs {op.weight.shape[1] * op.groups} channels, got {widths[0]}."

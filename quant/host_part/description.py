@@ -34,7 +34,7 @@ def host_part_to_json(part: HostPart) -> dict[str, Any]:
         "planes": part.encoding.planes,
         "direct": isinstance(part.encoding, Direct),
         "banked": part.encoding == BANK_SLICES,
-        "gains": 1 if decoding.offsets else len(decoding.gains),
+        "gains": _gains(decoding),
         "offsets": decoding.offsets,
         "wide": decoding == BankSum(coarse_copies=1),
     }
@@ -51,6 +51,9 @@ def host_part_from_json(record: Mapping[str, Any]) -> HostPart:
     # The file is not trusted: its core must read the planes that the host makes.
     if int(record["planes"]) != encoding.planes:
         raise ValueError(f"{record['planes']} planes of each channel instead of {encoding.planes}")
+    decoding = _decoding(record)
+    if int(record["gains"]) != _gains(decoding):
+        raise ValueError(f"{record['gains']} gains instead of {_gains(decoding)}")
     return HostPart(
         channels=int(record["channels"]),
         outputs=int(record["outputs"]),
@@ -58,8 +61,13 @@ def host_part_from_json(record: Mapping[str, Any]) -> HostPart:
         adds_image=bool(record.get("adds_image", True)),
         unit=float(record.get("unit", 1.0)),
         encoding=encoding,
-        decoding=_decoding(record),
+        decoding=decoding,
     )
+
+
+def _gains(decoding: OutputDecoding) -> int:
+    """Return in how many gains a file states that the result comes: windows count as one."""
+    return 1 if decoding.offsets else len(decoding.gains)
 
 
 def _encoding(record: Mapping[str, Any]) -> InputEncoding:

@@ -1,7 +1,7 @@
 """Patches: images with their references, in memory or simulated each time they are read."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, TypeVar
@@ -28,8 +28,11 @@ class Regenerated(Sequence[T]):
     def __len__(self) -> int:
         return self._count
 
+    def __iter__(self) -> Iterator[T]:
+        # Without it a loop would end at the first IndexError, also one within an item.
+        return map(self._item, range(self._count))
+
     def __getitem__(self, number: int) -> T:  # type: ignore[override]  # nobody reads slices
-        # `Sequence` ends a loop at the first IndexError.
         if not 0 <= number < self._count:
             raise IndexError(number)
         return self._item(number)

@@ -232,6 +232,7 @@ def light_factor(
         brightest = float(np.quantile(radiance, BRIGHTEST_PIXELS))
         target = full_scale * generator.uniform(*BRIGHT)
     else:
+        assert lighting == "saturated"  # noqa: S101 - there are no others
         brightest = float(np.quantile(radiance, 1 - generator.uniform(*SATURATED)))
         target = full_scale
     # No factor brightens ground without any light.

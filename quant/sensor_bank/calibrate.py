@@ -128,13 +128,13 @@ def body_graph(weights: Weights) -> Graph:
         bias = tensors[f"{name}.bias"]
         graph.append(Conv(name, source, output, weight, bias, activation, window=same(weight)))
 
-    stream = "head"
+    group = "head"
     for k in range(variant.blocks):
-        conv(f"body.{k}.first", stream, f"body.{k}.relu", Activation.relu)
+        conv(f"body.{k}.first", group, f"body.{k}.relu", Activation.relu)
         conv(f"body.{k}.second", f"body.{k}.relu", f"body.{k}.second")
-        graph.append(Add(f"body.{k}.add", (stream, f"body.{k}.second"), f"body.{k}.add"))
-        stream = f"body.{k}.add"
-    conv("body_end", stream, "body_end")
+        graph.append(Add(f"body.{k}.add", (group, f"body.{k}.second"), f"body.{k}.add"))
+        group = f"body.{k}.add"
+    conv("body_end", group, "body_end")
     graph.append(Add("deep", ("head", "body_end"), "deep"))
     conv("tail", "deep", CORRECTION)
     return tuple(graph)
@@ -242,13 +242,13 @@ def map_steps(conditioned: ConditionedCore, weights: Weights) -> list[np.ndarray
         factors = np.where(square > 0, products / np.maximum(square, 1e-30), 1.0)
         return np.asarray(2.0 ** -core.frac_bits[output] / factors)
 
-    stream = steps("head", 1.0, "head")
-    # The factors of the stream are in the weights that read it, so they are taken out first.
-    inputs = 2.0 ** core.frac_bits["head"] * stream[:, None, None]
+    group = steps("head", 1.0, "head")
+    # The weights that read the residual group hold its factors, which are taken out first.
+    inputs = 2.0 ** core.frac_bits["head"] * group[:, None, None]
     inner = (
         steps(f"body.{k}.first", inputs, f"body.{k}.relu") for k in range(weights.variant.blocks)
     )
-    return [stream, *inner]
+    return [group, *inner]
 
 
 def _biases(op: IntConv) -> np.ndarray:
@@ -277,22 +277,21 @@ SNR = (90.0, 165.0)
 
 
 def bank_images(
-    scenes: list[Scene], scale: int, seed: int, kernels: Kernels, patch_px: int = PATCH_PX
+    scenes: list[Scene], scale: int, seed: int, kernels: Kernels
 ) -> Sequence[np.ndarray]:
-    """What a family is calibrated on: scenes as many sensors of it see them, behind the bank of
-    each.
+    """Return what a network behind a bank is calibrated on: scenes as many sensors see them, behind
+    the bank of each.
 
     Args:
         scenes: to simulate images of.
         scale: of the network.
         seed: of everything that is drawn.
         kernels: of the banks.
-        patch_px: side of a patch.
     """
     like = Sensor.load(LIKE)
     reference = Sensor.load(REFERENCE)
     patches = draw_patches(
-        scenes, like, reference, PATCHES, seed, patch_px, SensorFamily(like.nominal(), SNR)
+        scenes, like, reference, PATCHES, seed, PATCH_PX, SensorFamily(like.nominal(), SNR)
     )
 
     def results(number: int) -> np.ndarray:

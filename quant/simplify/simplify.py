@@ -23,7 +23,7 @@ Constants, normalisation behind convolutions, padding and what does nothing are 
 onnxruntime's basic optimisation, which every installation has: it keeps to standard operators, and
 its own tests run on every release. (onnxsim or onnxscript's optimizer would be further packages for
 the same.) What it leaves is for the passes of this package; onnx's own converter changes the opset.
-Only what `quant.untrusted` has let through may come here: a runtime opens it.
+Only what `quant.onnx.runnable` has let through may come here: a runtime opens it.
 """
 
 from copy import deepcopy

@@ -195,3 +195,8 @@ def test_the_units_of_another_sensor_bring_its_offset_and_no_other_effect(tmp_pa
             64,
             {"smear", "offset"},
         )
+
+
+def test_noise_in_both_ways_is_refused_by_replace() -> None:
+    with pytest.raises(ProfileError, match="noise must have snr_0 and snr_1, or alpha and beta"):
+        Sensor.load("pleiades-degraded").replace(alpha=1.0, snr_0=3.0)

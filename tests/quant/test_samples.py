@@ -12,6 +12,7 @@ from onnx import TensorProto, helper
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from beers_deploy.quant.samples.own import OwnSamples, read_samples, samples_of
+from beers_deploy.quant.samples.patches import Regenerated
 
 RAMP = np.linspace(0, 1, 3 * 2 * 150 * 137, dtype=np.float32).reshape(3, 2, 150, 137)
 
@@ -163,3 +164,11 @@ def test_networks_that_simulated_patches_do_not_suit_ask_for_samples() -> None:
         )
     with pytest.raises(OptionError, match="only images of 32 x 32 pixels"):
         samples_of(pooled, None)
+
+
+def test_a_fault_while_a_patch_is_computed_does_not_end_a_loop() -> None:
+    def item(number: int) -> int:
+        return [0, 1][number]
+
+    with pytest.raises(IndexError):
+        list(Regenerated(item, 5))

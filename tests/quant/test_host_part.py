@@ -1,0 +1,68 @@
+"""The host part: what it encodes is not lost, and its description states it whole."""
+
+import json
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beers_deploy.profiles.instrument import MAX_DN
+from beers_deploy.quant.graph import Shuffle
+from beers_deploy.quant.host_part import (
+    BANK_SLICES,
+    IMAGE_SLICES,
+    BankSum,
+    Direct,
+    DualRange,
+    HostPart,
+    OffsetWindows,
+    Plain,
+    host_part_from_json,
+    host_part_to_json,
+)
+
+SHUFFLE = Shuffle("shuffle", "a", "b", 2)
+PLAIN_PARTS = [
+    HostPart(4, 3, back=(SHUFFLE,), adds_image=False, encoding=encoding, decoding=decoding)
+    for encoding, decoding in product(
+        (IMAGE_SLICES, Direct()), (Plain(), DualRange(), OffsetWindows(((0.5, -1.0, 2.0),) * 2))
+    )
+]
+BANK_PARTS = [
+    HostPart(unit=0.25, encoding=BANK_SLICES, decoding=BankSum(coarse_copies=count))
+    for count in (0, 1)
+]
+
+
+def described(part: HostPart) -> dict[str, Any]:
+    """Return a host part's description as a file holds it."""
+    description: dict[str, Any] = json.loads(json.dumps(host_part_to_json(part)))
+    return description
+
+
+@pytest.mark.parametrize("part", [*PLAIN_PARTS, *BANK_PARTS], ids=repr)
+def test_a_description_states_the_whole_host_part(part: HostPart) -> None:
+    assert host_part_from_json(described(part)) == part
+
+
+@pytest.mark.parametrize("part", [*PLAIN_PARTS, *BANK_PARTS], ids=repr)
+@pytest.mark.parametrize("count", ["planes", "gains"])
+@pytest.mark.parametrize("value", [0, 5, None, "x"])
+def test_counts_that_contradict_a_description_are_refused(
+    part: HostPart, count: str, value: object
+) -> None:
+    with pytest.raises((TypeError, ValueError)):
+        host_part_from_json({**described(part), count: value})
+
+
+@pytest.mark.parametrize("slices", [IMAGE_SLICES, BANK_SLICES], ids=["image", "bank"])
+def test_bit_slices_hold_every_digital_number(slices: Any) -> None:
+    dn = np.arange(MAX_DN + 1)
+    planes = slices.encode((dn / np.float32(MAX_DN)).astype(np.float32)[None, None, None])
+    coarse = planes[0, -3, 0].astype(int)
+    remainder = planes[0, -2, 0].astype(int)
+    np.testing.assert_array_equal(slices.step * coarse + remainder + slices.middle, dn)
+    low, high = slices.limits
+    assert planes.min() == min(low)
+    assert planes.max() == max(high)
