@@ -187,6 +187,13 @@ def test_a_limit_that_no_network_breaks_is_refused(name: str, tmp_path: Path) ->
         limits_of(None, math.inf)
 
 
+@pytest.mark.parametrize(("name", "value"), [("mae", 0.5), ("p999", 1.1), ("saturated", 2.0)])
+def test_a_limit_that_a_black_image_keeps_is_refused(name: str, value: float) -> None:
+    """By values of its own, because the table of the bounds may be wrong itself."""
+    with pytest.raises(OptionError, match="broken network"):
+        limits_of({name: value})
+
+
 NO_LIMITS = [
     "mae = 'small'",
     "mae = true",

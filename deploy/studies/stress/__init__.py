@@ -2,7 +2,7 @@
 
 - `cases` draws the hard cases; `networks` opens the pair and looks at a case at each stage, by the
   `checks`;
-- `battery` runs every case through every stage, tells what held, and writes tables as Markdown;
+- `battery` runs every case through every stage, and returns a table of what held;
 - `faults` flips bits and guards against them; `bit_flips` says what flips cost and what the guards
   do.
 """

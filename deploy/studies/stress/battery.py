@@ -177,6 +177,7 @@ def battery_table(
     overflowing = [row.name for row in layers if row.text["can it overflow int32"] != "no"]
     reasons = dict.fromkeys(result.reason for result in results if result.reason)
     return Table(
+        command="stress",
         inputs=subject.inputs,
         rows=(
             *battery_rows(results),

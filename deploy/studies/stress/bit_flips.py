@@ -65,6 +65,7 @@ def flip_table(subject: Subject, source: Calibration, board: TargetProfile) -> T
     target = make_target(subject, source)
     curves = curve_rows(target, source.patches, source.seed)
     return Table(
+        command="stress",
         inputs=subject.inputs,
         rows=(*curves, *price_rows(target, prediction, dpu)),
         notes=(CURVE_NOTE, GUARD_NOTE),
