@@ -23,7 +23,7 @@ def require_same_units(degraded: Sensor, reference: Sensor) -> None:
 
 
 def describe_units(profile: Sensor) -> str:
-    """What a digital number of the profile means, in words."""
+    """Return what a digital number of the profile means, in words."""
     gain, bits, offset_dn = profile.units
     return f"{gain:g} DN per W/m2/sr/um, {bits:g} bits" + (
         f", {offset_dn:g} DN of offset" if offset_dn else ""

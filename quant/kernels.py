@@ -20,6 +20,7 @@ checked as what they become.
 """
 
 import hashlib
+from abc import ABC, abstractmethod
 from collections import defaultdict
 from copy import deepcopy
 from dataclasses import dataclass
@@ -80,16 +81,16 @@ point.
 """
 
 
-class _Rewriting:
+class _Rewriting(ABC):
     """A copy of a model whose nodes are replaced one by one, and its constants."""
 
     def __init__(self, model: onnx.ModelProto) -> None:
         self.model = deepcopy(model)
         self.arrays = constants(model)
 
+    @abstractmethod
     def around(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
         """Return what replaces a node."""
-        raise NotImplementedError
 
     def rewritten(self) -> onnx.ModelProto:
         """Replace every node, and return the model."""
