@@ -16,6 +16,7 @@ from beers_deploy.quant.host_part.input_encoding import (
     BANK_SLICES,
     IMAGE_SLICES,
     Direct,
+    InputEncoding,
 )
 from beers_deploy.quant.host_part.output_decoding import (
     ANALYTIC_COPIES,
@@ -43,6 +44,7 @@ __all__ = [
     "DualRange",
     "HostPart",
     "HostWriter",
+    "InputEncoding",
     "OffsetWindows",
     "OutputDecoding",
     "Plain",

@@ -16,18 +16,24 @@ from beers_deploy.quant.host_part import (
     Direct,
     DualRange,
     HostPart,
+    InputEncoding,
     OffsetWindows,
+    OutputDecoding,
     Plain,
     host_part_from_json,
     host_part_to_json,
 )
 
 SHUFFLE = Shuffle("shuffle", "a", "b", 2)
+ENCODINGS: tuple[InputEncoding, ...] = (IMAGE_SLICES, Direct())
+DECODINGS: tuple[OutputDecoding, ...] = (
+    Plain(),
+    DualRange(),
+    OffsetWindows(((0.5, -1.0, 2.0),) * 2),
+)
 PLAIN_PARTS = [
     HostPart(4, 3, back=(SHUFFLE,), adds_image=False, encoding=encoding, decoding=decoding)
-    for encoding, decoding in product(
-        (IMAGE_SLICES, Direct()), (Plain(), DualRange(), OffsetWindows(((0.5, -1.0, 2.0),) * 2))
-    )
+    for encoding, decoding in product(ENCODINGS, DECODINGS)
 ]
 BANK_PARTS = [
     HostPart(unit=0.25, encoding=BANK_SLICES, decoding=BankSum(coarse_copies=count))
