@@ -33,13 +33,36 @@ from beers_deploy.quant.graph.split_network import (
     sized,
     unsupported,
 )
-from beers_deploy.quant.onnx.graph import Node
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.runnable import check_runnable
-from beers_deploy.quant.simplify.fold_affine import per_channel
+from beers_deploy.quant.simplify.fold_affine import affine_of
 from beers_deploy.quant.untrusted import contradictions, times
 
-NO_IMAGE = {"Flatten", "Gemm", "MatMul", "NonMaxSuppression", "Sigmoid", "Softmax"}
-"""Operators with which classifiers and detectors end."""
+NO_IMAGE = (
+    "'quantize' accepts networks that make an image of an image: cut the network in front of it. "
+    "'check' and 'bench' read any network."
+)
+NORMALISES = (
+    "It normalizes each image, or each pixel, by its own statistics. Train the network with batch "
+    "normalization, which becomes part of the convolutions, or without normalization."
+)
+OF_ONE_SIZE = (
+    "The network computes with the size of its image. Export it with fixed height and width."
+)
+REMEDIES = {
+    **dict.fromkeys(("Flatten", "Gemm", "MatMul", "NonMaxSuppression", "Softmax"), NO_IMAGE),
+    **dict.fromkeys(
+        ("GroupNormalization", "InstanceNormalization", "LayerNormalization", "ReduceMean"),
+        NORMALISES,
+    ),
+    **dict.fromkeys(("ConstantOfShape", "Expand", "Shape", "Size", "Tile"), OF_ONE_SIZE),
+    "Pad": (
+        "Pad in the convolution; a network behind a bank is quantised from its weights "
+        "(.safetensors)."
+    ),
+}
+"""What to do about an operator that no DPU computes."""
+OTHER_REMEDY = "Replace it by one that the DPU computes, or cut the network in front of it."
 
 
 def read_network(model: onnx.ModelProto) -> SplitNetwork:
@@ -84,6 +107,12 @@ class _Reader:
 
     def graph(self) -> Graph:
         """Return the operations from `IMAGE` to `CORRECTION`; global pooling needs a fixed size."""
+        if len(self.source.inputs) > 1:
+            raise unsupported(
+                f"The network must have one input, the image, but it has {len(self.source.inputs)}"
+                f": {', '.join(self.source.inputs)}.",
+                "Export it with the other inputs as constants, or as channels of the image.",
+            )
         if len(self.source.outputs) != 1:
             raise unsupported(
                 f"The network must have one output, but it has {len(self.source.outputs)}: "
@@ -91,7 +120,13 @@ class _Reader:
                 "Export it with one of them.",
             )
         (result,) = self.source.outputs
-        for node in self.source.nodes:
+        *nodes, last = self.source.nodes
+        if _clips_to_image(last, self.source) and last.outputs[0] == result:
+            # The host clips images to [0, 1] in any case.
+            result = last.inputs[0]
+        else:
+            nodes.append(last)
+        for node in nodes:
             self._read(node)
         if not self.ops or self.ops[-1].output != result:
             raise unsupported("No operation writes the network's output.")
@@ -109,23 +144,12 @@ class _Reader:
     def _read(self, node: Node) -> None:
         if node.op_type in ACTIVATIONS:
             self._activation(node)
-        elif node.op_type in ("Add", "Mul", "Sub"):
-            self._append(self._arithmetic(node))
+        elif node.op_type in ("Add", "Div", "Mul", "Sub"):
+            self._arithmetic(node)
         elif node.op_type in READERS:
             self._append(READERS[node.op_type](node, self.source))
         else:
-            remedy = "Replace it by one that the DPU computes, or cut the network in front of it."
-            if node.op_type in NO_IMAGE:
-                remedy = (
-                    "'quantize' accepts networks that make an image of an image: cut the network "
-                    "in front of it. 'check' and 'bench' read any network."
-                )
-            if node.op_type == "Pad":
-                remedy = (
-                    "Pad in the convolution; a network behind a bank is quantised from its "
-                    "weights (.safetensors)."
-                )
-            raise unsupported(f"The DPU does not compute the operation {node}.", remedy)
+            raise _refused(node)
 
     def _append(self, op: Op) -> None:
         self._places[op.output] = len(self.ops)
@@ -139,47 +163,43 @@ class _Reader:
         self._measured = len(self.ops)
         return self._widths[tensor]
 
-    def _arithmetic(self, node: Node) -> Op:
-        """Read a sum, difference or product of two tensors, or of one with constants."""
-        constants = {k: v for k in (0, 1) if (v := self.source.value(node, k)) is not None}
-        if constants:
-            return self._by_constant(node, constants)
-        # Simplification has made an Add of a Sub where it can.
-        require(
-            node.op_type != "Sub",
-            node,
-            "is supported only if a convolution writes its second tensor, which nothing else reads",
-        )
-        kind = Add if node.op_type == "Add" else Mul
-        return kind(node.name, (node.inputs[0], node.inputs[1]), node.outputs[0])
+    def _arithmetic(self, node: Node) -> None:
+        """Append a sum, difference or product of two tensors, or of one with constants."""
+        if any(self.source.value(node, place) is not None for place in (0, 1)):
+            self._append(self._by_constant(node))
+            return
+        inputs = node.inputs[0], node.inputs[1]
+        require(node.op_type != "Div", node, "must divide by a constant, not by a computed tensor")
+        if node.op_type == "Sub":
+            # A DPU adds, so the second tensor is negated first.
+            negated = f"{node.outputs[0]}.negated"
+            minus_one = np.full(self._channels_of(inputs[1]), -1, np.float32)
+            self._append(_depthwise(negated, inputs[1], negated, minus_one, 0 * minus_one))
+            inputs = inputs[0], negated
+        kind = Mul if node.op_type == "Mul" else Add
+        self._append(kind(node.name, inputs, node.outputs[0]))
 
-    def _by_constant(self, node: Node, constants: dict[int, np.ndarray]) -> Op:
+    def _by_constant(self, node: Node) -> Op:
         """Read arithmetic with one number a channel as a depthwise convolution of one pixel."""
-        (place, value), *others = constants.items()
-        flat = None if others else per_channel(value)
-        if flat is None:
+        match = affine_of(self.source, node)
+        if match is None:
+            shapes = (self.source.value(node, place) for place in (0, 1))
+            shape = next(value.shape for value in shapes if value is not None)
             raise unsupported(
-                f"{node} must have a constant of one number for each channel, got "
-                f"{times(value.shape)}."
+                f"{node} must have a constant of one number for each channel, got {times(shape)}."
             )
-        require(
-            node.op_type != "Sub" or place == 1, node, "must subtract the constant, not the tensor"
-        )
-        source = node.inputs[1 - place]
+        source, affine = match
         channels = self._channels_of(source)
         require(
-            value.size in (1, channels),
+            affine.channels in (1, channels),
             node,
-            f"must have a constant of {channels} numbers, got {value.size}",
+            f"must have a constant of {channels} numbers, got {affine.channels}",
         )
-        values = np.broadcast_to(flat.astype(np.float32), (channels,))
-        one = np.ones(channels, np.float32)
-        zero = np.zeros(channels, np.float32)
-        operators = {"Add": (one, values), "Sub": (one, -values), "Mul": (values, zero)}
-        factor, offset = operators[node.op_type]
-        return Conv(
-            node.name, source, node.outputs[0], factor[:, None, None, None], offset, groups=channels
+        scale, shift = (
+            np.broadcast_to(values.astype(np.float32), channels)
+            for values in (affine.scale, affine.shift)
         )
+        return _depthwise(node.name, source, node.outputs[0], scale, shift)
 
     def _activation(self, node: Node) -> None:
         """Fuse an activation into the operation before it, or append it by itself."""
@@ -203,6 +223,23 @@ class _Reader:
                 self._widths[output] = self._widths[source]
         else:
             self._append(Pointwise(node.name, source, node.outputs[0], activation))
+
+
+def _refused(node: Node) -> ModelError:
+    """Return the error of an operator that no DPU computes."""
+    remedy = REMEDIES.get(node.op_type, OTHER_REMEDY)
+    return unsupported(f"The DPU does not compute the operation {node}.", remedy)
+
+
+def _clips_to_image(node: Node, graph: OnnxGraph) -> bool:
+    """Return True if a node clips to [0, 1], all that an image has."""
+    limits = [graph.value(node, place) for place in (1, 2)]
+    return node.op_type == "Clip" and [None if v is None else v.item() for v in limits] == [0, 1]
+
+
+def _depthwise(name: str, source: str, output: str, scale: np.ndarray, shift: np.ndarray) -> Conv:
+    """Return a convolution that scales and shifts each channel by itself, (C,) each."""
+    return Conv(name, source, output, scale[:, None, None, None], shift, groups=len(scale))
 
 
 def _fuses(producer: Conv | Add, activation: Activation) -> bool:

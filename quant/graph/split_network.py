@@ -190,8 +190,10 @@ def sized(graph: Graph, size: Pair) -> Graph:
     ops = list[Op]()
     for op in graph:
         input_sizes = [sizes[name] for name in op.inputs]
-        input_size = input_sizes[0]
-        if any(other != input_size for other in input_sizes):
+        input_size = max(input_sizes)
+        # Squeeze and excite: a factor for each channel, of one pixel, times a map.
+        is_gate = isinstance(op, Mul) and (1, 1) in input_sizes
+        if not is_gate and any(other != input_size for other in input_sizes):
             unequal = " and ".join(f"{rows} x {columns}" for rows, columns in input_sizes)
             raise unsupported(f"{op.name} needs tensors of one size, but they have {unequal}.")
         # Global pooling is a window of the whole map, whose size is known from here on.

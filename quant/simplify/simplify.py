@@ -41,6 +41,7 @@ from onnx.shape_inference import InferenceError
 from beers_deploy.profiles.errors import ModelError, reason_of
 from beers_deploy.quant.domains import IR_VERSION, OPSET, opset_of
 from beers_deploy.quant.onnx.graph import OnnxGraph, free_name
+from beers_deploy.quant.simplify.channels_first import channels_first
 from beers_deploy.quant.simplify.fold_affine import (
     add_negated,
     affine_of,
@@ -48,14 +49,17 @@ from beers_deploy.quant.simplify.fold_affine import (
     fold_behind,
     fold_in_front,
 )
+from beers_deploy.quant.simplify.free_sizes import free_sizes
 from beers_deploy.quant.simplify.fully_connected import ConnectByConvolutions
+from beers_deploy.quant.simplify.spelled_activations import join_hard_swish, join_relu
+from beers_deploy.quant.simplify.split_channels import split_channels
 from beers_deploy.quant.simplify.standard_operators import (
     drop_cast,
     float_shapes,
-    join_hard_swish,
     pool_mean,
     split_sums,
 )
+from beers_deploy.quant.simplify.strided_slices import unshuffle_slices
 from beers_deploy.quant.untrusted import contradictions, held_tensors
 
 PLAIN = {
@@ -72,15 +76,19 @@ PLAIN = {
 }
 """Operators behind which nothing is to be folded, where they read no constants but weights."""
 
-ALTERING = ["CommonSubexpressionElimination", "TransposeOptimizer"]
-"""Optimisers of the runtime's that make other networks: layers of equal weights would be one, pixel
-shuffles that are spelled out would not be recognised.
+ALTERING = [
+    "CommonSubexpressionElimination",
+    "SliceConcatToSpaceToDepthFusion",
+    "TransposeOptimizer",
+]
+"""Optimisers of the runtime's that make other networks: layers of equal weights would be one,
+slices would become a Gather, and pixel shuffles that are spelled out would not be recognised.
 """
 
 HALVES = (TensorProto.FLOAT16, TensorProto.BFLOAT16)
 
 
-NEEDS_SHAPES = {"Cast", "Gemm", "ReduceMean", "Softmax"}
+NEEDS_SHAPES = {"Cast", "Gemm", "ReduceMean", "Slice", "Softmax", "Split"}
 """What may be rewritten where shapes are known."""
 
 
@@ -98,6 +106,7 @@ def simplify(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     network = deepcopy(model)
     _widen(network)
+    network = channels_first(network)
     weights = {tensor.name for tensor in network.graph.initializer}
     inputs = [value for value in network.graph.input if value.name not in weights]
     outputs = list(network.graph.output)
@@ -108,7 +117,7 @@ def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     # Sizes that an older operator holds itself become constants first, which are then folded.
     if opset_of(model) < OPSET:
         network = _of_our_opset(network)
-    network = _of_our_opset(_folded(network, where))
+    network = free_sizes(_folded(network, where), partial(_folded, where=where))
     _run_passes(network)
     # Inputs and outputs stay as the file states them.
     _replace(network.graph.input, inputs)
@@ -120,14 +129,20 @@ def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 def _run_passes(model: onnx.ModelProto) -> None:
     """Rewrite the nodes of a network in place; its inputs and outputs keep their names."""
     graph = OnnxGraph(model)
-    for rewriting in (split_sums, add_negated, fold_behind, join_hard_swish):
+    for rewriting in (split_sums, join_relu, join_hard_swish, add_negated, fold_behind):
         graph.rewrite(rewriting)
     graph.save()
     if not any(node.op_type in NEEDS_SHAPES or affine_of(graph, node) for node in graph.nodes):
         return
     shapes = float_shapes(graph)
     fold_in_front(graph, shapes)
-    for with_shapes in (drop_cast, pool_mean, convolve_normalisation):
+    for with_shapes in (
+        drop_cast,
+        pool_mean,
+        convolve_normalisation,
+        unshuffle_slices,
+        split_channels,
+    ):
         graph.rewrite(partial(with_shapes, shapes))
     # A normalisation that has become a convolution takes in what stands around it.
     graph.rewrite(fold_behind)
@@ -167,7 +182,7 @@ def _widen(model: onnx.ModelProto) -> None:
 
 
 def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
-    """The network as the runtime's basic optimisation leaves it."""
+    """The network as the runtime's basic optimisation leaves it, with operators of our opset."""
     options = ort.SessionOptions()
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_BASIC
     options.intra_op_num_threads = 1
@@ -192,7 +207,7 @@ def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
                 "export it again."
             ) from error
         network.ParseFromString(path.read_bytes())
-    return network
+    return _of_our_opset(network)
 
 
 def _of_our_opset(model: onnx.ModelProto) -> onnx.ModelProto:

@@ -1,6 +1,5 @@
 """Operators that exporters spell in several ways become the one operator that a DPU has."""
 
-import numpy as np
 from onnx import TensorProto
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
@@ -33,23 +32,6 @@ def split_sums(_: OnnxGraph, node: Node) -> list[Node] | None:
     return adds
 
 
-def join_hard_swish(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a tensor times its own HardSigmoid by HardSwish.
-
-    The runtime and older exporters spell it so.
-    """
-    if node.op_type != "Mul":
-        return None
-    for source, gate in (node.inputs, node.inputs[::-1]):
-        before = graph.writers.get(gate)
-        if before is None or before.op_type != "HardSigmoid" or before.inputs[0] != source:
-            continue
-        slope_and_offset = before.attributes.get("alpha", 0.2), before.attributes.get("beta", 0.5)
-        if np.allclose(slope_and_offset, (1 / 6, 0.5), atol=1e-6):
-            return [Node.new("HardSwish", [source], node.outputs[0], node.proto.name)]
-    return None
-
-
 def drop_cast(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Remove a Cast to float32 of what is float32 already.
 
@@ -63,18 +45,19 @@ def drop_cast(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None
     return []
 
 
-def pool_mean(shapes: Shapes, _: OnnxGraph, node: Node) -> list[Node] | None:
+def pool_mean(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a mean over rows and columns by GlobalAveragePool, and Flatten if it drops both."""
-    axes = {axis % 4 for axis in node.attributes.get("axes", [])}
+    # From opset 18 on the axes are an input.
+    axes = {axis % 4 for axis in graph.numbers(node, 1, "axes") or ()}
     size = shapes.get(node.inputs[0], ()) if node.op_type == "ReduceMean" else ()
     if len(size) != 4 or axes != {2, 3}:
         return None
     (output,) = node.outputs
     if node.attributes.get("keepdims", 1):
-        return [Node.new("GlobalAveragePool", node.inputs, output, node.proto.name)]
+        return [Node.new("GlobalAveragePool", node.inputs[:1], output, node.proto.name)]
     pooled = f"{output}.pooled"
     shapes[pooled] = (*size[:2], 1, 1)
     return [
-        Node.new("GlobalAveragePool", node.inputs, pooled, node.proto.name),
+        Node.new("GlobalAveragePool", node.inputs[:1], pooled, node.proto.name),
         Node.new("Flatten", [pooled], output, f"{output}.flat"),
     ]

@@ -47,6 +47,8 @@ def values() -> dict[str, np.ndarray]:
     tensors |= {"small": np.array([2, 4, 2, 3]), "rows": np.array([0, -1])}
     tensors |= {"two": np.array([2]), "four": np.array([4])}
     tensors |= {"map again": np.array([-1, 4, 1, 1])}
+    tensors |= {"three": np.array(3, np.float32), "sixth": np.array(1 / 6, np.float32)}
+    tensors |= {"1 and 3": np.array([1, 3]), "channels": np.array([1]), "last": np.array([9])}
     tensors |= {"axes": np.array([2, 3]), "roi": np.zeros(0, np.float32)}
     return tensors
 
@@ -127,6 +129,59 @@ CASES: dict[str, tuple[list[NodeProto], dict[str, int]]] = {
     "HardSwish": (
         [node("HardSigmoid", "x", to="h", alpha=1 / 6, beta=0.5), node("Mul", "h", "x")],
         {"HardSwish": 1},
+    ),
+    "ReLU, clipped on one side": ([conv(), node("Clip", "c", "zero")], {"Conv": 1, "Relu": 1}),
+    "ReLU as the larger of two": ([conv(), node("Max", "zero", "c")], {"Conv": 1, "Relu": 1}),
+    "HardSwish spelled out": (
+        [
+            conv(),
+            node("Add", "c", "three", to="a"),
+            node("Clip", "a", "zero", "six", to="k"),
+            node("Div", "k", "six", to="h"),
+            node("Mul", "c", "h"),
+        ],
+        {"Conv": 1, "HardSwish": 1},
+    ),
+    "HardSwish, its sixth at the end": (
+        [
+            conv(),
+            node("Add", "three", "c", to="a"),
+            node("Clip", "a", "zero", "six", to="k"),
+            node("Mul", "k", "c", to="p"),
+            node("Mul", "p", "sixth"),
+        ],
+        {"Conv": 1, "HardSwish": 1},
+    ),
+    "split behind a depthwise convolution": (
+        [
+            conv(),
+            conv("c", "d", "deep", group=4),
+            node("Relu", "d", to="r"),
+            helper.make_node("Split", ["r", "1 and 3"], ["s", "t"], axis=1),
+            node("Concat", "t", "s", axis=1),
+        ],
+        {"Conv": 4, "Relu": 2, "Concat": 1},
+    ),
+    "split, and read whole": (
+        [
+            conv(),
+            helper.make_node("Split", ["c", "1 and 3"], ["s", "t"], axis=1),
+            node("Concat", "t", "s", to="j", axis=1),
+            node("Mul", "j", "c"),
+        ],
+        {"Conv": 3, "Concat": 1, "Mul": 1},
+    ),
+    "slices of channels": (
+        [
+            conv(),
+            node("Slice", "c", "channels", "last", "channels", to="s"),
+            node("Sigmoid", "s"),
+        ],
+        {"Conv": 1, "Sigmoid": 1},
+    ),
+    "a slice of the image": (
+        [node("Slice", "x", "channels", "last", "channels")],
+        {"Conv": 1},
     ),
     "a gate of another slope": (
         [node("HardSigmoid", "x", to="h", alpha=0.2, beta=0.5), node("Mul", "h", "x")],

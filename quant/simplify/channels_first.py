@@ -1,0 +1,54 @@
+"""Give a network whose image has its channels last (N, H, W, C) one with its channels first.
+
+1. Exporters from TensorFlow transpose the image as the first node, and the result as the last.
+2. Where that is so, both go, and input and output are (N, C, H, W), as in all other networks.
+"""
+
+import onnx
+
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+
+TO_FIRST = [0, 3, 1, 2]
+TO_LAST = [0, 2, 3, 1]
+
+
+def channels_first(model: onnx.ModelProto) -> onnx.ModelProto:
+    """Return the network with the channels of image and result first; not changed if they are."""
+    graph = OnnxGraph(model)
+    images = [name for name in graph.inputs if _is_transposed(graph.readers[name], TO_FIRST)]
+    results = [
+        name
+        for name in graph.outputs
+        if name in graph.writers and _is_transposed([graph.writers[name]], TO_LAST)
+    ]
+    if not images:
+        return model
+    network = onnx.ModelProto()
+    network.CopyFrom(model)
+    graph = OnnxGraph(network)
+
+    def without(_: OnnxGraph, node: Node) -> list[Node] | None:
+        is_end = node.inputs[0] in images or node.outputs[0] in results
+        if node.op_type != "Transpose" or not is_end:
+            return None
+        return [Node.new("Identity", node.inputs, node.outputs[0], node.name)]
+
+    graph.rewrite(without)
+    graph.save()
+    values = [
+        *(value for value in network.graph.input if value.name in images),
+        *(value for value in network.graph.output if value.name in results),
+    ]
+    for value in values:
+        dims = value.type.tensor_type.shape.dim
+        channels = dims.pop()
+        dims.insert(1, channels)
+    return network
+
+
+def _is_transposed(nodes: list[Node], order: list[int]) -> bool:
+    """Return True if these nodes exist and all transpose in this order."""
+    return bool(nodes) and all(
+        node.op_type == "Transpose" and list(node.attributes.get("perm", [])) == order
+        for node in nodes
+    )

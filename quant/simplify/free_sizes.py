@@ -1,0 +1,144 @@
+"""Remove what a network computes from the size of its image: shapes, and what crops, pads or
+enlarges to them.
+
+1. Give the free sizes of the image numbers, so that the runtime folds arithmetic on shapes.
+2. Write a Resize to a size as one by factors; drop a Pad by nothing and a Slice of the whole map;
+   let a convolution write a map of one number a channel, such as a noise level.
+3. Do both for two sizes. If the networks are equal, the size decides nothing, and theirs is the
+   network of every image whose sides are multiples of `MULTIPLE_PX`. Otherwise the network stays
+   as it is.
+
+Exporters write such arithmetic for a U-Net that pads or enlarges to the size of its skips, for
+`chunk`, and for a number that is repeated over the image.
+"""
+
+from collections.abc import Callable
+from copy import deepcopy
+
+import numpy as np
+import onnx
+
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
+
+MULTIPLE_PX = 64
+"""Six levels of a U-Net halve sides of this many pixels without a remainder."""
+SIZES_PX = (2 * MULTIPLE_PX, 3 * MULTIPLE_PX), (4 * MULTIPLE_PX, 3 * MULTIPLE_PX)
+"""Rows and columns differ, so that a network that takes one for the other is noticed."""
+SIZED = {"Concat", "Pad", "Resize", "Shape", "Size", "Slice"}
+"""Operators that may need the size of an image."""
+
+Fold = Callable[[onnx.ModelProto], onnx.ModelProto]
+"""Folds constants, as onnxruntime does."""
+
+
+def free_sizes(model: onnx.ModelProto, fold: Fold) -> onnx.ModelProto:
+    """Return the network without arithmetic on sizes; as it is if the size decides something.
+
+    Args:
+        model: a float network, of our opset; not changed.
+        fold: folds the constants of a network.
+    """
+    constants = {tensor.name for tensor in model.graph.initializer}
+    if not any(
+        node.op_type in SIZED and (node.op_type != "Concat" or constants.intersection(node.input))
+        for node in model.graph.node
+    ):
+        return model
+    first, second = (_of_size(model, rows, columns, fold) for rows, columns in SIZES_PX)
+    if _content(first) != _content(second):
+        return model
+    # The sizes that the file states are as free as before.
+    del first.graph.input[:]
+    first.graph.input.extend(model.graph.input)
+    del first.graph.output[:]
+    first.graph.output.extend(model.graph.output)
+    first.graph.ClearField("value_info")
+    return first
+
+
+def _of_size(model: onnx.ModelProto, rows: int, columns: int, fold: Fold) -> onnx.ModelProto:
+    """Return the network for images of one size, where the file leaves the size free (1, 2)."""
+    network = deepcopy(model)
+    for value in network.graph.input:
+        dims = value.type.tensor_type.shape.dim
+        if len(dims) == 4:
+            for dim, size in zip(dims, (1, 0, rows, columns), strict=True):
+                if size and not dim.dim_value:
+                    dim.dim_value = size
+    # What the file says of other tensors may contradict the numbers.
+    network.graph.ClearField("value_info")
+    for value in network.graph.output:
+        value.type.tensor_type.ClearField("shape")
+    network = fold(network)
+    network.graph.ClearField("value_info")
+    graph = OnnxGraph(network)
+    sizes = {name: sizes_of(tensor) for name, tensor in graph.tensor_types().items()}
+    graph.rewrite(lambda graph, node: _sized(graph, node, sizes))
+    graph.save()
+    return fold(network)
+
+
+def _sized(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> list[Node] | None:
+    """Return what takes the place of a node whose input has a known size (2)."""
+    source = node.inputs[0] if node.inputs else ""
+    before = sizes.get(source, ())
+    after = sizes.get(node.outputs[0], ())
+    if len(before) != 4 or len(after) != 4 or min(*before, *after) < 1:
+        return None
+    if node.op_type == "Resize" and len(node.inputs) == 4:
+        factors = np.divide(after, before)
+        # Other factors may be rounded, and the result have another size.
+        if not all(factor == int(factor) for factor in factors):
+            return None
+        scales = graph.add_constant(f"{node.name}.scales", factors)
+        attributes = {k: v for k, v in node.attributes.items() if k != "keep_aspect_ratio_policy"}
+        inputs = [source, "", scales]
+        return [Node.new("Resize", inputs, node.outputs[0], node.name, **attributes)]
+    if node.op_type == "Concat":
+        return _with_written_maps(graph, node, before, after)
+    keeps_all = (
+        node.op_type == "Slice"
+        and before == after
+        and all(step == 1 for step in graph.numbers(node, 4, "steps") or ())
+    )
+    adds_nothing = node.op_type == "Pad" and graph.numbers(node, 1, "pads") == [0] * 8
+    if keeps_all or adds_nothing:
+        return [Node.new("Identity", [source], node.outputs[0], node.name)]
+    return None
+
+
+def _with_written_maps(
+    graph: OnnxGraph, node: Node, before: tuple[int, ...], after: tuple[int, ...]
+) -> list[Node] | None:
+    """Return a Concat whose constant maps are written by convolutions with weights of zero."""
+    source = node.inputs[0]
+    maps = {name: graph.constants[name] for name in node.inputs if name in graph.constants}
+    is_map = all(
+        value.ndim == 4 and value.shape[2:] == after[2:] and (value == value[..., :1, :1]).all()
+        for value in maps.values()
+    )
+    if not maps or not is_map or source in maps:
+        return None
+    nodes: list[Node] = []
+    names = {}
+    for number, (name, value) in enumerate(maps.items()):
+        names[name] = f"{node.outputs[0]}.constant_{number}"
+        weight = np.zeros((value.shape[1], before[1], 1, 1))
+        inputs = [
+            source,
+            graph.add_constant(f"{names[name]}.weight", weight),
+            graph.add_constant(f"{names[name]}.bias", value[0, :, 0, 0]),
+        ]
+        nodes.append(Node.new("Conv", inputs, names[name], names[name], kernel_shape=[1, 1]))
+    node.inputs = tuple(names.get(name, name) for name in node.inputs)
+    return [*nodes, node]
+
+
+def _content(model: onnx.ModelProto) -> tuple[list[bytes], dict[str, bytes]]:
+    """Return all that a network computes with: its nodes and its constants."""
+    nodes = [node.SerializeToString(deterministic=True) for node in model.graph.node]
+    constants = {
+        tensor.name: tensor.SerializeToString(deterministic=True)
+        for tensor in model.graph.initializer
+    }
+    return nodes, constants

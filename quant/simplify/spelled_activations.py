@@ -1,0 +1,102 @@
+"""Activations that exporters spell out become the one operator that a DPU has.
+
+1. A Clip at 0 without a limit above, and a Max with 0, are ReLU.
+2. A shift by 3, a clip from 0 to 6 and a sixth are HardSigmoid, and HardSwish if they are times the
+   tensor itself, whichever order they are in.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+
+UNLIMITED = 1e30
+"""A Clip above this limits no value."""
+SLOPE_AND_OFFSET = {"alpha": 1 / 6, "beta": 0.5}
+"""Of the HardSigmoid that HardSwish has; ONNX's default is another slope."""
+
+
+def join_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace a Clip or a Max that is a ReLU (1)."""
+    source = None
+    if node.op_type == "Clip":
+        low = _scalar(graph, node, 1)
+        has_limit = len(node.inputs) > 2 and node.inputs[2] != ""
+        high = _scalar(graph, node, 2) if has_limit else np.inf
+        if low == 0 and high is not None and high > UNLIMITED:
+            source = node.inputs[0]
+    elif node.op_type == "Max" and len(node.inputs) == 2:
+        for place in (0, 1):
+            if _scalar(graph, node, 1 - place) == 0:
+                source = node.inputs[place]
+    if source is None:
+        return None
+    return [Node.new("Relu", [source], node.outputs[0], node.name)]
+
+
+def join_hard_swish(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Replace a node that completes a HardSwish, or a HardSigmoid, by it (2)."""
+    result = node.outputs[0]
+    clipped = _sixth_of(graph, node) or ""
+    shifted = _shifted_and_clipped(graph, clipped)
+    if shifted is not None:
+        return [Node.new("HardSigmoid", [shifted], result, node.name, **SLOPE_AND_OFFSET)]
+    source = _gated_by(graph, node, _hard_sigmoid_of)
+    product = graph.sole_writer(clipped)
+    if product is not None:
+        source = _gated_by(graph, product, _shifted_and_clipped)
+    return None if source is None else [Node.new("HardSwish", [source], result, node.name)]
+
+
+def _gated_by(
+    graph: OnnxGraph, node: Node, gated: Callable[[OnnxGraph, str], str | None]
+) -> str | None:
+    """Return x if a node computes x times a function of x."""
+    if node.op_type != "Mul":
+        return None
+    pairs = node.inputs, node.inputs[::-1]
+    return next((source for source, gate in pairs if source == gated(graph, gate)), None)
+
+
+def _hard_sigmoid_of(graph: OnnxGraph, name: str) -> str | None:
+    """Return x if a tensor is HardSigmoid(x) of slope 1/6."""
+    node = graph.writers.get(name)
+    if node is None or node.op_type != "HardSigmoid":
+        return None
+    slope_and_offset = node.attributes.get("alpha", 0.2), node.attributes.get("beta", 0.5)
+    is_of_hard_swish = np.allclose(slope_and_offset, (1 / 6, 0.5), atol=1e-6)
+    return node.inputs[0] if is_of_hard_swish else None
+
+
+def _sixth_of(graph: OnnxGraph, node: Node) -> str | None:
+    """Return the tensor of which a node computes a sixth."""
+    if node.op_type == "Div" and _scalar(graph, node, 1) == 6:
+        return node.inputs[0]
+    if node.op_type == "Mul":
+        for place in (0, 1):
+            factor = _scalar(graph, node, 1 - place)
+            if factor is not None and np.isclose(factor, 1 / 6, rtol=1e-6):
+                return node.inputs[place]
+    return None
+
+
+def _shifted_and_clipped(graph: OnnxGraph, name: str) -> str | None:
+    """Return x if a tensor is x + 3, clipped from 0 to 6."""
+    clip = graph.writers.get(name)
+    if clip is None or clip.op_type != "Clip":
+        return None
+    shift = graph.writers.get(clip.inputs[0])
+    if (_scalar(graph, clip, 1), _scalar(graph, clip, 2)) != (0, 6) or shift is None:
+        return None
+    if shift.op_type == "Add":
+        for place in (0, 1):
+            if _scalar(graph, shift, 1 - place) == 3:
+                return shift.inputs[place]
+    return None
+
+
+def _scalar(graph: OnnxGraph, node: Node, place: int) -> float | None:
+    """Return a constant of one number that a node reads; None if it reads none there."""
+    value = graph.value(node, place)
+    return float(value.item()) if value is not None and value.size == 1 else None

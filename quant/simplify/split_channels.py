@@ -1,0 +1,110 @@
+"""Compute each part of a map's channels by operations of its own, so that nothing splits a map.
+
+1. A Split, or a Slice, along the channels has parts, each a list of channels.
+2. Where only such nodes read a map, and a convolution writes it, each part becomes a convolution
+   with the weights of its channels. Activations and depthwise convolutions in between are divided
+   with it. Neither more nor less is computed.
+3. In front of anything else, a convolution of one pixel selects the channels.
+
+All of it is exact. What is divided stays behind, and goes where nothing reads it.
+"""
+
+from functools import partial
+
+import numpy as np
+
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.simplify.fold_affine import is_convolution
+from beers_deploy.quant.simplify.standard_operators import Shapes
+
+POINTWISE = {"HardSigmoid", "HardSwish", "LeakyRelu", "Relu", "Sigmoid", "Tanh"}
+CHANNEL_AXIS = (1, -3)
+Part = tuple[str, np.ndarray]
+"""The name of a part, and the numbers of its channels."""
+
+
+def split_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Return operations that compute the parts of a map (1)."""
+    parts = _parts(graph, node, shapes)
+    source = node.inputs[0] if parts else ""
+    only_parts = all(_parts(graph, reader, shapes) for reader in graph.readers[source])
+    if source in graph.outputs or not only_parts:
+        compute = partial(_select, graph, source, shapes.get(source, (0, 0))[1])
+    else:
+        compute = partial(_divide, graph, source, shapes)
+    nodes: list[Node] = []
+    for name, channels in parts:
+        nodes += compute(channels, name)
+    return nodes or None
+
+
+def _parts(graph: OnnxGraph, node: Node, shapes: Shapes) -> list[Part]:
+    """Return the parts that a node takes from a map of known channels; none of another node."""
+    source = shapes.get(node.inputs[0], ()) if node.inputs else ()
+    if len(source) != 4 or source[1] < 1:
+        return []
+    numbers = np.arange(source[1])
+    if node.op_type == "Split" and node.attributes.get("axis", 0) in CHANNEL_AXIS:
+        sizes = [shapes.get(name, ()) for name in node.outputs]
+        if not all(len(size) == 4 and size[1] > 0 for size in sizes):
+            return []
+        ends = np.cumsum([size[1] for size in sizes])
+        return list(zip(node.outputs, np.split(numbers, ends[:-1]), strict=True))
+    if node.op_type == "Slice":
+        starts, stops, axes, steps = (graph.numbers(node, place, "") for place in range(1, 5))
+        if starts and stops and axes and len(axes) == 1 and axes[0] in CHANNEL_AXIS:
+            step = steps[0] if steps else 1
+            return [(node.outputs[0], numbers[starts[0] : stops[0] : step])]
+    return []
+
+
+def _divide(
+    graph: OnnxGraph, source: str, shapes: Shapes, channels: np.ndarray, name: str
+) -> list[Node]:
+    """Return what computes some channels of a map, of which nobody needs the whole (2)."""
+    before = graph.writers.get(source)
+    divided_name = f"{name}.{before.op_type}" if before else ""
+    if before is not None and before.op_type in POINTWISE:
+        inner = f"{name}.before"
+        behind = Node.of(before.written())
+        behind.proto.name = divided_name
+        behind.inputs = (inner,)
+        behind.outputs = (name,)
+        return [*_part_of(graph, before.inputs[0], shapes, channels, inner), behind]
+    if before is None or before.op_type != "Conv" or not is_convolution(graph, before):
+        return _select(graph, source, shapes[source][1], channels, name)
+    weight = graph.constants[before.inputs[1]]
+    groups = before.attributes.get("group", 1)
+    is_depthwise = groups == len(weight) and weight.shape[1] == 1
+    if groups != 1 and not is_depthwise:
+        return _select(graph, source, len(weight), channels, name)
+    inputs = [before.inputs[0], graph.add_constant(f"{divided_name}.weight", weight[channels])]
+    bias = graph.value(before, 2)
+    if bias is not None:
+        inputs.append(graph.add_constant(f"{divided_name}.bias", bias[channels]))
+    attributes = dict(before.attributes)
+    nodes: list[Node] = []
+    if groups != 1:
+        inputs[0] = f"{name}.before"
+        attributes["group"] = len(channels)
+        nodes = _part_of(graph, before.inputs[0], shapes, channels, inputs[0])
+    return [*nodes, Node.new("Conv", inputs, name, divided_name, **attributes)]
+
+
+def _part_of(
+    graph: OnnxGraph, source: str, shapes: Shapes, channels: np.ndarray, name: str
+) -> list[Node]:
+    """Return what computes some channels of a map that is read by one node, or by several."""
+    if graph.n_reads(source) == 1:
+        return _divide(graph, source, shapes, channels, name)
+    return _select(graph, source, shapes[source][1], channels, name)
+
+
+def _select(
+    graph: OnnxGraph, source: str, width: int, channels: np.ndarray, name: str
+) -> list[Node]:
+    """Return a convolution of one pixel that selects channels of `width` (3)."""
+    node_name = f"{name}.Conv"
+    weight = np.eye(width, dtype=np.float32)[channels][..., None, None]
+    constant = graph.add_constant(f"{node_name}.weight", weight)
+    return [Node.new("Conv", [source, constant], name, node_name, kernel_shape=[1, 1])]

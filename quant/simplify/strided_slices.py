@@ -1,0 +1,88 @@
+"""Write strided slices of rows and columns that are put side by side as one pixel unshuffle.
+
+1. A Concat of slices that start at each place of a block, and step by the block, has the pixels of
+   SpaceToDepth; its channels may come in another order.
+2. Convolutions that read it take that order into their weights.
+
+YOLO's Focus layer is an example. Slices are tried out on an image of numbered pixels.
+"""
+
+import numpy as np
+
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.simplify.fold_affine import is_convolution
+from beers_deploy.quant.simplify.standard_operators import Shapes
+
+BLOCKS = (2, 3, 4)
+
+
+def unshuffle_slices(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Return the pixel unshuffle that a Concat of slices is (1)."""
+    if node.op_type != "Concat" or node.attributes.get("axis") not in (1, -3):
+        return None
+    origins = {_origin(graph, name)[0] for name in node.inputs}
+    source, *others = origins
+    size = shapes.get(source, ())
+    readers = graph.readers[node.outputs[0]]
+    takes_order = all(
+        reader.op_type == "Conv"
+        and is_convolution(graph, reader)
+        and reader.attributes.get("group", 1) == 1
+        for reader in readers
+    )
+    is_read = readers and node.outputs[0] not in graph.outputs
+    if others or len(size) != 4 or size[1] < 1 or not is_read or not takes_order:
+        return None
+    for block in BLOCKS:
+        order = _order(graph, node, size[1], block)
+        if order is None:
+            continue
+        # 2.
+        for reader in readers:
+            weight = graph.constants[reader.inputs[1]]
+            # Channel k of the Concat is channel order[k] of the unshuffle.
+            name = graph.add_constant(f"{reader.name}.weight", weight[:, np.argsort(order)])
+            reader.inputs = (reader.inputs[0], name, *reader.inputs[2:])
+        output = node.outputs[0]
+        return [Node.new("SpaceToDepth", [source], output, node.name, blocksize=block)]
+    return None
+
+
+def _origin(graph: OnnxGraph, name: str) -> tuple[str, list[Node]]:
+    """Return the tensor that slices in front of a name begin with, and these in their order."""
+    slices: list[Node] = []
+    while (writer := graph.writers.get(name)) is not None and writer.op_type == "Slice":
+        slices.insert(0, writer)
+        name = writer.inputs[0]
+    return name, slices
+
+
+def _order(graph: OnnxGraph, node: Node, channels: int, block: int) -> np.ndarray | None:
+    """Return the unshuffle's channels in the order of a Concat, or None if pixels differ."""
+    shape = (1, channels, 4 * block, 6 * block)
+    image = np.arange(np.prod(shape)).reshape(shape)
+    parts = []
+    for name in node.inputs:
+        part = image
+        for each in _origin(graph, name)[1]:
+            starts, stops, axes, steps = (graph.numbers(each, k, "") for k in range(1, 5))
+            if not (starts and stops and axes) or steps is None:
+                return None
+            places = [slice(None)] * 4
+            for axis, start, stop, by in zip(
+                axes, starts, stops, steps or [1] * len(axes), strict=True
+            ):
+                places[axis] = slice(start, stop, by)
+            part = part[tuple(places)]
+        parts.append(part)
+    blocks = image.reshape(channels, 4, block, 6, block).transpose(2, 4, 0, 1, 3)
+    unshuffled = blocks.reshape(1, block**2 * channels, 4, 6)
+    if any(part.shape[2:] != unshuffled.shape[2:] for part in parts):
+        return None
+    result = np.concatenate(parts, axis=1)
+    if result.shape != unshuffled.shape:
+        return None
+    # Each channel is known by its first pixel.
+    firsts = unshuffled[0, :, 0, 0].tolist()
+    order = np.array([firsts.index(n) if n in firsts else 0 for n in result[0, :, 0, 0].tolist()])
+    return order if np.array_equal(unshuffled[:, order], result) else None
