@@ -70,6 +70,7 @@ def read_network(model: onnx.ModelProto) -> SplitNetwork:
     with contradictions("the float network"):
         reader = _Reader(model)
         network = cut(reader.graph(), reader.channels())
+        network = replace(network, border_px=reader.border_px)
         check_network(network)
     return network
 
@@ -95,6 +96,27 @@ class _Reader:
         self._places: dict[str, int] = {}  # where the operation that writes a tensor stands
         self._widths: dict[str, int] = {}  # channels of what the first operations write
         self._measured = 0  # how many operations `_widths` covers
+        self.border_px = self._take_mirror()
+
+    def _take_mirror(self) -> int:
+        """Remove a Pad that mirrors the image, and return its border in pixels; the host does it.
+
+        The sum with the image is the host's too, so it may read the image as it is.
+        """
+        source = self.source
+        pads = [node for node in source.readers[self.image] if node.op_type == "Pad"]
+        others = [node.op_type for node in source.readers[self.image] if node not in pads]
+        if len(pads) != 1 or set(others) - {"Add"} or pads[0].attributes.get("mode") != "reflect":
+            return 0
+        amounts = source.numbers(pads[0], 1, "pads") or [0]
+        border_px = int(amounts[-1])
+        if amounts != [0, 0, border_px, border_px] * 2 or border_px < 1:
+            return 0
+        mirrored = pads[0].outputs[0]
+        for node in source.readers[mirrored]:
+            node.inputs = tuple(self.image if n == mirrored else n for n in node.inputs)
+        source.set_nodes([node for node in source.nodes if node is not pads[0]])
+        return border_px
 
     def channels(self) -> int:
         """Return the channels of the image."""
@@ -120,12 +142,10 @@ class _Reader:
                 "Export it with one of them.",
             )
         (result,) = self.source.outputs
-        *nodes, last = self.source.nodes
-        if _clips_to_image(last, self.source) and last.outputs[0] == result:
-            # The host clips images to [0, 1] in any case.
-            result = last.inputs[0]
-        else:
-            nodes.append(last)
+        nodes = list(self.source.nodes)
+        # The host clips images to [0, 1] in any case.
+        while nodes and nodes[-1].outputs[0] == result and _clips_to_image(nodes[-1], self.source):
+            result = nodes.pop().inputs[0]
         for node in nodes:
             self._read(node)
         if not self.ops or self.ops[-1].output != result:

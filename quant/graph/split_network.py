@@ -45,6 +45,7 @@ class SplitNetwork:
             numbers.
         last: what it does to the sum: pixel shuffle. An image of one channel is added to each of
             the sum's.
+        border_px: by how many pixels it mirrors the image beyond its borders.
     """
 
     graph: Graph = field(compare=False)
@@ -53,6 +54,7 @@ class SplitNetwork:
     back: tuple[Shuffle, ...] = ()
     adds_image: bool = True
     last: tuple[Shuffle, ...] = ()
+    border_px: int = 0
 
     @property
     def core_channels(self) -> int:

@@ -1,13 +1,14 @@
 """The host's part as JSON, in the metadata of an INT8 file: read from it, and written to it."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 from beers_deploy.quant.graph import Shuffle
 from beers_deploy.quant.host_part.input_encoding import (
     BANK_SLICES,
     IMAGE_SLICES,
+    BitSlices,
     Direct,
     InputEncoding,
 )
@@ -21,6 +22,8 @@ from beers_deploy.quant.host_part.output_decoding import (
 from beers_deploy.quant.host_part.part import HostPart
 
 SHUFFLES = ("front", "back", "last")
+MOST_MARGIN_PX = 1024
+"""No network that is of use mirrors more of its image."""
 
 
 def host_part_to_json(part: HostPart) -> dict[str, Any]:
@@ -29,6 +32,9 @@ def host_part_to_json(part: HostPart) -> dict[str, Any]:
     record = asdict(part)
     # Encoding and decoding are described by the flags that the first files had.
     del record["encoding"], record["decoding"]
+    if isinstance(part.encoding, BitSlices) and part.encoding != BANK_SLICES:
+        # Files without a margin are described as they were before there was any.
+        record |= {"margin_px": part.encoding.margin_px} if part.encoding.margin_px else {}
     return {
         **record,
         "planes": part.encoding.planes,
@@ -73,7 +79,12 @@ def _gains(decoding: OutputDecoding) -> int:
 def _encoding(record: Mapping[str, Any]) -> InputEncoding:
     if record.get("direct"):
         return Direct()
-    return BANK_SLICES if record.get("banked") else IMAGE_SLICES
+    if record.get("banked"):
+        return BANK_SLICES
+    margin_px = int(record.get("margin_px", 0))
+    if not 0 <= margin_px <= MOST_MARGIN_PX:
+        raise ValueError(f"a margin of {margin_px} px")
+    return replace(IMAGE_SLICES, margin_px=margin_px)
 
 
 def _decoding(record: Mapping[str, Any]) -> OutputDecoding:

@@ -4,7 +4,7 @@ image -> pixel unshuffle -> encoding -> core -> decoding -> pixel shuffle -> + i
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from onnx import TensorProto
@@ -60,6 +60,7 @@ class HostPart:
             network.back,
             network.adds_image,
             network.last,
+            encoding=replace(IMAGE_SLICES, margin_px=network.border_px),
             decoding=decoding,
         )
 

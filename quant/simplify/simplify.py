@@ -13,7 +13,9 @@ network:
 4. Sub of a convolution's result is Add, Sum is Add, a mean over the image is GlobalAveragePool,
    HardSwish is itself, ReLU6 is Clip from 0 to 6.
 5. Operators are those of opset 17, unless one has no form there.
-6. Inputs, outputs, metadata and nodes that stay keep their names, each node has one, and no two
+6. The result of a network without padding has the image's size, or a multiple of it: the image is
+   mirrored beyond its borders.
+7. Inputs, outputs, metadata and nodes that stay keep their names, each node has one, and no two
    convolutions share what was folded into one of them.
 
 A network that needs none of it is returned as it is: its results stay the same to the bit. The same
@@ -51,6 +53,7 @@ from beers_deploy.quant.simplify.fold_affine import (
 )
 from beers_deploy.quant.simplify.free_sizes import free_sizes
 from beers_deploy.quant.simplify.fully_connected import ConnectByConvolutions
+from beers_deploy.quant.simplify.missing_border import with_missing_border
 from beers_deploy.quant.simplify.spelled_activations import join_hard_swish, join_relu
 from beers_deploy.quant.simplify.split_channels import split_channels
 from beers_deploy.quant.simplify.standard_operators import (
@@ -100,7 +103,8 @@ def simplify(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
         where: name of the network for messages, such as "a.onnx".
     """
     with contradictions(where):
-        return model if _is_plain(model) else _simplified(model, where)
+        network = model if _is_plain(model) else _simplified(model, where)
+        return with_missing_border(network)
 
 
 def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:

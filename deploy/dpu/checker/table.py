@@ -13,6 +13,7 @@ from beers_deploy.dpu.board import Dpu, ruled
 from beers_deploy.dpu.checker.finding import Finding
 from beers_deploy.dpu.checker.placement import Cut, PlacedNode, Placement, place
 from beers_deploy.dpu.checker.remarks import is_island, remarks_on
+from beers_deploy.dpu.graph import SizedGraph
 from beers_deploy.dpu.reading import network_of, own_tile_px
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.network import Network, NetworkLike
@@ -58,7 +59,14 @@ class Checked(Table):
             return f"check FAILED: {'; '.join(map(str, self.failed))}"
         if self.dpu.target.npu:
             return "check passed: no rule is broken; nothing was compiled"
-        return "check passed: the core runs whole on the DPU"
+        if not self.placement.note:
+            return "check passed: it fits as it is, the core runs whole on the DPU"
+        if any(check.name == ACCEPTED for check in self.checks):
+            return "check passed: it fits once 'quantize' has rewritten it to INT8"
+        return (
+            "check passed: its nodes run on the DPU; 'quantize' is for networks that make one "
+            "image of one image"
+        )
 
 
 def check_network(
@@ -82,9 +90,12 @@ def check_network(
     tile_px = own_tile_px(source.model) or TILE_PX
     if tile is not None:
         tile_px = require_side(tile)
-    placement = place(network_of(source.model, tile_px, source.label), build)
+    sized = network_of(source.model, tile_px, source.label)
+    placement = place(sized, build)
     npu = bool(target.npu)
     checks = [legality(placement, npu=npu), *(_file_checks(source.model, build) if npu else [])]
+    if not is_quantized(source.model) and _makes_image(sized):
+        checks.append(_acceptance(source.model))
     return Checked(
         title=f"{source.input.name} on {target.name} {build.name}, tile {tile_px}",
         command="check",
@@ -112,13 +123,27 @@ DETAILS = frozenset({"nodes", "subgraphs", "summary"})
 """Tables for a closer look: a line for each node."""
 
 
+ACCEPTED = "networks that 'quantize' refuses"
+
+
+def _makes_image(network: SizedGraph) -> bool:
+    """Return True if a network makes one image of one image, as 'quantize' wants."""
+    results = [op.out_shape for op in network.operations if op.output in network.outputs]
+    sides_px = [min(shape[1:]) for shape in results if shape is not None]
+    return len(network.inputs) == 1 and len(network.outputs) == 1 and max(sides_px, default=0) > 1
+
+
+def _acceptance(model: onnx.ModelProto) -> Check:
+    """Return the check that fails if 'quantize' refuses a float network."""
+    reason = refusal(model)
+    return Check(ACCEPTED, int(bool(reason)), 0, "network", detail=reason)
+
+
 def _notes(placement: Placement, source: Network) -> list[str]:
     """Return what a reader must know of a network that was not quantised here."""
     if not placement.note:
         return []
-    refused = refusal(source.model)
-    note = OTHERS_NOTE if is_quantized(source.model) else placement.note
-    return [note, f"'quantize' refuses it: {refused}" if refused else "'quantize' accepts it"]
+    return [OTHERS_NOTE if is_quantized(source.model) else placement.note]
 
 
 def _rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:

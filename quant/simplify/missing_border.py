@@ -1,0 +1,91 @@
+"""Mirror the image beyond its borders where a network has no padding and makes a smaller result.
+
+1. Where no layer pads, the sizes of the result for two sizes of image tell how many pixels a side
+   are missing.
+2. A Pad in front of the network mirrors half of them at each border. The result has the size of the
+   image then, or a multiple of it, and is the old one inside its border.
+"""
+
+import numpy as np
+import onnx
+from onnx import helper, numpy_helper, shape_inference
+
+from beers_deploy.quant.onnx.graph import sizes_of
+
+WINDOWS = {"AveragePool", "Conv", "ConvTranspose", "MaxPool", "Pad"}
+SIZES_PX = (256, 320), (384, 512)
+"""Rows and columns of the two images."""
+MOST_PX = 128
+"""A larger border is not what a network without padding lacks."""
+
+
+def with_missing_border(model: onnx.ModelProto) -> onnx.ModelProto:
+    """Return a network whose result lacks no border; as it is if none is missing."""
+    windows = [node for node in model.graph.node if node.op_type in WINDOWS]
+    # Zeros that a layer pads with would lie beyond the mirrored border, not at the image's.
+    border_px = 0 if any(map(_is_padded, windows)) else _missing_px(model)
+    if not border_px:
+        return model
+    network = onnx.ModelProto()
+    network.CopyFrom(model)
+    graph = network.graph
+    image = graph.input[0].name
+    mirrored = f"{image}.mirrored"
+    # 2.
+    for node in graph.node:
+        names = [mirrored if name == image else name for name in node.input]
+        del node.input[:]
+        node.input.extend(names)
+    amounts = np.array([0, 0, border_px, border_px] * 2)
+    pads = numpy_helper.from_array(amounts, f"{mirrored}.pads")
+    graph.initializer.append(pads)
+    pad = helper.make_node("Pad", [image, pads.name], [mirrored], mirrored, mode="reflect")
+    graph.node.insert(0, pad)
+    return network
+
+
+def _is_padded(node: onnx.NodeProto) -> bool:
+    """Return True for a node that adds pixels around its map."""
+    states_pads = any(a.name == "pads" and any(a.ints) for a in node.attribute)
+    return node.op_type == "Pad" or states_pads
+
+
+def _missing_px(model: onnx.ModelProto) -> int:
+    """Return how many pixels of a border are missing at each side; 0 for none (1)."""
+    results = []
+    for size in SIZES_PX:
+        sides = _result_size(model, size)
+        if not sides:
+            return 0
+        results.append(sides)
+    borders = set()
+    for axis in (0, 1):
+        growth = (results[1][axis] - results[0][axis]) / (SIZES_PX[1][axis] - SIZES_PX[0][axis])
+        if growth < 1:
+            return 0
+        borders.add((SIZES_PX[0][axis] - results[0][axis] / growth) / 2)
+    border_px = borders.pop()
+    is_whole = border_px == int(border_px)
+    return int(border_px) if is_whole and not borders and 0 < border_px <= MOST_PX else 0
+
+
+def _result_size(model: onnx.ModelProto, size: tuple[int, int]) -> tuple[int, ...]:
+    """Return rows and columns of the result for an image of this size; empty if not known."""
+    if len(model.graph.input) != 1 or len(model.graph.output) != 1:
+        return ()
+    network = onnx.ModelProto()
+    network.CopyFrom(model)
+    network.graph.ClearField("value_info")
+    dims = network.graph.input[0].type.tensor_type.shape.dim
+    # A network of one size is left as it is: nobody can tell what its result grows with.
+    if len(dims) != 4 or any(dim.dim_value for dim in dims[2:]):
+        return ()
+    for dim, side_px in zip(dims[2:], size, strict=True):
+        dim.dim_value = side_px
+    network.graph.output[0].type.tensor_type.ClearField("shape")
+    try:
+        inferred = shape_inference.infer_shapes(network)
+    except shape_inference.InferenceError:
+        return ()
+    sizes = sizes_of(inferred.graph.output[0].type.tensor_type)
+    return sizes[2:] if len(sizes) == 4 and min(sizes[2:]) > 0 else ()

@@ -1,0 +1,134 @@
+"""Networks that compute with the size of their image are the same without that arithmetic."""
+
+import io
+import warnings
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from beers_deploy.quant.graph import refusal
+from beers_deploy.quant.session import open_session, result_of
+from beers_deploy.quant.simplify.simplify import simplify
+
+FEATURES = 4
+
+
+class PaddedUNet(nn.Module):
+    """Pads what it enlarged to the size of the skip, as the most copied U-Net does."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fine = nn.Conv2d(1, FEATURES, 3, padding=1)
+        self.deep = nn.Conv2d(FEATURES, FEATURES, 3, padding=1)
+        self.up = nn.ConvTranspose2d(FEATURES, FEATURES, 2, stride=2)
+        self.tail = nn.Conv2d(2 * FEATURES, 1, 1)
+
+    def enlarged(self, deep: Tensor, fine: Tensor) -> Tensor:
+        up: Tensor = self.up(deep)
+        rows = fine.size(2) - up.size(2)
+        columns = fine.size(3) - up.size(3)
+        sides = [columns // 2, columns - columns // 2, rows // 2, rows - rows // 2]
+        return functional.pad(up, sides)
+
+    def forward(self, image: Tensor) -> Tensor:
+        fine = torch.relu(self.fine(image))
+        deep = torch.relu(self.deep(functional.max_pool2d(fine, 2)))
+        result: Tensor = self.tail(torch.cat([self.enlarged(deep, fine), fine], 1))
+        return result
+
+
+class ResizedUNet(PaddedUNet):
+    """Enlarges to the size of the skip, and clips."""
+
+    def enlarged(self, deep: Tensor, fine: Tensor) -> Tensor:
+        return functional.interpolate(deep, size=fine.shape[2:], mode="bilinear")
+
+    def forward(self, image: Tensor) -> Tensor:
+        return torch.clamp(image + super().forward(image), 0, 1)
+
+
+class Gated(nn.Module):
+    """NAFNet's gate: half of the channels times the other half."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.wide = nn.Conv2d(1, 2 * FEATURES, 1)
+        self.deep = nn.Conv2d(2 * FEATURES, 2 * FEATURES, 3, padding=1, groups=2 * FEATURES)
+        self.tail = nn.Conv2d(FEATURES, 1, 1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        first, second = self.deep(self.wide(image)).chunk(2, 1)
+        correction: Tensor = self.tail(first * second)
+        return image + correction
+
+
+class NoiseLevel(nn.Module):
+    """FFDNet's map of one noise level, as a constant."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.head = nn.Conv2d(2, FEATURES, 3, padding=1)
+        self.tail = nn.Conv2d(FEATURES, 1, 3, padding=1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        level = torch.full((1, 1, 1, 1), 0.1)
+        level = level.expand(1, 1, image.shape[2], image.shape[3])
+        result: Tensor = self.tail(torch.relu(self.head(torch.cat([image, level], 1))))
+        return result
+
+
+def exported(module: nn.Module) -> onnx.ModelProto:
+    """Export a module with drawn weights, its height and width free."""
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for numbers in module.parameters():
+            numbers.uniform_(-0.5, 0.5, generator=generator)
+    file = io.BytesIO()
+    axes = {"input": {2: "height", 3: "width"}, "output": {2: "h", 3: "w"}}
+    names = {"input_names": ["input"], "output_names": ["output"]}
+    image = torch.zeros(1, 1, 32, 32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            module.eval(),
+            (image,),
+            file,
+            dynamo=False,
+            opset_version=17,
+            dynamic_axes=axes,
+            **names,
+        )
+    return onnx.load_model_from_string(file.getvalue())
+
+
+@pytest.mark.parametrize("make", [PaddedUNet, ResizedUNet, Gated, NoiseLevel])
+def test_sizes_are_gone_and_results_are_the_same(make: Callable[[], nn.Module]) -> None:
+    model = exported(make())
+    short = simplify(model, "a.onnx")
+    left = Counter(node.op_type for node in short.graph.node)
+    assert not left.keys() & {"Shape", "Slice", "Split", "Pad", "Expand", "Gather"}
+    assert refusal(short) == ""
+    image = np.random.default_rng(2).uniform(0, 1, (1, 1, 22, 38)).astype(np.float32)
+    before = result_of(open_session(model), image)
+    after = result_of(open_session(short), image)
+    np.testing.assert_allclose(after, before, atol=1e-6)
+
+
+class Cropped(nn.Module):
+    """Uses a tenth of its rows more than once, whatever their number."""
+
+    def forward(self, image: Tensor) -> Tensor:
+        rows = image.shape[2] // 10
+        return torch.cat([image, image[:, :, :rows]], 2)
+
+
+def test_what_depends_on_the_size_stays_and_is_refused() -> None:
+    model = simplify(exported(Cropped()), "a.onnx")
+    assert any(node.op_type == "Shape" for node in model.graph.node)
+    assert "Export it with fixed height and width" in refusal(model)
