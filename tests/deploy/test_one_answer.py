@@ -1,0 +1,125 @@
+"""What check passes, quantize accepts, gate judges, bench predicts and restore runs."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from onnx import helper
+
+import beers_deploy as bd
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
+from tests.quant.quick import one_guess
+
+CHANNELS = 4
+GENERATOR = 5
+
+
+class Drawn(GraphWriter):
+    """Writes a network of drawn weights."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._generator = np.random.default_rng(GENERATOR)
+
+    def number(self, value: float, *shape: int) -> str:
+        name = f"number_{len(self.nodes)}_{value}"
+        return self.constant(name, np.full(shape, value, np.float32))
+
+    def add(self, kind: str, *sources: str, **attributes: object) -> str:
+        return self.node(kind, f"t{len(self.nodes)}", list(sources), **attributes)
+
+    def conv(self, source: str, outputs: int, inputs: int, side: int = 3, pad: int = 1) -> str:
+        weight = self._generator.normal(0, 0.3, (outputs, inputs, side, side))
+        name = self.constant(f"w{len(self.nodes)}", weight.astype(np.float32))
+        return self.add("Conv", source, name, pads=[pad] * 4)
+
+
+Part = Callable[[Drawn, str], str]
+"""Writes operations behind a map of `CHANNELS` channels, and returns another such map."""
+
+
+def split_gate(w: Drawn, source: str) -> str:
+    wide = w.conv(source, 2 * CHANNELS, CHANNELS)
+    names = [f"{wide}.a", f"{wide}.b"]
+    node = helper.make_node("Split", [wide], names, f"{wide}.split", axis=1)
+    w.nodes.append(node)
+    return w.add("Mul", *names)
+
+
+def hard_swish(w: Drawn, source: str) -> str:
+    clipped = w.add("Clip", w.add("Add", source, w.number(3)), w.number(0), w.number(6))
+    return w.add("Mul", source, w.add("Div", clipped, w.number(6)))
+
+
+PARTS: dict[str, Part] = {
+    "convolution": lambda w, x: w.conv(x, CHANNELS, CHANNELS),
+    "valid": lambda w, x: w.conv(x, CHANNELS, CHANNELS, pad=0),
+    "relu": lambda w, x: w.add("Relu", x),
+    "one-sided clip": lambda w, x: w.add("Clip", x, w.number(0)),
+    "larger of two": lambda w, x: w.add("Max", x, w.number(0)),
+    "hard-swish": hard_swish,
+    "split gate": split_gate,
+    "less itself": lambda w, x: w.add("Sub", w.conv(x, CHANNELS, CHANNELS), x),
+    "over a constant": lambda w, x: w.add("Div", x, w.number(2, CHANNELS, 1, 1)),
+    "down and up": lambda w, x: w.add(
+        "Resize",
+        w.add("MaxPool", x, kernel_shape=[2, 2], strides=[2, 2]),
+        "",
+        w.constant("twice", np.array([1, 1, 2, 2], np.float32)),
+        mode="nearest",
+        coordinate_transformation_mode="asymmetric",
+        nearest_mode="floor",
+    ),
+    "leaky": lambda w, x: w.add("LeakyRelu", x, alpha=0.3),
+    "hard sigmoid": lambda w, x: w.add("HardSigmoid", x, alpha=0.2),
+    "mean over channels": lambda w, x: w.add("Sub", x, w.add("ReduceMean", x, axes=[1])),
+    "sine": lambda w, x: w.add("Sin", x),
+}
+
+
+def drawn(path: Path, parts: list[str], *, adds_image: bool, clips: bool) -> Path:
+    """Write a network of these parts between two convolutions."""
+    w = Drawn()
+    last = w.conv("image", CHANNELS, 1)
+    for part in parts:
+        last = PARTS[part](w, last)
+    last = w.conv(last, 1, CHANNELS)
+    if adds_image:
+        last = w.add("Add", "image", last)
+    if clips:
+        last = w.add("Clip", last, w.number(0), w.number(1))
+    result = helper.make_tensor_value_info(last, onnx.TensorProto.FLOAT, ["N", 1, "h", "w"])
+    onnx.save(make_model(w.graph("drawn", [image_info("image", 1, None)], [result]), {}), path)
+    return path
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    parts=st.lists(st.sampled_from(sorted(PARTS)), max_size=3),
+    adds_image=st.booleans(),
+    clips=st.booleans(),
+)
+def test_commands_do_not_contradict_each_other(
+    tmp_path_factory: pytest.TempPathFactory, parts: list[str], adds_image: bool, clips: bool
+) -> None:
+    path = drawn(
+        tmp_path_factory.mktemp("drawn") / "a.onnx", parts, adds_image=adds_image, clips=clips
+    )
+    samples = np.random.default_rng(1).uniform(0, 1, (4, 1, 32, 32)).astype(np.float32)
+    fits = bool(bd.check(path, tile=64))
+    with one_guess():
+        if not fits:
+            with pytest.raises(ModelError):
+                bd.quantize(path, samples=samples, progress=False)
+            return
+        int8 = bd.quantize(path, samples=samples, progress=False)
+    assert bd.check(int8, tile=64)
+    bd.gate(path, int8, samples=samples, progress=False)
+    bd.bench(path, tile=64, traditional=False)
+    restored = bd.restore(samples[0, 0], network=int8, progress=False, force=True)
+    assert restored.shape == (32, 32)
