@@ -52,10 +52,10 @@ class Data:
     """
 
     sensor: Sensor
-    samples: object = None
-    images: Path | None = None
-    patches: int = 64
-    seed: int = 0
+    samples: object
+    images: Path | None
+    patches: int
+    seed: int
     patch_px: int = 128
 
     def own(self, network: Network) -> OwnSamples | None:

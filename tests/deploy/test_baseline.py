@@ -162,7 +162,7 @@ def test_a_folder_is_known_by_its_files(change: str, tmp_path: Path) -> None:
     folder.mkdir()
     (folder / "a.tif").write_bytes(b"1")
     (folder / "b.tif").write_bytes(b"2")
-    data = Data(Sensor.load("pleiades-degraded"), images=folder)
+    data = Data(Sensor.load("pleiades-degraded"), samples=None, images=folder, patches=1, seed=0)
     before = data.inputs
     # A file that is not read as a scene does not count.
     (folder / "gate.json").touch()
