@@ -14,7 +14,8 @@ from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.shipped import INT8, SENSOR, VARIANT, shipped_weights
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import OptionError, printable
-from beers_deploy.profiles.sensor import Sensor, SensorLike, numbers_of
+from beers_deploy.profiles.sensor import Sensor, SensorLike
+from beers_deploy.profiles.sensor_numbers import numbers_of
 from beers_deploy.quant.gate import METRICS, GateResult, gate_row
 from beers_deploy.quant.gate import compare as differences_of
 from beers_deploy.quant.onnx_file import faults_named, metadata, require_quantized
