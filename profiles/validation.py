@@ -90,6 +90,12 @@ def check_keys(
     """Refuse a table with an unknown key, or without a required one.
 
     For tables whose keys depend on more than a type.
+
+    Args:
+        where: names the file and the table in messages.
+        raw: the table.
+        required: the keys that it must have; as a mapping also what each can be.
+        optional: keys that it may have.
     """
     allowed = sorted({*required, *optional})
     for key in raw:
@@ -97,12 +103,13 @@ def check_keys(
             choices = f"it can have the keys {', '.join(allowed)}"
             raise ProfileError(f"{where} has the unknown key {_spelling(key, allowed, choices)}")
     for key in sorted({*required} - set(raw)):
-        raise ProfileError(_missing(where, key))
+        kind = f": {required[key]}" if isinstance(required, Mapping) else ""
+        raise ProfileError(_missing(where, key, kind))
 
 
-def _missing(where: str, key: str) -> str:
-    how = f", such as {EXAMPLES[key]}" if key in EXAMPLES else "; a shipped profile shows how"
-    return f"{where} has no key {key!r}. Add it{how}."
+def _missing(where: str, key: str, kind: str = "") -> str:
+    example = f", such as {EXAMPLES[key]}" if key in EXAMPLES else "; a shipped profile shows how"
+    return f"{where} has no key {key!r}. Add it{kind or example}."
 
 
 def _spelling(key: str, names: Sequence[str], choices: str = "") -> str:

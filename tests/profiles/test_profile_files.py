@@ -110,6 +110,13 @@ def test_what_loads_can_be_drawn_at_the_very_bounds(
             ),
         ),
         (
+            "defects = { dead_per_million = 1 }",
+            (
+                "defects has no key 'hot_per_million'. Add it: a number of at least 0 and at most "
+                "1e+06."
+            ),
+        ),
+        (
             "prnu = { rms = { value = 0.1, source = 'x' } }",
             "prnu.rms has no key 'status'. Add it, such as status = \"measured\".",
         ),
