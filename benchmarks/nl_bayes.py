@@ -17,8 +17,9 @@ import skimage.data
 import torch
 
 from beers_deploy.model.metrics.fidelity import psnr_db
-from beers_deploy.model.traditional.nl_bayes import QUALITIES, nl_bayes_strips
+from beers_deploy.model.traditional.nl_bayes import nl_bayes_strips
 from beers_deploy.model.traditional.noise import Noise
+from beers_deploy.model.traditional.patch_groups import QUALITIES
 
 CPP = {
     ("camera", 10): (34.26, 0.95),

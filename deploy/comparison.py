@@ -14,7 +14,8 @@ from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.shipped import INT8, SENSOR, VARIANT, shipped_weights
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import OptionError, printable
-from beers_deploy.profiles.sensor import Sensor, SensorLike, numbers_of
+from beers_deploy.profiles.sensor import Sensor, SensorLike
+from beers_deploy.profiles.sensor_numbers import numbers_of
 from beers_deploy.quant.gate import METRICS, GateResult, gate_row
 from beers_deploy.quant.gate import compare as differences_of
 from beers_deploy.quant.onnx_file import faults_named, metadata, require_quantized
@@ -52,10 +53,10 @@ class Data:
     """
 
     sensor: Sensor
-    samples: object = None
-    images: Path | None = None
-    patches: int = 64
-    seed: int = 0
+    samples: object
+    images: Path | None
+    patches: int
+    seed: int
     patch_px: int = 128
 
     def own(self, network: Network) -> OwnSamples | None:

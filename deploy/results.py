@@ -79,6 +79,7 @@ class Table:
         notes: sentences that a reader must know.
         title: heading of the whole.
         headings: the heading of each table of rows, if its name is not clear enough by itself.
+        captions: a sentence to be shown after a table, by its heading.
         details: tables, figures and words that are shown only in detail, by their names.
 
     Examples:
@@ -97,6 +98,7 @@ class Table:
     notes: tuple[str, ...] = ()
     title: str = ""
     headings: Mapping[str, str] = field(default_factory=dict)
+    captions: Mapping[str, str] = field(default_factory=dict)
     details: frozenset[str] = frozenset()
 
     @property
@@ -147,6 +149,8 @@ class Table:
         tables = self.shown(details)
         for heading, rows in tables.items():
             print_rows(heading if heading != self.title else "", rows, console)
+            if heading in self.captions:
+                console.print(plain(self.captions[heading]), highlight=False, soft_wrap=True)
         if any(row.figures for rows in tables.values() for row in rows):
             console.print(LEGEND, style="dim", highlight=False, markup=False)
         for sentence in self.sentences:
@@ -201,6 +205,8 @@ class Table:
         lines = [f"# {markdown_text(self.title)}", ""] if self.title else []
         for heading, rows in self.shown().items():
             lines += [f"## {markdown_text(heading)}", "", *markdown_table(rows), ""]
+            if heading in self.captions:
+                lines += [markdown_text(self.captions[heading]), ""]
         lines += [f"- {markdown_text(sentence)}" for sentence in self.sentences]
         return "\n".join(lines).rstrip() + "\n"
 
@@ -253,7 +259,11 @@ class Table:
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: each table, checks and notes."""
-        tables = [html_table(heading, rows) for heading, rows in self.shown().items()]
+        tables = []
+        for heading, rows in self.shown().items():
+            tables.append(html_table(heading, rows))
+            if heading in self.captions:
+                tables.append(f"<p>{html_text(one_line(self.captions[heading]))}</p>")
         sentences = [f"<p>{html_text(one_line(sentence))}</p>" for sentence in self.sentences]
         return "".join(tables) + "".join(sentences)
 

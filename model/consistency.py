@@ -35,17 +35,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from beers_deploy.model.blocks import (
+    BLOCK_PX,
+    BORDER_BLOCKS,
+    Image,
+    Placed,
+    block_means,
+    extend,
+    interpolate,
+    reached_blocks,
+    weighted_sums,
+)
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.profiles.instrument import Instrument
-
-Image = NDArray[np.float32]
-
-BLOCK_PX = 8
-"""Side of a block.
-
-The mean of 64 pixels has an eighth of a pixel's noise. Blocks of 16 and 32 gained less (0.01 and
-0.03 dB, measured).
-"""
 
 NEAR_PX = 8
 """Radius of the near part of H.
@@ -65,11 +67,6 @@ FAR_BLOCKS = 8
 Twice as many changed the PSNR by less than 0.01 dB (measured).
 """
 
-BORDER_BLOCKS = 2
-"""Blocks at the image's border that are left out, because H brings light into them that x does not
-show. With all blocks the outer 8 pixels lost 0.2 dB, with one left out 0.05 dB; with two they gain
-(measured on training places).
-"""
 
 REACH_PX = BLOCK_PX * (FAR_BLOCKS + BORDER_BLOCKS + 1) - 1
 """How far from a pixel lie the restored pixels that its correction depends on."""
@@ -99,45 +96,6 @@ PRODUCTS_PER_PX = (
 
 EXCESS_SIGMAS = 6.0
 """Above so many standard deviations of noise no pixel is clipped at zero."""
-
-
-@dataclass(frozen=True)
-class Placed:
-    """Where in an image the pixels of an array lie along one side.
-
-    Attributes:
-        size_px: of the image.
-        start: place in the image of the array's first pixel.
-        keep_start: first kept pixel, in the image.
-        keep_stop: end of the kept pixels (excluded).
-    """
-
-    size_px: int
-    start: int
-    keep_start: int
-    keep_stop: int
-
-    @property
-    def blocks(self) -> tuple[int, int]:
-        """First and last block that the kept pixels are interpolated from.
-
-        BORDER_BLOCKS at either end of the image are left out, unless it has no others.
-        """
-        # Pixel p lies between the centres of blocks (p - 4) // 8 and the next: a centre lies at 8 k
-        # + 3.5.
-        half = BLOCK_PX // 2
-        count = -(-self.size_px // BLOCK_PX)
-        left_out = BORDER_BLOCKS if count > 2 * BORDER_BLOCKS else 0
-        low = left_out
-        high = count - 1 - left_out
-        first = (self.keep_start - half) // BLOCK_PX
-        last = (self.keep_stop - 1 - half) // BLOCK_PX + 1
-        return min(max(first, low), high), max(min(last, high), low)
-
-    def span(self, around_px: int) -> tuple[int, int]:
-        """Pixels of all these blocks, and as many around them; they may lie beyond the image."""
-        first, last = self.blocks
-        return BLOCK_PX * first - around_px, BLOCK_PX * (last + 1) + around_px
 
 
 @dataclass(frozen=True)
@@ -213,19 +171,21 @@ class Consistency:
         any_missing = bool(missing.any())
         finite = np.where(missing, np.float32(0), restored) if any_missing else restored
         origin = down.start, across.start
-        blurred = self._near(_extended(finite, (down, across), origin, NEAR_PX))
+        blurred = self._near(extend(finite, (down, across), origin, NEAR_PX))
         blurred += self._far(finite, missing if any_missing else None, down, across)
-        raw_means = _block_means(_extended(raw, (down, across), raw_at, 0))
+        raw_means = block_means(extend(raw, (down, across), raw_at, 0))
         residual = raw_means - _interpolated_excess(raw_means, self.means, self.excess) - blurred
         saturated = (raw >= self.full_scale).astype(np.float32)
-        weights = np.float32(1) - _reached(_extended(saturated, (down, across), raw_at, NEAR_PX))
+        weights = np.float32(1) - reached_blocks(
+            extend(saturated, (down, across), raw_at, NEAR_PX), NEAR_PX
+        )
         if any_missing:
-            missing_pixels = _extended(missing.astype(np.float32), (down, across), origin, NEAR_PX)
-            weights *= np.float32(1) - _reached(missing_pixels)
+            missing_pixels = extend(missing.astype(np.float32), (down, across), origin, NEAR_PX)
+            weights *= np.float32(1) - reached_blocks(missing_pixels, NEAR_PX)
         if weights.all():
-            return _interpolated(residual, down, across)
-        share = _interpolated(weights, down, across)
-        change = _interpolated(residual * weights, down, across)
+            return interpolate(residual, down, across)
+        share = interpolate(weights, down, across)
+        change = interpolate(residual * weights, down, across)
         change /= np.maximum(share, np.float32(LEAST_SHARE))
         return change
 
@@ -233,7 +193,7 @@ class Consistency:
         """Block means of the near part of H x, from pixels with NEAR_PX more on every side."""
         total: Image | None = None
         for row, column in zip(self.rows, self.columns, strict=True):
-            term = _weighted(_weighted(padded, row, 0), column, 1)
+            term = weighted_sums(weighted_sums(padded, row, 0), column, 1)
             total = term if total is None else total + term
         assert total is not None  # noqa: S101 - RANK is at least 1
         return total
@@ -247,11 +207,11 @@ class Consistency:
         """
         around_px = BLOCK_PX * FAR_BLOCKS
         origin = down.start, across.start
-        means = _block_means(_extended(finite, (down, across), origin, around_px))
+        means = block_means(extend(finite, (down, across), origin, around_px))
         if missing is None:
             return self._around(means)
-        missing_share = _block_means(
-            _extended(missing.astype(np.float32), (down, across), origin, around_px)
+        missing_share = block_means(
+            extend(missing.astype(np.float32), (down, across), origin, around_px)
         )
         complete = (missing_share == 0).astype(np.float32)
         middle = means[FAR_BLOCKS:-FAR_BLOCKS, FAR_BLOCKS:-FAR_BLOCKS]
@@ -328,97 +288,7 @@ def _clipped_noise(sensor: Instrument, full_scale: float) -> tuple[Image, Image]
     return means, np.asarray(excess_dn * unit, np.float32)
 
 
-def _interpolated_excess(block_means: Image, means: Image, excess: Image) -> Image:
-    """The excess at block means `own`; a mean below the least that is possible counts as no light
-    at all.
-    """
-    values = np.interp(block_means, means, excess, right=0.0).astype(np.float32)
-    return np.minimum(values, np.maximum(block_means, np.float32(0)))
-
-
-def _extended(
-    image: Image, sides: tuple[Placed, Placed], origin: tuple[int, int], around_px: int
-) -> NDArray[np.float32]:
-    """The pixels of the blocks of a window and `around_px` more, mirrored beyond the image's
-    borders (edge twice).
-    """
-    slices = []
-    pads = []
-    for placed, first in zip(sides, origin, strict=True):
-        start, stop = placed.span(around_px)
-        low = max(start, 0)
-        high = min(stop, placed.size_px)
-        slices.append(slice(low - first, high - first))
-        pads.append((low - start, stop - high))
-    inside = image[slices[0], slices[1]]
-    if not any(map(any, pads)):
-        return inside
-    return _mirrored(image, sides, origin, around_px)
-
-
-def _mirrored(
-    image: Image, sides: tuple[Placed, Placed], origin: tuple[int, int], around_px: int
-) -> NDArray[np.float32]:
-    """As `_extended`, pixel by pixel: c b a | a b c | c b a, folded back
-    whatever the image's size.
-    """
-    numbers = []
-    for placed, first in zip(sides, origin, strict=True):
-        period = 2 * placed.size_px
-        number = np.arange(*placed.span(around_px)) % period
-        numbers.append(np.minimum(number, period - 1 - number) - first)
-    return np.asarray(image[np.ix_(*numbers)])
-
-
-def _weighted(image: Image, weights: Image, axis: int) -> Image:
-    """Weighted sums over windows that begin BLOCK_PX apart along an axis: as long as `weights`,
-    from the first on.
-    """
-    count = (image.shape[axis] - len(weights)) // BLOCK_PX + 1
-    end = BLOCK_PX * (count - 1) + 1
-    total: Image | None = None
-    for place, weight in enumerate(weights):
-        steps = slice(place, place + end, BLOCK_PX)
-        term = (image[steps] if axis == 0 else image[:, steps]) * weight
-        total = term if total is None else np.add(total, term, out=total)
-    assert total is not None  # noqa: S101 - there are weights
-    return total
-
-
-def _block_means(image: Image) -> Image:
-    """The means of whole blocks."""
-    mean = np.full(BLOCK_PX, 1 / BLOCK_PX, np.float32)
-    return _weighted(_weighted(image, mean, 0), mean, 1)
-
-
-def _reached(flags: Image) -> Image:
-    """1 for each block that a flag reaches within NEAR_PX, else 0; `flags` has NEAR_PX more on
-    every side.
-    """
-    ones = np.ones(BLOCK_PX + 2 * NEAR_PX, np.float32)
-    if not flags.any():
-        shape = tuple((side - 2 * NEAR_PX) // BLOCK_PX for side in flags.shape)
-        return np.zeros(shape, np.float32)
-    return np.asarray(_weighted(_weighted(flags, ones, 0), ones, 1) > 0, np.float32)
-
-
-def _interpolated(blocks: Image, down: Placed, across: Placed) -> Image:
-    """Bilinear interpolation between the centres of blocks, at the kept pixels."""
-    return _along(_along(blocks, down).T, across).T
-
-
-def _along(blocks: Image, placed: Placed) -> Image:
-    """Linear interpolation along the first axis; at the image's border the nearest block inside
-    counts.
-    """
-    half = BLOCK_PX // 2
-    first, last = placed.blocks
-    pixels = np.arange(placed.keep_start, placed.keep_stop)
-    left = (pixels - half) // BLOCK_PX
-    # In sixteenths, which float32 holds exactly: the two weights add up to 1.
-    share = ((2 * (pixels - half) + 1) % (2 * BLOCK_PX)).astype(np.float32) / np.float32(
-        2 * BLOCK_PX
-    )
-    lower = np.clip(left, first, last) - first
-    upper = np.clip(left + 1, first, last) - first
-    return blocks[lower] * (np.float32(1) - share)[:, None] + blocks[upper] * share[:, None]
+def _interpolated_excess(raw_means: Image, means: Image, excess: Image) -> Image:
+    """Return the excess at block means; one below the least that is possible counts as no light."""
+    values = np.interp(raw_means, means, excess, right=0.0).astype(np.float32)
+    return np.minimum(values, np.maximum(raw_means, np.float32(0)))

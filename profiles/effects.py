@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import AfterValidator, PlainValidator, create_model
 
 from beers_deploy.profiles.constant import Constant, Limits
-from beers_deploy.profiles.validation import CONFIG
+from beers_deploy.profiles.validation import CONFIG, check_keys
 
 PATTERN_LIMIT = 4.0
 """Detectors further out are rejected at the factory: draws are clipped here, so that bounds can be
@@ -290,6 +290,21 @@ def _spread(excess: np.ndarray, length_px: float) -> np.ndarray:
     from scipy.ndimage import convolve1d
 
     return np.asarray(convolve1d(excess, kernel / kernel.sum(), axis=-2, mode="constant"))
+
+
+def effect_tables(label: str, raw: Mapping[str, object]) -> dict[str, object]:
+    """Return the tables of effects that a file has, with their keys checked.
+
+    Args:
+        label: names the file in errors.
+        raw: its tables.
+    """
+    tables = {name: raw[name] for name in TABLES if name in raw}
+    for name, table in tables.items():
+        # A type can refuse an unknown key, but it cannot say which keys there are.
+        if isinstance(table, Mapping):
+            check_keys(f"{label} {name}", table, TABLES[name].limits())
+    return tables
 
 
 Table = Mapping[str, Constant]

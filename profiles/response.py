@@ -17,7 +17,14 @@ from typing import Annotated, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationInfo, field_validator, model_validator, with_config
+from pydantic import (
+    AfterValidator,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+    with_config,
+)
 
 from beers_deploy.profiles.errors import printable
 from beers_deploy.profiles.validation import CONFIG
@@ -54,9 +61,21 @@ def _require_contrast(response: R) -> R:
 
 
 Numbers = tuple[Annotated[float, Field(strict=True, allow_inf_nan=False)], ...]
-SamplesPerPx = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=2, le=64)]
-"""With fewer than two, nothing is said of the frequencies that sampling by the sensor folds back.
-"""
+
+
+def _fine_enough(samples_per_px: float) -> float:
+    # With fewer than two, nothing is known of the frequencies that the sensor's sampling aliases.
+    if not 2 <= samples_per_px <= 64:
+        raise ValueError(
+            f"must be from 2 to 64, but it is {samples_per_px:g}. Sample the point-spread function "
+            "as often in each target pixel."
+        )
+    return samples_per_px
+
+
+SamplesPerPx = Annotated[
+    float, Field(strict=True, allow_inf_nan=False), AfterValidator(_fine_enough)
+]
 Side = Annotated[int, Field(strict=True, ge=1, le=KEPT_SIDE)]
 
 

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from beers_deploy.profiles.constant import Constant, Limits
-from beers_deploy.profiles.effects import TABLES, AnyEffects, Effects, Table
+from beers_deploy.profiles.effects import TABLES, AnyEffects, Effects, Table, effect_tables
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import HERE
@@ -50,7 +50,7 @@ class SceneCall:
         check_keys(label, raw, ("description", "radiance_scale"), ("without", *TABLES))
         fields = {key: value for key, value in raw.items() if key not in TABLES}
         fields["name"] = label.removesuffix(".toml")
-        fields["effects"] = {key: raw[key] for key in TABLES if key in raw}
+        fields["effects"] = effect_tables(label, raw)
         return validated(SceneCall, fields, label, {"effects": ""})
 
 

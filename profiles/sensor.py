@@ -387,24 +387,3 @@ class Sensor:
 
 SensorLike = Sensor | str | os.PathLike[str]
 """A profile, the name of a shipped one, or a .toml file."""
-
-
-def same_instrument(one: Sensor, other: Sensor) -> bool:
-    """Whether two profiles state the same numbers, whatever they are called and wherever the
-    numbers come from.
-    """
-    return numbers_of(one) == numbers_of(other)
-
-
-def numbers_of(profile: Sensor) -> dict[str, object]:
-    """The low and high end of each constant by name: what of a profile decides what its images are
-    like.
-    """
-    constants: dict[str, Constant | None] = {key: getattr(profile, key) for key in TABLE_OF}
-    for effect, table in profile.effects.items():
-        constants |= {f"{effect}.{key}": constant for key, constant in table.items()}
-    numbers: dict[str, object] = {
-        key: constant and (constant.low, constant.high) for key, constant in constants.items()
-    }
-    # The representation holds all samples, where the text of a response holds a digest.
-    return {**numbers, "response": repr(profile.response)}

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 from beers_deploy.profiles.constant import Constant, Limits, Stated, Status
 from beers_deploy.profiles.effects import TABLES as EFFECT_TABLES
+from beers_deploy.profiles.effects import effect_tables
 from beers_deploy.profiles.errors import ProfileError, printable
 from beers_deploy.profiles.instrument import MTF_NYQUIST_MAX
 from beers_deploy.profiles.point_spread_file import PointSpreadFile
@@ -88,7 +89,7 @@ def sensor_fields(label: str, raw: Mapping[str, Any], folder: Path) -> dict[str,
     fields: dict[str, Any] = {
         "name": label.removesuffix(".toml"),
         "description": raw["description"],
-        "effects": {name: raw[name] for name in EFFECT_TABLES if name in raw},
+        "effects": effect_tables(label, raw),
     }
     for table in TABLES:
         fields |= _content(f"{label} {table}", table, raw[table])
@@ -121,9 +122,9 @@ def _content(where: str, table: str, raw: object) -> Mapping[str, Any]:
 
 def _blur(label: str, raw: Mapping[str, object], folder: Path) -> dict[str, Any]:
     """Return the response that [mtf] states, and its contrasts at Nyquist as constants."""
-    parts = {key: validated(Stated, value, f"{label} mtf.{key}") for key, value in raw.items()}
-    values = {key: part.value for key, part in parts.items()}
     groups = {key: f"mtf.{key}" for key in RESPONSE}
+    parts = validated(dict[str, Stated], raw, label, groups)
+    values = {key: part.value for key, part in parts.items()}
     if "psf" in parts:
         about = parts["psf"]
         response: Response = validated(PointSpreadFile, values, label, groups).read(label, folder)

@@ -13,12 +13,21 @@ T = TypeVar("T")
 CONFIG = ConfigDict(extra="forbid")
 """Of every model here: a misspelt key is refused, never ignored."""
 
+TABLE_TYPES = ("dataclass_type", "dict_type", "mapping_type", "model_type")
 EXPECTED = {
-    **dict.fromkeys(("dataclass_type", "dict_type", "mapping_type", "model_type"), "a table"),
-    "string_type": "a text",
-    "tuple_type": "a list",
+    **dict.fromkeys(TABLE_TYPES, ("a table", "Write it as [{key}].")),
+    "string_type": ("a text", "Write it in quotes."),
+    "tuple_type": ("a list", "Write it in square brackets, with commas between."),
 }
-"""TOML's words for pydantic's types of errors; of the others pydantic's own message is shown."""
+"""TOML's words for pydantic's types of errors, and what to do; of the others pydantic's own message
+is shown, which names the allowed values.
+"""
+EXAMPLES = {
+    "description": 'description = "our camera"',
+    "status": 'status = "measured"',
+    "source": 'source = "data sheet, page 3"',
+}
+"""Lines that show how to write a key that is missing."""
 
 
 def validated(kind: type[T], raw: object, label: str, groups: Mapping[str, str] | None = None) -> T:
@@ -43,10 +52,13 @@ def validated(kind: type[T], raw: object, label: str, groups: Mapping[str, str] 
 def _sentence(label: str, error: ValidationError, groups: Mapping[str, str]) -> str:
     """Return the sentence about the likeliest of the faults."""
 
-    def place(path: Sequence[str | int]) -> str:
+    def dotted(path: Sequence[str | int]) -> str:
         names = [str(name) for name in path if name != "value"]
         names[:1] = [groups.get(name, name) for name in names[:1]]
-        return f"{label} {'.'.join(filter(None, names))}".rstrip()
+        return ".".join(filter(None, names))
+
+    def place(path: Sequence[str | int]) -> str:
+        return f"{label} {dotted(path)}".rstrip()
 
     faults = error.errors(include_url=False)
     missing = {fault["loc"] for fault in faults if fault["type"] == "missing"}
@@ -63,9 +75,10 @@ def _sentence(label: str, error: ValidationError, groups: Mapping[str, str]) -> 
         return _missing(place(fault["loc"][:-1]), str(fault["loc"][-1]))
     if fault["type"] == "value_error":
         return f"{where} {fault['ctx']['error']}"
-    expected = EXPECTED.get(fault["type"], fault["msg"].removeprefix("Input should be "))
+    stated = fault["msg"].removeprefix("Input should be ")
+    expected, hint = EXPECTED.get(fault["type"], (stated, "Correct the value."))
     value = printable(repr(fault["input"]))
-    return f"{where} must be {expected}, got {value}. Correct it; a shipped profile shows how."
+    return f"{where} must be {expected}, got {value}. {hint.format(key=dotted(fault['loc']))}"
 
 
 def check_keys(
@@ -77,6 +90,12 @@ def check_keys(
     """Refuse a table with an unknown key, or without a required one.
 
     For tables whose keys depend on more than a type.
+
+    Args:
+        where: names the file and the table in messages.
+        raw: the table.
+        required: the keys that it must have; as a mapping also what each can be.
+        optional: keys that it may have.
     """
     allowed = sorted({*required, *optional})
     for key in raw:
@@ -84,11 +103,13 @@ def check_keys(
             choices = f"it can have the keys {', '.join(allowed)}"
             raise ProfileError(f"{where} has the unknown key {_spelling(key, allowed, choices)}")
     for key in sorted({*required} - set(raw)):
-        raise ProfileError(_missing(where, key))
+        kind = f": {required[key]}" if isinstance(required, Mapping) else ""
+        raise ProfileError(_missing(where, key, kind))
 
 
-def _missing(where: str, key: str) -> str:
-    return f"{where} has no key {key!r}. Add it; a shipped profile shows how."
+def _missing(where: str, key: str, kind: str = "") -> str:
+    example = f", such as {EXAMPLES[key]}" if key in EXAMPLES else "; a shipped profile shows how"
+    return f"{where} has no key {key!r}. Add it{kind or example}."
 
 
 def _spelling(key: str, names: Sequence[str], choices: str = "") -> str:

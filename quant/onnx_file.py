@@ -28,7 +28,7 @@ from beers_deploy.profiles.errors import (
     reason_of,
 )
 from beers_deploy.profiles.toml import read_whole, unreadable
-from beers_deploy.quant.domains import IR_VERSION, OPSET, opset_of
+from beers_deploy.quant.domains import IR_VERSION, MICROSOFT, OPSET, opset_of
 from beers_deploy.quant.onnx.external_weights import take_in
 from beers_deploy.quant.onnx.runnable import check_runnable
 from beers_deploy.quant.simplify.simplify import simplify
@@ -144,7 +144,7 @@ def make_model(
 ) -> onnx.ModelProto:
     """A model of our opset around a graph; `microsoft` adds onnxruntime's own operator domain."""
     opsets = [onnx.helper.make_opsetid("", OPSET)]
-    opsets += [onnx.helper.make_opsetid("com.microsoft", 1)] if microsoft else []
+    opsets += [onnx.helper.make_opsetid(MICROSOFT, 1)] if microsoft else []
     model = onnx.helper.make_model(
         graph, opset_imports=opsets, ir_version=IR_VERSION, producer_name="beers-deploy"
     )

@@ -217,7 +217,7 @@ def _equalized_groups(
     for group, guess in list(zip(plan.groups, guesses, strict=True))[1:]:
         graph = equalize(graph, group, guess)
     for number, group in enumerate(plan.groups):
-        step(f"equalising the channels of residual group {number + 1} of {len(plan.groups)}")
+        step(f"equalizing the channels of residual group {number + 1} of {len(plan.groups)}")
         # The search starts from the group as it is in the float network.
         if number:
             graph = equalize(graph, group, 1 / guesses[number])
@@ -237,7 +237,7 @@ def _equalized_singles(
     """
     if not plan.singles.tensors:
         return graph
-    step(f"equalising the channels of {len(plan.singles.tensors)} tensors")
+    step(f"equalizing the channels of {len(plan.singles.tensors)} tensors")
     ranges = single_ranges(graph, plan.singles, images, plan.host_part)
     factors = equalize_single(graph, plan.singles, ranges, np.ones(len(ranges)), trial)
     graph = plan.singles.scaled(graph, factors)

@@ -71,10 +71,7 @@ def _given(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _write_junit(command: Command, given: dict[str, Any], json: Path | None, message: str) -> None:
-    """Write why a gate could not judge to its JUnit file, if no output is refused.
-
-    The verb itself does so once its parameters are accepted.
-    """
+    """Write why a gate could not judge to its JUnit file, if no output is refused."""
     from beers_deploy.model.io.files import write_text
     from beers_deploy.verdict import junit_error
 

@@ -12,7 +12,7 @@ from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.profiles.target_limits import CONFIGURATION
 
 BoardLike = TargetProfile | str | os.PathLike[str]
-"""A board: what was read of it, its name, or the path of its .toml file."""
+"""A board: its profile, its name, or the path of its .toml file."""
 
 ALL = "all"
 """Every shipped board, or every configuration."""
@@ -22,8 +22,8 @@ def boards_of(board: BoardLike | Sequence[BoardLike]) -> list[TargetProfile]:
     """Return one board or several.
 
     Args:
-        board: a board, several, or names separated by commas, each with or without -model behind
-            it; "all" stands for the shipped boards with a DPU.
+        board: a board, several, or names separated by commas, each with or without the suffix
+            -model; "all" stands for the shipped boards with a DPU.
     """
     if isinstance(board, str) and board.removesuffix(MODEL_SUFFIX) == ALL:
         return [TargetProfile.load(name) for name in board_names()]
@@ -35,9 +35,9 @@ def boards_of(board: BoardLike | Sequence[BoardLike]) -> list[TargetProfile]:
 
 
 REQUIRED = ("cores", "batch_handlers", "cpb", "peak_tops")
-"""What every configuration states."""
+"""Constants that every configuration must have."""
 SIZED = ("array", "memory", "elementwise")
-"""Tables whose constants a configuration may state for itself, by their names: a smaller array has
+"""Tables whose constants a configuration may override, by their names, because a smaller array has
 smaller banks.
 """
 
@@ -58,7 +58,7 @@ class Dpu:
 
     @cached_property
     def tables(self) -> dict[str, dict[str, Constant]]:
-        """The target's tables, with what the configuration states in place of theirs."""
+        """The target's tables, with the constants that the configuration overrides."""
         sized = {
             name: {k: self.constants.get(k, v) for k, v in self.target.tables.get(name, {}).items()}
             for name in SIZED
@@ -68,32 +68,32 @@ class Dpu:
 
     @property
     def cores(self) -> int:
-        """Copies of the compute unit, each with instructions, maps and weights of its own."""
+        """Number of compute units, each with instructions, maps and weights of its own."""
         return int(self.constants["cores"].low)
 
     @property
     def handlers(self) -> int:
-        """Images that a core takes at once."""
+        """Number of images that a core processes at once."""
         return int(self.constants["batch_handlers"].low)
 
     @property
     def batch(self) -> int:
-        """Images that go through at once, one a batch handler of every core."""
+        """Number of images that are processed at once: one for each batch handler of every core."""
         return self.cores * self.handlers
 
     @property
     def channels_max(self) -> int:
-        """The most channels that an operator of the array can take."""
+        """The largest number of channels of an operator on the array."""
         return self.whole("array", "channel_groups") * self.input_parallel
 
     @property
     def input_parallel(self) -> int:
-        """Input channels that a batch handler takes in at a time."""
+        """Number of input channels that a batch handler reads at a time."""
         return self.whole("array", "input_channel_parallel")
 
     @property
     def output_parallel(self) -> int:
-        """Output channels that a batch handler computes at a time."""
+        """Number of output channels that a batch handler computes at a time."""
         return int(self.constants["cpb"].low)
 
     @property
@@ -111,24 +111,22 @@ class Dpu:
 
     @property
     def lane_steps_per_s(self) -> float:
-        """Values a second that an engine in programmable logic takes in: channels x pixels x its
-        clock.
-        """
+        """Values per second that an engine in programmable logic reads."""
         channels = self.value("elementwise", "channels_per_cycle")
         lanes = channels * self.value("elementwise", "pixels_per_cycle")
         return lanes * self.value("array", "pl_clock_hz")
 
     def limit(self, table: str, key: str) -> Constant:
-        """A constant with both ends of its range: a rule's window, or one limit as both."""
+        """Return a constant with both ends of its range; a single limit is both."""
         constant = self.tables.get(table, {}).get(key)
         return self.target.constant(table, key) if constant is None else constant
 
     def value(self, table: str, key: str) -> float:
-        """The single value of a constant."""
+        """Return the single value of a constant."""
         return self.limit(table, key).low
 
     def whole(self, table: str, key: str) -> int:
-        """The value of a constant that counts something."""
+        """Return the value of a constant that is a count."""
         return int(self.value(table, key))
 
 
@@ -138,8 +136,15 @@ def load_dpu(target: str, configuration: str | None = None) -> Dpu:
 
 
 def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
-    """As `load_dpu`, of a target that has been read: of a user's file its name alone would not be
-    found.
+    """Return one configuration of a target profile.
+
+    Args:
+        profile: the board. A profile from a user's file could not be loaded again by its name.
+        configuration: the name of the configuration; the default one if None.
+
+    Raises:
+        OptionError: the board has no DPU.
+        ProfileError: no such configuration, or a profile that lacks a constant or its documents.
     """
     if not profile.configurations:
         raise OptionError(
@@ -162,8 +167,9 @@ def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
 
 
 def ruled(profile: TargetProfile, configuration: str | None = None) -> Dpu:
-    """What a network is held against: as `dpu_of`, or an NPU, which has rules and nothing that
-    predicts.
+    """Return the device whose rules a network is compared with: a DPU, or a board's NPU.
+
+    An NPU has rules, but no constants for predictions.
     """
     if not profile.npu:
         return dpu_of(profile, configuration)

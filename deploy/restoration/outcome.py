@@ -1,8 +1,8 @@
-"""What comes out of a restoration, held against what went in: a network of another scale writes no
+"""Compare a restored image with its raw image, so that a network of another scale does not write a
 white image.
 
-A restoration keeps the mean, most of the contrast, and leaves few pixels at an end of full scale.
-Small departures are told, those that no restoration has are refused.
+A restoration keeps the mean and most of the contrast, and leaves few pixels at 0 or at full scale.
+Small departures give a warning. Departures that no restoration has are refused.
 """
 
 import math
@@ -20,62 +20,62 @@ MANY_AT_ENDS = 0.9
 FAR = 0.5
 FLAT = 0.001
 FEW = 1000
-"""Refused: more of the results at an end of full scale, a mean moved by more of it, less contrast
-left; of fewer pixels nothing is.
+"""A result is refused if a larger share of it is at 0 or full scale, if its mean moved by a larger
+share of full scale, or if less of the contrast is left. Images of fewer pixels are never refused.
 """
 SOME_AT_ENDS = 0.05
-"""Told: more of the results at an end."""
+"""A warning reports a larger share of the results at 0 or full scale."""
 BLANK_PX = 8
 MANY_BLANK = 0.01
-"""Told: more of the image in squares of so many pixels a side that are exactly 0, while no pixel is
-stated to be missing. Noise leaves no such square, even around 0.
+"""A warning reports a larger share of the image in squares of `BLANK_PX` a side that are exactly 0,
+if no pixel is stated to be missing. Noise leaves no such square, even around 0.
 """
 MEAN_KEPT = 0.015
 LEAST_MOVE = 0.0003
 SCATTER = 2.0
 DARK_MOVE = RANGES["sigma_dark"][1] / 2
-"""Told: a mean moved by more than the sum of these shares: of itself; of full scale (1 DN of 12
-bits); of the standard error of the mean, since a border of zeros changes a small image; and of full
-scale, for the dark part.
+"""A warning reports a mean that moved by more than the sum of these shares: of itself; of full
+scale (1 DN of 12 bits); of the standard error of the mean, since a border of zeros changes a small
+image; and of full scale, for the dark part.
 
 A detector stores no value below 0, which raises the mean of a dark, noisy image, and a network adds
 up to half a standard deviation of the noise to that. Of 443 restorations by the shipped networks,
 of 24 px and more a side, at 1 to 1/500 of the light, none reached 0.75 of the bound (measured).
 """
 DARK = 3 * RANGES["sigma_dark"][1]
-"""Of full scale: within three standard deviations of the loudest sensor's noise, which clipping at
-0 can reach.
+"""Pixels below this share of full scale lie within three standard deviations of the noisiest
+sensor's noise, which clipping at 0 can reach.
 """
 LEAST_SPREAD = 1e-6
-"""Of an image that is constant but for rounding, in shares of full scale."""
+"""Standard deviation, as a share of full scale, up to which an image counts as constant."""
 
 
 @dataclass(frozen=True)
 class Tally:
-    """What was seen of an image and of its result where both are known: counts, and sums in shares
-    of full scale.
+    """Counts and sums over an image and its result, without missing pixels.
+
+    Values are shares of full scale.
 
     Attributes:
-        known: results that are no missing pixels.
-        clipped: pixels of the image above full scale.
-        at_ends: results that came to 0 or to full scale where the image lay between.
-        compared: pixels of the image that the sums count; none where the network makes other bands
-            of them.
+        known: number of results that are not missing.
+        clipped: number of pixels of the image above full scale.
+        at_ends: number of results at 0 or at full scale where the image lies between.
+        compared: number of pixels of the image in the sums; 0 if the network returns other bands.
         before: sum of these pixels.
-        before_squared: of their squares.
+        before_squared: sum of their squares.
         after: sum of the results.
-        after_squared: of their squares.
-        tiles: tiles that the network was run on.
-        runs: of the network, one for each exposure that a tile asks for.
-        brightened: results that were restored at an exposure above 1.
-        change_squared: sum of the squares of what the consistency step changed.
-        network_at_ends: as `at_ends`, of what the network gave. The consistency step would hide a
+        after_squared: sum of their squares.
+        tiles: number of tiles that the network was run on.
+        runs: number of runs of the network, one for each exposure of a tile.
+        brightened: number of results that were restored at an exposure above 1.
+        change_squared: sum of the squared changes of the consistency step.
+        network_at_ends: `at_ends` of the network's results. The consistency step would hide a
             network that does not fit, since it gives nearly any image the mean and the coarse
             structure of the raw one.
-        network_after: as `after`, of what the network gave.
-        network_after_squared: as `after_squared`, of what the network gave.
-        dark: pixels of the image that noise may take to 0.
-        blank: pixels of the image in squares of 8 x 8 that are exactly 0.
+        network_after: `after` of the network's results.
+        network_after_squared: `after_squared` of the network's results.
+        dark: number of pixels of the image that noise may take to 0.
+        blank: number of pixels of the image in squares of 8 x 8 that are exactly 0.
     """
 
     known: int = 0
@@ -104,14 +104,13 @@ class Tally:
         seen: np.ndarray | None,
         known: np.ndarray | None,
     ) -> "Tally":
-        """Of a part of an image.
+        """Return the tally of a part of an image.
 
         Args:
             stored: its pixels (bands, h, w), in shares of full scale.
-            restored: its results, of as many or other bands, of so many times as many rows and
-                columns.
-            seen: which pixels are known; None for all.
-            known: which results are; None for all.
+            restored: its results (bands', h s, w s) at a scale s.
+            seen: mask of the pixels that are not missing; None if none is missing.
+            known: mask of the results that are not missing; None if none is missing.
         """
         alike = len(stored) == len(restored)
         between = (stored > 0) & (stored < 1)
@@ -145,8 +144,11 @@ class Tally:
         )
 
     def changed_from(self, network: "Tally", change_squared: float) -> "Tally":
-        """Return this tally of pixels that the consistency step made of those that `network` is the
-        tally of.
+        """Return this tally, taken after the consistency step, with the network's own results.
+
+        Args:
+            network: the tally before the step.
+            change_squared: sum of the squared changes of the step.
         """
         return replace(
             self,
@@ -161,7 +163,7 @@ class Tally:
 
     @property
     def network(self) -> "Tally":
-        """The tally of what the network gave, before the consistency step."""
+        """The tally of the network's results, before the consistency step."""
         return replace(
             self,
             at_ends=self.network_at_ends,
@@ -172,22 +174,22 @@ class Tally:
 
     @property
     def share_at_ends(self) -> float:
-        """Of the results, those at an end of full scale where the image lay between."""
+        """The share of the results at 0 or full scale where the image lies between."""
         return self.at_ends / max(self.known, 1)
 
     @property
     def means(self) -> tuple[float, float]:
-        """Before and after, in shares of full scale; 0 where they cannot be compared."""
+        """Mean before and after, in shares of full scale; 0 if they cannot be compared."""
         return self.before / max(self.compared, 1), self.after / max(self.known, 1)
 
     @property
     def moved(self) -> float:
-        """By how much the mean moved."""
+        """The change of the mean (after minus before)."""
         return self.means[1] - self.means[0]
 
     @property
     def mean_bound(self) -> float:
-        """By how much a restoration may move the mean."""
+        """The largest change of the mean that gives no warning."""
         count = max(self.compared, 1)
         # A border of zeros changes the mean of a small image, hence the standard error.
         scatter = SCATTER * self.spreads[0] / math.sqrt(count)
@@ -207,13 +209,13 @@ class Tally:
 
     @property
     def flat(self) -> bool:
-        """Whether the results are constant and the image is not."""
+        """True if the results are constant and the image is not."""
         before, after = self.spreads
         return before > LEAST_SPREAD and after < FLAT * before
 
     @property
     def figures(self) -> Mapping[str, Figure]:
-        """For the results of a run."""
+        """Figures of clipped pixels, ends and the mean, for the results of a run."""
         ends = "results at 0 or full scale where the image is not"
         mean = "mean of the known pixels, after less before"
         return {
@@ -226,7 +228,7 @@ class Tally:
 
     @property
     def exposure_figures(self) -> Mapping[str, Figure]:
-        """What several exposures of the network were used for, for the results of a run."""
+        """Figures of the exposures of the network, for the results of a run."""
         runs = "exposures that tiles asked for, mean of the tiles"
         pixels = "restored at an exposure above 1"
         share = 100 * self.brightened / max(self.known, 1)
@@ -237,16 +239,14 @@ class Tally:
 
     @property
     def consistency_figures(self) -> Mapping[str, Figure]:
-        """What the consistency step changed, for the results of a run."""
+        """The change by the consistency step, for the results of a run."""
         rms = math.sqrt(self.change_squared / max(self.known, 1))
         source = "root mean square of what the step added to the known pixels"
         return {"consistency step": measured(100 * rms, "% of full scale", source)}
 
     @property
     def doubts(self) -> list[str]:
-        """What a user should look at, a clause each; of the network's results, before the
-        consistency step.
-        """
+        """The warnings, one clause each, on the network's results before the consistency step."""
         clauses = []
         # The consistency step gives nearly any image the mean of the raw one, and so would hide
         # a network that does not fit.
@@ -271,7 +271,11 @@ class Tally:
         return clauses
 
     def require(self, name: str) -> None:
-        """Refuse what no restoration gives of an image, `name` in messages."""
+        """Raise ImageError if no restoration returns such results.
+
+        Args:
+            name: the name of the image, for the message.
+        """
         network = self.network
         impossible = (
             network.share_at_ends > MANY_AT_ENDS or abs(network.moved) > FAR or network.flat
@@ -288,7 +292,7 @@ class Tally:
 
 
 def _blank_px(stored: np.ndarray) -> int:
-    """Return how many pixels (bands, h, w) lie in whole squares of `BLANK_PX` that are 0."""
+    """Return the number of pixels (bands, h, w) in whole squares of `BLANK_PX` that are 0."""
     bands, height, width = stored.shape
     rows = height // BLANK_PX
     columns = width // BLANK_PX

@@ -1,8 +1,9 @@
-"""How the pixels of an image are understood: which value is full scale, and who says so: the user,
-the file, the sensor's profile, or nobody.
+"""The radiometry of an image: the pixel value that is full scale, and its source (the user, the
+file or the sensor's profile).
 
-What nobody states is assumed in sight: 12 bits. Values above a stated full scale are clipped,
-counted and told; above an assumed one they show that the assumption is wrong, and are refused.
+If none of them states a full scale, 12 bits are assumed, and the output reports the assumption.
+Values above a stated full scale are clipped, counted and reported. Values above an assumed one show
+that the assumption is wrong, and the image is refused.
 """
 
 from collections.abc import Iterable, Mapping
@@ -19,17 +20,18 @@ from beers_deploy.profiles.sensor import Sensor
 
 @dataclass(frozen=True)
 class Reading:
-    """How the pixels of an image are understood.
+    """Options that decide how an image is read.
 
     Attributes:
-        sensors: that the user names, by band; under no name where one is for all, empty where none
-            is named.
-        full_scale: the pixel value that is 1.0 to a network; None leaves it to `radiometry`.
-        nodata: the value of an array's missing pixels, besides NaN; a file states its own.
-        strict: whether an image is refused that contradicts its sensor.
-        force: whether an image is accepted that was restored already, an index may lead to tiles
-            outside its folder and at URLs, and any result is written.
-        memory_bytes: budget of this process; None is what is free.
+        sensors: the sensors that the user names, by band. One sensor for all bands has the key "";
+            the mapping is empty if none is named.
+        full_scale: the pixel value that is 1.0 to a network; None to take it from the file or the
+            sensor.
+        nodata: the value of an array's missing pixels, in addition to NaN; a file states its own.
+        strict: True to refuse an image that contradicts its sensor.
+        force: True to accept an image that was restored before and an index that leads to tiles
+            outside its folder or at URLs, and to write implausible results.
+        memory_bytes: memory budget of this process; None for all that is free.
         fix_detectors: the list of faulty detectors to replace, or 'found'; empty to replace none.
     """
 
@@ -43,14 +45,18 @@ class Reading:
 
     @property
     def sensor_bits(self) -> int | None:
-        """Bits of a digital number, where a sensor is named."""
+        """Bits per pixel of the named sensors, the least of them; None if none is named."""
         return min((int(sensor.bits.low) for sensor in self.sensors.values()), default=None)
 
 
 @dataclass(frozen=True)
 class FullScale:
-    """The pixel value that is full scale, in words where it is from, and whether that is an
-    assumption.
+    """A full scale and its source.
+
+    Attributes:
+        value: the pixel value that is full scale.
+        source: what states it, for messages.
+        assumed: True if nothing states it.
     """
 
     value: float
@@ -59,12 +65,12 @@ class FullScale:
 
     @property
     def words(self) -> str:
-        """The value, and where it is from."""
+        """The value and its source."""
         return f"{self.value:g} ({self.source})"
 
     @property
     def text(self) -> dict[str, str]:
-        """Both as the text of a row of results."""
+        """The value and its source as the text of a row of results."""
         return {"full scale": f"{self.value:g}", "full scale from": self.source}
 
 
@@ -75,14 +81,18 @@ def full_scale_of(
     asked: float | None = None,
     bits: int | None = None,
 ) -> FullScale:
-    """The full scale of an image.
+    """Return the full scale of an image: the user's, that of its file, of the sensor, or 12 bits.
 
     Args:
-        name: of the image, for messages.
-        raster: what its file states.
+        name: the name of the image, for messages.
+        raster: the description of its file.
         extents: as for `model.raster.full_scale.settled_scale`, drawn for floats only.
-        asked: by the user.
-        bits: of the sensor, where the user names its profile.
+        asked: the full scale that the user gives, or None.
+        bits: bits per pixel of the sensor, if the user names its profile.
+
+    Raises:
+        OptionError: a full scale that is not positive, or that the output's type cannot hold.
+        ImageError: pixels that contradict an assumed full scale.
     """
     if asked is not None:
         settled_scale(name, raster.dtype, extents, asked)
@@ -105,7 +115,7 @@ def full_scale_of(
 
 
 def require_room(raster: Raster, full_scale: float) -> None:
-    """That restored pixels up to full scale fit into the output's type."""
+    """Raise OptionError if the output's type cannot hold pixels up to full scale."""
     kind = raster.out_dtype
     # A float output holds any full scale.
     if kind.kind != "f" and full_scale > np.iinfo(kind).max:

@@ -3,6 +3,7 @@
 import logging
 import os
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,7 +22,7 @@ from beers_deploy.verbs.parameters import (
     Seed,
     SensorLike,
 )
-from beers_deploy.verbs.verb import refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.pairs import Pair
@@ -110,17 +111,10 @@ def evaluate(
     from beers_deploy.model.raster.images import list_images
 
     folder = None if out is None else Path(out)
+    given = partial(changed, evaluate, locals())
     if detector is not None:
-        unused = {
-            "pairs": pairs is not None,
-            "lpips": lpips is not None,
-            "sweep": sweep,
-            "brightness": brightness != "1",
-            "consistency": not consistency,
-            "exposure": not exposure,
-            "strict": strict,
-        }
-        refuse_with("`detector`", **unused)
+        steps = ("consistency", "exposure", "strict")
+        refuse_with("`detector`", **given("pairs", "lpips", "sweep", "brightness", *steps))
         return _detection(
             methods,
             images,
@@ -134,15 +128,9 @@ def evaluate(
             seed,
             folder,
         )
-    refuse_without(
-        "`detector`",
-        labels=labels is not None,
-        split=split is not None,
-        side=side is not None,
-        classes=classes is not None,
-    )
+    refuse_without("`detector`", **given("labels", "split", "side", "classes"))
     if pairs is not None:
-        refuse_with("`pairs`", images=images is not None, sweep=sweep, brightness=brightness != "1")
+        refuse_with("`pairs`", **given("images", "sweep", "brightness"))
     if images is not None:
         # An empty folder is refused before torch is loaded.
         list_images(Path(images))

@@ -1,13 +1,12 @@
 """`gate`: whether an INT8 network stays close enough to its float network."""
 
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from beers_deploy.kit import RECORD
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.profiles.errors import BeersError, OptionError
+from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.shipped import DEFAULT_TARGET
 from beers_deploy.verbs.parameters import (
     Holds,
@@ -23,7 +22,7 @@ from beers_deploy.verbs.parameters import (
     VerdictFile,
     VerdictFolder,
 )
-from beers_deploy.verbs.verb import recorded, refuse_with, verb
+from beers_deploy.verbs.verb import changed, recorded, refuse_with, verb
 
 if TYPE_CHECKING:
     from beers_deploy.verdict import Verdict
@@ -97,55 +96,39 @@ def gate(
     # Standard output is for the results document.
     if junit_file == Path("-"):
         raise OptionError("`junit` must be a file, got '-'. Name the file to write.")
-    try:
-        if folder is not None:
-            from beers_deploy.kit.record import require_library
+    if folder is not None:
+        from beers_deploy.kit.record import require_library
 
-            require_library()
-        # Imported here: if a library does not load, no older verdict is left either.
-        from beers_deploy.comparison import Data, compared, pair_of
-        from beers_deploy.model.io.files import write_text
-        from beers_deploy.profiles.sensor import Sensor
-        from beers_deploy.profiles.target import TargetProfile
-        from beers_deploy.quant.limits import limits_of
-        from beers_deploy.verdict import baseline_for, judged, require_references
-
-        if samples is not None:
-            refuse_with(
-                "`samples`", images=images is not None, patches=patches != 32, seed=seed != 0
-            )
-        allowed = limits_of(limits, max_mae)
-        board = TargetProfile.load(target)
-        profile = Sensor.load(sensor)
-        floating, int8 = pair_of(float_network, int8_network, profile)
-        scenes = None if images is None else Path(images)
-        data = Data(profile, samples, scenes, patches, seed)
-        earlier = baseline_for(baseline, data.arguments, allowed, metric)
-        # Missing references are refused before the networks run.
-        own = data.own(floating)
-        require_references(own, allowed, metric)
-        comparison = compared(floating, int8, data, own, metric or "")
-        verdict = judged(comparison, allowed, earlier, board, own)
-        asked = recorded({"limits": limits, "baseline": baseline, "metric": metric})
-        verdict = replace(verdict, arguments={**verdict.arguments, **asked})
-        # The record comes first: its library may fail, and then no other file may have a verdict.
-        if folder is not None:
-            from beers_deploy.kit.record import write_record
-
-            write_record(verdict, int8, profile, folder, floating)
-        if junit_file is not None:
-            write_text(junit_file, verdict.to_junit())
-    except BeersError as error:
-        _write_error(junit_file, error)
-        raise
-    return verdict
-
-
-def _write_error(junit: Path | None, error: BeersError) -> None:
-    """Write the reason why nothing could be judged to the JUnit file."""
+        require_library()
+    # Imported here: if a library does not load, no older verdict is left either.
+    from beers_deploy.comparison import Data, compared, pair_of
     from beers_deploy.model.io.files import write_text
-    from beers_deploy.verdict import junit_error
+    from beers_deploy.profiles.sensor import Sensor
+    from beers_deploy.profiles.target import TargetProfile
+    from beers_deploy.quant.limits import limits_of
+    from beers_deploy.verdict import baseline_for, judged, require_references
 
-    if junit is not None:
-        with suppress(BeersError):
-            write_text(junit, junit_error("INT8 gate", str(error)))
+    if samples is not None:
+        refuse_with("`samples`", **changed(gate, locals(), "images", "patches", "seed"))
+    allowed = limits_of(limits, max_mae)
+    board = TargetProfile.load(target)
+    profile = Sensor.load(sensor)
+    floating, int8 = pair_of(float_network, int8_network, profile)
+    scenes = None if images is None else Path(images)
+    data = Data(profile, samples, scenes, patches, seed)
+    earlier = baseline_for(baseline, data.arguments, allowed, metric)
+    # Missing references are refused before the networks run.
+    own = data.own(floating)
+    require_references(own, allowed, metric)
+    comparison = compared(floating, int8, data, own, metric or "")
+    verdict = judged(comparison, allowed, earlier, board, own)
+    asked = recorded({"limits": limits, "baseline": baseline, "metric": metric})
+    verdict = replace(verdict, arguments={**verdict.arguments, **asked})
+    # The record comes first: its library may fail, and then no other file may have a verdict.
+    if folder is not None:
+        from beers_deploy.kit.record import write_record
+
+        write_record(verdict, int8, profile, folder, floating)
+    if junit_file is not None:
+        write_text(junit_file, verdict.to_junit())
+    return verdict

@@ -1,5 +1,6 @@
 """`stress`: hard cases and bit flips against a network."""
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,7 +18,7 @@ from beers_deploy.verbs.parameters import (
     SensorLike,
     TargetLike,
 )
-from beers_deploy.verbs.verb import refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.results import Table
@@ -76,15 +77,11 @@ def stress(
         ModelError: a network that cannot be tiled, or a float and an INT8 network that are swapped.
         OptionError: no such case or stage, or options that do not go together.
     """
+    given = partial(changed, stress, locals())
     if bit_flips:
-        refuse_with("`bit_flips`", cases=cases is not None, stages=stages is not None)
+        refuse_with("`bit_flips`", **given("cases", "stages"))
     else:
-        refuse_without(
-            "`bit_flips`",
-            draws=draws != DRAWS,
-            images=images is not None,
-            target=target != DEFAULT_TARGET,
-        )
+        refuse_without("`bit_flips`", **given("draws", "images", "target"))
     # These load torch.
     from beers_deploy.model.io.files import write_text
     from beers_deploy.studies.stress.battery import battery_table, chosen

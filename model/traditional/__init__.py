@@ -2,7 +2,7 @@
 
 1. `noise`: radiance to a scale on which the sensor's noise has variance 1 everywhere, and back
   again after 2.
-2. `nl_bayes`: two-pass non-local Bayes denoising, with the published numbers.
+2. `nl_bayes`: two-pass non-local Bayes denoising, with the published numbers (`patch_groups`).
 3. `compensate`: regularised inverse filter, from the degraded sensor's MTF to the reference's;
   `regularisation` derives how strongly from the noise and the contrast of the image.
 

@@ -4,186 +4,27 @@ Two passes over a regular grid of reference patches. In each, similar patches fo
 group a Gaussian model, and the model an estimate of every patch of the group; overlapping estimates
 are averaged. The second pass searches, and takes its model, in the result of the first.
 
-The settings are the published ones, for grey levels of 0 to 255 (section on the parameters).
+`patch_groups` has the estimate of a group, and the published settings.
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from itertools import tee
-from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from beers_deploy.model.traditional.noise import Noise
+from beers_deploy.model.traditional.patch_groups import (
+    ALIKE_RMS,
+    PassSettings,
+    Quality,
+    estimate_groups,
+    first_pass,
+    second_pass,
+)
 from beers_deploy.model.traditional.rows import Rows, map_tiles, mirrored
 from beers_deploy.profiles.errors import ImageError
-
-T = TypeVar("T", int, float)
-
-ALIKE_RMS = 4.0
-"""Pass 2 takes every patch within this RMS distance, in grey levels (tau = 16 k^2)."""
-
-FLAT_GAMMA = 1.05
-"""A group of pass 1 whose variance stays below gamma sigma^2 holds nothing but noise (homogeneous
-area criterion).
-"""
-
-
-@dataclass(frozen=True)
-class Quality:
-    """How dense the references are, and how large a group of pass 2 may grow.
-
-    `stride_px` lies between neighbouring references; `group_cap` counts in multiples of the usual
-    group. The published method has no cap, and visits every second pixel unless an earlier group
-    held it.
-    """
-
-    stride_px: int
-    group_cap: int
-
-
-QUALITIES = {"fast": Quality(4, 2), "standard": Quality(3, 4), "best": Quality(2, 8)}
-
-
-@dataclass(frozen=True)
-class PassSettings:
-    """What one pass works with; sigma and distances in grey levels.
-
-    Attributes:
-        side_px: k, the side of a patch.
-        similar: N, the patches of a group.
-        most_similar: the largest group, where more than N patches lie within ALIKE_RMS.
-        excess: beta, the factor on the noise variance.
-        clean_guide: of pass 2: the guide's covariance is that of the signal alone, noise removed.
-    """
-
-    side_px: int
-    similar: int
-    most_similar: int
-    excess: float
-    clean_guide: bool
-
-    @property
-    def window_px(self) -> int:
-        """Candidates along each axis of the search window: about N / 2, odd so that it has a
-        middle.
-        """
-        return self.similar // 2 | 1
-
-    @property
-    def margin_px(self) -> int:
-        """What a reference centred on a border pixel sees beyond it."""
-        return self.window_px // 2 + self.side_px // 2
-
-
-def first_pass(sigma: float) -> PassSettings:
-    """Pass 1: the noisy image is its own guide."""
-    side_px = 5 if sigma < 30 else 7
-    similar = _below(sigma, {10: 35, 30: 45, 80: 90}, 100)
-    excess = _below(sigma, {15: 1.1, 70: 1.0}, 0.9)
-    return PassSettings(side_px, similar, similar, excess, clean_guide=False)
-
-
-def second_pass(sigma: float, quality: Quality) -> PassSettings:
-    """Pass 2: the result of pass 1 is the guide."""
-    similar = _below(sigma, {20: 15, 40: 25, 80: 30}, 45)
-    excess = _below(sigma, {15: 1.1, 35: 1.0}, 0.9)
-    return PassSettings(5, similar, quality.group_cap * similar, excess, clean_guide=True)
-
-
-def _below(sigma: float, table: dict[int, T], otherwise: T) -> T:
-    """The value of the first bound that sigma stays below."""
-    return next((value for bound, value in table.items() if sigma < bound), otherwise)
-
-
-JITTER = 1e-3
-"""Added to the diagonal of a noisy covariance, in units of sigma^2.
-
-Up to 1e-2 costs less than 0.01 dB (measured).
-"""
-
-
-def estimate_groups(
-    noisy: Tensor, guide: Tensor, taken: Tensor | None, noise: Noise, settings: PassSettings
-) -> Tensor:
-    """Posterior mean of every patch: P - beta Sigma S^-1 (P - mean of P), Sigma the covariance of
-    the noise.
-
-    1. Pass 1: S is the covariance of the noisy patches, signal and noise together.
-    2. Pass 2: S is the covariance of the guide's patches plus beta Sigma.
-    3. A flat group of pass 1 (variance of all its pixels below gamma sigma^2): every pixel becomes
-      their mean.
-    4. No Cholesky factor of S: the noisy patches stay.
-
-    Both S give P_mean + C S^-1 (P - P_mean) with C the signal's covariance, so only S needs an
-    inverse (IPOL 2013, estimates of the first and the second step; there Sigma = sigma^2 I).
-
-    Args:
-        noisy: (B, N, k * k) groups of patches.
-        guide: the same patches of the guide image; in pass 1 `noisy` itself.
-        taken: (B, N) of 0 and 1: which patches the group counts, None for all; the others'
-            estimates mean nothing.
-        noise: that of `noisy`.
-        settings: those of the pass.
-    """
-    mean, centred, covariance = _moments(noisy, taken)
-    if guide is not noisy:
-        covariance = _moments(guide, taken)[2]
-    flat = _is_flat(mean, covariance, 0.0 if settings.clean_guide else FLAT_GAMMA * noise.sigma**2)
-    shrinkage = torch.zeros_like(covariance)
-    shrinkage[~flat] = _shrinkage(covariance[~flat], noise, settings)
-    estimates = torch.baddbmm(noisy, centred, shrinkage, alpha=-1)
-    # The plain mean knows that the signal is one number; the Gaussian model would have to find that
-    # out.
-    estimates[flat] = mean[flat].mean(2, keepdim=True)
-    return estimates
-
-
-def _moments(patches: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean patch (B, 1, k * k), the patches without it, and their covariance, of the taken patches.
-
-    Divided by their number and not by one less, as published.
-    """
-    if mask is None:
-        mean = patches.mean(1, keepdim=True)
-        centred = patches - mean
-        return mean, centred, centred.mT @ centred / patches.shape[1]
-    share = mask / mask.sum(1, keepdim=True)
-    mean = share[:, None] @ patches
-    centred = patches - mean
-    return mean, centred, centred.mT @ (centred * share[..., None])
-
-
-def _is_flat(mean: Tensor, covariance: Tensor, bound: float) -> Tensor:
-    """(B,) whether the variance of all the pixels of a group stays below `bound`.
-
-    It is the variance within the k * k positions, the trace, plus that between them: two small
-    sums, where the sum of the squared pixels would drown sigma^2 in float32.
-    """
-    within = covariance.diagonal(dim1=1, dim2=2).mean(1)
-    return within + mean[:, 0].var(1, correction=0) < bound
-
-
-def _shrinkage(covariance: Tensor, noise: Noise, settings: PassSettings) -> Tensor:
-    """The matrix beta S^-1 Sigma, for patches as rows, or 0 where S has no Cholesky factor."""
-    sigma_matrix = noise.covariance(settings.side_px).to(covariance) * settings.excess
-    diagonal = covariance.diagonal(dim1=1, dim2=2)
-    # A drawn or saturated area has rank 0 or 1: the covariance is then no better known than its own
-    # rounding.
-    diagonal.add_(torch.finfo(covariance.dtype).eps * diagonal.sum(1, keepdim=True))
-    if settings.clean_guide:
-        covariance = covariance + sigma_matrix
-    else:
-        diagonal.add_(JITTER * noise.sigma**2)
-    factor, failed = torch.linalg.cholesky_ex(covariance)
-    no_factor = failed != 0
-    # Any factor does there, since its result is thrown away: the batch has to stay one call.
-    factor[no_factor] = torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device)
-    shrinkage = torch.cholesky_inverse(factor) @ sigma_matrix
-    shrinkage[no_factor] = 0
-    return shrinkage
 
 
 def patch_matrix(image: Tensor, side_px: int) -> Tensor:

@@ -15,12 +15,7 @@ from torch import Tensor
 
 from beers_deploy.model.simulator.detector import to_dn, to_radiance
 from beers_deploy.model.traditional.compensate import compensation_kernel, filter_strips
-from beers_deploy.model.traditional.nl_bayes import (
-    QUALITIES,
-    Quality,
-    finite_or_missing,
-    nl_bayes_strips,
-)
+from beers_deploy.model.traditional.nl_bayes import finite_or_missing, nl_bayes_strips
 from beers_deploy.model.traditional.noise import (
     Noise,
     bias_radiance,
@@ -29,6 +24,7 @@ from beers_deploy.model.traditional.noise import (
     stabilise,
     with_rounding_noise,
 )
+from beers_deploy.model.traditional.patch_groups import QUALITIES, Quality
 from beers_deploy.model.traditional.regularisation import derived_epsilon, measure
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.instrument import Instrument
@@ -48,9 +44,9 @@ Order = Literal["denoise-first", "deconvolve-first"]
 class Chain:
     """How to restore what `degraded` acquired to what `reference` would have, without its noise.
 
-    `quality` is one of `nl_bayes.QUALITIES`. `epsilon` regularises the MTF compensation. With None
-    it is derived from each image: by `restore_traditional` itself, by `fitted_to` for an image that
-    comes in strips.
+    `quality` is one of `patch_groups.QUALITIES`. `epsilon` regularises the MTF compensation. With
+    None it is derived from each image: by `restore_traditional` itself, by `fitted_to` for an image
+    that comes in strips.
     """
 
     degraded: Instrument

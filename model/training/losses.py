@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from beers_deploy.model.consistency import BLOCK_PX
+from beers_deploy.model.blocks import BLOCK_PX
 from beers_deploy.model.metrics.perceptual import Lpips
 from beers_deploy.profiles.instrument import MAX_DN
 

@@ -14,12 +14,11 @@ from beers_deploy.quant.encodings.board import (
     vint8_model,
 )
 from beers_deploy.quant.encodings.description import BORDER_PX, PLACE_PX
-from beers_deploy.quant.encodings.host import MICROSOFT, encoding_faults, host_model, read_core
+from beers_deploy.quant.encodings.host import encoding_faults, host_model, read_core
 
 __all__ = [
     "BORDER_PX",
     "CONFIG",
-    "MICROSOFT",
     "PLACE_PX",
     "as_on_board",
     "board_model",

@@ -22,6 +22,7 @@ from onnx import TensorProto
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from beers_deploy.quant.domains import MICROSOFT
 from beers_deploy.quant.encodings.description import KEY, describe, described_core, phases
 from beers_deploy.quant.graph import (
     CORRECTION,
@@ -52,7 +53,6 @@ from beers_deploy.quant.onnx.graph import constants
 from beers_deploy.quant.onnx_file import fixed_tile_px, image_info, make_model, metadata
 from beers_deploy.quant.untrusted import contradictions
 
-MICROSOFT = "com.microsoft"
 LEGAL = "int8 legal"
 """What the metadata of a file that `quantize` wrote state as its precision."""
 

@@ -225,7 +225,7 @@ def quantize_behind_bank(
 def map_steps(conditioned: ConditionedCore, weights: Weights) -> list[np.ndarray]:
     """Compute the value of an integer 1 of the maps in those of the float network, at a gain of 1.
 
-    Equalisation multiplied each channel by a factor: the ratio of integer weights to float ones.
+    Equalization multiplied each channel by a factor: the ratio of integer weights to float ones.
 
     Returns:
         (F,) of the maps between head and tail, then of the one within each block.

@@ -2,7 +2,7 @@
 
 from onnx import TensorProto
 
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
 
 Shapes = dict[str, tuple[int, ...]]
 
@@ -10,7 +10,7 @@ Shapes = dict[str, tuple[int, ...]]
 def float_shapes(graph: OnnxGraph) -> Shapes:
     """Infer the sizes of each float32 tensor whose rank is known, 0 for a size that is not."""
     return {
-        name: tuple(dim.dim_value for dim in tensor.shape.dim)
+        name: sizes_of(tensor)
         for name, tensor in graph.tensor_types().items()
         if tensor.elem_type == TensorProto.FLOAT and tensor.HasField("shape")
     }

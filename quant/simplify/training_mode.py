@@ -7,11 +7,11 @@ are folded away.
 
 import numpy as np
 import onnx
-from onnx import NodeProto, TensorProto, numpy_helper
+from onnx import NodeProto
 
 from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.domains import STANDARD, opset_of
-from beers_deploy.quant.onnx.graph import attributes_of
+from beers_deploy.quant.onnx.graph import attributes_of, constants
 
 IS_TEST_UNTIL = 6
 """The last opset whose operators state by `is_test` whether they are in use; without it they are in
@@ -32,12 +32,12 @@ def require_inference(model: onnx.ModelProto, where: str) -> None:
             leaves open.
     """
     opset = opset_of(model)
-    constants = _constants(model.graph)
+    values = constants(model)
     for node in model.graph.node:
         if (
             node.domain in STANDARD
             and node.op_type in TRAINED
-            and TRAINED[node.op_type](node, opset, constants)
+            and TRAINED[node.op_type](node, opset, values)
         ):
             name = printable(repr(node.name or node.output[0]))
             raise ModelError(
@@ -47,17 +47,7 @@ def require_inference(model: onnx.ModelProto, where: str) -> None:
             )
 
 
-def _constants(graph: onnx.GraphProto) -> dict[str, TensorProto]:
-    """Return the constants that a file holds, by name."""
-    constants = {tensor.name: tensor for tensor in graph.initializer}
-    for node in graph.node:
-        for attribute in node.attribute:
-            if node.op_type == "Constant" and attribute.name == "value":
-                constants[node.output[0]] = attribute.t
-    return constants
-
-
-def _drops(node: NodeProto, opset: int, constants: dict[str, TensorProto]) -> bool:
+def _drops(node: NodeProto, opset: int, values: dict[str, np.ndarray]) -> bool:
     """Return True if a Dropout draws: its mode is a third input, and a mode that is computed may be
     any.
     """
@@ -66,11 +56,11 @@ def _drops(node: NodeProto, opset: int, constants: dict[str, TensorProto]) -> bo
     if len(node.input) <= DROPOUT_MODE_INPUT or not node.input[DROPOUT_MODE_INPUT]:
         return False
     # A mode that is computed could be anything when the network runs.
-    mode = constants.get(node.input[DROPOUT_MODE_INPUT])
-    return mode is None or bool(np.any(numpy_helper.to_array(mode)))
+    mode = values.get(node.input[DROPOUT_MODE_INPUT])
+    return mode is None or bool(mode.any())
 
 
-def _adapts(node: NodeProto, opset: int, _: dict[str, TensorProto]) -> bool:
+def _adapts(node: NodeProto, opset: int, _: dict[str, np.ndarray]) -> bool:
     """Return True if a BatchNormalization takes mean and variance from the image, and gives them as
     further results.
 

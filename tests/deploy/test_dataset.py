@@ -234,6 +234,16 @@ def test_a_damaged_part_of_an_unfinished_dataset_is_made_again(
     assert bytes_of(folder) == bytes_of(dataset)
 
 
+def test_a_recipe_with_the_line_ends_of_windows_is_the_same(
+    scene: Path, dataset: Path, tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(dataset, tmp_path / "other"))
+    recipe = folder / "recipe.json"
+    recipe.write_bytes(recipe.read_bytes().replace(b"\n", b"\r\n"))
+    write_dataset(small(scene), folder, 1, resume=True)
+    assert bytes_of(folder) == bytes_of(dataset)
+
+
 def test_a_scene_without_room_for_a_patch_is_refused(scene: Path) -> None:
     with pytest.raises(ImageError, match="scene pixels a side"):
         plan_windows(small(scene, patch_px=200))

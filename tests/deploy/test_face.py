@@ -17,7 +17,7 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 import beers_deploy as bd
-from beers_deploy.profiles.sensor import numbers_of
+from beers_deploy.profiles.sensor_numbers import numbers_of
 from beers_deploy.profiles.shipped import board_names, sensor_names
 from beers_deploy.results import SCHEMA_PATH
 

@@ -1,10 +1,7 @@
 """The gate catches faults of quantised files, and a CI job can read its verdict."""
 
-import math
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
-from xml.etree import ElementTree as ET
 
 import numpy as np
 import onnx
@@ -16,26 +13,23 @@ from onnxruntime.quantization import quantize_static
 import beers_deploy as bd
 from beers_deploy.float_onnx import float_model
 from beers_deploy.network import Network
-from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
-from beers_deploy.profiles.figures import Bound, Check
+from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.profiles.target import TargetProfile
+from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.gate import compare
-from beers_deploy.quant.limits import BREAKABLE, Limits, judge, limits_of
+from beers_deploy.quant.limits import Limits, judge
 from beers_deploy.quant.onnx_file import (
     GraphWriter,
     image_info,
     load_onnx,
     make_model,
-    metadata,
     save_onnx,
 )
-from beers_deploy.quant.samples.own import CALIBRATED_ON, digest_of
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session
-from beers_deploy.quant.structure import Relus, saturated_shares
-from beers_deploy.results import Table
-from beers_deploy.verdict import file_checks, junit_text
+from beers_deploy.quant.structure import Relus, count_relus, rounded_tensors, saturated_shares
+from beers_deploy.verdict import file_checks
 from tests.deploy.command_line import done, refused
 from tests.quant.quick import Calibration, change, changed, drawn
 from tests.shipped import shipped_pair
@@ -159,65 +153,6 @@ def test_a_spoilt_file_is_stopped(
     assert checks <= failed(reference_model, unseen, tmp_path, spoil)
 
 
-def test_limits_come_from_a_file(tmp_path: Path) -> None:
-    path = tmp_path / "gate.toml"
-    path.write_text("mae = 0.0007\npsnr_drop_db = 0.25\n")
-    limits = limits_of(path)
-    assert (limits.mae, limits.psnr_drop_db, limits.p999) == (0.0007, 0.25, None)
-    assert limits_of(path, 0.001).mae == 0.001
-    assert limits_of(None) == Limits()
-    assert limits_of({"mae": 0}).mae == limits_of(None, 0.0).mae == 0
-    path.write_text("mae_growth = 1.2")
-    # A limit that is left out has its default.
-    assert limits_of(path) == Limits(mae_growth=1.2)
-
-
-@pytest.mark.parametrize("name", BREAKABLE)
-def test_a_limit_that_no_network_breaks_is_refused(name: str, tmp_path: Path) -> None:
-    low, high = BREAKABLE[name]
-    for value in (low, high):
-        assert limits_of({name: value}) == replace(Limits(), **{name: value})
-    for value in (high * 1.001, math.inf, *([low / 1.001] if low else [])):
-        (tmp_path / "gate.toml").write_text(f"{name} = {value}")
-        one = {name: value}
-        for limits in (tmp_path / "gate.toml", one, replace(Limits(), **one)):
-            with pytest.raises(OptionError, match="broken network"):
-                limits_of(limits)
-    with pytest.raises(OptionError, match="max_mae"):
-        limits_of(None, math.inf)
-
-
-@pytest.mark.parametrize(("name", "value"), [("mae", 0.5), ("p999", 1.1), ("saturated", 2.0)])
-def test_a_limit_that_a_black_image_keeps_is_refused(name: str, value: float) -> None:
-    """By values of its own, because the table of the bounds may be wrong itself."""
-    with pytest.raises(OptionError, match="broken network"):
-        limits_of({name: value})
-
-
-NO_LIMITS = [
-    "mae = 'small'",
-    "mae = true",
-    "mea = 0.1",
-    "mae = -1",
-    "mae = nan",
-    "= 3",
-    "[mae]",
-    "",
-    "# none",
-]
-
-
-@pytest.mark.parametrize(
-    "text", [*NO_LIMITS, "mae = [1]", "mae = 0x" + "f" * 400, "mae = " + "9" * 5000]
-)
-def test_limits_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
-    (tmp_path / "gate.toml").write_text(text)
-    with pytest.raises(OptionError, match=r"gate\.toml(?!.*sys\.set).* mae\b"):
-        limits_of(tmp_path / "gate.toml")
-    with pytest.raises(OptionError, match="no such file"):
-        limits_of(tmp_path / "none.toml")
-
-
 def test_without_8_bit_results_no_limit_on_them_is_kept() -> None:
     result = bd.compare("convbeers-xs", patches=1).result
     unlimited = len(judge(result, Limits(), shares={}))
@@ -227,73 +162,12 @@ def test_without_8_bit_results_no_limit_on_them_is_kept() -> None:
     assert "none is 8-bit" in check.found
 
 
-CHECKS = [
-    Check("MAE", 6e-4, 8e-4, "of full scale"),
-    Check("PSNR drop", 0.31, 0.25, "dB"),
-    Check("nodes <all>", 1, 0, "node", detail="tail: x & y | z\n::error::\x1b[31m"),
-    Check("PSNR float-INT8", 61.15, 60, "dB", "at least"),
-]
-
-
-def test_a_job_can_read_the_verdict() -> None:
-    suite = ET.fromstring(junit_text("INT8 gate", CHECKS))  # noqa: S314 - our own text
-    assert [suite.get(name) for name in ("tests", "failures", "errors")] == ["4", "2", "0"]
-    assert [case.find("failure") is not None for case in suite] == [False, True, True, False]
-
-
-def test_the_last_line_names_what_failed_and_nothing_else() -> None:
-    assert Table(command="gate", checks=tuple(CHECKS[:1])).verdict == "gate passed, all 1 checks"
-    text = Table(command="gate", checks=tuple(CHECKS)).verdict
-    # A node's name may hold what a terminal or a CI's log would obey.
-    assert text.isprintable()
-    assert text.startswith(
-        "gate FAILED, 2 of 4 checks: PSNR drop 0.31 dB, allowed at most 0.25; nodes <all> 1 (tail"
-    )
-    assert "MAE" not in text
-    assert "float-INT8" not in text
-
-
-@pytest.mark.parametrize(
-    ("value", "limit", "bound", "expected"),
-    [
-        (1.0, 1.0, "at most", True),
-        (1.0, 1.0, "at least", True),
-        (1.1, 1.0, "at most", False),
-        (1.1, 1.0, "at least", True),
-        (np.nan, np.inf, "at most", False),
-        (np.nan, 0.0, "at least", False),
-        (np.inf, 60.0, "at least", True),
-    ],
-)
-def test_the_number_decides(value: float, limit: float, bound: Bound, expected: bool) -> None:
-    assert Check("x", value, limit, "dB", bound).passed == expected
-
-
 def test_options_that_do_not_go_together_are_refused(tmp_path: Path) -> None:
     (tmp_path / "float.onnx").touch()
     (tmp_path / "gate.toml").write_text("mae = 0.01\nmae_growth = 1.0001\n")
     assert "INT8 network of float.onnx" in refused(f"gate {tmp_path}/float.onnx")
     assert "--junit" in refused("gate --junit -")
     assert "'mae_growth' needs a --baseline" in refused(f"gate --limits {tmp_path}/gate.toml")
-
-
-def test_the_judged_file_does_not_choose_its_judges(model: Path) -> None:
-    """Whatever samples it claims to be calibrated on, all are judged, and the claim is a note."""
-    samples = np.random.default_rng(0).random((12, 1, 32, 40), np.float32)
-    # Given one after the other, they can be read only once.
-    int8 = bd.quantize(model, samples=iter(samples[:8]))
-    mixed = np.concatenate([samples[10:], samples[2:7]])
-    comparison = bd.compare(int8, samples=mixed)
-    assert comparison.result.patches == 7
-    # Quantising held two of its eight samples out of calibration, and one of them is here.
-    assert "4 of the 7 samples" in comparison.notes[0]
-    model_with_claim = onnx.ModelProto()
-    model_with_claim.CopyFrom(int8.model)
-    claim = {CALIBRATED_ON: " ".join(map(digest_of, mixed[:, None]))}
-    onnx.helper.set_model_props(model_with_claim, metadata(int8.model) | claim)
-    second = bd.compare(replace(int8, model=model_with_claim), samples=mixed)
-    assert (second.result.mae, second.result.patches) == (comparison.result.mae, 7)
-    assert "7 of the 7 samples" in second.notes[0]
 
 
 def test_what_is_no_image_is_compared_unclipped_and_other_shapes_are_refused() -> None:
@@ -309,15 +183,6 @@ def test_what_is_no_image_is_compared_unclipped_and_other_shapes_are_refused() -
     assert compare(shifted(-2), shifted(-3), patches).mae == pytest.approx(1)
     with pytest.raises(ModelError, match="1 x 3 x 8 x 9"):
         compare(shifted(0), shifted(0, 3), patches)
-
-
-def test_samples_without_contrast_judge_nothing() -> None:
-    samples = np.zeros((5, 1, 32, 40), np.float32)
-    with pytest.raises(ImageError, match="contrast"):
-        bd.compare("convbeers-xs", samples=samples)
-    samples[3] = np.random.default_rng(0).random((1, 32, 40))
-    pair = "convbeers-xs", "convbeers-xs-int8"
-    assert bd.compare(*pair, samples=samples).result.patches == 1
 
 
 SMALL = "convbeers-xs"
@@ -342,6 +207,22 @@ def test_a_baseline_shows_a_wrong_bias_in_nearly_any_layer(unseen: Patches) -> N
         checks = judge(compare(session, open_session(model), unseen), Limits(), before)
         hidden |= {name.removesuffix(".bias")} if all(check.passed for check in checks) else set()
     assert hidden == {"body.2.second", "body.3.second", "body.3.first"}
+
+
+def test_the_constants_of_an_int8_file_may_be_nodes() -> None:
+    by_initializers = onnx.load(shipped_pair(SMALL)[1])
+    by_nodes = onnx.load(shipped_pair(SMALL)[1])
+    constants = [
+        onnx.helper.make_node("Constant", [], [t.name], name=f"of.{t.name}", value=t)
+        for t in by_nodes.graph.initializer
+    ]
+    nodes = [*constants, *by_nodes.graph.node]
+    del by_nodes.graph.initializer[:], by_nodes.graph.node[:]
+    by_nodes.graph.node.extend(nodes)
+    assert count_relus(by_nodes) == count_relus(by_initializers) == Relus(4, 0)
+    names = [tensor.name for tensor in rounded_tensors(by_initializers)]
+    assert [tensor.name for tensor in rounded_tensors(by_nodes)] == names
+    assert read_core(by_nodes).frac_bits == read_core(by_initializers).frac_bits
 
 
 def test_results_that_are_never_below_zero_need_no_relu() -> None:

@@ -14,6 +14,7 @@ from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import noise
+from tests.deploy.two_workers import local_cluster
 from tests.quant.tiling.small_networks import espcn
 
 
@@ -53,6 +54,16 @@ def test_only_the_chunks_that_are_needed_are_read(da: Any, model: Path) -> None:
     corner = lazy[:30, :30].compute(scheduler="synchronous")
     assert_array_equal(corner, restore(pixels, network=model, tile=40)[:30, :30])
     assert chunks_read == [(0, 0)]
+
+
+@pytest.mark.slow
+def test_a_dask_array_is_computed_by_other_processes(da: Any, model: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    pixels = noise(150, 120)
+    lazy = restore(da.from_array(pixels, chunks=64), network=model, tile=40)
+    with local_cluster(2) as local, distributed.Client(local) as client:
+        computed = client.compute(lazy).result()
+    assert_array_equal(computed, restore(pixels, network=model, tile=40))
 
 
 def test_a_dask_array_of_shares_is_refused_when_it_is_computed(da: Any, model: Path) -> None:

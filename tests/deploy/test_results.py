@@ -1,5 +1,6 @@
 import json
 import math
+import platform
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,7 @@ import jsonschema
 import numpy as np
 import pytest
 
+from beers_deploy.model.processor import processor_name
 from beers_deploy.profiles.figures import (
     Check,
     Figure,
@@ -19,7 +21,7 @@ from beers_deploy.profiles.figures import (
 from beers_deploy.quant.gate import GateResult, Spread, gate_row
 from beers_deploy.quant.limits import Limits, judge
 from beers_deploy.quant.samples.coverage import SampleRange
-from beers_deploy.results import SCHEMA_PATH, Table
+from beers_deploy.results import SCHEMA_PATH, Table, host
 
 SCHEMA = json.loads(SCHEMA_PATH.read_text())
 
@@ -201,3 +203,20 @@ def test_a_printed_table_shows_its_figures_and_notes() -> None:
         assert word in text
     assert text.endswith("\na note\\nof two lines")
     assert not any(line != line.rstrip() for line in text.splitlines())
+
+
+def test_results_say_what_they_were_measured_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert host()["processor"] == processor_name()
+    monkeypatch.setattr(platform, "system", lambda: "Windows")
+    # On Windows psutil's first answer is a zero that means unknown.
+    assert host()["load_1_min"] is None
+
+
+def test_a_caption_follows_its_table() -> None:
+    rows = tuple(Row(name, "a row", {"size": measured(1, "px", "here")}) for name in ("a", "b"))
+    table = Table(rows=rows, headings={"a": "First"}, captions={"First": "What ok means."})
+    lines = table.to_markdown().splitlines()
+    assert lines.index("## First") < lines.index("What ok means.") < lines.index("## b")
+    text = str(table)
+    assert text.index("First") < text.index("What ok means.") < text.rindex("a row")
+    assert "<p>What ok means.</p>" in table._repr_html_()

@@ -3,7 +3,9 @@ no matter.
 """
 
 import hashlib
+import io
 import json
+import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,11 +15,12 @@ import pytest
 import tifffile
 import torch
 
-from beers_deploy.model.convbeers import arrays
+from beers_deploy.model.convbeers import arrays, load_network
 from beers_deploy.model.dataset import _read_summary
 from beers_deploy.model.io.lock import part_folder
 from beers_deploy.model.io.tensors import read_tensors as read_weights
 from beers_deploy.model.io.tensors import write_tensors
+from beers_deploy.model.metrics.perceptual import read_tensors
 from beers_deploy.model.raster.images import read_pixels
 from beers_deploy.model.training.run import Log
 from beers_deploy.profiles.errors import BeersError, ModelError, OptionError
@@ -64,6 +67,30 @@ def test_a_spoilt_checkpoint_is_refused(spoil: Spoil, tmp_path: Path) -> None:
     write_tensors(path, arrays(tensors), header)
     with pytest.raises(ModelError, match="checkpoint of this network"):
         go_on(path)
+
+
+def test_a_header_that_is_nested_too_deep_is_refused(tmp_path: Path) -> None:
+    content = json.dumps({"__metadata__": {"variant": "[" * 50_000}}).encode()
+    (tmp_path / "w.safetensors").write_bytes(len(content).to_bytes(8, "little") + content)
+    with pytest.raises(ModelError, match="nesting"):
+        load_network(tmp_path / "w.safetensors")
+
+
+def archive(path: Path, content: bytes) -> Path:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("a.npy", content)
+    return path
+
+
+def test_an_array_larger_than_its_archive_is_refused(tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    np.save(stream, np.ones((2, 3), np.float32))
+    assert read_tensors(archive(tmp_path / "a.npz", stream.getvalue()), ["a"])["a"].shape == (2, 3)
+    header = io.BytesIO()
+    about: dict[str, object] = {"descr": "<f4", "fortran_order": False, "shape": (1 << 40,)}
+    np.lib.format.write_array_header_1_0(header, about)
+    with pytest.raises(ModelError, match="arrays"):
+        read_tensors(archive(tmp_path / "b.npz", header.getvalue() + bytes(24)), ["a"])
 
 
 def stored_rows(rows_px: int = 4, **counts: int) -> tuple[bytes, FinishedRow]:

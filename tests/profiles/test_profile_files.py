@@ -98,6 +98,48 @@ def test_what_loads_can_be_drawn_at_the_very_bounds(
     assert 25 / sensor.noise_sigma(25) == pytest.approx(snr_0)
 
 
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("offset = 3", "offset must be a table, got 3. Write it as [offset]."),
+        (
+            "veil = { transmitance = 1 }",
+            (
+                "veil has the unknown key 'transmitance'; it can have the keys path_radiance, "
+                "transmittance. Write 'transmittance'."
+            ),
+        ),
+        (
+            "defects = { dead_per_million = 1 }",
+            (
+                "defects has no key 'hot_per_million'. Add it: a number of at least 0 and at most "
+                "1e+06."
+            ),
+        ),
+        (
+            "prnu = { rms = { value = 0.1, source = 'x' } }",
+            "prnu.rms has no key 'status'. Add it, such as status = \"measured\".",
+        ),
+        (
+            "prnu = { rms = { value = 0.1, status = 'guessed', source = 'x' } }",
+            (
+                "prnu.rms.status must be 'published', 'inferred', 'measured', 'assumed' or "
+                "'stated', got 'guessed'. Correct the value."
+            ),
+        ),
+    ],
+)
+def test_a_hint_says_what_to_write(line: str, words: str, tmp_path: Path) -> None:
+    assert refusal(own_sensor(tmp_path, text=f"{line}\n{SHIPPED}")).endswith(f"mine.toml {words}")
+
+
+def test_a_fault_in_a_table_of_contrasts_has_its_dotted_key(tmp_path: Path) -> None:
+    nyquist = next(line for line in SHIPPED.splitlines() if line.startswith("mtf_nyquist ="))
+    contrasts = 'across = { value = [1, 0.1], status = "guessed", source = "x" }'
+    path = own_sensor(tmp_path, (nyquist, f"frequency = [0, 0.5]\n{contrasts}"))
+    assert "mine.toml mtf.across.status must be 'published'," in refusal(path)
+
+
 @given(st.floats(1, 90), st.floats(1.1, 9), st.floats(5, 300), st.floats(5, 300))
 def test_noise_reproduces_any_two_points(
     radiance_0: float, factor: float, snr_0: float, snr_1: float

@@ -17,7 +17,8 @@ from typer.testing import CliRunner
 
 from beers_deploy.cli.commands import app
 from beers_deploy.profiles.response import MtfTable, PointSpread, centroid, packed, unpacked
-from beers_deploy.profiles.sensor import Sensor, same_instrument
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_numbers import same_instrument
 from beers_deploy.profiles.validation import validated
 from tests.profiles.own_sensor import SHIPPED, own_sensor
 from tests.profiles.test_profile_files import refusal
@@ -207,7 +208,7 @@ def test_another_contrast_beside_a_response_is_refused(tmp_path: Path) -> None:
         (TABLE.replace("0.05]", "-0.05]"), ("above 0", "along", "psf")),
         (TABLE.replace("1, 0.5, 0.12", "1, 0.95, 0.12"), ("0.9003", "sinc")),
         (TABLE + "\n[antialias]\nsigma_px = 0.1", ("no table antialias", "MTF table", "Remove")),
-        (PSF.replace("4", "1"), ("mtf.psf_samples_per_px", "or equal to 2, got 1.")),
+        (PSF.replace("4", "1"), ("mtf.psf_samples_per_px", "from 2 to 64, but it is 1.")),
         (PSF.replace("4", "true"), ("valid number", "True")),
         (PSF.replace("4", '"x"'), ("valid number", "'x'")),
         (PSF.replace("psf.npy", "none.npy"), ("no such file", "none.npy")),

@@ -15,13 +15,13 @@ from torch import Tensor
 from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.mtf import gamma_from_mtf, mtf
-from beers_deploy.model.traditional.nl_bayes import (
+from beers_deploy.model.traditional.noise import Noise
+from beers_deploy.model.traditional.patch_groups import (
     QUALITIES,
     estimate_groups,
     first_pass,
     second_pass,
 )
-from beers_deploy.model.traditional.noise import Noise
 from beers_deploy.model.traditional.pipeline import Chain, Order, restore_traditional
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Sensor

@@ -1,6 +1,5 @@
-"""Faults of single detectors in an image to restore: looked for, told, and replaced where the user
-asks for it.
+"""Detect faults of single detectors in a raw image, warn of them, and replace them on request.
 
-`look` reads strips of an image, `words` says what was found, `fault_list` is a list of faults and
-its file, and `fix` replaces their pixels while rows are read.
+`look` searches strips of an image, `words` writes the warnings, `fault_list` reads and writes lists
+of faults, and `fix` replaces their pixels while rows are read.
 """

@@ -26,7 +26,7 @@ REACH_PX = 16
 STRIP_PX = 256
 """Rows that are searched at a time."""
 WRONG_GAIN = 0.05
-"""Gain from which a single column or row is replaced: a smaller one is for an equalisation to
+"""Gain from which a single column or row is replaced: a smaller one is for an equalization to
 correct.
 """
 MANY = 0.01

@@ -14,7 +14,7 @@ from beers_deploy.restoration.detectors.look import BandFaults, look_at_detector
 logger = logging.getLogger(__name__)
 
 SHARPENS = "restoration about doubles it"
-EQUALISE = "equalise the image first"
+EQUALIZE = "equalize the image first"
 FIX = f"`fix_detectors` {FOUND} replaces"
 EFFECTS = {"columns": "or train with the effects prnu and dsnu in the sensor's profile", "rows": ""}
 """By the lines' name: the effects that describe them."""
@@ -72,7 +72,7 @@ def _of_lines(name: str, lines: Stripes) -> Iterator[str]:
             f"{name}"
         )
     kinds = {True: "gains", False: "offsets", None: "gains or offsets"}[lines.grows_with_level]
-    remedy = ", ".join(filter(None, (EQUALISE, EFFECTS[name])))
+    remedy = ", ".join(filter(None, (EQUALIZE, EFFECTS[name])))
     if lines.seen and lines.spread is not None:
         worst = f", {one} {lines.off[0].index} by {lines.off[0].gain:+.2%}" if lines.off else ""
         yield (
@@ -85,7 +85,7 @@ def _of_lines(name: str, lines: Stripes) -> Iterator[str]:
         yield (
             f"{_count(len(lines.off), one)} {verb} off in gain or offset "
             f"({_some(places, len(lines.off))}); "
-            f"{SHARPENS}: {EQUALISE}, or list them for `fix_detectors`"
+            f"{SHARPENS}: {EQUALIZE}, or list them for `fix_detectors`"
         )
 
 
@@ -98,7 +98,7 @@ def _of_pattern(pattern: Pattern) -> str:
         return (
             f"{message}, as of a mosaic of colour filters: split the image into its colours first"
         )
-    return f"{message}; {SHARPENS}: {EQUALISE}, channel by channel"
+    return f"{message}; {SHARPENS}: {EQUALIZE}, channel by channel"
 
 
 def _count(number: int, name: str) -> str:

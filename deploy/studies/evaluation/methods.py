@@ -14,7 +14,7 @@ import onnx
 import torch
 
 from beers_deploy.model.shipped import INT8, shipped_names
-from beers_deploy.model.traditional.nl_bayes import QUALITIES
+from beers_deploy.model.traditional.patch_groups import QUALITIES
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.model.traditional.pipeline import Chain, Order, restore_traditional
 from beers_deploy.network import Network

@@ -196,8 +196,9 @@ def battery_table(
                 detail=", ".join(overflowing),
             ),
         ),
-        notes=(LEGEND, *(f"not checked: {reason}" for reason in reasons)),
+        notes=tuple(f"not checked: {reason}" for reason in reasons),
         headings=HEADINGS,
+        captions={HEADINGS["battery"]: LEGEND},
         details=frozenset({"findings"}),
     )
 

@@ -20,7 +20,7 @@ from beers_deploy.dpu.cost.latency import dpu_power, predict
 from beers_deploy.dpu.graph import SizedGraph
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.model.shipped import shipped_names
-from beers_deploy.model.traditional.nl_bayes import QUALITIES
+from beers_deploy.model.traditional.patch_groups import QUALITIES
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.performance import tables

@@ -21,11 +21,12 @@ from beers_deploy.network import Network, NetworkLike
 from beers_deploy.performance.swath import PAPER_SIZE, Swath, parse_size
 from beers_deploy.performance.tables import PAPER_TARGET, published_rows
 from beers_deploy.performance.timing import interleaved
-from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Check, Row, predicted
 from beers_deploy.profiles.figures import measured as measured_figure
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import TargetProfile
+from beers_deploy.quant.graph import refusal
 from beers_deploy.results import Input, Table, input_of
 from beers_deploy.studies.evaluation.methods import Method, method_named, method_of
 from beers_deploy.studies.evaluation.pairs import pairs_of_scenes
@@ -99,6 +100,21 @@ class Study:
         return [profile.name for profile in self.boards]
 
     @property
+    def arguments(self) -> dict[str, str]:
+        """The arguments that are recorded as they were read; the others stand as they were given.
+
+        A limit names its figure and unit: `board latency <= 20 s`, however it was typed.
+        """
+        sensor, reference = self.sensors
+        return {
+            "sensor": sensor.name,
+            "reference": reference.name,
+            "network": ",".join(self.names),
+            "budget": ", ".join(map(str, self.budget)),
+            "need": ", ".join(map(str, self.need)),
+        }
+
+    @property
     def inputs(self) -> tuple[Input, ...]:
         """All files that the figures rest on."""
         files = [path for path in map(Path, self.names) if path.is_file()]
@@ -139,10 +155,15 @@ def run_tradeoff(study: Study) -> Tradeoff:
     question = advice.Question(study.budget, study.need, Comparison(benchmark.sites, study.seed))
     notes = (*_notes(benchmark, study.board_names), *remarks)
     table = weigh(results, study.board_names, question, notes)
-    sensor, reference = study.sensors
-    # The other arguments are recorded as they were given.
-    names = {"sensor": sensor.name, "reference": reference.name, "network": ",".join(study.names)}
-    return replace(table, arguments=names, inputs=inputs)
+    return replace(table, arguments=study.arguments, inputs=inputs)
+
+
+def require_quantizable(network: Network) -> Network:
+    """Return a float network; raise ModelError if `quantize` refuses it."""
+    reason = refusal(network.model)
+    if reason:
+        raise ModelError(reason)
+    return network
 
 
 PREVIEW_PX = 256
@@ -153,7 +174,7 @@ def preview(study: Study) -> Table:
     """Return what a study would measure and about how long that takes, from a crop timed here."""
     benchmark, _ = benchmark_of(study)
     # A float network stands for its INT8 one: to quantise it would take longer than the answer.
-    points = points_for(study, lambda network: network)
+    points = points_for(study, require_quantizable)
     methods = _methods([point.variant for point in points], benchmark)
     first = benchmark.pairs[0]
     crop = first.degraded[:PREVIEW_PX, :PREVIEW_PX]
@@ -180,6 +201,7 @@ def preview(study: Study) -> Table:
     figures["time here"] = predicted((low_s + high_s) / 2, "s", (low_s, high_s), how)
     return Table(
         title="what a study of these options measures",
+        arguments=study.arguments,
         inputs=study.inputs,
         rows=(Row("preview", "study", figures),),
         headings={"preview": ""},

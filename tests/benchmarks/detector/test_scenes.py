@@ -12,17 +12,13 @@ from hypothesis import strategies as st
 
 from beers_deploy.model.simulator.procedural import turn
 from beers_deploy.studies.detection.boxes import Boxes
+from benchmarks.detector.objects import Part, aircraft, ship, tank, vehicle
 from benchmarks.detector.scenes import (
     CLASSES,
     SCENE_GSD_M,
     Canvas,
-    Part,
     Plot,
-    aircraft,
-    ship,
     synthetic_scene,
-    tank,
-    vehicle,
 )
 
 SHAPES: list[Callable[[np.random.Generator], list[Part]]] = [

@@ -22,7 +22,8 @@ from beers_deploy.kit import RECORD
 from beers_deploy.kit.golden import read_golden
 from beers_deploy.kit.host_facts import host_facts
 from beers_deploy.model.bank import bank_of_vector
-from beers_deploy.model.consistency import REACH_PX, Consistency, Placed
+from beers_deploy.model.blocks import Placed
+from beers_deploy.model.consistency import REACH_PX, Consistency
 from beers_deploy.model.convbeers import arrays
 from beers_deploy.model.exposure import HEADROOM, choose_factors, factors_for
 from beers_deploy.model.io.tensors import Weights

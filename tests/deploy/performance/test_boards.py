@@ -19,8 +19,8 @@ from beers_deploy.dpu.cost.model import TASKS
 from beers_deploy.model.raster.images import read_acquisition
 from beers_deploy.network import Network
 from beers_deploy.performance.board import Bench, Question, bench_board, boards_for
-from beers_deploy.performance.swath import Swath
-from beers_deploy.performance.tables import sweep_rows, within_words
+from beers_deploy.performance.swath import Swath, predict_network
+from beers_deploy.performance.tables import frame_row, sweep_rows, within_words
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
@@ -109,6 +109,17 @@ def test_a_network_that_is_not_tiled_is_predicted_by_the_frame(classifier: Path)
     with pytest.raises(ModelError, match="GlobalAveragePool"):
         # A size is that of a swath.
         bench(classifier, size="300x260")
+
+
+def test_a_frame_need_not_be_square(classifier: Path, tmp_path: Path) -> None:
+    model = onnx.load(classifier)
+    model.graph.input[0].type.tensor_type.shape.dim[3].dim_value = 96
+    onnx.save(model, tmp_path / "wide.onnx")
+    square, wide = (
+        frame_row(predict_network(path, load_dpu("vck190"), None)).figures["work"].value or 0
+        for path in (classifier, tmp_path / "wide.onnx")
+    )
+    assert wide > 2.5 * square
 
 
 @pytest.mark.parametrize("target", ["all", "kv260,vck190"])

@@ -19,7 +19,7 @@ from beers_deploy.performance.tables import (
 )
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import measured, predicted, unavailable
-from tests.deploy.command_line import done
+from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 from tests.deploy.dpu.graphs import float_convbeers, integer_convbeers
 from tests.deploy.performance.test_host import value
@@ -155,6 +155,30 @@ def test_bench_on_this_machine(tmp_path: Path) -> None:
     row, *_ = valid(out)["rows"]
     assert isinstance(row["figures"], dict)
     assert row["figures"]["p50"]["value"] <= row["figures"]["p90"]["value"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--target host --tile 64,32", "--tile must be one side with --target host, got 2."),
+        ("--target host --dpu C32B3", "--dpu has no effect"),
+        ("--target host --no-traditional", "--no-traditional has no effect"),
+        ("--threads 1", "--threads has no effect without --target host"),
+        ("--dpu C1B1", "--dpu"),
+        ("--tile 16 --halo 8", "--tile"),
+        ("--image colour.tif", "one band"),
+        ("--image half.tif", "0.5, which may be shares"),
+        ("--target kv261", "kv261"),
+    ],
+)
+def test_bench_refuses_what_does_not_go_together(
+    options: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    tifffile.imwrite("colour.tif", np.zeros((8, 9, 3), np.uint8), photometric="rgb")
+    tifffile.imwrite("half.tif", np.full((8, 9), 0.5, np.float32))
+    integer_convbeers(tmp_path / "net.onnx", 1, 8)
+    assert message in refused(f"bench net.onnx {options}")
 
 
 def test_the_paper_counts_fractions() -> None:

@@ -189,6 +189,19 @@ def test_a_list_that_does_not_fit_is_refused(tmp_path: Path, text: str, words: s
     assert words in str(error.value)
 
 
+@pytest.mark.parametrize("content", [b"\xff\xfe\x00", None])
+def test_a_list_that_is_a_binary_file_or_a_folder_is_refused(
+    tmp_path: Path, content: bytes | None
+) -> None:
+    path = tmp_path / "list.csv"
+    if content is None:
+        path.mkdir()
+    else:
+        path.write_bytes(content)
+    with pytest.raises(OptionError, match="list of faulty detectors"):
+        read_list(path, Raster(3, 8, 10, np.dtype(np.uint16)))
+
+
 def test_an_image_full_of_single_pixels_has_no_single_faults() -> None:
     pixels = ground(HEIGHT, WIDTH)
     pixels[5::7, 5::7] = 4095

@@ -33,6 +33,50 @@ def test_polynomials_bits_and_gains_of_a_dimap_are_kept(
         assert [after.tags(band)["RADIANCE_BIAS"] for band in (1, 2)] == ["0.0", "0.1"]
 
 
+def test_names_and_gains_of_the_bands_of_a_vrt_are_kept(model: Path, tmp_path: Path) -> None:
+    more = "<Description>B0</Description><Offset>-0.5</Offset><Scale>0.25</Scale>"
+    image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers(), more)
+    restore(image, tmp_path / "out.tif", network=model)
+    with rasterio.open(tmp_path / "out.tif") as after:
+        assert after.descriptions == ("B0", "B0")
+        assert (after.scales, after.offsets) == ((0.25, 0.25), (-0.5, -0.5))
+
+
+def test_ground_control_points_of_a_vrt_are_kept(model: Path, tmp_path: Path) -> None:
+    points = "".join(
+        f'<GCP Id="{k}" Pixel="{17 * k}" Line="{9 * k * k}" X="{k / 3!r}" Y="{45 - k / 7!r}" '
+        'Z="0"/>'
+        for k in range(5)
+    )
+    image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers())
+    text = image.read_text()
+    place = text[text.index("<SRS>") : text.index("</GeoTransform>") + len("</GeoTransform>")]
+    image.write_text(text.replace(place, f'<GCPList Projection="EPSG:4326">{points}</GCPList>'))
+    restore(image, tmp_path / "out.tif", network=model)
+    with rasterio.open(image) as before, rasterio.open(tmp_path / "out.tif") as after:
+        assert before.gcps[1] == after.gcps[1] == rasterio.CRS.from_epsg(4326)
+        points_of = [[(p.col, p.row, p.x, p.y) for p in file.gcps[0]] for file in (before, after)]
+    assert len(points_of[0]) == 5
+    assert_allclose(points_of[1], points_of[0], rtol=0, atol=1e-9)
+
+
+def test_alpha_in_a_jpeg_2000_and_a_mask_next_to_one_are_missing_pixels(tmp_path: Path) -> None:
+    pixels = images.digital_numbers(bands=2)
+    hidden = np.zeros((images.HEIGHT, images.WIDTH), bool)
+    hidden[30:50, 40:] = True
+    pixels[1] = np.where(hidden, 0, 4095)
+    alpha = {"NBITS": 12, "PHOTOMETRIC": "MINISBLACK", "ALPHA": "YES"}
+    images.write_jp2(tmp_path / "alpha.jp2", pixels, **alpha)
+    images.write_jp2(tmp_path / "mask.jp2", pixels[:1], NBITS=12)
+    images.write_mask(tmp_path / "mask.jp2", ~hidden)
+    for kind in ("alpha", "mask"):
+        with open_raster(tmp_path / f"{kind}.jp2") as source:
+            rows = source.read(20, 60)
+            assert (source.raster.bands, source.raster.mask_kind) == (1, kind)
+            np.testing.assert_array_equal(np.ma.getdata(rows)[0], pixels[0, 20:60])
+            np.testing.assert_array_equal(source.raster.missing(rows)[0], hidden[20:60])
+
+
 def not_restored(image: Path, out: Path, model: Path, error: type[BeersError], *words: str) -> None:
     """Expect an error of one line with these words, and nothing written."""
     before = sorted(out.parent.iterdir())

@@ -10,17 +10,19 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from beers_deploy.model.traditional.nl_bayes import (
-    QUALITIES,
-    estimate_groups,
-    first_pass,
     nl_bayes_strips,
     overlap_add,
     patch_matrix,
-    second_pass,
     window_distances,
     window_numbers,
 )
 from beers_deploy.model.traditional.noise import Noise, coloured_by
+from beers_deploy.model.traditional.patch_groups import (
+    QUALITIES,
+    estimate_groups,
+    first_pass,
+    second_pass,
+)
 from beers_deploy.profiles.errors import ImageError
 from tests.model.traditional.whole import nl_bayes
 

@@ -5,8 +5,9 @@ from torch import Tensor
 
 from beers_deploy.model.simulator.mtf import Blur
 from beers_deploy.model.traditional.compensate import compensation_kernel, filter_strips
-from beers_deploy.model.traditional.nl_bayes import QUALITIES, Quality, nl_bayes_strips
+from beers_deploy.model.traditional.nl_bayes import nl_bayes_strips
 from beers_deploy.model.traditional.noise import Noise
+from beers_deploy.model.traditional.patch_groups import QUALITIES, Quality
 
 
 def nl_bayes(image: Tensor, noise: Noise, quality: Quality = QUALITIES["standard"]) -> Tensor:

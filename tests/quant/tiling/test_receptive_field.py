@@ -14,6 +14,7 @@ from onnx import TensorProto, helper
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.tiling.receptive_field import Tiling, tiling_of
+from tests.quant.tiling.random_networks import networks
 from tests.quant.tiling.small_networks import (
     Row,
     check_tiles,
@@ -21,7 +22,6 @@ from tests.quant.tiling.small_networks import (
     float_unet,
     graph,
     int8_unet,
-    networks,
     real,
     taps,
     whole,

@@ -42,6 +42,7 @@ from beers_deploy.studies.tradeoff.points import (
     network_variants,
     radius_px,
 )
+from beers_deploy.studies.tradeoff.run import require_quantizable
 from tests.deploy.dpu.graphs import integer_convbeers
 from tests.deploy.studies.tradeoff.made import DPU
 from tests.model.networks import plain
@@ -94,6 +95,21 @@ def test_an_own_network_is_quantized_and_one_that_cannot_be_stays_float(
     (record,) = caplog.records
     assert record.levelno == logging.WARNING
     assert "compared in float32 alone: net has a sigmoid" in record.getMessage()
+
+
+def test_a_preview_counts_int8_of_a_network_only_if_quantize_accepts_it(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    model = onnx.load(float_file(tmp_path / "net.onnx"))
+    variants = network_variants([str(tmp_path / "net.onnx")], SENSOR, require_quantizable)
+    assert [variant.precision for variant in variants] == [FLOAT, INT8]
+    model.graph.node.append(onnx.helper.make_node("Sigmoid", [model.graph.output[0].name], ["s"]))
+    model.graph.output[0].name = "s"
+    onnx.save(model, tmp_path / "sigmoid.onnx")
+    variants = network_variants([str(tmp_path / "sigmoid.onnx")], SENSOR, require_quantizable)
+    assert [variant.precision for variant in variants] == [FLOAT]
+    assert "is compared in float32 alone: " in caplog.text
+    assert "Sigmoid" in caplog.text
 
 
 def test_an_int8_file_is_taken_as_it_is(variant: Variant) -> None:

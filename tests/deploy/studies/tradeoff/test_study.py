@@ -196,7 +196,7 @@ def test_the_command_writes_its_files_where_nothing_is_recommended(
     network = ("--network", folder / "narrow.safetensors", "--size", "1500x1200")
     images = ("--images", folder / "images", "--calibration", folder / "calibration")
     outputs = ("--out", out, "--json", tmp_path / "figures.json")
-    budget = ("--budget", "latency<=0.001s")
+    budget = ("--budget", "latency<=1e-3s, power <=20")
     output = done("tradeoff", *network, *images, *outputs, *budget, code=1)
     document = valid(tmp_path / "figures.json")
     line = document["rows"][0]["text"]["line"]
@@ -204,6 +204,8 @@ def test_the_command_writes_its_files_where_nothing_is_recommended(
     assert [text for text in output.splitlines() if "recommend" in text] == [line]
     assert f"wrote {out / 'tradeoff.html'}\n" in output
     assert document["verdict"] == "failed"
+    assert document["arguments"]["budget"] == "board latency <= 0.001 s, board power <= 20 W"
+    assert document["arguments"]["need"] == ""
     # The paper's runs are of its own swath.
     assert not any("paper" in row["name"] for row in document["rows"])
     assert {path.name for path in out.iterdir()} == {

@@ -1,6 +1,5 @@
 """What the machine's system says of a process's memory, on systems of every kind."""
 
-import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -9,10 +8,8 @@ from types import SimpleNamespace
 import psutil
 import pytest
 
-from beers_deploy.model.processor import processor_name
 from beers_deploy.profiles.figures import Figure
 from beers_deploy.restoration.memory import peak_memory
-from beers_deploy.results import host
 
 MEGABYTE = 1_000_000
 NOWHERE = Path("no such file")
@@ -78,10 +75,3 @@ def test_where_nothing_counts_it_there_is_a_reason_and_no_zero(
     figure = peak_memory()
     assert (figure.value, figure.mode) == (None, "unavailable")
     assert figure.reason
-
-
-def test_results_say_what_they_were_measured_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert host()["processor"] == processor_name()
-    monkeypatch.setattr(platform, "system", lambda: "Windows")
-    # On Windows psutil's first answer is a zero that means unknown.
-    assert host()["load_1_min"] is None

@@ -1,5 +1,5 @@
-"""A baseline is the document of a gate that passed on the same patches: every other file is
-refused.
+"""A verdict can be read by a CI job, and its baseline is the document of a gate that passed on the
+same patches: every other file is refused.
 """
 
 import json
@@ -7,17 +7,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
 
 import beers_deploy as bd
-from beers_deploy.comparison import Data, sensor_input
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.figures import Check, Row, measured
-from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.figures import Bound, Check, Row, measured
 from beers_deploy.results import Input, Table
-from beers_deploy.verdict import Baseline, read_baseline
+from beers_deploy.verdict import Baseline, junit_text, read_baseline
 from tests.deploy.command_line import done, refused
 
 ASKED: dict[str, Any] = {"sensor": "pleiades-degraded", "images": None, "patches": 2, "seed": 0}
@@ -149,32 +148,6 @@ def test_what_else_it_rests_on_must_be_the_same(digest: str) -> None:
         twice.require_same("a" * 64, 50.0, [Input("sensor s", "b" * 64)])
 
 
-def test_a_sensor_of_the_same_name_and_other_numbers_is_another() -> None:
-    sensor = Sensor.load("pleiades-degraded")
-    other = sensor.replace(gain_dn_per_radiance=2 * sensor.gain_dn_per_radiance.low)
-    assert sensor_input(sensor).name == sensor_input(other).name
-    assert sensor_input(sensor).sha256 != sensor_input(other).sha256
-
-
-@pytest.mark.parametrize("change", ["content", "name", "one more", "none"])
-def test_a_folder_is_known_by_its_files(change: str, tmp_path: Path) -> None:
-    folder = tmp_path / "ground"
-    folder.mkdir()
-    (folder / "a.tif").write_bytes(b"1")
-    (folder / "b.tif").write_bytes(b"2")
-    data = Data(Sensor.load("pleiades-degraded"), images=folder)
-    before = data.inputs
-    # A file that is not read as a scene does not count.
-    (folder / "gate.json").touch()
-    if change == "content":
-        (folder / "a.tif").write_bytes(b"3")
-    elif change == "name":
-        (folder / "a.tif").rename(folder / "c.tif")
-    elif change == "one more":
-        (folder / "c.tif").write_bytes(b"")
-    assert (data.inputs == before) == (change == "none")
-
-
 def test_a_baseline_of_other_samples_in_memory_is_refused(model: Path, tmp_path: Path) -> None:
     """Also where both networks are files of one name."""
     (tmp_path / "int8").mkdir()
@@ -219,3 +192,45 @@ def test_what_is_no_document_gets_one_sentence(
     with pytest.raises(OptionError, match=words) as caught:
         read_baseline(tmp_path / "x.json", ASKED)
     assert "\n" not in str(caught.value)
+
+
+CHECKS = [
+    Check("MAE", 6e-4, 8e-4, "of full scale"),
+    Check("PSNR drop", 0.31, 0.25, "dB"),
+    Check("nodes <all>", 1, 0, "node", detail="tail: x & y | z\n::error::\x1b[31m"),
+    Check("PSNR float-INT8", 61.15, 60, "dB", "at least"),
+]
+
+
+def test_a_job_can_read_the_verdict() -> None:
+    suite = ET.fromstring(junit_text("INT8 gate", CHECKS))  # noqa: S314 - our own text
+    assert [suite.get(name) for name in ("tests", "failures", "errors")] == ["4", "2", "0"]
+    assert [case.find("failure") is not None for case in suite] == [False, True, True, False]
+
+
+def test_the_last_line_names_what_failed_and_nothing_else() -> None:
+    assert Table(command="gate", checks=tuple(CHECKS[:1])).verdict == "gate passed, all 1 checks"
+    text = Table(command="gate", checks=tuple(CHECKS)).verdict
+    # A node's name may hold what a terminal or a CI's log would obey.
+    assert text.isprintable()
+    assert text.startswith(
+        "gate FAILED, 2 of 4 checks: PSNR drop 0.31 dB, allowed at most 0.25; nodes <all> 1 (tail"
+    )
+    assert "MAE" not in text
+    assert "float-INT8" not in text
+
+
+@pytest.mark.parametrize(
+    ("value", "limit", "bound", "expected"),
+    [
+        (1.0, 1.0, "at most", True),
+        (1.0, 1.0, "at least", True),
+        (1.1, 1.0, "at most", False),
+        (1.1, 1.0, "at least", True),
+        (np.nan, np.inf, "at most", False),
+        (np.nan, 0.0, "at least", False),
+        (np.inf, 60.0, "at least", True),
+    ],
+)
+def test_the_number_decides(value: float, limit: float, bound: Bound, expected: bool) -> None:
+    assert Check("x", value, limit, "dB", bound).passed == expected

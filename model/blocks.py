@@ -1,0 +1,164 @@
+"""Means over the blocks of an image, and bilinear interpolation between the centres of blocks.
+
+The blocks are aligned to the image, and every block and pixel is computed by the same float32
+operations in the same order wherever a tile begins. So tiles give the whole image's values bit for
+bit.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.float32]
+
+
+BLOCK_PX = 8
+"""Side of a block.
+
+The mean of 64 pixels has an eighth of a pixel's noise. Blocks of 16 and 32 gained less (0.01 and
+0.03 dB, measured).
+"""
+
+
+BORDER_BLOCKS = 2
+"""Blocks at the image's border that are left out, because H brings light into them that x does not
+show. With all blocks the outer 8 pixels lost 0.2 dB, with one left out 0.05 dB; with two they gain
+(measured on training places).
+"""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Where in an image the pixels of an array lie along one side.
+
+    Attributes:
+        size_px: of the image.
+        start: place in the image of the array's first pixel.
+        keep_start: first kept pixel, in the image.
+        keep_stop: end of the kept pixels (excluded).
+    """
+
+    size_px: int
+    start: int
+    keep_start: int
+    keep_stop: int
+
+    @property
+    def blocks(self) -> tuple[int, int]:
+        """First and last block that the kept pixels are interpolated from.
+
+        BORDER_BLOCKS at either end of the image are left out, unless it has no others.
+        """
+        # Pixel p lies between the centres of blocks (p - 4) // 8 and the next: a centre lies at 8 k
+        # + 3.5.
+        half = BLOCK_PX // 2
+        count = -(-self.size_px // BLOCK_PX)
+        left_out = BORDER_BLOCKS if count > 2 * BORDER_BLOCKS else 0
+        low = left_out
+        high = count - 1 - left_out
+        first = (self.keep_start - half) // BLOCK_PX
+        last = (self.keep_stop - 1 - half) // BLOCK_PX + 1
+        return min(max(first, low), high), max(min(last, high), low)
+
+    def span(self, around_px: int) -> tuple[int, int]:
+        """Return first pixel and end of all these blocks with `around_px` more on both sides; they
+        may lie beyond the image.
+        """
+        first, last = self.blocks
+        return BLOCK_PX * first - around_px, BLOCK_PX * (last + 1) + around_px
+
+
+def extend(
+    image: Image, sides: tuple[Placed, Placed], origin: tuple[int, int], around_px: int
+) -> NDArray[np.float32]:
+    """Return the pixels of the blocks of a window and `around_px` more, mirrored beyond the image's
+    borders (edge twice).
+
+    Args:
+        image: pixels (h, w) of a part of the image.
+        sides: where its rows and its columns lie, and which are kept.
+        origin: row and column in the image of its first pixel.
+        around_px: pixels beyond the blocks on every side.
+    """
+    slices = []
+    pads = []
+    for placed, first in zip(sides, origin, strict=True):
+        start, stop = placed.span(around_px)
+        low = max(start, 0)
+        high = min(stop, placed.size_px)
+        slices.append(slice(low - first, high - first))
+        pads.append((low - start, stop - high))
+    inside = image[slices[0], slices[1]]
+    if not any(map(any, pads)):
+        return inside
+    return _mirrored(image, sides, origin, around_px)
+
+
+def _mirrored(
+    image: Image, sides: tuple[Placed, Placed], origin: tuple[int, int], around_px: int
+) -> NDArray[np.float32]:
+    """Return the pixels of `extend` one by one: c b a | a b c | c b a, folded back whatever the
+    image's size.
+    """
+    numbers = []
+    for placed, first in zip(sides, origin, strict=True):
+        period = 2 * placed.size_px
+        number = np.arange(*placed.span(around_px)) % period
+        numbers.append(np.minimum(number, period - 1 - number) - first)
+    return np.asarray(image[np.ix_(*numbers)])
+
+
+def weighted_sums(image: Image, weights: Image, axis: int) -> Image:
+    """Return weighted sums over windows along an axis, as long as `weights` and BLOCK_PX apart."""
+    count = (image.shape[axis] - len(weights)) // BLOCK_PX + 1
+    end = BLOCK_PX * (count - 1) + 1
+    total: Image | None = None
+    for place, weight in enumerate(weights):
+        steps = slice(place, place + end, BLOCK_PX)
+        term = (image[steps] if axis == 0 else image[:, steps]) * weight
+        total = term if total is None else np.add(total, term, out=total)
+    assert total is not None  # noqa: S101 - there are weights
+    return total
+
+
+def block_means(image: Image) -> Image:
+    """Return the means of whole blocks."""
+    mean = np.full(BLOCK_PX, 1 / BLOCK_PX, np.float32)
+    return weighted_sums(weighted_sums(image, mean, 0), mean, 1)
+
+
+def reached_blocks(flags: Image, reach_px: int) -> Image:
+    """Return 1 for each block within `reach_px` of a flag, else 0.
+
+    Args:
+        flags: 0 or 1 for each pixel of the blocks, and of `reach_px` more on every side.
+        reach_px: distance along rows and columns.
+    """
+    ones = np.ones(BLOCK_PX + 2 * reach_px, np.float32)
+    if not flags.any():
+        shape = tuple((side - 2 * reach_px) // BLOCK_PX for side in flags.shape)
+        return np.zeros(shape, np.float32)
+    return np.asarray(weighted_sums(weighted_sums(flags, ones, 0), ones, 1) > 0, np.float32)
+
+
+def interpolate(blocks: Image, down: Placed, across: Placed) -> Image:
+    """Interpolate bilinearly between the centres of blocks, at the kept pixels."""
+    return _along(_along(blocks, down).T, across).T
+
+
+def _along(blocks: Image, placed: Placed) -> Image:
+    """Interpolate linearly along the first axis; at the image's border the nearest block inside
+    counts.
+    """
+    half = BLOCK_PX // 2
+    first, last = placed.blocks
+    pixels = np.arange(placed.keep_start, placed.keep_stop)
+    left = (pixels - half) // BLOCK_PX
+    # In sixteenths, which float32 holds exactly: the two weights add up to 1.
+    share = ((2 * (pixels - half) + 1) % (2 * BLOCK_PX)).astype(np.float32) / np.float32(
+        2 * BLOCK_PX
+    )
+    lower = np.clip(left, first, last) - first
+    upper = np.clip(left + 1, first, last) - first
+    return blocks[lower] * (np.float32(1) - share)[:, None] + blocks[upper] * share[:, None]

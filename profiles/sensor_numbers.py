@@ -1,0 +1,24 @@
+"""The numbers of a sensor profile, without their provenance: what decides its images."""
+
+from beers_deploy.profiles.constant import Constant
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import (
+    TABLE_OF,
+)
+
+
+def same_instrument(one: Sensor, other: Sensor) -> bool:
+    """Return True if two profiles have the same numbers, whatever their names and sources."""
+    return numbers_of(one) == numbers_of(other)
+
+
+def numbers_of(profile: Sensor) -> dict[str, object]:
+    """Return the low and high end of each constant, by name."""
+    constants: dict[str, Constant | None] = {key: getattr(profile, key) for key in TABLE_OF}
+    for effect, table in profile.effects.items():
+        constants |= {f"{effect}.{key}": constant for key, constant in table.items()}
+    numbers: dict[str, object] = {
+        key: constant and (constant.low, constant.high) for key, constant in constants.items()
+    }
+    # The representation holds all samples, where the text of a response holds a digest.
+    return {**numbers, "response": repr(profile.response)}

@@ -1,0 +1,74 @@
+"""Methods of an evaluation by their names, and which sensor each is given."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.studies.evaluation.methods import (
+    BLIND,
+    KNOWN,
+    Method,
+    method_named,
+    method_without_network,
+)
+from tests.deploy.studies.evaluation.small_pairs import (
+    DEGRADED,
+    OTHER,
+    REFERENCE,
+    SENSORS,
+)
+
+
+@pytest.mark.parametrize("name", ["magic", "traditional-superb", "convbeers-huge", ""])
+def test_an_unknown_method_is_refused(name: str) -> None:
+    with pytest.raises(OptionError, match=r"`methods`|variant"):
+        method_named(name, DEGRADED, REFERENCE)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("convbeers-xs", "known"),
+        ("convbeers-xs-int8", "known"),
+        ("convbeers-xs@blind", "blind"),
+        ("convbeers-xs@dior-medium", "another: dior-medium"),
+        ("traditional", "known"),
+    ],
+)
+def test_a_shipped_network_knows_the_images_sensor_unless_its_name_says_another(
+    name: str, expected: str
+) -> None:
+    assert method_named(name, DEGRADED, REFERENCE).sensor_known == expected
+
+
+def test_a_shipped_network_restores_as_it_knows_the_sensor() -> None:
+    """Specialised to the sensor that is given, and to no other where its name says one."""
+    dn = np.random.default_rng(0).uniform(300, 900, (47, 53)).astype(np.float32)
+    blurred = replace(DEGRADED.nominal(), mtf_nyquist=0.03)
+    method = method_named("convbeers-xs", DEGRADED, REFERENCE)
+    assert method.specialise is not None
+    np.testing.assert_allclose(
+        method.specialise(DEGRADED.nominal())(dn), method.restore(dn), rtol=0, atol=1
+    )
+    assert np.abs(method.specialise(blurred)(dn) - method.restore(dn)).max() > 5
+    assert method_named("convbeers-xs@blind", DEGRADED, REFERENCE).specialise is None
+
+
+@pytest.mark.parametrize("name", ["traditional-fast", "deconvolve-first-fast", "wiener"])
+def test_a_chain_that_gets_to_know_a_sensor_is_the_one_made_for_it(name: str) -> None:
+    """Its gain included: the reference that is aimed at then has it too."""
+    dn = np.random.default_rng(0).integers(200, 1800, (40, 47)).astype(np.float32)
+    method = method_without_network(name, *SENSORS)
+    other = method_without_network(name, OTHER, SENSORS[1].in_units_of(OTHER))
+    restored = method.knowing(OTHER).restore(dn)
+    assert np.array_equal(restored, other.restore(dn))
+    assert not np.array_equal(restored, method.restore(dn))
+
+
+def test_who_can_know_a_sensor_says_so_and_what_depends_on_none_stays_as_it_is() -> None:
+    for fixed in (method_without_network("degraded", *SENSORS), Method("blind", np.sqrt, BLIND)):
+        assert fixed.knowing(OTHER) is fixed
+    method = Method("net", np.sqrt, BLIND, lambda _: np.abs)
+    assert (method.knowing(OTHER).sensor_known, method.sensor_known) == (KNOWN, BLIND)

@@ -1,0 +1,176 @@
+"""Scores of restored pairs: which pixels count, biases, and means by site."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from beers_deploy.model.metrics.fidelity import fidelity_db
+from beers_deploy.model.shipped import shipped_names
+from beers_deploy.model.simulator.procedural import procedural_scene
+from beers_deploy.network import Network
+from beers_deploy.profiles.figures import by_table
+from beers_deploy.studies.evaluation.methods import BLIND, Method
+from beers_deploy.studies.evaluation.pairs import NamedPair, simulate_pairs
+from beers_deploy.studies.evaluation.scores import (
+    BIAS,
+    INNER,
+    INNER_BORDER_PX,
+    INNER_NOISE_FREE,
+    LARGEST_BIAS,
+    NOISE_FREE,
+    READ,
+    bias_percent,
+    inner_border_px,
+    inner_note,
+    score,
+    site_rows,
+)
+from beers_deploy.tables.columns import missing
+from tests.deploy.studies.evaluation.small_pairs import (
+    DEGRADED,
+    IDENTITY,
+    PLAIN,
+    REFERENCE,
+    pair,
+)
+
+
+def test_clipped_pixels_do_not_count() -> None:
+    """Trap 17: above full scale the truth is unknown, in the reference as in the input."""
+    one = pair()
+    reference = one.reference.copy()
+    degraded = one.degraded.copy()
+    reference[3:9, 5:11] = 4095
+    degraded[20:25, 5:11] = 4095
+    restored = degraded.copy()
+    before = fidelity_db(restored, reference, degraded)
+    restored[3:9, 5:11] = 100
+    restored[20:25, 5:11] = 100
+    assert fidelity_db(restored, reference, degraded) == before
+    restored[30, 30] += 500
+    assert fidelity_db(restored, reference, degraded) < before
+    white = np.full((12, 13), 4095, np.float32)
+    # All of the image is clipped: then no pixel is left out.
+    assert fidelity_db(white - 1, white, white) == pytest.approx(20 * np.log10(4095))
+
+
+def test_the_degraded_input_gains_nothing_and_missing_figures_have_a_reason() -> None:
+    mean, *images = score(IDENTITY, [pair(f"{'abcde'[s]}.tif", seed=s) for s in range(5)], PLAIN, 0)
+    assert mean.figures["PSNR gain"].value == 0
+    assert len(images) == 5
+    assert mean.figures["LPIPS-squeeze"].reason == "no weights"
+    reasons = [f"{NOISE_FREE}, {INNER_NOISE_FREE}: {READ}", "LPIPS-squeeze: no weights"]
+    assert missing([mean, *images]) == reasons
+    interval = mean.figures["PSNR"].interval
+    assert interval is not None
+    assert interval[0] <= (mean.figures["PSNR"].value or 0) <= interval[1]
+    assert NOISE_FREE not in {row.table.removesuffix(" by site") for row in site_rows(images)}
+    few, *_ = score(IDENTITY, [pair(f"{'abcd'[s]}.tif", seed=s) for s in range(4)], PLAIN, 0)
+    assert few.figures["PSNR"].interval is None
+    assert "no interval: 4 sites, fewer than 5" in few.figures["PSNR"].source
+
+
+def test_identical_images_are_no_number() -> None:
+    perfect = replace(pair(), degraded=pair().reference)
+    mean, image = score(IDENTITY, [perfect], PLAIN, 0)
+    assert mean.figures["PSNR"].value is None
+    assert "identical" in image.figures["PSNR"].reason
+
+
+def test_errors_in_the_border_are_none_of_inner_pixels() -> None:
+    for height, width in ((37, 45), (300, 131)):
+        border_px = inner_border_px(height, width)
+        reference = (
+            np.random.default_rng(height).uniform(100, 3000, (height, width)).astype(np.float32)
+        )
+        inside = np.zeros((height, width), bool)
+        inside[border_px : height - border_px, border_px : width - border_px] = True
+        assert inside.sum(0).max() >= height / 2
+        restored = reference + np.where(inside, 2, 400).astype(np.float32)
+        scores = PLAIN.score(restored, NamedPair("a", reference, reference, noise_free=reference))
+        for key in (INNER, INNER_NOISE_FREE):
+            assert scores[key] == pytest.approx(20 * np.log10(4095 / 2), abs=1e-3)
+        assert (scores["PSNR"] or 0) < 30
+        assert scores[BIAS] == pytest.approx(200 / reference[inside].mean(), rel=1e-3)
+
+
+def test_the_border_covers_what_every_shipped_network_sees_and_is_less_of_small_images() -> None:
+    reach_of_the_consistency_step_px = 19
+    halos_px = [Network.load(name).tiling.halo_px for name in shipped_names()]
+    assert max(halos_px) + reach_of_the_consistency_step_px == INNER_BORDER_PX
+    assert inner_border_px(4 * INNER_BORDER_PX, 999) == INNER_BORDER_PX
+    assert inner_border_px(101, 60) == 15
+    large = NamedPair("large", *(np.ones((4 * INNER_BORDER_PX, 230), np.float32),) * 2)
+    assert not inner_note([large])
+    assert "(1 of 2)" in inner_note([large, pair()])
+
+
+@pytest.mark.parametrize("factor", [1.01, 0.97])
+def test_a_method_that_multiplies_has_that_bias(factor: float) -> None:
+    perfect = [
+        replace(pair(f"{name}_1.tif", seed), degraded=pair(seed=seed).reference)
+        for seed, name in enumerate("ab")
+    ]
+    scaled = Method("scaled", lambda dn: dn * np.float32(factor), BLIND)
+    mean, *images = score(scaled, perfect, PLAIN, 0)
+    for row in (mean, *images):
+        assert row.figures[BIAS].value == pytest.approx(100 * (factor - 1), abs=1e-3)
+        assert row.figures[BIAS].unit == "%"
+
+
+def test_the_largest_bias_is_that_of_the_worst_image_with_its_sign() -> None:
+    perfect = [
+        replace(pair(f"{name}.tif", 1), degraded=pair(seed=1).reference)
+        for name in ("a_1", "b_1", "b_2")
+    ]
+    factors = iter((1.01, 0.96, 1.02))
+    mean, *_ = score(
+        Method("drifts", lambda dn: dn * np.float32(next(factors)), BLIND), perfect, PLAIN, 0
+    )
+    assert mean.figures[BIAS].value == pytest.approx(-1 / 3, abs=1e-3)
+    assert mean.figures[LARGEST_BIAS].value == pytest.approx(-4, abs=1e-3)
+    assert mean.figures[LARGEST_BIAS].source == "one pair of site b"
+
+
+def test_clipped_pixels_and_the_offset_are_no_bias_and_black_has_none() -> None:
+    level = np.full((40, 41), 500, np.float32)
+    restored = level.copy()
+    unclipped = np.ones(level.shape, bool)
+    restored[15:20, 15:20] = 4095
+    unclipped[15:20, 15:20] = False
+    assert bias_percent(restored, level, unclipped) == 0
+    assert bias_percent(restored, level) > 1
+    assert bias_percent(level + 4, level, offset_dn=100) == pytest.approx(1)
+    black = np.zeros((40, 41), np.float32)
+    mean, _ = score(
+        Method("lifts", lambda dn: dn + 1, BLIND), [NamedPair("a", black, black)], PLAIN, 0
+    )
+    assert mean.figures[BIAS].reason == "the reference is black"
+
+
+def test_noise_of_the_reference_is_no_error_of_a_method_that_leaves_it_out() -> None:
+    scene = procedural_scene(700, 760, np.random.default_rng(3))
+    (one,), _ = simulate_pairs([scene], DEGRADED, REFERENCE, 7)
+    clean = one.noise_free
+    assert clean is not None
+    oracle = Method("oracle", lambda _: clean + np.float32(2), "known")
+    mean, image = score(oracle, [one], PLAIN, 0)
+    assert f"{NOISE_FREE} by site" in by_table(site_rows([image]))
+    noise_free = mean.figures[NOISE_FREE].value or 0
+    assert noise_free == pytest.approx(20 * np.log10(4095 / 2), abs=1e-3)
+    assert noise_free > (mean.figures["PSNR"].value or 0) + 5
+
+
+def test_sites_are_means_of_their_images() -> None:
+    pairs = [pair("a_1.tif", 1, 10), pair("a_2.tif", 2, 40), pair("b_1.tif", 3, 20)]
+    _, *images = score(IDENTITY, pairs, PLAIN, 0)
+    rows = site_rows(images)
+    keys = "PSNR", INNER, BIAS, "SSIM"
+    assert list(by_table(rows)) == [f"{key} by site" for key in keys]
+    first, second = rows[:2]
+    levels = [row.figures["PSNR"].value or 0 for row in images]
+    assert (first.name, second.name) == ("a", "b")
+    assert first.figures["degraded"].value == pytest.approx(sum(levels[:2]) / 2)
+    assert second.figures["degraded"].value == pytest.approx(levels[2])
+    assert (first.text["images"], second.text["images"]) == ("2", "1")

@@ -1,0 +1,69 @@
+"""What a comparison of float and INT8 rests on, and which samples it judges."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+
+import beers_deploy as bd
+from beers_deploy.comparison import Data, sensor_input
+from beers_deploy.profiles.errors import ImageError
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.quant.onnx_file import metadata
+from beers_deploy.quant.samples.own import CALIBRATED_ON, digest_of
+
+
+def test_a_sensor_of_the_same_name_and_other_numbers_is_another() -> None:
+    sensor = Sensor.load("pleiades-degraded")
+    other = sensor.replace(gain_dn_per_radiance=2 * sensor.gain_dn_per_radiance.low)
+    assert sensor_input(sensor).name == sensor_input(other).name
+    assert sensor_input(sensor).sha256 != sensor_input(other).sha256
+
+
+@pytest.mark.parametrize("change", ["content", "name", "one more", "none"])
+def test_a_folder_is_known_by_its_files(change: str, tmp_path: Path) -> None:
+    folder = tmp_path / "ground"
+    folder.mkdir()
+    (folder / "a.tif").write_bytes(b"1")
+    (folder / "b.tif").write_bytes(b"2")
+    data = Data(Sensor.load("pleiades-degraded"), samples=None, images=folder, patches=1, seed=0)
+    before = data.inputs
+    # A file that is not read as a scene does not count.
+    (folder / "gate.json").touch()
+    if change == "content":
+        (folder / "a.tif").write_bytes(b"3")
+    elif change == "name":
+        (folder / "a.tif").rename(folder / "c.tif")
+    elif change == "one more":
+        (folder / "c.tif").write_bytes(b"")
+    assert (data.inputs == before) == (change == "none")
+
+
+def test_the_judged_file_does_not_choose_its_judges(model: Path) -> None:
+    """Whatever samples it claims to be calibrated on, all are judged, and the claim is a note."""
+    samples = np.random.default_rng(0).random((12, 1, 32, 40), np.float32)
+    # Given one after the other, they can be read only once.
+    int8 = bd.quantize(model, samples=iter(samples[:8]))
+    mixed = np.concatenate([samples[10:], samples[2:7]])
+    comparison = bd.compare(int8, samples=mixed)
+    assert comparison.result.patches == 7
+    # Quantising held two of its eight samples out of calibration, and one of them is here.
+    assert "4 of the 7 samples" in comparison.notes[0]
+    model_with_claim = onnx.ModelProto()
+    model_with_claim.CopyFrom(int8.model)
+    claim = {CALIBRATED_ON: " ".join(map(digest_of, mixed[:, None]))}
+    onnx.helper.set_model_props(model_with_claim, metadata(int8.model) | claim)
+    second = bd.compare(replace(int8, model=model_with_claim), samples=mixed)
+    assert (second.result.mae, second.result.patches) == (comparison.result.mae, 7)
+    assert "7 of the 7 samples" in second.notes[0]
+
+
+def test_samples_without_contrast_judge_nothing() -> None:
+    samples = np.zeros((5, 1, 32, 40), np.float32)
+    with pytest.raises(ImageError, match="contrast"):
+        bd.compare("convbeers-xs", samples=samples)
+    samples[3] = np.random.default_rng(0).random((1, 32, 40))
+    pair = "convbeers-xs", "convbeers-xs-int8"
+    assert bd.compare(*pair, samples=samples).result.patches == 1
