@@ -28,6 +28,7 @@ from beers_deploy.quant.graph.split_network import (
     SplitNetwork,
     add_channels,
     check_network,
+    check_result_size,
     cut,
     named_apart,
     sized,
@@ -159,6 +160,8 @@ class _Reader:
                 "image, whose size must be known.",
                 "Export it with fixed height and width.",
             )
+        if not (rows and columns):
+            check_result_size(graph, self.border_px)
         return sized(graph, (rows, columns)) if pools else graph
 
     def _read(self, node: Node) -> None:
@@ -190,12 +193,8 @@ class _Reader:
             return
         inputs = node.inputs[0], node.inputs[1]
         require(node.op_type != "Div", node, "must divide by a constant, not by a computed tensor")
-        if node.op_type == "Sub":
-            # A DPU adds, so the second tensor is negated first.
-            negated = f"{node.outputs[0]}.negated"
-            minus_one = np.full(self._channels_of(inputs[1]), -1, np.float32)
-            self._append(_depthwise(negated, inputs[1], negated, minus_one, 0 * minus_one))
-            inputs = inputs[0], negated
+        # Simplification has made an Add of a Sub whose channels are known.
+        require(node.op_type != "Sub", node, "subtracts a map of unknown channels")
         kind = Mul if node.op_type == "Mul" else Add
         self._append(kind(node.name, inputs, node.outputs[0]))
 
@@ -219,7 +218,8 @@ class _Reader:
             np.broadcast_to(values.astype(np.float32), channels)
             for values in (affine.scale, affine.shift)
         )
-        return _depthwise(node.name, source, node.outputs[0], scale, shift)
+        weight = scale[:, None, None, None]
+        return Conv(node.name, source, node.outputs[0], weight, shift, groups=channels)
 
     def _activation(self, node: Node) -> None:
         """Fuse an activation into the operation before it, or append it by itself."""
@@ -255,11 +255,6 @@ def _clips_to_image(node: Node, graph: OnnxGraph) -> bool:
     """Return True if a node clips to [0, 1], all that an image has."""
     limits = [graph.value(node, place) for place in (1, 2)]
     return node.op_type == "Clip" and [None if v is None else v.item() for v in limits] == [0, 1]
-
-
-def _depthwise(name: str, source: str, output: str, scale: np.ndarray, shift: np.ndarray) -> Conv:
-    """Return a convolution that scales and shifts each channel by itself, (C,) each."""
-    return Conv(name, source, output, scale[:, None, None, None], shift, groups=len(scale))
 
 
 def _fuses(producer: Conv | Add, activation: Activation) -> bool:

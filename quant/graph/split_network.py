@@ -191,19 +191,54 @@ def sized(graph: Graph, size: Pair) -> Graph:
     sizes = {IMAGE: size}
     ops = list[Op]()
     for op in graph:
-        input_sizes = [sizes[name] for name in op.inputs]
-        input_size = max(input_sizes)
-        # Squeeze and excite: a factor for each channel, of one pixel, times a map.
-        is_gate = isinstance(op, Mul) and (1, 1) in input_sizes
-        if not is_gate and any(other != input_size for other in input_sizes):
-            unequal = " and ".join(f"{rows} x {columns}" for rows, columns in input_sizes)
-            raise unsupported(f"{op.name} needs tensors of one size, but they have {unequal}.")
+        input_size = _input_size(op, sizes)
         # Global pooling is a window of the whole map, whose size is known from here on.
         if isinstance(op, AveragePool) and op.kernel is None:
             op = replace(op, kernel=input_size)
         sizes[op.output] = _size(op, input_size)
         ops.append(op)
     return tuple(ops)
+
+
+def _input_size(op: Op, sizes: Mapping[str, Pair]) -> Pair:
+    """Return the size that all tensors have that an operation reads."""
+    input_sizes = [sizes[name] for name in op.inputs]
+    # Squeeze and excite: a factor for each channel, of one pixel, times a map.
+    is_gate = isinstance(op, Mul) and (1, 1) in input_sizes
+    if not is_gate and len(set(input_sizes)) > 1:
+        unequal = " and ".join(f"{rows} x {columns}" for rows, columns in input_sizes)
+        raise unsupported(f"{op.name} needs tensors of one size, but they have {unequal}.")
+    return max(input_sizes)
+
+
+WHOLE_PX = 64 * 3 * 5 * 7
+"""A side that networks of use divide without a remainder."""
+
+
+def check_result_size(graph: Graph, border_px: int) -> None:
+    """Raise ModelError unless the result has the image's size, or a multiple or a part of it.
+
+    Args:
+        graph: from `IMAGE` to `CORRECTION`, for any size of image.
+        border_px: by which the image is mirrored.
+    """
+    once, twice = (
+        _size_of_result(graph, side_px + 2 * border_px) for side_px in (WHOLE_PX, 2 * WHOLE_PX)
+    )
+    missing = [2 * one - two for one, two in zip(once, twice, strict=True)]
+    if any(missing):
+        raise unsupported(
+            f"The network's result is not its image's size or a multiple of it: {-missing[0]:+d} "
+            f"rows and {-missing[1]:+d} columns, because some layers lack padding.",
+            "Pad every convolution, or none: then the image is mirrored beyond its borders.",
+        )
+
+
+def _size_of_result(graph: Graph, side_px: int) -> Pair:
+    sizes = {IMAGE: (side_px, side_px)}
+    for op in graph:
+        sizes[op.output] = _size(op, _input_size(op, sizes))
+    return sizes[CORRECTION]
 
 
 def _size(op: Op, size: Pair) -> Pair:

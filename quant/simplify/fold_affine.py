@@ -1,6 +1,7 @@
 """Fold what multiplies and shifts each channel by itself into the convolutions next to it.
 
-1. A Sub of what a convolution computes becomes an Add: the convolution is negated.
+1. A Sub of what a convolution computes becomes an Add: the convolution is negated. A Sub of any
+   other map of known channels becomes one too: a convolution of one pixel negates the map.
 2. A BatchNormalization, or arithmetic with one constant a channel, is folded into the convolution
    that it follows, if nothing else reads that one's result.
 3. What stands in front of convolutions is folded into all of them, if that is exact: the zeros that
@@ -42,6 +43,19 @@ def add_negated(graph: OnnxGraph, node: Node) -> list[Node] | None:
         return None
     _fold(graph, before, Affine(np.full(1, -1.0), np.zeros(1)), into_results=True)
     return [Node.new("Add", node.inputs, node.outputs[0], node.proto.name)]
+
+
+def negate_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Negate what is subtracted by a convolution of its own, and add the result (1)."""
+    constants = [name for name in node.inputs if name in graph.constants]
+    size = shapes.get(node.inputs[1], ()) if node.op_type == "Sub" and not constants else ()
+    if len(size) != 4 or size[1] < 1:
+        return None
+    name = f"{node.outputs[0]}.negated"
+    attributes = {"kernel_shape": [1, 1], "group": size[1]}
+    negation = Node.new("Conv", [node.inputs[1]], name, name, **attributes)
+    _set_weights(graph, negation, np.full((size[1], 1, 1, 1), -1.0), np.zeros(size[1]))
+    return [negation, Node.new("Add", [node.inputs[0], name], node.outputs[0], node.proto.name)]
 
 
 def fold_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:

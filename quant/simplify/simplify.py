@@ -50,6 +50,7 @@ from beers_deploy.quant.simplify.fold_affine import (
     convolve_normalisation,
     fold_behind,
     fold_in_front,
+    negate_by_convolution,
 )
 from beers_deploy.quant.simplify.free_sizes import free_sizes
 from beers_deploy.quant.simplify.fully_connected import ConnectByConvolutions
@@ -91,7 +92,7 @@ slices would become a Gather, and pixel shuffles that are spelled out would not 
 HALVES = (TensorProto.FLOAT16, TensorProto.BFLOAT16)
 
 
-NEEDS_SHAPES = {"Cast", "Gemm", "ReduceMean", "Slice", "Softmax", "Split"}
+NEEDS_SHAPES = {"Cast", "Gemm", "ReduceMean", "Slice", "Softmax", "Split", "Sub"}
 """What may be rewritten where shapes are known."""
 
 
@@ -144,6 +145,7 @@ def _run_passes(model: onnx.ModelProto) -> None:
         drop_cast,
         pool_mean,
         convolve_normalisation,
+        negate_by_convolution,
         unshuffle_slices,
         split_channels,
     ):

@@ -22,8 +22,9 @@ GENERATOR = 5
 class Drawn(GraphWriter):
     """Writes a network of drawn weights."""
 
-    def __init__(self) -> None:
+    def __init__(self, pad: int) -> None:
         super().__init__()
+        self._pad = pad
         self._generator = np.random.default_rng(GENERATOR)
 
     def number(self, value: float, *shape: int) -> str:
@@ -33,8 +34,9 @@ class Drawn(GraphWriter):
     def add(self, kind: str, *sources: str, **attributes: object) -> str:
         return self.node(kind, f"t{len(self.nodes)}", list(sources), **attributes)
 
-    def conv(self, source: str, outputs: int, inputs: int, side: int = 3, pad: int = 1) -> str:
-        weight = self._generator.normal(0, 0.3, (outputs, inputs, side, side))
+    def conv(self, source: str, outputs: int, inputs: int, pad: int | None = None) -> str:
+        pad = self._pad if pad is None else pad
+        weight = self._generator.normal(0, 0.3, (outputs, inputs, 3, 3))
         name = self.constant(f"w{len(self.nodes)}", weight.astype(np.float32))
         return self.add("Conv", source, name, pads=[pad] * 4)
 
@@ -82,14 +84,17 @@ PARTS: dict[str, Part] = {
 }
 
 
-def drawn(path: Path, parts: list[str], *, adds_image: bool, clips: bool) -> Path:
+def drawn(
+    path: Path, parts: list[str], *, adds_image: bool, clips: bool, padded: bool = True
+) -> Path:
     """Write a network of these parts between two convolutions."""
-    w = Drawn()
+    w = Drawn(int(padded))
     last = w.conv("image", CHANNELS, 1)
     for part in parts:
         last = PARTS[part](w, last)
     last = w.conv(last, 1, CHANNELS)
-    if adds_image:
+    # Without padding the result has another size than the image.
+    if adds_image and padded:
         last = w.add("Add", "image", last)
     if clips:
         last = w.add("Clip", last, w.number(0), w.number(1))
@@ -98,28 +103,30 @@ def drawn(path: Path, parts: list[str], *, adds_image: bool, clips: bool) -> Pat
     return path
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     parts=st.lists(st.sampled_from(sorted(PARTS)), max_size=3),
     adds_image=st.booleans(),
     clips=st.booleans(),
+    padded=st.booleans(),
 )
 def test_commands_do_not_contradict_each_other(
-    tmp_path_factory: pytest.TempPathFactory, parts: list[str], adds_image: bool, clips: bool
+    tmp_path_factory: pytest.TempPathFactory, parts: list[str], **shape: bool
 ) -> None:
-    path = drawn(
-        tmp_path_factory.mktemp("drawn") / "a.onnx", parts, adds_image=adds_image, clips=clips
-    )
-    samples = np.random.default_rng(1).uniform(0, 1, (4, 1, 32, 32)).astype(np.float32)
+    path = drawn(tmp_path_factory.mktemp("drawn") / "a.onnx", parts, **shape)
+    blocks = np.random.default_rng(1).uniform(0, 1, (4, 1, 4, 4)).astype(np.float32)
+    samples = np.kron(blocks, np.ones((8, 8), np.float32))
     fits = bool(bd.check(path, tile=64))
-    with one_guess():
-        if not fits:
-            with pytest.raises(ModelError):
-                bd.quantize(path, samples=samples, progress=False)
-            return
-        int8 = bd.quantize(path, samples=samples, progress=False)
-    assert bd.check(int8, tile=64)
+    try:
+        with one_guess():
+            int8 = bd.quantize(path, samples=samples, progress=False)
+    except ModelError:
+        int8 = None
+    # What a board does not run, such as an activation behind a resize, may have integers.
+    assert fits == (int8 is not None and bool(bd.check(int8, tile=64)))
+    if not fits:
+        return
     bd.gate(path, int8, samples=samples, progress=False)
     bd.bench(path, tile=64, traditional=False)
-    restored = bd.restore(samples[0, 0], network=int8, progress=False, force=True)
+    restored = bd.restore(samples[0, 0], network=int8, full_scale=1, progress=False, force=True)
     assert restored.shape == (32, 32)

@@ -175,13 +175,6 @@ def squeezed(w: Sketch) -> onnx.ModelProto:
     return w.model(1, 36)
 
 
-def subtracted(w: Sketch) -> onnx.ModelProto:
-    first = w.conv("first", "in", (3, 1, 3, 3), pads=[1] * 4)
-    rectified = w.node("Relu", "r", [first])
-    w.conv("out", w.node("Sub", "difference", [first, rectified]), (1, 3, 1, 1))
-    return w.model(1)
-
-
 SOUND = [
     features_beside_the_image,
     pooled_image,
@@ -197,7 +190,6 @@ SOUND = [
     dead_channels,
     many_classes,
     squeezed,
-    subtracted,
 ]
 
 
