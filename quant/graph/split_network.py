@@ -225,11 +225,11 @@ def check_result_size(graph: Graph, border_px: int) -> None:
     once, twice = (
         _size_of_result(graph, side_px + 2 * border_px) for side_px in (WHOLE_PX, 2 * WHOLE_PX)
     )
-    missing = [2 * one - two for one, two in zip(once, twice, strict=True)]
-    if any(missing):
+    extra = [2 * one - two for one, two in zip(once, twice, strict=True)]
+    if any(extra):
         raise unsupported(
-            f"The network's result is not its image's size or a multiple of it: {-missing[0]:+d} "
-            f"rows and {-missing[1]:+d} columns, because some layers lack padding.",
+            f"The network's result is not its image's size or a multiple of it: {extra[0]:+d} "
+            f"rows and {extra[1]:+d} columns, because some layers lack padding.",
             "Pad every convolution, or none: then the image is mirrored beyond its borders.",
         )
 

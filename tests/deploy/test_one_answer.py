@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from onnx import helper
 
 import beers_deploy as bd
-from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from tests.quant.quick import one_guess
 
@@ -126,7 +126,11 @@ def test_commands_do_not_contradict_each_other(
     assert fits == (int8 is not None and bool(bd.check(int8, tile=64)))
     if not fits:
         return
-    bd.gate(path, int8, samples=samples, progress=False)
+    try:
+        bd.gate(path, int8, samples=samples, progress=False)
+    except OptionError as error:
+        assume("more contrast" not in str(error))
+        raise
     bd.bench(path, tile=64, traditional=False)
     restored = bd.restore(samples[0, 0], network=int8, full_scale=1, progress=False, force=True)
     assert restored.shape == (32, 32)

@@ -1,0 +1,80 @@
+"""Both ends of a network: channels last, as in TensorFlow, missing borders, and strided slices."""
+
+from itertools import pairwise
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper
+
+from beers_deploy.quant.graph import read_network, refusal
+from beers_deploy.quant.session import open_session, result_of
+from beers_deploy.quant.simplify.simplify import simplify
+from tests.quant.simplify.networks import CHANNELS, conv, made, node
+
+IMAGE = np.random.default_rng(4).uniform(0, 1, (1, CHANNELS, 18, 23)).astype(np.float32)
+
+
+def test_a_network_of_channels_last_becomes_one_of_channels_first() -> None:
+    first = [0, 3, 1, 2]
+    last = [0, 2, 3, 1]
+    nodes = [
+        node("Transpose", "x", to="t", perm=first),
+        conv("t", "c"),
+        node("Transpose", "c", perm=last),
+    ]
+    model = made(nodes)
+    sizes = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", "H", "W", CHANNELS])
+        for name in ("x", "y")
+    ]
+    model.graph.input[0].CopyFrom(sizes[0])
+    model.graph.output[0].CopyFrom(sizes[1])
+    short = simplify(model, "a.onnx")
+    assert [n.op_type for n in short.graph.node] == ["Conv"]
+    assert short.graph.input[0].type.tensor_type.shape.dim[1].dim_value == CHANNELS
+    onnx.checker.check_model(short, full_check=True)
+    before = result_of(open_session(model), IMAGE.transpose(last)).transpose(first)
+    np.testing.assert_allclose(result_of(open_session(short), IMAGE), before, rtol=1e-5)
+
+
+@pytest.mark.parametrize("layers", [1, 2, 5])
+def test_the_image_of_a_network_without_padding_is_mirrored(layers: int) -> None:
+    tensors = ["x", *(f"c{k}" for k in range(1, layers)), "y"]
+    model = made([conv(a, b, pad_px=0) for a, b in pairwise(tensors)])
+    short = simplify(model, "a.onnx")
+    assert read_network(short).border_px == layers
+    inner = result_of(open_session(short), IMAGE)
+    assert inner.shape[2:] == IMAGE.shape[2:]
+    inner = inner[:, :, layers:-layers, layers:-layers]
+    np.testing.assert_allclose(inner, result_of(open_session(model), IMAGE), rtol=1e-4)
+
+
+def test_layers_with_and_without_padding_together_are_refused() -> None:
+    model = made([conv(), conv("c", "y", pad_px=0)])
+    short = simplify(model, "a.onnx")
+    assert [n.op_type for n in short.graph.node] == ["Conv", "Conv"]
+    reason = refusal(short)
+    assert "-2 rows and -2 columns" in reason
+
+
+def test_slices_side_by_side_are_a_pixel_unshuffle() -> None:
+    """YOLO's Focus layer has the columns of a block before its rows."""
+    starts = {"0 0": [0, 0], "1 0": [1, 0], "0 1": [0, 1], "1 1": [1, 1]}
+    constants = {"ends": [999, 999], "rows and columns": [2, 3], "by two": [2, 2], **starts}
+    slices = [
+        node("Slice", "x", name, "ends", "rows and columns", "by two", to=f"s{name}")
+        for name in starts
+    ]
+    joined = node("Concat", *(f"s{name}" for name in starts), to="j", axis=1)
+    model = made([*slices, joined, conv("j", "y", "focus")])
+    weight = np.random.default_rng(0).normal(0, 1, (3, 4 * CHANNELS, 3, 3)).astype(np.float32)
+    tensors = {name: np.array(numbers) for name, numbers in constants.items()} | {"focus": weight}
+    for name, value in tensors.items():
+        model.graph.initializer.append(onnx.numpy_helper.from_array(value, name))
+    short = simplify(model, "a.onnx")
+    assert [n.op_type for n in short.graph.node] == ["SpaceToDepth", "Conv"]
+    assert len(read_network(short).front) == 1
+    image = IMAGE[..., :18, :22]
+    before = result_of(open_session(model), image)
+    np.testing.assert_allclose(result_of(open_session(short), image), before, atol=1e-4)
