@@ -24,6 +24,7 @@ from beers_deploy.quant.graph.operations import (
 )
 from beers_deploy.quant.graph.pixel_shuffle import with_shuffles
 from beers_deploy.quant.graph.split_network import (
+    ADAPT,
     REMEDY,
     SplitNetwork,
     add_channels,
@@ -40,6 +41,8 @@ from beers_deploy.quant.untrusted import contradictions, times
 
 NO_IMAGE = {"Flatten", "Gemm", "MatMul", "NonMaxSuppression", "Sigmoid", "Softmax"}
 """Operators with which classifiers and detectors end."""
+ADAPTABLE = {"PRelu", "Sigmoid", "Swish"}
+"""Operators that `quant.adapt` replaces, but for one that writes the network's result."""
 
 
 def read_network(model: onnx.ModelProto) -> SplitNetwork:
@@ -115,7 +118,9 @@ class _Reader:
             self._append(READERS[node.op_type](node, self.source))
         else:
             remedy = "Replace it by one that the DPU computes, or cut the network in front of it."
-            if node.op_type in NO_IMAGE:
+            if node.op_type in ADAPTABLE and node.outputs != self.source.outputs:
+                remedy = ADAPT
+            elif node.op_type in NO_IMAGE:
                 remedy = (
                     "'quantize' accepts networks that make an image of an image: cut the network "
                     "in front of it. 'check' and 'bench' read any network."
