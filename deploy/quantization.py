@@ -143,7 +143,9 @@ def quantize_alone(
         optional("torch", "finetune")
         from beers_deploy.quant.passes.finetune import Tuning
 
-        tuning = Tuning(calibration.for_tuning.pairs, steps)
+        # The integers learn the results of the network that was given, not of the adapted one.
+        original = origin.model if adapts else None
+        tuning = Tuning(calibration.for_tuning.pairs, steps, original=original)
     with progress("calibrating"):
         about = {**calibration.about, "target": target.name}
         adapted = Adapted(origin.model)

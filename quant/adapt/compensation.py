@@ -23,9 +23,9 @@ from beers_deploy.quant.onnx_file import with_outputs
 from beers_deploy.quant.session import open_any_size, tensors_of
 from beers_deploy.quant.simplify.fold_affine import is_convolution
 
-MOST_UNKNOWNS = 4096
-"""Weights of one result; of more the normal equations take too long."""
-ROWS_OF_EACH_UNKNOWN = 32
+MOST_UNKNOWNS = 2304
+"""Weights of one result, as of 256 channels and 3 x 3; of more the equations take too long."""
+ROWS_OF_EACH_UNKNOWN = 16
 LEAST_ROWS = 8192
 RIDGE = 1e-5
 """The penalty on leaving the old weights, in mean squares of what a convolution reads."""
@@ -96,7 +96,9 @@ def compensated(
         if behind.intersection(node.inputs):
             behind.update(node.outputs)
             # Convolutions within an exact replacement have no tensor to be compared with.
-            if networks.is_conv(node) and node.outputs[0] in originals:
+            is_known = networks.is_conv(node) and node.outputs[0] in originals
+            weight = networks.graph.value(node, 1)
+            if is_known and weight is not None and np.prod(weight.shape[1:]) <= MOST_UNKNOWNS:
                 convolutions.append(node)
     for number, node in enumerate(convolutions, 1):
         step(f"fitting convolution {number} of {len(convolutions)}")
@@ -170,15 +172,14 @@ def _fit(networks: Networks, node: Node, factors: np.ndarray | None) -> None:
     """
     weight, bias = networks.weights(node)
     kernel_and_window = node.window(weight.shape[2:])
-    unknowns = int(np.prod(weight.shape[1:]))
-    if kernel_and_window is None or unknowns > MOST_UNKNOWNS:
+    if kernel_and_window is None:
         return
     kernel, window = kernel_and_window
     groups = int(node.attributes.get("group", 1))
+    unknowns = int(np.prod(weight.shape[1:]))
     n_rows = -(-max(LEAST_ROWS, ROWS_OF_EACH_UNKNOWN * unknowns) // len(networks.images))
+    equations = Equations(groups, unknowns, len(weight) // groups)
     generator = np.random.default_rng(0)
-    reads = []
-    errors = []
     (output,) = node.outputs
     originals = _values(networks.original, [output], networks.images)
     adapted = _values(networks.adapted, [node.inputs[0], output], networks.images)
@@ -188,21 +189,50 @@ def _fit(networks: Networks, node: Node, factors: np.ndarray | None) -> None:
         size = result.shape[2:]
         places = generator.integers(0, size[0] * size[1], min(n_rows, size[0] * size[1]))
         rows, columns = np.unravel_index(places, size)
-        reads.append(_windows(source[0], kernel, window, (rows, columns)))
-        errors.append((expected - result)[0, :, rows, columns])
-    # (groups, rows, unknowns) and (groups, rows, results).
-    x = np.concatenate(reads).reshape(-1, groups, unknowns).swapaxes(0, 1).astype(np.float64)
-    y = np.concatenate(errors).reshape(len(x[0]), groups, -1).swapaxes(0, 1).astype(np.float64)
-    x_mean = x.mean(1, keepdims=True)
-    y_mean = y.mean(1, keepdims=True)
-    x -= x_mean
-    gram = x.swapaxes(1, 2) @ x / x.shape[1]
-    penalty = RIDGE * np.trace(gram, axis1=1, axis2=2) / unknowns + np.finfo(np.float32).tiny
-    gram += penalty[:, None, None] * np.eye(unknowns)
-    change = np.linalg.solve(gram, x.swapaxes(1, 2) @ (y - y_mean) / x.shape[1])
-    bias_change = y_mean - x_mean @ change
-    weight = weight + change.swapaxes(1, 2).reshape(weight.shape)
-    networks.set_weights(node, weight, bias + bias_change.ravel())
+        equations.add(
+            _windows(source[0], kernel, window, (rows, columns)),
+            (expected - result)[0, :, rows, columns],
+        )
+    change, bias_change = equations.solved()
+    networks.set_weights(node, weight + change.reshape(weight.shape), bias + bias_change)
+
+
+class Equations:
+    """The normal equations of a convolution's weights and bias, added up image by image."""
+
+    def __init__(self, groups: int, unknowns: int, results: int) -> None:
+        """Begin those of `results` results in each group, of so many weights each."""
+        self._shape = groups, unknowns, results
+        self._gram = np.zeros((groups, unknowns, unknowns))
+        self._moment = np.zeros((groups, unknowns, results))
+        self._reads = np.zeros((groups, unknowns, 1))
+        self._errors = np.zeros((groups, 1, results))
+        self._count = 0
+
+    def add(self, reads: np.ndarray, errors: np.ndarray) -> None:
+        """Add what a convolution reads for K results (K, I, kh, kw), and their errors (K, O)."""
+        groups, unknowns, results = self._shape
+        x = reads.reshape(-1, groups, unknowns).transpose(1, 2, 0).astype(np.float64)
+        y = errors.reshape(-1, groups, results).swapaxes(0, 1).astype(np.float64)
+        self._gram += x @ x.swapaxes(1, 2)
+        self._moment += x @ y
+        self._reads += x.sum(2, keepdims=True)
+        self._errors += y.sum(1, keepdims=True)
+        self._count += len(reads)
+
+    def solved(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the change of the weights (O, I / groups kh kw) and of the bias (O,)."""
+        groups, unknowns, results = self._shape
+        # About the means, so that the bias has no penalty.
+        reads = self._reads / self._count
+        errors = self._errors / self._count
+        gram = self._gram / self._count - reads @ reads.swapaxes(1, 2)
+        moment = self._moment / self._count - reads @ errors
+        penalty = RIDGE * np.trace(gram, axis1=1, axis2=2) / unknowns + np.finfo(np.float32).tiny
+        gram += penalty[:, None, None] * np.eye(unknowns)
+        change = np.linalg.solve(gram, moment)
+        bias_change = errors - reads.swapaxes(1, 2) @ change
+        return change.swapaxes(1, 2).reshape(groups * results, unknowns), bias_change.ravel()
 
 
 def _windows(

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import onnx
@@ -14,13 +15,15 @@ from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.quant.adapt.adaptation import ADAPTED, NEAR_DB, adapt
 from beers_deploy.quant.adapt.compensation import compensated
 from beers_deploy.quant.adapt.replacements import EXACT, Kind, nodes_by_kind, replaced
-from beers_deploy.quant.graph import read_network
+from beers_deploy.quant.encodings import host_model
+from beers_deploy.quant.graph import read_network, read_planes
 from beers_deploy.quant.onnx.graph import OnnxGraph
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model, metadata
+from beers_deploy.quant.passes.finetune import Tuning, finetune
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.simplify import simplify
-from tests.quant.quick import image, one_guess
+from tests.quant.quick import image, one_guess, quickly
 
 FEATURES = 6
 Act = Callable[[GraphWriter, str, str], str]
@@ -224,6 +227,23 @@ def test_quantize_adapts_and_compares_with_the_original(name: str, tmp_path: Pat
     path = int8.save(tmp_path / "int8.onnx")
     verdict = bd.compare(original, path, samples=tuple(held_out), progress=False)
     assert verdict.result.psnr_between_db > 30
+
+
+def test_finetuning_learns_from_the_original() -> None:
+    model = network(silu)
+    near = replaced(model, {Kind.silu}, ())
+    int8 = quickly(near, BARE)
+    errors = []
+    for original in (None, model):
+        tuning = Tuning(BARE.pairs, 40, rate=0.3, original=original)
+        # One image a step, so that the steps are quick.
+        with patch("beers_deploy.quant.passes.finetune.BATCH_PIXELS", 1):
+            core, _ = finetune(int8.core, read_planes(read_network(near).graph), tuning)
+        session = open_session(host_model(core, {}))
+        sessions = session, open_session(model)
+        results = [[result_of(s, x) for s in sessions] for x in BARE.degraded]
+        errors.append(np.mean([np.square(a - b).mean() for a, b in results]))
+    assert errors[1] < 0.8 * errors[0]
 
 
 def test_nothing_to_replace_is_a_note_and_conditioned_weights_are_refused() -> None:
