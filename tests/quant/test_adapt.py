@@ -23,7 +23,7 @@ from beers_deploy.quant.passes.finetune import Tuning, finetune
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.simplify import simplify
-from tests.quant.quick import image, one_guess, quickly
+from tests.quant.quick import changed, image, one_guess, quickly
 
 FEATURES = 6
 Act = Callable[[GraphWriter, str, str], str]
@@ -151,8 +151,8 @@ def test_compensation_comes_nearer_to_the_original_and_keeps_the_rest(name: str)
     nodes = nodes_by_kind(OnnxGraph(model))
     assert {key: len(found) for key, found in nodes.items()} == {kind: count}
     before = replaced(model, {kind}, ())
-    changed = [node.outputs[0] for node in nodes[kind]]
-    after = compensated(model, before, changed, SAMPLES.degraded)
+    outputs = [node.outputs[0] for node in nodes[kind]]
+    after = compensated(model, before, outputs, SAMPLES.degraded)
     read_network(after)
     errors = []
     for candidate in (before, after):
@@ -168,6 +168,33 @@ def test_compensation_comes_nearer_to_the_original_and_keeps_the_rest(name: str)
         for m in (before, after)
     ]
     assert others[0] == others[1]
+
+
+@pytest.mark.parametrize(
+    ("shape", "attributes"),
+    [
+        ((4, FEATURES, 3, 3), {"strides": [2, 2], "pads": [1, 0, 0, 1]}),
+        ((4, FEATURES, 1, 3), {"dilations": [1, 2], "pads": [0, 2, 0, 2]}),
+        ((FEATURES, 1, 3, 3), {"group": FEATURES, "pads": [1, 1, 1, 1]}),
+        ((4, FEATURES // 2, 2, 2), {"group": 2, "strides": [1, 2]}),
+    ],
+)
+def test_least_squares_find_the_weights_of_any_convolution(
+    shape: tuple[int, ...], attributes: dict[str, list[int]]
+) -> None:
+    w = GraphWriter()
+    w.node("Relu", "changed", [conv(w, "image", "a", (FEATURES, 1, 3, 3))])
+    weight = np.random.default_rng(0).normal(0, 1, shape).astype(np.float32)
+    names = [w.constant("w", weight), w.constant("b", np.arange(shape[0], dtype=np.float32))]
+    w.node("Conv", "restored", ["changed", *names], kernel_shape=list(shape[2:]), **attributes)
+    result = [onnx.helper.make_tensor_value_info("restored", onnx.TensorProto.FLOAT, None)]
+    model = make_model(w.graph("g", [image_info("image", 1, None)], result), {})
+    wrong = changed(changed(model, "w", np.zeros_like), "b", np.ones_like)
+    fitted = compensated(model, wrong, ["changed"], SAMPLES.degraded)
+    for pixels in HELD_OUT.degraded:
+        expected, actual = (result_of(open_session(m), pixels) for m in (model, fitted))
+        # The penalty holds back directions that the samples hardly have.
+        assert np.square(actual - expected).mean() < 1e-4 * expected.var()
 
 
 def test_an_exact_replacement_is_chosen_where_the_other_loses_too_much() -> None:
