@@ -24,6 +24,7 @@ from beers_deploy.quant.adapt.replacements import (
     replaced,
 )
 from beers_deploy.quant.gate import GateResult, compare
+from beers_deploy.quant.graph import read_network
 from beers_deploy.quant.onnx.graph import OnnxGraph
 from beers_deploy.quant.onnx_file import fixed_tile_px
 from beers_deploy.quant.samples.patches import Patches
@@ -107,33 +108,33 @@ def adapt(model: onnx.ModelProto, samples: Patches, held_out: Patches) -> Adapte
         held_out: others, on which the loss is measured.
     """
     counts = {kind: len(nodes) for kind, nodes in nodes_by_kind(OnnxGraph(model)).items()}
+    if not counts:
+        return Adapted(model)
+    exact = {kind for kind in counts if kind not in APPROXIMATIONS}
+    # Refuses what is still no operator of the DPU before the work of fitting.
+    read_network(replaced(model, counts.keys() - exact, exact))
     images = _fit_images(model, samples.degraded)
     # 1. and 2.
-    exact = {kind for kind in counts if kind not in APPROXIMATIONS}
     trials = dict[Kind, Trial]()
-    for kind in set(counts) - exact:
+    for kind in [kind for kind in counts if kind in APPROXIMATIONS]:
         trials[kind] = _trial(model, {kind}, set(), images, held_out)
         if kind in EXACT and not trials[kind].is_enough:
             exact.add(kind)
-    # 3.
-    if not counts:
-        return Adapted(model)
-    if list(trials) == list(counts) and len(trials) == 1 and not exact:
+    # 3. One kind alone has been tried as it is chosen.
+    if len(counts) == 1 and not exact:
         (chosen,) = trials.values()
     else:
-        chosen = _trial(model, set(counts) - exact, exact, images, held_out)
-    becomes = {kind: EXACT[kind] if kind in exact else APPROXIMATIONS[kind] for kind in counts}
-    rows = [
-        Row(
-            ADAPTED,
-            f"{count} {kind}",
-            trials[kind].figures if kind in trials else {},
-            {"becomes": f"{becomes[kind]}, {'exactly' if kind in exact else 'compensated'}"},
-        )
-        for kind, count in counts.items()
-    ]
+        chosen = _trial(model, counts.keys() - exact, exact, images, held_out)
+    rows = []
+    for kind, count in counts.items():
+        if kind in exact:
+            becomes = f"{EXACT[kind]}, exactly"
+        else:
+            becomes = f"{APPROXIMATIONS[kind]}, compensated"
+        figures = trials[kind].figures if kind in trials else {}
+        rows.append(Row(ADAPTED, f"{count} {kind}", figures, {"becomes": becomes}))
+    record = "; ".join(f"{row.name}: {row.text['becomes']}" for row in rows)
     rows.append(Row(ADAPTED, "all", chosen.figures))
-    record = "; ".join(f"{row.name}: {row.text['becomes']}" for row in rows[:-1])
     return Adapted(chosen.model, tuple(rows), record)
 
 

@@ -29,7 +29,7 @@ ROWS_OF_EACH_UNKNOWN = 16
 LEAST_ROWS = 8192
 RIDGE = 1e-5
 """The penalty on leaving the old weights, in mean squares of what a convolution reads."""
-FACTORS = np.geomspace(0.6, 2.4, 25)
+FACTORS = np.geomspace(0.6, 3.6, 31)
 """Candidates of k."""
 VALUES = 2048
 """Of a channel that are compared for k, from each image."""

@@ -1,17 +1,17 @@
 """Replace activations that a DPU lacks, in the simplified ONNX graph of a float network.
 
-By another function (`approximate`):
+By another function:
 
-1. x * Sigmoid(x), SiLU, becomes HardSwish.
+1. x * Sigmoid(x), SiLU, becomes HardSwish; so does x * Sigmoid(c x), the quick GELU.
 2. A Sigmoid inside the network becomes HardSigmoid.
 3. LeakyReLU of another slope, and PReLU, become LeakyReLU of 26/256.
 
-Without any error but the rounding of float32 (`exact`):
+Exactly, but for the rounding of float32:
 
 4. LeakyReLU and PReLU of slopes s up to 1 become s x + ReLU((1 - s) x): two branches and an Add.
 5. HardSigmoid of another slope and offset becomes that of 1/6 and 0.5 behind a scaled input.
 
-GELU, Mish, Tanh, ELU and Softplus stay: no function of the DPU is near enough to be fitted.
+Other GELUs, Mish, Tanh, ELU and Softplus stay: no function of the DPU is near enough to be fitted.
 """
 
 from collections.abc import Collection
@@ -67,21 +67,39 @@ def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
         plain = np.allclose(given, (1 / 6, 0.5), 1e-4)
         return None if plain or not given[0] else Kind.hard_sigmoid
     slopes = slopes_of(graph, node)
-    if slopes is None or np.array_equal(np.unique(slopes), [np.float32(LEAKY_SLOPE)]):
+    if slopes is None:
         return None
-    return Kind.leaky_relu if node.op_type == "LeakyRelu" else Kind.prelu
+    if node.op_type == "PRelu":
+        return Kind.prelu
+    return None if slopes[0] == np.float32(LEAKY_SLOPE) else Kind.leaky_relu
 
 
 def silu_input(graph: OnnxGraph, node: Node) -> str:
-    """Return the tensor x of which a node computes x * Sigmoid(x); "" if it computes another."""
-    if node.op_type == "Swish" and node.attributes.get("alpha", 1.0) == 1:
-        return node.inputs[0]
+    """Return the tensor x of which a node computes x * Sigmoid(c x), c a constant or 1.
+
+    Another c is that of the quick GELU, and the runtime writes ONNX's Swish with one. "" if the
+    node computes something else.
+    """
     if node.op_type == "Mul":
         for source, gate in (node.inputs, node.inputs[::-1]):
             before = graph.writers.get(gate)
-            if before is not None and before.op_type == "Sigmoid" and before.inputs[0] == source:
-                return source
+            if before is not None and before.op_type == "Sigmoid":
+                scaled = graph.writers.get(before.inputs[0])
+                is_source = before.inputs[0] == source
+                if is_source or (scaled is not None and _by_constant(graph, scaled, source)):
+                    return source
     return ""
+
+
+def _by_constant(graph: OnnxGraph, node: Node, source: str) -> bool:
+    """Return True for the product of a tensor and a constant number."""
+    if node.op_type != "Mul" or source not in node.inputs:
+        return False
+    factor = node.inputs[1 - node.inputs.index(source)]
+    before = graph.writers.get(factor)
+    # The runtime leaves a Cast of the constant of a Swish.
+    name = before.inputs[0] if before is not None and before.op_type == "Cast" else factor
+    return name in graph.constants and graph.constants[name].size == 1
 
 
 def slopes_of(graph: OnnxGraph, node: Node) -> np.ndarray | None:

@@ -41,7 +41,7 @@ from beers_deploy.quant.untrusted import contradictions, times
 
 NO_IMAGE = {"Flatten", "Gemm", "MatMul", "NonMaxSuppression", "Sigmoid", "Softmax"}
 """Operators with which classifiers and detectors end."""
-ADAPTABLE = {"PRelu", "Sigmoid", "Swish"}
+ADAPTABLE = {"PRelu", "Sigmoid"}
 """Operators that `quant.adapt` replaces, but for one that writes the network's result."""
 
 

@@ -34,6 +34,13 @@ def silu(w: GraphWriter, x: str, name: str) -> str:
     return w.node("Mul", name, [x, w.node("Sigmoid", f"{name}.gate", [x])])
 
 
+def quick_gelu(w: GraphWriter, x: str, name: str) -> str:
+    factor = w.constant("1.702", np.array(1.702, np.float32))
+    return w.node(
+        "Mul", name, [w.node("Sigmoid", f"{name}.s", [w.node("Mul", f"{name}.c", [x, factor])]), x]
+    )
+
+
 def gated(w: GraphWriter, x: str, name: str) -> str:
     """A Sigmoid that multiplies another tensor."""
     return w.node("Mul", name, [conv(w, x, f"{name}.other"), w.node("Sigmoid", f"{name}.s", [x])])
@@ -138,6 +145,7 @@ def test_one_slope_for_all_channels_and_a_twin_of_each_convolution() -> None:
 
 REPLACED = {
     "SiLU": (silu, Kind.silu, 3),
+    "quick GELU": (quick_gelu, Kind.silu, 3),
     "Sigmoid": (gated, Kind.sigmoid, 3),
     "LeakyReLU": (leaky(0.2), Kind.leaky_relu, 3),
     "PReLU": (prelu(*np.linspace(0.05, 0.3, FEATURES)), Kind.prelu, 3),
@@ -164,8 +172,7 @@ def test_compensation_comes_nearer_to_the_original_and_keeps_the_rest(name: str)
     names = [{n.name: n for n in OnnxGraph(m).nodes if n.op_type == "Conv"} for m in (model, after)]
     assert names[0].keys() == names[1].keys()
     others = [
-        [n.written() for n in OnnxGraph(m).nodes if n.op_type not in ("Conv", "Sigmoid")]
-        for m in (before, after)
+        [n.written() for n in OnnxGraph(m).nodes if n.op_type != "Conv"] for m in (before, after)
     ]
     assert others[0] == others[1]
 
@@ -227,6 +234,18 @@ def test_what_a_dpu_has_and_what_nothing_replaces_stays() -> None:
         assert adapt(model, SAMPLES, HELD_OUT).model is model
     with pytest.raises(ModelError, match="Tanh first"):
         read_network(network(tanh))
+    # Refused before anything is fitted, next to what is replaced as well.
+    with pytest.raises(ModelError, match="Tanh third"):
+        adapt(
+            network(lambda w, x, name: (tanh if name == "third" else silu)(w, x, name)), BARE, BARE
+        )
+
+
+def test_prelu_of_the_dpus_own_slope_becomes_its_leaky_relu() -> None:
+    model = network(prelu(*[26 / 256] * FEATURES))
+    adapted = adapt(model, BARE, BARE)
+    assert "compensated" in adapted.record
+    assert_same(model, adapted.model)
 
 
 @pytest.mark.parametrize("act", [silu, leaky(0.2), prelu(0.2), hard_sigmoid(0.2, 0.5)])
