@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -187,7 +188,7 @@ def test_compensation_comes_nearer_to_the_original_and_keeps_the_rest(name: str)
     ],
 )
 def test_least_squares_find_the_weights_of_any_convolution(
-    shape: tuple[int, ...], attributes: dict[str, list[int]]
+    shape: tuple[int, ...], attributes: dict[str, Any]
 ) -> None:
     w = GraphWriter()
     w.node("Relu", "changed", [conv(w, "image", "a", (FEATURES, 1, 3, 3))])
