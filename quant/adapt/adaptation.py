@@ -40,7 +40,7 @@ NEAR_DB = 60.0
 error of 60 dB loses 0.04 dB.
 """
 FIT_IMAGES = 32
-FIT_PX = 64
+FIT_PX = 48
 """What convolutions are fitted on: at most so many images, of so many pixels a side."""
 
 

@@ -31,7 +31,7 @@ RIDGE = 1e-5
 """The penalty on leaving the old weights, in mean squares of what a convolution reads."""
 FACTORS = np.geomspace(0.6, 3.6, 31)
 """Candidates of k."""
-VALUES = 2048
+VALUES = 256
 """Of a channel that are compared for k, from each image."""
 
 
@@ -100,10 +100,45 @@ def compensated(
             weight = networks.graph.value(node, 1)
             if is_known and weight is not None and np.prod(weight.shape[1:]) <= MOST_UNKNOWNS:
                 convolutions.append(node)
-    for number, node in enumerate(convolutions, 1):
+    targets = _targets(networks, convolutions)
+    for number, (node, target) in enumerate(zip(convolutions, targets, strict=True), 1):
         step(f"fitting convolution {number} of {len(convolutions)}")
-        _fit(networks, node, factors.get(node.outputs[0]))
+        _fit(networks, node, target, factors.get(node.outputs[0]))
     return model
+
+
+@dataclass(frozen=True)
+class Target:
+    """What the original network computes at some places of a map.
+
+    Attributes:
+        rows: (K,) of the places.
+        columns: (K,) of the places.
+        values: (K, O) of the channels there.
+    """
+
+    rows: np.ndarray
+    columns: np.ndarray
+    values: np.ndarray
+
+
+def _targets(networks: Networks, nodes: Sequence[Node]) -> list[list[Target]]:
+    """Return for each convolution what it computes of each image, in one run of the original."""
+    targets = [list[Target]() for _ in nodes]
+    if not nodes:
+        return targets
+    generator = np.random.default_rng(0)
+    unknowns = [int(np.prod(networks.weights(node)[0].shape[1:])) for node in nodes]
+    outputs = [node.outputs[0] for node in nodes]
+    for maps in _values(networks.original, outputs, networks.images):
+        for target, values, count in zip(targets, maps, unknowns, strict=True):
+            total = max(LEAST_ROWS, ROWS_OF_EACH_UNKNOWN * count)
+            height, width = values.shape[2:]
+            n_rows = min(-(-total // len(networks.images)), height * width)
+            places = generator.integers(0, height * width, n_rows)
+            rows, columns = np.unravel_index(places, (height, width))
+            target.append(Target(rows, columns, values[0][:, rows, columns].T))
+    return targets
 
 
 def _scale_activations(networks: Networks, replaced: Sequence[Node]) -> dict[str, np.ndarray]:
@@ -162,12 +197,15 @@ def _best_factors(is_swish: bool, source: np.ndarray, result: np.ndarray) -> np.
     return np.asarray(FACTORS[np.argmin(residuals, axis=0)], np.float32)
 
 
-def _fit(networks: Networks, node: Node, factors: np.ndarray | None) -> None:
+def _fit(
+    networks: Networks, node: Node, targets: Sequence[Target], factors: np.ndarray | None
+) -> None:
     """Solve the normal equations of a convolution, group by group.
 
     Args:
         networks: both.
         node: the convolution of the adapted one.
+        targets: what it computes in the original one, for each image.
         factors: k (O,) of its results, None for 1.
     """
     weight, bias = networks.weights(node)
@@ -177,21 +215,14 @@ def _fit(networks: Networks, node: Node, factors: np.ndarray | None) -> None:
     kernel, window = kernel_and_window
     groups = int(node.attributes.get("group", 1))
     unknowns = int(np.prod(weight.shape[1:]))
-    n_rows = -(-max(LEAST_ROWS, ROWS_OF_EACH_UNKNOWN * unknowns) // len(networks.images))
     equations = Equations(groups, unknowns, len(weight) // groups)
-    generator = np.random.default_rng(0)
-    (output,) = node.outputs
-    originals = _values(networks.original, [output], networks.images)
-    adapted = _values(networks.adapted, [node.inputs[0], output], networks.images)
-    for (expected,), (source, result) in zip(originals, adapted, strict=True):
-        if factors is not None:
-            expected = expected * factors[:, None, None]
-        size = result.shape[2:]
-        places = generator.integers(0, size[0] * size[1], min(n_rows, size[0] * size[1]))
-        rows, columns = np.unravel_index(places, size)
+    names = [node.inputs[0], node.outputs[0]]
+    adapted = _values(networks.adapted, names, networks.images)
+    for target, (source, result) in zip(targets, adapted, strict=True):
+        expected = target.values if factors is None else target.values * factors
         equations.add(
-            _windows(source[0], kernel, window, (rows, columns)),
-            (expected - result)[0, :, rows, columns],
+            _windows(source[0], kernel, window, (target.rows, target.columns)),
+            expected - result[0, :, target.rows, target.columns],
         )
     change, bias_change = equations.solved()
     networks.set_weights(node, weight + change.reshape(weight.shape), bias + bias_change)
