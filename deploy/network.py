@@ -64,7 +64,8 @@ class Network:
         name: the stem of its file, or the name that it is shipped under.
         path: the file that holds it; None of one that is in memory alone.
         origin: the float network that it was quantised from, where that was done here.
-        layers: of a network that was quantised here, a row for each integer layer.
+        layers: of a network that was quantised here, a row for each replaced operator and each
+            integer layer.
         quantised: its integers and the graph that they were rounded from, where it was quantised
             here by itself.
         file_sha256: of the file as it was read; empty of one that is in memory alone.

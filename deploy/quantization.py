@@ -22,6 +22,7 @@ from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import REFERENCE, board_names, npu_names
 from beers_deploy.profiles.target import TargetProfile
+from beers_deploy.quant.adapt.adaptation import ADAPTED, Adapted, adapt
 from beers_deploy.quant.core import SHIFTS, Shifts, target_shifts
 from beers_deploy.quant.encodings import host_model, read_core
 from beers_deploy.quant.gate import GateResult, compare, gate_row
@@ -73,7 +74,11 @@ def steps_of(finetune: int | str) -> int | None:
 
 
 def quantized(
-    network: NetworkLike, data: Data, target: TargetProfile, finetune: int | str
+    network: NetworkLike,
+    data: Data,
+    target: TargetProfile,
+    finetune: int | str,
+    adapts: bool = False,
 ) -> tuple[Network, "Patches | None"]:
     """Quantise a float network; the INT8 one knows its `origin`.
 
@@ -85,6 +90,7 @@ def quantized(
         data: what it is calibrated on.
         target: whose rules count.
         finetune: steps that train the integers, or "auto".
+        adapts: replace operators that the DPU lacks.
 
     Raises:
         ModelError: an operation that the DPU does not compute.
@@ -99,6 +105,11 @@ def quantized(
             f"{unfit} cannot be combined with {weights.name}, because a network conditioned on a "
             f"sensor is calibrated over the whole family of sensors at once. Leave {unfit} out."
         )
+    if weights and adapts:
+        raise OptionError(
+            f"`adapt` has no effect on {weights.name}, because a DPU computes all its operators. "
+            "Leave `adapt` out."
+        )
     origin = Network.load(network, sensor=data.sensor)
     require_quantized(origin.model, origin.label, wanted=False)
     with faults_named(origin.label):
@@ -107,11 +118,15 @@ def quantized(
             return int8, None
         # Samples in memory may be given one after the other, so they are read only here.
         source = data.own(origin) or data.simulated
-        return quantize_alone(origin, source, target, steps), source.unseen
+        return quantize_alone(origin, source, target, steps, adapts), source.unseen
 
 
 def quantize_alone(
-    origin: Network, calibration: Source, target: TargetProfile, steps: int | None
+    origin: Network,
+    calibration: Source,
+    target: TargetProfile,
+    steps: int | None,
+    adapts: bool = False,
 ) -> Network:
     """Quantise a network that is calibrated by itself.
 
@@ -120,6 +135,7 @@ def quantize_alone(
         calibration: patches or samples.
         target: whose rules count.
         steps: of fine-tuning; None while it helps, 0 for none.
+        adapts: replace operators that the DPU lacks. The result is compared with `origin` as it is.
     """
     shifts = _shifts_of(target)
     tuning = None
@@ -127,14 +143,24 @@ def quantize_alone(
         optional("torch", "finetune")
         from beers_deploy.quant.passes.finetune import Tuning
 
-        tuning = Tuning(calibration.for_tuning.pairs, steps)
+        # The integers learn the results of the network that was given, not of the adapted one.
+        original = origin.model if adapts else None
+        tuning = Tuning(calibration.for_tuning.pairs, steps, original=original)
     with progress("calibrating"):
         about = {**calibration.about, "target": target.name}
-        result = quantize_model(origin.model, calibration.drawn, about, shifts, tuning)
+        adapted = Adapted(origin.model)
+        if adapts:
+            adapted = adapt(origin.model, calibration.drawn, calibration.unseen)
+            about |= {ADAPTED: adapted.record} if adapted.record else {}
+        result = quantize_model(adapted.model, calibration.drawn, about, shifts, tuning)
         step("statistics of each layer")
         layers = integer_rows(origin.model, result.core, result.host, calibration.drawn.degraded)
     return Network(
-        result.host, f"{origin.name}-int8", origin=origin, layers=layers, quantized=result
+        result.host,
+        f"{origin.name}-int8",
+        origin=origin,
+        layers=(*adapted.rows, *layers),
+        quantized=result,
     )
 
 

@@ -52,6 +52,7 @@ def quantize(
     patches: Annotated[int, Interval(ge=1, le=100_000)] = PATCHES,
     patch: Annotated[int, Interval(ge=32, le=2048)] = PATCH_PX,
     finetune: Steps = 0,
+    adapt: bool = False,
     seed: Seed = 0,
     board_file: OutputFile | None = None,
     tile: Annotated[int, Interval(ge=16, le=8192)] | None = None,
@@ -78,6 +79,10 @@ def quantize(
         patch: side of a simulated patch in pixels.
         finetune: number of steps that train the integers on the patches; 'auto' trains for minutes,
             while it helps.
+        adapt: replace activations that the DPU lacks: SiLU by HardSwish, Sigmoid by HardSigmoid,
+            LeakyReLU and PReLU by LeakyReLU of 26/256, or exactly if that loses more than 0.05 dB.
+            The convolutions around them are fitted to the original network, and the table has the
+            loss in float. INT8 is compared with the original.
         seed: seed of the patches.
         board_file: also write the core in the board's encoding: QDQ ONNX, of an NPU VINT8.
         tile: side of the tile in pixels that `board_file` is fixed to; an NPU needs one.
@@ -107,6 +112,7 @@ def quantize(
     from beers_deploy.kit.board_file import require_core_file, save_core
     from beers_deploy.profiles.sensor import Sensor
     from beers_deploy.profiles.target import TargetProfile
+    from beers_deploy.quant.adapt.adaptation import ADAPTED
     from beers_deploy.quant.encodings import read_core
     from beers_deploy.quant.onnx_file import metadata, require_onnx_name
     from beers_deploy.quant.samples.coverage import recorded_range
@@ -132,7 +138,7 @@ def quantize(
     data = Data(
         Sensor.load(sensor), samples, None if images is None else Path(images), patches, seed, patch
     )
-    result, held_out = quantized(network, data, board, finetune)
+    result, held_out = quantized(network, data, board, finetune, adapt)
     # Both are made before the first is written: a core that is refused leaves no file.
     core = result.core(board, tile) if files[1] else None
     if files[0] is not None:
@@ -143,6 +149,8 @@ def quantize(
         save_core(core, files[1], board)
     covered = recorded_range(metadata(result.model))
     notes = [] if covered is None else [f"calibration: {covered}"]
+    if adapt and ADAPTED not in metadata(result.model):
+        notes.append("`adapt` replaced nothing: the DPU computes all activations of the network")
     rows = list(result.layers)
     if held_out is not None:
         page = pages[0] if pages else None
@@ -162,6 +170,7 @@ def quantize(
                 "patches": patches,
                 "patch": patch,
                 "finetune": finetune,
+                "adapt": adapt,
                 "seed": seed,
                 "tile": tile,
             }
@@ -179,6 +188,7 @@ def quantize(
 
 
 HEADINGS = {
+    "adapted": "activations that the DPU lacks, and what replacing them costs in float",
     "rounding": "tie rounding",
     "gate": "float against INT8, on patches that calibration did not see",
 }

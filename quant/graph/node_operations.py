@@ -20,15 +20,15 @@ from beers_deploy.quant.graph.operations import (
 )
 from beers_deploy.quant.graph.pixel_shuffle import MOVES, ORDERS
 from beers_deploy.quant.graph.resize import Resizing
-from beers_deploy.quant.graph.split_network import unsupported
+from beers_deploy.quant.graph.split_network import ADAPT, REMEDY, unsupported
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.window import Pair, Window
 
 
-def require(condition: bool, node: Node, rule: str) -> None:
+def require(condition: bool, node: Node, rule: str, remedy: str = REMEDY) -> None:
     """Raise ModelError unless a node meets a rule: "must ..." or "has ..."."""
     if not condition:
-        raise unsupported(f"{node} {rule}.")
+        raise unsupported(f"{node} {rule}.", remedy)
 
 
 def _weights(node: Node, graph: OnnxGraph) -> tuple[np.ndarray, np.ndarray]:
@@ -207,6 +207,7 @@ def read_activation(node: Node, graph: OnnxGraph) -> Activation:
             slope == np.float32(LEAKY_SLOPE),
             node,
             f"must have a slope of 26/256 (0.1015625), got {slope:g}",
+            ADAPT,
         )
     if node.op_type == "Clip":
         low, high = (graph.value(node, k) for k in (1, 2))
@@ -216,5 +217,6 @@ def read_activation(node: Node, graph: OnnxGraph) -> Activation:
         alpha = node.attributes.get("alpha", 0.2)
         beta = node.attributes.get("beta", 0.5)
         plain = bool(np.isclose(alpha, 1 / 6, 1e-4)) and beta == 0.5
-        require(plain, node, f"must have alpha 1/6 and beta 0.5, got {alpha:g} and {beta:g}")
+        rule = f"must have alpha 1/6 and beta 0.5, got {alpha:g} and {beta:g}"
+        require(plain, node, rule, "'quantize --adapt' (adapt=True) rewrites it exactly.")
     return activation

@@ -24,6 +24,7 @@ from beers_deploy.quant.graph.operations import (
 )
 from beers_deploy.quant.graph.pixel_shuffle import with_shuffles
 from beers_deploy.quant.graph.split_network import (
+    ADAPT,
     REMEDY,
     SplitNetwork,
     add_channels,
@@ -63,6 +64,8 @@ REMEDIES = {
     ),
 }
 """What to do about an operator that no DPU computes."""
+ADAPTABLE = {"PRelu", "Sigmoid"}
+"""Operators that `quant.adapt` replaces, but for one that writes the network's result."""
 OTHER_REMEDY = "Replace it by one that the DPU computes, or cut the network in front of it."
 
 
@@ -172,7 +175,7 @@ class _Reader:
         elif node.op_type in READERS:
             self._append(READERS[node.op_type](node, self.source))
         else:
-            raise _refused(node)
+            raise _refused(node, self.source)
 
     def _append(self, op: Op) -> None:
         self._places[op.output] = len(self.ops)
@@ -245,9 +248,11 @@ class _Reader:
             self._append(Pointwise(node.name, source, node.outputs[0], activation))
 
 
-def _refused(node: Node) -> ModelError:
+def _refused(node: Node, graph: OnnxGraph) -> ModelError:
     """Return the error of an operator that no DPU computes."""
     remedy = REMEDIES.get(node.op_type, OTHER_REMEDY)
+    if node.op_type in ADAPTABLE:
+        remedy = NO_IMAGE if node.outputs == graph.outputs else ADAPT
     return unsupported(f"The DPU does not compute the operation {node}.", remedy)
 
 

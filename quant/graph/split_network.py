@@ -30,6 +30,10 @@ REMEDY = (
     "See docs/reference/any-network.md for the operators that 'quantize' accepts; 'check' names "
     "what a DPU does not run."
 )
+ADAPT = (
+    "'quantize --adapt' (adapt=True) replaces SiLU, Sigmoid, and LeakyReLU and PReLU of slopes up "
+    "to 1, and measures what that costs."
+)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import onnx
 import torch
 
 from beers_deploy.model.progress import step
@@ -27,7 +28,7 @@ from beers_deploy.quant.graph import CORRECTION, Graph, graph_to_onnx
 from beers_deploy.quant.host_part import HostPart
 from beers_deploy.quant.integer.trainable import Tensor, TrainableCore
 from beers_deploy.quant.samples.patches import Pair
-from beers_deploy.quant.session import open_session, result_of, tensor_values
+from beers_deploy.quant.session import open_any_size, open_session, result_of, tensor_values
 from beers_deploy.quant.untrusted import times
 
 HELD_OUT_EVERY = 8
@@ -55,12 +56,15 @@ class Tuning:
         steps: gradient steps; None adds rounds of them until pairs that are held out err no less.
         rate: the highest rate of learning, in units of each number's scale.
         seed: of the order of the pairs.
+        original: the float network whose results are learnt; None for that of the rounded graph,
+            which is another one where operators were replaced (`quant.adapt`).
     """
 
     pairs: Sequence[Pair]
     steps: int | None = None
     rate: float = 0.05
     seed: int = 0
+    original: onnx.ModelProto | None = None
 
 
 @dataclass(frozen=True)
@@ -99,7 +103,7 @@ def finetune(core: IntCore, full: Graph, tuning: Tuning) -> tuple[IntCore, int]:
         tuning: on what, how long, how fast.
     """
     # 1.
-    samples = list(_samples(core.host_part, full, tuning.pairs))
+    samples = list(_samples(core.host_part, full, tuning))
     # Too few samples to hold one out are trained on and judged by.
     held_out = (samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or samples)[:MOST_HELD_OUT]
     training = [sample for k, sample in enumerate(samples) if (k + 1) % HELD_OUT_EVERY] or samples
@@ -167,10 +171,14 @@ def loss_of(core: IntCore, samples: Sequence[Sample]) -> float:
     return float(np.mean(errors)) - float(np.mean(in_float))
 
 
-def _samples(host_part: HostPart, full: Graph, pairs: Sequence[Pair]) -> Iterator[Sample]:
+def _samples(host_part: HostPart, full: Graph, tuning: Tuning) -> Iterator[Sample]:
     session = open_session(graph_to_onnx(full, [CORRECTION], host_part.planes))
-    for image, reference in pairs:
-        ((floats,),) = tensor_values(session, [CORRECTION], image, None, host_part)
+    original = None if tuning.original is None else open_any_size(tuning.original)
+    for image, reference in tuning.pairs:
+        if original is None:
+            ((floats,),) = tensor_values(session, [CORRECTION], image, None, host_part)
+        else:
+            floats = host_part.correction_of(image, result_of(original, image))
         planes = torch.from_numpy(host_part.encode(image).astype(np.float32)).to(
             memory_format=torch.channels_last
         )

@@ -42,7 +42,7 @@ INSTEAD = {
         "reciprocal"
     ),
     "Exp": "leave it to the host, behind the network",
-    "Sigmoid": "use HardSigmoid",
+    "Sigmoid": "use HardSigmoid, or let 'quantize --adapt' put it there",
     "Tanh": "use HardSigmoid, scaled by the weights behind it",
     "Log": "leave it to the host, in front of the network",
     "Sqrt": "leave it to the host, in front of the network",
@@ -215,7 +215,8 @@ def leaky_relu_alpha(op: Operation, dpu: Dpu) -> Finding | None:
     if not is_leaky or (isinstance(alpha, int | float) and abs(alpha - dpu_alpha) < 1e-6):
         return None
     reason = f"its alpha is {alpha}, but the DPU supports only {dpu_alpha}"
-    return Finding(reason, f"train with alpha = {dpu_alpha}, or ReLU")
+    remedy = f"train with alpha = {dpu_alpha}, or ReLU, or use 'quantize --adapt'"
+    return Finding(reason, remedy)
 
 
 def mul_constant(op: Operation, dpu: Dpu) -> Finding | None:

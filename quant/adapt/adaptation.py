@@ -1,0 +1,175 @@
+"""Choose how each kind of operator that a DPU lacks is replaced, and measure what that costs.
+
+1. Replace each kind by the other function, alone, and compensate.
+2. Where that still loses more than `ENOUGH_DB`, take the exact replacement if there is one: it
+   loses nothing in float, but takes more operations.
+3. Replace all kinds as chosen, and compensate jointly.
+"""
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import onnx
+
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
+from beers_deploy.quant.adapt.compensation import compensated
+from beers_deploy.quant.adapt.replacements import (
+    APPROXIMATIONS,
+    EXACT,
+    Kind,
+    nodes_by_kind,
+    replaced,
+)
+from beers_deploy.quant.gate import GateResult, compare
+from beers_deploy.quant.graph import read_network
+from beers_deploy.quant.onnx.graph import OnnxGraph
+from beers_deploy.quant.onnx_file import fixed_tile_px
+from beers_deploy.quant.samples.patches import Patches
+from beers_deploy.quant.session import open_any_size
+from beers_deploy.quant.tiling.receptive_field import tiling_of
+
+ADAPTED = "adapted"
+"""The table of replaced operators, and what an INT8 file calls its record of them."""
+ENOUGH_DB = 0.05
+"""An approximation that loses no more PSNR than this is preferred to an exact replacement."""
+NEAR_DB = 60.0
+"""The same without references, as PSNR to the original's results: where these restore to 40 dB, an
+error of 60 dB loses 0.04 dB.
+"""
+FIT_IMAGES = 32
+FIT_PX = 48
+"""What convolutions are fitted on: at most so many images, of so many pixels a side."""
+
+
+@dataclass(frozen=True)
+class Adapted:
+    """A float network of operators that a DPU computes, and what the replacement costs.
+
+    Attributes:
+        model: the network.
+        rows: what became of each kind of operator, and the loss in float.
+        record: the same in words, for the metadata of a file; empty if nothing was replaced.
+    """
+
+    model: onnx.ModelProto
+    rows: tuple[Row, ...] = ()
+    record: str = ""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A replacement as it is and compensated, each compared with the original network.
+
+    Attributes:
+        model: the compensated network, or the one without if that is nearer to the original.
+        before: the difference without compensation.
+        after: the difference of `model`.
+    """
+
+    model: onnx.ModelProto
+    before: GateResult
+    after: GateResult
+
+    @property
+    def is_enough(self) -> bool:
+        """Return True if the loss is small enough to do without an exact replacement."""
+        if math.isnan(self.after.drop_db):
+            return self.after.psnr_between_db >= NEAR_DB
+        return self.after.drop_db <= ENOUGH_DB
+
+    @property
+    def figures(self) -> dict[str, Figure]:
+        """The loss before and after compensation."""
+        source = f"{self.after.source} that no convolution was fitted on, in float"
+        figures = {}
+        for name, result in (("replaced", self.before), ("compensated", self.after)):
+            figures[f"PSNR lost, {name}"] = _db(result.drop_db, source)
+            figures[f"PSNR to the original, {name}"] = _db(result.psnr_between_db, source)
+        return figures
+
+
+def _db(value: float, source: str) -> Figure:
+    if math.isinf(value):
+        return unavailable("dB", "infinite: the results are identical")
+    if math.isnan(value):
+        return unavailable("dB", "the samples have no references")
+    return measured(value, "dB", source)
+
+
+def adapt(model: onnx.ModelProto, samples: Patches, held_out: Patches) -> Adapted:
+    """Replace the operators that a DPU lacks, and compensate.
+
+    Args:
+        model: a simplified float network.
+        samples: that convolutions are fitted on.
+        held_out: others, on which the loss is measured.
+    """
+    counts = {kind: len(nodes) for kind, nodes in nodes_by_kind(OnnxGraph(model)).items()}
+    if not counts:
+        return Adapted(model)
+    exact = {kind for kind in counts if kind not in APPROXIMATIONS}
+    # Refuses what is still no operator of the DPU before the work of fitting.
+    read_network(replaced(model, counts.keys() - exact, exact))
+    images = _fit_images(model, samples.degraded)
+    # 1. and 2.
+    trials = dict[Kind, Trial]()
+    for kind in [kind for kind in counts if kind in APPROXIMATIONS]:
+        trials[kind] = _trial(model, {kind}, set(), images, held_out)
+        if kind in EXACT and not trials[kind].is_enough:
+            exact.add(kind)
+    # 3. One kind alone has been tried as it is chosen.
+    if len(counts) == 1 and not exact:
+        (chosen,) = trials.values()
+    else:
+        chosen = _trial(model, counts.keys() - exact, exact, images, held_out)
+    rows = []
+    for kind, count in counts.items():
+        if kind in exact:
+            becomes = f"{EXACT[kind]}, exactly"
+        else:
+            becomes = f"{APPROXIMATIONS[kind]}, compensated"
+        figures = trials[kind].figures if kind in trials else {}
+        rows.append(Row(ADAPTED, f"{count} {kind}", figures, {"becomes": becomes}))
+    record = "; ".join(f"{row.name}: {row.text['becomes']}" for row in rows)
+    rows.append(Row(ADAPTED, "all", chosen.figures))
+    return Adapted(chosen.model, tuple(rows), record)
+
+
+def _trial(
+    model: onnx.ModelProto,
+    approximated: Collection[Kind],
+    exact: Collection[Kind],
+    images: Sequence[np.ndarray],
+    held_out: Patches,
+) -> Trial:
+    """Replace some kinds of operators by other functions and some exactly, and compensate."""
+    network = replaced(model, approximated, exact)
+    session = open_any_size(model)
+    before = compare(session, open_any_size(network), held_out)
+    if not approximated:
+        return Trial(network, before, before)
+    nodes = nodes_by_kind(OnnxGraph(model))
+    changed = [node.outputs[0] for kind in approximated for node in nodes[kind]]
+    fitted = compensated(model, network, changed, images)
+    after = compare(session, open_any_size(fitted), held_out)
+    # Not by the references: another network may gain on a few samples by chance.
+    if after.psnr_between_db < before.psnr_between_db:
+        return Trial(network, before, before)
+    return Trial(fitted, before, after)
+
+
+def _fit_images(model: onnx.ModelProto, images: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return some of the images, cut to FIT_PX a side if the network accepts that size."""
+    places = np.unique(np.linspace(0, len(images) - 1, FIT_IMAGES).astype(int))
+    side_px = fixed_tile_px(model)
+    if side_px is None:
+        try:
+            lattice_px = tiling_of(model).lattice_px
+        except ModelError:
+            # The operator that is to be replaced may be none that can be tiled.
+            lattice_px = FIT_PX
+        side_px = -(-FIT_PX // lattice_px) * lattice_px
+    return [images[int(k)][..., :side_px, :side_px] for k in places]

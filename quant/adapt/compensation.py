@@ -1,0 +1,299 @@
+"""Fit the convolutions around replaced activations to the original network, without training.
+
+1. HardSwish and HardSigmoid are nearest to SiLU and Sigmoid over other ranges than as they stand.
+   Each channel gets the factor k with which a line through HardSwish(k x), or HardSigmoid(k x), is
+   nearest to the original. The convolutions in front and behind hold k and 1 / k.
+2. Each convolution that reads what has changed is fitted in order, by least squares: of the adapted
+   network's tensors it shall compute what it computed of the original's. That includes a scale for
+   each channel, the correction of the bias, and what the layers before have left.
+"""
+
+from collections.abc import Collection, Iterator, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+
+import numpy as np
+import onnx
+from onnx import TensorProto
+
+from beers_deploy.model.progress import step
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.window import Pair, Window
+from beers_deploy.quant.onnx_file import with_outputs
+from beers_deploy.quant.session import open_any_size, tensors_of
+from beers_deploy.quant.simplify.fold_affine import is_convolution
+
+MOST_UNKNOWNS = 2304
+"""Weights of one result, as of 256 channels and 3 x 3; of more the equations take too long."""
+ROWS_OF_EACH_UNKNOWN = 16
+LEAST_ROWS = 8192
+RIDGE = 1e-5
+"""The penalty on leaving the old weights, in mean squares of what a convolution reads."""
+FACTORS = np.geomspace(0.6, 3.6, 31)
+"""Candidates of k."""
+VALUES = 256
+"""Of a channel that are compared for k, from each image."""
+
+
+@dataclass(frozen=True)
+class Networks:
+    """The original network and the adapted one, in which tensors keep their names.
+
+    Attributes:
+        original: the original network.
+        adapted: the adapted network; its weights change.
+        graph: of the adapted network.
+        images: (1, C, H, W) in [0, 1] that both are run on.
+    """
+
+    original: onnx.ModelProto
+    adapted: onnx.ModelProto
+    graph: OnnxGraph
+    images: Sequence[np.ndarray]
+
+    def is_conv(self, node: Node) -> bool:
+        """Return True for a convolution, not transposed, whose pads are stated."""
+        is_plain = node.attributes.get("auto_pad", "NOTSET") == "NOTSET"
+        return node.op_type == "Conv" and is_plain and is_convolution(self.graph, node)
+
+    def weights(self, node: Node) -> tuple[np.ndarray, np.ndarray]:
+        """Return the weights (O, I / groups, kh, kw) and the bias (O,) of a convolution."""
+        weight = self.graph.constants[node.inputs[1]]
+        bias = self.graph.value(node, 2)
+        return weight, np.zeros(len(weight), np.float32) if bias is None else bias
+
+    def set_weights(self, node: Node, weight: np.ndarray, bias: np.ndarray) -> None:
+        """Give a convolution weights of its own, in the model too."""
+        numbers = {"weight": weight, "bias": bias}
+        names = [self.graph.add_constant(f"{node.name}.{role}", v) for role, v in numbers.items()]
+        node.inputs = (node.inputs[0], *names)
+        self.graph.save()
+
+
+def compensated(
+    original: onnx.ModelProto,
+    adapted: onnx.ModelProto,
+    changed: Collection[str],
+    images: Sequence[np.ndarray],
+) -> onnx.ModelProto:
+    """Return an adapted network whose convolutions are fitted to the original network.
+
+    Args:
+        original: the original network.
+        adapted: the same with other activations.
+        changed: the tensors that these write.
+        images: (1, C, H, W) in [0, 1] that both are run on.
+    """
+    model = deepcopy(adapted)
+    networks = Networks(original, model, OnnxGraph(model), images)
+    originals = OnnxGraph(original).writers
+    # 1.
+    factors = _scale_activations(networks, [networks.graph.writers[name] for name in changed])
+    # 2.
+    behind = set(changed)
+    convolutions = []
+    for node in networks.graph.nodes:
+        if behind.intersection(node.inputs):
+            behind.update(node.outputs)
+            # Convolutions within an exact replacement have no tensor to be compared with.
+            is_known = networks.is_conv(node) and node.outputs[0] in originals
+            weight = networks.graph.value(node, 1)
+            if is_known and weight is not None and np.prod(weight.shape[1:]) <= MOST_UNKNOWNS:
+                convolutions.append(node)
+    targets = _targets(networks, convolutions)
+    for number, (node, target) in enumerate(zip(convolutions, targets, strict=True), 1):
+        step(f"fitting convolution {number} of {len(convolutions)}")
+        _fit(networks, node, target, factors.get(node.outputs[0]))
+    return model
+
+
+@dataclass(frozen=True)
+class Target:
+    """What the original network computes at some places of a map.
+
+    Attributes:
+        rows: (K,) of the places.
+        columns: (K,) of the places.
+        values: (K, O) of the channels there.
+    """
+
+    rows: np.ndarray
+    columns: np.ndarray
+    values: np.ndarray
+
+
+def _targets(networks: Networks, nodes: Sequence[Node]) -> list[list[Target]]:
+    """Return for each convolution what it computes of each image, in one run of the original."""
+    targets = [list[Target]() for _ in nodes]
+    if not nodes:
+        return targets
+    generator = np.random.default_rng(0)
+    unknowns = [int(np.prod(networks.weights(node)[0].shape[1:])) for node in nodes]
+    outputs = [node.outputs[0] for node in nodes]
+    for maps in _values(networks.original, outputs, networks.images):
+        for target, values, count in zip(targets, maps, unknowns, strict=True):
+            total = max(LEAST_ROWS, ROWS_OF_EACH_UNKNOWN * count)
+            height, width = values.shape[2:]
+            n_rows = min(-(-total // len(networks.images)), height * width)
+            places = generator.integers(0, height * width, n_rows)
+            rows, columns = np.unravel_index(places, (height, width))
+            target.append(Target(rows, columns, values[0][:, rows, columns].T))
+    return targets
+
+
+def _scale_activations(networks: Networks, replaced: Sequence[Node]) -> dict[str, np.ndarray]:
+    """Put k in front of activations and 1 / k behind them; return k (C,) of each tensor."""
+    nodes = [node for node in replaced if _may_scale(networks, node)]
+    names = [name for node in nodes for name in (node.inputs[0], node.outputs[0])]
+    if not names:
+        return {}
+    values = list[list[np.ndarray]]()
+    for maps in _values(networks.original, names, networks.images):
+        flat = [array[0].reshape(array.shape[1], -1) for array in maps]
+        values.append([array[:, :: -(-array.shape[1] // VALUES)] for array in flat])
+    columns = [np.concatenate(arrays, axis=1) for arrays in zip(*values, strict=True)]
+    factors = dict[str, np.ndarray]()
+    for node, source, result in zip(nodes, columns[::2], columns[1::2], strict=True):
+        best = _best_factors(node.op_type == "HardSwish", source, result)
+        factors[node.inputs[0]] = best
+        before = networks.graph.writers[node.inputs[0]]
+        weight, bias = networks.weights(before)
+        networks.set_weights(before, weight * best[:, None, None, None], bias * best)
+        for reader in (
+            networks.graph.readers[node.outputs[0]] if node.op_type == "HardSwish" else ()
+        ):
+            weight, bias = networks.weights(reader)
+            # Depthwise convolutions and those of groups read only their own group's channels.
+            shape = (reader.attributes.get("group", 1), 1, -1, 1, 1)
+            split = weight.reshape(shape[0], -1, *weight.shape[1:])
+            networks.set_weights(reader, (split / best.reshape(shape)).reshape(weight.shape), bias)
+    return factors
+
+
+def _may_scale(networks: Networks, node: Node) -> bool:
+    """Return True if factors can go into the convolutions in front of an activation and behind."""
+    graph = networks.graph
+    before = graph.sole_writer(node.inputs[0])
+    if before is None or not networks.is_conv(before):
+        return False
+    (output,) = node.outputs
+    behind = all(networks.is_conv(reader) for reader in graph.readers[output])
+    # HardSigmoid has its k in front alone.
+    is_alone = node.op_type == "HardSwish" and behind and output not in graph.outputs
+    return is_alone or node.op_type == "HardSigmoid"
+
+
+def _best_factors(is_swish: bool, source: np.ndarray, result: np.ndarray) -> np.ndarray:
+    """Return k (C,) for what an activation reads and what the original computes, (C, K)."""
+    residuals = []
+    centred = result - result.mean(1, keepdims=True)
+    for factor in FACTORS:
+        scaled = source * np.float32(factor)
+        candidate = np.clip(scaled / 6 + 0.5, 0, 1) * (scaled if is_swish else 1)
+        candidate = candidate - candidate.mean(1, keepdims=True)
+        variance = np.maximum(np.square(candidate).mean(1), np.finfo(np.float32).tiny)
+        # What a line through the candidate explains; only that part depends on k.
+        residuals.append(-np.square((candidate * centred).mean(1)) / variance)
+    return np.asarray(FACTORS[np.argmin(residuals, axis=0)], np.float32)
+
+
+def _fit(
+    networks: Networks, node: Node, targets: Sequence[Target], factors: np.ndarray | None
+) -> None:
+    """Solve the normal equations of a convolution, group by group.
+
+    Args:
+        networks: both.
+        node: the convolution of the adapted one.
+        targets: what it computes in the original one, for each image.
+        factors: k (O,) of its results, None for 1.
+    """
+    weight, bias = networks.weights(node)
+    kernel_and_window = node.window(weight.shape[2:])
+    if kernel_and_window is None:
+        return
+    kernel, window = kernel_and_window
+    groups = int(node.attributes.get("group", 1))
+    unknowns = int(np.prod(weight.shape[1:]))
+    equations = Equations(groups, unknowns, len(weight) // groups)
+    names = [node.inputs[0], node.outputs[0]]
+    adapted = _values(networks.adapted, names, networks.images)
+    for target, (source, result) in zip(targets, adapted, strict=True):
+        expected = target.values if factors is None else target.values * factors
+        equations.add(
+            _windows(source[0], kernel, window, (target.rows, target.columns)),
+            expected - result[0, :, target.rows, target.columns],
+        )
+    change, bias_change = equations.solved()
+    networks.set_weights(node, weight + change.reshape(weight.shape), bias + bias_change)
+
+
+class Equations:
+    """The normal equations of a convolution's weights and bias, added up image by image."""
+
+    def __init__(self, groups: int, unknowns: int, results: int) -> None:
+        """Begin those of `results` results in each group, of so many weights each."""
+        self._shape = groups, unknowns, results
+        self._gram = np.zeros((groups, unknowns, unknowns))
+        self._moment = np.zeros((groups, unknowns, results))
+        self._reads = np.zeros((groups, unknowns, 1))
+        self._errors = np.zeros((groups, 1, results))
+        self._count = 0
+
+    def add(self, reads: np.ndarray, errors: np.ndarray) -> None:
+        """Add what a convolution reads for K results (K, I, kh, kw), and their errors (K, O)."""
+        groups, unknowns, results = self._shape
+        x = reads.reshape(-1, groups, unknowns).transpose(1, 2, 0).astype(np.float64)
+        y = errors.reshape(-1, groups, results).swapaxes(0, 1).astype(np.float64)
+        self._gram += x @ x.swapaxes(1, 2)
+        self._moment += x @ y
+        self._reads += x.sum(2, keepdims=True)
+        self._errors += y.sum(1, keepdims=True)
+        self._count += len(reads)
+
+    def solved(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the change of the weights (O, I / groups kh kw) and of the bias (O,)."""
+        groups, unknowns, results = self._shape
+        # About the means, so that the bias has no penalty.
+        reads = self._reads / self._count
+        errors = self._errors / self._count
+        gram = self._gram / self._count - reads @ reads.swapaxes(1, 2)
+        moment = self._moment / self._count - reads @ errors
+        penalty = RIDGE * np.trace(gram, axis1=1, axis2=2) / unknowns + np.finfo(np.float32).tiny
+        gram += penalty[:, None, None] * np.eye(unknowns)
+        change = np.linalg.solve(gram, moment)
+        bias_change = errors - reads.swapaxes(1, 2) @ change
+        return change.swapaxes(1, 2).reshape(groups * results, unknowns), bias_change.ravel()
+
+
+def _windows(
+    source: np.ndarray, kernel: Pair, window: Window, places: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """Return what a convolution reads of a map (I, H, W) for its results at some places.
+
+    Returns:
+        (K, I, kh, kw) for K places.
+    """
+    top, left, bottom, right = window.pads
+    padded = np.pad(source, ((0, 0), (top, bottom), (left, right)))
+    rows, columns = (
+        place[:, None] * stride + np.arange(side) * dilation
+        for place, stride, side, dilation in zip(
+            places, window.strides, kernel, window.dilations, strict=True
+        )
+    )
+    return padded[:, rows[:, :, None], columns[:, None, :]].swapaxes(0, 1)
+
+
+def _values(
+    model: onnx.ModelProto, names: Sequence[str], images: Sequence[np.ndarray]
+) -> Iterator[list[np.ndarray]]:
+    """Yield the named tensors for each image; only the nodes in front of them are run."""
+    part = with_outputs(model, dict.fromkeys(names, TensorProto.FLOAT))
+    outputs = [value for value in part.graph.output if value.name in names]
+    del part.graph.output[:]
+    part.graph.output.extend(outputs)
+    OnnxGraph(part).save()
+    session = open_any_size(part)
+    for image in images:
+        yield tensors_of(session, list(names), image)

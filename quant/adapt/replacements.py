@@ -1,0 +1,199 @@
+"""Replace activations that a DPU lacks, in the simplified ONNX graph of a float network.
+
+By another function:
+
+1. x * Sigmoid(x), SiLU, becomes HardSwish; so does x * Sigmoid(c x), the quick GELU.
+2. A Sigmoid inside the network becomes HardSigmoid.
+3. LeakyReLU of another slope, and PReLU, become LeakyReLU of 26/256.
+
+Exactly, but for the rounding of float32:
+
+4. LeakyReLU and PReLU of slopes s up to 1 become s x + ReLU((1 - s) x): two branches and an Add.
+5. HardSigmoid of another slope and offset becomes that of 1/6 and 0.5 behind a scaled input.
+
+Other GELUs, Mish, Tanh, ELU and Softplus stay: no function of the DPU is near enough to be fitted.
+"""
+
+from collections.abc import Collection
+from copy import deepcopy
+from enum import StrEnum
+
+import numpy as np
+import onnx
+
+from beers_deploy.quant.graph.operations import LEAKY_SLOPE
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.simplify.fold_affine import fold_behind, is_convolution, per_channel
+
+
+class Kind(StrEnum):
+    """A kind of operator that a DPU lacks, by the name that tables have for it."""
+
+    silu = "SiLU"
+    sigmoid = "Sigmoid"
+    hard_sigmoid = "HardSigmoid of another slope"
+    leaky_relu = "LeakyReLU of another slope"
+    prelu = "PReLU"
+
+
+APPROXIMATIONS = {
+    Kind.silu: "HardSwish",
+    Kind.sigmoid: "HardSigmoid",
+    Kind.leaky_relu: "LeakyReLU of 26/256",
+    Kind.prelu: "LeakyReLU of 26/256",
+}
+"""The other function that replaces each kind (1 to 3)."""
+EXACT = {
+    Kind.hard_sigmoid: "HardSigmoid of a scaled input",
+    Kind.leaky_relu: "ReLU in a second branch, and an Add",
+    Kind.prelu: "ReLU in a second branch, and an Add",
+}
+"""What computes the same as each kind (4 and 5)."""
+
+
+def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
+    """Return the kind of operator that a node is; None if it is not replaced."""
+    attributes = node.attributes
+    if silu_input(graph, node):
+        return Kind.silu
+    if node.op_type == "Sigmoid":
+        (result,) = node.outputs
+        # The network's result can be left to the host, which computes any function.
+        is_result = result in graph.outputs
+        part_of_silu = all(silu_input(graph, reader) for reader in graph.readers[result])
+        return None if is_result or part_of_silu else Kind.sigmoid
+    if node.op_type == "HardSigmoid":
+        given = attributes.get("alpha", 0.2), attributes.get("beta", 0.5)
+        plain = np.allclose(given, (1 / 6, 0.5), 1e-4)
+        return None if plain or not given[0] else Kind.hard_sigmoid
+    slopes = slopes_of(graph, node)
+    if slopes is None:
+        return None
+    if node.op_type == "PRelu":
+        return Kind.prelu
+    return None if slopes[0] == np.float32(LEAKY_SLOPE) else Kind.leaky_relu
+
+
+def silu_input(graph: OnnxGraph, node: Node) -> str:
+    """Return the tensor x of which a node computes x * Sigmoid(c x), c a constant or 1.
+
+    Another c is that of the quick GELU, and the runtime writes ONNX's Swish with one. "" if the
+    node computes something else.
+    """
+    if node.op_type == "Mul":
+        for source, gate in (node.inputs, node.inputs[::-1]):
+            before = graph.writers.get(gate)
+            if before is not None and before.op_type == "Sigmoid":
+                scaled = graph.writers.get(before.inputs[0])
+                is_source = before.inputs[0] == source
+                if is_source or (scaled is not None and _by_constant(graph, scaled, source)):
+                    return source
+    return ""
+
+
+def _by_constant(graph: OnnxGraph, node: Node, source: str) -> bool:
+    """Return True for the product of a tensor and a constant number."""
+    if node.op_type != "Mul" or source not in node.inputs:
+        return False
+    factor = node.inputs[1 - node.inputs.index(source)]
+    before = graph.writers.get(factor)
+    # The runtime leaves a Cast of the constant of a Swish.
+    name = before.inputs[0] if before is not None and before.op_type == "Cast" else factor
+    return name in graph.constants and graph.constants[name].size == 1
+
+
+def slopes_of(graph: OnnxGraph, node: Node) -> np.ndarray | None:
+    """Return the slopes (C,) or (1,) of a LeakyReLU or PReLU; None if any is above 1."""
+    slopes: np.ndarray | None = None
+    if node.op_type == "LeakyRelu":
+        slopes = np.array([node.attributes.get("alpha", 0.01)], np.float32)
+    elif node.op_type == "PRelu":
+        slopes = per_channel(graph.value(node, 1))
+    # Above 1 the function bends the other way, which no sum with a ReLU does.
+    return None if slopes is None or not (slopes <= 1).all() else slopes
+
+
+def nodes_by_kind(graph: OnnxGraph) -> dict[Kind, list[Node]]:
+    """Return the nodes of a network that can be replaced, by their kind."""
+    nodes: dict[Kind, list[Node]] = {}
+    for node in graph.nodes:
+        kind = kind_of(graph, node)
+        if kind is not None:
+            nodes.setdefault(kind, []).append(node)
+    return nodes
+
+
+def replaced(
+    model: onnx.ModelProto, approximated: Collection[Kind], exact: Collection[Kind]
+) -> onnx.ModelProto:
+    """Return the network with nodes of some kinds replaced by another function, of others exactly.
+
+    Tensors keep their names, but for those within an exact replacement.
+    """
+    network = deepcopy(model)
+    graph = OnnxGraph(network)
+    # Before the graph changes, because a SiLU is known by the Sigmoid in front of it.
+    plan: dict[Node, list[Node]] = {}
+    for kind, nodes in nodes_by_kind(graph).items():
+        if kind in approximated:
+            plan |= {node: [_approximation(graph, node, kind)] for node in nodes}
+        elif kind in exact and kind is Kind.hard_sigmoid:
+            plan |= {node: _scaled_hard_sigmoid(graph, node) for node in nodes}
+        elif kind in exact:
+            plan |= {node: _two_branches(graph, node) for node in nodes}
+    graph.rewrite(lambda _, node: plan.get(node))
+    graph.rewrite(fold_behind)
+    graph.save()
+    return network
+
+
+def _approximation(graph: OnnxGraph, node: Node, kind: Kind) -> Node:
+    (output,) = node.outputs
+    if kind is Kind.silu:
+        return Node.new("HardSwish", [silu_input(graph, node)], output, node.name)
+    if kind is Kind.sigmoid:
+        return Node.new("HardSigmoid", node.inputs, output, node.name, alpha=1 / 6, beta=0.5)
+    return Node.new("LeakyRelu", node.inputs[:1], output, node.name, alpha=LEAKY_SLOPE)
+
+
+def _scaled_hard_sigmoid(graph: OnnxGraph, node: Node) -> list[Node]:
+    """Return clip(slope x + offset, 0, 1) as HardSigmoid of 6 slope x + 6 (offset - 0.5)."""
+    slope = node.attributes.get("alpha", 0.2)
+    offset = node.attributes.get("beta", 0.5)
+    (output,) = node.outputs
+    scaled = _times(graph, node.inputs[0], np.array([6 * slope]), f"{output}.scaled")
+    shift = graph.add_constant(f"{output}.offset", np.array(6 * (offset - 0.5)))
+    shifted = Node.new("Add", [scaled.outputs[0], shift], f"{output}.shifted", f"{output}.shifted")
+    hard = Node.new("HardSigmoid", shifted.outputs, output, node.name, alpha=1 / 6, beta=0.5)
+    return [scaled, shifted, hard]
+
+
+def _two_branches(graph: OnnxGraph, node: Node) -> list[Node]:
+    """Return slopes x + ReLU((1 - slopes) x)."""
+    slopes = slopes_of(graph, node)
+    assert slopes is not None  # noqa: S101 - `kind_of` has asked
+    source = node.inputs[0]
+    (output,) = node.outputs
+    nodes = []
+    bent_source = source
+    before = graph.sole_writer(source)
+    # A convolution that only this node reads is computed twice, each time with the factors in its
+    # weights: so each branch is rounded once. Other tensors get a depthwise convolution a branch.
+    if before is not None and is_convolution(graph, before):
+        bent_source = f"{output}.source"
+        twin = Node.of(before.written())
+        twin.name = twin.proto.name = f"{before.name}.bent"
+        twin.outputs = (bent_source,)
+        nodes.append(twin)
+    straight = _times(graph, source, slopes, f"{output}.straight")
+    scaled = _times(graph, bent_source, 1 - slopes, f"{output}.scaled")
+    bent = Node.new("Relu", scaled.outputs, f"{output}.bent", f"{output}.bent")
+    names = [straight.outputs[0], bent.outputs[0]]
+    return [*nodes, straight, scaled, bent, Node.new("Add", names, output, node.name)]
+
+
+def _times(graph: OnnxGraph, source: str, factors: np.ndarray, output: str) -> Node:
+    """Return the product of a tensor and one number a channel."""
+    shape = (1, -1, 1, 1) if factors.size > 1 else ()
+    constant = graph.add_constant(f"{output}.factor", factors.reshape(shape))
+    return Node.new("Mul", [source, constant], output, output)
