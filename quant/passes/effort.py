@@ -159,4 +159,4 @@ def _of_result(op: Op) -> int:
     if not isinstance(op, Conv):
         return RESULT
     rounding = LEAKY_RESULT if op.activation is Activation.leaky_relu else RESULT
-    return op.weight[0].size + rounding
+    return int(op.weight[0].size) + rounding

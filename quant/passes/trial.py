@@ -50,7 +50,7 @@ Targets = list[tuple[np.ndarray, np.ndarray]]
 
 def crop_count(crop: np.ndarray) -> int:
     """Return on how many crops of the size of this one (1, C, h, w) a search measures, at most."""
-    height, width = crop.shape[2:]
+    height, width = map(int, crop.shape[2:])
     return min(max(SEARCH_CROPS * TILE_PX**2 // (height * width), SEARCH_CROPS), MOST_CROPS)
 
 

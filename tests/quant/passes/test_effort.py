@@ -7,6 +7,7 @@ import numpy as np
 import onnx
 import pytest
 
+from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.graph import Graph
 from beers_deploy.quant.host_part import ONE_CHANNEL
@@ -130,7 +131,7 @@ def test_running_only_what_changes_costs_the_same_as_running_all(
     seen: list[tuple[np.ndarray, np.ndarray]] = []
     costs = CropTrials._costs
 
-    def both(self: CropTrials, parts: list, values: list, core: object):  # type: ignore[no-untyped-def,type-arg]
+    def both(self: CropTrials, parts: list, values: list, core: IntCore):  # type: ignore[no-untyped-def,type-arg]
         cost = costs(self, parts, values, core)
         whole = open_session(host_model(core, {}), threads=1)
         restored = [whole.run(None, {"image": crop})[0] for crop, _ in self.targets]
