@@ -245,7 +245,7 @@ def _equalized(
     long it takes.
     """
     first_crop, *others = crops(images[0], 0 if halo_of(graph) is not None else None)
-    count = min(crop_count(first_crop), len(images) * (1 + len(others)))
+    count = crop_count(first_crop, len(images) * (1 + len(others)))
     work = work_of(graph, plan.host_part, first_crop)
     limit = bound(plan.stages(), graph, work, count, plan.effort)
     step("float results to compare with")

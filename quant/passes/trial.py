@@ -48,10 +48,16 @@ Targets = list[tuple[np.ndarray, np.ndarray]]
 """Degraded crops (1, C, h, w) and their float results, clipped to [0, 1]."""
 
 
-def crop_count(crop: np.ndarray) -> int:
-    """Return on how many crops of the size of this one (1, C, h, w) a search measures, at most."""
+def crop_count(crop: np.ndarray, available: int) -> int:
+    """Return on how many crops of the size of this one (1, C, h, w) a search measures, at most.
+
+    Args:
+        crop: one of them.
+        available: about how many there are; images of other sizes than the first may have more.
+    """
     height, width = map(int, crop.shape[2:])
-    return min(max(SEARCH_CROPS * TILE_PX**2 // (height * width), SEARCH_CROPS), MOST_CROPS)
+    count = max(SEARCH_CROPS * TILE_PX**2 // (height * width), SEARCH_CROPS)
+    return min(count, MOST_CROPS, max(available, SEARCH_CROPS))
 
 
 def search_targets(
