@@ -28,6 +28,7 @@ from beers_deploy.quant.encodings import host_model, read_core
 from beers_deploy.quant.gate import GateResult, compare, gate_row
 from beers_deploy.quant.integer.reference import integer_rows
 from beers_deploy.quant.onnx_file import faults_named, load_onnx, metadata, require_quantized
+from beers_deploy.quant.passes.effort import Effort
 from beers_deploy.quant.passes.selection import ALL, Passes
 from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.samples.own import OwnSamples
@@ -78,6 +79,7 @@ def quantized(
     data: Data,
     target: TargetProfile,
     finetune: int | str,
+    effort: Effort = Effort.normal,
     adapts: bool = False,
 ) -> tuple[Network, "Patches | None"]:
     """Quantise a float network; the INT8 one knows its `origin`.
@@ -90,6 +92,7 @@ def quantized(
         data: what it is calibrated on.
         target: whose rules count.
         finetune: steps that train the integers, or "auto".
+        effort: of the search for equalization factors.
         adapts: replace operators that the DPU lacks.
 
     Raises:
@@ -114,11 +117,13 @@ def quantized(
     require_quantized(origin.model, origin.label, wanted=False)
     with faults_named(origin.label):
         if weights:
-            int8 = quantize_conditioned(weights, origin, data.simulated, data.sensor, target)
+            int8 = quantize_conditioned(
+                weights, origin, data.simulated, data.sensor, target, effort
+            )
             return int8, None
         # Samples in memory may be given one after the other, so they are read only here.
         source = data.own(origin) or data.simulated
-        return quantize_alone(origin, source, target, steps, adapts), source.unseen
+        return quantize_alone(origin, source, target, steps, effort, adapts), source.unseen
 
 
 def quantize_alone(
@@ -126,6 +131,7 @@ def quantize_alone(
     calibration: Source,
     target: TargetProfile,
     steps: int | None,
+    effort: Effort,
     adapts: bool = False,
 ) -> Network:
     """Quantise a network that is calibrated by itself.
@@ -135,6 +141,7 @@ def quantize_alone(
         calibration: patches or samples.
         target: whose rules count.
         steps: of fine-tuning; None while it helps, 0 for none.
+        effort: of the search for equalization factors.
         adapts: replace operators that the DPU lacks. The result is compared with `origin` as it is.
     """
     shifts = _shifts_of(target)
@@ -152,7 +159,9 @@ def quantize_alone(
         if adapts:
             adapted = adapt(origin.model, calibration.drawn, calibration.unseen)
             about |= {ADAPTED: adapted.record} if adapted.record else {}
-        result = quantize_model(adapted.model, calibration.drawn, about, shifts, tuning)
+        result = quantize_model(
+            adapted.model, calibration.drawn, about, shifts, tuning, effort=effort
+        )
         step("statistics of each layer")
         layers = integer_rows(origin.model, result.core, result.host, calibration.drawn.degraded)
     return Network(
@@ -170,6 +179,7 @@ def quantize_conditioned(
     calibration: "Calibration",
     sensor: Sensor,
     target: TargetProfile,
+    effort: Effort,
 ) -> Network:
     """Quantise a network that is conditioned on its sensor, over the whole family of sensors.
 
@@ -179,9 +189,10 @@ def quantize_conditioned(
         calibration: patches on which the integer layers are described.
         sensor: that the result is conditioned on.
         target: whose rules count.
+        effort: of the search for equalization factors.
     """
     images = [] if calibration.images is None else [calibration.images]
-    family = family_model(network, images, calibration.seed, _shifts_of(target))
+    family = family_model(network, images, calibration.seed, _shifts_of(target), effort=effort)
     host = int8_for_sensor(family, sensor, {"target": target.name})
     layers = integer_rows(origin.model, read_core(host), host, calibration.drawn.degraded)
     return Network(host, f"{network.name}-int8", origin=origin, layers=layers)
@@ -267,6 +278,7 @@ def family_model(
     seed: int = 0,
     shifts: Shifts = SHIFTS,
     passes: Passes = ALL,
+    effort: Effort = Effort.normal,
 ) -> onnx.ModelProto:
     """Quantise a conditioned network over the family of sensors, and return its INT8 file for the
     middle of the family.
@@ -278,6 +290,7 @@ def family_model(
         seed: of the patches.
         shifts: the windows of the target.
         passes: that reduce the error.
+        effort: of the search for equalization factors.
     """
     # This loads SciPy, which samples of one's own do without.
     from beers_deploy.model.simulator.procedural import load_scenes
@@ -294,7 +307,7 @@ def family_model(
     with progress(f"calibrating {network.name} over the family of sensors"):
         patches = bank_images(scenes, scale, seed, weights.kernels)
         middle = bank_of_vector((0.0,) * len(RANGES), weights.kernels)
-        quantized = quantize_behind_bank(weights, middle, patches, shifts, passes)
+        quantized = quantize_behind_bank(weights, middle, patches, shifts, passes, effort)
     description = {
         "variant": network.name,
         "reference": REFERENCE,

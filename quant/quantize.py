@@ -11,6 +11,8 @@ the host out.
 8. Train the integers, if asked to.
 """
 
+import logging
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -20,7 +22,7 @@ import numpy as np
 import onnx
 
 from beers_deploy.model.progress import step
-from beers_deploy.quant.core import SHIFTS, IntCore, Shifts, build_core
+from beers_deploy.quant.core import SHIFTS, IntCore, RoundedConvs, Shifts, build_core
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.graph import (
     CORRECTION,
@@ -39,7 +41,15 @@ from beers_deploy.quant.passes.dual_range import (
     with_copies,
     with_windows,
 )
+from beers_deploy.quant.passes.effort import (
+    Effort,
+    Stage,
+    bound,
+    channel_groups,
+    work_of,
+)
 from beers_deploy.quant.passes.equalize import (
+    FIRST_GUESSES,
     FULL,
     GAMMAS,
     channel_ranges,
@@ -62,12 +72,15 @@ from beers_deploy.quant.passes.residual_groups import (
     single_tensors,
 )
 from beers_deploy.quant.passes.selection import ALL, Passes
-from beers_deploy.quant.passes.trial import Costs, Trial, crop_costs, search_targets
+from beers_deploy.quant.passes.trial import CropTrials, Trials, crop_count, search_targets
 from beers_deploy.quant.samples.coverage import KEY, histogram, range_from
 from beers_deploy.quant.samples.patches import Patches
+from beers_deploy.quant.session import crops, halo_of
 
 if TYPE_CHECKING:
     from beers_deploy.quant.passes.finetune import Tuning
+
+logger = logging.getLogger(__name__)
 
 PASSES = "fine_planes, least_squares, shared_residual_scale, equalise, dual_gain"
 """What a file records as done beyond rounding each tensor, in the words of the first files."""
@@ -93,6 +106,7 @@ class Plan:
         singles: what is equalized in addition to the groups, or where there are none.
         shifts: the windows of the target.
         passes: that reduce the error.
+        effort: of the search for equalization factors.
     """
 
     graph: Graph
@@ -101,17 +115,35 @@ class Plan:
     singles: SingleTensors
     shifts: Shifts
     passes: Passes = ALL
+    effort: Effort = Effort.normal
 
-    def core(self, candidate: Graph, frac_bits: Mapping[str, int]) -> IntCore:
-        """Round a candidate, whose tensors have these least-squares scales, to an integer core."""
+    def stages(self) -> list[Stage]:
+        """Return the stages of the search for equalization factors."""
+        groups = self.groups if self.passes.equalization else []
+        widths = channels_of(self.graph, {PLANES: self.host_part.planes})
+        stages = [
+            Stage(
+                group, FIRST_GUESSES, max(part.stop or widths[name] for name, part in group.items())
+            )
+            for group in groups
+        ]
+        singles = self.singles.stages(self.effort) if self.singles.tensors else []
+        return [*stages, *singles]
+
+    def core(
+        self, candidate: Graph, frac_bits: Mapping[str, int], earlier: RoundedConvs | None = None
+    ) -> IntCore:
+        """Round a candidate, whose tensors have these least-squares scales, to an integer core.
+
+        Convolutions in `earlier` are not rounded again.
+        """
         # Equalized tensors are scaled to fill int8 at one scale.
         shared = [*chain.from_iterable(self.groups), *self.singles.tensors]
         scales = {**frac_bits, **dict.fromkeys(shared, GROUP_FRAC_BITS)}
         # A coarse copy holds what a finer scale clips.
         scales[CORRECTION] += self.host_part.decoding.finer_bits
-        final = with_copies(candidate, self.host_part.decoding)
-        assert set(tensors(final)) <= set(scales)  # noqa: S101
-        return build_core(final, scales, self.shifts, self.host_part)
+        assert set(tensors(candidate)) <= set(scales)  # noqa: S101
+        return build_core(candidate, scales, self.shifts, self.host_part, earlier)
 
 
 def quantize_model(
@@ -121,6 +153,7 @@ def quantize_model(
     shifts: Shifts = SHIFTS,
     tuning: "Tuning | None" = None,
     passes: Passes = ALL,
+    effort: Effort = Effort.normal,
 ) -> Quantized:
     """Quantise a float network under the DPU's rules: int8, symmetric, per tensor, power-of-two
     scales.
@@ -135,6 +168,7 @@ def quantize_model(
         shifts: the windows of the target.
         tuning: on what, how long and how fast the integers are trained at last; None leaves them.
         passes: that reduce the error.
+        effort: of the search for equalization factors.
 
     Raises:
         ModelError: an operation that the DPU does not compute, or weights of no sensible size.
@@ -146,7 +180,9 @@ def quantize_model(
     host_part = HostPart.of(network, DualRange() if dual_range else Plain())
     # 2.
     groups = residual_groups(graph)
-    plan = Plan(graph, host_part, groups, _singles(graph, host_part, groups), shifts, passes)
+    plan = Plan(
+        graph, host_part, groups, _singles(graph, host_part, groups), shifts, passes, effort
+    )
     # 3. to 7.
     core, final = rounded(plan, patches.degraded)
     about = {
@@ -156,6 +192,7 @@ def quantize_model(
         KEY: range_from(sum(map(histogram, patches.degraded), np.zeros(1))).to_words(),
         **about,
         "passes": PASSES,
+        "effort": effort,
     }
     # 8.
     if tuning:
@@ -193,23 +230,42 @@ def rounded(plan: Plan, images: Sequence[np.ndarray]) -> tuple[IntCore, Graph]:
     if plan.passes.dual_range:
         host_part = with_windows(plan.graph, plan.host_part, frac_bits[CORRECTION], images)
         plan = replace(plan, host_part=host_part)
-    # 6.
-    graph = plan.graph
+    # 6. Copies are written already, so that the search rounds its last convolution once.
+    graph = with_copies(plan.graph, plan.host_part.decoding)
     if plan.groups or plan.singles.tensors:
-        targets = search_targets(graph, plan.host_part, images)
-
-        def trial(candidate: Graph) -> Costs:
-            return crop_costs(host_model(plan.core(candidate, frac_bits), {}), targets)
-
-        graph = plan.singles.scaled(graph, plan.singles.unscaled(frac_bits))
-        graph = _equalized_groups(graph, plan, trial, images)
-        graph = _equalized_singles(graph, plan, trial, images)
+        graph = _equalized(graph, plan, frac_bits, images)
     # 7.
-    return plan.core(graph, frac_bits), with_copies(graph, plan.host_part.decoding)
+    return plan.core(graph, frac_bits), graph
+
+
+def _equalized(
+    graph: Graph, plan: Plan, frac_bits: Mapping[str, int], images: Sequence[np.ndarray]
+) -> Graph:
+    """Equalize the channels of the groups, then those of the single tensors, and report before how
+    long it takes.
+    """
+    first_crop, *others = crops(images[0], 0 if halo_of(graph) is not None else None)
+    count = crop_count(first_crop, len(images) * (1 + len(others)))
+    work = work_of(graph, plan.host_part, first_crop)
+    limit = bound(plan.stages(), graph, work, count, plan.effort)
+    step("float results to compare with")
+    targets = search_targets(plan.graph, plan.host_part, images, limit.crops)
+    earlier: RoundedConvs = {}
+    trials = CropTrials(lambda candidate: plan.core(candidate, frac_bits, earlier), targets)
+    graph = plan.singles.scaled(graph, plan.singles.unscaled(frac_bits))
+    # The time is only reported: what is tried depends on counted work alone.
+    start = time.perf_counter()
+    trials(graph, tensors(graph))(graph)(None)
+    seconds = (time.perf_counter() - start) * limit.runs
+    logger.info(
+        "equalization tries at most %d candidates, in about %.0f s", limit.candidates, seconds
+    )
+    graph = _equalized_groups(graph, plan, trials, images, limit.groups)
+    return _equalized_singles(graph, plan, trials, images, limit.groups)
 
 
 def _equalized_groups(
-    graph: Graph, plan: Plan, trial: Trial, images: Sequence[np.ndarray]
+    graph: Graph, plan: Plan, trials: Trials, images: Sequence[np.ndarray], most_groups: int
 ) -> Graph:
     """Equalize group after group, the others by a first guess until their turn comes."""
     ranges = [channel_ranges(plan.graph, group, images, plan.host_part) for group in plan.groups]
@@ -222,7 +278,8 @@ def _equalized_groups(
         if number:
             graph = equalize(graph, group, 1 / guesses[number])
         if plan.passes.equalization:
-            factors = search(graph, group, ranges[number], trial)
+            channels = channel_groups(ranges[number], most_groups)
+            factors = search(graph, group, ranges[number], trials(graph, group), channels)
         else:
             factors = first_guess(ranges[number], 0.0, 1.0)
         graph = equalize(graph, group, factors)
@@ -230,7 +287,7 @@ def _equalized_groups(
 
 
 def _equalized_singles(
-    graph: Graph, plan: Plan, trial: Trial, images: Sequence[np.ndarray]
+    graph: Graph, plan: Plan, trials: Trials, images: Sequence[np.ndarray], most_groups: int
 ) -> Graph:
     """Equalize the single tensors; what the image itself passes through clips nothing that
     calibration sees.
@@ -239,7 +296,8 @@ def _equalized_singles(
         return graph
     step(f"equalizing the channels of {len(plan.singles.tensors)} tensors")
     ranges = single_ranges(graph, plan.singles, images, plan.host_part)
-    factors = equalize_single(graph, plan.singles, ranges, np.ones(len(ranges)), trial)
+    start = np.ones(len(ranges))
+    factors = equalize_single(graph, plan.singles, ranges, start, trials, plan.effort, most_groups)
     graph = plan.singles.scaled(graph, factors)
     if not plan.host_part.decoding.offsets:
         return graph

@@ -4,7 +4,7 @@ import logging
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from beers_deploy.model.shipped import SENSOR
 from beers_deploy.profiles.errors import OptionError, optional, printable
@@ -51,6 +51,7 @@ def quantize(
     images: InputPath | None = None,
     patches: Annotated[int, Interval(ge=1, le=100_000)] = PATCHES,
     patch: Annotated[int, Interval(ge=32, le=2048)] = PATCH_PX,
+    effort: Literal["fast", "normal", "best"] = "normal",
     finetune: Steps = 0,
     adapt: bool = False,
     seed: Seed = 0,
@@ -77,6 +78,9 @@ def quantize(
         images: folder of scenes for the simulated patches; drawn scenes if none.
         patches: number of simulated patches.
         patch: side of a simulated patch in pixels.
+        effort: of the search that equalizes channels: first guesses alone, groups of channels
+            within a bound of time, or each channel by itself without one. An estimate of the time
+            is printed before it begins.
         finetune: number of steps that train the integers on the patches; 'auto' trains for minutes,
             while it helps.
         adapt: replace activations that the DPU lacks: SiLU by HardSwish, Sigmoid by HardSigmoid,
@@ -115,6 +119,7 @@ def quantize(
     from beers_deploy.quant.adapt.adaptation import ADAPTED
     from beers_deploy.quant.encodings import read_core
     from beers_deploy.quant.onnx_file import metadata, require_onnx_name
+    from beers_deploy.quant.passes.effort import Effort
     from beers_deploy.quant.samples.coverage import recorded_range
     from beers_deploy.quantization import quantized
     from beers_deploy.results import Table
@@ -138,7 +143,7 @@ def quantize(
     data = Data(
         Sensor.load(sensor), samples, None if images is None else Path(images), patches, seed, patch
     )
-    result, held_out = quantized(network, data, board, finetune, adapt)
+    result, held_out = quantized(network, data, board, finetune, Effort(effort), adapt)
     # Both are made before the first is written: a core that is refused leaves no file.
     core = result.core(board, tile) if files[1] else None
     if files[0] is not None:
@@ -169,6 +174,7 @@ def quantize(
                 "images": images,
                 "patches": patches,
                 "patch": patch,
+                "effort": effort,
                 "finetune": finetune,
                 "adapt": adapt,
                 "seed": seed,

@@ -11,6 +11,7 @@ from pathlib import Path
 from beers_deploy.model.shipped import INT8, shipped_names, shipped_weights
 from beers_deploy.network_files import Conditioned
 from beers_deploy.quant.onnx_file import save_onnx
+from beers_deploy.quant.passes.effort import Effort
 from beers_deploy.quantization import family_model
 
 WEIGHTS = Path(__file__).parents[2] / "model" / "weights"
@@ -29,7 +30,8 @@ def main() -> None:
     for name in arguments.names:
         shipped = WEIGHTS / f"{name}{INT8}.onnx"
         network = Conditioned(name, shipped_weights(name))
-        save_onnx(family_model(network, arguments.images), shipped)
+        int8 = family_model(network, arguments.images, effort=Effort.best)
+        save_onnx(int8, shipped)
         print(shipped.name, flush=True)
 
 

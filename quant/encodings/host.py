@@ -14,6 +14,7 @@ ask for is a fault.
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,38 @@ def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None)
         [_result(core, tile_px)],
     )
     return make_model(graph, {**about, KEY: describe(core)}, microsoft=True)
+
+
+def part_model(core: IntCore, start: int, stop: int) -> onnx.ModelProto:
+    """Return operations `start` to `stop` of a core on onnxruntime, from the tensors in front of
+    them that they read to those that are read behind them.
+    """
+    writer = HostWriter()
+    part = core.ops[start:stop]
+    for op in part:
+        _WRITERS[type(op)](writer, core, op)
+    written = {op.output for op in part}
+    reads = dict.fromkeys(chain.from_iterable(op.inputs for op in part))
+    ends = [
+        [
+            onnx.helper.make_tensor_value_info(name, TensorProto.UINT8, ["N", None, None, None])
+            for name in names
+        ]
+        for names in (
+            [name for name in reads if name not in written],
+            [name for name in live_tensors(core, stop) if name in written],
+        )
+    ]
+    return make_model(writer.graph("part", *ends), {}, microsoft=True)
+
+
+def live_tensors(core: IntCore, at: int) -> list[str]:
+    """Return the tensors in front of operation `at` that it or one behind it reads; behind the last
+    one, the result.
+    """
+    written = [PLANES, *(op.output for op in core.ops[:at])]
+    reads = {CORRECTION, *chain.from_iterable(op.inputs for op in core.ops[at:])}
+    return [name for name in written if name in reads]
 
 
 def _result(core: IntCore, tile_px: int | None) -> onnx.ValueInfoProto:

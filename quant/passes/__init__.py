@@ -2,7 +2,8 @@
 
 - `least_squares`: the scale of each tensor.
 - `residual_groups`: the tensors that adds connect, and those that stand alone.
-- `equalize`, `equalize_single`: factors for the channels of both; `trial`: what factors cost.
+- `equalize`, `equalize_single`: factors for the channels of both; `trial`: what factors cost;
+  `effort`: how many are tried.
 - `dual_range`: the result in copies of several scales.
 - `finetune`: the integers trained with their rounding.
 - `selection`: the passes to apply; `benchmarks/ablation.py` measures what each buys.

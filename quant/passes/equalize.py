@@ -6,11 +6,12 @@ network.
    rounded finer for a larger k, and one that overflows is clipped less for a smaller k.
 2. Behind ReLU6 raise k until int8 ends at the six, so that its clip stands for that of ReLU6.
 3. Guess k = range^-gamma for a few gammas, and a few shares of int8's range for the widest channel.
-4. Try each channel larger and smaller on crops of calibration images, because what counts is what a
-   channel's rounding does to the output. A trial that is worse on the costliest crops is given up.
+4. Try channels larger and smaller on crops of calibration images, because what counts is what a
+   channel's rounding does to the output: each by itself, or groups of similar range together. A
+   trial that is worse on the costliest crops is given up.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -37,16 +38,13 @@ HEADROOM = (0.64, 0.8, 1.0, 1.25)
 Above 1 the largest values are clipped.
 """
 
+FIRST_GUESSES = len(GAMMAS) * len(HEADROOM)
+
 FULL = INT8_MAX * 2.0**-GROUP_FRAC_BITS
 """Where int8 ends in tensors that are equalised."""
 
 STEPS = (1.5, 1.2)
 """Factors by which each channel is tried larger and smaller, a sweep each."""
-
-MOST_CHANNELS = 256
-"""More are not tried one by one: each costs four runs of all crops at most, hours in a wide
-network.
-"""
 
 FIRST_CROPS = 2
 MARGIN = 0.003
@@ -66,7 +64,13 @@ def equalize(graph: Graph, group: ResidualGroup, factors: np.ndarray) -> Graph:
             # 2. Below this factor int8 would end beyond the six, and ReLU could not stand for
             # ReLU6.
             factors[part] = np.maximum(factors[part], FULL / op.ceilings)
-    return tuple(_scaled(op, factors, group) if isinstance(op, Conv) else op for op in graph)
+    return tuple(
+        _scaled(op, factors, group)
+        if isinstance(op, Conv) and group.keys() & {op.input, op.output}
+        # Left as the same object, so that it is not rounded again.
+        else op
+        for op in graph
+    )
 
 
 def _scaled(op: Conv, factors: np.ndarray, group: ResidualGroup) -> Conv:
@@ -136,8 +140,22 @@ def first_guess(ranges: np.ndarray, gamma: float, headroom: float) -> np.ndarray
     return np.asarray(factors * headroom * FULL / (ranges * factors).max())
 
 
-def search(graph: Graph, group: ResidualGroup, ranges: np.ndarray, trial: Trial) -> np.ndarray:
-    """Return the factors of least error: the best first guess, then channel by channel."""
+def search(
+    graph: Graph,
+    group: ResidualGroup,
+    ranges: np.ndarray,
+    trial: Trial,
+    channels: Sequence[np.ndarray],
+) -> np.ndarray:
+    """Return the factors of least error: the best first guess, then step by step.
+
+    Args:
+        graph: of which the group is.
+        group: to be equalized.
+        ranges: of its channels, (C,).
+        trial: of candidates.
+        channels: the numbers of those that are tried larger and smaller together.
+    """
 
     def costs_of(factors: np.ndarray) -> Costs:
         return trial(equalize(graph, group, factors))
@@ -150,21 +168,20 @@ def search(graph: Graph, group: ResidualGroup, ranges: np.ndarray, trial: Trial)
         for guess in others:
             best = race(costs_of(guess), guess, best)
             bar.advance()
-    # 4. One channel after the other takes hours in a wide network.
-    channels = range(len(ranges)) if len(ranges) <= MOST_CHANNELS else ()
+    # 4.
     return stepped(costs_of, channels, best).factors
 
 
 def stepped(
-    costs_of: Callable[[np.ndarray], Costs], channels: Iterable[int], best: "Best"
+    costs_of: Callable[[np.ndarray], Costs], channels: Sequence[np.ndarray], best: "Best"
 ) -> "Best":
-    """Return the best factors once each of these channels has been tried larger and smaller."""
+    """Return the best factors once these channels have been tried larger and smaller."""
     trials = list(product(STEPS, channels))
-    with steps("channels", len(trials)) as bar:
-        for size, channel in trials:
+    with steps("groups of channels", len(trials)) as bar:
+        for size, together in trials:
             for factor in (size, 1 / size):
                 candidate = best.factors.copy()
-                candidate[channel] *= factor
+                candidate[together] *= factor
                 winner = race(costs_of(candidate), candidate, best)
                 if winner is not best:
                     best = winner

@@ -11,15 +11,16 @@ powers of two.
 3. Try the guesses on all tensors together, because the error of the worst hides what the others
    gain.
 4. Try them on one tensor after the other, from the last, because what is rounded late reaches the
-   result. Then try each of its channels larger and smaller.
+   result. Then try its channels larger and smaller, each by itself or groups of them together.
 
 Next to a residual group this made no network of dense convolutions better that is made for one
 sensor. It helps those with depthwise ones. It helps those behind a bank too, where one file serves
 sensors of little noise and of much, and what lies inside a block is small in most channels.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -27,8 +28,8 @@ import numpy as np
 from beers_deploy.model.progress import steps
 from beers_deploy.quant.graph import Conv, Graph
 from beers_deploy.quant.host_part import HostPart
+from beers_deploy.quant.passes.effort import MOST_GROUPS, Effort, Stage, channel_groups
 from beers_deploy.quant.passes.equalize import (
-    MOST_CHANNELS,
     QUANTILE,
     Best,
     above_dead,
@@ -38,7 +39,7 @@ from beers_deploy.quant.passes.equalize import (
     stepped,
 )
 from beers_deploy.quant.passes.residual_groups import GROUP_FRAC_BITS, only
-from beers_deploy.quant.passes.trial import Costs, Trial
+from beers_deploy.quant.passes.trial import Costs, Trial, Trials
 
 GAMMAS = (0.0, 0.25, 0.5, 1.0)
 HEADROOM = (0.5, 0.75, 1.0, 1.4)
@@ -88,6 +89,31 @@ class SingleTensors:
         ends = np.cumsum([0, *self.widths]).tolist()
         return dict(zip(self.tensors, map(slice, ends, ends[1:]), strict=True))
 
+    def tried_alone(self, most_groups: int) -> tuple[str, ...]:
+        """Return the tensors that are tried one by one."""
+        few = self.by_channel or len(self.tensors) <= FEW_TENSORS
+        return self.tensors if few and most_groups else ()
+
+    def guesses_alone(self, effort: Effort) -> bool:
+        """Return True if the first guesses are tried on each tensor, too.
+
+        Where groups of channels are tried, these gained nothing by it (measured).
+        """
+        return not self.by_channel or effort is Effort.best
+
+    def stages(self, effort: Effort) -> list[Stage]:
+        """Return the stages of the search for their factors."""
+        guesses = len(GAMMAS) * len(HEADROOM)
+        alone = guesses if self.guesses_alone(effort) else 0
+        widths = dict(zip(self.tensors, self.widths, strict=True))
+        return [
+            Stage(self.tensors, 1 + guesses),
+            *(
+                Stage([name], alone, widths[name] if self.by_channel else 0)
+                for name in self.tried_alone(MOST_GROUPS[effort])
+            ),
+        ]
+
     def scaled(self, graph: Graph, factors: np.ndarray) -> Graph:
         """Return the same network with each channel scaled by its factor."""
         for name, part in self.parts.items():
@@ -130,38 +156,72 @@ def _over_tiles(
 
 
 def equalize_single(
-    graph: Graph, singles: SingleTensors, ranges: np.ndarray, start: np.ndarray, trial: Trial
+    graph: Graph,
+    singles: SingleTensors,
+    ranges: np.ndarray,
+    start: np.ndarray,
+    trials: Trials,
+    effort: Effort,
+    most_groups: int,
 ) -> np.ndarray:
-    """Return the factors of least error, never more than that of `start`."""
+    """Return the factors of least error, never more than that of `start`.
+
+    Args:
+        graph: of which the tensors are.
+        singles: to be equalized.
+        ranges: of their channels, (sum of the channels,).
+        start: factors, of the same shape.
+        trials: of candidates.
+        effort: of the search.
+        most_groups: most groups of channels that are tried larger and smaller; 0 for the guesses
+            for all tensors alone.
+    """
     weights_of = {
         op.output: np.abs(op.weight).max((1, 2, 3)) for op in graph if isinstance(op, Conv)
     }
-    tensors = [(part, ranges[part], weights_of[name]) for name, part in singles.parts.items()]
+    parts = singles.parts
 
-    def costs_of(factors: np.ndarray) -> Costs:
-        return trial(singles.scaled(graph, factors))
-
-    def guessed(best: Best, group: list[tuple[slice, np.ndarray, np.ndarray]]) -> Best:
+    def guessed(best: Best, names: Sequence[str], costs_of: Callable[[np.ndarray], Costs]) -> Best:
         """Return the best of the first guesses for these tensors, the others as they are."""
-        for shape in product(GAMMAS, HEADROOM):
-            candidate = best.factors.copy()
-            for part, sizes, weights in group:
-                candidate[part] = _guess(sizes, weights, *shape)
-            best = _better(candidate, costs_of, best)
+        shapes = list(product(GAMMAS, HEADROOM))
+        with steps("first guesses", len(shapes)) as bar:
+            for shape in shapes:
+                candidate = best.factors.copy()
+                for name in names:
+                    part = parts[name]
+                    candidate[part] = _guess(ranges[part], weights_of[name], *shape)
+                best = _better(candidate, costs_of, best)
+                bar.advance()
         return best
 
     # 3.
-    best = guessed(Best(start, costs_of(start)(None)), tensors)
-    if not singles.by_channel and len(tensors) > FEW_TENSORS:
-        return best.factors
-    with steps("tensors", len(tensors)) as bar:
+    trial = trials(graph, singles.tensors)
+
+    def costs_of_all(factors: np.ndarray) -> Costs:
+        return trial(singles.scaled(graph, factors))
+
+    best = guessed(Best(start, costs_of_all(start)(None)), singles.tensors, costs_of_all)
+    alone = singles.tried_alone(most_groups)
+    with steps("tensors", len(alone)) as bar:
         # 4.
-        for tensor in reversed(tensors):
-            best = guessed(best, [tensor])
-            if singles.by_channel and len(ranges) <= MOST_CHANNELS:
-                best = stepped(costs_of, range(tensor[0].start, tensor[0].stop), best)
+        for name in reversed(alone):
+            part = parts[name]
+            others = best.factors.copy()
+            others[part] = 1.0
+            base = singles.scaled(graph, others)
+            costs_of = partial(_costs_of_one, trials(base, [name]), base, name, part)
+            if singles.guesses_alone(effort):
+                best = guessed(best, [name], costs_of)
+            if singles.by_channel:
+                groups = channel_groups(ranges[part], most_groups)
+                best = stepped(costs_of, [group + part.start for group in groups], best)
             bar.advance()
     return best.factors
+
+
+def _costs_of_one(trial: Trial, graph: Graph, name: str, part: slice, factors: np.ndarray) -> Costs:
+    """Return what it costs to scale one tensor of a graph by its part of the factors."""
+    return trial(equalize(graph, only(name), factors[part]))
 
 
 def _better(factors: np.ndarray, costs_of: Callable[[np.ndarray], Costs], best: Best) -> Best:

@@ -6,22 +6,26 @@
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 import numpy as np
-import onnx
 
-from beers_deploy.quant.graph import CORRECTION, Graph, graph_to_onnx
-from beers_deploy.quant.host_part import HostPart
+from beers_deploy.quant.core import IntCore
+from beers_deploy.quant.encodings.host import live_tensors, part_model
+from beers_deploy.quant.graph import CORRECTION, PLANES, Graph, graph_to_onnx
+from beers_deploy.quant.host_part import ZERO, HostPart
+from beers_deploy.quant.passes.effort import span
 from beers_deploy.quant.session import (
     TILE_PX,
     crops,
     halo_of,
     open_session,
-    result_of,
     tensor_values,
 )
+
+T = TypeVar("T")
 
 SEARCH_CROPS = 16
 """What equalization is searched on, a quarter of them with the strongest edges: there int8 clips.
@@ -36,12 +40,31 @@ decide alone.
 Costs = Callable[[np.ndarray | None], np.ndarray]
 """The cost of one graph in INT8 on the crops of given numbers, or on all of them: an error each."""
 Trial = Callable[[Graph], Costs]
+Trials = Callable[[Graph, Collection[str]], Trial]
+"""A trial of candidates that differ from a graph only where these tensors are written and read."""
+Values = dict[str, np.ndarray]
+"""Tensors (1, C, h, w) uint8 of an integer core, by name."""
 Targets = list[tuple[np.ndarray, np.ndarray]]
 """Degraded crops (1, C, h, w) and their float results, clipped to [0, 1]."""
 
 
-def search_targets(graph: Graph, host_part: HostPart, images: Sequence[np.ndarray]) -> Targets:
-    """Return the crops with the largest corrections, and others of all sizes.
+def crop_count(crop: np.ndarray, available: int) -> int:
+    """Return on how many crops of the size of this one (1, C, h, w) a search measures, at most.
+
+    Args:
+        crop: one of them.
+        available: about how many there are; images of other sizes than the first may have more.
+    """
+    height, width = map(int, crop.shape[2:])
+    count = max(SEARCH_CROPS * TILE_PX**2 // (height * width), SEARCH_CROPS)
+    return min(count, MOST_CROPS, max(available, SEARCH_CROPS))
+
+
+def search_targets(
+    graph: Graph, host_part: HostPart, images: Sequence[np.ndarray], count: int
+) -> Targets:
+    """Return the crops with the largest corrections, and others of all sizes: `count` of them, if
+    there are so many.
 
     Only the sizes of corrections are stored; the images of the chosen are simulated once more.
     """
@@ -62,8 +85,6 @@ def search_targets(graph: Graph, host_part: HostPart, images: Sequence[np.ndarra
         for n, crop in enumerate(crops(image, halo_px)):
             sizes[k, n] = size(crop)
     order = sorted(sizes, key=lambda place: sizes[place], reverse=True)
-    height, width = map(int, crops(images[0], halo_px)[0].shape[2:])
-    count = min(max(SEARCH_CROPS * TILE_PX**2 // (height * width), SEARCH_CROPS), MOST_CROPS)
     # 2. int8 clips the largest corrections, so a quarter of the crops are those that hold them.
     hard = count // 4
     others = order[hard :: max((len(order) - hard) // (count - hard), 1)]
@@ -73,35 +94,107 @@ def search_targets(graph: Graph, host_part: HostPart, images: Sequence[np.ndarra
     return [(crop, restored(crop)) for crop in selection]
 
 
-def crop_costs(model: onnx.ModelProto, targets: Targets) -> Costs:
-    """Return a function for the root mean squared difference of an integer network from the float
-    one, by crop.
+class CropTrials:
+    """Measures what candidates cost on crops, running again only what they change.
 
-    Squared, because clipping is rare and must count; its root, so that no single crop that clips
-    decides alone. It is relative to what the float network changes in the crop: a loss of PSNR is
-    relative too, and in absolute terms bright crops with large corrections would outweigh the dark
-    ones, where the same step costs most.
+    What lies in front of the first changed operation is computed once. What lies behind the last
+    one stays one session.
     """
-    # 3.
-    session = open_session(model, threads=1)
 
-    def cost(number: int) -> float:
-        image, target = targets[number]
-        return rms(result_of(session, image) - target) / changes[number]
+    def __init__(self, core_of: Callable[[Graph], IntCore], targets: Targets) -> None:
+        """Measure candidates rounded by `core_of` against the float results of `targets`."""
+        self.core_of = core_of
+        self.targets = targets
+        # Without an image of the result's size there is no change to compare with.
+        same_size = all(image.shape == target.shape for image, target in targets)
+        self.changes = [
+            _rms(target - image) + LEAST_CHANGE if same_size else 1.0 for image, target in targets
+        ]
 
-    def rms(values: np.ndarray) -> float:
-        return float(np.sqrt(np.square(values, dtype=np.float64).mean()))
+    def __call__(self, graph: Graph, names: Collection[str]) -> Trial:
+        """Return a trial of candidates that differ from `graph` only where these tensors are
+        written and read.
+        """
+        start, stop = span(graph, names)
+        core = self.core_of(graph)
+        encode = core.host_part.encode
+        images = [
+            {PLANES: (encode(image).astype(np.int16) + ZERO).astype(np.uint8)}
+            for image, _ in self.targets
+        ]
+        front = _Part(core, 0, start)
+        values = _on_all_cores(lambda number: front(images[number]), range(len(images)))
+        behind = _Part(core, stop, len(core.ops))
 
-    # Without an image of the result's size there is no change to compare with.
-    same_size = all(image.shape == target.shape for image, target in targets)
-    changes = [
-        rms(target - image) + LEAST_CHANGE if same_size else 1.0 for image, target in targets
-    ]
+        def trial(candidate: Graph) -> Costs:
+            rounded = self.core_of(candidate)
+            # A scale that has to move may move others, also far from what was changed.
+            if _same_outside(core, rounded, start, stop):
+                return self._costs([_Part(rounded, start, stop), behind], values, rounded)
+            return self._costs([_Part(rounded, 0, len(rounded.ops))], images, rounded)
 
-    def of(crops: np.ndarray | None) -> np.ndarray:
-        # Small crops keep cores busier one to each than all on one: threads that share a crop wait
-        # for each other.
-        with ThreadPoolExecutor(os.cpu_count()) as cores:
-            return np.array(list(cores.map(cost, range(len(targets)) if crops is None else crops)))
+        return trial
 
-    return of
+    def _costs(self, parts: "list[_Part]", values: list[Values], core: IntCore) -> Costs:
+        """Return a function for the root mean squared difference of an integer network from the
+        float one, by crop.
+
+        Squared, because clipping is rare and must count; its root, so that no single crop that
+        clips decides alone. It is relative to what the float network changes in the crop: a loss of
+        PSNR is relative too, and in absolute terms bright crops with large corrections would
+        outweigh the dark ones, where the same step costs most.
+        """
+
+        # 3.
+        def cost(number: int) -> float:
+            image, target = self.targets[number]
+            tensors = values[number]
+            for part in parts:
+                tensors = part(tensors)
+            result = (tensors[CORRECTION] - np.float32(ZERO)) * np.float32(core.scale(CORRECTION))
+            restored = core.host_part.restore(image, result, core.scale(CORRECTION))
+            return _rms(restored - target) / self.changes[number]
+
+        everything = np.arange(len(self.targets))
+        return lambda crops: np.array(_on_all_cores(cost, everything if crops is None else crops))
+
+
+class _Part:
+    """Operations `start` to `stop` of a core, on uint8 tensors."""
+
+    def __init__(self, core: IntCore, start: int, stop: int) -> None:
+        self.passed_on = live_tensors(core, stop)
+        self.session = open_session(part_model(core, start, stop), 1) if start < stop else None
+
+    def __call__(self, values: Values) -> Values:
+        """Return the tensors that are read behind the part."""
+        if self.session is None:
+            return values
+        feeds = {each.name: values[each.name] for each in self.session.get_inputs()}
+        names = [each.name for each in self.session.get_outputs()]
+        results = values | dict(zip(names, self.session.run(names, feeds), strict=True))
+        return {name: results[name] for name in self.passed_on}
+
+
+def _same_outside(one: IntCore, other: IntCore, start: int, stop: int) -> bool:
+    """Return True if two cores have the same operations and scales outside a part."""
+    # Convolutions that were not rounded again are the same objects.
+    same = [a is b for a, b in zip(one.ops, other.ops, strict=True)]
+    within = {op.output for op in one.ops[start:stop]} - {*live_tensors(one, stop)}
+    scales = (core.frac_bits.items() for core in (one, other))
+    differing = {name for name, _ in set.symmetric_difference(*map(set, scales))}
+    return all(same[:start]) and all(same[stop:]) and differing <= within
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.square(values, dtype=np.float64).mean()))
+
+
+def _on_all_cores(compute: Callable[[int], T], numbers: Iterable[int]) -> list[T]:
+    """Return what is computed for each crop.
+
+    Small crops keep cores busier one to each than all on one: threads that share a crop wait for
+    each other.
+    """
+    with ThreadPoolExecutor(os.cpu_count()) as cores:
+        return list(cores.map(compute, numbers))

@@ -41,6 +41,7 @@ from beers_deploy.quant.host_part import (
     HostPart,
 )
 from beers_deploy.quant.integer.arithmetic import convolve
+from beers_deploy.quant.passes.effort import Effort
 from beers_deploy.quant.passes.equalize_single import SingleTensors
 from beers_deploy.quant.passes.residual_groups import residual_groups, single_tensors
 from beers_deploy.quant.passes.selection import ALL, Passes
@@ -198,6 +199,7 @@ def quantize_behind_bank(
     images: Sequence[np.ndarray],
     shifts: Shifts = SHIFTS,
     passes: Passes = ALL,
+    effort: Effort = Effort.normal,
 ) -> ConditionedCore:
     """Quantise a network behind a bank; its core is for the middle of the range of sensors.
 
@@ -207,8 +209,9 @@ def quantize_behind_bank(
         images: of `bank_results`, of sensors from the whole range.
         shifts: the windows of the target.
         passes: that reduce the error.
+        effort: of the search for equalization factors.
     """
-    body, _ = rounded(_plan(weights, shifts, passes), images)
+    body, _ = rounded(_plan(weights, shifts, passes, effort), images)
     biases = {op.name: _biases(op) for op in body.convolutions}
     # A sensor's values are constant, so their planes become part of the biases.
     ops = tuple(
@@ -260,7 +263,7 @@ def _biases(op: IntConv) -> np.ndarray:
     return np.concatenate([op.float_bias[:, None], values], 1)
 
 
-def _plan(weights: Weights, shifts: Shifts, passes: Passes) -> Plan:
+def _plan(weights: Weights, shifts: Shifts, passes: Passes, effort: Effort) -> Plan:
     """Return the plan to quantise the body, which reads a bank's results."""
     graph = body_graph(weights)
     scale = weights.variant.scale
@@ -268,7 +271,7 @@ def _plan(weights: Weights, shifts: Shifts, passes: Passes) -> Plan:
     host_part = HostPart(width, scale**2, adds_image=False, encoding=Direct(), decoding=DualRange())
     inner = tuple(single_tensors(graph))
     singles = SingleTensors(inner, (weights.variant.features,) * len(inner), by_channel=False)
-    return Plan(graph, host_part, residual_groups(graph), singles, shifts, passes)
+    return Plan(graph, host_part, residual_groups(graph), singles, shifts, passes, effort)
 
 
 PATCHES = 80

@@ -25,10 +25,12 @@ from beers_deploy.quant.graph import (
 from beers_deploy.quant.host_part import IMAGE_SLICES, HostPart, Plain
 from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.passes import equalize_single as single
-from beers_deploy.quant.passes.equalize import FULL, MOST_CHANNELS
+from beers_deploy.quant.passes.effort import Effort
+from beers_deploy.quant.passes.equalize import FULL
 from beers_deploy.quant.passes.equalize_single import SingleTensors, single_ranges
 from beers_deploy.quant.passes.residual_groups import GROUP_FRAC_BITS, single_tensors
 from beers_deploy.quant.passes.trial import Costs
+from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.simplify.simplify import simplify
 from examples.networks import build, to_onnx
@@ -130,9 +132,10 @@ class Bowl:
         return lambda crops: np.array([1.0, 2.0])[slice(None) if crops is None else crops] * off
 
 
-@pytest.mark.parametrize("most", [MOST_CHANNELS, 10])
-def test_the_search_never_ends_above_its_start(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(single, "MOST_CHANNELS", most)
+@pytest.mark.parametrize(
+    ("effort", "most_groups"), [(Effort.fast, 0), (Effort.normal, 3), (Effort.best, 256)]
+)
+def test_the_search_never_ends_above_its_start(effort: Effort, most_groups: int) -> None:
     _, graph, host_part, singles = read("espcn")
     ranges = single_ranges(graph, singles, images(), host_part)
     trial = Bowl(graph)
@@ -140,7 +143,9 @@ def test_the_search_never_ends_above_its_start(most: int, monkeypatch: pytest.Mo
         np.ones(sum(singles.widths)),
         np.concatenate([trial.lowest, np.ones(singles.widths[1])]),
     ):
-        factors = single.equalize_single(graph, singles, ranges, start, trial)
+        factors = single.equalize_single(
+            graph, singles, ranges, start, lambda *_: trial, effort, most_groups
+        )
         before, after = (
             trial(singles.scaled(graph, trial_factors))(None).sum()
             for trial_factors in (start, factors)
@@ -175,8 +180,6 @@ def test_unequal_channels_err_half_as_much_once_they_are_equalized(
     """A network whose channels differ thirtyfold, as training with batch
     normalisation leaves them.
     """
-    # Only the first guesses are tried, because the search of each channel takes half a minute.
-    monkeypatch.setattr(single, "MOST_CHANNELS", 0)
     network = build("dncnn", torch.Generator().manual_seed(0))
     layers = [
         layer
@@ -194,12 +197,12 @@ def test_unequal_channels_err_half_as_much_once_they_are_equalized(
     patches = patches_of(image_list)
 
     def mae() -> float:
-        int8 = quickly(model, patches)
+        int8 = quantize_model(model, patches, {}, effort=Effort.fast)
         return compare(open_session(model), open_session(int8.host), patches).mae
 
     equalized = mae()
     monkeypatch.setattr(
         "beers_deploy.quant.quantize.equalize_single",
-        lambda _graph, _chain, _ranges, start, _trial: start,
+        lambda _graph, _chain, _ranges, start, *_: start,
     )
     assert equalized < 0.5 * mae()

@@ -25,8 +25,10 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.host_part import FINE_MAX, GAIN, DualRange, Plain
 from beers_deploy.quant.passes.dual_range import with_copies
+from beers_deploy.quant.passes.effort import Stage, channel_groups
 from beers_deploy.quant.passes.equalize import (
     FIRST_CROPS,
+    FIRST_GUESSES,
     channel_ranges,
     equalize,
     first_guess,
@@ -164,7 +166,9 @@ CROPS = 5
 RANGES = np.geomspace(1, 0.05, 8)
 
 
-def searched(graph: Graph, weights: np.ndarray) -> tuple[list[float], float, list[int]]:
+def searched(
+    graph: Graph, weights: np.ndarray, most_groups: int = 8
+) -> tuple[list[float], float, list[int]]:
     """What each first guess costs, what the search ends at, and how many crops each trial ran on.
 
     The cost on each crop is known: how far the channels are from factors of their own, times the
@@ -187,7 +191,8 @@ def searched(graph: Graph, weights: np.ndarray) -> tuple[list[float], float, lis
 
         return of
 
-    factors = search(graph, group_of(graph), RANGES, trial)
+    channels = channel_groups(RANGES, most_groups)
+    factors = search(graph, group_of(graph), RANGES, trial, channels)
     pairs = product((0.5, 0.75, 1.0), (0.64, 0.8, 1.0, 1.25))
     guesses = [first_guess(RANGES, g, h) for g, h in pairs]
     ends = [
@@ -208,13 +213,21 @@ def test_the_search_ends_below_its_best_guess_and_drops_a_trial_that_fails_on_it
     assert runs.count(FIRST_CROPS) > len(runs) / 3
 
 
-def test_a_wide_group_is_not_searched_channel_by_channel(
-    graph: Graph, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("beers_deploy.quant.passes.equalize.MOST_CHANNELS", 7)
-    guesses, cost, runs = searched(graph, np.arange(1.0, CROPS + 1))
+def test_without_groups_of_channels_the_search_ends_with_the_best_guess(graph: Graph) -> None:
+    guesses, cost, runs = searched(graph, np.arange(1.0, CROPS + 1), 0)
     assert cost == min(guesses)
     assert len(runs) == len(guesses)
+
+
+def test_more_groups_of_channels_try_more_and_never_end_higher(graph: Graph) -> None:
+    ends = [searched(graph, np.arange(1.0, CROPS + 1), most)[1:] for most in (0, 2, 4, 8)]
+    costs = [cost for cost, _ in ends]
+    assert costs == sorted(costs, reverse=True)
+    counts = [len(runs) for _, runs in ends]
+    assert counts == sorted(counts)
+    stage = Stage(group_of(graph), FIRST_GUESSES, len(RANGES))
+    for most, count in zip((0, 2, 4, 8), counts, strict=True):
+        assert count <= stage.candidates(most)
 
 
 def test_a_trial_that_the_costliest_crops_favour_still_has_to_win_on_all(graph: Graph) -> None:
@@ -270,4 +283,4 @@ def test_each_step_is_named(float_onnx: onnx.ModelProto, patches: Patches) -> No
     with reporting(reported.append), progress("calibrating"):
         quickly(float_onnx, patches)
     names = [step.what.removeprefix("calibrating: ") for step in reported]
-    assert [name.split(" ")[0] for name in names] == ["scale", "equalizing"]
+    assert [name.split(" ")[0] for name in names] == ["scale", "float", "equalizing"]

@@ -1,0 +1,162 @@
+"""Bound the search for equalization factors, and estimate its time before it begins.
+
+1. Count the work of a candidate: the multiply-accumulates of the operations that it runs again, and
+   what rounding and loading its weights takes.
+2. Where the likely work is too much, try fewer groups of channels, then measure on fewer crops.
+3. Where the most work that is possible is too much, go on until it is not.
+
+Work is counted and not timed, because the same samples and seed must give the same file.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from beers_deploy.quant.graph import Activation, Conv, Graph, Op, tensors
+from beers_deploy.quant.host_part import HostPart
+from beers_deploy.quant.session import values_of
+
+
+class Effort(StrEnum):
+    """How long the search for equalization factors may take.
+
+    - `fast`: first guesses alone.
+    - `normal`: groups of channels with similar ranges, within a bound of work.
+    - `best`: each channel by itself, without a bound.
+    """
+
+    fast = "fast"
+    normal = "normal"
+    best = "best"
+
+
+MOST_GROUPS = {Effort.fast: 0, Effort.normal: 16, Effort.best: 256}
+"""Of the channels of a tensor or residual group, to be tried together."""
+FEWEST_GROUPS = 8
+FEWEST_CROPS = 24
+"""With fewer much of the gain was lost (measured), so that they may exceed the likely work: a
+quarter with 4 groups in a U-Net, all with 12 crops of 64 pixels in a residual network.
+"""
+LIKELY_WORK = 7e11
+MOST_WORK = 2e12
+"""Multiply-accumulates: what the search should take, and what it must not exceed. On a processor
+without VNNI 1e10 took half a second to a second.
+"""
+LEAST_CROPS = 4
+
+RESULT = 64
+LEAKY_RESULT = 512
+WEIGHT = 400
+"""Multiply-accumulates that take as long as rounding a result, computing a LeakyReLU in float64,
+and rounding and loading a weight (measured).
+"""
+TRIED = 0.35
+"""Share of the crops that a candidate is run on before it is given up, on average (measured)."""
+TURNS = 4
+"""Candidates of a group of channels: larger and smaller, in two sizes."""
+
+
+def channel_groups(ranges: np.ndarray, most: int) -> list[np.ndarray]:
+    """Return the numbers of the channels to be tried together, for ranges (C,): neighbours in size.
+
+    There is one group for each channel if `most` allows.
+    """
+    if most >= len(ranges):
+        return list(np.arange(len(ranges))[:, None])
+    return np.array_split(np.argsort(ranges, kind="stable"), most) if most else []
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One search: of a residual group, of a tensor, or of all single tensors together.
+
+    Attributes:
+        tensors: whose channels are scaled.
+        guesses: number of first guesses.
+        channels: number of channels that are tried larger and smaller; 0 for first guesses alone.
+    """
+
+    tensors: Collection[str]
+    guesses: int
+    channels: int = 0
+
+    def candidates(self, groups: int) -> int:
+        """Return the largest number of candidates with so many groups of channels."""
+        return self.guesses + TURNS * min(groups, self.channels)
+
+
+@dataclass(frozen=True)
+class Bound:
+    """What a search may take.
+
+    Attributes:
+        groups: most groups of channels of a tensor or residual group.
+        crops: number of crops that candidates are run on.
+        candidates: most candidates.
+        runs: likely work, in runs of the first candidate on all crops.
+    """
+
+    groups: int
+    crops: int
+    candidates: int
+    runs: float
+
+
+def bound(
+    stages: Sequence[Stage], graph: Graph, work: Sequence[int], crops: int, effort: Effort
+) -> Bound:
+    """Return what a search may take.
+
+    Args:
+        stages: of the search.
+        graph: that is searched.
+        work: of each operation on one crop.
+        crops: number of crops, if there is no bound.
+        effort: allowed.
+    """
+
+    def of_candidate(stage: Stage, crops: float) -> float:
+        start, stop = span(graph, stage.tensors)
+        weights = sum(op.weight.size for op in graph[start:stop] if isinstance(op, Conv))
+        return WEIGHT * weights + crops * sum(work[start:])
+
+    def total(groups: int, crops: float) -> float:
+        return sum(stage.candidates(groups) * of_candidate(stage, crops) for stage in stages)
+
+    groups = MOST_GROUPS[effort]
+    if effort is not Effort.best:
+        # 2.
+        while groups > FEWEST_GROUPS and total(groups, TRIED * crops) > LIKELY_WORK:
+            groups -= 1
+        while crops // 2 >= FEWEST_CROPS and total(groups, TRIED * crops) > LIKELY_WORK:
+            crops //= 2
+        # 3.
+        while crops > LEAST_CROPS and total(groups, crops) > MOST_WORK:
+            crops //= 2
+        while groups and total(groups, crops) > MOST_WORK:
+            groups -= 1
+    candidates = sum(stage.candidates(groups) for stage in stages)
+    first = of_candidate(Stage(tensors(graph), 1), crops)
+    return Bound(groups, crops, candidates, total(groups, TRIED * crops) / first)
+
+
+def span(graph: Graph, names: Collection[str]) -> tuple[int, int]:
+    """Return where the operations that write or read these tensors begin and end."""
+    places = [k for k, op in enumerate(graph) if not {*op.inputs, op.output}.isdisjoint(names)]
+    return places[0], places[-1] + 1
+
+
+def work_of(graph: Graph, host_part: HostPart, crop: np.ndarray) -> list[int]:
+    """Return the work of each operation on a crop (1, C, h, w)."""
+    # 1.
+    (results,) = values_of(graph, tensors(graph), [crop], host_part)
+    return [result.size * _of_result(op) for op, result in zip(graph, results, strict=True)]
+
+
+def _of_result(op: Op) -> int:
+    if not isinstance(op, Conv):
+        return RESULT
+    rounding = LEAKY_RESULT if op.activation is Activation.leaky_relu else RESULT
+    return int(op.weight[0].size) + rounding
