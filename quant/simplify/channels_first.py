@@ -13,7 +13,14 @@ TO_LAST = [0, 2, 3, 1]
 
 
 def channels_first(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Return the network with the channels of image and result first; not changed if they are."""
+    """Return the network with the channels of image and result first.
+
+    Args:
+        model: a float network; not changed.
+
+    Returns:
+        A network of (N, C, H, W), the given one if its image is not transposed first.
+    """
     graph = OnnxGraph(model)
     images = [name for name in graph.inputs if _is_transposed(graph.readers[name], TO_FIRST)]
     results = [

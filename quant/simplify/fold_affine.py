@@ -46,7 +46,16 @@ def add_negated(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
 
 def negate_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Negate what is subtracted by a convolution of its own, and add the result (1)."""
+    """Negate what is subtracted by a convolution of its own, and add the result (1).
+
+    Args:
+        shapes: of each float tensor.
+        graph: that the node belongs to; its constants are extended.
+        node: any node.
+
+    Returns:
+        The convolution and the Add, None if the node is no Sub of two maps of known channels.
+    """
     constants = [name for name in node.inputs if name in graph.constants]
     size = shapes.get(node.inputs[1], ()) if node.op_type == "Sub" and not constants else ()
     if len(size) != 4 or size[1] < 1:

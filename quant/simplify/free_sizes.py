@@ -79,7 +79,13 @@ def _of_size(model: onnx.ModelProto, rows: int, columns: int, fold: Fold) -> onn
 
 
 def _sized(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> list[Node] | None:
-    """Return what takes the place of a node whose input has a known size (2)."""
+    """Return what takes the place of a node whose input has a known size (2).
+
+    Args:
+        graph: that the node belongs to; its constants are extended.
+        node: any node.
+        sizes: of each tensor, for the images that are tried.
+    """
     source = node.inputs[0] if node.inputs else ""
     before = sizes.get(source, ())
     after = sizes.get(node.outputs[0], ())
@@ -110,7 +116,17 @@ def _sized(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> l
 def _with_written_maps(
     graph: OnnxGraph, node: Node, before: tuple[int, ...], after: tuple[int, ...]
 ) -> list[Node] | None:
-    """Return a Concat whose constant maps are written by convolutions with weights of zero."""
+    """Return a Concat whose constant maps are written by convolutions with weights of zero.
+
+    Args:
+        graph: that the node belongs to; its constants are extended.
+        node: the Concat.
+        before: sizes (N, C, H, W) of its first input, which the convolutions read.
+        after: sizes of its result.
+
+    Returns:
+        The convolutions and the Concat, None if a constant is no map of one number a channel.
+    """
     source = node.inputs[0]
     maps = {name: graph.constants[name] for name in node.inputs if name in graph.constants}
     is_map = all(

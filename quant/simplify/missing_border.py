@@ -20,7 +20,14 @@ MOST_PX = 128
 
 
 def with_missing_border(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Return a network whose result lacks no border; as it is if none is missing."""
+    """Return a network whose result lacks no border.
+
+    Args:
+        model: a float network without needless nodes; not changed.
+
+    Returns:
+        The network with a Pad in front, the given one if no border is missing.
+    """
     windows = [node for node in model.graph.node if node.op_type in WINDOWS]
     # Zeros that a layer pads with would lie beyond the mirrored border, not at the image's.
     border_px = 0 if any(map(_is_padded, windows)) else _missing_px(model)

@@ -18,7 +18,15 @@ SLOPE_AND_OFFSET = {"alpha": 1 / 6, "beta": 0.5}
 
 
 def join_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a Clip or a Max that is a ReLU (1)."""
+    """Replace a Clip or a Max that is a ReLU (1).
+
+    Args:
+        graph: that the node belongs to.
+        node: any node.
+
+    Returns:
+        The ReLU, None if the node is something else.
+    """
     source = None
     if node.op_type == "Clip":
         low = _scalar(graph, node, 1)
@@ -36,7 +44,15 @@ def join_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
 
 def join_hard_swish(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a node that completes a HardSwish, or a HardSigmoid, by it (2)."""
+    """Replace a node that completes a HardSwish, or a HardSigmoid, by it (2).
+
+    Args:
+        graph: that the node belongs to.
+        node: any node; what stands in front of it goes where nothing else reads it.
+
+    Returns:
+        The activation, None if the node completes none.
+    """
     result = node.outputs[0]
     clipped = _sixth_of(graph, node) or ""
     shifted = _shifted_and_clipped(graph, clipped)

@@ -24,7 +24,16 @@ Part = tuple[str, np.ndarray]
 
 
 def split_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Return operations that compute the parts of a map (1)."""
+    """Return operations that compute the parts of a map (1).
+
+    Args:
+        shapes: of each float tensor.
+        graph: that the node belongs to; its constants are extended.
+        node: any node.
+
+    Returns:
+        The operations that take the node's place, None if it takes no parts.
+    """
     parts = _parts(graph, node, shapes)
     source = node.inputs[0] if parts else ""
     only_parts = all(_parts(graph, reader, shapes) for reader in graph.readers[source])
@@ -61,9 +70,18 @@ def _parts(graph: OnnxGraph, node: Node, shapes: Shapes) -> list[Part]:
 def _divide(
     graph: OnnxGraph, source: str, shapes: Shapes, channels: np.ndarray, name: str
 ) -> list[Node]:
-    """Return what computes some channels of a map, of which nobody needs the whole (2)."""
+    """Return what computes some channels of a map, of which nobody needs the whole (2).
+
+    Args:
+        graph: its constants are extended by the weights of the part.
+        source: the map.
+        shapes: of each float tensor.
+        channels: the numbers of the channels, (C,).
+        name: of the part.
+    """
     before = graph.writers.get(source)
     divided_name = f"{name}.{before.op_type}" if before else ""
+    # An activation works on each value by itself, so it is repeated behind the part.
     if before is not None and before.op_type in POINTWISE:
         inner = f"{name}.before"
         behind = Node.of(before.written())
@@ -76,6 +94,7 @@ def _divide(
     weight = graph.constants[before.inputs[1]]
     groups = before.attributes.get("group", 1)
     is_depthwise = groups == len(weight) and weight.shape[1] == 1
+    # The channels of a group read others of their group, which the part need not have.
     if groups != 1 and not is_depthwise:
         return _select(graph, source, len(weight), channels, name)
     inputs = [before.inputs[0], graph.add_constant(f"{divided_name}.weight", weight[channels])]
@@ -85,6 +104,7 @@ def _divide(
     attributes = dict(before.attributes)
     nodes: list[Node] = []
     if groups != 1:
+        # A depthwise kernel reads the channel that it writes, so the map in front has parts too.
         inputs[0] = f"{name}.before"
         attributes["group"] = len(channels)
         nodes = _part_of(graph, before.inputs[0], shapes, channels, inputs[0])

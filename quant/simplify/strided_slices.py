@@ -17,7 +17,16 @@ BLOCKS = (2, 3, 4)
 
 
 def unshuffle_slices(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Return the pixel unshuffle that a Concat of slices is (1)."""
+    """Return the pixel unshuffle that a Concat of slices is (1).
+
+    Args:
+        shapes: of each float tensor.
+        graph: that the node belongs to; convolutions that read the result get other weights.
+        node: any node.
+
+    Returns:
+        The unshuffle, None if the node is something else.
+    """
     if node.op_type != "Concat" or node.attributes.get("axis") not in (1, -3):
         return None
     origins = {_origin(graph, name)[0] for name in node.inputs}
@@ -58,10 +67,18 @@ def _origin(graph: OnnxGraph, name: str) -> tuple[str, list[Node]]:
 
 
 def _order(graph: OnnxGraph, node: Node, channels: int, block: int) -> np.ndarray | None:
-    """Return the unshuffle's channels in the order of a Concat, or None if pixels differ."""
+    """Return the unshuffle's channels in the order of a Concat, or None if pixels differ.
+
+    Args:
+        graph: that the slices belong to.
+        node: the Concat.
+        channels: of the map that is sliced.
+        block: side of the unshuffle's blocks in pixels.
+    """
     shape = (1, channels, 4 * block, 6 * block)
     image = np.arange(np.prod(shape)).reshape(shape)
     parts = []
+    # Each pixel has a number of its own, so that the result says where each one went.
     for name in node.inputs:
         part = image
         for each in _origin(graph, name)[1]:
@@ -75,6 +92,7 @@ def _order(graph: OnnxGraph, node: Node, channels: int, block: int) -> np.ndarra
                 places[axis] = slice(start, stop, by)
             part = part[tuple(places)]
         parts.append(part)
+    # ONNX's SpaceToDepth has the place in the block before the channel.
     blocks = image.reshape(channels, 4, block, 6, block).transpose(2, 4, 0, 1, 3)
     unshuffled = blocks.reshape(1, block**2 * channels, 4, 6)
     if any(part.shape[2:] != unshuffled.shape[2:] for part in parts):
