@@ -1,4 +1,4 @@
-"""Eleven small networks, trained briefly: what `benchmarks.int8_peers` and `benchmarks.ablation`
+"""Thirteen small networks, trained briefly: what `benchmarks.int8_peers` and `benchmarks.ablation`
 quantise.
 
 What each learns from stands in `examples.samples`.
@@ -23,7 +23,7 @@ from torch.nn import functional
 from beers_deploy.model.metrics.fidelity import psnr_db
 from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.session import open_session, result_of
-from examples.networks import ESPCN, DnCNN
+from examples.networks import DPU_SLOPE, ESPCN, DnCNN
 from examples.samples import batches_of
 
 SIDE_PX = 64
@@ -127,6 +127,83 @@ def residual() -> nn.Module:
     return Added(nn.Conv2d(1, DENSE, 3, padding=1), *blocks, nn.Conv2d(DENSE, 1, 3, padding=1))
 
 
+class Distillation(nn.Module):
+    """RFDN's block: three times a part of the features is put aside, and all parts are joined (Liu
+    et al., 2020), without its attention and with the DPU's slope.
+    """
+
+    def __init__(self, features: int = DENSE) -> None:
+        super().__init__()
+        act = nn.LeakyReLU(DPU_SLOPE)
+        half = features // 2
+        self.aside = nn.ModuleList(conv(features, half, act, 1) for _ in range(3))
+        self.refine = nn.ModuleList(nn.Conv2d(features, features, 3, padding=1) for _ in range(3))
+        self.last = conv(features, half, act)
+        self.join = nn.Conv2d(4 * half, features, 1)
+        self.act = act
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The same shape."""
+        parts = []
+        for aside, refine in zip(self.aside, self.refine, strict=True):
+            parts.append(aside(x))
+            x = self.act(refine(x) + x)
+        joined: Tensor = self.join(torch.cat([*parts, self.last(x)], 1))
+        return joined
+
+
+class RFDN(nn.Module):
+    """Two blocks of distillation, their results joined, a long residual and a global add."""
+
+    def __init__(self, features: int = DENSE) -> None:
+        super().__init__()
+        self.head = nn.Conv2d(1, features, 3, padding=1)
+        self.blocks = nn.ModuleList(Distillation(features) for _ in range(2))
+        self.join = conv(2 * features, features, nn.LeakyReLU(DPU_SLOPE), 1)
+        self.smooth = nn.Conv2d(features, features, 3, padding=1)
+        self.tail = nn.Conv2d(features, 1, 3, padding=1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Images (N, 1, H, W) to the same."""
+        head = self.head(image)
+        x = head
+        results = []
+        for block in self.blocks:
+            x = block(x)
+            results.append(x)
+        correction: Tensor = self.tail(self.smooth(self.join(torch.cat(results, 1))) + head)
+        return image + correction
+
+
+class Gated(nn.Module):
+    """NAFNet's block without layer normalisation and attention: half of the features times the
+    other half (Chen et al., 2022).
+    """
+
+    def __init__(self, features: int = DENSE) -> None:
+        super().__init__()
+        wide = 2 * features
+        self.spread = nn.Conv2d(features, wide, 1)
+        self.filter = nn.Conv2d(wide, wide, 3, padding=1, groups=wide)
+        self.narrow = nn.Conv2d(features, features, 1)
+        self.mix = nn.Conv2d(features, wide, 1)
+        self.end = nn.Conv2d(features, features, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The same shape."""
+        first, second = self.filter(self.spread(x)).chunk(2, 1)
+        x = x + self.narrow(first * second)
+        first, second = self.mix(x).chunk(2, 1)
+        result: Tensor = x + self.end(first * second)
+        return result
+
+
+def gated() -> nn.Module:
+    """NAFNet's blocks at one size, with a global add."""
+    tail = nn.Conv2d(DENSE, 1, 3, padding=1)
+    return Added(nn.Conv2d(1, DENSE, 3, padding=1), Gated(), Gated(), tail)
+
+
 NETWORKS: dict[str, tuple[str, Callable[[], nn.Module]]] = {
     "depthwise, ReLU6": ("dncnn", lambda: depthwise(nn.ReLU6())),
     "depthwise, ReLU": ("dncnn", lambda: depthwise(nn.ReLU())),
@@ -139,6 +216,8 @@ NETWORKS: dict[str, tuple[str, Callable[[], nn.Module]]] = {
     "residual": ("dncnn", residual),
     "DnCNN": ("dncnn", lambda: DnCNN(6)),
     "ESPCN": ("espcn", ESPCN),
+    "RFDN": ("dncnn", RFDN),
+    "NAF-like": ("dncnn", gated),
 }
 """By name, what each learns from (`examples.samples`) and how it is made."""
 
