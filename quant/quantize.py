@@ -256,7 +256,7 @@ def _equalized(
     # The time is only reported: what is tried depends on counted work alone.
     start = time.perf_counter()
     trials(graph, tensors(graph))(graph)(None)
-    seconds = (time.perf_counter() - start) * limit.runs
+    seconds = max((time.perf_counter() - start) * limit.runs, 1)
     logger.info(
         "equalization tries at most %d candidates, in about %.0f s", limit.candidates, seconds
     )
