@@ -57,7 +57,14 @@ def free_sizes(model: onnx.ModelProto, fold: Fold) -> onnx.ModelProto:
 
 
 def _of_size(model: onnx.ModelProto, rows: int, columns: int, fold: Fold) -> onnx.ModelProto:
-    """Return the network for images of one size, where the file leaves the size free (1, 2)."""
+    """Return the network for images of one size, where the file leaves the size free (1, 2).
+
+    Args:
+        model: a float network; not changed.
+        rows: of the image.
+        columns: of the image.
+        fold: folds the constants of a network.
+    """
     network = deepcopy(model)
     for value in network.graph.input:
         dims = value.type.tensor_type.shape.dim

@@ -77,7 +77,12 @@ def _missing_px(model: onnx.ModelProto) -> int:
 
 
 def _result_size(model: onnx.ModelProto, size: tuple[int, int]) -> tuple[int, ...]:
-    """Return rows and columns of the result for an image of this size; empty if not known."""
+    """Return rows and columns of the result for an image of this size; empty if not known.
+
+    Args:
+        model: a float network of one input and one result.
+        size: rows and columns of the image.
+    """
     if len(model.graph.input) != 1 or len(model.graph.output) != 1:
         return ()
     network = onnx.ModelProto()

@@ -48,7 +48,13 @@ def split_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] |
 
 
 def _parts(graph: OnnxGraph, node: Node, shapes: Shapes) -> list[Part]:
-    """Return the parts that a node takes from a map of known channels; none of another node."""
+    """Return the parts that a node takes from a map of known channels; none of another node.
+
+    Args:
+        graph: that the node belongs to.
+        node: any node.
+        shapes: of each float tensor.
+    """
     source = shapes.get(node.inputs[0], ()) if node.inputs else ()
     if len(source) != 4 or source[1] < 1:
         return []
@@ -114,7 +120,15 @@ def _divide(
 def _part_of(
     graph: OnnxGraph, source: str, shapes: Shapes, channels: np.ndarray, name: str
 ) -> list[Node]:
-    """Return what computes some channels of a map that is read by one node, or by several."""
+    """Return what computes some channels of a map that is read by one node, or by several.
+
+    Args:
+        graph: its constants are extended.
+        source: the map.
+        shapes: of each float tensor.
+        channels: the numbers of the channels, (C,).
+        name: of the part.
+    """
     if graph.n_reads(source) == 1:
         return _divide(graph, source, shapes, channels, name)
     return _select(graph, source, shapes[source][1], channels, name)
@@ -123,7 +137,15 @@ def _part_of(
 def _select(
     graph: OnnxGraph, source: str, width: int, channels: np.ndarray, name: str
 ) -> list[Node]:
-    """Return a convolution of one pixel that selects channels of `width` (3)."""
+    """Return a convolution of one pixel that selects channels (3).
+
+    Args:
+        graph: its constants are extended.
+        source: the map.
+        width: channels of the map.
+        channels: the numbers of those that are selected, (C,).
+        name: of the part.
+    """
     node_name = f"{name}.Conv"
     weight = np.eye(width, dtype=np.float32)[channels][..., None, None]
     constant = graph.add_constant(f"{node_name}.weight", weight)

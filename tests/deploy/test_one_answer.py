@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -28,13 +29,16 @@ class Drawn(GraphWriter):
         self._generator = np.random.default_rng(GENERATOR)
 
     def number(self, value: float, *shape: int) -> str:
+        """Write a constant of one value and return its name."""
         name = f"number_{len(self.nodes)}_{value}"
         return self.constant(name, np.full(shape, value, np.float32))
 
-    def add(self, kind: str, *sources: str, **attributes: object) -> str:
+    def add(self, kind: str, *sources: str, **attributes: Any) -> str:
+        """Write a node and return its result."""
         return self.node(kind, f"t{len(self.nodes)}", list(sources), **attributes)
 
     def conv(self, source: str, outputs: int, inputs: int, pad: int | None = None) -> str:
+        """Write a convolution of 3 x 3 with drawn weights and return its result."""
         pad = self._pad if pad is None else pad
         weight = self._generator.normal(0, 0.3, (outputs, inputs, 3, 3))
         name = self.constant(f"w{len(self.nodes)}", weight.astype(np.float32))
@@ -46,6 +50,7 @@ Part = Callable[[Drawn, str], str]
 
 
 def split_gate(w: Drawn, source: str) -> str:
+    """Write NAFNet's gate."""
     wide = w.conv(source, 2 * CHANNELS, CHANNELS)
     names = [f"{wide}.a", f"{wide}.b"]
     node = helper.make_node("Split", [wide], names, f"{wide}.split", axis=1)
@@ -54,6 +59,7 @@ def split_gate(w: Drawn, source: str) -> str:
 
 
 def hard_swish(w: Drawn, source: str) -> str:
+    """Write HardSwish as exporters spell it out."""
     clipped = w.add("Clip", w.add("Add", source, w.number(3)), w.number(0), w.number(6))
     return w.add("Mul", source, w.add("Div", clipped, w.number(6)))
 
@@ -113,6 +119,10 @@ def drawn(
 def test_commands_do_not_contradict_each_other(
     tmp_path_factory: pytest.TempPathFactory, parts: list[str], **shape: bool
 ) -> None:
+    """A network that check passes has integers that check passes, and that run.
+
+    One that check refuses is refused by quantize, or has integers that check refuses.
+    """
     path = drawn(tmp_path_factory.mktemp("drawn") / "a.onnx", parts, **shape)
     blocks = np.random.default_rng(1).uniform(0, 1, (4, 1, 4, 4)).astype(np.float32)
     samples = np.kron(blocks, np.ones((8, 8), np.float32))

@@ -32,26 +32,34 @@ Act = Callable[[GraphWriter, str, str], str]
 
 
 def silu(w: GraphWriter, x: str, name: str) -> str:
+    """x * Sigmoid(x), as exporters write it."""
     return w.node("Mul", name, [x, w.node("Sigmoid", f"{name}.gate", [x])])
 
 
 def quick_gelu(w: GraphWriter, x: str, name: str) -> str:
+    """x * Sigmoid(1.702 x), as exporters write it."""
     factor = w.constant("1.702", np.array(1.702, np.float32))
-    return w.node(
-        "Mul", name, [w.node("Sigmoid", f"{name}.s", [w.node("Mul", f"{name}.c", [x, factor])]), x]
-    )
+    scaled = w.node("Mul", f"{name}.c", [x, factor])
+    gate = w.node("Sigmoid", f"{name}.s", [scaled])
+    return w.node("Mul", name, [gate, x])
 
 
 def gated(w: GraphWriter, x: str, name: str) -> str:
     """A Sigmoid that multiplies another tensor."""
-    return w.node("Mul", name, [conv(w, x, f"{name}.other"), w.node("Sigmoid", f"{name}.s", [x])])
+    other = conv(w, x, f"{name}.other")
+    gate = w.node("Sigmoid", f"{name}.s", [x])
+    return w.node("Mul", name, [other, gate])
 
 
 def leaky(slope: float) -> Act:
+    """LeakyReLU of a slope."""
+
     return lambda w, x, name: w.node("LeakyRelu", name, [x], alpha=slope)
 
 
 def prelu(*slopes: float) -> Act:
+    """PReLU of one slope, or one a channel."""
+
     def write(w: GraphWriter, x: str, name: str) -> str:
         values = np.array(slopes, np.float32).reshape(-1, 1, 1)
         return w.node("PRelu", name, [x, w.constant(f"{name}.slope", values)])
@@ -60,6 +68,8 @@ def prelu(*slopes: float) -> Act:
 
 
 def hard_sigmoid(slope: float, offset: float) -> Act:
+    """A HardSigmoid that multiplies another tensor."""
+
     def write(w: GraphWriter, x: str, name: str) -> str:
         gate = w.node("HardSigmoid", f"{name}.gate", [x], alpha=slope, beta=offset)
         return w.node("Mul", name, [conv(w, x, f"{name}.other"), gate])

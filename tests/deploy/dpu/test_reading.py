@@ -64,7 +64,7 @@ def test_a_board_file_keeps_only_the_conversions_at_its_border_and_its_numbers(
 @pytest.mark.parametrize(
     ("attributes", "expected"),
     [
-        ({"pads": [0, 0, 0, 0]}, (5, 35, 35)),
+        ({"pads": [0, 0, 1, 1]}, (5, 36, 36)),
         ({"strides": [2, 2]}, (5, 19, 19)),
         ({"dilations": [3, 3], "pads": [3, 3, 3, 3]}, (5, 37, 37)),
         ({"auto_pad": "SAME_UPPER", "strides": [2, 2], "pads": [0, 0, 0, 0]}, (5, 19, 19)),

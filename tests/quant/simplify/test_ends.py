@@ -16,6 +16,7 @@ IMAGE = np.random.default_rng(4).uniform(0, 1, (1, CHANNELS, 18, 23)).astype(np.
 
 
 def test_a_network_of_channels_last_becomes_one_of_channels_first() -> None:
+    """TensorFlow's exporters leave a Transpose at either end."""
     first = [0, 3, 1, 2]
     last = [0, 2, 3, 1]
     nodes = [
@@ -40,6 +41,7 @@ def test_a_network_of_channels_last_becomes_one_of_channels_first() -> None:
 
 @pytest.mark.parametrize("layers", [1, 2, 5])
 def test_the_image_of_a_network_without_padding_is_mirrored(layers: int) -> None:
+    """Inside the border it computes what it computed before."""
     tensors = ["x", *(f"c{k}" for k in range(1, layers)), "y"]
     model = made([conv(a, b, pad_px=0) for a, b in pairwise(tensors)])
     short = simplify(model, "a.onnx")
@@ -51,6 +53,7 @@ def test_the_image_of_a_network_without_padding_is_mirrored(layers: int) -> None
 
 
 def test_layers_with_and_without_padding_together_are_refused() -> None:
+    """Zeros that a layer pads with would lie beyond a mirrored border."""
     model = made([conv(), conv("c", "y", pad_px=0)])
     short = simplify(model, "a.onnx")
     assert [n.op_type for n in short.graph.node] == ["Conv", "Conv"]

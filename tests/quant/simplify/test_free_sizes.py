@@ -4,6 +4,7 @@ import io
 import warnings
 from collections import Counter
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import onnx
@@ -30,6 +31,7 @@ class PaddedUNet(nn.Module):
         self.tail = nn.Conv2d(2 * FEATURES, 1, 1)
 
     def enlarged(self, deep: Tensor, fine: Tensor) -> Tensor:
+        """Return deep features at the size of fine ones, (1, F, H, W)."""
         up: Tensor = self.up(deep)
         rows = fine.size(2) - up.size(2)
         columns = fine.size(3) - up.size(3)
@@ -37,6 +39,7 @@ class PaddedUNet(nn.Module):
         return functional.pad(up, sides)
 
     def forward(self, image: Tensor) -> Tensor:
+        """Images (N, 1, H, W) to the same."""
         fine = torch.relu(self.fine(image))
         deep = torch.relu(self.deep(functional.max_pool2d(fine, 2)))
         result: Tensor = self.tail(torch.cat([self.enlarged(deep, fine), fine], 1))
@@ -47,9 +50,11 @@ class ResizedUNet(PaddedUNet):
     """Enlarges to the size of the skip, and clips."""
 
     def enlarged(self, deep: Tensor, fine: Tensor) -> Tensor:
+        """Return deep features at the size of fine ones, (1, F, H, W)."""
         return functional.interpolate(deep, size=fine.shape[2:], mode="bilinear")
 
     def forward(self, image: Tensor) -> Tensor:
+        """Images (N, 1, H, W) to the same."""
         return torch.clamp(image + super().forward(image), 0, 1)
 
 
@@ -63,6 +68,7 @@ class Gated(nn.Module):
         self.tail = nn.Conv2d(FEATURES, 1, 1)
 
     def forward(self, image: Tensor) -> Tensor:
+        """Images (N, 1, H, W) to the same."""
         first, second = self.deep(self.wide(image)).chunk(2, 1)
         correction: Tensor = self.tail(first * second)
         return image + correction
@@ -77,6 +83,7 @@ class NoiseLevel(nn.Module):
         self.tail = nn.Conv2d(FEATURES, 1, 3, padding=1)
 
     def forward(self, image: Tensor) -> Tensor:
+        """Images (N, 1, H, W) to the same."""
         level = torch.full((1, 1, 1, 1), 0.1)
         level = level.expand(1, 1, image.shape[2], image.shape[3])
         result: Tensor = self.tail(torch.relu(self.head(torch.cat([image, level], 1))))
@@ -91,24 +98,18 @@ def exported(module: nn.Module) -> onnx.ModelProto:
             numbers.uniform_(-0.5, 0.5, generator=generator)
     file = io.BytesIO()
     axes = {"input": {2: "height", 3: "width"}, "output": {2: "h", 3: "w"}}
-    names = {"input_names": ["input"], "output_names": ["output"]}
+    how: dict[str, Any] = {"input_names": ["input"], "output_names": ["output"]}
+    how |= {"dynamic_axes": axes, "opset_version": 17, "dynamo": False}
     image = torch.zeros(1, 1, 32, 32)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        torch.onnx.export(
-            module.eval(),
-            (image,),
-            file,
-            dynamo=False,
-            opset_version=17,
-            dynamic_axes=axes,
-            **names,
-        )
+        torch.onnx.export(module.eval(), (image,), file, **how)  # type: ignore[arg-type]
     return onnx.load_model_from_string(file.getvalue())
 
 
 @pytest.mark.parametrize("make", [PaddedUNet, ResizedUNet, Gated, NoiseLevel])
 def test_sizes_are_gone_and_results_are_the_same(make: Callable[[], nn.Module]) -> None:
+    """Also for sides that are no multiples of 64, as far as the network halves them evenly."""
     model = exported(make())
     short = simplify(model, "a.onnx")
     left = Counter(node.op_type for node in short.graph.node)
@@ -124,11 +125,13 @@ class Cropped(nn.Module):
     """Uses a tenth of its rows more than once, whatever their number."""
 
     def forward(self, image: Tensor) -> Tensor:
+        """Images (N, 1, H, W) to the same."""
         rows = image.shape[2] // 10
         return torch.cat([image, image[:, :, :rows]], 2)
 
 
 def test_what_depends_on_the_size_stays_and_is_refused() -> None:
+    """The reason says what to do about it."""
     model = simplify(exported(Cropped()), "a.onnx")
     assert any(node.op_type == "Shape" for node in model.graph.node)
     assert "Export it with fixed height and width" in refusal(model)
