@@ -30,6 +30,7 @@ from beers_deploy.profiles.errors import (
 from beers_deploy.profiles.toml import read_whole, unreadable
 from beers_deploy.quant.domains import IR_VERSION, MICROSOFT, OPSET, opset_of
 from beers_deploy.quant.onnx.external_weights import take_in
+from beers_deploy.quant.onnx.node_order import sort_nodes
 from beers_deploy.quant.onnx.runnable import check_runnable
 from beers_deploy.quant.simplify.simplify import simplify
 from beers_deploy.quant.simplify.training_mode import require_inference
@@ -102,6 +103,7 @@ def parse_onnx(
             take_in(model, path)
         # Before onnx's checker, which looks for the files that weights are said to be in.
         check_content(model, where)
+        sort_nodes(model.graph)
         onnx.checker.check_model(model)
     except BeersError:
         raise

@@ -241,6 +241,11 @@ def _input_shape(
             "another `tile`."
         )
     other_sides = {size for size in sizes[2:] if size} - {side}
+    if list(sizes[2:]) == [1, 1] and side > 1:
+        raise ModelError(
+            f"The input {printable(name)} of {where} has one pixel, so it is a parameter and no "
+            "image. Export the network with it as a constant."
+        )
     if other_sides:
         fixed = f"{_side_px(sizes[3], places)} x {_side_px(sizes[2], places)}"
         raise ModelError(

@@ -48,15 +48,20 @@ NORMALISES = (
     "It normalizes each image, or each pixel, by its own statistics. Train the network with batch "
     "normalization, which becomes part of the convolutions, or without normalization."
 )
+STATISTICS = (
+    "It is a statistic of all channels or of the whole image, as layer normalization and some "
+    "attention have it. Train the network with batch normalization, which becomes part of the "
+    "convolutions, and with global average pooling."
+)
 OF_ONE_SIZE = (
     "The network computes with the size of its image. Export it with fixed height and width."
 )
 REMEDIES = {
     **dict.fromkeys(("Flatten", "Gemm", "MatMul", "NonMaxSuppression", "Softmax"), NO_IMAGE),
     **dict.fromkeys(
-        ("GroupNormalization", "InstanceNormalization", "LayerNormalization", "ReduceMean"),
-        NORMALISES,
+        ("GroupNormalization", "InstanceNormalization", "LayerNormalization"), NORMALISES
     ),
+    **dict.fromkeys(("ReduceL2", "ReduceMax", "ReduceMean", "ReduceSum"), STATISTICS),
     **dict.fromkeys(("ConstantOfShape", "Expand", "Shape", "Size", "Tile"), OF_ONE_SIZE),
     "Pad": (
         "Pad in the convolution; a network behind a bank is quantised from its weights "
