@@ -127,7 +127,7 @@ def by_table(rows: Iterable[Row]) -> dict[str, list[Row]]:
 
 Bound = Literal["at most", "at least"]
 
-IN_THE_NAME = {"ratio", "node", "layer", "ReLU", "fault", "step", "opset", "size"}
+IN_THE_NAME = {"ratio", "node", "layer", "ReLU", "fault", "step", "opset", "size", "network"}
 """Units that a check's name tells a reader already."""
 
 
