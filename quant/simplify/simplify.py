@@ -10,8 +10,10 @@ network:
    convolution that only it reads, nor in front of convolutions where they are exact. A
    BatchNormalization of images that is left is a depthwise 1 x 1 convolution. Zeros that Pad adds
    are the convolution's own.
-4. Sub of a convolution's result is Add, Sum is Add, a mean over the image is GlobalAveragePool,
-   HardSwish is itself, ReLU6 is Clip from 0 to 6.
+4. Sub of two maps is Add, Sum is Add, a mean over the image is GlobalAveragePool, HardSwish is
+   itself, ReLU6 is Clip from 0 to 6, and a Clip at 0 alone is ReLU. Nothing splits a map: each part
+   is computed by itself. Nothing is computed from the size of the image, unless it decides
+   something. The channels of the image stand first.
 5. Operators are those of opset 17, unless one has no form there.
 6. The result of a network without padding has the image's size, or a multiple of it: the image is
    mirrored beyond its borders.
