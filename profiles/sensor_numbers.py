@@ -2,9 +2,7 @@
 
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.sensor_file import (
-    TABLE_OF,
-)
+from beers_deploy.profiles.sensor_file import TABLE_OF
 
 
 def same_instrument(one: Sensor, other: Sensor) -> bool:
