@@ -133,8 +133,8 @@ class Consistency:
                 itself if None.
         """
         scale = sensor.max_dn if full_scale is None else full_scale
-        kernel = _blur_between(sensor, reference)
-        near = _centre(kernel, NEAR_PX)
+        kernel = blur_between(sensor, reference)
+        near = centre(kernel, NEAR_PX)
         left, values, right = np.linalg.svd(near)
         left = left[:, :RANK]
         values = values[:RANK]
@@ -233,7 +233,7 @@ class Consistency:
         return total
 
 
-def _blur_between(sensor: Instrument, reference: Instrument) -> NDArray[np.float64]:
+def blur_between(sensor: Instrument, reference: Instrument) -> NDArray[np.float64]:
     """The filter H around its first pixel, (GRID, GRID) float64 of sum 1."""
     fy = np.fft.fftfreq(GRID)[:, None]
     fx = np.fft.fftfreq(GRID)[None, :]
@@ -241,7 +241,7 @@ def _blur_between(sensor: Instrument, reference: Instrument) -> NDArray[np.float
     return np.asarray(np.fft.ifft2(ratio / ratio[0, 0]).real)
 
 
-def _centre(kernel: NDArray[np.float64], radius: int) -> NDArray[np.float64]:
+def centre(kernel: NDArray[np.float64], radius: int) -> NDArray[np.float64]:
     """The middle (2 R + 1, 2 R + 1) of a filter that lies around its first element."""
     return np.roll(kernel, (radius, radius), (0, 1))[: 2 * radius + 1, : 2 * radius + 1]
 
@@ -259,7 +259,7 @@ def _far_weights(kernel: NDArray[np.float64], near: NDArray[np.float64]) -> NDAr
     ramp = np.maximum(BLOCK_PX - np.abs(np.fft.fftfreq(GRID, 1 / GRID)), 0)
     overlap = np.outer(ramp, ramp) / BLOCK_PX**2
     summed = np.fft.ifft2(np.fft.fft2(remainder) * np.fft.fft2(overlap)).real
-    weights = _centre(summed[::BLOCK_PX, ::BLOCK_PX], FAR_BLOCKS)
+    weights = centre(summed[::BLOCK_PX, ::BLOCK_PX], FAR_BLOCKS)
     return np.asarray(weights + (1 - near.sum() - weights.sum()) / weights.size)
 
 

@@ -31,6 +31,7 @@ class Output:
         compression: of the TIFF.
         cog: whether it is a Cloud-Optimised GeoTIFF.
         resume: whether a stopped run goes on.
+        self_check: where the map of the self-check is written; None for nowhere.
         others: further files that will be written, which must be no input either.
     """
 
@@ -38,6 +39,7 @@ class Output:
     compression: Compression = "zlib"
     cog: bool = False
     resume: bool = False
+    self_check: Path | None = None
     others: tuple[Path | None, ...] = ()
 
 

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from math import prod
 from pathlib import Path
@@ -24,7 +24,7 @@ from beers_deploy.model.raster.reader import open_raster, require_image_file
 from beers_deploy.model.raster.source import Source, fingerprint, stamps
 from beers_deploy.model.raster.writer import cog_bytes, require_codec
 from beers_deploy.profiles.errors import BeersError, ImageError, MachineError
-from beers_deploy.profiles.figures import Row, measured
+from beers_deploy.profiles.figures import Figure, Row, measured
 from beers_deploy.profiles.sensor_numbers import numbers_of
 from beers_deploy.restoration.bands import in_order
 from beers_deploy.restoration.checkpoint import Checkpoint
@@ -35,6 +35,13 @@ from beers_deploy.restoration.memory import peak_memory
 from beers_deploy.restoration.output import Output, require_tiff_name, what_was_done, write_output
 from beers_deploy.restoration.prepare import Pipeline, Restoration
 from beers_deploy.restoration.radiometry import Reading
+from beers_deploy.restoration.self_check import (
+    BlockMap,
+    check_result,
+    checks_of,
+    require_checkable,
+    write_map,
+)
 from beers_deploy.restoration.tiles.rows import RestoredRow
 from beers_deploy.results import Input, Table
 
@@ -90,20 +97,32 @@ def restore_file(
             logger.info(ALPHA.format(band=stored.raster.bands + 1))
         faults = faults_of(stored, reading.fix_detectors, str(image))
         work = pipeline.prepare(fixed(stored, faults), reading, str(image), cluster)
+        checks = checks_of(reading.sensors, stored.raster, work.out_shape, work.scale.value)
+        require_checkable(output.self_check, checks)
         checkpoint = _checkpoint(output, work, faults)
         done_px = checkpoint.rows
         with _kept_for_resuming(checkpoint, bool(work.row_ends)):
             _finish_rows(checkpoint, work)
+            self_check_started = time.perf_counter()
+            blocks = check_result(work.source, checkpoint.read, checks)
+            self_check_s = time.perf_counter() - self_check_started
             require_unchanged(stored, str(image), before, checkpoint.job["image"])
+            if reading.strict:
+                blocks.require(str(image))
         # All rows are finished: a stop now would save nothing.
         with held_back():
             about = what_was_done(work.networks, work.scale)
             write_output(checkpoint, work.source, output, about)
             write_list(faults, list_beside(out, reading.fix_detectors))
-    # The sensor check is no part of a restoration, and its time is a figure of its own.
-    time_s = time.perf_counter() - started - work.check_s
+            if output.self_check is not None:
+                write_map(output.self_check, blocks, stored.raster)
+    # The two checks are no part of a restoration, and their times are figures of their own.
+    time_s = time.perf_counter() - started - work.check_s - self_check_s
     _warn_of_clipping(work, checkpoint)
+    if blocks.doubt:
+        logger.warning("the result fails the self-check: %s", blocks.doubt)
     row = _row(image.name, work, checkpoint, done_px, time_s, faults)
+    row = replace(row, figures={**row.figures, **_self_check_figures(blocks, self_check_s)})
     listed = reading.fix_detectors not in ("", FOUND)
     return Run(
         title=f"wrote {out}",
@@ -116,8 +135,16 @@ def restore_file(
     )
 
 
-DETAILS = frozenset({"runtime", "sensor check", "work factor"})
+DETAILS = frozenset({"runtime", "sensor check", "self-check", "work factor"})
 """Figures and words for a closer look."""
+
+
+def _self_check_figures(blocks: BlockMap, time_s: float) -> dict[str, Figure]:
+    """Return the figures of the self-check; none where no band has one."""
+    if not blocks.bands:
+        return {}
+    source = "the self-check of all blocks: no part of time and throughput"
+    return {**blocks.figures, "self-check": measured(time_s, "s", source)}
 
 
 def _inputs(work: Restoration) -> list[Input]:

@@ -48,6 +48,7 @@ def restore(
     scheduler: str | None = None,
     cog: bool = False,
     stac: OutputFile | None = None,
+    self_check: OutputFile | None = None,
     strict: bool = False,
     consistency: bool = True,
     exposure: bool = True,
@@ -91,7 +92,10 @@ def restore(
             tcp://host:8786.
         cog: write a Cloud-Optimised GeoTIFF: tiles, overviews and what was done.
         stac: STAC item of the output to write; needs `cog`.
-        strict: refuse an image whose pixels contradict the sensor, instead of a warning.
+        self_check: TIFF to write with one pixel for each block of 64 x 64 pixels: whether the
+            result, blurred as the sensor blurs, agrees with the image.
+        strict: refuse an image whose pixels contradict the sensor, and a result that fails the
+            self-check, instead of a warning.
         consistency: make the result agree with the image at low spatial frequencies, if the sensor
             is named.
         exposure: restore dark parts at a higher exposure (shipped networks).
@@ -149,8 +153,8 @@ def restore(
     if path is None:
         refuse_with(
             "an array",
-            **given("out", "compression", "cog", "stac", "resume", "overwrite", "dry_run"),
-            **given("fix_detectors", "scheduler"),
+            **given("out", "compression", "cog", "stac", "self_check", "resume", "overwrite"),
+            **given("dry_run", "fix_detectors", "scheduler"),
         )
     else:
         refuse_with("an image file, which states its own", **given("nodata"))
@@ -159,6 +163,7 @@ def restore(
     output = None
     if path is not None and not dry_run:
         how = {"compression": compression, "cog": cog, "resume": resume}
+        how["self_check"] = None if self_check is None else Path(self_check)
         output = _output(out, stac, overwrite or resume, fix_detectors or "", **how)
     sensors = sensors_of(sensor)
     unknown = is_unknown(sensors)
@@ -239,7 +244,8 @@ def _output(
         optional("pystac", "stac")
     # The list of faults is an output of its own where they are searched for.
     listed = list_beside(path, fix_detectors)
-    return Output(path, others=(None if stac is None else Path(stac), listed), **how)
+    others = (None if stac is None else Path(stac), listed, how["self_check"])
+    return Output(path, others=others, **how)
 
 
 def _preview(image: Path, pipeline: "NetworkPipeline", reading: "Reading") -> "Table":

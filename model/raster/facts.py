@@ -68,8 +68,9 @@ class Place:
     rpcs: tuple[tuple[str, str], ...] = ()
     area_or_point: str = ""
 
-    def enlarged(self, scale: int) -> "Place":
-        """Return the place of the same image with `scale` times the pixels along either side.
+    def enlarged(self, scale: float) -> "Place":
+        """Return the place of the same image with `scale` times the pixels along either side; fewer
+        of them if `scale` is below 1.
 
         A pixel's corner at (column, row) moves to `scale` times both. Rational polynomials count
         from the middle of the first pixel, so their offsets also move by half a pixel (NITF
@@ -91,7 +92,7 @@ class Place:
         )
 
 
-def _of_smaller_pixels(transform: Any, scale: int) -> Any:
+def _of_smaller_pixels(transform: Any, scale: float) -> Any:
     """Return the affine transform of pixels that are `scale` times smaller along either side."""
     a, b, c, d, e, f = transform[:6]
     return type(transform)(a / scale, b / scale, c, d / scale, e / scale, f)

@@ -1,0 +1,183 @@
+"""What the self-check of `restore` finds, and what it does not.
+
+    python -m benchmarks.self_check --images aerial-test/ [--flips 200] [--networks ...]
+
+It prints three tables, measured on simulated acquisitions of the images:
+
+1. Right restorations under every sensor of the sweep and at 1, 1/4 and 1/20 of the radiance: the
+   number of blocks, of decidable ones, and of those outside the bound.
+2. A file for another sensor, whose MTF at Nyquist is 30 % too low or too high.
+3. Single bit flips in the weights of INT8 networks: of those that cost a block more than 0.5 dB,
+   how many are found, by the block's sharpening.
+"""
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from beers_deploy.model.blocks import Placed
+from beers_deploy.model.self_check import BLOCK_PX, Judged, SelfCheck
+from beers_deploy.model.simulator.procedural import load_scenes
+from beers_deploy.network import Network
+from beers_deploy.network_files import conditioned
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.quant.encodings import host_model, read_core
+from beers_deploy.restoration.method import network_method
+from beers_deploy.restoration.steps import BOTH
+from beers_deploy.studies.evaluation.methods import network_restore, profile_of
+from beers_deploy.studies.evaluation.pairs import NamedPair, scenes_at, simulate_pairs
+from beers_deploy.studies.evaluation.sweep import conditions
+from beers_deploy.studies.stress.faults import flip_weights
+
+WRONG = (0.7, 1.3)
+RADIANCES = (1.0, 0.25, 0.05)
+COSTLY_DB = 0.5
+CLASSES = (0, 10, 20, 30, 40, 60, 100, np.inf)
+"""Of the sharpening, for the tables."""
+PEAK_DN = 4095.0
+
+NOMINAL = Sensor.load("pleiades-degraded")
+REFERENCE = Sensor.load("pleiades-reference").nominal()
+
+
+def judged(check: SelfCheck, raw: np.ndarray, restored: np.ndarray) -> Judged:
+    """Judge a whole image."""
+    return check.judge(raw, restored, *(Placed(side, 0, 0, side) for side in raw.shape))
+
+
+def restorer(name: str, sensor: Instrument):
+    """Return what restores digital numbers by a shipped network conditioned on a sensor."""
+    weights = conditioned(Path(name.removesuffix("-int8")))
+    profile = profile_of(sensor, NOMINAL)
+    network = Network.for_sensor(weights, profile, int8=name.endswith("-int8"))
+    return network_restore(network, profile, REFERENCE, BOTH)
+
+
+def pairs_at(images: Path, sensor: Instrument, radiance: float, seed: int) -> list[NamedPair]:
+    """Simulate acquisitions of the images."""
+    scenes = scenes_at(radiance, load_scenes(images, REFERENCE, seed))
+    return simulate_pairs(scenes, sensor, REFERENCE.in_units_of(sensor), seed)[0]
+
+
+def flat(parts: list[Judged]) -> Judged:
+    """Return the known blocks of several images in one row."""
+    chi2, sharpening = (
+        np.concatenate([getattr(part, name).ravel() for part in parts])
+        for name in ("chi2", "sharpening")
+    )
+    known = np.isfinite(chi2)
+    return Judged(chi2[known], sharpening[known])
+
+
+def by_class(blocks: Judged) -> str:
+    """Return the share of blocks outside the bound, by sharpening."""
+    words = []
+    for low, high in pairwise(CLASSES):
+        inside = (blocks.sharpening >= low) & (blocks.sharpening < high)
+        if inside.any():
+            share = blocks.outside[inside].mean()
+            words.append(f"{low:g}-{high:g}: {share:.1%} of {inside.sum()}")
+    return ", ".join(words)
+
+
+def right(images: Path, names: list[str], seed: int) -> Iterator[str]:
+    """Yield a line for each network: what is flagged of right restorations."""
+    instrument = NOMINAL.nominal()
+    cases = [(sensor, 1.0) for sensor in conditions(instrument, NOMINAL).values()]
+    cases += [(instrument, radiance) for radiance in RADIANCES[1:]]
+    for name in names:
+        parts = []
+        for sensor, radiance in cases:
+            check = SelfCheck.of(sensor, REFERENCE.in_units_of(sensor))
+            restore = restorer(name, sensor)
+            raws = [pair.degraded for pair in pairs_at(images, sensor, radiance, seed)]
+            parts += [judged(check, raw, restore(raw)) for raw in raws]
+        blocks = flat(parts)
+        yield (
+            f"{name}: {blocks.chi2.size} blocks, {np.count_nonzero(blocks.decidable)} decidable, "
+            f"{np.count_nonzero(blocks.outside)} outside; largest chi2 {blocks.chi2.max():.3f}; "
+            f"99.9 % {np.quantile(blocks.chi2, 0.999):.3f}; {by_class(blocks)}"
+        )
+
+
+def wrong(images: Path, names: list[str], seed: int) -> Iterator[str]:
+    """Yield a line for each network and wrong MTF: what is found, by sharpening."""
+    sensor = NOMINAL.nominal()
+    check = SelfCheck.of(sensor, REFERENCE.in_units_of(sensor))
+    pairs = pairs_at(images, sensor, 1.0, seed)
+    for name in names:
+        for factor in WRONG:
+            restore = restorer(name, replace(sensor, mtf_nyquist=factor * sensor.mtf_nyquist))
+            parts = [judged(check, pair.degraded, restore(pair.degraded)) for pair in pairs]
+            yield f"{name}, MTF x {factor:g}: {by_class(flat(parts))}"
+
+
+def block_db(restored: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Return the PSNR of each whole block in dB."""
+    height, width = (side // BLOCK_PX * BLOCK_PX for side in truth.shape)
+    squared = np.square(restored - truth, dtype=np.float64)[:height, :width]
+    blocks = squared.reshape(height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX)
+    return np.asarray(10 * np.log10(PEAK_DN**2 / blocks.mean(axis=(1, 3))))
+
+
+def flips(images: Path, name: str, count: int, seed: int) -> str:
+    """Return a line: of the flips that cost a block too much, how many are found."""
+    sensor = NOMINAL.nominal()
+    reference = REFERENCE.in_units_of(sensor)
+    check = SelfCheck.of(sensor, reference)
+    weights = conditioned(Path(name.removesuffix("-int8")))
+    network = Network.for_sensor(weights, profile_of(sensor, NOMINAL), int8=True)
+    core = read_core(network.model)
+    pairs = pairs_at(images, sensor, 1.0, seed)
+    sound = network_method(network.model, PEAK_DN, {}, sensor, reference)
+    costly = found = costly_flips = found_flips = 0
+    before: dict[int, np.ndarray] = {}
+    for draw in range(count):
+        generator = np.random.default_rng([seed, draw])
+        model = host_model(flip_weights(core, 1, generator), {})
+        number = draw % len(pairs)
+        pair = pairs[number]
+        if number not in before:
+            before[number] = block_db(sound(pair.degraded), pair.noise_free)
+        restored = network_method(model, PEAK_DN, {}, sensor, reference)(pair.degraded)
+        loss_db = before[number] - block_db(restored, pair.noise_free)
+        blocks = judged(check, pair.degraded, restored)
+        rows, columns = loss_db.shape
+        whole = np.s_[:rows, :columns]
+        hurt = (loss_db > COSTLY_DB) & blocks.decidable[whole] & np.isfinite(blocks.chi2[whole])
+        costly += np.count_nonzero(hurt)
+        found += np.count_nonzero(hurt & blocks.outside[whole])
+        if hurt.any():
+            costly_flips += 1
+            found_flips += bool((hurt & blocks.outside[whole]).any())
+    return (
+        f"{name}: {count} flips, {costly_flips} cost a decidable block more than {COSTLY_DB:g} dB, "
+        f"{found_flips} of them found; {found} of {costly} such blocks"
+    )
+
+
+def main() -> None:
+    """Print the three tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--images", type=Path, required=True)
+    parser.add_argument("--networks", default="convbeers-xs,convbeers-xs-int8,convbeers-s-int8")
+    parser.add_argument("--flips", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    names = arguments.networks.split(",")
+    for line in wrong(arguments.images, names, arguments.seed):
+        print(line, flush=True)
+    for name in names:
+        if name.endswith("-int8"):
+            print(flips(arguments.images, name, arguments.flips, arguments.seed), flush=True)
+    for line in right(arguments.images, names, arguments.seed):
+        print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()

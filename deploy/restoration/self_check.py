@@ -1,0 +1,227 @@
+"""The self-check of a restored image: run over all of its rows, reported, refused and written.
+
+`model.self_check` judges blocks. Here each band is read once more from the image and from the
+finished rows, the blocks are counted, and the map of them can be written as a GeoTIFF.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from beers_deploy.model.blocks import Placed
+from beers_deploy.model.io.files import whole_file
+from beers_deploy.model.progress import steps
+from beers_deploy.model.raster.facts import BandInfo, Raster
+from beers_deploy.model.raster.source import Source, strips
+from beers_deploy.model.raster.writer import ArrayPixels, write_raster
+from beers_deploy.model.self_check import (
+    BLOCK_PX,
+    LEAST_SHARPENING,
+    MOST_CHI2,
+    REACH_PX,
+    Judged,
+    SelfCheck,
+)
+from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.figures import Figure, measured
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import BLIND
+from beers_deploy.restoration.bands import in_order
+
+ROWS_PX = 4 * BLOCK_PX
+COLUMNS_PX = 32 * BLOCK_PX
+"""Rows and columns that are judged at a time, in addition to REACH_PX on every side."""
+
+MANY_OUTSIDE = 0.01
+"""A larger share of decidable blocks outside the bound gives a warning, or is refused by `strict`:
+of right restorations none was outside (measured on photographs).
+"""
+
+ReadRows = Callable[[int, int, int], np.ndarray]
+"""Return restored rows (rows, width) as stored, given the band, the first row and the end."""
+
+
+@dataclass(frozen=True)
+class BlockMap:
+    """What the self-check says of every block of an image.
+
+    Attributes:
+        bands: the blocks of each band that has a known sensor, by its number.
+    """
+
+    bands: Mapping[int, Judged]
+
+    def _count(self, flags: Callable[[Judged], np.ndarray]) -> int:
+        return sum(int(np.count_nonzero(flags(judged))) for judged in self.bands.values())
+
+    @property
+    def known(self) -> int:
+        """The number of blocks with enough pixels."""
+        return self._count(lambda judged: np.isfinite(judged.chi2))
+
+    @property
+    def decidable(self) -> int:
+        """The number of blocks that would show a wrong restoration."""
+        return self._count(lambda judged: judged.decidable)
+
+    @property
+    def outside(self) -> int:
+        """The number of blocks whose residual is more than noise."""
+        return self._count(lambda judged: judged.outside)
+
+    @property
+    def figures(self) -> dict[str, Figure]:
+        """Return the shares of blocks, for the results of a run."""
+        blocks = f"blocks of {BLOCK_PX} x {BLOCK_PX} pixels"
+        outside = f"{blocks} that are decidable: residual above {MOST_CHI2:g} times the noise"
+        smooth = f"{blocks}: too smooth to show a wrong restoration"
+        undecided = self.known - self.decidable
+        return {
+            "self-check outside": measured(
+                100 * self.outside / max(self.decidable, 1), "%", outside
+            ),
+            "self-check not decidable": measured(100 * undecided / max(self.known, 1), "%", smooth),
+        }
+
+    @property
+    def doubt(self) -> str:
+        """A sentence for a result that contradicts its raw image; empty if it does not."""
+        if self.outside <= MANY_OUTSIDE * self.decidable:
+            return ""
+        return (
+            f"{self.outside} of {self.decidable} blocks of the result contradict the raw image: "
+            f"blurred as the sensor blurs, they differ from it by more than {MOST_CHI2:g} times "
+            "the noise. Check that the network was made for this sensor, with 'check' that its "
+            "file is whole, and `sensor`."
+        )
+
+    def require(self, name: str) -> None:
+        """Raise ImageError if the result contradicts its raw image.
+
+        Args:
+            name: of the image, for the message.
+        """
+        if self.doubt:
+            raise ImageError(f"{name} fails the self-check: {self.doubt}")
+
+
+def checks_of(
+    sensors: Mapping[str, Sensor], raster: Raster, out_shape: Sequence[int], full_scale: float
+) -> dict[int, SelfCheck]:
+    """Build the self-check of each band whose sensor is known.
+
+    Args:
+        sensors: by band, or one under no name.
+        raster: the image's facts.
+        out_shape: (bands, H, W) of the restored image; without one pixel of the same band for each
+            pixel there is no check.
+        full_scale: the pixel value that is full scale.
+    """
+    if tuple(out_shape) != raster.shape or not sensors:
+        return {}
+    in_bands = in_order(sensors, raster) * (1 if "" not in sensors else raster.bands)
+    return {
+        band: SelfCheck.of(sensor.nominal(), sensor.reference.nominal(), full_scale)
+        for band, sensor in enumerate(in_bands)
+        if sensor.name != BLIND
+    }
+
+
+def require_checkable(path: Path | None, checks: Mapping[int, SelfCheck]) -> None:
+    """Raise OptionError if a map is asked for where there is no self-check."""
+    if path is not None and not checks:
+        raise OptionError(
+            "`self_check` needs a known sensor, and a network that gives one pixel of the same "
+            "band for each pixel. Name the sensor with `sensor`, or leave `self_check` out."
+        )
+
+
+def check_result(source: Source, read: ReadRows, checks: Mapping[int, SelfCheck]) -> BlockMap:
+    """Judge all blocks of a restored image.
+
+    Args:
+        source: the raw image.
+        read: returns restored rows.
+        checks: the self-check of each band that has one.
+    """
+    raster = source.raster
+    judged: dict[int, list[Judged]] = {band: [] for band in checks}
+    rows = list(strips(raster.height_px, ROWS_PX)) if checks else []
+    with steps("self-check", len(rows)) as bar:
+        for start, stop in rows:
+            top = max(start - REACH_PX, 0)
+            bottom = min(stop + REACH_PX, raster.height_px)
+            down = Placed(raster.height_px, top, start, stop)
+            stored = source.read(top, bottom)
+            missing = raster.missing(stored)
+            stored = np.ma.getdata(stored)
+            for band, check in checks.items():
+                raw = np.where(missing[band], np.nan, stored[band]).astype(np.float32)
+                restored = read(band, top, bottom).astype(np.float32)
+                judged[band].append(_judge_rows(check, raw, restored, down))
+            bar.advance()
+    return BlockMap({band: _joined(parts, axis=0) for band, parts in judged.items()})
+
+
+def _judge_rows(check: SelfCheck, raw: np.ndarray, restored: np.ndarray, down: Placed) -> Judged:
+    """Judge rows (h, width) of an image window by window, which bounds the memory."""
+    width = raw.shape[1]
+    parts = []
+    for start, stop in strips(width, COLUMNS_PX):
+        left = max(start - REACH_PX, 0)
+        right = min(stop + REACH_PX, width)
+        across = Placed(width, left, start, stop)
+        parts.append(check.judge(raw[:, left:right], restored[:, left:right], down, across))
+    return _joined(parts, axis=1)
+
+
+def _joined(parts: Sequence[Judged], axis: int) -> Judged:
+    chi2, sharpening = zip(*((part.chi2, part.sharpening) for part in parts), strict=True)
+    return Judged(np.concatenate(chi2, axis), np.concatenate(sharpening, axis))
+
+
+WITHIN, OUTSIDE, SMOOTH = 0, 1, 2
+"""States of a block in a written map."""
+
+
+def write_map(path: Path, blocks: BlockMap, raster: Raster) -> None:
+    """Write the map as a GeoTIFF of float32 with one pixel for each block.
+
+    It has two planes for each band that was judged: chi2, and the state of the block (0 within the
+    bound, 1 outside, 2 too smooth to decide). Both are NaN where too few pixels are known.
+    """
+    planes = []
+    infos = []
+    for band, judged in blocks.bands.items():
+        state = np.where(judged.decidable, np.where(judged.outside, OUTSIDE, WITHIN), SMOOTH)
+        planes += [judged.chi2, np.where(np.isnan(judged.chi2), np.nan, state)]
+        name = raster.band_names[band] if raster.band_names else f"band {band + 1}"
+        infos += [
+            BandInfo(f"{name}: chi2", tags=(("most", f"{MOST_CHI2:g}"),)),
+            BandInfo(
+                f"{name}: state",
+                tags=(
+                    ("meaning", "0 within the bound, 1 outside, 2 too smooth to decide"),
+                    ("least_sharpening", f"{LEAST_SHARPENING:g}"),
+                ),
+            ),
+        ]
+    pixels = np.stack(planes).astype(np.float32)
+    count, height, width = pixels.shape
+    facts = replace(
+        raster,
+        bands=count,
+        height_px=height,
+        width_px=width,
+        dtype=pixels.dtype,
+        nodata=float("nan"),
+        mask_kind="",
+        colour=False,
+        place=raster.place.enlarged(1 / BLOCK_PX),
+        band_info=tuple(infos),
+        tags=(),
+    )
+    with whole_file(path) as temporary:
+        write_raster(temporary, facts, ArrayPixels(pixels), "zlib", "beers-deploy")

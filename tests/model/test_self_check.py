@@ -1,0 +1,191 @@
+"""The self-check: noise alone gives a chi2 of 1 under every blur, wrong images are found, and
+windows give the whole image's blocks.
+"""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from beers_deploy.model.blocks import Placed
+from beers_deploy.model.self_check import (
+    BLOCK_PX,
+    LEAST_PX,
+    LEAST_SHARPENING,
+    NEAR_PX,
+    REACH_PX,
+    Judged,
+    SelfCheck,
+)
+from beers_deploy.profiles.effects import Dsnu, Prnu, Striping
+from beers_deploy.profiles.instrument import Instrument
+from tests.model.consistency_images import (
+    COLUMNS,
+    FULL_SCALE,
+    REFERENCE,
+    ROWS,
+    SENSORS,
+    blurred,
+    noisy,
+    scene,
+    sigma_dn,
+)
+from tests.model.simulator.stages import plain_sensor
+
+
+def judged(check: SelfCheck, raw: np.ndarray, restored: np.ndarray) -> Judged:
+    whole = [Placed(side, 0, 0, side) for side in raw.shape]
+    return check.judge(raw.astype(np.float32), restored.astype(np.float32), *whole)
+
+
+def noise_of(sensor: Instrument, image: np.ndarray, seed: int = 1) -> np.ndarray:
+    """Draw noise whose variance follows the signal, and the pattern of each column's detector."""
+    generator = np.random.default_rng(seed)
+    sigma = np.vectorize(lambda signal: sigma_dn(sensor, signal))(np.round(image, -1))
+    noise = sigma * generator.normal(size=image.shape)
+    # One number a pixel instead of one a column: the same variance, and little scatter in a block.
+    for effect in sensor.effects.values():
+        if isinstance(effect, Dsnu):
+            noise += effect.rms_dn * generator.normal(size=image.shape)
+        elif isinstance(effect, Prnu):
+            noise += effect.rms * image * generator.normal(size=image.shape)
+        elif isinstance(effect, Striping):
+            noise += effect.odd_even_dn * (0.5 - np.arange(image.shape[1]) % 2)
+    return np.asarray(noise)
+
+
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        *SENSORS.values(),
+        plain_sensor(prnu=Prnu(0.01), dsnu=Dsnu(8.0)),
+        plain_sensor(striping=Striping(30.0)),
+    ],
+)
+def test_the_true_scene_leaves_noise_alone(sensor: Instrument) -> None:
+    # Some blurs ring below zero at the edges of the darkest ground, where a converter clips.
+    truth = 0.8 * scene() + 400
+    image = blurred(truth, sensor)
+    raw = np.rint(image + noise_of(sensor, image))
+    assert 0 < raw.min() < raw.max() < FULL_SCALE
+    result = judged(SelfCheck.of(sensor, REFERENCE), raw, truth)
+    # chi2 of n pixels scatters by sqrt(2 / n); the kernel is cut, hence the rest.
+    scatter = 5 * np.sqrt(2 / LEAST_PX)
+    assert_allclose(result.chi2[np.isfinite(result.chi2)], 1, atol=scatter)
+    assert not result.outside.any()
+
+
+def test_the_scale_of_the_pixels_changes_nothing() -> None:
+    sensor = SENSORS["offset"]
+    raw = noisy(blurred(scene(), sensor), sensor)
+    own = judged(SelfCheck.of(sensor, REFERENCE), raw, scene())
+    shares = judged(SelfCheck.of(sensor, REFERENCE, 1.0), raw / FULL_SCALE, scene() / FULL_SCALE)
+    assert_allclose(shares.chi2, own.chi2, rtol=1e-3)
+    assert_allclose(shares.sharpening, own.sharpening, rtol=1e-3)
+
+
+WRONG = {
+    "not restored": lambda raw, _: raw,
+    "moved by a pixel": lambda _, truth: np.roll(truth, 1, axis=1),
+    "of another sensor": lambda _, truth: truth + 0.5 * (truth - blurred(truth, plain_sensor())),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_no_restoration_of_the_image_is_found(name: str) -> None:
+    sensor = plain_sensor()
+    raw = noisy(blurred(scene(), sensor), sensor)
+    check = SelfCheck.of(sensor, REFERENCE)
+    result = judged(check, raw, WRONG[name](raw, scene()))
+    textured = judged(check, raw, scene()).sharpening >= LEAST_SHARPENING
+    assert textured.any()
+    assert result.outside[textured].all()
+
+
+def test_a_broken_block_is_found_where_it_is() -> None:
+    sensor = plain_sensor()
+    raw = noisy(blurred(scene(), sensor), sensor)
+    broken = scene().copy()
+    broken[2 * BLOCK_PX : 3 * BLOCK_PX, BLOCK_PX : 2 * BLOCK_PX] *= 1.2
+    result = judged(SelfCheck.of(sensor, REFERENCE), raw, broken)
+    assert result.outside[2, 1]
+    # The blur carries light over the border of the block, but no farther than to its neighbours.
+    far = result.outside.copy()
+    far[1:4, 0:3] = False
+    assert not far.any()
+
+
+def spans(size_px: int, cuts: set[int]) -> list[Placed]:
+    """Return windows that end at these blocks, with the reach around each."""
+    ends = [0, *sorted(BLOCK_PX * cut for cut in cuts), size_px]
+    return [
+        Placed(size_px, max(start - REACH_PX, 0), start, stop) for start, stop in pairwise(ends)
+    ]
+
+
+@given(
+    down=st.sets(st.integers(1, ROWS // BLOCK_PX), max_size=3),
+    across=st.sets(st.integers(1, COLUMNS // BLOCK_PX), max_size=2),
+)
+@settings(max_examples=6, deadline=None)
+def test_windows_give_the_blocks_of_the_whole_image(down: set[int], across: set[int]) -> None:
+    sensor = SENSORS["two axes"]
+    check = SelfCheck.of(sensor, REFERENCE)
+    raw = noisy(blurred(scene(), sensor), sensor)
+    raw[150:160, 20:30] = np.nan
+    raw[40, 200] = FULL_SCALE
+    whole = judged(check, raw, scene())
+    chi2 = []
+    for rows in spans(ROWS, down):
+        bottom = min(rows.keep_stop + REACH_PX, ROWS)
+        blocks = []
+        for columns in spans(COLUMNS, across):
+            right = min(columns.keep_stop + REACH_PX, COLUMNS)
+            window = np.s_[rows.start : bottom, columns.start : right]
+            blocks.append(check.judge(raw[window], scene()[window], rows, columns).chi2)
+        chi2.append(np.concatenate(blocks, axis=1))
+    # A missing pixel may be filled from another window, which far tails see.
+    assert_allclose(np.concatenate(chi2), whole.chi2, rtol=0.01)
+
+
+def test_pixels_that_no_residual_is_known_of_do_not_count() -> None:
+    sensor = plain_sensor()
+    check = SelfCheck.of(sensor, REFERENCE)
+    image = blurred(scene(), sensor)
+    raw = np.clip(image + noise_of(sensor, image), 0, FULL_SCALE - 1)
+    clean = judged(check, raw, scene())
+    hidden = raw.copy()
+    hidden[BLOCK_PX : 2 * BLOCK_PX, BLOCK_PX : 2 * BLOCK_PX] = np.nan
+    saturated = raw.copy()
+    saturated[220, 220] = FULL_SCALE
+    for other, (row, column) in ((hidden, (1, 1)), (saturated, (3, 3))):
+        result = judged(check, other, scene())
+        expected = replace(clean, chi2=clean.chi2.copy())
+        unchanged = np.isfinite(expected.chi2)
+        unchanged[row - 1 : row + 2, column - 1 : column + 2] = False
+        assert_allclose(result.chi2[unchanged], expected.chi2[unchanged], rtol=0.02)
+        assert not result.outside.any()
+    assert np.isnan(judged(check, hidden, scene()).chi2[1, 1])
+    # What a missing pixel is stored as is no part of the image.
+    hidden_restored = scene().copy()
+    hidden_restored[np.isnan(hidden)] = 4000
+    assert_array_equal(
+        judged(check, hidden, hidden_restored).chi2, judged(check, hidden, scene()).chi2
+    )
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 700), (2 * NEAR_PX, 90), (65, 65), (96, 129)])
+def test_small_images_have_blocks_of_their_own(shape: tuple[int, int]) -> None:
+    sensor = plain_sensor()
+    image = scene()[: shape[0], : shape[1]] if shape[1] <= COLUMNS else np.full(shape, 900.0)
+    result = judged(SelfCheck.of(sensor, REFERENCE), image, image)
+    assert result.chi2.shape == tuple(-(-side // BLOCK_PX) for side in shape)
+    inside = [max(side - 2 * NEAR_PX, 0) for side in shape]
+    if inside[0] * inside[1] < LEAST_PX:
+        assert np.isnan(result.chi2).all()
+        assert not result.decidable.any()
+        assert not result.outside.any()
