@@ -47,6 +47,11 @@ REACH_PX = 128
 the radius (measured on a drawn scene of 480 DN rms).
 """
 
+LEAST_TERM = 1e-5
+"""Share of the largest term below which the kernel's terms are left out. They sum to 0.001
+(measured).
+"""
+
 NEAR_PX = 16
 """Pixels this close to a missing or saturated one, or to the image's border, do not count: 2 % of
 H's kernel lie farther away.
@@ -90,14 +95,17 @@ class SelfCheck:
     """The self-check for images of one sensor.
 
     Attributes:
-        kernel: of H, (2 REACH_PX + 1, 2 REACH_PX + 1), of sum 1.
+        rows: (terms, 2 REACH_PX + 1); H's kernel is the sum of the terms' products of a row and a
+            column.
+        columns: likewise.
         variances: of the noise in squared pixel values: in the dark, its growth with the light, and
             its growth with the squared light.
         offset: the pixel value of the dark.
         full_scale: the pixel value at and above which a raw pixel is saturated.
     """
 
-    kernel: Image
+    rows: Image
+    columns: Image
     variances: tuple[float, float, float]
     offset: float
     full_scale: float
@@ -119,9 +127,12 @@ class SelfCheck:
         kernel = centre(blur_between(sensor, reference), REACH_PX)
         # The kernel has long tails: cut without this, a constant image would come out darker.
         kernel = kernel + (1 - kernel.sum()) / kernel.size
+        left, values, right = np.linalg.svd(kernel)
+        terms = np.count_nonzero(values > LEAST_TERM * values[0])
         dark_dn, growth_dn, square = _variances(sensor)
         return cls(
-            kernel=kernel.astype(np.float32),
+            rows=(left[:, :terms] * values[:terms]).T.astype(np.float32),
+            columns=right[:terms].astype(np.float32),
             variances=(dark_dn * unit**2, growth_dn * unit, square),
             offset=sensor.offset_dn * unit,
             full_scale=float(scale),
@@ -142,7 +153,8 @@ class SelfCheck:
         # Only far tails of the kernel see the filling, because pixels near it do not count.
         x = _filled(restored, missing)
         pads = [_beyond(placed, side) for placed, side in zip((down, across), x.shape, strict=True)]
-        blurred = oaconvolve(np.pad(x, pads, "symmetric"), self.kernel, mode="valid")
+        kernel = self.rows.T @ self.columns
+        blurred = oaconvolve(np.pad(x, pads, "symmetric"), kernel, mode="valid")
 
         kept = tuple(
             slice(placed.keep_start - placed.start, placed.keep_stop - placed.start)

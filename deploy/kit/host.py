@@ -12,6 +12,8 @@ in `cores`.
   and adds it to the tile.
 3. After the last tile, the consistency step (`consistent`) makes the restored image agree with the
   raw one at low spatial frequencies, if host.json has its weights.
+4. Then the self-check (`judged`) blurs it as the sensor blurs and compares it with the raw image,
+  block by block. restored-check.npy holds its two figures of each block.
 """
 
 from __future__ import annotations
@@ -25,6 +27,11 @@ from typing import Any
 import numpy as np
 
 F = np.float32
+CHECK = 64
+CLOSE = 16
+"""Pixels: the side of a block of the self-check, and how close to a saturated pixel or the border
+none counts.
+"""
 HERE = Path(__file__).parent
 BLOCK = 8
 NEAR = 8
@@ -183,6 +190,50 @@ def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
     return np.asarray(np.clip(x + change, 0, F(1)))
 
 
+def judged(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return two figures (2, n, m) of each block of CHECK pixels a side of one band (H, W).
+
+    The first is chi2, the mean of (raw - H x)^2 / variance of the noise. The second is the mean of
+    (x - H x)^2 / variance, which tells whether a wrong restoration would show. Both are NaN where
+    too few pixels count.
+    """
+    facts = S["self_check"]
+    kernel = np.array(facts["rows"], F).T @ np.array(facts["columns"], F)
+    reach = len(kernel) // 2
+    wide = np.pad(x, reach, "symmetric")
+    spectrum = np.fft.rfft2(wide) * np.fft.rfft2(kernel, wide.shape)
+    blurred = np.fft.irfft2(spectrum, wide.shape)[2 * reach :, 2 * reach :]
+    dark, growth, square = facts["variances"]
+    light = np.maximum(blurred - S["offset"], 0)
+    variance = dark + growth * light + square * light**2
+    # Saturated pixels, those close to one, and those at the image's border have no residual.
+    counts = brightest_around((raw >= 1).astype(F), CLOSE) == 0
+    inside = np.zeros_like(counts)
+    inside[CLOSE:-CLOSE, CLOSE:-CLOSE] = counts[CLOSE:-CLOSE, CLOSE:-CLOSE]
+    starts = [np.arange(0, side, CHECK) for side in x.shape]
+
+    def sums(values: np.ndarray) -> np.ndarray:
+        """Add up the values of the pixels that count, block by block."""
+        by_rows = np.add.reduceat(np.where(inside, values, 0), starts[0], 0, dtype=float)
+        return np.asarray(np.add.reduceat(by_rows, starts[1], 1))
+
+    pixels = sums(np.ones_like(x))
+    enough = np.where(pixels < CHECK**2 // 4, np.nan, pixels)
+    return np.stack([sums((y - blurred) ** 2 / variance) / enough for y in (raw, x)])
+
+
+def report(blocks: np.ndarray) -> str:
+    """Say how many blocks (bands, 2, n, m) contradict the raw image."""
+    facts = S["self_check"]
+    chi2, sharpening = blocks[:, 0], blocks[:, 1]
+    outside = chi2 > facts["most_chi2"]
+    decidable = outside | (sharpening >= facts["least_sharpening"])
+    return (
+        f"self-check: {outside.sum()} of {decidable.sum()} decidable blocks contradict the raw "
+        f"image; {np.isfinite(chi2).sum() - decidable.sum()} are too smooth to decide\n"
+    )
+
+
 def extended(x: np.ndarray, margin: int) -> np.ndarray:
     """Mirror an image (H, W) beyond its borders: to whole blocks, and `margin` pixels more on every
     side.
@@ -278,6 +329,11 @@ def main(source: str, target: str, runs: dict[int, Any]) -> None:
     if S["consistency"]:
         out = np.stack([consistent(raw, np.clip(x, 0, F(1))) for raw, x in zip(image, out)])  # noqa: B905 - as above
     np.save(target, out)
+    if S["self_check"]:
+        blocks = np.stack([judged(raw, x) for raw, x in zip(image, out)])  # noqa: B905 - as above
+        path = Path(target)
+        np.save(path.with_name(f"{path.stem}-check.npy"), blocks)
+        sys.stdout.write(report(blocks))
 
 
 def cores() -> dict[int, Any]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from beers_deploy.model.consistency import Consistency
 from beers_deploy.model.exposure import HEADROOM
+from beers_deploy.model.self_check import LEAST_SHARPENING, MOST_CHI2, SelfCheck
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Sensor
@@ -49,7 +50,8 @@ def host_facts(
     if facts is None:
         return None
     units = {str(factor): _unit(facts, other, tile_px) for factor, other in others.items()}
-    return {**facts, **exposure_facts(sensor, units), "consistency": step}
+    check = None if sensor is None or step is None else self_check_facts(sensor)
+    return {**facts, **exposure_facts(sensor, units), "consistency": step, "self_check": check}
 
 
 def host_constants(network: Network, tile_px: int) -> Facts | None:
@@ -109,6 +111,18 @@ def exposure_facts(sensor: Sensor | None, units: Mapping[str, object]) -> Facts:
     instrument = None if sensor is None or sensor.name == BLIND else sensor.nominal()
     offset = instrument.offset_dn / instrument.max_dn if instrument else 0.0
     return {"exposures": dict(units), "headroom": HEADROOM, "offset": offset}
+
+
+def self_check_facts(sensor: Sensor) -> Facts:
+    """Return what the self-check needs of a sensor for pixels that are shares of full scale."""
+    check = SelfCheck.of(sensor.nominal(), sensor.reference.nominal(), full_scale=1.0)
+    return {
+        "rows": check.rows.tolist(),
+        "columns": check.columns.tolist(),
+        "variances": list(check.variances),
+        "most_chi2": MOST_CHI2,
+        "least_sharpening": LEAST_SHARPENING,
+    }
 
 
 def consistency_facts(network: Network, sensor: Sensor) -> Facts | None:

@@ -27,6 +27,7 @@ from beers_deploy.model.consistency import REACH_PX, Consistency
 from beers_deploy.model.convbeers import arrays
 from beers_deploy.model.exposure import HEADROOM, choose_factors, factors_for
 from beers_deploy.model.io.tensors import Weights
+from beers_deploy.model.self_check import SelfCheck
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import OptionError, ProfileError
 from beers_deploy.quant.encodings import host_model
@@ -197,6 +198,21 @@ def test_the_host_part_chooses_factors_and_takes_the_consistency_step_as_the_lib
         change: np.ndarray = step.correction(raw, restored, down, across, (0, 0))
         expected = np.clip(restored + change, 0, 1)
         np.testing.assert_array_equal(host["consistent"](raw, restored), expected)
+
+
+def test_the_host_part_judges_blocks_as_the_library_does(
+    kit: Path, sensor: bd.Sensor, image: np.ndarray
+) -> None:
+    by_host(kit, image)
+    blocks = np.load(kit / "out-check.npy")
+    check = SelfCheck.of(sensor.nominal(), sensor.reference.nominal(), full_scale=1.0)
+    sides = (Placed(side, 0, 0, side) for side in image.shape)
+    expected = check.judge(image, np.load(kit / "out.npy")[0], *sides)
+    np.testing.assert_allclose(blocks[0, 0], expected.chi2, rtol=1e-3)
+    np.testing.assert_allclose(blocks[0, 1], expected.sharpening, rtol=1e-3)
+    host = runpy.run_path(str(kit / "host.py"))
+    count = f"{expected.outside.sum()} of {expected.decidable.sum()} decidable blocks"
+    assert count in host["report"](blocks)
 
 
 def test_a_network_in_memory_takes_the_same_steps(

@@ -1,0 +1,140 @@
+"""The self-check of `restore`: what it reports, refuses and writes."""
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+from numpy.testing import assert_array_equal
+from rasterio.control import GroundControlPoint
+
+import beers_deploy as bd
+from beers_deploy.model.self_check import BLOCK_PX, MOST_CHI2
+from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.verbs.restore import restore
+
+NAME = "pleiades-degraded"
+HEIGHT = 150
+WIDTH = 214
+NODATA = 65535
+TRANSFORM = rasterio.Affine(0.5, 0.1, 500000, 0.05, -0.5, 4600000)
+
+
+@pytest.fixture(scope="module")
+def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two bands of a drawn scene, the second with missing pixels, at a place on Earth."""
+    pair = bd.simulate(sensor=NAME, size=WIDTH, seed=3)
+    assert isinstance(pair, bd.Pair)
+    band = pair.degraded[:HEIGHT]
+    second = band.copy()
+    second[:BLOCK_PX, :BLOCK_PX] = NODATA
+    path = tmp_path_factory.mktemp("image") / "raw.tif"
+    with rasterio.open(
+        path, "w", driver="GTiff", width=WIDTH, height=HEIGHT, count=2, dtype="uint16",
+        crs="EPSG:32631", transform=TRANSFORM, nodata=NODATA,
+    ) as file:  # fmt: skip
+        file.write(np.stack([band, second]))
+        file.descriptions = ("blue", "red")
+    return path
+
+
+@pytest.fixture(scope="module")
+def other_network(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A network for a sensor that is far sharper."""
+    sharp = Sensor.load(NAME).replace(mtf_nyquist=0.15)
+    path = tmp_path_factory.mktemp("network") / "other.onnx"
+    bd.Network.load("convbeers-xs", sensor=sharp).save(path)
+    return path
+
+
+def run(image: Path, out: Path, **options: Any) -> Row:
+    (row,) = restore(image, out, sensor=NAME, overwrite=True, progress=False, **options).rows
+    return row
+
+
+def test_a_right_restoration_is_within_the_bound_and_its_map_lies_over_the_image(
+    image: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "map.tif"
+    row = run(image, tmp_path / "out.tif", network="convbeers-xs", self_check=path, strict=True)
+    assert row.figures["self-check outside"].value == 0
+    assert row.figures["self-check"].mode == "measured"
+    assert "self-check" not in caplog.text
+    with rasterio.open(path) as file:
+        chi2, state, chi2_red, state_red = file.read()
+        assert file.descriptions == ("blue: chi2", "blue: state", "red: chi2", "red: state")
+        assert file.crs == "EPSG:32631"
+        assert_array_equal(file.transform, TRANSFORM * rasterio.Affine.scale(BLOCK_PX))
+    assert chi2.shape == (3, 4)
+    # The last blocks of a row and of a column have too few pixels.
+    known = np.isfinite(chi2)
+    assert_array_equal(known, np.isfinite(state))
+    assert 0.1 < chi2[known].min() < chi2[known].max() < MOST_CHI2
+    assert np.isnan(chi2_red[0, 0])
+    assert np.isnan(state_red[0, 0])
+    # Far from the missing pixels both bands are the same image.
+    assert_array_equal(chi2_red[2:, 3], chi2[2:, 3])
+    undecided = 100 * np.mean(
+        np.concatenate([state[known], state_red[np.isfinite(state_red)]]) == 2
+    )
+    assert row.figures["self-check not decidable"].value == pytest.approx(undecided)
+
+
+def test_a_network_for_another_sensor_is_found(
+    image: Path, other_network: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    out = tmp_path / "out.tif"
+    with caplog.at_level(logging.WARNING):
+        row = run(image, out, network=other_network)
+    assert (row.figures["self-check outside"].value or 0) > 50
+    assert "the result fails the self-check" in caplog.text
+    strict = tmp_path / "strict.tif"
+    with pytest.raises(ImageError, match=r"fails the self-check: .* contradict the raw image"):
+        run(image, strict, network=other_network, strict=True, self_check=tmp_path / "map.tif")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["out.tif"]
+
+
+def test_the_traditional_pipeline_is_checked_too(image: Path, tmp_path: Path) -> None:
+    row = run(image, tmp_path / "out.tif", method="traditional", quality="fast")
+    assert row.figures["self-check outside"].value == 0
+
+
+def test_without_a_known_sensor_there_is_no_check(image: Path, tmp_path: Path) -> None:
+    (row,) = restore(image, tmp_path / "out.tif", network="convbeers-xs", progress=False).rows
+    assert not any("self-check" in name for name in row.figures)
+    with pytest.raises(OptionError, match="needs a known sensor"):
+        restore(
+            image, tmp_path / "2.tif", network="convbeers-xs", self_check=tmp_path / "map.tif",
+            progress=False,
+        )  # fmt: skip
+    assert not (tmp_path / "2.tif").exists()
+    with pytest.raises(OptionError, match="self_check"):
+        restore(np.ones((80, 80), np.uint16), sensor=NAME, self_check=tmp_path / "map.tif")
+
+
+def test_ground_control_points_move_to_the_blocks(image: Path, tmp_path: Path) -> None:
+    with rasterio.open(image) as file:
+        pixels = file.read(1)
+    points = [
+        GroundControlPoint(row, column, x=column / 2, y=-row / 2, z=3.0)
+        for row, column in ((0, 0), (0, WIDTH), (HEIGHT, 0))
+    ]
+    with rasterio.open(
+        tmp_path / "raw.tif", "w", driver="GTiff", width=WIDTH, height=HEIGHT, count=1,
+        dtype="uint16", gcps=points, crs="EPSG:32631",
+    ) as file:  # fmt: skip
+        file.write(pixels, 1)
+    run(
+        tmp_path / "raw.tif", tmp_path / "out.tif", network="convbeers-xs",
+        self_check=tmp_path / "map.tif",
+    )  # fmt: skip
+    with rasterio.open(tmp_path / "map.tif") as file:
+        moved, crs = file.gcps
+    assert crs == "EPSG:32631"
+    assert [(p.row * BLOCK_PX, p.col * BLOCK_PX, p.x, p.y, p.z) for p in moved] == [
+        (p.row, p.col, p.x, p.y, p.z) for p in points
+    ]
