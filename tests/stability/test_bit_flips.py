@@ -125,7 +125,7 @@ def test_all_guards_cost_under_two_per_cent_on_the_board(variant: str) -> None:
         if isinstance(op, IntConv) and op.activation is Activation.relu
     }
     dpu = load_dpu("vck190", None)
-    target = FaultTarget(core, Guards(relus, 1024.0, checksums(core)), ())
+    target = FaultTarget(core, Guards(relus, 1024.0, checksums(core)), (), ())
     prices = price_rows(target, predict_network(shipped_pair(variant)[1], dpu, TILE_PX), dpu)
     *parts, together = (db(row, "time") for row in prices)
     assert together == pytest.approx(sum(parts))

@@ -14,10 +14,12 @@ import numpy as np
 from beers_deploy.dpu.board import Dpu, dpu_of
 from beers_deploy.dpu.cost.latency import Prediction
 from beers_deploy.dpu.cost.model import Constants
+from beers_deploy.model.blocks import Placed
 from beers_deploy.model.metrics.fidelity import psnr_db
 from beers_deploy.model.progress import steps
+from beers_deploy.model.self_check import Judged, SelfCheck
 from beers_deploy.performance.swath import predict_network
-from beers_deploy.profiles.figures import Row, measured, predicted
+from beers_deploy.profiles.figures import Row, measured, predicted, unavailable
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.core import IntCore
@@ -81,11 +83,13 @@ class FaultTarget:
         core: the network as the board stores it.
         guards: learnt from calibration patches.
         pairs: patches that it restores, degraded and reference, (1, 1, H, W) in [0, 1] each.
+        checks: the self-check of each patch's sensor.
     """
 
     core: IntCore
     guards: faults.Guards
     pairs: Sequence[tuple[np.ndarray, np.ndarray]]
+    checks: Sequence[SelfCheck]
 
 
 def make_target(subject: Subject, source: Calibration) -> FaultTarget:
@@ -98,7 +102,10 @@ def make_target(subject: Subject, source: Calibration) -> FaultTarget:
     guards = faults.learn_guards(
         core, (core.host_part.encode(image) for image in calibration.drawn.degraded)
     )
-    return FaultTarget(core, guards, list(held_out.drawn.pairs))
+    patches = held_out.drawn
+    aim = source.sensor.reference.nominal()
+    checks = [SelfCheck.of(view.degraded, aim, full_scale=1.0) for view in patches.views]
+    return FaultTarget(core, guards, list(patches.pairs), checks)
 
 
 SETS = ("no guard", "clamped", "all guards")
@@ -111,6 +118,25 @@ def name_of(memory: str, rate: float) -> str:
 
 Quality = tuple[float, float, float]
 """PSNR in dB with each set of guards."""
+COSTLY_DB = 0.5
+"""A flip that costs an unguarded patch more is one that the self-check ought to find."""
+
+
+@dataclass(frozen=True)
+class Injection:
+    """What one injection did to a patch.
+
+    Attributes:
+        flips: the number of bits.
+        quality: with each set of guards.
+        costly: whether it cost more than COSTLY_DB without a guard, where a block is decidable.
+        detected: whether the self-check finds a block outside its bound, without a guard.
+    """
+
+    flips: int
+    quality: Quality
+    costly: bool = False
+    detected: bool = False
 
 
 def curve_rows(target: FaultTarget, draws: int, seed: int) -> list[Row]:
@@ -120,7 +146,7 @@ def curve_rows(target: FaultTarget, draws: int, seed: int) -> list[Row]:
         sound = faults.Injected(target.core, SOUND, image, 0)
         bare, clamped = (_quality_db(sound, guards, reference) for guards in (None, target.guards))
         clean.append((bare, clamped, clamped))
-    rows = [_curve_row("none", [(0, quality) for quality in clean], "patches")]
+    rows = [_curve_row("none", [Injection(0, quality) for quality in clean], "patches")]
     count = sum(len(memory.rates) * memory.times for memory in faults.MEMORIES.values()) * draws
     with steps("turning bits over", count) as bar:
         for name, memory in faults.MEMORIES.items():
@@ -141,10 +167,16 @@ def _quality_db(
     return psnr_db(faults.restored(injected, guards), reference, 1.0)
 
 
+def _judged(check: SelfCheck, image: np.ndarray, restored: np.ndarray) -> Judged:
+    """Judge a patch, (1, 1, H, W) raw and restored."""
+    sides = (Placed(side, 0, 0, side) for side in image.shape[2:])
+    return check.judge(image[0, 0].astype(np.float32), restored[0, 0], *sides)
+
+
 def _drawn(
     target: FaultTarget, name: str, rate: float, draw: int, seed: int, clean: Quality
-) -> tuple[int, Quality]:
-    """The bits that one injection into a memory flipped, and what is left of the quality."""
+) -> Injection:
+    """Flip bits of a memory once, and return what that did."""
     image, reference = target.pairs[draw % len(target.pairs)]
     memory = faults.MEMORIES[name]
     # Keyed by what is drawn, so that a draw is the same whatever else runs.
@@ -153,25 +185,40 @@ def _drawn(
     injected = memory.inject(target.core, image, rate, generator)
     # No flip, no change: the fault-free figures stand, at no cost.
     if injected.flips == 0:
-        return 0, clean
-    bare, clamped = (_quality_db(injected, guards, reference) for guards in (None, target.guards))
-    if not memory.kept:
-        return injected.flips, (bare, clamped, clamped)
-    repaired = faults.corrected(injected, target.core, target.guards, rate, generator)
-    return injected.flips, (bare, clamped, _quality_db(repaired, target.guards, reference))
+        return Injection(0, clean)
+    unguarded = faults.restored(injected)
+    bare = psnr_db(unguarded, reference, 1.0)
+    clamped = _quality_db(injected, target.guards, reference)
+    guarded = clamped
+    if memory.kept:
+        repaired = faults.corrected(injected, target.core, target.guards, rate, generator)
+        guarded = _quality_db(repaired, target.guards, reference)
+    blocks = _judged(target.checks[draw % len(target.pairs)], injected.image, unguarded)
+    return Injection(
+        injected.flips,
+        (bare, clamped, guarded),
+        costly=clean[0] - bare > COSTLY_DB and bool(blocks.decidable.any()),
+        detected=bool(blocks.outside.any()),
+    )
 
 
-def _curve_row(name: str, draws: Sequence[tuple[int, Quality]], kind: str) -> Row:
+def _curve_row(name: str, draws: Sequence[Injection], kind: str) -> Row:
     source = f"integer reference, mean and range of {len(draws)} {kind}"
-    flips = measured(float(np.mean([count for count, _ in draws])), "bits", source)
+    flips = measured(float(np.mean([draw.flips for draw in draws])), "bits", source)
     figures = {"flips": flips}
-    by_guards = zip(*(quality for _, quality in draws), strict=True)
+    by_guards = zip(*(draw.quality for draw in draws), strict=True)
     for guards, values in zip(SETS, by_guards, strict=True):
         # Exact before it is rounded once: the mean of the same values is the same, however often
         # each stands there.
         figures[guards] = measured(
             statistics.mean(values), "dB", source, (min(values), max(values))
         )
+    costly = [draw.detected for draw in draws if draw.costly]
+    about = f"{len(costly)} of {len(draws)} {kind} that lost more than {COSTLY_DB:g} dB unguarded"
+    if costly:
+        figures["found by the self-check"] = measured(100 * float(np.mean(costly)), "%", about)
+    elif name != "none":
+        figures["found by the self-check"] = unavailable("%", f"{about}: none to find")
     return Row("bit flips", name, figures)
 
 
