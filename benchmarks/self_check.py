@@ -23,11 +23,10 @@ from beers_deploy.model.blocks import Placed
 from beers_deploy.model.self_check import BLOCK_PX, Judged, SelfCheck
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.network import Network
-from beers_deploy.network_files import conditioned
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.encodings import host_model, read_core
-from beers_deploy.restoration.method import network_method
+from beers_deploy.restoration.method import Restore, network_method
 from beers_deploy.restoration.steps import BOTH
 from beers_deploy.studies.evaluation.methods import network_restore, profile_of
 from beers_deploy.studies.evaluation.pairs import NamedPair, scenes_at, simulate_pairs
@@ -39,7 +38,7 @@ RADIANCES = (1.0, 0.25, 0.05)
 COSTLY_DB = 0.5
 CLASSES = (0, 10, 20, 30, 40, 60, 100, np.inf)
 """Of the sharpening, for the tables."""
-PEAK_DN = 4095.0
+PEAK_DN = 4095
 
 NOMINAL = Sensor.load("pleiades-degraded")
 REFERENCE = Sensor.load("pleiades-reference").nominal()
@@ -50,12 +49,10 @@ def judged(check: SelfCheck, raw: np.ndarray, restored: np.ndarray) -> Judged:
     return check.judge(raw, restored, *(Placed(side, 0, 0, side) for side in raw.shape))
 
 
-def restorer(name: str, sensor: Instrument):
+def restorer(name: str, sensor: Instrument) -> Restore:
     """Return what restores digital numbers by a shipped network conditioned on a sensor."""
-    weights = conditioned(Path(name.removesuffix("-int8")))
     profile = profile_of(sensor, NOMINAL)
-    network = Network.for_sensor(weights, profile, int8=name.endswith("-int8"))
-    return network_restore(network, profile, REFERENCE, BOTH)
+    return network_restore(Network.load(name, sensor=profile), profile, REFERENCE, BOTH)
 
 
 def pairs_at(images: Path, sensor: Instrument, radiance: float, seed: int) -> list[NamedPair]:
@@ -132,18 +129,21 @@ def flips(images: Path, name: str, count: int, seed: int) -> str:
     sensor = NOMINAL.nominal()
     reference = REFERENCE.in_units_of(sensor)
     check = SelfCheck.of(sensor, reference)
-    weights = conditioned(Path(name.removesuffix("-int8")))
-    network = Network.for_sensor(weights, profile_of(sensor, NOMINAL), int8=True)
+    network = Network.load(name, sensor=profile_of(sensor, NOMINAL))
     core = read_core(network.model)
     pairs = pairs_at(images, sensor, 1.0, seed)
     sound = network_method(network.model, PEAK_DN, {}, sensor, reference)
-    costly = found = costly_flips = found_flips = 0
+    costly = 0
+    found = 0
+    costly_flips = 0
+    found_flips = 0
     before: dict[int, np.ndarray] = {}
     for draw in range(count):
         generator = np.random.default_rng([seed, draw])
         model = host_model(flip_weights(core, 1, generator), {})
         number = draw % len(pairs)
         pair = pairs[number]
+        assert pair.noise_free is not None  # noqa: S101 - simulated here
         if number not in before:
             before[number] = block_db(sound(pair.degraded), pair.noise_free)
         restored = network_method(model, PEAK_DN, {}, sensor, reference)(pair.degraded)
@@ -152,8 +152,8 @@ def flips(images: Path, name: str, count: int, seed: int) -> str:
         rows, columns = loss_db.shape
         whole = np.s_[:rows, :columns]
         hurt = (loss_db > COSTLY_DB) & blocks.decidable[whole] & np.isfinite(blocks.chi2[whole])
-        costly += np.count_nonzero(hurt)
-        found += np.count_nonzero(hurt & blocks.outside[whole])
+        costly += int(np.count_nonzero(hurt))
+        found += int(np.count_nonzero(hurt & blocks.outside[whole]))
         if hurt.any():
             costly_flips += 1
             found_flips += bool((hurt & blocks.outside[whole]).any())

@@ -2,14 +2,17 @@
 windows give the whole image's blocks.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
 
 from beers_deploy.model.blocks import Placed
 from beers_deploy.model.self_check import (
@@ -88,7 +91,9 @@ def test_the_scale_of_the_pixels_changes_nothing() -> None:
     assert_allclose(shares.sharpening, own.sharpening, rtol=1e-3)
 
 
-WRONG = {
+Wrong = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[Any]]
+
+WRONG: dict[str, Wrong] = {
     "not restored": lambda raw, _: raw,
     "moved by a pixel": lambda _, truth: np.roll(truth, 1, axis=1),
     "of another sensor": lambda _, truth: truth + 0.5 * (truth - blurred(truth, plain_sensor())),

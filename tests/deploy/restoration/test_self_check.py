@@ -1,6 +1,7 @@
 """The self-check of `restore`: what it reports, refuses and writes."""
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,8 +53,10 @@ def other_network(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(image: Path, out: Path, **options: Any) -> Row:
-    (row,) = restore(image, out, sensor=NAME, overwrite=True, progress=False, **options).rows
-    return row
+    rows: Sequence[Row] = restore(
+        image, out, sensor=NAME, overwrite=True, progress=False, **options
+    ).rows
+    return rows[0]
 
 
 def test_a_right_restoration_is_within_the_bound_and_its_map_lies_over_the_image(
