@@ -50,6 +50,7 @@ class Data:
         patches: number of patches.
         seed: of the patches.
         patch_px: their side; those of a gate have 128 pixels.
+        input_range: of the samples, as the user states it; None to find it.
     """
 
     sensor: Sensor
@@ -58,11 +59,12 @@ class Data:
     patches: int
     seed: int
     patch_px: int = 128
+    input_range: object = None
 
     def own(self, network: Network) -> OwnSamples | None:
         """Read the user's samples for a network; None for simulated patches."""
         with faults_named(network.label):
-            return samples_of(network.model, self.samples)
+            return samples_of(network.model, self.samples, self.input_range)
 
     @property
     def simulated(self) -> "Calibration":

@@ -29,7 +29,8 @@ from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.shipped import BLIND, DEFAULT_TARGET
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.domains import OPSET
-from beers_deploy.quant.encodings import board_model, read_core, vint8_model
+from beers_deploy.quant.encodings import CORE, board_model, read_core, vint8_model
+from beers_deploy.quant.input_range import Ranges
 from beers_deploy.quant.onnx.external_weights import unchanged
 from beers_deploy.quant.onnx_file import (
     fixed_tile_px,
@@ -196,12 +197,19 @@ class Network:
         return Network(write(core, metadata(self.model), side_px), f"{self.name}-core")
 
     def __call__(self, images: Any) -> np.ndarray:
-        """What the network makes of images (N, C, H, W) in [0, 1]: (N, C', H', W') float32."""
+        """What the network makes of images (N, C, H, W), in its own units: (N, C', H', W')."""
         return result_of(self._session, np.ascontiguousarray(images, np.float32))
 
     @cached_property
     def _session(self) -> ort.InferenceSession:
         return open_session(self.model)
+
+    @property
+    def input_ranges(self) -> Ranges:
+        """(low, high) of each channel that an INT8 network reads; empty where all are in [0, 1]."""
+        if CORE not in metadata(self.model):
+            return ()
+        return read_core(self.model).host_part.input_ranges
 
     @property
     def precision(self) -> str:

@@ -13,8 +13,8 @@ from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.profiles.instrument import MAX_DN
+from beers_deploy.quant.input_range import LARGEST, Ranges, to_shares
 from beers_deploy.quant.samples.coverage import BINS, SampleRange, histogram, range_from
-from beers_deploy.quant.samples.own import LARGEST
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import result_of
 from beers_deploy.quant.untrusted import times
@@ -24,6 +24,9 @@ MOST = 0.5
 """Share of a float network's results that lie in [0, 1] where they are an image, and not of another
 scale.
 """
+NEARLY_ALL = 0.99
+AROUND_UNIT = -0.1, 1.1
+"""Where nearly all results of a network lie that returns an image in [0, 1], overshoot included."""
 
 
 @dataclass(frozen=True)
@@ -184,6 +187,9 @@ def compare(
 ) -> GateResult:
     """Run both networks on patches; images are clipped as a file would.
 
+    Images of other ranges than [0, 1] are compared as shares of these. The patches' own ranges
+    count, because an INT8 file that stated a wide one would make its errors small.
+
     Without references, or where they have another size than what is compared, the PSNRs to them are
     NaN.
 
@@ -208,8 +214,9 @@ def compare(
     metric_values = []
     unfit = dict[int, np.ndarray]()
     for number, (degraded, reference) in enumerate(patches.pairs):
+        in_float, in_int8, ranges = _results(float_session, int8_session, degraded, patches.ranges)
+        degraded = to_shares(degraded, patches.ranges)
         counts += histogram(degraded)
-        in_float, in_int8 = _results(float_session, int8_session, degraded)
         difference = (in_int8 - in_float).ravel()
         differences.append(difference)
         # Shifted by the largest digital number, because `bincount` counts from 0 on.
@@ -220,6 +227,8 @@ def compare(
         contrasts.append(float(np.abs(in_float - in_float.mean()).mean()))
         if reference.shape != in_float.shape:
             unfit[number] = reference
+        elif patches.ranges:
+            reference = to_shares(reference, ranges)
         elif not (reference.min() >= 0 and reference.max() <= LARGEST):
             raise ImageError(
                 f"The reference of {_name(patches, number)} must have values in [0, 1], but they "
@@ -263,10 +272,15 @@ def compare(
 
 
 def _results(
-    float_session: ort.InferenceSession, int8_session: ort.InferenceSession, degraded: np.ndarray
-) -> list[np.ndarray]:
-    """Return the float and the INT8 result, clipped to [0, 1] if they are images; NaN where
-    infinite, which no clipping makes a pixel.
+    float_session: ort.InferenceSession,
+    int8_session: ort.InferenceSession,
+    degraded: np.ndarray,
+    ranges: Ranges,
+) -> tuple[np.ndarray, np.ndarray, Ranges]:
+    """Return the float and the INT8 result as shares of their ranges, and these.
+
+    They are clipped to [0, 1] if they are images; NaN where infinite, which no clipping makes a
+    pixel.
     """
     results = [result_of(session, degraded) for session in (float_session, int8_session)]
     if results[0].shape != results[1].shape:
@@ -281,13 +295,23 @@ def _results(
             f"{times(results[0].shape)}. The gate is for networks that make an image of an "
             "image; 'check' and 'bench' read any network."
         )
-    # The float result alone decides, so that both are clipped or neither is.
-    inside = ((results[0] >= 0) & (results[0] <= 1)).mean()
-    is_image = results[0].shape[1] == degraded.shape[1] and inside >= MOST
-    return [
+    # The float result alone decides, so that both are treated alike. A network may read normalised
+    # pixels and return an image in [0, 1], of which shares of the input's range would hide errors.
+    reads, returns = (_share_within(x, *AROUND_UNIT) for x in (degraded, results[0]))
+    if returns >= NEARLY_ALL > reads:
+        ranges = ()
+    results = [to_shares(result, ranges) for result in results]
+    is_image = results[0].shape[1] == degraded.shape[1] and _share_within(results[0], 0, 1) >= MOST
+    in_float, in_int8 = (
         np.where(np.isinf(result), np.nan, np.clip(result, 0, 1) if is_image else result)
         for result in results
-    ]
+    )
+    return in_float, in_int8, ranges
+
+
+def _share_within(values: np.ndarray, low: float, high: float) -> float:
+    """Return the share of the values that lie between two."""
+    return float(((values >= low) & (values <= high)).mean())
 
 
 def _name(patches: Patches, number: int) -> str:

@@ -35,6 +35,7 @@ from beers_deploy.quant.graph import (
     tensors,
 )
 from beers_deploy.quant.host_part import DualRange, HostPart, Plain
+from beers_deploy.quant.input_range import to_shares
 from beers_deploy.quant.onnx_file import fixed_tile_px, metadata
 from beers_deploy.quant.passes.dual_range import (
     can_write_copies,
@@ -175,9 +176,10 @@ def quantize_model(
     """
     # 1.
     network = read_network(model)
-    graph = read_planes(network.graph)
-    dual_range = passes.dual_range and network.adds_image and can_write_copies(graph)
-    host_part = HostPart.of(network, DualRange() if dual_range else Plain())
+    host_part = HostPart.of(network, Plain(), patches.ranges)
+    graph = read_planes(network.graph, host_part.full_scale)
+    if passes.dual_range and network.adds_image and can_write_copies(graph):
+        host_part = replace(host_part, decoding=DualRange())
     # 2.
     groups = residual_groups(graph)
     plan = Plan(
@@ -185,11 +187,12 @@ def quantize_model(
     )
     # 3. to 7.
     core, final = rounded(plan, patches.degraded)
+    shares = (to_shares(image, patches.ranges) for image in patches.degraded)
     about = {
         **metadata(model),
         "precision": "int8 legal",
         "calibration_sha256": patches.digest,
-        KEY: range_from(sum(map(histogram, patches.degraded), np.zeros(1))).to_words(),
+        KEY: range_from(sum(map(histogram, shares), np.zeros(1))).to_words(),
         **about,
         "passes": PASSES,
         "effort": effort,

@@ -31,6 +31,7 @@ from beers_deploy.quant.graph import (
     tensors,
     ties_scales,
 )
+from beers_deploy.quant.input_range import to_shares
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import (
@@ -111,8 +112,8 @@ class LayerError:
 def layer_errors(
     graph: Graph, core: IntCore, crops: Iterable[np.ndarray]
 ) -> tuple[list[LayerError], Loss]:
-    """Return what each layer of a network loses, and what all lose jointly, over crops (1, 1, H, W)
-    in [0, 1].
+    """Return what each layer of a network loses, and what all lose jointly, over crops (1, C, H,
+    W).
 
     Args:
         graph: plane-reading, in float: what the core was rounded from.
@@ -139,11 +140,13 @@ def layer_errors(
     layers = [LayerError(op.name, Loss(), Loss()) for op in graph]
     together = Loss()
     scale = core.scale(CORRECTION)
+    ranges = core.host_part.input_ranges
     for crop in crops:
         (values,) = tensor_values(float_session, names, crop, halo_px, core.host_part)
         float_values = dict(zip(names, values, strict=True))
         restored = core.host_part.restore(crop, float_values[CORRECTION], scale)
-        offset = crop if core.host_part.adds_image else 0.0
+        restored = to_shares(restored, ranges)
+        offset = to_shares(crop, ranges) if core.host_part.adds_image else 0.0
         for op, layer in zip(graph, layers, strict=True):
             result = _in_int8(op, core, float_values)
             expected = float_values[op.output]
@@ -159,8 +162,8 @@ def layer_errors(
             else:
                 feed = {PLANES: planes_of(crop, core.host_part), op.output: result}
                 image = core.host_part.restore(crop, rests[op.output].run(None, feed)[0], scale)
-            layer.network.add(image, restored, offset)
-        together.add(result_of(int8_session, crop), restored, offset)
+            layer.network.add(to_shares(image, ranges), restored, offset)
+        together.add(to_shares(result_of(int8_session, crop), ranges), restored, offset)
     return layers, together
 
 

@@ -28,6 +28,7 @@ from beers_deploy.profiles.toml import read_json, unreadable
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import PLANES
+from beers_deploy.quant.input_range import from_shares
 from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px
 from beers_deploy.quant.untrusted import times
@@ -67,6 +68,8 @@ def write_golden(
     names = files_of(core)
     generator = np.random.default_rng(0)
     images = _images(network, core.host_part.image_channels, tile, generator)
+    ranges = core.host_part.input_ranges
+    images = {case: from_shares(image, ranges) for case, image in images.items()}
     planes = {case: core.host_part.encode(image) for case, image in images.items()}
     planes[EXTREMES] = generator.choice(np.array([-128, 127], np.int8), planes["noise"].shape)
     _remove_older(folder)

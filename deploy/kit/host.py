@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 """The host's part of a network on a board: python3 host.py image.npy restored.npy, float32 (C, H,
-W) in [0, 1].
+W) as the network reads them, in [0, 1] unless host.json has other factors.
 
 The script needs NumPy, host.json and, for the cores, onnxruntime. On a board, replace the runners
 in `cores`.
@@ -58,7 +58,8 @@ def encoded(image: np.ndarray) -> np.ndarray:
     """Encode a tile as the core's planes, in multiples of 1/128: coarse steps, remainder, part."""
     wide = np.pad(image, ((0, 0), (0, 0), *[(S["border_px"],) * 2] * 2), "reflect")
     places = shuffled(wide, S["front"], up=False)
-    dn = np.clip(np.rint(places * F(4095)), 0, F(4095)) - F(S["middle"])
+    shares = places * np.array(S["input_factors"], F)[:, None, None]
+    dn = np.clip(np.rint(shares * F(4095)), F(S["lowest_dn"]), F(4095)) - F(S["middle"])
     coarse = np.minimum(np.rint(dn * F(1 / S["step"])), F(127))
     rest = dn - coarse * F(S["step"])
     parts = np.rint(rest * F(1 / S["part"]))
@@ -107,11 +108,13 @@ DECODINGS: dict[str, Any] = {
 
 
 def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
-    """Restore a tile (1, C, h, w) by one core: encode it, decode the result, add both and clip."""
+    """Restore a tile (1, C, h, w) by one core: encode it, decode the result, and add both."""
     copies = np.split(run(encoded(image)), S["copies"], 1)
     value = shuffled(DECODINGS[S["decoding"]](*copies), S["back"], up=True) * F(unit)
     if S["adds_image"]:
-        value = np.clip(image + value, 0, 1)
+        value = image + value
+    if S["limits"]:
+        value = np.clip(value, *S["limits"])
     return shuffled(value, S["last"], up=True)
 
 

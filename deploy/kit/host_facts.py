@@ -84,7 +84,9 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
         **part.decoding.constants(core.scale(CORRECTION)),
         "copies": part.decoding.copies,
         "border_px": part.border_px,
+        "input_factors": [1.0] if part.full_scale is None else (1 / part.full_scale).tolist(),
         "adds_image": part.adds_image,
+        "limits": part.clip_limits,
         UNIT: part.unit,
         "tile_px": tile_px,
         "halo_px": tiling.halo_px,
@@ -130,10 +132,10 @@ def consistency_facts(network: Network, sensor: Sensor) -> Facts | None:
 
     Returns:
         None if no sensor is known, or if the network changes the grid of pixels or bands: `restore`
-            leaves the step out there too.
+            leaves the step out there too. A network of another range than [0, 1] has none either.
     """
     tiling = network.tiling
-    if sensor.name == BLIND or not keeps_pixels(tiling):
+    if sensor.name == BLIND or not keeps_pixels(tiling) or network.input_ranges:
         return None
     step = Consistency.of(sensor.nominal(), sensor.reference.nominal(), full_scale=1.0)
     names = ("rows", "columns", "far", "means", "excess")

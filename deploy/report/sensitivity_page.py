@@ -9,6 +9,7 @@ from beers_deploy.model.io.pictures import error_row, grid, picture_url, stretch
 from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.gate import Spread
+from beers_deploy.quant.input_range import to_shares
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import run
 from beers_deploy.report.page import Picture, Report, Section
@@ -43,9 +44,7 @@ def sensitivity_page(
     """
     white_dn = next(dn for dn in range(1, MAX_DN + 1) if spread.share_beyond(dn) <= 1 - WHITE_SHARE)
     pictures = [Picture("Errors by size", histogram_url(spread), HISTOGRAM_CAPTION)]
-    pictures += [
-        worst_picture(number, patches.degraded[number], sessions, white_dn) for number in worst
-    ]
+    pictures += [worst_picture(number, patches, sessions, white_dn) for number in worst]
     tables = [
         Section(name.capitalize(), table, CAPTIONS.get(name, ""))
         for name, table in by_table(rows).items()
@@ -53,14 +52,14 @@ def sensitivity_page(
     return Report("Where INT8 errs", headline, tables, pictures, NOTES)
 
 
-def worst_picture(
-    number: int, degraded: np.ndarray, sessions: Sessions, white_dn: float
-) -> Picture:
+def worst_picture(number: int, patches: Patches, sessions: Sessions, white_dn: float) -> Picture:
     """A patch as it is given, in float, in INT8, and the size of the difference."""
-    in_float, in_int8 = (
-        np.clip(run(session, degraded), 0, 1)[0, 0] * MAX_DN for session in sessions
+    degraded = patches.degraded[number]
+    given, in_float, in_int8 = (
+        np.clip(to_shares(image, patches.ranges), 0, 1)[0, 0] * MAX_DN
+        for image in (degraded, *(run(session, degraded) for session in sessions))
     )
-    images = {"degraded": degraded[0, 0] * MAX_DN, "float": in_float, "INT8": in_int8}
+    images = {"degraded": given, "float": in_float, "INT8": in_int8}
     difference = np.abs(in_int8 - in_float)
     cells = [*strip_row(images.values(), stretch_of(in_float)), *error_row([difference], white_dn)]
     caption = (

@@ -163,6 +163,7 @@ if TYPE_CHECKING:
     Effects: TypeAlias = Sequence[str]
     Factors: TypeAlias = str | Sequence[float]
     Mtf: TypeAlias = str | tuple[float, float]
+    InputRange: TypeAlias = str | Sequence[float] | Sequence[tuple[float, float]]
 else:
     InputPath = LimitsLike = Samples = Image = Pairs = Path
     OutputFile = Annotated[Path, Written()]
@@ -179,3 +180,4 @@ else:
     TargetLike = Targets = Annotated[str, Completed(target_names, listed=True)]
     Progress = Annotated[object, PythonOnly()]
     Halo = Tiles = Size = Steps = Names = Factors = Methods = Mtf = str
+    InputRange = str

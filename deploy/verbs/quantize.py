@@ -12,6 +12,7 @@ from beers_deploy.profiles.shipped import DEFAULT_TARGET
 from beers_deploy.verbs.parameters import (
     Holds,
     InputPath,
+    InputRange,
     Interval,
     NetworkLike,
     OutputFile,
@@ -48,6 +49,7 @@ def quantize(
     target: TargetLike = DEFAULT_TARGET,
     sensor: SensorLike = SENSOR,
     samples: Samples | None = None,
+    input_range: InputRange | None = None,
     images: InputPath | None = None,
     patches: Annotated[int, Interval(ge=1, le=100_000)] = PATCHES,
     patch: Annotated[int, Interval(ge=32, le=2048)] = PATCH_PX,
@@ -73,8 +75,11 @@ def quantize(
         target: board or NPU whose rules count: a name, or a .toml file.
         sensor: sensor of the simulated patches, and of a network that is conditioned on one.
         samples: your own samples in place of simulated patches: .npy or .npz (N, C, H, W), or a
-            folder; in Python also arrays (N, C, H, W) in [0, 1], two of them (images, references),
-            or an iterable of these such as a DataLoader.
+            folder; in Python also arrays (N, C, H, W), two of them (images, references), or an
+            iterable of these such as a DataLoader. They are what the network reads.
+        input_range: LOW,HIGH of the values that the network reads, or such a pair for each channel,
+            as 0,1,0,1,0,1,0,50 for colours and a map of noise levels; [0, 1] for channels whose
+            samples lie in it, else what the samples span.
         images: folder of scenes for the simulated patches; drawn scenes if none.
         patches: number of simulated patches.
         patch: side of a simulated patch in pixels.
@@ -116,17 +121,17 @@ def quantize(
     from beers_deploy.kit.board_file import require_core_file, save_core
     from beers_deploy.profiles.sensor import Sensor
     from beers_deploy.profiles.target import TargetProfile
-    from beers_deploy.quant.adapt.adaptation import ADAPTED
     from beers_deploy.quant.encodings import read_core
-    from beers_deploy.quant.onnx_file import metadata, require_onnx_name
+    from beers_deploy.quant.onnx_file import require_onnx_name
     from beers_deploy.quant.passes.effort import Effort
-    from beers_deploy.quant.samples.coverage import recorded_range
     from beers_deploy.quantization import quantized
     from beers_deploy.results import Table
 
     if board_file is None:
         refuse_without("`board_file`", tile=tile is not None)
-    if samples is not None:
+    if samples is None:
+        refuse_without("`samples`", input_range=input_range is not None)
+    else:
         refuse_with(
             "`samples`",
             images=images is not None,
@@ -140,9 +145,8 @@ def quantize(
     pages = _report_files(report, network)
     require_onnx_name(*files)
     require_core_file(board, files[1], tile, inputs)
-    data = Data(
-        Sensor.load(sensor), samples, None if images is None else Path(images), patches, seed, patch
-    )
+    scenes = None if images is None else Path(images)
+    data = Data(Sensor.load(sensor), samples, scenes, patches, seed, patch, input_range)
     result, held_out = quantized(network, data, board, finetune, Effort(effort), adapt)
     # Both are made before the first is written: a core that is refused leaves no file.
     core = result.core(board, tile) if files[1] else None
@@ -152,10 +156,7 @@ def quantize(
         logger.info("wrote %s: %d integer operations", files[0], count)
     if core is not None and files[1] is not None:
         save_core(core, files[1], board)
-    covered = recorded_range(metadata(result.model))
-    notes = [] if covered is None else [f"calibration: {covered}"]
-    if adapt and ADAPTED not in metadata(result.model):
-        notes.append("`adapt` replaced nothing: the DPU computes all activations of the network")
+    notes = _notes(result, adapt)
     rows = list(result.layers)
     if held_out is not None:
         page = pages[0] if pages else None
@@ -171,6 +172,7 @@ def quantize(
                 "target": board,
                 "sensor": data.sensor,
                 "samples": samples,
+                "input_range": input_range,
                 "images": images,
                 "patches": patches,
                 "patch": patch,
@@ -212,6 +214,23 @@ DETAILS = frozenset(
     }
 )
 """Tables and figures for a closer look."""
+
+
+def _notes(result: "Network", adapt: bool) -> list[str]:
+    """Return what the INT8 file records of its calibration, a sentence each."""
+    from beers_deploy.quant.adapt.adaptation import ADAPTED
+    from beers_deploy.quant.input_range import KEY
+    from beers_deploy.quant.onnx_file import metadata
+    from beers_deploy.quant.samples.coverage import recorded_range
+
+    about = metadata(result.model)
+    covered = recorded_range(about)
+    notes = [] if covered is None else [f"calibration: {covered}"]
+    if KEY in about:
+        notes.append(f"input range: {about[KEY]}")
+    if adapt and ADAPTED not in about:
+        notes.append("`adapt` replaced nothing: the DPU computes all activations of the network")
+    return notes
 
 
 def _judged(network: "Network", held_out: "Patches", page: Path | None) -> "tuple[list[Row], str]":

@@ -14,11 +14,13 @@ from beers_deploy.quant.encodings.board import (
     vint8_model,
 )
 from beers_deploy.quant.encodings.description import BORDER_PX, PLACE_PX
+from beers_deploy.quant.encodings.description import KEY as CORE
 from beers_deploy.quant.encodings.host import encoding_faults, host_model, read_core
 
 __all__ = [
     "BORDER_PX",
     "CONFIG",
+    "CORE",
     "PLACE_PX",
     "as_on_board",
     "board_model",

@@ -290,22 +290,29 @@ PLANES_FRAC_BITS = 7
 """The planes' scale is 2^-7: coarse 127 stands for about 1, the full scale."""
 
 
-def read_planes(graph: Graph) -> Graph:
+def read_planes(graph: Graph, full_scale: np.ndarray | None = None) -> Graph:
     """The same graph, the convolutions that read the image reading the planes (as q * 2^-7)
     instead.
+
+    Args:
+        graph: that reads the image.
+        full_scale: (C,) the value of each channel that is encoded as 1; None for 1.
     """
     return tuple(
-        _reads_planes(op) if isinstance(op, Conv) and op.input == IMAGE else op for op in graph
+        _reads_planes(op, full_scale) if isinstance(op, Conv) and op.input == IMAGE else op
+        for op in graph
     )
 
 
-def _reads_planes(op: Conv) -> Conv:
+def _reads_planes(op: Conv, full_scale: np.ndarray | None) -> Conv:
     unit = np.float32(2.0**PLANES_FRAC_BITS / MAX_DN)
     weight = op.weight
     # Each result of a depthwise convolution reads several planes of its channel, which a depthwise
     # one cannot, so it becomes an ordinary one with zeros for the other channels.
     if op.groups != 1:
         weight = weight * np.eye(op.groups, dtype=np.float32)[:, :, None, None]
+    if full_scale is not None:
+        weight = weight * full_scale[:, None, None]
     # The third plane only makes the steps of the weights finer: in float it adds nothing.
     planes = [weight * (STEP * unit), weight * unit, np.zeros_like(weight)]
     return replace(

@@ -17,7 +17,7 @@ def plain_network(model: onnx.ModelProto) -> SplitNetwork:
     network = read_network(model)
     blocks = [[shuffle.block for shuffle in end] for end in (network.front, network.back)]
     adds_to_one_channel = network == SplitNetwork(
-        network.graph, front=network.front, back=network.back
+        network.graph, front=network.front, back=network.back, limits=network.limits
     )
     if not (adds_to_one_channel and blocks[0] == blocks[1] and len(blocks[0]) <= 1):
         raise unsupported(

@@ -13,6 +13,7 @@ from beers_deploy.quant.graph.node_operations import ACTIVATIONS, READERS, read_
 from beers_deploy.quant.graph.operations import (
     CORRECTION,
     IMAGE,
+    SIX,
     Activation,
     Add,
     AveragePool,
@@ -35,6 +36,7 @@ from beers_deploy.quant.graph.split_network import (
     sized,
     unsupported,
 )
+from beers_deploy.quant.input_range import is_range
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.runnable import check_runnable
 from beers_deploy.quant.simplify.fold_affine import affine_of
@@ -79,7 +81,7 @@ def read_network(model: onnx.ModelProto) -> SplitNetwork:
     with contradictions("the float network"):
         reader = _Reader(model)
         network = cut(reader.graph(), reader.channels())
-        network = replace(network, border_px=reader.border_px)
+        network = replace(network, border_px=reader.border_px, limits=reader.limits)
         check_network(network)
     return network
 
@@ -105,6 +107,7 @@ class _Reader:
         self._places: dict[str, int] = {}  # where the operation that writes a tensor stands
         self._widths: dict[str, int] = {}  # channels of what the first operations write
         self._measured = 0  # how many operations `_widths` covers
+        self.limits: tuple[float, ...] = ()
         self.border_px = self._take_mirror()
 
     def _take_mirror(self) -> int:
@@ -152,8 +155,9 @@ class _Reader:
             )
         (result,) = self.source.outputs
         nodes = list(self.source.nodes)
-        # The host clips images to [0, 1] in any case.
-        while nodes and nodes[-1].outputs[0] == result and _clips_to_image(nodes[-1], self.source):
+        # The host clips the result.
+        while nodes and nodes[-1].outputs[0] == result and (ends := self._limits(nodes[-1])):
+            self.limits = ends
             result = nodes.pop().inputs[0]
         for node in nodes:
             self._read(node)
@@ -171,6 +175,19 @@ class _Reader:
         if not (rows and columns):
             check_result_size(graph, self.border_px)
         return sized(graph, (rows, columns)) if pools else graph
+
+    def _limits(self, node: Node) -> tuple[float, ...]:
+        """Return the limits of a Clip, within those of the one behind it; empty for another node.
+
+        ReLU6 is the DPU's.
+        """
+        ends = [self.source.value(node, place) for place in (1, 2)]
+        if node.op_type != "Clip" or any(end is None or end.size != 1 for end in ends):
+            return ()
+        low, high = (float(end.item()) for end in ends if end is not None)
+        if self.limits:
+            low, high = max(low, self.limits[0]), min(high, self.limits[1])
+        return (low, high) if is_range(low, high) and (low, high) != (0, SIX) else ()
 
     def _read(self, node: Node) -> None:
         if node.op_type in ACTIVATIONS:
@@ -259,12 +276,6 @@ def _refused(node: Node, graph: OnnxGraph) -> ModelError:
     if node.op_type in ADAPTABLE:
         remedy = NO_IMAGE if node.outputs == graph.outputs else ADAPT
     return unsupported(f"The DPU does not compute the operation {node}.", remedy)
-
-
-def _clips_to_image(node: Node, graph: OnnxGraph) -> bool:
-    """Return True if a node clips to [0, 1], all that an image has."""
-    limits = [graph.value(node, place) for place in (1, 2)]
-    return node.op_type == "Clip" and [None if v is None else v.item() for v in limits] == [0, 1]
 
 
 def _fuses(producer: Conv | Add, activation: Activation) -> bool:

@@ -50,6 +50,7 @@ class SplitNetwork:
         last: what it does to the sum: pixel shuffle. An image of one channel is added to each of
             the sum's.
         border_px: by how many pixels it mirrors the image beyond its borders.
+        limits: to which it clips the result; empty if the network does not clip it.
     """
 
     graph: Graph = field(compare=False)
@@ -59,6 +60,7 @@ class SplitNetwork:
     adds_image: bool = True
     last: tuple[Shuffle, ...] = ()
     border_px: int = 0
+    limits: tuple[float, ...] = ()
 
     @property
     def core_channels(self) -> int:

@@ -1,13 +1,12 @@
 """The host's part as JSON, in the metadata of an INT8 file: read from it, and written to it."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 from beers_deploy.quant.graph import Shuffle
 from beers_deploy.quant.host_part.input_encoding import (
     BANK_SLICES,
-    IMAGE_SLICES,
     BitSlices,
     Direct,
     InputEncoding,
@@ -19,7 +18,8 @@ from beers_deploy.quant.host_part.output_decoding import (
     OutputDecoding,
     Plain,
 )
-from beers_deploy.quant.host_part.part import HostPart
+from beers_deploy.quant.host_part.part import HostPart, image_encoding
+from beers_deploy.quant.input_range import Ranges, require_ranges
 
 SHUFFLES = ("front", "back", "last")
 MOST_MARGIN_PX = 1024
@@ -32,6 +32,10 @@ def host_part_to_json(part: HostPart) -> dict[str, Any]:
     record = asdict(part)
     # Encoding and decoding are described by the flags that the first files had.
     del record["encoding"], record["decoding"]
+    # Files of images in [0, 1] are described as they were before there were other ranges.
+    for name in ("input_ranges", "limits"):
+        if not record[name]:
+            del record[name]
     if isinstance(part.encoding, BitSlices) and part.encoding != BANK_SLICES:
         # Files without a margin are described as they were before there was any.
         record |= {"margin_px": part.encoding.margin_px} if part.encoding.margin_px else {}
@@ -53,14 +57,17 @@ def host_part_from_json(record: Mapping[str, Any]) -> HostPart:
         LookupError, TypeError, ValueError: a damaged description.
     """
     shuffles = {name: tuple(Shuffle(**shuffle) for shuffle in record[name]) for name in SHUFFLES}
-    encoding = _encoding(record)
+    ranges = tuple((float(low), float(high)) for low, high in record.get("input_ranges", ()))
+    limits = tuple(map(float, record.get("limits", ())))
+    require_ranges((*ranges, limits) if limits else ranges)
+    encoding = _encoding(record, ranges)
     # The file is not trusted: its core must read the planes that the host makes.
     if int(record["planes"]) != encoding.planes:
         raise ValueError(f"{record['planes']} planes of each channel instead of {encoding.planes}")
     decoding = _decoding(record)
     if int(record["gains"]) != _gains(decoding):
         raise ValueError(f"{record['gains']} gains instead of {_gains(decoding)}")
-    return HostPart(
+    part = HostPart(
         channels=int(record["channels"]),
         outputs=int(record["outputs"]),
         **shuffles,
@@ -68,7 +75,12 @@ def host_part_from_json(record: Mapping[str, Any]) -> HostPart:
         unit=float(record.get("unit", 1.0)),
         encoding=encoding,
         decoding=decoding,
+        input_ranges=ranges,
+        limits=limits,
     )
+    if len(ranges) not in (0, part.image_channels):
+        raise ValueError(f"{len(ranges)} ranges of {part.image_channels} channels")
+    return part
 
 
 def _gains(decoding: OutputDecoding) -> int:
@@ -76,7 +88,7 @@ def _gains(decoding: OutputDecoding) -> int:
     return 1 if decoding.offsets else len(decoding.gains)
 
 
-def _encoding(record: Mapping[str, Any]) -> InputEncoding:
+def _encoding(record: Mapping[str, Any], ranges: Ranges) -> InputEncoding:
     if record.get("direct"):
         return Direct()
     if record.get("banked"):
@@ -84,7 +96,7 @@ def _encoding(record: Mapping[str, Any]) -> InputEncoding:
     margin_px = int(record.get("margin_px", 0))
     if not 0 <= margin_px <= MOST_MARGIN_PX:
         raise ValueError(f"a margin of {margin_px} px")
-    return replace(IMAGE_SLICES, margin_px=margin_px)
+    return image_encoding(margin_px, ranges)
 
 
 def _decoding(record: Mapping[str, Any]) -> OutputDecoding:

@@ -28,6 +28,7 @@ class BitSlices:
         coarse_planes: how often the coarse plane comes. Two of them share the weights of a filter,
             which then reach twice as far as int8 does.
         margin_px: the pixels by which the image must at least be mirrored beyond its borders.
+        signed: if True, the image is in [-1, 1] instead of [0, 1].
     """
 
     step: int = STEP
@@ -35,6 +36,12 @@ class BitSlices:
     middle: int = 0
     coarse_planes: int = 1
     margin_px: int = 0
+    signed: bool = False
+
+    @property
+    def lowest_dn(self) -> int:
+        """The digital number of the smallest value."""
+        return -MAX_DN if self.signed else 0
 
     @property
     def planes(self) -> int:
@@ -44,16 +51,16 @@ class BitSlices:
     @property
     def limits(self) -> tuple[list[int], list[int]]:
         """The smallest and the largest integer of each plane of a channel, tried on every DN."""
-        every_dn = np.arange(MAX_DN + 1, dtype=np.float32)[None, None, None] / np.float32(MAX_DN)
-        planes = self.encode(every_dn)[0, :, 0]
+        every_dn = np.arange(self.lowest_dn, MAX_DN + 1, dtype=np.float32)[None, None, None]
+        planes = self.encode(every_dn / np.float32(MAX_DN))[0, :, 0]
         return planes.min(1).tolist(), planes.max(1).tolist()
 
     def encode(self, image: np.ndarray) -> np.ndarray:
-        """Encode an image (N, C, H, W) in [0, 1] as planes (N, planes C, H, W) int8.
+        """Encode an image (N, C, H, W), at most 1 in size, as planes (N, planes C, H, W) int8.
 
         All channels of a plane come before the next plane.
         """
-        dn = np.clip(np.rint(image * np.float32(MAX_DN)), 0, MAX_DN) - self.middle
+        dn = np.clip(np.rint(image * np.float32(MAX_DN)), self.lowest_dn, MAX_DN) - self.middle
         # Full scale rounds to 128 steps, one more than int8 holds, so the remainder holds more.
         coarse = np.minimum(np.rint(dn / self.step), COARSE_MAX)
         remainder = dn - self.step * coarse
@@ -65,7 +72,8 @@ class BitSlices:
         max_dn = w.scalar("max_dn", MAX_DN)
         scaled = w.node("Mul", "host_front.scale", [image, max_dn])
         whole = w.node("Round", "host_front.round", [scaled])
-        dn = w.node("Clip", "host_front.dn", [whole, w.scalar("zero", 0), max_dn])
+        lowest = w.scalar("lowest_dn" if self.signed else "zero", self.lowest_dn)
+        dn = w.node("Clip", "host_front.dn", [whole, lowest, max_dn])
         if self.middle:
             dn = w.node("Sub", "host_front.centred", [dn, w.scalar("middle", self.middle)])
         steps = w.node("Mul", "host_front.steps", [dn, w.scalar("one_step", 1 / self.step)])
@@ -87,6 +95,7 @@ class BitSlices:
             "part": self.part,
             "middle": self.middle,
             "coarse_planes": self.coarse_planes,
+            "lowest_dn": self.lowest_dn,
         }
 
 

@@ -1,6 +1,8 @@
 """The host's part of an INT8 network: both sides of the integer core, in NumPy and as ONNX nodes.
 
 image -> pixel unshuffle -> encoding -> core -> decoding -> pixel shuffle -> + image
+
+The encoding reads an image over its full scale.
 """
 
 import math
@@ -21,6 +23,7 @@ from beers_deploy.quant.graph.writer import write_shuffle
 from beers_deploy.quant.host_part.input_encoding import ENCODED, IMAGE_SLICES, InputEncoding
 from beers_deploy.quant.host_part.output_decoding import DECODED, OutputDecoding, Plain
 from beers_deploy.quant.host_part.writer import ZERO, HostWriter
+from beers_deploy.quant.input_range import UNIT, Ranges, largest_size
 
 
 @dataclass(frozen=True)
@@ -32,11 +35,14 @@ class HostPart:
         outputs: channels of the decoded result.
         front: pixel unshuffles of the image.
         back: pixel shuffles of the decoded result.
-        adds_image: if True, the image is added to the result, and the sum clipped to [0, 1].
+        adds_image: if True, the image is added to the result. The sum of an image in [0, 1] is
+            clipped to that.
         last: pixel shuffles of the sum.
         unit: the share of full scale that is 1 in the decoded result.
         encoding: of the image for the core.
         decoding: of the core's result.
+        input_ranges: of the channels of the image in front of `front`.
+        limits: to which another result is clipped; empty for none.
     """
 
     channels: int = 1
@@ -48,9 +54,13 @@ class HostPart:
     unit: float = 1.0
     encoding: InputEncoding = IMAGE_SLICES
     decoding: OutputDecoding = field(default_factory=Plain)
+    input_ranges: Ranges = ()
+    limits: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, network: SplitNetwork, decoding: OutputDecoding) -> "HostPart":
+    def of(
+        cls, network: SplitNetwork, decoding: OutputDecoding, input_ranges: Ranges = ()
+    ) -> "HostPart":
         """Return the host's part of a float network that reads the image, for a decoding."""
         channels = network.core_channels
         return cls(
@@ -60,9 +70,27 @@ class HostPart:
             network.back,
             network.adds_image,
             network.last,
-            encoding=replace(IMAGE_SLICES, margin_px=network.border_px),
+            encoding=image_encoding(network.border_px, input_ranges),
             decoding=decoding,
+            input_ranges=input_ranges,
+            # An image in [0, 1] is clipped by whoever stores it.
+            limits=network.limits if input_ranges or network.limits != UNIT else (),
         )
+
+    @property
+    def full_scale(self) -> np.ndarray | None:
+        """The value (C,) float32 of each channel behind `front` that is encoded as 1; None for 1.
+
+        Zero stays zero, so that the network's zero padding is that of the planes. An offset could
+        not be folded into a bias, because a border that is padded has no offset.
+        """
+        if not self.input_ranges:
+            return None
+        sizes = np.array([largest_size(*ends) for ends in self.input_ranges], np.float32)
+        image = np.tile(sizes[None, :, None, None], (1, 1, self.place_px, self.place_px))
+        for shuffle in self.front:
+            image = shuffle(image)
+        return image.ravel()
 
     @property
     def planes(self) -> int:
@@ -91,11 +119,13 @@ class HostPart:
         return math.prod(shuffle.block for shuffle in self.back)
 
     def encode(self, image: np.ndarray) -> np.ndarray:
-        """Encode an image (N, C, H, W) in [0, 1] as the core's planes, int8."""
+        """Encode an image (N, C, H, W), in the network's units, as the core's planes, int8."""
         if self.border_px:
             image = np.pad(image, ((0, 0), (0, 0), *[(self.border_px,) * 2] * 2), "reflect")
         for shuffle in self.front:
             image = shuffle(image)
+        if self.full_scale is not None:
+            image = image * (1 / self.full_scale)[:, None, None]
         return self.encoding.encode(image)
 
     def decode(self, result: np.ndarray, scale: float) -> np.ndarray:
@@ -115,7 +145,7 @@ class HostPart:
         result = decoded
         for shuffle in self.back:
             result = shuffle(result)
-        result = self.clip(image + result) if self.adds_image else result
+        result = self.clip(image + result if self.adds_image else result)
         for shuffle in self.last:
             result = shuffle(result)
         return result
@@ -134,8 +164,14 @@ class HostPart:
         return np.ascontiguousarray(result)
 
     def clip(self, result: np.ndarray) -> np.ndarray:
-        """Clip a float network's result to [0, 1] if the host clips its own."""
-        return np.clip(result, 0, 1) if self.adds_image else result
+        """Clip a float network's result as the host clips its own."""
+        return np.clip(result, *self.clip_limits) if self.clip_limits else result
+
+    @property
+    def clip_limits(self) -> tuple[float, ...]:
+        """The limits to which the host clips the result; empty if it does not."""
+        adds_unit = self.adds_image and not self.input_ranges
+        return self.limits or (UNIT if adds_unit else ())
 
     def write_front(self, w: HostWriter) -> None:
         """Write the nodes in front of the core, from the image to planes in uint8."""
@@ -148,6 +184,9 @@ class HostPart:
             write_shuffle(w, shuffle, image, f"host_front.shuffled_{k}", channels)
             image = f"host_front.shuffled_{k}"
             channels = channels * shuffle.block**2
+        if self.full_scale is not None:
+            factors = w.constant("input_factors", (1 / self.full_scale)[None, :, None, None])
+            image = w.node("Mul", "host_front.shares", [image, factors])
         self.encoding.write(w, image)
         w.node("Add", "host_front.offset", [ENCODED, w.scalar("offset", ZERO)])
         w.node("Cast", PLANES, ["host_front.offset"], to=TensorProto.UINT8)
@@ -167,18 +206,27 @@ class HostPart:
             result = f"host_back.shuffled_{k}"
         if self.unit != 1:
             result = w.node("Mul", "host_back.in_units", [result, w.scalar("unit", self.unit)])
-        if not self.adds_image:
-            # The file's output is named `restored`, whatever the node in front of it.
-            w.node("Identity", "restored", [result], name="host_back.result")
-            return
-        w.node("Add", "host_back.add", [IMAGE, result])
-        limits = [w.scalar("zero", 0), w.scalar("one", 1)]
+        if self.adds_image:
+            result = w.node("Add", "host_back.add", [IMAGE, result])
         name = "host_back.clipped" if self.last else "restored"
-        w.node("Clip", name, ["host_back.add", *limits], name="host_back.clip")
+        if self.clip_limits:
+            low, high = self.clip_limits
+            ends = [w.scalar("zero" if low == 0 else "low", low)]
+            ends.append(w.scalar("one" if high == 1 else "high", high))
+            w.node("Clip", name, [result, *ends], name="host_back.clip")
+        else:
+            # The file's output is named `restored`, whatever the node in front of it.
+            w.node("Identity", name, [result], name="host_back.result")
         for k, shuffle in enumerate(self.last):
             result = name
             name = "restored" if k + 1 == len(self.last) else f"host_back.last_{k}"
             write_shuffle(w, shuffle, result, name)
+
+
+def image_encoding(margin_px: int, input_ranges: Ranges) -> InputEncoding:
+    """Return the encoding of a network that reads the image itself, of these ranges."""
+    signed = any(low < 0 for low, _ in input_ranges)
+    return replace(IMAGE_SLICES, margin_px=margin_px, signed=signed)
 
 
 ONE_CHANNEL = HostPart()

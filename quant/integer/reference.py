@@ -33,6 +33,7 @@ from beers_deploy.quant.graph import (
     Shuffle,
 )
 from beers_deploy.quant.host_part import ZERO
+from beers_deploy.quant.input_range import to_shares
 from beers_deploy.quant.integer.arithmetic import (
     activated,
     activation_table,
@@ -302,11 +303,14 @@ def integer_rows(
     by_layer = zip(*(one.layers for one in agreements), strict=True)
     layers = [_layer_row(list(same), source) for same in by_layer]
     session = open_any_size(model)
+    part = core.host_part
     results = [
-        [core.host_part.finish(crop, result) for result in (one.up, one.even)]
+        [to_shares(part.finish(crop, x), part.input_ranges) for x in (one.up, one.even)]
         for crop, one in zip(patches, agreements, strict=True)
     ]
-    in_float = [core.host_part.clip(result_of(session, crop)) for crop in patches]
+    in_float = [
+        to_shares(part.clip(result_of(session, crop)), part.input_ranges) for crop in patches
+    ]
     return (*layers, _rounding_row(in_float, results, source))
 
 

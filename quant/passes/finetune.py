@@ -163,7 +163,7 @@ def descend(
 def loss_of(core: IntCore, samples: Sequence[Sample]) -> float:
     """Return the mean error of a core, as the host computes it, beyond the float network's own."""
     # Samples are corrections, so the host must stop once it has decoded the copies.
-    host_part = replace(core.host_part, back=(), adds_image=False, last=())
+    host_part = replace(core.host_part, back=(), adds_image=False, last=(), limits=())
     session = open_session(host_model(replace(core, host_part=host_part), {}))
     errors = [float(s.error(torch.from_numpy(result_of(session, s.image)))) for s in samples]
     # The float network errs from a reference as well, and no integers can be blamed for that.

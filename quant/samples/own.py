@@ -1,7 +1,8 @@
 """A user's own samples, as their network reads them: what any network is calibrated and judged on.
 
 One .npy or .npz file of a batch (N, C, H, W), or a folder of images and .npy files of one image
-each, (C, H, W). Values are in [0, 1] of full scale: of pixels of 8 bits 255, of more 4095. A .npz
+each, (C, H, W). Values are as the network reads them: in [0, 1] of full scale, unless another range
+is stated or found. Full scale of pixels of 8 bits in image files is 255, of more 4095. A .npz
 file may hold what the network should give in addition to what it reads, as `image` and `reference`.
 """
 
@@ -20,6 +21,18 @@ from beers_deploy.model.raster.images import read_pixels
 from beers_deploy.profiles.arrays import load_arrays
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError, printable
 from beers_deploy.profiles.instrument import MAX_DN
+from beers_deploy.quant.input_range import (
+    FROM_SAMPLES,
+    KEY,
+    LARGEST,
+    UNIT,
+    Ranges,
+    in_words,
+    ranges_of,
+    read_ranges,
+    require_ranges,
+    to_shares,
+)
 from beers_deploy.quant.onnx_file import fixed_tile_px
 from beers_deploy.quant.samples.patches import PATCH_PX, Pair, Patches
 from beers_deploy.quant.tiling.receptive_field import tiling_of
@@ -37,7 +50,6 @@ HELD_OUT_EVERY = 4
 CALIBRATED_ON = "calibration_samples"
 """What an INT8 file calls the digests of the samples that it was calibrated on."""
 DIGEST_DIGITS = 16
-LARGEST = 1 + 1e-6
 LEAST_CONTRAST = 1 / MAX_DN
 FULL_SCALE_8 = 255
 REMEDY = "See docs/reference/any-network.md for how to give samples."
@@ -45,20 +57,29 @@ REMEDY = "See docs/reference/any-network.md for how to give samples."
 
 @dataclass(frozen=True)
 class OwnSamples:
-    """A user's samples, in the place of `quant.samples.simulated.Calibration`."""
+    """A user's samples, in the place of `quant.samples.simulated.Calibration`.
+
+    Attributes:
+        name: of their file.
+        samples: each with its name.
+        ranges: of their channels; empty where all are in [0, 1].
+        stated: whether the user states the ranges.
+    """
 
     name: str
     samples: Sequence[Named]
+    ranges: Ranges = ()
+    stated: bool = False
 
     @property
     def all(self) -> Patches:
         """Every sample."""
-        return _patches(self.samples)
+        return self._patches(self.samples)
 
     @property
     def drawn(self) -> Patches:
         """The samples that the network is calibrated on."""
-        return _patches([s for k, s in enumerate(self.samples) if (k + 1) % HELD_OUT_EVERY])
+        return self._patches([s for k, s in enumerate(self.samples) if (k + 1) % HELD_OUT_EVERY])
 
     @property
     def for_tuning(self) -> Patches:
@@ -69,18 +90,22 @@ class OwnSamples:
     def unseen(self) -> Patches:
         """Every fourth sample, which calibration does not see."""
         # Fewer than four samples are too few to leave one out of calibration.
-        return _patches(self.samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or self.samples)
+        return self._patches(self.samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or self.samples)
 
     @property
     def about(self) -> dict[str, str]:
         """The metadata by which an INT8 file describes its calibration."""
         digests = " ".join(map(digest_of, self.drawn.degraded))
-        return {"calibration_data": self.name, CALIBRATED_ON: digests}
+        about = {"calibration_data": self.name, CALIBRATED_ON: digests}
+        if self.ranges:
+            source = "" if self.stated else f", {FROM_SAMPLES}"
+            about[KEY] = f"{in_words(self.ranges)}{source}"
+        return about
 
-
-def _patches(samples: Sequence[Named]) -> Patches:
-    pairs = [pair for _, pair in samples]
-    return Patches(pairs, [image for image, _ in pairs], [name for name, _ in samples])
+    def _patches(self, samples: Sequence[Named]) -> Patches:
+        pairs = [pair for _, pair in samples]
+        images = [image for image, _ in pairs]
+        return Patches(pairs, images, [name for name, _ in samples], ranges=self.ranges)
 
 
 def digest_of(sample: np.ndarray) -> str:
@@ -89,16 +114,19 @@ def digest_of(sample: np.ndarray) -> str:
     return hashlib.sha256(content).hexdigest()[:DIGEST_DIGITS]
 
 
-def samples_of(model: onnx.ModelProto, given: object) -> OwnSamples | None:
+def samples_of(
+    model: onnx.ModelProto, given: object, input_range: object = None
+) -> OwnSamples | None:
     """Read a user's samples for a network; return None if there are none and simulated patches suit
     it.
 
     Args:
         model: the network.
         given: a path, or what `samples_in` accepts; None for simulated patches.
+        input_range: the ranges that the user states; None finds them.
 
     Raises:
-        OptionError: no samples, and simulated patches do not suit the network.
+        OptionError: no samples, and simulated patches do not suit the network; no range.
         ImageError: samples that the network does not accept.
     """
     channels = int(model.graph.input[0].type.tensor_type.shape.dim[1].dim_value) or 1
@@ -109,7 +137,8 @@ def samples_of(model: onnx.ModelProto, given: object) -> OwnSamples | None:
         multiple_px = 0
     if given is not None:
         source = Path(given) if isinstance(given, str | os.PathLike) else samples_in(given)
-        return read_samples(source, channels, fixed_px, multiple_px or 1)
+        ranges = None if input_range is None else read_ranges(input_range, channels)
+        return read_samples(source, channels, fixed_px, multiple_px or 1, ranges)
     # Simulated patches have one channel and PATCH_PX a side.
     if not multiple_px:
         what = f"only images of {fixed_px} x {fixed_px} pixels"
@@ -122,7 +151,7 @@ def samples_of(model: onnx.ModelProto, given: object) -> OwnSamples | None:
     raise OptionError(
         f"`samples` must be given, because the network reads {what}, and simulated patches "
         f"are {PATCH_PX} x {PATCH_PX} pixels of one channel. Give a .npy or .npz file of "
-        "(N, C, H, W) in [0, 1], or a folder of images."
+        "(N, C, H, W), or a folder of images."
     )
 
 
@@ -131,7 +160,7 @@ def samples_in(given: object) -> list[Pair]:
     such one after the other.
 
     Args:
-        given: a batch (N, C, H, W), or one image (C, H, W), of NumPy or torch and in [0, 1]; a
+        given: a batch (N, C, H, W), or one image (C, H, W), of NumPy or torch; a
             tuple of two; a simulated pair, which knows its full scale; or an iterable of any of
             these, such as a DataLoader.
     """
@@ -185,10 +214,14 @@ def _plain(array: Any) -> np.ndarray:
 
 
 def read_samples(
-    source: Path | Sequence[Pair], channels: int, fixed_px: int | None, multiple_px: int = 1
+    source: Path | Sequence[Pair],
+    channels: int,
+    fixed_px: int | None,
+    multiple_px: int = 1,
+    ranges: Ranges | None = None,
 ) -> OwnSamples:
     """Read the samples of a file, a folder or arrays, cut to what the network takes: each
-    (1, C, h, w) float32 in [0, 1].
+    (1, C, h, w) float32.
 
     Args:
         source: the file or folder, or the samples (C, H, W) with their references.
@@ -196,6 +229,7 @@ def read_samples(
         fixed_px: side of the image that the network is fixed to; None cuts large samples to
             patches.
         multiple_px: what sides must be multiples of; the rest is cut off.
+        ranges: that the values must be in; None finds them.
 
     Raises:
         ImageError: samples that the network does not accept, or of which none has contrast.
@@ -208,23 +242,49 @@ def read_samples(
         label = str(source)
         name = source.name
         folder = source.is_dir()
+        if ranges and any(file.suffix.lower() in IMAGE_SUFFIXES for file in sample_files(source)):
+            raise ImageError(
+                f"The images in {label} have values in [0, 1], but `input_range` is "
+                f"{in_words(ranges)}. Give .npy files of what the network reads."
+            )
         items = map(_stored, sample_files(source)) if folder else _stored_batch(source)
     else:
         items = ((f"{IN_MEMORY}[{k}]", *pair) for k, pair in enumerate(source))
     samples = list[Named]()
     for sample, image, reference in items:
-        pixels = _valid_image(sample, image, channels)
+        pixels = _valid_image(sample, image, channels, ranges)
         target = _valid_reference(sample, reference)
         samples += [(sample, p) for p in _cut(pixels, target, sample, fixed_px, multiple_px)]
     if not samples:
         raise ImageError(f"{label} contains no sample, but at least one is needed. {REMEDY}")
-    # Any network keeps what is constant, so a mean over such samples would hide errors.
-    textured = [s for s in samples if np.ptp(s[1][0]) >= LEAST_CONTRAST]
+    stated = ranges is not None
+    if ranges is None:
+        ranges = _found(label, (image for _, (image, _) in samples))
+    # Any network keeps what is constant, so a mean over such samples would hide errors. A map of
+    # noise levels is constant in each sample.
+    textured = [s for s in samples if _contrast(s[1][0], ranges) >= LEAST_CONTRAST]
     if not textured:
         raise ImageError(
             f"All samples of {label} are constant, but samples need contrast. Give real images."
         )
-    return OwnSamples(name, textured)
+    return OwnSamples(name, textured, ranges, stated)
+
+
+def _found(label: str, images: Iterable[np.ndarray]) -> Ranges:
+    """Return the ranges that samples span; raise ImageError if no network is quantised for them."""
+    ranges = ranges_of(images)
+    try:
+        require_ranges(ranges)
+    except ValueError as error:
+        raise ImageError(
+            f"The values of {label} have {error}. Divide them by full scale."
+        ) from error
+    return ranges
+
+
+def _contrast(image: np.ndarray, ranges: Ranges) -> float:
+    """Return the largest share of its range that a channel of an image (1, C, h, w) spans."""
+    return float(np.ptp(to_shares(image, ranges), (2, 3)).max())
 
 
 def sample_files(path: Path) -> list[Path]:
@@ -325,7 +385,7 @@ def _valid_reference(name: str, reference: np.ndarray) -> np.ndarray:
     return values
 
 
-def _valid_image(name: str, image: np.ndarray, channels: int) -> np.ndarray:
+def _valid_image(name: str, image: np.ndarray, channels: int, ranges: Ranges | None) -> np.ndarray:
     if image.dtype.kind not in "fui" or len(image) != channels:
         raise ImageError(
             f"{name} must have {channels} channels of numbers, as the network reads, got "
@@ -334,21 +394,21 @@ def _valid_image(name: str, image: np.ndarray, channels: int) -> np.ndarray:
     if not image.size:
         raise ImageError(f"{name} has no pixels: its shape is {_shape(image)}. {REMEDY}")
     values = np.asarray(image, np.float32)
-    low = float(values.min())
-    high = float(values.max())
-    # NaN fails every comparison, so it is refused as well.
-    if not (low >= 0 and high <= LARGEST):
-        remedy = (
-            "Divide them by full scale."
-            if np.isfinite(high)
-            else "Leave out samples with missing pixels."
-        )
+    lost = np.count_nonzero(~np.isfinite(values))
+    if lost:
         raise ImageError(
-            f"The values of {name} must be in [0, 1], but they are {low:.4g} to {high:.4g}. "
-            f"{remedy}"
+            f"{name} has {lost} values that are NaN or infinite. Leave out samples with missing "
+            "pixels."
         )
-    # What rounding has left above 1, within the tolerance of LARGEST.
-    return np.minimum(values, 1)
+    shares = to_shares(values, ranges or ())
+    within = shares.min() >= 1 - LARGEST and shares.max() <= LARGEST
+    if ranges is not None and not within:
+        raise ImageError(
+            f"The values of {name} must be in `input_range`, {in_words(ranges or (UNIT,))}, but "
+            f"they are {values.min():.4g} to {values.max():.4g}. State a range that holds them."
+        )
+    # What rounding has left outside, within the tolerance of LARGEST.
+    return np.clip(values, 0, 1) if within and not ranges else values
 
 
 def _cut(

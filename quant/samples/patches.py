@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from beers_deploy.quant.input_range import Ranges
+
 if TYPE_CHECKING:
     from beers_deploy.quant.samples.views import View
 
@@ -40,7 +42,7 @@ class Regenerated(Sequence[T]):
 
 @dataclass(frozen=True)
 class Patches:
-    """Images (1, C, h, w) float32 in [0, 1], and their references.
+    """Images (1, C, h, w) float32 as the network reads them, and their references.
 
     Attributes:
         pairs: (degraded, reference) of each patch.
@@ -48,12 +50,14 @@ class Patches:
         names: of a user's own samples, for messages; empty for simulated patches.
         views: what each simulated patch shows, and the sensors that see it; empty for a user's own
             samples.
+        ranges: of the channels of the images; empty where all are in [0, 1].
     """
 
     pairs: Sequence[Pair]
     degraded: Sequence[np.ndarray]
     names: Sequence[str] = ()
     views: "Sequence[View]" = ()
+    ranges: Ranges = ()
 
     @cached_property
     def digest(self) -> str:

@@ -258,9 +258,11 @@ def _require_pointwise(at: AxisNode) -> None:
     if kind in AXES:
         at.require(at.attribute("axis", AXES[kind]) in (1, -3), "does not work along the channels")
     elif kind == "Gather":
-        # Our host files have an activation by itself as a table.
-        table = at.shapes.get(at.node.inputs[0], ())
-        at.require(len(table) == 1 and at.attribute("axis", 0) == 0, "moves pixels")
+        # Our host files have an activation by itself as a table, and in front of a core that reads
+        # several channels at a lower resolution they change the order of channels.
+        table, order = (len(at.shapes.get(name, ())) for name in at.node.inputs)
+        is_order = (table, order, at.attribute("axis", 0)) == (0, 1, 1)
+        at.require(is_order or (table, at.attribute("axis", 0)) == (1, 0), "moves pixels")
     else:
         why = next(
             (why for why, marks in WHY.items() if any(mark in kind for mark in marks)),

@@ -13,6 +13,7 @@ from onnx import helper
 
 import beers_deploy as bd
 from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.quant.input_range import from_shares, to_shares
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from tests.quant.quick import one_guess
 
@@ -37,10 +38,12 @@ class Drawn(GraphWriter):
         """Write a node and return its result."""
         return self.node(kind, f"t{len(self.nodes)}", list(sources), **attributes)
 
-    def conv(self, source: str, outputs: int, inputs: int, pad: int | None = None) -> str:
+    def conv(
+        self, source: str, outputs: int, inputs: int, pad: int | None = None, gain: float = 1
+    ) -> str:
         """Write a convolution of 3 x 3 with drawn weights and return its result."""
         pad = self._pad if pad is None else pad
-        weight = self._generator.normal(0, 0.3, (outputs, inputs, 3, 3))
+        weight = gain * self._generator.normal(0, 0.3, (outputs, inputs, 3, 3))
         name = self.constant(f"w{len(self.nodes)}", weight.astype(np.float32))
         return self.add("Conv", source, name, pads=[pad] * 4)
 
@@ -90,20 +93,30 @@ PARTS: dict[str, Part] = {
 }
 
 
+RANGES = [(0.0, 1.0), (-1.0, 1.0), (0.0, 255.0), (-2.1, 2.6)]
+
+
 def drawn(
-    path: Path, parts: list[str], *, adds_image: bool, clips: bool, padded: bool = True
+    path: Path,
+    parts: list[str],
+    *,
+    adds_image: bool,
+    clips: bool,
+    padded: bool = True,
+    ends: tuple[float, float] = (0.0, 1.0),
 ) -> Path:
-    """Write a network of these parts between two convolutions."""
+    """Write a network of these parts between two convolutions, for images of a range."""
     w = Drawn(int(padded))
-    last = w.conv("image", CHANNELS, 1)
+    size = ends[1] - ends[0]
+    last = w.conv("image", CHANNELS, 1, gain=1 / size)
     for part in parts:
         last = PARTS[part](w, last)
-    last = w.conv(last, 1, CHANNELS)
+    last = w.conv(last, 1, CHANNELS, gain=size)
     # Without padding the result has another size than the image.
     if adds_image and padded:
         last = w.add("Add", "image", last)
     if clips:
-        last = w.add("Clip", last, w.number(0), w.number(1))
+        last = w.add("Clip", last, *map(w.number, ends))
     result = helper.make_tensor_value_info(last, onnx.TensorProto.FLOAT, ["N", 1, "h", "w"])
     onnx.save(make_model(w.graph("drawn", [image_info("image", 1, None)], [result]), {}), path)
     return path
@@ -115,21 +128,26 @@ def drawn(
     adds_image=st.booleans(),
     clips=st.booleans(),
     padded=st.booleans(),
+    ends=st.sampled_from(RANGES),
 )
 def test_commands_do_not_contradict_each_other(
-    tmp_path_factory: pytest.TempPathFactory, parts: list[str], **shape: bool
+    tmp_path_factory: pytest.TempPathFactory,
+    parts: list[str],
+    ends: tuple[float, float],
+    **shape: bool,
 ) -> None:
     """A network that check passes has integers that check passes, and that run.
 
     One that check refuses is refused by quantize, or has integers that check refuses.
     """
-    path = drawn(tmp_path_factory.mktemp("drawn") / "a.onnx", parts, **shape)
+    path = drawn(tmp_path_factory.mktemp("drawn") / "a.onnx", parts, ends=ends, **shape)
     blocks = np.random.default_rng(1).uniform(0, 1, (4, 1, 4, 4)).astype(np.float32)
-    samples = np.kron(blocks, np.ones((8, 8), np.float32))
+    shares = np.kron(blocks, np.ones((8, 8), np.float32))
+    samples = from_shares(shares, (ends,))
     fits = bool(bd.check(path, tile=64))
     try:
         with one_guess():
-            int8 = bd.quantize(path, samples=samples, progress=False)
+            int8 = bd.quantize(path, samples=samples, input_range=ends, progress=False)
     except ModelError:
         int8 = None
     # What a board does not run, such as an activation behind a resize, may have integers.
@@ -142,5 +160,7 @@ def test_commands_do_not_contradict_each_other(
         assume("more contrast" not in str(error))
         raise
     bd.bench(path, tile=64, traditional=False)
-    restored = bd.restore(samples[0, 0], network=int8, full_scale=1, progress=False, force=True)
-    assert restored.shape == (32, 32)
+    restored = bd.restore(shares[0, 0], network=int8, full_scale=1, progress=False, force=True)
+    # The whole image is one tile.
+    expected = np.clip(to_shares(int8(samples[:1])[0, 0][None], (ends,)), 0, 1)[0]
+    np.testing.assert_allclose(restored, expected, atol=0.01)

@@ -111,8 +111,8 @@ def with_reference(
     ("write", "message"),
     [
         (of(RAMP), "must have 1 channels of numbers.*got 2"),
-        (of(RAMP[:, :1] * 300), "in \\[0, 1\\], but they are 0 to "),
-        (of(np.full((1, 1, 9, 9), np.nan)), "but they are nan"),
+        (of(RAMP[:, :1] * 3e5), "a range of 0 to .*Divide them by full scale"),
+        (of(np.full((1, 1, 9, 9), np.nan)), "81 values that are NaN or infinite"),
         (of(RAMP[0, 0]), "a batch of"),
         (of(RAMP[:, :1, :3, :3]), "at least 4 pixels a side, got 3 x 3"),
         (of(RAMP[:0, :1]), "contains no sample"),

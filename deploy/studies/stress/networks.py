@@ -31,6 +31,7 @@ from beers_deploy.quant.graph import (
     correction_graph,
     image_channels,
 )
+from beers_deploy.quant.input_range import in_words
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.onnx_file import any_size, require_quantized
 from beers_deploy.quant.session import open_session, run
@@ -146,6 +147,11 @@ def open_subject(
     for network in subject.by_name.values():
         # A network that cannot be tiled is refused before anything runs.
         _ = network.tiling
+        if network.source.input_ranges:
+            raise ModelError(
+                f"{network.source.label} reads images of {in_words(network.source.input_ranges)}, "
+                "but stress tests are for networks that read images in [0, 1]."
+            )
     return subject
 
 

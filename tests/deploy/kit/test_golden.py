@@ -32,6 +32,8 @@ from tests.quant.quick import one_guess
 
 SHIPPED = ("convbeers-xs-int8", "convbeers-half-xs-int8")
 USERS = ("unet", "mobile")
+NORMALISED = "unet, normalised"
+"""A network that reads images in [-1, 1]."""
 TILE_PX = 32
 
 
@@ -39,15 +41,18 @@ def network(name: str) -> bd.Network:
     if name in SHIPPED:
         return bd.Network.load(name)
     samples = np.random.default_rng(0).random((4, 1, 32, 32), dtype=np.float32)
+    normalised = name == NORMALISED
+    name = name.partition(",")[0]
     with one_guess():
         return bd.quantize(
             to_onnx(name, build(name, torch.Generator().manual_seed(0))),
-            samples=samples,
+            samples=2 * samples - 1 if normalised else samples,
+            input_range="-1,1" if normalised else None,
             progress=False,
         )
 
 
-@pytest.fixture(scope="module", params=[*SHIPPED, *USERS])
+@pytest.fixture(scope="module", params=[*SHIPPED, *USERS, NORMALISED])
 def vectors(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_golden(network(request.param), tmp_path_factory.mktemp("golden"), tile=TILE_PX)
 

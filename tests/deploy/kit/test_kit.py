@@ -33,7 +33,7 @@ from beers_deploy.profiles.errors import OptionError, ProfileError
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.sensor_bank.calibrate import bank_results, quantize_behind_bank
 from tests.deploy.command_line import done
-from tests.deploy.kit.test_golden import network
+from tests.deploy.kit.test_golden import NORMALISED, network
 from tests.model.networks import behind_a_bank
 from tests.profiles.own_sensor import edited, own_sensor
 from tests.quant.sensor_bank.test_filters import textured
@@ -62,13 +62,15 @@ def behind_fitted_kernels() -> bd.Network:
 
 
 @pytest.mark.parametrize(
-    "name", ["convbeers-xs-int8", "convbeers-half-xs-int8", "unet", "espcn", "fitted kernels"]
+    "name",
+    ["convbeers-xs-int8", "convbeers-half-xs-int8", "unet", "espcn", "fitted kernels", NORMALISED],
 )
 def test_the_host_part_gives_the_host_files_bytes(name: str, tmp_path: Path) -> None:
     """On a Python with NumPy and onnxruntime alone, on a swath of odd sides."""
     int8 = behind_fitted_kernels() if name == "fitted kernels" else network(name)
     folder = bd.Board.load("vck190").kit(int8, tmp_path / "kit", tile=96)
     image = np.random.default_rng(1).random((1, 131, 203), dtype=np.float32)
+    image = 2 * image - 1 if name == NORMALISED else image
     np.save(tmp_path / "image.npy", image)
     command = [
         sys.executable,

@@ -1,0 +1,103 @@
+"""A network of colours and a map of noise levels, as FFDNet reads them: from samples to a board."""
+
+from pathlib import Path
+
+import numpy as np
+import onnxruntime as ort
+import pytest
+import torch
+from torch import nn
+
+import beers_deploy as bd
+from beers_deploy.profiles.errors import ModelError
+from tests.deploy.command_line import done, refused
+from tests.quant.quick import one_guess
+
+TOP = 50
+"""The largest noise level, in digital numbers of 8 bits."""
+
+
+def network(largest: float) -> bd.Network:
+    """Return a network of 3 + 1 channels, the last one of levels up to `largest`."""
+    layers = [nn.Conv2d(16, 12, 3, padding=1), nn.ReLU(), nn.Conv2d(12, 12, 3, padding=1)]
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for layer in (layers[0], layers[2]):
+            layer.weight.normal_(0, 0.1, generator=generator)
+            layer.bias.normal_(0, 0.1, generator=generator)
+        # The unshuffled channels of the map come last.
+        layers[0].weight[:, 12:] /= largest
+    net = nn.Sequential(nn.PixelUnshuffle(2), *layers, nn.PixelShuffle(2))
+    return bd.Network.load(net, example=(1, 4, 32, 32))
+
+
+def samples(largest: float, count: int = 8) -> np.ndarray:
+    generator = np.random.default_rng(2)
+    blocks = generator.uniform(0, 1, (count, 3, 9, 9)).astype(np.float32)
+    image = np.kron(blocks, np.ones((4, 4), np.float32))
+    levels = largest * generator.uniform(0, 1, (count, 1, 1, 1)).astype(np.float32)
+    return np.concatenate([image, np.broadcast_to(levels, image[:, :1].shape)], 1)
+
+
+@pytest.mark.parametrize(
+    ("largest", "option"),
+    [(75 / 255, None), (TOP, None), (TOP, f"0,1,0,1,0,1,0,{TOP}")],
+    ids=["in the usual range", "found", "stated"],
+)
+def test_a_map_of_noise_levels_is_a_channel_of_its_own_range(
+    largest: float, option: str | None
+) -> None:
+    floating = network(largest)
+    given = samples(largest)
+    with one_guess():
+        int8 = bd.quantize(floating, samples=given, input_range=option, progress=False)
+    notes = [note for note in int8.table.notes if note.startswith("input range: ")]  # type: ignore[union-attr]
+    if largest < 1:
+        assert int8.input_ranges == ()
+        assert notes == []
+    else:
+        top = TOP if option else float(given[:, 3].max())
+        assert int8.input_ranges == ((0, 1),) * 3 + ((0, top),)
+        assert notes[0].endswith("found in the samples") == (option is None)
+    verdict = bd.gate(floating, int8, samples=given, max_mae=0.02, progress=False)
+    assert verdict
+    assert bd.check(int8, tile=64)
+    assert bd.bench(int8, tile=64, traditional=False)
+    apart = np.abs(int8(given) - floating(given))
+    assert apart.mean() == pytest.approx(verdict.comparison.result.mae, rel=0.3)
+
+
+def test_the_file_reads_the_networks_own_units(tmp_path: Path) -> None:
+    """With stock onnxruntime, from the command line."""
+    floating = network(TOP)
+    floating.save(tmp_path / "a.onnx")
+    np.save(tmp_path / "x.npy", samples(TOP))
+    arguments = ("quantize", str(tmp_path / "a.onnx"), "--out", str(tmp_path / "b.onnx"))
+    text = done(
+        *arguments,
+        *("--samples", tmp_path / "x.npy", "--input-range", f"0,1,0,1,0,1,0,{TOP}"),
+        *("--effort", "fast"),
+    )
+    assert "input range: 0 to 1, 0 to 1, 0 to 1, 0 to 50" in " ".join(text.split())
+    session = ort.InferenceSession(tmp_path / "b.onnx", providers=["CPUExecutionProvider"])
+    result = session.run(None, {"image": samples(TOP)})[0]
+    assert np.abs(result - floating(samples(TOP))).mean() < 0.05
+    assert "has no effect without --samples" in refused(*arguments, "--input-range", "0,255")
+
+
+def test_restore_maps_full_scale_onto_a_stated_range() -> None:
+    floating = network(TOP)
+    given = samples(TOP)
+    option = ((-1, 1),) * 3 + ((0, TOP),)
+    with one_guess():
+        stated = bd.quantize(floating, samples=given, input_range=option, progress=False)
+        found = bd.quantize(floating, samples=given, progress=False)
+    low, high = np.array(option, np.float32).T[:, :, None, None]
+    shares = (given[0] - low) / (high - low)
+    # In tiles, because the host moves the pixels of several channels first.
+    how = {"full_scale": 1, "progress": False, "force": True, "tile": 24}
+    restored = bd.restore(shares, network=stated, **how)
+    expected = (stated(given[:1])[0] + 1) / 2
+    np.testing.assert_allclose(restored, np.clip(expected, 0, 1), atol=1e-5)
+    with pytest.raises(ModelError, match="Quantise it again with `input_range`"):
+        bd.restore(shares, network=found, **how)
