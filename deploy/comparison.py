@@ -152,6 +152,7 @@ def compare(
     patches: int = 32,
     seed: int = 0,
     metric: str | None = None,
+    output: str | None = None,
     progress: Progress = None,
 ) -> Comparison:
     """Compare a float and an INT8 network on samples that calibration did not see.
@@ -166,6 +167,7 @@ def compare(
         patches: number of simulated patches, 128 x 128 pixels each.
         seed: of the patches.
         metric: psnr, ssim or mae: also compare the results with the references.
+        output: name of the output to compare, of a network that has several.
         progress: a function that is called at each step, False for silence, None for a bar or lines
             on standard error.
 
@@ -189,7 +191,7 @@ def compare(
         raise OptionError(
             f"`metric` must be one of {', '.join(METRICS)}, but it is {printable(repr(metric))}."
         )
-    floating, int8 = pair_of(float_network, int8_network, profile)
+    floating, int8 = pair_of(float_network, int8_network, profile, output)
     data = Data(profile, samples, None if images is None else Path(images), patches, seed)
     with reporting(progress):
         return compared(floating, int8, data, data.own(floating), metric or "")
@@ -257,7 +259,10 @@ def compared(
 
 
 def pair_of(
-    float_network: NetworkLike | None, int8_network: NetworkLike | None, sensor: Sensor
+    float_network: NetworkLike | None,
+    int8_network: NetworkLike | None,
+    sensor: Sensor,
+    output: str | None = None,
 ) -> tuple[Network, Network]:
     """Return a float network and its INT8 network.
 
@@ -266,13 +271,14 @@ def pair_of(
             quantised in this process, or the name of a shipped pair; the default pair if None.
         int8_network: the INT8 network, or None.
         sensor: that shipped networks are conditioned on.
+        output: of a network that has several, the one that is compared.
 
     Raises:
-        OptionError: no INT8 network.
+        OptionError: no INT8 network, or no such output.
         ModelError: a float network in the place of the INT8 one, or the other way round.
     """
     if int8_network is None and isinstance(float_network, Network) and float_network.origin:
-        return float_network.origin, float_network
+        return float_network.origin.with_output(output), float_network
     if int8_network is None:
         int8_network = _shipped_int8(float_network)
         float_network = str(int8_network).removesuffix(INT8)
@@ -282,7 +288,9 @@ def pair_of(
     int8 = Network.load(int8_network, sensor=sensor, int8=True)
     require_quantized(floating.model, floating.label, wanted=False)
     require_quantized(int8.model, int8.label, wanted=True)
-    return floating, int8
+    # The INT8 file of 'quantize' has one output, whatever its float network has.
+    its_output = output if len(int8.model.graph.output) > 1 else None
+    return floating.with_output(output), int8.with_output(its_output)
 
 
 def _shipped_int8(network: NetworkLike | None) -> str:

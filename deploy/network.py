@@ -5,7 +5,7 @@ import io
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Union
@@ -30,15 +30,18 @@ from beers_deploy.profiles.shipped import BLIND, DEFAULT_TARGET
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.domains import OPSET
 from beers_deploy.quant.encodings import CORE, board_model, read_core, vint8_model
+from beers_deploy.quant.graph import require_one_image
 from beers_deploy.quant.input_range import Ranges
 from beers_deploy.quant.onnx.external_weights import unchanged
 from beers_deploy.quant.onnx_file import (
+    faults_named,
     fixed_tile_px,
     is_quantized,
     load_onnx,
     metadata,
     read_onnx,
     save_onnx,
+    with_one_output,
 )
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.tiling.receptive_field import Tiling, tiling_of
@@ -152,6 +155,23 @@ class Network:
         """
         name = f"{weights.name}{INT8}" if int8 else weights.name
         return cls(weights.model(sensor, int8), name, weights=weights, profile=sensor)
+
+    def with_output(self, name: str | None) -> "Network":
+        """Return the network with one of its outputs alone.
+
+        Args:
+            name: of the output; None for the only one.
+
+        Raises:
+            ModelError: several outputs and no name, or several inputs.
+            OptionError: no such output.
+        """
+        model = self.model if name is None else with_one_output(self.model, name, self.label)
+        weights = {tensor.name for tensor in model.graph.initializer}
+        inputs = [value.name for value in model.graph.input if value.name not in weights]
+        with faults_named(self.label):
+            require_one_image(inputs, [value.name for value in model.graph.output])
+        return self if name is None else replace(self, model=model)
 
     @cached_property
     def exposures(self) -> Mapping[int, "Network"]:

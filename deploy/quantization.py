@@ -81,6 +81,7 @@ def quantized(
     finetune: int | str,
     effort: Effort = Effort.normal,
     adapts: bool = False,
+    output: str | None = None,
 ) -> tuple[Network, "Patches | None"]:
     """Quantise a float network; the INT8 one knows its `origin`.
 
@@ -94,6 +95,7 @@ def quantized(
         finetune: steps that train the integers, or "auto".
         effort: of the search for equalization factors.
         adapts: replace operators that the DPU lacks.
+        output: name of the output that is kept; None for the only one.
 
     Raises:
         ModelError: an operation that the DPU does not compute.
@@ -113,7 +115,7 @@ def quantized(
             f"`adapt` has no effect on {weights.name}, because a DPU computes all its operators. "
             "Leave `adapt` out."
         )
-    origin = Network.load(network, sensor=data.sensor)
+    origin = Network.load(network, sensor=data.sensor).with_output(output)
     require_quantized(origin.model, origin.label, wanted=False)
     with faults_named(origin.label):
         if weights:

@@ -56,8 +56,8 @@ default limit of the MAE.
 """
 
 
-PATCHES = ("sensor", "images", "patches", "seed", "samples")
-"""The arguments that say what INT8 and float are compared on."""
+PATCHES = ("sensor", "images", "patches", "seed", "samples", "output")
+"""The arguments that say on what INT8 and float are compared, and by which output."""
 
 SAME_DB = 0.01
 """Between the PSNRs of one float network on two processors: most differ by less

@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,7 @@ from beers_deploy.profiles.errors import (
 from beers_deploy.profiles.toml import read_whole, unreadable
 from beers_deploy.quant.domains import IR_VERSION, MICROSOFT, OPSET, opset_of
 from beers_deploy.quant.onnx.external_weights import take_in
+from beers_deploy.quant.onnx.graph import OnnxGraph
 from beers_deploy.quant.onnx.node_order import sort_nodes
 from beers_deploy.quant.onnx.runnable import check_runnable
 from beers_deploy.quant.simplify.simplify import simplify
@@ -221,6 +222,36 @@ def with_outputs(model: onnx.ModelProto, kinds: Mapping[str, int]) -> onnx.Model
         if name not in names
     )
     return extended
+
+
+OUTPUT = "output"
+"""In the metadata of a network with one of its outputs alone: the name of that."""
+
+
+def with_one_output(model: onnx.ModelProto, name: str, where: str) -> onnx.ModelProto:
+    """Return the network with one of its outputs, and only what that is computed of.
+
+    Raises:
+        OptionError: no such output.
+    """
+    values = {value.name: value for value in model.graph.output}
+    if name not in values:
+        raise OptionError(
+            f"`output` must be an output of {where}, {printable(', '.join(values))}, got "
+            f"{printable(repr(name))}. The file to write is `out`."
+        )
+    copy = deepcopy(model)
+    graph = copy.graph
+    del graph.output[:]
+    graph.output.append(values[name])
+    OnnxGraph(copy).save()
+    reads = {name, *chain.from_iterable(node.input for node in graph.node)}
+    for parts in (graph.input, graph.initializer):
+        needed = [part for part in parts if part.name in reads]
+        del parts[:]
+        parts.extend(needed)
+    onnx.helper.set_model_props(copy, {**metadata(copy), OUTPUT: name})
+    return _simplified(copy, where, to_run=False)
 
 
 def fixed_tile_px(model: onnx.ModelProto) -> int | None:

@@ -17,6 +17,7 @@ def check(
     target: TargetLike = DEFAULT_TARGET,
     dpu: str | None = None,
     tile: Annotated[int, Interval(ge=1, le=8192)] | None = None,
+    output: str | None = None,
 ) -> "Checked":
     """Check every operator of a network against the rules of a DPU.
 
@@ -29,6 +30,7 @@ def check(
         target: board or NPU whose rules count: a name, or a .toml file.
         dpu: configuration of the DPU that the board lists; its default if none.
         tile: side of a tile in pixels; the network's own if it has one, else 640.
+        output: name of the output to keep of a network that has several; all if none.
 
     Returns:
         A table of devices, refusals and nodes. It is true if the DPU runs its part whole.
@@ -45,4 +47,4 @@ def check(
     from beers_deploy.dpu.checker.table import check_network
     from beers_deploy.profiles.target import TargetProfile
 
-    return check_network(network, TargetProfile.load(target), dpu, tile)
+    return check_network(network, TargetProfile.load(target), dpu, tile, output)

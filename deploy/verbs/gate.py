@@ -42,6 +42,7 @@ def gate(
     samples: Samples | None = None,
     patches: Annotated[int, Interval(ge=1, le=100_000)] = 32,
     metric: Literal["psnr", "ssim", "mae"] | None = None,
+    output: str | None = None,
     seed: Seed = 0,
     junit: VerdictFile | None = None,
     record: Annotated[VerdictFolder, Holds(*RECORD)] | None = None,
@@ -69,6 +70,7 @@ def gate(
             images; in Python also arrays.
         patches: number of simulated patches of 128 x 128 pixels.
         metric: also compare the results with the references of the samples, by this metric.
+        output: name of the output to compare, of a network that has several.
         seed: seed of the patches.
         junit: JUnit XML file to write the verdict to.
         record: folder for a record of evidence: JSON, a page and an ML-BOM.
@@ -113,16 +115,16 @@ def gate(
     allowed = limits_of(limits, max_mae)
     board = TargetProfile.load(target)
     profile = Sensor.load(sensor)
-    floating, int8 = pair_of(float_network, int8_network, profile)
+    floating, int8 = pair_of(float_network, int8_network, profile, output)
     scenes = None if images is None else Path(images)
     data = Data(profile, samples, scenes, patches, seed)
-    earlier = baseline_for(baseline, data.arguments, allowed, metric)
+    earlier = baseline_for(baseline, {**data.arguments, "output": output}, allowed, metric)
     # Missing references are refused before the networks run.
     own = data.own(floating)
     require_references(own, allowed, metric)
     comparison = compared(floating, int8, data, own, metric or "")
     verdict = judged(comparison, allowed, earlier, board, own)
-    asked = recorded({"limits": limits, "baseline": baseline, "metric": metric})
+    asked = recorded({"limits": limits, "baseline": baseline, "metric": metric, "output": output})
     verdict = replace(verdict, arguments={**verdict.arguments, **asked})
     # The record comes first: its library may fail, and then no other file may have a verdict.
     if folder is not None:

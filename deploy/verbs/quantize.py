@@ -56,6 +56,7 @@ def quantize(
     effort: Literal["fast", "normal", "best"] = "normal",
     finetune: Steps = 0,
     adapt: bool = False,
+    output: str | None = None,
     seed: Seed = 0,
     board_file: OutputFile | None = None,
     tile: Annotated[int, Interval(ge=16, le=8192)] | None = None,
@@ -92,6 +93,7 @@ def quantize(
             LeakyReLU and PReLU by LeakyReLU of 26/256, or exactly if that loses more than 0.05 dB.
             The convolutions around them are fitted to the original network, and the table has the
             loss in float. INT8 is compared with the original.
+        output: name of the output to keep of a network that has several.
         seed: seed of the patches.
         board_file: also write the core in the board's encoding: QDQ ONNX, of an NPU VINT8.
         tile: side of the tile in pixels that `board_file` is fixed to; an NPU needs one.
@@ -147,7 +149,7 @@ def quantize(
     require_core_file(board, files[1], tile, inputs)
     scenes = None if images is None else Path(images)
     data = Data(Sensor.load(sensor), samples, scenes, patches, seed, patch, input_range)
-    result, held_out = quantized(network, data, board, finetune, Effort(effort), adapt)
+    result, held_out = quantized(network, data, board, finetune, Effort(effort), adapt, output)
     # Both are made before the first is written: a core that is refused leaves no file.
     core = result.core(board, tile) if files[1] else None
     if files[0] is not None:
@@ -179,6 +181,7 @@ def quantize(
                 "effort": effort,
                 "finetune": finetune,
                 "adapt": adapt,
+                "output": output,
                 "seed": seed,
                 "tile": tile,
             }

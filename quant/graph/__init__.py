@@ -36,7 +36,12 @@ from beers_deploy.quant.graph.operations import (
 )
 from beers_deploy.quant.graph.plain import correction_graph, image_channels, plain_network
 from beers_deploy.quant.graph.reader import read_network, refusal
-from beers_deploy.quant.graph.split_network import SplitNetwork, channels_of, check_network
+from beers_deploy.quant.graph.split_network import (
+    SplitNetwork,
+    channels_of,
+    check_network,
+    require_one_image,
+)
 from beers_deploy.quant.graph.writer import graph_to_onnx
 from beers_deploy.quant.onnx.window import Window
 
@@ -71,6 +76,7 @@ __all__ = [
     "read_network",
     "read_planes",
     "refusal",
+    "require_one_image",
     "same",
     "tensors",
     "tied",

@@ -33,6 +33,7 @@ from beers_deploy.quant.graph.split_network import (
     check_result_size,
     cut,
     named_apart,
+    require_one_image,
     sized,
     unsupported,
 )
@@ -141,18 +142,7 @@ class _Reader:
 
     def graph(self) -> Graph:
         """Return the operations from `IMAGE` to `CORRECTION`; global pooling needs a fixed size."""
-        if len(self.source.inputs) > 1:
-            raise unsupported(
-                f"The network must have one input, the image, but it has {len(self.source.inputs)}"
-                f": {', '.join(self.source.inputs)}.",
-                "Export it with the other inputs as constants, or as channels of the image.",
-            )
-        if len(self.source.outputs) != 1:
-            raise unsupported(
-                f"The network must have one output, but it has {len(self.source.outputs)}: "
-                f"{', '.join(self.source.outputs)}.",
-                "Export it with one of them.",
-            )
+        require_one_image(self.source.inputs, self.source.outputs)
         (result,) = self.source.outputs
         nodes = list(self.source.nodes)
         # The host clips the result.

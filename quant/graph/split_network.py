@@ -1,6 +1,6 @@
 """A network cut where the DPU's part begins and ends, and whether its operations fit together."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -76,6 +76,21 @@ def unsupported(fault: str, remedy: str = REMEDY) -> ModelError:
         remedy: another sentence.
     """
     return ModelError(f"{printable(fault, 4 * LONGEST)} {remedy}")
+
+
+def require_one_image(inputs: Collection[str], outputs: Collection[str]) -> None:
+    """Raise ModelError unless a network has one input and one output, of these names."""
+    if len(inputs) != 1:
+        raise unsupported(
+            f"The network must have one input, the image, but it has {len(inputs)}: "
+            f"{', '.join(inputs)}.",
+            "Concatenate them along the channels into one input, and split that in the network.",
+        )
+    if len(outputs) != 1:
+        raise unsupported(
+            f"The network must have one output, but it has {len(outputs)}: {', '.join(outputs)}.",
+            "Name the one to keep as `output`.",
+        )
 
 
 def cut(graph: Graph, channels: int) -> SplitNetwork:

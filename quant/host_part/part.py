@@ -165,7 +165,10 @@ class HostPart:
 
     def clip(self, result: np.ndarray) -> np.ndarray:
         """Clip a float network's result as the host clips its own."""
-        return np.clip(result, *self.clip_limits) if self.clip_limits else result
+        if not self.clip_limits:
+            return result
+        low, high = self.clip_limits
+        return np.clip(result, low, high)
 
     @property
     def clip_limits(self) -> tuple[float, ...]:

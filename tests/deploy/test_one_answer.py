@@ -104,21 +104,32 @@ def drawn(
     clips: bool,
     padded: bool = True,
     ends: tuple[float, float] = (0.0, 1.0),
+    has_two: bool = False,
 ) -> Path:
-    """Write a network of these parts between two convolutions, for images of a range."""
+    """Write a network of these parts between two convolutions, for images of a range.
+
+    It may have an output of twice the sampling too.
+    """
     w = Drawn(int(padded))
     size = ends[1] - ends[0]
     last = w.conv("image", CHANNELS, 1, gain=1 / size)
     for part in parts:
         last = PARTS[part](w, last)
+    large = w.conv(last, 4, CHANNELS, gain=size)
     last = w.conv(last, 1, CHANNELS, gain=size)
     # Without padding the result has another size than the image.
     if adds_image and padded:
         last = w.add("Add", "image", last)
     if clips:
         last = w.add("Clip", last, *map(w.number, ends))
-    result = helper.make_tensor_value_info(last, onnx.TensorProto.FLOAT, ["N", 1, "h", "w"])
-    onnx.save(make_model(w.graph("drawn", [image_info("image", 1, None)], [result]), {}), path)
+    names = [w.node("Identity", "restored", [last])]
+    if has_two:
+        names.append(w.node("DepthToSpace", "large", [large], blocksize=2))
+    results = [
+        helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["N", 1, None, None])
+        for name in names
+    ]
+    onnx.save(make_model(w.graph("drawn", [image_info("image", 1, None)], results), {}), path)
     return path
 
 
@@ -129,25 +140,30 @@ def drawn(
     clips=st.booleans(),
     padded=st.booleans(),
     ends=st.sampled_from(RANGES),
+    output=st.sampled_from([None, "restored", "large"]),
 )
 def test_commands_do_not_contradict_each_other(
     tmp_path_factory: pytest.TempPathFactory,
     parts: list[str],
     ends: tuple[float, float],
+    output: str | None,
     **shape: bool,
 ) -> None:
     """A network that check passes has integers that check passes, and that run.
 
     One that check refuses is refused by quantize, or has integers that check refuses.
     """
-    path = drawn(tmp_path_factory.mktemp("drawn") / "a.onnx", parts, ends=ends, **shape)
+    path = tmp_path_factory.mktemp("drawn") / "a.onnx"
+    drawn(path, parts, ends=ends, has_two=output is not None, **shape)
     blocks = np.random.default_rng(1).uniform(0, 1, (4, 1, 4, 4)).astype(np.float32)
     shares = np.kron(blocks, np.ones((8, 8), np.float32))
     samples = from_shares(shares, (ends,))
-    fits = bool(bd.check(path, tile=64))
+    fits = bool(bd.check(path, tile=64, output=output))
     try:
         with one_guess():
-            int8 = bd.quantize(path, samples=samples, input_range=ends, progress=False)
+            int8 = bd.quantize(
+                path, samples=samples, input_range=ends, output=output, progress=False
+            )
     except ModelError:
         int8 = None
     # What a board does not run, such as an activation behind a resize, may have integers.
@@ -155,11 +171,12 @@ def test_commands_do_not_contradict_each_other(
     if not fits:
         return
     try:
-        bd.gate(path, int8, samples=samples, progress=False)
+        bd.gate(path, int8, samples=samples, output=output, progress=False)
     except OptionError as error:
         assume("more contrast" not in str(error))
         raise
-    bd.bench(path, tile=64, traditional=False)
+    for network in (path, int8):
+        bd.bench(network, tile=64, traditional=False)
     restored = bd.restore(shares[0, 0], network=int8, full_scale=1, progress=False, force=True)
     # The whole image is one tile.
     expected = np.clip(to_shares(int8(samples[:1])[0, 0][None], (ends,)), 0, 1)[0]

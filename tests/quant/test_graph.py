@@ -166,5 +166,14 @@ def test_two_outputs_are_refused_by_name() -> None:
     model.graph.output.append(
         helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, ["N", 2, "H", "W"])
     )
-    with pytest.raises(ModelError, match="one output, but it has 2: restored, x"):
+    with pytest.raises(ModelError, match=r"one output, but it has 2: restored, x.*as `output`"):
+        read_network(model)
+
+
+def test_two_inputs_are_refused_by_name() -> None:
+    model = behind_conv(lambda w: w.node("Add", "restored", ["x", "level"]))
+    model.graph.input.append(
+        helper.make_tensor_value_info("level", onnx.TensorProto.FLOAT, ["N", 1, "H", "W"])
+    )
+    with pytest.raises(ModelError, match=r"has 2: image, level\. Concatenate them"):
         read_network(model)

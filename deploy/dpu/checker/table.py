@@ -70,7 +70,11 @@ class Checked(Table):
 
 
 def check_network(
-    network: NetworkLike | None, target: TargetProfile, dpu: str | None, tile: int | None
+    network: NetworkLike | None,
+    target: TargetProfile,
+    dpu: str | None,
+    tile: int | None,
+    output: str | None = None,
 ) -> Checked:
     """Place every node of a network and return the rules that are broken.
 
@@ -79,6 +83,7 @@ def check_network(
         target: a board with a DPU or an NPU.
         dpu: configuration of the DPU; the board's default if None.
         tile: side of a tile in pixels; the network's own, else 640, if None.
+        output: the output that is kept; all if None.
 
     Raises:
         ModelError: no ONNX network of images.
@@ -86,6 +91,8 @@ def check_network(
         OptionError: a target without DPU or NPU.
     """
     source = Network.load(network, sensor=SENSOR, int8=True, to_run=False)
+    if output is not None:
+        source = source.with_output(output)
     build = ruled(target, dpu)
     tile_px = own_tile_px(source.model) or TILE_PX
     if tile is not None:
