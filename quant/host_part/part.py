@@ -168,7 +168,7 @@ class HostPart:
         if not self.clip_limits:
             return result
         low, high = self.clip_limits
-        return np.clip(result, low, high)
+        return np.asarray(np.clip(result, low, high))
 
     @property
     def clip_limits(self) -> tuple[float, ...]:

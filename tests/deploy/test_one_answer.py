@@ -175,6 +175,7 @@ def test_commands_do_not_contradict_each_other(
     except OptionError as error:
         assume("more contrast" not in str(error))
         raise
+    assert int8 is not None
     for network in (path, int8):
         bd.bench(network, tile=64, traditional=False)
     restored = bd.restore(shares[0, 0], network=int8, full_scale=1, progress=False, force=True)

@@ -22,7 +22,8 @@ from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from beers_deploy.quant.samples.own import read_samples
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session, result_of
-from tests.quant.quick import in_float, quickly
+from tests.quant.quick import in_float as float_result
+from tests.quant.quick import quickly
 
 ENDS = st.floats(-300, 300, width=32)
 PAIRS = st.tuples(ENDS, ENDS).filter(lambda ends: ends[1] - ends[0] > 0.01)
@@ -126,7 +127,7 @@ def test_padding_stays_zero(
     part = HostPart.of(split, Plain(), ranges)
     (image,) = shares(channels, block * sides[0], block * sides[1], 1)
     image = from_shares(image, ranges)
-    result = in_float(read_planes(split.graph, part.full_scale), image, part)
+    result = float_result(read_planes(split.graph, part.full_scale), image, part)
     # Half a digital number at each of up to 4 * 9 taps, whose weights are below 1.5.
     np.testing.assert_allclose(
         part.finish(image, result), result_of(open_session(model), image), atol=36 * 1.5 * 30 / 8190
@@ -191,12 +192,12 @@ def test_figures_do_not_depend_on_the_unit(exponents: list[int], error: float) -
     images[0][..., 0, 0] = 1
     figures = []
     for unit in (np.ones(len(gains)), gains):
-        sessions = [
+        in_float, in_int8 = (
             open_session(network(len(unit), len(unit), gains=1 / unit, out_gains=gain * unit))
             for gain in (1, 1 + error)
-        ]
+        )
         scaled = [(image * unit[:, None, None]).astype(np.float32) for image in images]
-        result = compare(*sessions, patches(scaled, ranges_of(scaled)))
+        result = compare(in_float, in_int8, patches(scaled, ranges_of(scaled)))
         figures.append((result.mae, result.max_abs, result.psnr_float_db, result.input_change))
     assert figures[0] == pytest.approx(figures[1], rel=1e-6, abs=1e-9)
 
