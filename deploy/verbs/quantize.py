@@ -81,8 +81,8 @@ def quantize(
         effort: of the search that equalizes channels: first guesses alone, groups of channels
             within a bound of time, or each channel by itself without one. An estimate of the time
             is printed before it begins.
-        finetune: number of steps that train the integers on the patches; 'auto' trains for minutes,
-            while it helps.
+        finetune: number of steps that train the integers on the patches, between which scales are
+            moved; 'auto' trains for minutes, while it helps.
         adapt: replace activations that the DPU lacks: SiLU by HardSwish, Sigmoid by HardSigmoid,
             LeakyReLU and PReLU by LeakyReLU of 26/256, or exactly if that loses more than 0.05 dB.
             The convolutions around them are fitted to the original network, and the table has the
