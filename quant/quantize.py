@@ -29,6 +29,7 @@ from beers_deploy.quant.graph import (
     PLANES,
     Conv,
     Graph,
+    SplitNetwork,
     channels_of,
     read_network,
     read_planes,
@@ -91,11 +92,14 @@ FINETUNE = "finetune"
 
 @dataclass(frozen=True)
 class Quantized:
-    """One network in integers, also as the host's file, and the float graph that was rounded."""
+    """One network in integers, also as the host's file, the float graph that was rounded, and the
+    float network as it was read.
+    """
 
     host: onnx.ModelProto
     core: IntCore
     graph: Graph
+    network: SplitNetwork
 
 
 @dataclass(frozen=True)
@@ -210,7 +214,7 @@ def quantize_model(
             f"{steps} steps on {len(tuning.pairs)} patches, scales of {moved(untrained, core)} "
             "tensors moved"
         )
-    return Quantized(host_model(core, about, fixed_tile_px(model)), core, final)
+    return Quantized(host_model(core, about, fixed_tile_px(model)), core, final, network)
 
 
 def _singles(graph: Graph, host_part: HostPart, groups: list[ResidualGroup]) -> SingleTensors:
