@@ -16,7 +16,7 @@ step 5 is the difference to the same integers in tensors whose values have no en
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 
@@ -37,8 +37,9 @@ from beers_deploy.quant.graph import (
     read_planes,
     tensors,
 )
+from beers_deploy.quant.host_part import HostPart
 from beers_deploy.quant.quantize import Quantized
-from beers_deploy.quant.samples.patches import Patches
+from beers_deploy.quant.samples.patches import Pair, Patches
 from beers_deploy.quant.session import open_any_size, open_session, planes_of, result_of
 
 BITS = 8
@@ -53,8 +54,8 @@ class Grid:
     """The multiples of a scale from `low` to `high` times it, to which a tensor is rounded."""
 
     scale: float
-    low: float = INT8_MIN
-    high: float = INT8_MAX
+    low: float
+    high: float
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,94 @@ class Cost:
         return measured(self.mae - before.mae, SCALE, source)
 
 
+@dataclass(frozen=True)
+class Measured:
+    """Samples that steps are measured on.
+
+    Attributes:
+        pairs: of an image and its reference, which may be empty.
+        floats: results of the float network.
+        ranges: the smallest and the largest value of each of its tensors, and 0.
+        host_part: the host's part.
+    """
+
+    pairs: Sequence[Pair]
+    floats: Sequence[np.ndarray]
+    ranges: Mapping[str, tuple[float, float]]
+    host_part: HostPart
+
+    @classmethod
+    def of(cls, result: Quantized, pairs: Sequence[Pair]) -> "Measured":
+        """Run the float network on the samples."""
+        host_part = result.core.host_part
+        graph = read_planes(result.network.graph)
+        names = tensors(graph)
+        session = open_session(graph_to_onnx(graph, names, host_part.planes))
+        floats = []
+        # Steps include 0, because padding has to be exact.
+        lows, highs = np.zeros((2, len(names)))
+        for image, _ in pairs:
+            values = session.run(names, {PLANES: planes_of(image, host_part)})
+            floats.append(host_part.finish(image, values[names.index(CORRECTION)]))
+            lows = np.minimum(lows, [value.min() for value in values])
+            highs = np.maximum(highs, [value.max() for value in values])
+        limits = zip(lows.tolist(), highs.tolist(), strict=True)
+        return cls(pairs, floats, dict(zip(names, limits, strict=True)), host_part)
+
+    def corrections(self, graph: Graph, grids: Mapping[str, Grid]) -> Iterator[np.ndarray]:
+        """Yield the results of a plane-reading graph whose tensors are rounded to grids."""
+        model = rounded_model(graph_to_onnx(graph, [CORRECTION], self.host_part.planes), grids)
+        session = open_session(model)
+        for image, _ in self.pairs:
+            yield session.run(None, {PLANES: planes_of(image, self.host_part)})[0]
+
+    def cost(self, results: Iterable[np.ndarray]) -> Cost:
+        """Return what restored images lose, in the mean over the samples."""
+        maes = []
+        drops_db = []
+        for result, in_float, (_, reference) in zip(results, self.floats, self.pairs, strict=True):
+            maes.append(float(np.abs(result - in_float).mean()))
+            drop_db = math.nan
+            if reference.shape == result.shape:
+                images = (np.clip(image, 0, 1) for image in (in_float, result))
+                float_db, step_db = (psnr_db(image, reference, 1.0) for image in images)
+                drop_db = float_db - step_db
+            drops_db.append(drop_db)
+        return Cost(float(np.mean(maes)), float(np.mean(drops_db)))
+
+    def cost_of_step(
+        self, graph: Graph, axes: tuple[int, ...] | None, zero_point: bool, powers: bool
+    ) -> Cost:
+        """Return what a float graph loses whose weights share scales over `axes`, with or without
+        zero points and scales of any size.
+        """
+        rounded = tuple(
+            replace(op, weight=rounded_weight(op.weight, axes, powers))
+            if isinstance(op, Conv)
+            else op
+            for op in graph
+        )
+        grids = {
+            name: grid_of(low, high, zero_point, powers)
+            for name, (low, high) in self.ranges.items()
+        }
+        corrections = self.corrections(read_planes(rounded), grids)
+        pairs = zip(self.pairs, corrections, strict=True)
+        return self.cost(self.host_part.finish(image, each) for (image, _), each in pairs)
+
+    def cost_of_integers(self, result: Quantized, clips: bool) -> Cost:
+        """Return what the INT8 network's own integers lose, in tensors with or without an end."""
+        graph = tuple(
+            dequantized(op, whole) if isinstance(op, Conv) and isinstance(whole, IntConv) else op
+            for op, whole in zip(result.graph, result.core.ops, strict=True)
+        )
+        ends = (INT8_MIN, INT8_MAX) if clips else (-math.inf, math.inf)
+        grids = {name: Grid(result.core.scale(name), *ends) for name in tensors(graph)}
+        scale = result.core.scale(CORRECTION)
+        pairs = zip(self.pairs, self.corrections(graph, grids), strict=True)
+        return self.cost(self.host_part.restore(image, each, scale) for (image, _), each in pairs)
+
+
 def price_rows(result: Quantized, held_out: Patches) -> list[Row]:
     """Return a row for each step, and one for what clipping costs in the last.
 
@@ -80,78 +169,31 @@ def price_rows(result: Quantized, held_out: Patches) -> list[Row]:
         result: the INT8 network, which knows the float one.
         held_out: samples that calibration did not see.
     """
-    pairs = list(islice(held_out.pairs, SAMPLES))
-    images = [image for image, _ in pairs]
-    core = result.core
-    float_graph = read_planes(result.network.graph)
-    names = tensors(float_graph)
-    session = open_session(graph_to_onnx(float_graph, names, core.host_part.planes))
-    floats = []
-    lows, highs = np.zeros((2, len(names)))
-    for image in images:
-        values = session.run(names, {PLANES: planes_of(image, core.host_part)})
-        floats.append(core.host_part.finish(image, values[names.index(CORRECTION)]))
-        # Steps start at 0 at the latest, because padding has to be exact.
-        lows = np.minimum(lows, [value.min() for value in values])
-        highs = np.maximum(highs, [value.max() for value in values])
-
-    def cost(results: Sequence[np.ndarray]) -> Cost:
-        return _cost(results, floats, [reference for _, reference in pairs])
-
-    def simulated(graph: Graph, grids: Mapping[str, Grid]) -> list[np.ndarray]:
-        model = rounded_model(graph_to_onnx(graph, [CORRECTION], core.host_part.planes), grids)
-        session = open_session(model)
-        feeds = [{PLANES: planes_of(image, core.host_part)} for image in images]
-        return [session.run(None, feed)[0] for feed in feeds]
-
-    def of_step(axes: tuple[int, ...] | None, zero_point: bool, powers: bool) -> Cost:
-        graph = tuple(
-            replace(op, weight=rounded_weight(op.weight, axes, powers))
-            if isinstance(op, Conv)
-            else op
-            for op in result.network.graph
-        )
-        grids = {
-            name: grid_of(low, high, zero_point, powers)
-            for name, low, high in zip(names, lows, highs, strict=True)
-        }
-        corrections = simulated(read_planes(graph), grids)
-        return cost(
-            [core.host_part.finish(*each) for each in zip(images, corrections, strict=True)]
-        )
-
-    def of_core(grids: Mapping[str, Grid]) -> Cost:
-        corrections = simulated(_in_integers(result), grids)
-        scale = core.scale(CORRECTION)
-        return cost(
-            [core.host_part.restore(*each, scale) for each in zip(images, corrections, strict=True)]
-        )
-
+    samples = Measured.of(result, list(islice(held_out.pairs, SAMPLES)))
+    graph = result.network.graph
     int8 = open_any_size(result.host)
     costs = {
-        "8 bits": of_step(PER_CHANNEL, zero_point=True, powers=False),
-        "no zero point": of_step(PER_CHANNEL, zero_point=False, powers=False),
-        "one scale for the weights of a layer": of_step(None, zero_point=False, powers=False),
-        "powers of two as scales": of_step(None, zero_point=False, powers=True),
-        "INT8 as written": cost([result_of(int8, image) for image in images]),
+        "8 bits": samples.cost_of_step(graph, PER_CHANNEL, zero_point=True, powers=False),
+        "no zero point": samples.cost_of_step(graph, PER_CHANNEL, zero_point=False, powers=False),
+        "one scale for the weights of a layer": samples.cost_of_step(
+            graph, None, zero_point=False, powers=False
+        ),
+        "powers of two as scales": samples.cost_of_step(graph, None, zero_point=False, powers=True),
+        "INT8 as written": samples.cost(result_of(int8, image) for image, _ in samples.pairs),
     }
-    source = f"{len(images)} samples that calibration did not see"
+    source = f"{len(samples.pairs)} samples that calibration did not see"
     rows = []
-    before = Cost(0.0, 0.0 if math.isfinite(costs["8 bits"].drop_db) else math.nan)
-    for name, step_cost in costs.items():
-        figures = {"price": step_cost.beyond(before, source)}
-        if math.isfinite(step_cost.drop_db):
-            figures["PSNR drop"] = measured(step_cost.drop_db, "dB", source)
-        figures["MAE"] = measured(step_cost.mae, SCALE, source)
+    before = Cost(0.0, 0.0)
+    for name, cost in costs.items():
+        figures = {"price": cost.beyond(before, source)}
+        if math.isfinite(cost.drop_db):
+            figures["PSNR drop"] = measured(cost.drop_db, "dB", source)
+        figures["MAE"] = measured(cost.mae, SCALE, source)
         rows.append(Row("price", name, figures))
-        before = step_cost
-    scales = {name: core.scale(name) for name in names}
-    clipped = of_core({name: Grid(scale) for name, scale in scales.items()})
-    endless = of_core({name: Grid(scale, -np.inf, np.inf) for name, scale in scales.items()})
-    rows.append(
-        Row("price", "clipping, of INT8 as written", {"price": clipped.beyond(endless, source)})
-    )
-    return rows
+        before = cost
+    clipped = samples.cost_of_integers(result, clips=True)
+    price = clipped.beyond(samples.cost_of_integers(result, clips=False), source)
+    return [*rows, Row("price", "clipping, of INT8 as written", {"price": price})]
 
 
 def rounded_weight(weight: np.ndarray, axes: tuple[int, ...] | None, powers: bool) -> np.ndarray:
@@ -204,28 +246,3 @@ def rounded_model(model: onnx.ModelProto, grids: Mapping[str, Grid]) -> onnx.Mod
     del model.graph.node[:]
     model.graph.node.extend(nodes)
     return model
-
-
-def _in_integers(result: Quantized) -> Graph:
-    """Return the rounded graph with the values that its int8 weights and biases stand for."""
-    pairs = zip(result.graph, result.core.ops, strict=True)
-    return tuple(
-        dequantized(op, whole) if isinstance(op, Conv) and isinstance(whole, IntConv) else op
-        for op, whole in pairs
-    )
-
-
-def _cost(
-    results: Sequence[np.ndarray], floats: Sequence[np.ndarray], references: Sequence[np.ndarray]
-) -> Cost:
-    """Return what results lose, in the mean over the samples."""
-    triples = list(zip(results, floats, references, strict=True))
-    mae = float(np.mean([np.abs(result - in_float).mean() for result, in_float, _ in triples]))
-    if any(result.shape != reference.shape for result, _, reference in triples):
-        return Cost(mae, math.nan)
-    drops = [
-        psnr_db(np.clip(in_float, 0, 1), reference, 1.0)
-        - psnr_db(np.clip(result, 0, 1), reference, 1.0)
-        for result, in_float, reference in triples
-    ]
-    return Cost(mae, float(np.mean(drops)))

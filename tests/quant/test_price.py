@@ -17,10 +17,10 @@ from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import PLANES, Conv
 from beers_deploy.quant.passes.selection import Passes
-from beers_deploy.quant.price import grid_of, price_rows, rounded_weight
+from beers_deploy.quant.price import Measured, grid_of, price_rows, rounded_weight
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.samples.patches import Patches
-from beers_deploy.quant.session import open_session
+from beers_deploy.quant.session import open_session, result_of
 from tests.quant.quick import quickly
 
 
@@ -56,6 +56,16 @@ def test_steps_add_up_to_what_the_gate_measures(
     assert last["PSNR drop"].value == pytest.approx(gate.drop_db, abs=1e-3)
     assert sum(prices(rows[:-1]).values()) == pytest.approx(gate.drop_db, abs=1e-3)
     assert all(row.figures["price"].mode == "measured" for row in rows)
+
+
+def test_simulated_integers_are_those_of_the_network(quantized: Quantized, unseen: Patches) -> None:
+    samples = Measured.of(quantized, unseen.pairs)
+    session = open_session(quantized.host)
+    written = samples.cost(result_of(session, image) for image in unseen.degraded)
+    simulated = samples.cost_of_integers(quantized, clips=True)
+    # onnxruntime rounds ties to even, a DPU up.
+    assert simulated.mae == pytest.approx(written.mae, rel=0.02)
+    assert simulated.drop_db == pytest.approx(written.drop_db, abs=0.02)
 
 
 def test_of_many_bits_nothing_is_lost(
