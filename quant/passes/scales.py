@@ -65,7 +65,7 @@ def with_better_scales(
 def _moves(core: IntCore, graph: Graph) -> Iterator[Callable[..., TrainableCore]]:
     """Yield what moves each scale of a core by some fractional bits."""
     # 1.
-    links = [(name,) for name in core.frac_bits]
+    links: list[tuple[str, ...]] = [(name,) for name in core.frac_bits]
     for op in core.ops:
         names = (*op.inputs, op.output)
         exact = isinstance(op, Add) and len({core.frac_bits[name] for name in names}) == 1
@@ -78,12 +78,12 @@ def _moves(core: IntCore, graph: Graph) -> Iterator[Callable[..., TrainableCore]
         if isinstance(op, Conv) and op.activation is Activation.relu6:
             fixed.add(op.output)
     for first in dict.fromkeys(leader.values()):
-        names = [name for name in leader if leader[name] == first]
-        if fixed.isdisjoint(names):
-            yield partial(TrainableCore.with_finer_tensors, names=names)
+        together = [name for name in leader if leader[name] == first]
+        if fixed.isdisjoint(together):
+            yield partial(TrainableCore.with_finer_tensors, names=together)
     # 3.
-    last_moves = core.host_part.decoding.copies == 1
-    for number in range(len(core.convolutions) - (not last_moves)):
+    writes_copies = core.host_part.decoding.copies > 1
+    for number in range(len(core.convolutions) - writes_copies):
         yield partial(TrainableCore.with_finer_weights, number=number)
 
 
