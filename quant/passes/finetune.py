@@ -182,18 +182,14 @@ def descend(
 
 
 def loss_of(core: IntCore, samples: Sequence[Sample]) -> float:
-    """Return the mean root of the squared errors of a core, as the host computes it, beyond that of
-    the float network.
-
-    Roots, so that a single sample that INT8 clips does not decide alone.
-    """
+    """Return the mean error of a core, as the host computes it, beyond the float network's own."""
     # Samples are corrections, so the host must stop once it has decoded the copies.
     host_part = replace(core.host_part, back=(), adds_image=False, last=())
     session = open_session(host_model(replace(core, host_part=host_part), {}))
     errors = [float(s.error(torch.from_numpy(result_of(session, s.image)))) for s in samples]
     # The float network errs from a reference as well, and no integers can be blamed for that.
     in_float = [float(sample.error(sample.floats)) for sample in samples]
-    return float(np.mean(np.sqrt(errors))) - float(np.mean(np.sqrt(in_float)))
+    return float(np.mean(errors)) - float(np.mean(in_float))
 
 
 def _samples(host_part: HostPart, full: Graph, tuning: Tuning) -> Iterator[Sample]:

@@ -28,7 +28,8 @@ def distance(core: IntCore, target: torch.Tensor) -> float:
 def correction_of(core: IntCore) -> torch.Tensor:
     planes = torch.from_numpy(PLANES_OF_NOISE.astype(np.float32))
     with torch.no_grad():
-        return TrainableCore(core)(planes)
+        correction: torch.Tensor = TrainableCore(core)(planes)
+    return correction
 
 
 def chain(seed: int) -> tuple[Graph, IntCore]:
