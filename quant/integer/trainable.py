@@ -119,6 +119,14 @@ class TrainableCore(torch.nn.Module):
         copy.weights[number].data.mul_(2.0**by).clamp_(INT8_MIN, INT8_MAX)
         return copy
 
+    def with_finer_biases(self, number: int, by: int) -> "TrainableCore":
+        """Return a copy in which the biases of a convolution have `by` more fractional bits."""
+        copy = deepcopy(self)
+        op = self._convs[number]
+        copy._convs[number] = replace(op, bias_frac_bits=op.bias_frac_bits + by)
+        copy.biases[number].data.mul_(2.0**by).clamp_(INT8_MIN, INT8_MAX)
+        return copy
+
     def forward(self, planes: Tensor) -> Tensor:
         """Return the one correction (N, C, H, W) for int8 planes (N, P, H, W), both in float32."""
         return self.tensors(planes)[CORRECTION] * self._core.scale(CORRECTION)

@@ -9,8 +9,8 @@ more, and one bit coarser, where it rounds more. What is judged is the error of 
    because that add is exact.
 2. The planes stay, because the host writes them. So does what a ReLU6 writes, because the end of
    int8 may stand for its six.
-3. The scale of a convolution's weights moves by itself. That of copies stays, because the coarse
-   copy would have to move as well.
+3. The scales of a convolution's weights and of its biases move by themselves. Those of copies
+   stay, because the coarse copy would have to move as well.
 4. A move is left out if the DPU's shifts do not reach it, and undone if the core errs no less.
 """
 
@@ -85,11 +85,15 @@ def _moves(core: IntCore, graph: Graph) -> Iterator[Callable[..., TrainableCore]
     writes_copies = core.host_part.decoding.copies > 1
     for number in range(len(core.convolutions) - writes_copies):
         yield partial(TrainableCore.with_finer_weights, number=number)
+        yield partial(TrainableCore.with_finer_biases, number=number)
 
 
 def moved(core: IntCore, other: IntCore) -> int:
-    """Return how many tensors, weights included, have other scales in another form of a core."""
+    """Return how many tensors, weights and biases included, have other scales in another form of a
+    core.
+    """
     count = sum(core.frac_bits[name] != other.frac_bits[name] for name in core.frac_bits)
     for one, another in zip(core.convolutions, other.convolutions, strict=True):
         count += one.weight_frac_bits != another.weight_frac_bits
+        count += one.bias_frac_bits != another.bias_frac_bits
     return count
