@@ -221,7 +221,7 @@ def differences_of(network: Network, held_out: "Patches") -> GateResult:
 
 
 def sensitivity_report(
-    network: Network, held_out: "Patches", differences: GateResult
+    network: Network, held_out: "Patches", differences: GateResult, prices: Sequence[Row]
 ) -> tuple[list[Row], Report]:
     """Return where INT8 errs on samples that calibration did not see: rows, and a page.
 
@@ -229,6 +229,7 @@ def sensitivity_report(
         network: that was quantised here.
         held_out: the samples.
         differences: that were measured on them.
+        prices: of `price_rows`, which the page shows as well.
     """
     assert network.origin is not None and network.quantized is not None  # noqa: S101, PT018
     worst = differences.spread.worst(WORST)
@@ -242,7 +243,7 @@ def sensitivity_report(
     sessions = open_any_size(network.origin.model), open_any_size(network.model)
     return rows, sensitivity_page(
         headline(differences, layers),
-        [*rows, *network.layers],
+        [*rows, *prices, *network.layers],
         differences.spread,
         held_out,
         sessions,

@@ -8,7 +8,7 @@ the host out.
 5. Write a result that nothing is added to in windows.
 6. Equalize the channels of the groups, then those of the single tensors.
 7. Round the graph, which writes its copies last, to the integer core.
-8. Train the integers, if asked to.
+8. Train the integers and move scales, if asked to.
 """
 
 import logging
@@ -29,6 +29,7 @@ from beers_deploy.quant.graph import (
     PLANES,
     Conv,
     Graph,
+    SplitNetwork,
     channels_of,
     read_network,
     read_planes,
@@ -86,14 +87,20 @@ logger = logging.getLogger(__name__)
 PASSES = "fine_planes, least_squares, shared_residual_scale, equalise, dual_gain"
 """What a file records as done beyond rounding each tensor, in the words of the first files."""
 
+FINETUNE = "finetune"
+"""What a file calls its fine-tuning."""
+
 
 @dataclass(frozen=True)
 class Quantized:
-    """One network in integers, also as the host's file, and the float graph that was rounded."""
+    """One network in integers, also as the host's file, the float graph that was rounded, and the
+    float network as it was read.
+    """
 
     host: onnx.ModelProto
     core: IntCore
     graph: Graph
+    network: SplitNetwork
 
 
 @dataclass(frozen=True)
@@ -167,7 +174,8 @@ def quantize_model(
         patches: that it is calibrated on.
         about: metadata of the files.
         shifts: the windows of the target.
-        tuning: on what, how long and how fast the integers are trained at last; None leaves them.
+        tuning: on what, how long and how fast the integers are trained at last; None leaves them
+            and their scales.
         passes: that reduce the error.
         effort: of the search for equalization factors.
 
@@ -201,10 +209,15 @@ def quantize_model(
     if tuning:
         # Imported here because it needs torch, which no other step does.
         from beers_deploy.quant.passes.finetune import finetune
+        from beers_deploy.quant.passes.scales import moved
 
-        core, steps = finetune(core, graph, tuning)
-        about["finetune"] = f"{steps} steps on {len(tuning.pairs)} patches"
-    return Quantized(host_model(core, about, fixed_tile_px(model)), core, final)
+        untrained = core
+        core, steps = finetune(core, graph, tuning, shifts)
+        about[FINETUNE] = (
+            f"{steps} steps on {len(tuning.pairs)} patches, scales of {moved(untrained, core)} "
+            "tensors moved"
+        )
+    return Quantized(host_model(core, about, fixed_tile_px(model)), core, final, network)
 
 
 def _singles(graph: Graph, host_part: HostPart, groups: list[ResidualGroup]) -> SingleTensors:

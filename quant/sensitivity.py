@@ -32,7 +32,8 @@ from beers_deploy.quant.graph import (
     ties_scales,
 )
 from beers_deploy.quant.input_range import to_shares
-from beers_deploy.quant.quantize import Quantized
+from beers_deploy.quant.onnx_file import metadata
+from beers_deploy.quant.quantize import FINETUNE, Quantized
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import (
     few_crops,
@@ -285,10 +286,14 @@ def losses(
         return message
     costliest = _costliest(layers or layer_error_rows(result, patches))
     names = ", ".join(f"{name} ({share:.0f} %)" for name, share in costliest)
-    add = ""
+    message = f"{message}: most of it in {names}"
+    remedies = []
+    # Of a network that is fine-tuned already there is nothing left to gain by it.
+    if FINETUNE not in metadata(result.host):
+        remedies.append("`finetune` auto")
     if not result.core.host_part.adds_image:
-        add = ", or a network that ends with a global add, of which INT8 errs less"
-    return f"{message}: most of it in {names}; try `finetune` auto{add}"
+        remedies.append("a network that ends with a global add, of which INT8 errs less")
+    return f"{message}; try {', or '.join(remedies)}" if remedies else message
 
 
 MOST = 3

@@ -68,6 +68,8 @@ def quantize(
     The DPU computes the correction, and the host adds it to the image. Any network that a DPU
     computes is accepted: see docs/reference/any-network.md, or ask 'check'. The table has each
     integer layer: bits of its accumulator, measured and proven, and the share of saturated results.
+    It also has what each restriction of the DPU costs, measured on samples that calibration did not
+    see.
 
     Args:
         network: float ONNX or weights, or a shipped name. Weights of 'train --conditioned' are
@@ -87,8 +89,8 @@ def quantize(
         effort: of the search that equalizes channels: first guesses alone, groups of channels
             within a bound of time, or each channel by itself without one. An estimate of the time
             is printed before it begins.
-        finetune: number of steps that train the integers on the patches; 'auto' trains for minutes,
-            while it helps.
+        finetune: number of steps that train the integers on the patches, between which scales are
+            moved; 'auto' trains for minutes, while it helps.
         adapt: replace activations that the DPU lacks: SiLU by HardSwish, Sigmoid by HardSigmoid,
             LeakyReLU and PReLU by LeakyReLU of 26/256, or exactly if that loses more than 0.05 dB.
             The convolutions around them are fitted to the original network, and the table has the
@@ -202,6 +204,7 @@ HEADINGS = {
     "adapted": "activations that the DPU lacks, and what replacing them costs in float",
     "rounding": "tie rounding",
     "gate": "float against INT8, on patches that calibration did not see",
+    "price": "what the DPU's restrictions cost, one more in each row",
 }
 DETAILS = frozenset(
     {
@@ -239,21 +242,24 @@ def _notes(result: "Network", adapt: bool) -> list[str]:
 def _judged(network: "Network", held_out: "Patches", page: Path | None) -> "tuple[list[Row], str]":
     """Return what INT8 changes on samples that calibration did not see: rows and a sentence.
 
-    With a page there are rows of layers and of the worst samples, and the page is written.
+    The rows state the price of each restriction of the DPU. With a page there are also rows of
+    layers and of the worst samples, and the page is written.
     """
+    from beers_deploy.quant.price import price_rows
     from beers_deploy.quant.sensitivity import losses
     from beers_deploy.quantization import differences_of, sensitivity_report
     from beers_deploy.report.page import write_report
 
     assert network.quantized is not None  # noqa: S101 - it was quantised here
     differences = differences_of(network, held_out)
+    prices = price_rows(network.quantized, held_out)
     rows: list[Row] = []
     if page is not None:
-        rows, report = sensitivity_report(network, held_out, differences)
+        rows, report = sensitivity_report(network, held_out, differences, prices)
         write_report(report, page)
         logger.info("wrote %s: %s", page, report.headline)
     layers = [row for row in rows if row.table == "layers"]
-    return rows, losses(network.quantized, differences, held_out, layers)
+    return [*rows, *prices], losses(network.quantized, differences, held_out, layers)
 
 
 def _report_files(folder: OutputFolder | None, network: Any) -> list[Path]:

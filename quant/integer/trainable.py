@@ -12,7 +12,8 @@ what the host computes by up to half a unit. `TrainableCore.core` makes the othe
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -99,6 +100,32 @@ class TrainableCore(torch.nn.Module):
             bias = self.biases[-1].detach().numpy() if host_part.decoding.offsets else one.bias
             ops[-1], host_part = _all_copies(last, host_part, one.weight, bias)
         return replace(self._core, ops=tuple(ops), host_part=host_part)
+
+    def with_finer_tensors(self, names: Collection[str], by: int) -> "TrainableCore":
+        """Return a copy in which these tensors have `by` more fractional bits."""
+        copy = deepcopy(self)
+        frac_bits = self._core.frac_bits
+        finer = {name: frac_bits[name] + by for name in names}
+        # Weights and biases have scales of their own, so their integers stay.
+        copy._core = replace(self._core, frac_bits={**frac_bits, **finer})
+        return copy
+
+    def with_finer_weights(self, number: int, by: int) -> "TrainableCore":
+        """Return a copy in which the weights of a convolution have `by` more fractional bits."""
+        copy = deepcopy(self)
+        op = self._convs[number]
+        copy._convs[number] = replace(op, weight_frac_bits=op.weight_frac_bits + by)
+        # What is clipped starts at the end of int8, where its slope is not 0.
+        copy.weights[number].data.mul_(2.0**by).clamp_(INT8_MIN, INT8_MAX)
+        return copy
+
+    def with_finer_biases(self, number: int, by: int) -> "TrainableCore":
+        """Return a copy in which the biases of a convolution have `by` more fractional bits."""
+        copy = deepcopy(self)
+        op = self._convs[number]
+        copy._convs[number] = replace(op, bias_frac_bits=op.bias_frac_bits + by)
+        copy.biases[number].data.mul_(2.0**by).clamp_(INT8_MIN, INT8_MAX)
+        return copy
 
     def forward(self, planes: Tensor) -> Tensor:
         """Return the one correction (N, C, H, W) for int8 planes (N, P, H, W), both in float32."""

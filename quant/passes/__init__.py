@@ -5,6 +5,6 @@
 - `equalize`, `equalize_single`: factors for the channels of both; `trial`: what factors cost;
   `effort`: how many are tried.
 - `dual_range`: the result in copies of several scales.
-- `finetune`: the integers trained with their rounding.
+- `finetune`: the integers trained with their rounding; `scales`: scales moved between the rounds.
 - `selection`: the passes to apply; `benchmarks/ablation.py` measures what each buys.
 """

@@ -4,16 +4,18 @@ clippings in the loop.
 Rounding each tensor as well as it can be done leaves errors that meet behind many layers, and noise
 that no rounding takes back. So the core is run as it is, and its numbers follow the slope of its
 result's error (training that sees the quantiser, Jacob et al. 2018): from the reference where there
-is one, and from the float network. Scales and shifts stay, so the core stays as legal as it was.
+is one, and from the float network. Gradients move no scale, because these are powers of two.
 
 1. Hold out some of the pairs.
-2. Take steps of gradient descent on the others.
-3. Every few steps round the numbers, and keep the core that errs least on the held-out pairs.
-4. Stop after a round of steps that gained little.
+2. Before each round of steps move scales one bit where the core then errs less on pairs that it is
+   trained on (`quant.passes.scales`). The core stays within the windows of the DPU's shifts.
+3. Take steps of gradient descent.
+4. Every few steps round the numbers, and keep the core that errs least on the held-out pairs.
+5. Stop after a round of steps that gained little.
 """
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,18 +24,20 @@ import torch
 
 from beers_deploy.model.progress import step
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.quant.core import IntCore
+from beers_deploy.quant.core import SHIFTS, IntCore, Shifts
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.graph import CORRECTION, Graph, graph_to_onnx
 from beers_deploy.quant.host_part import HostPart
 from beers_deploy.quant.integer.trainable import Tensor, TrainableCore
+from beers_deploy.quant.passes.scales import with_better_scales
+from beers_deploy.quant.passes.trial import hardest_and_others
 from beers_deploy.quant.samples.patches import Pair
 from beers_deploy.quant.session import open_any_size, open_session, result_of, tensor_values
 from beers_deploy.quant.untrusted import times
 
 HELD_OUT_EVERY = 8
 """One pair of so many is not trained on, but judges what is kept."""
-MOST_HELD_OUT = 16
+MOST_HELD_OUT = 48
 BATCH_PIXELS = 4 * 128**2
 """Of the planes in one step."""
 BORDER_PX = 8
@@ -45,6 +49,8 @@ ROUNDS = (400, 800, 1600)
 LEAST_GAIN = 0.02
 """Of what INT8 lost at first: a round that wins back less is the last one."""
 JUDGED_EVERY = 20
+JUDGING = 48
+"""Training pairs on which scales are judged."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +68,7 @@ class Tuning:
 
     pairs: Sequence[Pair]
     steps: int | None = None
-    rate: float = 0.05
+    rate: float = 0.02
     seed: int = 0
     original: onnx.ModelProto | None = None
 
@@ -94,13 +100,17 @@ class Sample:
         return self.weight * error
 
 
-def finetune(core: IntCore, full: Graph, tuning: Tuning) -> tuple[IntCore, int]:
-    """Return the core with the integers that erred least on held-out pairs, and the steps taken.
+def finetune(
+    core: IntCore, full: Graph, tuning: Tuning, shifts: Shifts = SHIFTS
+) -> tuple[IntCore, int]:
+    """Return the core with the integers and scales that erred least on held-out pairs, and the
+    steps taken.
 
     Args:
         core: to start from; it comes back as it is if training finds nothing better.
         full: the float network that reads all planes.
         tuning: on what, how long, how fast.
+        shifts: the windows of the target.
     """
     # 1.
     samples = list(_samples(core.host_part, full, tuning))
@@ -110,54 +120,65 @@ def finetune(core: IntCore, full: Graph, tuning: Tuning) -> tuple[IntCore, int]:
     rounds = (tuning.steps,) if tuning.steps else ROUNDS
     most = f"{'' if tuning.steps else 'at most '}{sum(rounds)}"
     trainable = TrainableCore(core)
+    generator = torch.Generator().manual_seed(tuning.seed)
+    # A scale that is too fine clips first what has the largest results.
+    order = sorted(training, key=lambda sample: float(sample.floats.abs().max()), reverse=True)
+    judging = hardest_and_others(order, JUDGING)
     first = least = before = loss_of(core, held_out)
     done = 0
-    # 2.
-    for done, remainder in descend(trainable, training, tuning, rounds):
-        # 3. Counted from the end, so that the last step is judged, where the rate is near 0.
-        if remainder % JUDGED_EVERY == 0:
-            candidate = trainable.core()
-            loss = loss_of(candidate, held_out)
-            if loss < least:
-                core = candidate
-                least = loss
-            step(
-                f"fine-tuning, step {done} of {most}: held-out pairs lose "
-                f"{least / max(first, LEAST_ERROR):.2f} of the first"
-            )
-        # 4.
-        if remainder == 0:
-            if before - least < LEAST_GAIN * first:
-                break
-            before = least
+    for steps in rounds:
+        # 2.
+        step("fine-tuning: trying other scales")
+        trainable = with_better_scales(
+            trainable, full, shifts, lambda candidate: loss_of(candidate, judging)
+        )
+        # 3.
+        for left in descend(trainable, training, steps, tuning.rate, generator):
+            # 4. Counted from the end, so that the last step is judged, where the rate is near 0.
+            if left % JUDGED_EVERY == 0 or left == steps:
+                candidate = trainable.core()
+                loss = loss_of(candidate, held_out)
+                if loss < least:
+                    core = candidate
+                    least = loss
+                step(
+                    f"fine-tuning, step {done + steps - left} of {most}: held-out pairs lose "
+                    f"{least / max(first, LEAST_ERROR):.2f} of the first"
+                )
+        done += steps
+        # 5.
+        if before - least < LEAST_GAIN * first:
+            break
+        before = least
     return core, done
 
 
 def descend(
-    trainable: TrainableCore, samples: Sequence[Sample], tuning: Tuning, rounds: Iterable[int]
-) -> Iterator[tuple[int, int]]:
-    """Train by Adam; yield the steps taken and the steps left in the round, after each.
+    trainable: TrainableCore,
+    samples: Sequence[Sample],
+    steps: int,
+    highest_rate: float,
+    generator: torch.Generator,
+) -> Iterator[int]:
+    """Train by Adam for a round; yield the steps that are left, before the first and after each.
 
-    In each round the rate of learning falls to 0 as a half cosine: while it is high, numbers turn
-    to and fro at the thresholds of their rounding, and no judgement is of use.
+    The rate of learning falls to 0 as a half cosine: while it is high, numbers turn to and fro at
+    the thresholds of their rounding, and no judgement is of use.
     """
-    generator = torch.Generator().manual_seed(tuning.seed)
     # Without references errors and gradients are small: Adam's eps must be smaller still.
     optimizer = torch.optim.Adam(trainable.parameters(), eps=1e-15)
     batch = max(BATCH_PIXELS // math.prod(samples[0].planes.shape[2:]), 1)
-    done = 0
-    for steps in rounds:
-        for taken in range(steps):
-            rate = tuning.rate * 0.5 * (1 + math.cos(math.pi * taken / steps))
-            optimizer.param_groups[0]["lr"] = rate
-            optimizer.zero_grad()
-            for number in torch.randint(len(samples), (batch,), generator=generator).tolist():
-                sample = samples[number]
-                # Gradients of the batch add up sample by sample, whose sizes may differ.
-                (sample.error(trainable(sample.planes)) / batch).backward()
-            optimizer.step()
-            done += 1
-            yield done, steps - taken - 1
+    yield steps
+    for taken in range(steps):
+        rate = highest_rate * 0.5 * (1 + math.cos(math.pi * taken / steps))
+        optimizer.param_groups[0]["lr"] = rate
+        optimizer.zero_grad()
+        for number in torch.randint(len(samples), (batch,), generator=generator).tolist():
+            sample = samples[number]
+            # Gradients of the batch add up sample by sample, whose sizes may differ.
+            (sample.error(trainable(sample.planes)) / batch).backward()
+        optimizer.step()
+        yield steps - taken - 1
 
 
 def loss_of(core: IntCore, samples: Sequence[Sample]) -> float:

@@ -85,13 +85,20 @@ def search_targets(
         for n, crop in enumerate(crops(image, halo_px)):
             sizes[k, n] = size(crop)
     order = sorted(sizes, key=lambda place: sizes[place], reverse=True)
-    # 2. int8 clips the largest corrections, so a quarter of the crops are those that hold them.
-    hard = count // 4
-    others = order[hard :: max((len(order) - hard) // (count - hard), 1)]
-    places = (*order[:hard], *others[: count - hard])
+    # 2.
+    places = hardest_and_others(order, count)
     # A copy, because a view would keep the whole image in memory.
     selection = [crops(images[k], halo_px)[n].copy() for k, n in places]
     return [(crop, restored(crop)) for crop in selection]
+
+
+def hardest_and_others(order: Sequence[T], count: int) -> list[T]:
+    """Choose `count` of what is ordered by its largest values, if there are so many: a quarter from
+    the first, where int8 clips, the rest from all of the others.
+    """
+    hard = count // 4
+    others = order[hard :: max((len(order) - hard) // (count - hard), 1)]
+    return [*order[:hard], *others[: count - hard]]
 
 
 class CropTrials:

@@ -72,6 +72,8 @@ def test_quantize_reports_layers(tmp_path: Path) -> None:
                 <= figures["accumulator, proven"]["value"]
                 < 31
             )
+    assert tables.count("price") == 6
+    assert "one scale for the weights of a layer" in (tmp_path / "r" / "report.html").read_text()
     layers = [row for row in document["rows"] if row["table"] == "layers"]
     assert [row["name"] for row in layers][-1] == "all layers"
     shares = [row["figures"]["share of squared error"]["value"] for row in layers[:-1]]

@@ -3,7 +3,6 @@ before.
 """
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import onnx
@@ -16,19 +15,8 @@ from beers_deploy.model.progress import Step, progress, reporting
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.quant.core import IntConv, IntCore, build_core, shift_faults
 from beers_deploy.quant.graph import (
-    CORRECTION,
     PLANES,
-    Activation,
-    Add,
-    AveragePool,
-    Conv,
-    Graph,
-    MaxPool,
-    Mul,
-    Pointwise,
-    Resize,
     Shuffle,
-    Window,
     correction_graph,
     read_planes,
 )
@@ -36,9 +24,11 @@ from beers_deploy.quant.host_part import HostPart
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.integer.trainable import TrainableCore
 from beers_deploy.quant.passes.finetune import BORDER_PX, Sample, Tuning, finetune
+from beers_deploy.quant.passes.scales import moved as moved_tensors
 from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.samples.patches import Patches
-from tests.quant.trained import hold_to_reference, moved
+from tests.quant.quick import quickly
+from tests.quant.trained import hold_to_reference, moved, odd_operations
 
 
 def spoilt(core: IntCore) -> IntCore:
@@ -91,55 +81,6 @@ def test_it_begins_with_the_core_s_own_numbers(quantized: Quantized) -> None:
         np.testing.assert_array_equal(one.bias, other.bias)
 
 
-def odd_operations(generator: np.random.Generator) -> Graph:
-    """Pads that differ from side to side, groups, dilation, shuffles, poolings, adds and products
-    of other scales.
-    """
-
-    def conv(
-        name: str, source: str, shape: tuple[int, ...], window: Window, groups: int = 1, **more: Any
-    ) -> Conv:
-        weight = generator.normal(0, 0.3, shape).astype(np.float32)
-        return Conv(
-            name,
-            source,
-            name,
-            weight,
-            generator.normal(0, 0.2, shape[0]).astype(np.float32),
-            window=window,
-            groups=groups,
-            **more,
-        )
-
-    return (
-        conv(
-            "a",
-            PLANES,
-            (8, 3, 3, 2),
-            Window((2, 1), (1, 0, 2, 1)),
-            activation=Activation.leaky_relu,
-        ),
-        conv(
-            "b",
-            "a",
-            (8, 4, 3, 3),
-            Window((1, 1), (2, 2, 2, 2), (2, 2)),
-            2,
-            activation=Activation.relu6,
-        ),
-        Add("c", ("a", "b"), "c", Activation.leaky_relu),
-        Shuffle("d", "c", "d", 2, True, False),
-        MaxPool("e", "d", "e", (3, 2), Window((1, 2), (2, 0, 1, 1))),
-        AveragePool("f", "e", "f", (2, 3), Window((1, 1), (0, 1, 1, 2))),
-        conv("g", "f", (4, 1, 3, 4), Window((2, 3), (0, 2, 1, 1)), 2, transposed=True),
-        Shuffle("h", "g", "h", 1, False, True),
-        Pointwise("i", "h", "i", Activation.hard_swish),
-        Mul("j", ("i", "h"), "j"),
-        conv("k", "j", (1, 4, 1, 1), Window()),
-        Resize("l", "k", CORRECTION, 2, True),
-    )
-
-
 @given(seed=st.integers(0, 2**32 - 1))
 def test_odd_operations_are_the_reference_s(seed: int) -> None:
     generator = np.random.default_rng(seed)
@@ -157,9 +98,31 @@ def test_without_references_it_comes_back_towards_the_float_network(
     tuned = trained(bad, float_onnx, Tuning(alone(patches), 40, rate=0.1))
     assert difference(tuned, quantized.core, unseen) < 0.7 * difference(bad, quantized.core, unseen)
     assert shift_faults(tuned) == []
-    assert tuned.frac_bits == quantized.core.frac_bits
 
 
+@pytest.mark.slow
+def test_moved_scales_pay_on_others_and_are_counted(
+    float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
+) -> None:
+    # All tensors one bit too coarse.
+    plain = quickly(float_onnx, patches)
+    bits = {name: n - (name != PLANES) for name, n in plain.core.frac_bits.items()}
+    coarse = build_core(plain.graph, bits, host_part=plain.core.host_part)
+    tuned = trained(coarse, float_onnx, Tuning(alone(patches), 1, rate=0.0))
+    assert moved_tensors(coarse, tuned) > 0
+    assert shift_faults(tuned) == []
+    loss, before = (difference(core, plain.core, unseen) for core in (tuned, coarse))
+    assert loss < 0.8 * before
+
+
+@pytest.fixture
+def no_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave all scales, which may gain by themselves."""
+    name = "beers_deploy.quant.passes.finetune.with_better_scales"
+    monkeypatch.setattr(name, lambda trainable, *_: trainable)
+
+
+@pytest.mark.usefixtures("no_moves")
 def test_what_comes_out_worse_is_not_kept(
     quantized: Quantized, float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
@@ -167,6 +130,7 @@ def test_what_comes_out_worse_is_not_kept(
     assert tuned is quantized.core
 
 
+@pytest.mark.usefixtures("no_moves")
 @pytest.mark.parametrize(("rate", "steps"), [(0.0, 12), (0.3, 14)])
 def test_it_goes_on_by_itself_while_held_out_pairs_gain(
     quantized: Quantized,
@@ -205,7 +169,7 @@ def test_the_same_seed_gives_the_same_numbers(
         assert reported[-1].what.startswith("calibrating: fine-tuning, step 3 of 3: ")
         assert {entry.key: entry.value for entry in model.host.metadata_props}[
             "finetune"
-        ].startswith("3 steps")
+        ].startswith(f"3 steps on {len(patches.pairs)} patches, scales of ")
         return bytes(model.host.SerializeToString())
 
     assert made(1) == made(1)

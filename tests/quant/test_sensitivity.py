@@ -69,6 +69,9 @@ def test_what_is_lost_is_told_and_of_much_also_where(
     worst = max(layers, key=lambda layer: layer.network.squared)
     assert f": most of it in {worst.name} (" in much
     assert much.endswith("; try `finetune` auto")
+    tuned = replace(spoilt, host=host_model(spoilt.core, {"finetune": "3 steps"}))
+    gate = replace(gate, psnr_float_db=40.0, psnr_int8_db=39.6)
+    assert losses(tuned, gate, patches).endswith(" %)")
 
 
 def test_a_spoilt_layer_is_found(spoilt: Quantized, crops: list[np.ndarray]) -> None:

@@ -2,14 +2,79 @@
 have become.
 """
 
+from typing import Any
+
 import numpy as np
 import torch
 
 from beers_deploy.quant.core import IntCore
-from beers_deploy.quant.graph import CORRECTION
+from beers_deploy.quant.graph import (
+    CORRECTION,
+    PLANES,
+    Activation,
+    Add,
+    AveragePool,
+    Conv,
+    Graph,
+    MaxPool,
+    Mul,
+    Pointwise,
+    Resize,
+    Shuffle,
+    Window,
+)
 from beers_deploy.quant.host_part import FINE_MAX
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.integer.trainable import TrainableCore
+
+
+def odd_operations(generator: np.random.Generator) -> Graph:
+    """Pads that differ from side to side, groups, dilation, shuffles, poolings, adds and products
+    of other scales.
+    """
+
+    def conv(
+        name: str, source: str, shape: tuple[int, ...], window: Window, groups: int = 1, **more: Any
+    ) -> Conv:
+        weight = generator.normal(0, 0.3, shape).astype(np.float32)
+        return Conv(
+            name,
+            source,
+            name,
+            weight,
+            generator.normal(0, 0.2, shape[0]).astype(np.float32),
+            window=window,
+            groups=groups,
+            **more,
+        )
+
+    return (
+        conv(
+            "a",
+            PLANES,
+            (8, 3, 3, 2),
+            Window((2, 1), (1, 0, 2, 1)),
+            activation=Activation.leaky_relu,
+        ),
+        conv(
+            "b",
+            "a",
+            (8, 4, 3, 3),
+            Window((1, 1), (2, 2, 2, 2), (2, 2)),
+            2,
+            activation=Activation.relu6,
+        ),
+        Add("c", ("a", "b"), "c", Activation.leaky_relu),
+        Shuffle("d", "c", "d", 2, True, False),
+        MaxPool("e", "d", "e", (3, 2), Window((1, 2), (2, 0, 1, 1))),
+        AveragePool("f", "e", "f", (2, 3), Window((1, 1), (0, 1, 1, 2))),
+        conv("g", "f", (4, 1, 3, 4), Window((2, 3), (0, 2, 1, 1)), 2, transposed=True),
+        Shuffle("h", "g", "h", 1, False, True),
+        Pointwise("i", "h", "i", Activation.hard_swish),
+        Mul("j", ("i", "h"), "j"),
+        conv("k", "j", (1, 4, 1, 1), Window()),
+        Resize("l", "k", CORRECTION, 2, True),
+    )
 
 
 def moved(core: IntCore) -> TrainableCore:

@@ -1,0 +1,99 @@
+"""Move scales by one fractional bit, where a core in training then errs less.
+
+Each scale was chosen by the squared error of its own tensor, before any integer was trained. A
+gradient step cannot move it, because scales are powers of two: Jain et al. (2020) train the
+logarithm of a threshold and round that up. Here each scale is tried one bit finer, where it clips
+more, and one bit coarser, where it rounds more. What is judged is the error of the result.
+
+1. Tensors move together that must share a scale. So do those that an add of one scale connects,
+   because that add is exact.
+2. The planes stay, because the host writes them. So does what a ReLU6 writes, because the end of
+   int8 may stand for its six.
+3. The scales of a convolution's weights and of its biases move by themselves. Those of copies
+   stay, because the coarse copy would have to move as well.
+4. A move is left out if the DPU's shifts do not reach it, and undone if the core errs no less.
+"""
+
+import logging
+from collections.abc import Callable, Iterator
+from functools import partial
+
+from beers_deploy.quant.core import IntCore, Shifts, shift_faults
+from beers_deploy.quant.graph import PLANES, Activation, Add, Conv, Graph, ties_scales
+from beers_deploy.quant.graph.operations import united
+from beers_deploy.quant.integer.trainable import TrainableCore
+
+logger = logging.getLogger(__name__)
+
+
+def with_better_scales(
+    trainable: TrainableCore, graph: Graph, shifts: Shifts, loss_of: Callable[[IntCore], float]
+) -> TrainableCore:
+    """Return the core with the scales moved that let it err less.
+
+    Args:
+        trainable: a core in training.
+        graph: the float network of the same operations.
+        shifts: the windows of the target.
+        loss_of: the error of a core.
+    """
+    least = loss_of(trainable.core())
+    tried = 0
+    start = trainable.core()
+    for move in _moves(trainable.core(), graph):
+        for by in (1, -1):
+            candidate = move(trainable, by=by)
+            core = candidate.core()
+            # 4.
+            if shift_faults(core, shifts):
+                continue
+            tried += 1
+            loss = loss_of(core)
+            if loss < least:
+                trainable = candidate
+                least = loss
+                # The other direction would lead back.
+                break
+    logger.info(
+        "fine-tuning tried %d moves of scales and moved those of %d tensors",
+        tried,
+        moved(start, trainable.core()),
+    )
+    return trainable
+
+
+def _moves(core: IntCore, graph: Graph) -> Iterator[Callable[..., TrainableCore]]:
+    """Yield what moves each scale of a core by some fractional bits."""
+    # 1.
+    links: list[tuple[str, ...]] = [(name,) for name in core.frac_bits]
+    for op in core.ops:
+        names = (*op.inputs, op.output)
+        exact = isinstance(op, Add) and len({core.frac_bits[name] for name in names}) == 1
+        if exact or ties_scales(op):
+            links.append(names)
+    leader = united(links)
+    # 2.
+    fixed = {PLANES}
+    for op in graph:
+        if isinstance(op, Conv) and op.activation is Activation.relu6:
+            fixed.add(op.output)
+    for first in dict.fromkeys(leader.values()):
+        together = [name for name in leader if leader[name] == first]
+        if fixed.isdisjoint(together):
+            yield partial(TrainableCore.with_finer_tensors, names=together)
+    # 3.
+    writes_copies = core.host_part.decoding.copies > 1
+    for number in range(len(core.convolutions) - writes_copies):
+        yield partial(TrainableCore.with_finer_weights, number=number)
+        yield partial(TrainableCore.with_finer_biases, number=number)
+
+
+def moved(core: IntCore, other: IntCore) -> int:
+    """Return how many tensors, weights and biases included, have other scales in another form of a
+    core.
+    """
+    count = sum(core.frac_bits[name] != other.frac_bits[name] for name in core.frac_bits)
+    for one, another in zip(core.convolutions, other.convolutions, strict=True):
+        count += one.weight_frac_bits != another.weight_frac_bits
+        count += one.bias_frac_bits != another.bias_frac_bits
+    return count

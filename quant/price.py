@@ -1,0 +1,253 @@
+"""What each restriction of a DPU costs: the float network with one more of them a step.
+
+Each step rounds weights and tensors as such hardware would, and computes in float between:
+
+1. 8 bits: a scale for the weights of each output channel, and 256 steps from the smallest to the
+   largest value of each tensor.
+2. No zero point: the steps lie around 0, so what is never negative has 128 of them.
+3. One scale for all weights of a convolution.
+4. Powers of two as scales, the finest that clip nothing.
+5. The INT8 network: also shifts, scales that tensors share and biases of 8 bits, against what the
+   passes and fine-tuning win back.
+
+Ranges are those of the samples that are measured, so that steps 1 to 4 clip nothing. The image
+enters, and is added at the end, as the host of the INT8 network does it. What clipping costs in
+step 5 is the difference to the same integers in tensors whose values have no end.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import numpy as np
+import onnx
+from onnx import helper, numpy_helper
+
+from beers_deploy.model.metrics.fidelity import psnr_db
+from beers_deploy.profiles.figures import Figure, Row, measured
+from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, dequantized
+from beers_deploy.quant.gate import SCALE
+from beers_deploy.quant.graph import (
+    CORRECTION,
+    PLANES,
+    Conv,
+    Graph,
+    graph_to_onnx,
+    read_planes,
+    tensors,
+)
+from beers_deploy.quant.host_part import HostPart
+from beers_deploy.quant.input_range import to_shares
+from beers_deploy.quant.quantize import Quantized
+from beers_deploy.quant.samples.patches import Pair, Patches
+from beers_deploy.quant.session import open_any_size, open_session, planes_of, result_of
+
+BITS = 8
+SAMPLES = 16
+"""That are measured, of those that calibration did not see."""
+PER_CHANNEL = (1, 2, 3)
+"""Axes of weights (O, I, kh, kw) over which a scale for each output channel is shared."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The multiples of a scale from `low` to `high` times it, to which a tensor is rounded."""
+
+    scale: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a step has lost: mean absolute difference from float in shares of the input's range, and
+    PSNR to references in dB, NaN without them.
+    """
+
+    mae: float
+    drop_db: float
+
+    def beyond(self, before: "Cost", source: str) -> Figure:
+        """Return what was added, in dB if there are references."""
+        if math.isfinite(self.drop_db) and math.isfinite(before.drop_db):
+            return measured(self.drop_db - before.drop_db, "dB", source)
+        return measured(self.mae - before.mae, SCALE, source)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Samples that steps are measured on.
+
+    Attributes:
+        pairs: of an image and its reference, which may be empty.
+        floats: results of the float network.
+        ranges: the smallest and the largest value of each of its tensors, and 0.
+        host_part: the host's part.
+    """
+
+    pairs: Sequence[Pair]
+    floats: Sequence[np.ndarray]
+    ranges: Mapping[str, tuple[float, float]]
+    host_part: HostPart
+
+    @classmethod
+    def of(cls, result: Quantized, pairs: Sequence[Pair]) -> "Measured":
+        """Run the float network on the samples."""
+        host_part = result.core.host_part
+        graph = read_planes(result.network.graph)
+        names = tensors(graph)
+        session = open_session(graph_to_onnx(graph, names, host_part.planes))
+        floats = []
+        # Steps include 0, because padding has to be exact.
+        lows, highs = np.zeros((2, len(names)))
+        for image, _ in pairs:
+            values = session.run(names, {PLANES: planes_of(image, host_part)})
+            floats.append(host_part.finish(image, values[names.index(CORRECTION)]))
+            lows = np.minimum(lows, [value.min() for value in values])
+            highs = np.maximum(highs, [value.max() for value in values])
+        limits = zip(lows.tolist(), highs.tolist(), strict=True)
+        return cls(pairs, floats, dict(zip(names, limits, strict=True)), host_part)
+
+    def corrections(self, graph: Graph, grids: Mapping[str, Grid]) -> Iterator[np.ndarray]:
+        """Yield the results of a plane-reading graph whose tensors are rounded to grids."""
+        model = rounded_model(graph_to_onnx(graph, [CORRECTION], self.host_part.planes), grids)
+        session = open_session(model)
+        for image, _ in self.pairs:
+            yield session.run(None, {PLANES: planes_of(image, self.host_part)})[0]
+
+    def cost(self, results: Iterable[np.ndarray]) -> Cost:
+        """Return what restored images lose, in the mean over the samples."""
+        maes = []
+        drops_db = []
+        ranges = self.host_part.input_ranges
+        for image, in_float, (_, reference) in zip(results, self.floats, self.pairs, strict=True):
+            float_shares, shares = (to_shares(each, ranges) for each in (in_float, image))
+            maes.append(float(np.abs(shares - float_shares).mean()))
+            drop_db = math.nan
+            if reference.shape == image.shape:
+                float_db, step_db = (
+                    psnr_db(np.clip(each, 0, 1), to_shares(reference, ranges), 1.0)
+                    for each in (float_shares, shares)
+                )
+                drop_db = float_db - step_db
+            drops_db.append(drop_db)
+        return Cost(float(np.mean(maes)), float(np.mean(drops_db)))
+
+    def cost_of_step(
+        self, graph: Graph, axes: tuple[int, ...] | None, zero_point: bool, powers: bool
+    ) -> Cost:
+        """Return what a float graph loses whose weights share scales over `axes`, with or without
+        zero points and scales of any size.
+        """
+        rounded = tuple(
+            replace(op, weight=rounded_weight(op.weight, axes, powers))
+            if isinstance(op, Conv)
+            else op
+            for op in graph
+        )
+        grids = {
+            name: grid_of(low, high, zero_point, powers)
+            for name, (low, high) in self.ranges.items()
+        }
+        corrections = self.corrections(read_planes(rounded), grids)
+        pairs = zip(self.pairs, corrections, strict=True)
+        return self.cost(self.host_part.finish(image, each) for (image, _), each in pairs)
+
+    def cost_of_integers(self, result: Quantized, clips: bool) -> Cost:
+        """Return what the INT8 network's own integers lose, in tensors with or without an end."""
+        graph = tuple(
+            dequantized(op, whole) if isinstance(op, Conv) and isinstance(whole, IntConv) else op
+            for op, whole in zip(result.graph, result.core.ops, strict=True)
+        )
+        ends = (INT8_MIN, INT8_MAX) if clips else (-math.inf, math.inf)
+        grids = {name: Grid(result.core.scale(name), *ends) for name in tensors(graph)}
+        scale = result.core.scale(CORRECTION)
+        pairs = zip(self.pairs, self.corrections(graph, grids), strict=True)
+        return self.cost(self.host_part.restore(image, each, scale) for (image, _), each in pairs)
+
+
+def price_rows(result: Quantized, held_out: Patches) -> list[Row]:
+    """Return a row for each step, and one for what clipping costs in the last.
+
+    Args:
+        result: the INT8 network, which knows the float one.
+        held_out: samples that calibration did not see.
+    """
+    samples = Measured.of(result, list(islice(held_out.pairs, SAMPLES)))
+    graph = result.network.graph
+    int8 = open_any_size(result.host)
+    costs = {
+        "8 bits": samples.cost_of_step(graph, PER_CHANNEL, zero_point=True, powers=False),
+        "no zero point": samples.cost_of_step(graph, PER_CHANNEL, zero_point=False, powers=False),
+        "one scale for the weights of a layer": samples.cost_of_step(
+            graph, None, zero_point=False, powers=False
+        ),
+        "powers of two as scales": samples.cost_of_step(graph, None, zero_point=False, powers=True),
+        "INT8 as written": samples.cost(result_of(int8, image) for image, _ in samples.pairs),
+    }
+    source = f"{len(samples.pairs)} samples that calibration did not see"
+    rows = []
+    before = Cost(0.0, 0.0)
+    for name, cost in costs.items():
+        figures = {"price": cost.beyond(before, source)}
+        if math.isfinite(cost.drop_db):
+            figures["PSNR drop"] = measured(cost.drop_db, "dB", source)
+        figures["MAE"] = measured(cost.mae, SCALE, source)
+        rows.append(Row("price", name, figures))
+        before = cost
+    clipped = samples.cost_of_integers(result, clips=True)
+    price = clipped.beyond(samples.cost_of_integers(result, clips=False), source)
+    return [*rows, Row("price", "clipping, of INT8 as written", {"price": price})]
+
+
+def rounded_weight(weight: np.ndarray, axes: tuple[int, ...] | None, powers: bool) -> np.ndarray:
+    """Round weights (O, I, kh, kw), with one scale over these axes, or None over all."""
+    largest = np.abs(weight).max(axes, keepdims=True)
+    scale = np.where(largest > 0, largest, 1) / (2 ** (BITS - 1) - 1)
+    if powers:
+        scale = 2.0 ** np.ceil(np.log2(scale))
+    return np.asarray(np.rint(weight / scale) * scale, np.float32)
+
+
+def grid_of(low: float, high: float, zero_point: bool, powers: bool) -> Grid:
+    """Return the grid of a tensor with values from `low` to `high`, which does not clip them."""
+    steps = 2**BITS - 1
+    if zero_point:
+        scale = (high - low) / steps or 1.0
+        first = round(low / scale)
+        return Grid(scale, first, first + steps)
+    end = steps // 2
+    scale = max(-low, high) / end or 1.0
+    if powers:
+        scale = 2.0 ** math.ceil(math.log2(scale))
+    return Grid(scale, -end - 1, end)
+
+
+def rounded_model(model: onnx.ModelProto, grids: Mapping[str, Grid]) -> onnx.ModelProto:
+    """Return a float model that rounds these tensors to their grids, half up as a DPU does."""
+    nodes = []
+    for node in model.graph.node:
+        nodes.append(node)
+        name = node.output[0]
+        if name not in grids:
+            continue
+        grid = grids[name]
+        node.output[0] = f"{name}.exact"
+        constants = {"scale": grid.scale, "half": 0.5, "low": grid.low, "high": grid.high}
+        for key, value in constants.items():
+            array = np.array(value, np.float32)
+            model.graph.initializer.append(numpy_helper.from_array(array, f"{name}.{key}"))
+        feeds = {
+            "Div": ["exact", "scale"],
+            "Add": ["Div", "half"],
+            "Floor": ["Add"],
+            "Clip": ["Floor", "low", "high"],
+        }
+        for kind, suffixes in feeds.items():
+            inputs = [f"{name}.{suffix}" for suffix in suffixes]
+            nodes.append(helper.make_node(kind, inputs, [f"{name}.{kind}"]))
+        nodes.append(helper.make_node("Mul", [f"{name}.Clip", f"{name}.scale"], [name]))
+    del model.graph.node[:]
+    model.graph.node.extend(nodes)
+    return model

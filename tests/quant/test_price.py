@@ -1,0 +1,147 @@
+"""The price of each restriction of a DPU: nothing where it restricts nothing, and the integers'
+own loss at the end.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from beers_deploy.profiles.figures import Row
+from beers_deploy.quant import price
+from beers_deploy.quant.core import build_core
+from beers_deploy.quant.encodings import host_model
+from beers_deploy.quant.gate import compare
+from beers_deploy.quant.graph import PLANES, Conv
+from beers_deploy.quant.passes.selection import Passes
+from beers_deploy.quant.price import Measured, grid_of, price_rows, rounded_weight
+from beers_deploy.quant.quantize import Quantized
+from beers_deploy.quant.samples.patches import Patches
+from beers_deploy.quant.session import open_session, result_of
+from tests.quant.quick import quickly
+
+
+def alone(patches: Patches) -> Patches:
+    """The patches without their references."""
+    nothing = np.empty(0, np.float32)
+    return Patches([(image, nothing) for image in patches.degraded], patches.degraded)
+
+
+STEPS = [
+    "8 bits",
+    "no zero point",
+    "one scale for the weights of a layer",
+    "powers of two as scales",
+    "INT8 as written",
+    "clipping, of INT8 as written",
+]
+
+
+def prices(rows: list[Row]) -> dict[str, float]:
+    values = {row.name: row.figures["price"].value for row in rows}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def test_steps_add_up_to_what_the_gate_measures(
+    quantized: Quantized, float_onnx: onnx.ModelProto, unseen: Patches
+) -> None:
+    rows = price_rows(quantized, unseen)
+    assert [row.name for row in rows] == STEPS
+    gate = compare(open_session(float_onnx), open_session(quantized.host), unseen)
+    last = rows[-2].figures
+    assert last["MAE"].value == pytest.approx(gate.mae, rel=1e-3)
+    assert last["PSNR drop"].value == pytest.approx(gate.drop_db, abs=1e-3)
+    assert sum(prices(rows[:-1]).values()) == pytest.approx(gate.drop_db, abs=1e-3)
+    assert all(row.figures["price"].mode == "measured" for row in rows)
+
+
+def test_simulated_integers_are_those_of_the_network(quantized: Quantized, unseen: Patches) -> None:
+    samples = Measured.of(quantized, unseen.pairs)
+    session = open_session(quantized.host)
+    written = samples.cost(result_of(session, image) for image in unseen.degraded)
+    simulated = samples.cost_of_integers(quantized, clips=True)
+    # onnxruntime rounds ties to even, a DPU up.
+    assert simulated.mae == pytest.approx(written.mae, rel=0.02)
+    assert simulated.drop_db == pytest.approx(written.drop_db, abs=0.02)
+
+
+def test_of_many_bits_nothing_is_lost(
+    quantized: Quantized, unseen: Patches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = {row.name: row.figures["MAE"].value or 0 for row in price_rows(quantized, unseen)[:4]}
+    monkeypatch.setattr(price, "BITS", 18)
+    many = {row.name: row.figures["MAE"].value or 0 for row in price_rows(quantized, unseen)[:4]}
+    for name, mae in many.items():
+        assert mae < few[name] / 200
+
+
+def with_equal_channels(quantized: Quantized) -> Quantized:
+    """The network with weights of each output channel that reach as far."""
+
+    def equal(op: Conv) -> Conv:
+        largest = np.abs(op.weight).max((1, 2, 3), keepdims=True)
+        return replace(op, weight=(op.weight * (0.25 / largest)).astype(np.float32))
+
+    network = quantized.network
+    graph = tuple(equal(op) if isinstance(op, Conv) else op for op in network.graph)
+    return replace(quantized, network=replace(network, graph=graph))
+
+
+def test_one_scale_for_equal_channels_costs_nothing(quantized: Quantized, unseen: Patches) -> None:
+    price_of = prices(price_rows(with_equal_channels(quantized), unseen))
+    assert price_of["one scale for the weights of a layer"] == pytest.approx(0, abs=1e-3)
+    assert abs(price_of["no zero point"]) > 1e-3
+
+
+def test_without_references_prices_are_differences_of_the_mae(
+    quantized: Quantized, unseen: Patches
+) -> None:
+    rows = price_rows(quantized, alone(unseen))
+    assert {row.figures["price"].unit for row in rows} == {"of full scale"}
+    assert all("PSNR drop" not in row.figures for row in rows)
+    assert sum(prices(rows[:-1]).values()) == pytest.approx(rows[-2].figures["MAE"].value)
+
+
+def test_what_clips_nothing_pays_nothing_for_it_and_what_clips_much_does(
+    float_onnx: onnx.ModelProto, patches: Patches
+) -> None:
+    unclipped = quickly(
+        float_onnx,
+        patches,
+        passes=Passes(dual_range=False, least_squares=False, equalization=False),
+    )
+    images = alone(patches)
+    rows = price_rows(unclipped, images)
+    # Channels are scaled by a quantile of their sizes, so a few values may be clipped.
+    assert abs(prices(rows)[STEPS[-1]]) < 0.01 * (rows[-2].figures["MAE"].value or 0)
+    finer = {name: bits + 3 * (name != PLANES) for name, bits in unclipped.core.frac_bits.items()}
+    core = build_core(unclipped.graph, finer, host_part=unclipped.core.host_part)
+    clipped = replace(unclipped, core=core, host=host_model(core, {}))
+    rows = price_rows(clipped, images)
+    assert prices(rows)[STEPS[-1]] > 0.5 * (rows[-2].figures["MAE"].value or 0)
+
+
+@given(low=st.floats(-10, 0), high=st.floats(0, 10), zero_point=st.booleans(), powers=st.booleans())
+def test_a_grid_holds_its_range_and_zero(
+    low: float, high: float, zero_point: bool, powers: bool
+) -> None:
+    grid = grid_of(low, high, zero_point, powers)
+    slack = 0.51 * grid.scale
+    assert grid.low * grid.scale <= low + slack
+    assert grid.high * grid.scale >= high - slack
+    assert grid.low <= 0 <= grid.high
+    assert grid.high - grid.low == 255
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_weights_are_rounded_by_less_than_a_step(seed: int) -> None:
+    weight = np.random.default_rng(seed).normal(0, 1, (3, 2, 2, 2)).astype(np.float32)
+    weight[0] *= 10
+    for axes in ((1, 2, 3), None):
+        largest = np.abs(weight).max(axes, keepdims=True)
+        for powers, most in ((False, 0.501), (True, 1.001)):
+            error = np.abs(rounded_weight(weight, axes, powers) - weight)
+            assert (error <= most * largest / 127).all()
