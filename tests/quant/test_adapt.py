@@ -1,5 +1,6 @@
 """Activations that a DPU lacks: replaced exactly or by others, compensated, measured, quantised."""
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,14 +17,16 @@ from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.quant.adapt.adaptation import ADAPTED, NEAR_DB, adapt
 from beers_deploy.quant.adapt.compensation import compensated
 from beers_deploy.quant.adapt.replacements import EXACT, Kind, nodes_by_kind, replaced
+from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.encodings import host_model
-from beers_deploy.quant.graph import read_network, read_planes
+from beers_deploy.quant.graph import Activation, Pointwise, read_network, read_planes
 from beers_deploy.quant.onnx.graph import OnnxGraph
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model, metadata
 from beers_deploy.quant.passes.finetune import Tuning, finetune
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.simplify import simplify
+from beers_deploy.quant.structure import structure_checks
 from tests.quant.quick import changed, image, one_guess, quickly
 
 FEATURES = 6
@@ -284,6 +287,43 @@ def test_quantize_adapts_and_compares_with_the_original(name: str, tmp_path: Pat
     path = int8.save(tmp_path / "int8.onnx")
     verdict = bd.compare(original, path, samples=tuple(held_out), progress=False)
     assert verdict.result.psnr_between_db > 30
+
+
+@pytest.mark.parametrize(
+    ("act", "approximated", "exact"),
+    [
+        (leaky(0.3), (), {Kind.leaky_relu}),
+        (leaky(0.3), {Kind.leaky_relu}, ()),
+        (prelu(*np.linspace(0, 0.3, FEATURES)), (), {Kind.prelu}),
+        (lambda w, x, name: silu(w, w.node("Relu", f"{name}.r", [x]), name), {Kind.silu}, ()),
+        (gated, {Kind.sigmoid}, ()),
+    ],
+)
+def test_the_gate_counts_the_relus_of_an_adapted_network(
+    act: Act, approximated: Any, exact: Any
+) -> None:
+    """None is reported lost or added, unless one is, even where HardSwish is a ReLU's table."""
+    model = network(act)
+    # On scales of some hundreds all of HardSwish and HardSigmoid that bends is one unit.
+    for values in model.graph.initializer:
+        if values.name == "a.w":
+            weight = 1e4 * onnx.numpy_helper.to_array(values)
+            values.CopyFrom(onnx.numpy_helper.from_array(weight, "a.w"))
+    int8 = quickly(replaced(model, approximated, exact), BARE)
+
+    def relus_off(ops: Any) -> float:
+        host = host_model(dataclasses.replace(int8.core, ops=tuple(ops)), {})
+        return structure_checks(model, host)[0].value
+
+    assert relus_off(int8.core.ops) == 0
+    ops = list(int8.core.ops)
+    for place, op in enumerate(ops):
+        if getattr(op, "activation", "") is Activation.relu and not isinstance(op, Pointwise):
+            lost = dataclasses.replace(op, activation=Activation.none)
+            assert relus_off([*ops[:place], lost, *ops[place + 1 :]]) == 1
+        if isinstance(op, IntConv) and op.activation is Activation.none:
+            added = dataclasses.replace(op, activation=Activation.relu)
+            assert relus_off([*ops[:place], added, *ops[place + 1 :]]) == 1
 
 
 def test_finetuning_learns_from_the_original() -> None:
