@@ -3,12 +3,13 @@
 By another function:
 
 1. x * Sigmoid(x), SiLU, becomes HardSwish; so does x * Sigmoid(c x), the quick GELU.
-2. A Sigmoid inside the network becomes HardSigmoid.
+2. Another Sigmoid becomes HardSigmoid.
 3. LeakyReLU of another slope, and PReLU, become LeakyReLU of 26/256.
 
 Exactly, but for the rounding of float32:
 
-4. LeakyReLU and PReLU of slopes s up to 1 become s x + ReLU((1 - s) x): two branches and an Add.
+4. LeakyReLU and PReLU of slopes s become s x + ReLU((1 - s) x): two branches and an Add. Where s is
+   above 1 the negative of it is computed so, and convolutions behind it are negated.
 5. HardSigmoid of another slope and offset becomes that of 1/6 and 0.5 behind a scaled input.
 
 Other GELUs, Mish, Tanh, ELU and Softplus stay: no function of the DPU is near enough to be fitted.
@@ -23,7 +24,13 @@ import onnx
 
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
-from beers_deploy.quant.simplify.fold_affine import fold_behind, is_convolution, per_channel
+from beers_deploy.quant.simplify.fold_affine import (
+    fold_behind,
+    fold_in_front,
+    is_convolution,
+    per_channel,
+)
+from beers_deploy.quant.simplify.standard_operators import float_shapes
 
 
 class Kind(StrEnum):
@@ -58,10 +65,9 @@ def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
         return Kind.silu
     if node.op_type == "Sigmoid":
         (result,) = node.outputs
-        # The network's result can be left to the host, which computes any function.
-        is_result = result in graph.outputs
-        part_of_silu = all(silu_input(graph, reader) for reader in graph.readers[result])
-        return None if is_result or part_of_silu else Kind.sigmoid
+        readers = graph.readers[result]
+        part_of_silu = readers and all(silu_input(graph, reader) for reader in readers)
+        return None if part_of_silu else Kind.sigmoid
     if node.op_type == "HardSigmoid":
         given = attributes.get("alpha", 0.2), attributes.get("beta", 0.5)
         plain = np.allclose(given, (1 / 6, 0.5), 1e-4)
@@ -103,14 +109,10 @@ def _by_constant(graph: OnnxGraph, node: Node, source: str) -> bool:
 
 
 def slopes_of(graph: OnnxGraph, node: Node) -> np.ndarray | None:
-    """Return the slopes (C,) or (1,) of a LeakyReLU or PReLU; None if any is above 1."""
-    slopes: np.ndarray | None = None
+    """Return the slopes (C,) or (1,) of a LeakyReLU or PReLU; None of another node."""
     if node.op_type == "LeakyRelu":
-        slopes = np.array([node.attributes.get("alpha", 0.01)], np.float32)
-    elif node.op_type == "PRelu":
-        slopes = per_channel(graph.value(node, 1))
-    # Above 1 the function bends the other way, which no sum with a ReLU does.
-    return None if slopes is None or not (slopes <= 1).all() else slopes
+        return np.array([node.attributes.get("alpha", 0.01)], np.float32)
+    return per_channel(graph.value(node, 1)) if node.op_type == "PRelu" else None
 
 
 def nodes_by_kind(graph: OnnxGraph) -> dict[Kind, list[Node]]:
@@ -144,6 +146,8 @@ def replaced(
     graph.rewrite(lambda _, node: plan.get(node))
     graph.rewrite(fold_behind)
     graph.save()
+    fold_in_front(graph, float_shapes(graph))
+    graph.save()
     return network
 
 
@@ -169,9 +173,10 @@ def _scaled_hard_sigmoid(graph: OnnxGraph, node: Node) -> list[Node]:
 
 
 def _two_branches(graph: OnnxGraph, node: Node) -> list[Node]:
-    """Return slopes x + ReLU((1 - slopes) x)."""
+    """Return slopes x + ReLU((1 - slopes) x), negated where a slope above 1 bends the other way."""
     slopes = slopes_of(graph, node)
     assert slopes is not None  # noqa: S101 - `kind_of` has asked
+    signs = np.where(slopes > 1, -1, 1)
     source = node.inputs[0]
     (output,) = node.outputs
     nodes = []
@@ -185,11 +190,15 @@ def _two_branches(graph: OnnxGraph, node: Node) -> list[Node]:
         twin.name = twin.proto.name = f"{before.name}.bent"
         twin.outputs = (bent_source,)
         nodes.append(twin)
-    straight = _times(graph, source, slopes, f"{output}.straight")
-    scaled = _times(graph, bent_source, 1 - slopes, f"{output}.scaled")
+    straight = _times(graph, source, signs * slopes, f"{output}.straight")
+    scaled = _times(graph, bent_source, np.abs(1 - slopes), f"{output}.scaled")
     bent = Node.new("Relu", scaled.outputs, f"{output}.bent", f"{output}.bent")
     names = [straight.outputs[0], bent.outputs[0]]
-    return [*nodes, straight, scaled, bent, Node.new("Add", names, output, node.name)]
+    nodes += [straight, scaled, bent]
+    if (signs > 0).all():
+        return [*nodes, Node.new("Add", names, output, node.name)]
+    negated = Node.new("Add", names, f"{output}.negated", f"{output}.negated")
+    return [*nodes, negated, _times(graph, negated.outputs[0], signs, output)]
 
 
 def _times(graph: OnnxGraph, source: str, factors: np.ndarray, output: str) -> Node:

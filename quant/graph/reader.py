@@ -26,6 +26,7 @@ from beers_deploy.quant.graph.pixel_shuffle import with_shuffles
 from beers_deploy.quant.graph.split_network import (
     ADAPT,
     REMEDY,
+    AdaptableError,
     SplitNetwork,
     add_channels,
     check_network,
@@ -53,15 +54,18 @@ STATISTICS = (
     "attention have it. Train the network with batch normalization, which becomes part of the "
     "convolutions, and with global average pooling."
 )
-OF_ONE_SIZE = (
-    "The network computes with the size of its image. Export it with fixed height and width."
+FIX_SIZE = (
+    "Export it with fixed height and width, or give the file some: python -m "
+    "onnxruntime.tools.make_dynamic_shape_fixed."
 )
+OF_ONE_SIZE = f"The network computes with the size of its image. {FIX_SIZE}"
 REMEDIES = {
     **dict.fromkeys(("Flatten", "Gemm", "MatMul", "NonMaxSuppression", "Softmax"), NO_IMAGE),
     **dict.fromkeys(
         ("GroupNormalization", "InstanceNormalization", "LayerNormalization"), NORMALISES
     ),
     **dict.fromkeys(("ReduceL2", "ReduceMax", "ReduceMean", "ReduceSum"), STATISTICS),
+    **dict.fromkeys(("PRelu", "Sigmoid"), ADAPT),
     **dict.fromkeys(("ConstantOfShape", "Expand", "Shape", "Size", "Tile"), OF_ONE_SIZE),
     "Pad": (
         "Pad in the convolution; a network behind a bank is quantised from its weights "
@@ -69,8 +73,6 @@ REMEDIES = {
     ),
 }
 """What to do about an operator that no DPU computes."""
-ADAPTABLE = {"PRelu", "Sigmoid"}
-"""Operators that `quant.adapt` replaces, but for one that writes the network's result."""
 OTHER_REMEDY = "Replace it by one that the DPU computes, or cut the network in front of it."
 
 
@@ -81,6 +83,9 @@ def read_network(model: onnx.ModelProto) -> SplitNetwork:
         network = cut(reader.graph(), reader.channels())
         network = replace(network, border_px=reader.border_px)
         check_network(network)
+    # Last, because what else is refused would be after adapting as well.
+    if reader.adaptable is not None:
+        raise reader.adaptable
     return network
 
 
@@ -106,6 +111,7 @@ class _Reader:
         self._widths: dict[str, int] = {}  # channels of what the first operations write
         self._measured = 0  # how many operations `_widths` covers
         self.border_px = self._take_mirror()
+        self.adaptable: AdaptableError | None = None  # the first
 
     def _take_mirror(self) -> int:
         """Remove a Pad that mirrors the image, and return its border in pixels; the host does it.
@@ -138,6 +144,36 @@ class _Reader:
 
     def graph(self) -> Graph:
         """Return the operations from `IMAGE` to `CORRECTION`; global pooling needs a fixed size."""
+        self._check_whole()
+        (result,) = self.source.outputs
+        nodes = list(self.source.nodes)
+        # The host clips images to [0, 1] in any case.
+        while nodes and nodes[-1].outputs[0] == result and _clips_to_image(nodes[-1], self.source):
+            result = nodes.pop().inputs[0]
+        for node in nodes:
+            try:
+                self._read(node)
+            except AdaptableError as error:
+                self.adaptable = self.adaptable or error
+                stand_in = Activation.hard_sigmoid
+                self._append(Pointwise(node.name, node.inputs[0], node.outputs[0], stand_in))
+        if not self.ops or self.ops[-1].output != result:
+            raise unsupported("No operation writes the network's output.")
+        graph = named_apart(self.ops, {self.image: IMAGE, result: CORRECTION})
+        pools = [op for op in graph if isinstance(op, AveragePool) and op.kernel is None]
+        rows, columns = self.source.inputs[self.image][2:]
+        if pools and not (rows and columns):
+            raise unsupported(
+                f"The network accepts images of any size, but {pools[0].name} pools over the whole "
+                "image, whose size must be known.",
+                FIX_SIZE,
+            )
+        if not (rows and columns):
+            check_result_size(graph, self.border_px)
+        return sized(graph, (rows, columns)) if pools else graph
+
+    def _check_whole(self) -> None:
+        """Raise ModelError for what concerns all of the network, or no size of image would help."""
         if len(self.source.inputs) > 1:
             raise unsupported(
                 f"The network must have one input, the image, but it has {len(self.source.inputs)}"
@@ -151,26 +187,18 @@ class _Reader:
                 "Export it with one of them.",
             )
         (result,) = self.source.outputs
-        nodes = list(self.source.nodes)
-        # The host clips images to [0, 1] in any case.
-        while nodes and nodes[-1].outputs[0] == result and _clips_to_image(nodes[-1], self.source):
-            result = nodes.pop().inputs[0]
-        for node in nodes:
-            self._read(node)
-        if not self.ops or self.ops[-1].output != result:
-            raise unsupported("No operation writes the network's output.")
-        graph = named_apart(self.ops, {self.image: IMAGE, result: CORRECTION})
-        pools = [op for op in graph if isinstance(op, AveragePool) and op.kernel is None]
-        rows, columns = self.source.inputs[self.image][2:]
-        if pools and not (rows and columns):
+        dims = self.source.result_sizes[result]
+        if dims and len(dims) != 4:
             raise unsupported(
-                f"The network accepts images of any size, but {pools[0].name} pools over the whole "
-                "image, whose size must be known.",
-                "Export it with fixed height and width.",
+                f"The network's result must be an image or a map (N, C, H, W), but {result} has "
+                f"{len(dims)} dimensions.",
+                NO_IMAGE,
             )
-        if not (rows and columns):
-            check_result_size(graph, self.border_px)
-        return sized(graph, (rows, columns)) if pools else graph
+        for node in self.source.nodes:
+            if REMEDIES.get(node.op_type) in (NORMALISES, STATISTICS):
+                raise _refused(node, self.source)
+            if node.op_type == "Resize":
+                READERS[node.op_type](node, self.source)
 
     def _read(self, node: Node) -> None:
         if node.op_type in ACTIVATIONS:
@@ -256,8 +284,9 @@ class _Reader:
 def _refused(node: Node, graph: OnnxGraph) -> ModelError:
     """Return the error of an operator that no DPU computes."""
     remedy = REMEDIES.get(node.op_type, OTHER_REMEDY)
-    if node.op_type in ADAPTABLE:
-        remedy = NO_IMAGE if node.outputs == graph.outputs else ADAPT
+    readers = [reader.op_type for reader in graph.readers[node.outputs[0]]]
+    if node.op_type == "ReduceMean" and "Sub" in readers and graph.numbers(node, 1, "axes") == [1]:
+        remedy = f"It begins a layer normalization. {NORMALISES}"
     return unsupported(f"The DPU does not compute the operation {node}.", remedy)
 
 
