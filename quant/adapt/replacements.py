@@ -12,6 +12,11 @@ Exactly, but for the rounding of float32:
    above 1 the negative of it is computed so, and convolutions behind it are negated.
 5. HardSigmoid of another slope and offset becomes that of 1/6 and 0.5 behind a scaled input.
 
+And by another function again:
+
+6. Spatial attention that shrinks and enlarges by no whole factors is aligned with its map
+   (`quant.graph.attention`).
+
 Other GELUs, Mish, Tanh, ELU and Softplus stay: no function of the DPU is near enough to be fitted.
 """
 
@@ -22,6 +27,7 @@ from enum import StrEnum
 import numpy as np
 import onnx
 
+from beers_deploy.quant.graph.attention import aligned, shrinking
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.fold_affine import (
@@ -41,6 +47,7 @@ class Kind(StrEnum):
     hard_sigmoid = "HardSigmoid of another slope"
     leaky_relu = "LeakyReLU of another slope"
     prelu = "PReLU"
+    attention = "spatial attention (ESA)"
 
 
 APPROXIMATIONS = {
@@ -48,8 +55,9 @@ APPROXIMATIONS = {
     Kind.sigmoid: "HardSigmoid",
     Kind.leaky_relu: "LeakyReLU of 26/256",
     Kind.prelu: "LeakyReLU of 26/256",
+    Kind.attention: "attention on an eighth of the sides",
 }
-"""The other function that replaces each kind (1 to 3)."""
+"""The other function that replaces each kind (1 to 3 and 6)."""
 EXACT = {
     Kind.hard_sigmoid: "HardSigmoid of a scaled input",
     Kind.leaky_relu: "ReLU in a second branch, and an Add",
@@ -61,6 +69,8 @@ EXACT = {
 def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
     """Return the kind of operator that a node is; None if it is not replaced."""
     attributes = node.attributes
+    if shrinking(graph, node):
+        return Kind.attention
     if silu_input(graph, node):
         return Kind.silu
     if node.op_type == "Sigmoid":
@@ -137,7 +147,10 @@ def replaced(
     # Before the graph changes, because a SiLU is known by the Sigmoid in front of it.
     plan: dict[Node, list[Node]] = {}
     for kind, nodes in nodes_by_kind(graph).items():
-        if kind in approximated:
+        if kind is Kind.attention and kind in approximated:
+            for node in nodes:
+                plan |= aligned(graph, node)
+        elif kind in approximated:
             plan |= {node: [_approximation(graph, node, kind)] for node in nodes}
         elif kind in exact and kind is Kind.hard_sigmoid:
             plan |= {node: _scaled_hard_sigmoid(graph, node) for node in nodes}

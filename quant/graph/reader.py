@@ -3,12 +3,14 @@
 A file from outside is checked once, here; behind it nothing asks again.
 """
 
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
 import onnx
 
 from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.graph.attention import aligned, shrinking
 from beers_deploy.quant.graph.node_operations import ACTIVATIONS, READERS, read_activation, require
 from beers_deploy.quant.graph.operations import (
     CORRECTION,
@@ -104,14 +106,29 @@ class _Reader:
     """Reads the nodes once, in order."""
 
     def __init__(self, model: onnx.ModelProto) -> None:
-        self.source = with_shuffles(model)
+        self.adaptable: AdaptableError | None = None  # the first
+        self.source = with_shuffles(self._aligned(model))
         self.image, *_ = self.source.inputs
         self.ops: list[Op] = []
         self._places: dict[str, int] = {}  # where the operation that writes a tensor stands
         self._widths: dict[str, int] = {}  # channels of what the first operations write
         self._measured = 0  # how many operations `_widths` covers
         self.border_px = self._take_mirror()
-        self.adaptable: AdaptableError | None = None  # the first
+
+    def _aligned(self, model: onnx.ModelProto) -> onnx.ModelProto:
+        """Return the model with spatial attention as `quant.adapt` aligns it, and note that."""
+        graph = OnnxGraph(model)
+        resizes = [node for node in graph.nodes if shrinking(graph, node)]
+        if not resizes:
+            return model
+        network = deepcopy(model)
+        graph = OnnxGraph(network)
+        plan = {key: nodes for node in graph.nodes for key, nodes in aligned(graph, node).items()}
+        graph.rewrite(lambda _, node: plan.get(node))
+        graph.save()
+        fault = f"{resizes[0]} enlarges to the size of another map, by no whole factor."
+        self.adaptable = AdaptableError(str(unsupported(fault, ADAPT)))
+        return network
 
     def _take_mirror(self) -> int:
         """Remove a Pad that mirrors the image, and return its border in pixels; the host does it.

@@ -19,7 +19,7 @@ from beers_deploy.quant.adapt.compensation import compensated
 from beers_deploy.quant.adapt.replacements import EXACT, Kind, nodes_by_kind, replaced
 from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.encodings import host_model
-from beers_deploy.quant.graph import Activation, Pointwise, read_network, read_planes
+from beers_deploy.quant.graph import Activation, Pointwise, Resize, read_network, read_planes
 from beers_deploy.quant.onnx.graph import OnnxGraph
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model, metadata
 from beers_deploy.quant.passes.finetune import Tuning, finetune
@@ -112,6 +112,26 @@ def patches(count: int, seed: int, px: int = 48) -> Patches:
         noisy = np.clip(clean + 0.03 * generator.standard_normal((px, px)), 0, 1)
         pairs.append(tuple(array[None, None].astype(np.float32) for array in (noisy, clean)))
     return Patches(pairs, [degraded for degraded, _ in pairs])
+
+
+def attention_network(free: bool) -> onnx.ModelProto:
+    """RLFN's attention behind a convolution, for images of 48 pixels or of any size."""
+    w = GraphWriter()
+    source = conv(w, "image", "a", (FEATURES, 1, 3, 3))
+    weight = w.constant("s.w", np.random.default_rng(3).normal(0, 0.3, (FEATURES, FEATURES, 3, 3)))
+    half = w.node("Conv", "half", [source, w.node("Cast", "s.f", [weight], to=1)], strides=[2, 2])
+    largest = w.node("MaxPool", "largest", [half], kernel_shape=[7, 7], strides=[3, 3])
+    inner = conv(w, w.node("Relu", "r", [conv(w, largest, "b")]), "c")
+    sizes = w.constant("sizes", np.array([1, FEATURES, 48, 48]))
+    if free:
+        sizes = w.node("Shape", "shape", [source])
+    wide = w.node("Resize", "wide", [inner, "", "", sizes], mode="linear")
+    gate = w.node("Sigmoid", "gate", [conv(w, wide, "d", (FEATURES, FEATURES, 1, 1))])
+    attended = w.node("Mul", "attended", [source, gate])
+    w.node("Add", "restored", ["image", conv(w, attended, "e", (1, FEATURES, 3, 3))])
+    px = None if free else 48
+    graph = w.graph("g", [image_info("image", 1, px)], [image_info("restored", 1, px)])
+    return simplify(make_model(graph, {}), "g")
 
 
 SAMPLES = patches(8, 0)
@@ -324,6 +344,23 @@ def test_the_gate_counts_the_relus_of_an_adapted_network(
         if isinstance(op, IntConv) and op.activation is Activation.none:
             added = dataclasses.replace(op, activation=Activation.relu)
             assert relus_off([*ops[:place], added, *ops[place + 1 :]]) == 1
+
+
+@pytest.mark.parametrize("free", [False, True])
+def test_spatial_attention_is_aligned_and_compensated(free: bool) -> None:
+    """The refusal names `adapt`, and the result is nearer than a network without attention."""
+    model = attention_network(free)
+    with pytest.raises(ModelError, match=r"no whole factor. 'quantize --adapt'"):
+        read_network(model)
+    adapted = adapt(model, SAMPLES, HELD_OUT)
+    assert [row.name for row in adapted.rows] == ["1 spatial attention (ESA)", "1 Sigmoid", "all"]
+    resizes = [op for op in read_network(adapted.model).graph if isinstance(op, Resize)]
+    assert [op.factor for op in resizes] == [4, 2]
+    even = [node.attributes.get("strides") for node in OnnxGraph(adapted.model).nodes]
+    assert [4, 4] in even
+    near = adapted.rows[-1].figures["PSNR to the original, compensated"].value
+    assert near is not None
+    assert near > 40
 
 
 def test_finetuning_learns_from_the_original() -> None:
