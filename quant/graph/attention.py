@@ -9,6 +9,8 @@ enlarges what convolutions make of that to the map's size: by a factor that is n
 That is another function, which `quant.adapt` puts in its place, measures and compensates.
 """
 
+from itertools import zip_longest
+
 import numpy as np
 
 from beers_deploy.quant.graph.resize import Resizing
@@ -18,26 +20,31 @@ BETWEEN = {"Conv", "LeakyRelu", "PRelu", "Relu"}
 """What stands between the maximum and the enlargement."""
 
 
-def shrinking(graph: OnnxGraph, node: Node) -> tuple[Node, Node] | None:
-    """Return the strided convolution and the maximum of the attention that a Resize belongs to."""
-    if node.op_type != "Resize" or Resizing.of(node, graph).mode != "linear":
-        return None
-    pool = _writer(graph, node.inputs[0])
-    while pool is not None and pool.op_type in BETWEEN:
-        pool = _writer(graph, pool.inputs[0])
-    conv = None if pool is None else _writer(graph, pool.inputs[0])
-    if conv is None or pool is None or (conv.op_type, pool.op_type) != ("Conv", "MaxPool"):
-        return None
-    weight = graph.value(conv, 1)
+def shrinking(graph: OnnxGraph, node: Node) -> list[Node]:
+    """Return the nodes in front of a Resize that attention has, the strided convolution first.
+
+    Empty if the node is something else.
+    """
+    nodes: list[Node] = []
+    writer = _writer(graph, node.inputs[0]) if node.op_type == "Resize" else None
+    while writer is not None and (not nodes or nodes[0].op_type != "MaxPool"):
+        nodes.insert(0, writer)
+        writer = _writer(graph, writer.inputs[0])
+    if writer is None or not BETWEEN.issuperset(inner.op_type for inner in nodes[1:]):
+        return []
+    pool = nodes[0]
+    weight = graph.value(writer, 1)
     is_known = (
-        weight is not None
+        writer.op_type == "Conv"
+        and weight is not None
         and weight.shape[2:] == (3, 3)
-        and conv.attributes.get("strides") == [2, 2]
+        and writer.attributes.get("strides") == [2, 2]
         and pool.attributes.get("kernel_shape") == [7, 7]
         and pool.attributes.get("strides") == [3, 3]
-        and not any([*conv.attributes.get("pads", []), *pool.attributes.get("pads", [])])
+        and not any([*writer.attributes.get("pads", []), *pool.attributes.get("pads", [])])
+        and Resizing.of(node, graph).mode == "linear"
     )
-    return (conv, pool) if is_known else None
+    return [writer, *nodes] if is_known else []
 
 
 def _writer(graph: OnnxGraph, name: str) -> Node | None:
@@ -53,25 +60,26 @@ def aligned(graph: OnnxGraph, node: Node) -> dict[Node, list[Node]]:
         graph: that the node belongs to; its constants are extended.
         node: any node.
     """
-    match = shrinking(graph, node)
-    if match is None:
+    nodes = shrinking(graph, node)
+    if not nodes:
         return {}
-    conv, pool = match
     # 1. Pads put each value in the middle of the eight pixels that it stands for, or next to it.
-    pads = {conv: {"pads": [1, 1, 1, 1]}, pool: {"strides": [4, 4], "pads": [1, 1, 2, 2]}}
-    replacements = {
-        old: [
-            Node.new(old.op_type, old.inputs, old.outputs[0], old.name, **{**old.attributes, **new})
-        ]
-        for old, new in pads.items()
-    }
+    changes = [{"pads": [1, 1, 1, 1]}, {"strides": [4, 4], "pads": [1, 1, 2, 2]}]
+    replacements: dict[Node, list[Node]] = {}
+    source = nodes[0].inputs[0]
+    for old, change in zip_longest(nodes, changes, fillvalue={}):
+        # Another name, because it is not the tensor of the original any more.
+        result = f"{old.outputs[0]}.aligned"
+        attributes = {**old.attributes, **change}
+        inputs = [source, *old.inputs[1:]]
+        replacements[old] = [Node.new(old.op_type, inputs, result, old.name, **attributes)]
+        source = result
     # 2.
     inner = f"{node.outputs[0]}.quarter"
     modes = {"mode": "linear", "coordinate_transformation_mode": "pytorch_half_pixel"}
-    ends = [(4, node.inputs[0], inner), (2, inner, node.outputs[0])]
-    replacements[node] = []
-    for factor, source, result in ends:
+    enlarged = []
+    for factor, name, result in ((4, inner, inner), (2, node.name, node.outputs[0])):
         scales = graph.add_constant(f"{result}.scales", np.array([1, 1, factor, factor]))
-        name = node.name if factor == 2 else inner
-        replacements[node].append(Node.new("Resize", [source, "", scales], result, name, **modes))
-    return replacements
+        enlarged.append(Node.new("Resize", [source, "", scales], result, name, **modes))
+        source = result
+    return replacements | {node: enlarged}

@@ -16,12 +16,14 @@ from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.fold_affine import is_convolution
 
 MOST_POSITIONS = 49
-"""Height times width, 7 x 7, that every target computes at any number of channels."""
+"""Height times width of a part, 7 x 7: at most 53 are what every target computes."""
+LARGE_POSITIONS = 64
+"""Height times width, 8 x 8, up to which a kernel stays, because some targets compute it."""
 
 
 def is_large(shape: tuple[int, ...]) -> bool:
-    """Return True for weights (O, I, kh, kw) that not every target computes."""
-    return len(shape) == 4 and shape[1] > 0 and shape[2] * shape[3] > MOST_POSITIONS
+    """Return True for weights (O, I, kh, kw) that are split."""
+    return len(shape) == 4 and shape[2] * shape[3] > LARGE_POSITIONS
 
 
 def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:

@@ -12,7 +12,7 @@ network:
    are the convolution's own.
 4. Sub of two maps is Add, Sum is Add, a mean over the image is GlobalAveragePool, HardSwish is
    itself, ReLU6 is Clip from 0 to 6, and a Clip at 0 alone is ReLU. Nothing splits or crops a map:
-   each part is computed by itself. Padded kernels have at most 7 x 7 positions. Nothing is computed
+   each part is computed by itself. Padded kernels have at most 64 positions. Nothing is computed
    from the size of the image, unless it decides something. The channels of the image stand first.
 5. Operators are those of opset 17, unless one has no form there.
 6. The result of a network without padding has the image's size, or a multiple of it: the image is

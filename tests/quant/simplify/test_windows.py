@@ -9,7 +9,7 @@ from onnx import TensorProto, helper, numpy_helper
 from beers_deploy.quant.graph import read_network, refusal
 from beers_deploy.quant.onnx.graph import OnnxGraph
 from beers_deploy.quant.session import open_session, result_of
-from beers_deploy.quant.simplify.large_kernels import MOST_POSITIONS
+from beers_deploy.quant.simplify.large_kernels import LARGE_POSITIONS, MOST_POSITIONS
 from beers_deploy.quant.simplify.simplify import simplify
 
 CHANNELS = 3
@@ -60,7 +60,7 @@ def test_a_large_kernel_is_several_small_ones_and_their_sum(
     short = simplify(model, "a.onnx")
     convs = [n for n in OnnxGraph(short).nodes if n.op_type == "Conv"]
     steps = -(-kernel[0] // (MOST_POSITIONS // kernel[1]))
-    may_split = kernel[0] * kernel[1] > MOST_POSITIONS
+    may_split = kernel[0] * kernel[1] > LARGE_POSITIONS
     if may_split and min(pads[0], pads[2]) >= (steps - 1) * dilations[0]:
         assert len(convs) == steps + 1
         areas = [np.prod(OnnxGraph(short).constants[n.inputs[1]].shape[2:]) for n in convs]
