@@ -9,8 +9,6 @@ enlarges what convolutions make of that to the map's size: by a factor that is n
 That is another function, which `quant.adapt` puts in its place, measures and compensates.
 """
 
-from itertools import zip_longest
-
 import numpy as np
 
 from beers_deploy.quant.graph.resize import Resizing
@@ -64,13 +62,13 @@ def aligned(graph: OnnxGraph, node: Node) -> dict[Node, list[Node]]:
     if not nodes:
         return {}
     # 1. Pads put each value in the middle of the eight pixels that it stands for, or next to it.
-    changes = [{"pads": [1, 1, 1, 1]}, {"strides": [4, 4], "pads": [1, 1, 2, 2]}]
+    changes = {0: {"pads": [1, 1, 1, 1]}, 1: {"strides": [4, 4], "pads": [1, 1, 2, 2]}}
     replacements: dict[Node, list[Node]] = {}
     source = nodes[0].inputs[0]
-    for old, change in zip_longest(nodes, changes, fillvalue={}):
+    for place, old in enumerate(nodes):
         # Another name, because it is not the tensor of the original any more.
         result = f"{old.outputs[0]}.aligned"
-        attributes = {**old.attributes, **change}
+        attributes = {**old.attributes, **changes.get(place, {})}
         inputs = [source, *old.inputs[1:]]
         replacements[old] = [Node.new(old.op_type, inputs, result, old.name, **attributes)]
         source = result
