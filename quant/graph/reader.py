@@ -301,8 +301,8 @@ class _Reader:
 def _refused(node: Node, graph: OnnxGraph) -> ModelError:
     """Return the error of an operator that no DPU computes."""
     remedy = REMEDIES.get(node.op_type, OTHER_REMEDY)
-    readers = [reader.op_type for reader in graph.readers[node.outputs[0]]]
-    if node.op_type == "ReduceMean" and "Sub" in readers and graph.numbers(node, 1, "axes") == [1]:
+    is_mean = node.op_type == "ReduceMean" and graph.numbers(node, 1, "axes") == [1]
+    if is_mean and any(other.op_type == "Sqrt" for other in graph.nodes):
         remedy = f"It begins a layer normalization. {NORMALISES}"
     return unsupported(f"The DPU does not compute the operation {node}.", remedy)
 

@@ -19,7 +19,7 @@ from beers_deploy.quant.adapt.compensation import compensated
 from beers_deploy.quant.adapt.replacements import EXACT, Kind, nodes_by_kind, replaced
 from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.encodings import host_model
-from beers_deploy.quant.graph import Activation, Pointwise, Resize, read_network, read_planes
+from beers_deploy.quant.graph import Activation, Add, Pointwise, Resize, read_network, read_planes
 from beers_deploy.quant.onnx.graph import OnnxGraph
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model, metadata
 from beers_deploy.quant.passes.finetune import Tuning, finetune
@@ -338,7 +338,7 @@ def test_the_gate_counts_the_relus_of_an_adapted_network(
     assert relus_off(int8.core.ops) == 0
     ops = list(int8.core.ops)
     for place, op in enumerate(ops):
-        if getattr(op, "activation", "") is Activation.relu and not isinstance(op, Pointwise):
+        if isinstance(op, IntConv | Add | Pointwise) and op.activation is Activation.relu:
             lost = dataclasses.replace(op, activation=Activation.none)
             assert relus_off([*ops[:place], lost, *ops[place + 1 :]]) == 1
         if isinstance(op, IntConv) and op.activation is Activation.none:

@@ -1,5 +1,7 @@
 """Large kernels and crops become windows that every target computes, and stay what they were."""
 
+from typing import Any
+
 import numpy as np
 import onnx
 from hypothesis import assume, given, settings
@@ -18,7 +20,10 @@ CHANNELS = 3
 def network(nodes: list[onnx.NodeProto], **constants: np.ndarray) -> onnx.ModelProto:
     """A network of `CHANNELS` channels from `x` to `y`."""
     initializers = [numpy_helper.from_array(value, name) for name, value in constants.items()]
-    sizes = {"x": ["N", CHANNELS, "H", "W"], "y": ["N", "C", "h", "w"]}
+    sizes: dict[str, list[str | int | None]] = {
+        "x": ["N", CHANNELS, "H", "W"],
+        "y": ["N", "C", "h", "w"],
+    }
     x, y = (
         helper.make_tensor_value_info(name, TensorProto.FLOAT, dims) for name, dims in sizes.items()
     )
@@ -54,7 +59,7 @@ def test_a_large_kernel_is_several_small_ones_and_their_sum(
     generator = np.random.default_rng(kernel)
     weight = generator.normal(0, 1, (outputs, CHANNELS, *kernel)).astype(np.float32)
     bias = generator.normal(0, 1, outputs).astype(np.float32)
-    windows = {"pads": pads, "strides": strides, "dilations": dilations}
+    windows: dict[str, Any] = {"pads": pads, "strides": strides, "dilations": dilations}
     node = helper.make_node("Conv", ["x", "w", "b"], ["y"], "large", kernel_shape=kernel, **windows)
     model = network([node], w=weight, b=bias)
     short = simplify(model, "a.onnx")
