@@ -36,6 +36,7 @@ for int8 and uint8. Not its QLinearConv, which may read (N, H, W, C).
 
 INLINE = "inline its functions first: onnx.inliner.inline_local_functions(model)"
 QDQ = "write the file with QuantizeLinear and DequantizeLinear (QDQ format)"
+FLOAT = "give the float file, because this one was quantised dynamically"
 UNOPTIMISED = (
     "give the file that onnxruntime read, because what it saves after its optimisation has "
     "operators of its own "
@@ -86,6 +87,8 @@ def is_foreign(name: str) -> bool:
 
 def foreign_remedy(domain: str, op_type: str) -> str:
     """Return what a user can do about a foreign operator."""
+    if op_type.startswith("Dynamic"):
+        return FLOAT
     if "QuantizeLinear" in op_type or op_type == "FixNeuron":
         return QDQ
     return UNOPTIMISED if domain.startswith(MICROSOFT) else OTHERS

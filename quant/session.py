@@ -235,5 +235,5 @@ def few_crops(images: Iterable[np.ndarray], model: onnx.ModelProto) -> list[np.n
     """Return one crop of each of the first few images, for figures of each layer; the whole image
     where a size is fixed.
     """
-    halo_px = None if fixed_tile_px(any_size(model)) is not None else 0
+    halo_px = None if fixed_tile_px(model) is not None else 0
     return [crops(image, halo_px)[0] for image in islice(images, LAYER_PATCHES)]

@@ -3,13 +3,19 @@
 By another function:
 
 1. x * Sigmoid(x), SiLU, becomes HardSwish; so does x * Sigmoid(c x), the quick GELU.
-2. A Sigmoid inside the network becomes HardSigmoid.
+2. Another Sigmoid becomes HardSigmoid.
 3. LeakyReLU of another slope, and PReLU, become LeakyReLU of 26/256.
 
 Exactly, but for the rounding of float32:
 
-4. LeakyReLU and PReLU of slopes s up to 1 become s x + ReLU((1 - s) x): two branches and an Add.
+4. LeakyReLU and PReLU of slopes s become s x + ReLU((1 - s) x): two branches and an Add. Where s is
+   above 1 the negative of it is computed so, and convolutions behind it are negated.
 5. HardSigmoid of another slope and offset becomes that of 1/6 and 0.5 behind a scaled input.
+
+And by another function again:
+
+6. Spatial attention that shrinks and enlarges by no whole factors is aligned with its map
+   (`quant.graph.attention`).
 
 Other GELUs, Mish, Tanh, ELU and Softplus stay: no function of the DPU is near enough to be fitted.
 """
@@ -21,9 +27,16 @@ from enum import StrEnum
 import numpy as np
 import onnx
 
+from beers_deploy.quant.graph.attention import aligned, shrinking
 from beers_deploy.quant.graph.operations import LEAKY_SLOPE
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
-from beers_deploy.quant.simplify.fold_affine import fold_behind, is_convolution, per_channel
+from beers_deploy.quant.simplify.fold_affine import (
+    fold_behind,
+    fold_in_front,
+    is_convolution,
+    per_channel,
+)
+from beers_deploy.quant.simplify.standard_operators import float_shapes
 
 
 class Kind(StrEnum):
@@ -34,6 +47,7 @@ class Kind(StrEnum):
     hard_sigmoid = "HardSigmoid of another slope"
     leaky_relu = "LeakyReLU of another slope"
     prelu = "PReLU"
+    attention = "spatial attention (ESA)"
 
 
 APPROXIMATIONS = {
@@ -41,8 +55,9 @@ APPROXIMATIONS = {
     Kind.sigmoid: "HardSigmoid",
     Kind.leaky_relu: "LeakyReLU of 26/256",
     Kind.prelu: "LeakyReLU of 26/256",
+    Kind.attention: "attention on an eighth of the sides",
 }
-"""The other function that replaces each kind (1 to 3)."""
+"""The other function that replaces each kind (1 to 3 and 6)."""
 EXACT = {
     Kind.hard_sigmoid: "HardSigmoid of a scaled input",
     Kind.leaky_relu: "ReLU in a second branch, and an Add",
@@ -54,14 +69,15 @@ EXACT = {
 def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
     """Return the kind of operator that a node is; None if it is not replaced."""
     attributes = node.attributes
+    if shrinking(graph, node):
+        return Kind.attention
     if silu_input(graph, node):
         return Kind.silu
     if node.op_type == "Sigmoid":
         (result,) = node.outputs
-        # The network's result can be left to the host, which computes any function.
-        is_result = result in graph.outputs
-        part_of_silu = all(silu_input(graph, reader) for reader in graph.readers[result])
-        return None if is_result or part_of_silu else Kind.sigmoid
+        readers = graph.readers[result]
+        part_of_silu = readers and all(silu_input(graph, reader) for reader in readers)
+        return None if part_of_silu else Kind.sigmoid
     if node.op_type == "HardSigmoid":
         given = attributes.get("alpha", 0.2), attributes.get("beta", 0.5)
         plain = np.allclose(given, (1 / 6, 0.5), 1e-4)
@@ -103,14 +119,10 @@ def _by_constant(graph: OnnxGraph, node: Node, source: str) -> bool:
 
 
 def slopes_of(graph: OnnxGraph, node: Node) -> np.ndarray | None:
-    """Return the slopes (C,) or (1,) of a LeakyReLU or PReLU; None if any is above 1."""
-    slopes: np.ndarray | None = None
+    """Return the slopes (C,) or (1,) of a LeakyReLU or PReLU; None of another node."""
     if node.op_type == "LeakyRelu":
-        slopes = np.array([node.attributes.get("alpha", 0.01)], np.float32)
-    elif node.op_type == "PRelu":
-        slopes = per_channel(graph.value(node, 1))
-    # Above 1 the function bends the other way, which no sum with a ReLU does.
-    return None if slopes is None or not (slopes <= 1).all() else slopes
+        return np.array([node.attributes.get("alpha", 0.01)], np.float32)
+    return per_channel(graph.value(node, 1)) if node.op_type == "PRelu" else None
 
 
 def nodes_by_kind(graph: OnnxGraph) -> dict[Kind, list[Node]]:
@@ -135,7 +147,10 @@ def replaced(
     # Before the graph changes, because a SiLU is known by the Sigmoid in front of it.
     plan: dict[Node, list[Node]] = {}
     for kind, nodes in nodes_by_kind(graph).items():
-        if kind in approximated:
+        if kind is Kind.attention and kind in approximated:
+            for node in nodes:
+                plan |= aligned(graph, node)
+        elif kind in approximated:
             plan |= {node: [_approximation(graph, node, kind)] for node in nodes}
         elif kind in exact and kind is Kind.hard_sigmoid:
             plan |= {node: _scaled_hard_sigmoid(graph, node) for node in nodes}
@@ -143,6 +158,8 @@ def replaced(
             plan |= {node: _two_branches(graph, node) for node in nodes}
     graph.rewrite(lambda _, node: plan.get(node))
     graph.rewrite(fold_behind)
+    graph.save()
+    fold_in_front(graph, float_shapes(graph))
     graph.save()
     return network
 
@@ -169,9 +186,10 @@ def _scaled_hard_sigmoid(graph: OnnxGraph, node: Node) -> list[Node]:
 
 
 def _two_branches(graph: OnnxGraph, node: Node) -> list[Node]:
-    """Return slopes x + ReLU((1 - slopes) x)."""
+    """Return slopes x + ReLU((1 - slopes) x), negated where a slope above 1 bends the other way."""
     slopes = slopes_of(graph, node)
     assert slopes is not None  # noqa: S101 - `kind_of` has asked
+    signs = np.where(slopes > 1, -1, 1)
     source = node.inputs[0]
     (output,) = node.outputs
     nodes = []
@@ -185,11 +203,15 @@ def _two_branches(graph: OnnxGraph, node: Node) -> list[Node]:
         twin.name = twin.proto.name = f"{before.name}.bent"
         twin.outputs = (bent_source,)
         nodes.append(twin)
-    straight = _times(graph, source, slopes, f"{output}.straight")
-    scaled = _times(graph, bent_source, 1 - slopes, f"{output}.scaled")
+    straight = _times(graph, source, signs * slopes, f"{output}.straight")
+    scaled = _times(graph, bent_source, np.abs(1 - slopes), f"{output}.scaled")
     bent = Node.new("Relu", scaled.outputs, f"{output}.bent", f"{output}.bent")
     names = [straight.outputs[0], bent.outputs[0]]
-    return [*nodes, straight, scaled, bent, Node.new("Add", names, output, node.name)]
+    nodes += [straight, scaled, bent]
+    if (signs > 0).all():
+        return [*nodes, Node.new("Add", names, output, node.name)]
+    negated = Node.new("Add", names, f"{output}.negated", f"{output}.negated")
+    return [*nodes, negated, _times(graph, negated.outputs[0], signs, output)]
 
 
 def _times(graph: OnnxGraph, source: str, factors: np.ndarray, output: str) -> Node:

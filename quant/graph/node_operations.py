@@ -20,9 +20,15 @@ from beers_deploy.quant.graph.operations import (
 )
 from beers_deploy.quant.graph.pixel_shuffle import MOVES, ORDERS
 from beers_deploy.quant.graph.resize import Resizing
-from beers_deploy.quant.graph.split_network import ADAPT, REMEDY, unsupported
+from beers_deploy.quant.graph.split_network import ADAPT, ADAPT_EXACTLY, REMEDY, unsupported
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.onnx.window import Pair, Window
+
+PAD_STRIDES = (
+    "Pad strided convolutions and pools, so that their result has a half or a quarter of the size, "
+    "enlarge it by 2 or 4, and train again; attention such as RFDN's can also be left out."
+)
+SHRINK = "Shrink by a pool or a strided convolution, or cut the network in front of it."
 
 
 def require(condition: bool, node: Node, rule: str, remedy: str = REMEDY) -> None:
@@ -131,13 +137,15 @@ def _read_average_pool(node: Node, _: OnnxGraph) -> Op:
 def _read_resize(node: Node, graph: OnnxGraph) -> Op:
     resizing = Resizing.of(node, graph)
     is_uniform = resizing.factors[:2] == (1, 1) and resizing.factors[2] == resizing.factors[3]
-    require(is_uniform, node, "must enlarge rows and columns by one constant factor")
+    rule = "must enlarge rows and columns by one factor for images of all sizes"
+    require(is_uniform, node, rule, PAD_STRIDES)
     factor = int(resizing.factors[2])
     where = resizing.where
     require(
         resizing.factors[2] == factor >= 1,
         node,
         f"must enlarge by an integer factor, got {resizing.factors[2]:g}",
+        SHRINK if resizing.factors[2] < 1 else PAD_STRIDES,
     )
     # A DPU enlarges bilinearly by 2 and 4 alone where centres are half-pixel ones.
     if resizing.mode == "linear":
@@ -218,5 +226,5 @@ def read_activation(node: Node, graph: OnnxGraph) -> Activation:
         beta = node.attributes.get("beta", 0.5)
         plain = bool(np.isclose(alpha, 1 / 6, 1e-4)) and beta == 0.5
         rule = f"must have alpha 1/6 and beta 0.5, got {alpha:g} and {beta:g}"
-        require(plain, node, rule, "'quantize --adapt' (adapt=True) rewrites it exactly.")
+        require(plain, node, rule, ADAPT_EXACTLY)
     return activation

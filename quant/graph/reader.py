@@ -3,12 +3,14 @@
 A file from outside is checked once, here; behind it nothing asks again.
 """
 
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
 import onnx
 
 from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.graph.attention import aligned, shrinking
 from beers_deploy.quant.graph.node_operations import ACTIVATIONS, READERS, read_activation, require
 from beers_deploy.quant.graph.operations import (
     CORRECTION,
@@ -27,6 +29,7 @@ from beers_deploy.quant.graph.pixel_shuffle import with_shuffles
 from beers_deploy.quant.graph.split_network import (
     ADAPT,
     REMEDY,
+    AdaptableError,
     SplitNetwork,
     add_channels,
     check_network,
@@ -56,15 +59,18 @@ STATISTICS = (
     "attention have it. Train the network with batch normalization, which becomes part of the "
     "convolutions, and with global average pooling."
 )
-OF_ONE_SIZE = (
-    "The network computes with the size of its image. Export it with fixed height and width."
+FIX_SIZE = (
+    "Export it with fixed height and width, or give the file some: python -m "
+    "onnxruntime.tools.make_dynamic_shape_fixed."
 )
+OF_ONE_SIZE = f"The network computes with the size of its image. {FIX_SIZE}"
 REMEDIES = {
     **dict.fromkeys(("Flatten", "Gemm", "MatMul", "NonMaxSuppression", "Softmax"), NO_IMAGE),
     **dict.fromkeys(
         ("GroupNormalization", "InstanceNormalization", "LayerNormalization"), NORMALISES
     ),
     **dict.fromkeys(("ReduceL2", "ReduceMax", "ReduceMean", "ReduceSum"), STATISTICS),
+    **dict.fromkeys(("PRelu", "Sigmoid"), ADAPT),
     **dict.fromkeys(("ConstantOfShape", "Expand", "Shape", "Size", "Tile"), OF_ONE_SIZE),
     "Pad": (
         "Pad in the convolution; a network behind a bank is quantised from its weights "
@@ -72,8 +78,6 @@ REMEDIES = {
     ),
 }
 """What to do about an operator that no DPU computes."""
-ADAPTABLE = {"PRelu", "Sigmoid"}
-"""Operators that `quant.adapt` replaces, but for one that writes the network's result."""
 OTHER_REMEDY = "Replace it by one that the DPU computes, or cut the network in front of it."
 
 
@@ -84,6 +88,9 @@ def read_network(model: onnx.ModelProto) -> SplitNetwork:
         network = cut(reader.graph(), reader.channels())
         network = replace(network, border_px=reader.border_px, limits=reader.limits)
         check_network(network)
+    # Last, because what else is refused would be after adapting as well.
+    if reader.adaptable is not None:
+        raise reader.adaptable
     return network
 
 
@@ -102,7 +109,8 @@ class _Reader:
     """Reads the nodes once, in order."""
 
     def __init__(self, model: onnx.ModelProto) -> None:
-        self.source = with_shuffles(model)
+        self.adaptable: AdaptableError | None = None  # the first
+        self.source = with_shuffles(self._aligned(model))
         self.image, *_ = self.source.inputs
         self.ops: list[Op] = []
         self._places: dict[str, int] = {}  # where the operation that writes a tensor stands
@@ -110,6 +118,21 @@ class _Reader:
         self._measured = 0  # how many operations `_widths` covers
         self.limits: tuple[float, ...] = ()
         self.border_px = self._take_mirror()
+
+    def _aligned(self, model: onnx.ModelProto) -> onnx.ModelProto:
+        """Return the model with spatial attention as `quant.adapt` aligns it, and note that."""
+        graph = OnnxGraph(model)
+        resizes = [node for node in graph.nodes if shrinking(graph, node)]
+        if not resizes:
+            return model
+        network = deepcopy(model)
+        graph = OnnxGraph(network)
+        plan = {key: nodes for node in graph.nodes for key, nodes in aligned(graph, node).items()}
+        graph.rewrite(lambda _, node: plan.get(node))
+        graph.save()
+        fault = f"{resizes[0]} enlarges to the size of another map, by no whole factor."
+        self.adaptable = AdaptableError(str(unsupported(fault, ADAPT)))
+        return network
 
     def _take_mirror(self) -> int:
         """Remove a Pad that mirrors the image, and return its border in pixels; the host does it.
@@ -142,7 +165,7 @@ class _Reader:
 
     def graph(self) -> Graph:
         """Return the operations from `IMAGE` to `CORRECTION`; global pooling needs a fixed size."""
-        require_one_image(self.source.inputs, self.source.outputs)
+        self._check_whole()
         (result,) = self.source.outputs
         nodes = list(self.source.nodes)
         # The host clips the result.
@@ -150,7 +173,12 @@ class _Reader:
             self.limits = ends
             result = nodes.pop().inputs[0]
         for node in nodes:
-            self._read(node)
+            try:
+                self._read(node)
+            except AdaptableError as error:
+                self.adaptable = self.adaptable or error
+                stand_in = Activation.hard_sigmoid
+                self._append(Pointwise(node.name, node.inputs[0], node.outputs[0], stand_in))
         if not self.ops or self.ops[-1].output != result:
             raise unsupported("No operation writes the network's output.")
         graph = named_apart(self.ops, {self.image: IMAGE, result: CORRECTION})
@@ -160,11 +188,28 @@ class _Reader:
             raise unsupported(
                 f"The network accepts images of any size, but {pools[0].name} pools over the whole "
                 "image, whose size must be known.",
-                "Export it with fixed height and width.",
+                FIX_SIZE,
             )
         if not (rows and columns):
             check_result_size(graph, self.border_px)
         return sized(graph, (rows, columns)) if pools else graph
+
+    def _check_whole(self) -> None:
+        """Raise ModelError for what concerns all of the network, or no size of image would help."""
+        require_one_image(self.source.inputs, self.source.outputs)
+        (result,) = self.source.outputs
+        dims = self.source.result_sizes[result]
+        if dims and len(dims) != 4:
+            raise unsupported(
+                f"The network's result must be an image or a map (N, C, H, W), but {result} has "
+                f"{len(dims)} dimensions.",
+                NO_IMAGE,
+            )
+        for node in self.source.nodes:
+            if REMEDIES.get(node.op_type) in (NORMALISES, STATISTICS):
+                raise _refused(node, self.source)
+            if node.op_type == "Resize":
+                READERS[node.op_type](node, self.source)
 
     def _limits(self, node: Node) -> tuple[float, ...]:
         """Return the limits of a Clip, within those of the one behind it; empty for another node.
@@ -263,8 +308,9 @@ class _Reader:
 def _refused(node: Node, graph: OnnxGraph) -> ModelError:
     """Return the error of an operator that no DPU computes."""
     remedy = REMEDIES.get(node.op_type, OTHER_REMEDY)
-    if node.op_type in ADAPTABLE:
-        remedy = NO_IMAGE if node.outputs == graph.outputs else ADAPT
+    is_mean = node.op_type == "ReduceMean" and graph.numbers(node, 1, "axes") == [1]
+    if is_mean and any(other.op_type == "Sqrt" for other in graph.nodes):
+        remedy = f"It begins a layer normalization. {NORMALISES}"
     return unsupported(f"The DPU does not compute the operation {node}.", remedy)
 
 

@@ -31,9 +31,10 @@ REMEDY = (
     "what a DPU does not run."
 )
 ADAPT = (
-    "'quantize --adapt' (adapt=True) replaces SiLU, Sigmoid, and LeakyReLU and PReLU of slopes up "
-    "to 1, and measures what that costs."
+    "'quantize --adapt' (adapt=True) replaces SiLU, Sigmoid, LeakyReLU, PReLU and RFDN's spatial "
+    "attention, and measures the cost."
 )
+ADAPT_EXACTLY = "'quantize --adapt' (adapt=True) rewrites it exactly."
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,10 @@ class SplitNetwork:
         return self.channels * int(np.prod([shuffle.block**2 for shuffle in self.front], initial=1))
 
 
+class AdaptableError(ModelError):
+    """An operator that `quant.adapt` replaces."""
+
+
 def unsupported(fault: str, remedy: str = REMEDY) -> ModelError:
     """Return the error of a float network that cannot be quantised.
 
@@ -75,7 +80,8 @@ def unsupported(fault: str, remedy: str = REMEDY) -> ModelError:
         fault: a sentence; names in it may come from a file, and a long one is cut.
         remedy: another sentence.
     """
-    return ModelError(f"{printable(fault, 4 * LONGEST)} {remedy}")
+    kind = AdaptableError if remedy in (ADAPT, ADAPT_EXACTLY) else ModelError
+    return kind(f"{printable(fault, 4 * LONGEST)} {remedy}")
 
 
 def require_one_image(inputs: Collection[str], outputs: Collection[str]) -> None:

@@ -110,6 +110,7 @@ class OnnxGraph:
         inputs: tensors that are no constants, with their sizes, 0 where the file states none.
         types: ONNX's number of what each input holds.
         outputs: the names of the results.
+        result_sizes: their sizes, 0 where the file states none; empty if it states no rank.
         readers: for each tensor the nodes that read it, one as often as it does.
         writers: for each tensor the node that writes it.
     """
@@ -124,6 +125,7 @@ class OnnxGraph:
         }
         self.inputs = {name: list(sizes_of(tensor)) for name, tensor in inputs.items()}
         self.types = {name: tensor.elem_type for name, tensor in inputs.items()}
+        self.result_sizes = {v.name: sizes_of(v.type.tensor_type) for v in model.graph.output}
         self.outputs = tuple(value.name for value in model.graph.output)
         # Of each name in use how many others were derived from it, so that a thousand nodes of one
         # name do not try each other's.

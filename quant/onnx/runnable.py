@@ -39,6 +39,8 @@ KEEPING = {
     "Unsqueeze",
 }
 """What may be computed of constants alone: no result of these is larger than what they read."""
+FILLING = {"ConstantOfShape", "Expand", "Tile"}
+"""What may be computed of constants alone, as far as the file states how large the result is."""
 
 
 def check_runnable(model: onnx.ModelProto, where: str) -> None:
@@ -94,7 +96,7 @@ class _Constants:
         result = _computed(node, arrays, self._opset)
         if result is not None:
             self.values[node.output[0]] = numpy_helper.from_array(result, node.output[0])
-        elif node.op_type not in KEEPING | {"ConstantOfShape"}:
+        elif node.op_type not in KEEPING | FILLING:
             raise ModelError(
                 f"{printable(named(node))} in {self._where} reads constants only, but only "
                 "operators on the image are supported here. Fold its constants."
@@ -112,12 +114,18 @@ class _Constants:
         return self._arrays.get(name)
 
     def _check_filled(self, node: NodeProto, arrays: list[np.ndarray | None]) -> None:
-        """Weights may be filled with one number, as far as the file states how many."""
-        if node.op_type != "ConstantOfShape":
+        """Weights may be filled with numbers, as far as the file states how many."""
+        if node.op_type not in FILLING:
             return
-        if len(arrays) != 1 or arrays[0] is None:
+        source = self.values.get(node.input[0])
+        if not arrays or arrays[-1] is None or source is None:
             raise _computed_size(node, self._where)
-        sizes = [int(size) for size in arrays[0].ravel()[: RANK + 1]]
+        sizes = [int(size) for size in arrays[-1].ravel()[: RANK + 1]]
+        # One size or factor each, or fewer sizes for Expand, whose source then is as large.
+        if node.op_type != "ConstantOfShape":
+            dims = [1] * (len(sizes) - len(source.dims)) + list(source.dims)
+            if len(dims) == len(sizes):
+                sizes = [abs(size) * dim for size, dim in zip(sizes, dims, strict=True)]
         check_size(named(node), sizes, self._where)
         self._made += math.prod(max(size, 0) for size in sizes)
         check_size("all filled constants", [self._made], self._where)
@@ -132,6 +140,7 @@ COMPUTED = {
     "Concat",
     "ConstantOfShape",
     "Div",
+    "Expand",
     "Gather",
     "Identity",
     "Mul",
@@ -142,6 +151,7 @@ COMPUTED = {
     "Sqrt",
     "Squeeze",
     "Sub",
+    "Tile",
     "Transpose",
     "Unsqueeze",
 }

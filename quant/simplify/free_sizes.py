@@ -2,8 +2,9 @@
 enlarges to them.
 
 1. Give the free sizes of the image numbers, so that the runtime folds arithmetic on shapes.
-2. Write a Resize to a size as one by factors; drop a Pad by nothing and a Slice of the whole map;
-   let a convolution write a map of one number a channel, such as a noise level.
+2. Write a Resize to a size as one by factors, and the pixel unshuffle of one channel as
+   SpaceToDepth; drop a Pad by nothing and a Slice of the whole map; let a convolution write a map
+   of one number a channel, such as a noise level.
 3. Do both for two sizes. If the networks are equal, the size decides nothing, and theirs is the
    network of every image whose sides are multiples of `MULTIPLE_PX`. Otherwise the network stays
    as it is.
@@ -18,6 +19,7 @@ from copy import deepcopy
 import numpy as np
 import onnx
 
+from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
 
 MULTIPLE_PX = 64
@@ -26,6 +28,8 @@ SIZES_PX = (2 * MULTIPLE_PX, 3 * MULTIPLE_PX), (4 * MULTIPLE_PX, 3 * MULTIPLE_PX
 """Rows and columns differ, so that a network that takes one for the other is noticed."""
 SIZED = {"Concat", "Pad", "Resize", "Shape", "Size", "Slice"}
 """Operators that may need the size of an image."""
+RESHAPING = {"Flatten", "Reshape", "Squeeze", "Unsqueeze"}
+"""Operators that move no value."""
 
 Fold = Callable[[onnx.ModelProto], onnx.ModelProto]
 """Folds constants, as onnxruntime does."""
@@ -44,7 +48,11 @@ def free_sizes(model: onnx.ModelProto, fold: Fold) -> onnx.ModelProto:
         for node in model.graph.node
     ):
         return model
-    first, second = (_of_size(model, rows, columns, fold) for rows, columns in SIZES_PX)
+    try:
+        first, second = (_of_size(model, rows, columns, fold) for rows, columns in SIZES_PX)
+    # A network may demand other sizes.
+    except ModelError:
+        return model
     if _content(first) != _content(second):
         return model
     # The sizes that the file states are as free as before.
@@ -96,6 +104,8 @@ def _sized(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> l
     source = node.inputs[0] if node.inputs else ""
     before = sizes.get(source, ())
     after = sizes.get(node.outputs[0], ())
+    if node.op_type in RESHAPING and before != after:
+        return _unshuffled(graph, node, sizes)
     if len(before) != 4 or len(after) != 4 or min(*before, *after) < 1:
         return None
     if node.op_type == "Resize" and len(node.inputs) == 4:
@@ -115,9 +125,39 @@ def _sized(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> l
         and all(step == 1 for step in graph.numbers(node, 4, "steps") or ())
     )
     adds_nothing = node.op_type == "Pad" and graph.numbers(node, 1, "pads") == [0] * 8
-    if keeps_all or adds_nothing:
+    if keeps_all or adds_nothing or node.op_type in RESHAPING:
         return [Node.new("Identity", [source], node.outputs[0], node.name)]
     return None
+
+
+def _unshuffled(
+    graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]
+) -> list[Node] | None:
+    """Return the pixel unshuffle that ends in a Reshape; None if it ends none of one channel.
+
+    Args:
+        graph: that the node belongs to.
+        node: a Reshape, or another operator that moves no value.
+        sizes: of each tensor, for the images that are tried.
+    """
+
+    def before_reshapes(name: str) -> str:
+        writer = graph.sole_writer(name)
+        while writer is not None and writer.op_type in RESHAPING:
+            name = writer.inputs[0]
+            writer = graph.sole_writer(name)
+        return name
+
+    moved = graph.sole_writer(before_reshapes(node.inputs[0]))
+    if moved is None or moved.attributes.get("perm") != [0, 1, 3, 5, 2, 4]:
+        return None
+    source = before_reshapes(moved.inputs[0])
+    count, channels, rows, block, columns, across = sizes.get(moved.inputs[0], (0,) * 6)
+    is_whole = sizes.get(source) == (count, 1, rows * block, columns * block)
+    result = (count, block * block, rows, columns)
+    if channels != 1 or block != across or not is_whole or sizes[node.outputs[0]] != result:
+        return None
+    return [Node.new("SpaceToDepth", [source], node.outputs[0], node.name, blocksize=block)]
 
 
 def _with_written_maps(

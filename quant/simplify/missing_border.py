@@ -54,7 +54,8 @@ def with_missing_border(model: onnx.ModelProto) -> onnx.ModelProto:
 def _is_padded(node: onnx.NodeProto) -> bool:
     """Return True for a node that adds pixels around its map."""
     states_pads = any(a.name == "pads" and any(a.ints) for a in node.attribute)
-    return node.op_type == "Pad" or states_pads
+    # The pads of a transposed convolution cut its result.
+    return node.op_type == "Pad" or (states_pads and node.op_type != "ConvTranspose")
 
 
 def _missing_px(model: onnx.ModelProto) -> int:

@@ -11,9 +11,9 @@ network:
    BatchNormalization of images that is left is a depthwise 1 x 1 convolution. Zeros that Pad adds
    are the convolution's own.
 4. Sub of two maps is Add, Sum is Add, a mean over the image is GlobalAveragePool, HardSwish is
-   itself, ReLU6 is Clip from 0 to 6, and a Clip at 0 alone is ReLU. Nothing splits a map: each part
-   is computed by itself. Nothing is computed from the size of the image, unless it decides
-   something. The channels of the image stand first.
+   itself, ReLU6 is Clip from 0 to 6, and a Clip at 0 alone is ReLU. Nothing splits or crops a map:
+   each part is computed by itself. Padded kernels have at most 64 positions. Nothing is computed
+   from the size of the image, unless it decides something. The channels of the image stand first.
 5. Operators are those of opset 17, unless one has no form there.
 6. The result of a network without padding has the image's size, or a multiple of it: the image is
    mirrored beyond its borders.
@@ -46,6 +46,7 @@ from beers_deploy.profiles.errors import ModelError, reason_of
 from beers_deploy.quant.domains import IR_VERSION, OPSET, opset_of
 from beers_deploy.quant.onnx.graph import OnnxGraph, free_name
 from beers_deploy.quant.simplify.channels_first import channels_first
+from beers_deploy.quant.simplify.crop_borders import convolve_crop
 from beers_deploy.quant.simplify.fold_affine import (
     add_negated,
     affine_of,
@@ -56,6 +57,7 @@ from beers_deploy.quant.simplify.fold_affine import (
 )
 from beers_deploy.quant.simplify.free_sizes import free_sizes
 from beers_deploy.quant.simplify.fully_connected import ConnectByConvolutions
+from beers_deploy.quant.simplify.large_kernels import is_large, split_large_kernel
 from beers_deploy.quant.simplify.missing_border import with_missing_border
 from beers_deploy.quant.simplify.spelled_activations import join_hard_swish, join_relu
 from beers_deploy.quant.simplify.split_channels import split_channels
@@ -136,7 +138,14 @@ def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 def _run_passes(model: onnx.ModelProto) -> None:
     """Rewrite the nodes of a network in place; its inputs and outputs keep their names."""
     graph = OnnxGraph(model)
-    for rewriting in (split_sums, join_relu, join_hard_swish, add_negated, fold_behind):
+    for rewriting in (
+        split_sums,
+        join_relu,
+        join_hard_swish,
+        add_negated,
+        fold_behind,
+        split_large_kernel,
+    ):
         graph.rewrite(rewriting)
     graph.save()
     if not any(node.op_type in NEEDS_SHAPES or affine_of(graph, node) for node in graph.nodes):
@@ -150,6 +159,7 @@ def _run_passes(model: onnx.ModelProto) -> None:
         negate_by_convolution,
         unshuffle_slices,
         split_channels,
+        convolve_crop,
     ):
         graph.rewrite(partial(with_shapes, shapes))
     # A normalisation that has become a convolution takes in what stands around it.
@@ -163,7 +173,10 @@ def _is_plain(model: onnx.ModelProto) -> bool:
     weights = {tensor.name for tensor in model.graph.initializer}
     return (
         opset_of(model) == OPSET
-        and not any(tensor.data_type in HALVES for tensor in model.graph.initializer)
+        and not any(
+            tensor.data_type in HALVES or is_large(tuple(tensor.dims))
+            for tensor in model.graph.initializer
+        )
         and not any(value.name in weights for value in model.graph.input)
         and all(
             node.op_type in PLAIN

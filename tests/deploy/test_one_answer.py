@@ -34,6 +34,10 @@ class Drawn(GraphWriter):
         name = f"number_{len(self.nodes)}_{value}"
         return self.constant(name, np.full(shape, value, np.float32))
 
+    def integers(self, *values: int) -> str:
+        """Write a constant list and return its name."""
+        return self.constant(f"integers_{len(self.nodes)}_{values}", np.array(values))
+
     def add(self, kind: str, *sources: str, **attributes: Any) -> str:
         """Write a node and return its result."""
         return self.node(kind, f"t{len(self.nodes)}", list(sources), **attributes)
@@ -70,6 +74,10 @@ def hard_swish(w: Drawn, source: str) -> str:
 PARTS: dict[str, Part] = {
     "convolution": lambda w, x: w.conv(x, CHANNELS, CHANNELS),
     "valid": lambda w, x: w.conv(x, CHANNELS, CHANNELS, pad=0),
+    "large kernel": lambda w, x: w.add(
+        "Conv", x, w.number(0.01, CHANNELS, CHANNELS, 9, 9), pads=[4] * 4
+    ),
+    "crop": lambda w, x: w.add("Slice", x, *(w.integers(k, k) for k in (2, -2)), w.integers(2, 3)),
     "relu": lambda w, x: w.add("Relu", x),
     "one-sided clip": lambda w, x: w.add("Clip", x, w.number(0)),
     "larger of two": lambda w, x: w.add("Max", x, w.number(0)),

@@ -1,5 +1,6 @@
 """Activations that a DPU lacks: replaced exactly or by others, compensated, measured, quantised."""
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,14 +17,16 @@ from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.quant.adapt.adaptation import ADAPTED, NEAR_DB, adapt
 from beers_deploy.quant.adapt.compensation import compensated
 from beers_deploy.quant.adapt.replacements import EXACT, Kind, nodes_by_kind, replaced
+from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.encodings import host_model
-from beers_deploy.quant.graph import read_network, read_planes
+from beers_deploy.quant.graph import Activation, Add, Pointwise, Resize, read_network, read_planes
 from beers_deploy.quant.onnx.graph import OnnxGraph
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model, metadata
 from beers_deploy.quant.passes.finetune import Tuning, finetune
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.simplify import simplify
+from beers_deploy.quant.structure import structure_checks
 from tests.quant.quick import changed, image, one_guess, quickly
 
 FEATURES = 6
@@ -111,10 +114,30 @@ def patches(count: int, seed: int, px: int = 48) -> Patches:
     return Patches(pairs, [degraded for degraded, _ in pairs])
 
 
+def attention_network(free: bool) -> onnx.ModelProto:
+    """RLFN's attention behind a convolution, for images of 48 pixels or of any size."""
+    w = GraphWriter()
+    source = conv(w, "image", "a", (FEATURES, 1, 3, 3))
+    weight = w.constant("s.w", np.random.default_rng(3).normal(0, 0.3, (FEATURES, FEATURES, 3, 3)))
+    half = w.node("Conv", "half", [source, w.node("Cast", "s.f", [weight], to=1)], strides=[2, 2])
+    largest = w.node("MaxPool", "largest", [half], kernel_shape=[7, 7], strides=[3, 3])
+    inner = conv(w, w.node("Relu", "r", [conv(w, largest, "b")]), "c")
+    sizes = w.constant("sizes", np.array([1, FEATURES, 48, 48]))
+    if free:
+        sizes = w.node("Shape", "shape", [source])
+    wide = w.node("Resize", "wide", [inner, "", "", sizes], mode="linear")
+    gate = w.node("Sigmoid", "gate", [conv(w, wide, "d", (FEATURES, FEATURES, 1, 1))])
+    attended = w.node("Mul", "attended", [source, gate])
+    w.node("Add", "restored", ["image", conv(w, attended, "e", (1, FEATURES, 3, 3))])
+    px = None if free else 48
+    graph = w.graph("g", [image_info("image", 1, px)], [image_info("restored", 1, px)])
+    return simplify(make_model(graph, {}), "g")
+
+
 SAMPLES = patches(8, 0)
 HELD_OUT = patches(4, 1)
 BARE = Patches([(x, np.empty(0, np.float32)) for x in HELD_OUT.degraded], HELD_OUT.degraded)
-SLOPES = st.floats(-1, 1, width=32)
+SLOPES = st.floats(-1, 2, width=32)
 
 
 def assert_same(model: onnx.ModelProto, other: onnx.ModelProto) -> None:
@@ -240,7 +263,7 @@ def test_what_a_dpu_has_and_what_nothing_replaces_stays() -> None:
     def tanh(w: GraphWriter, x: str, name: str) -> str:
         return w.node("Tanh", name, [x])
 
-    for act in (leaky(26 / 256), prelu(*[1.5] * FEATURES), tanh):
+    for act in (leaky(26 / 256), tanh):
         model = network(act)
         assert adapt(model, SAMPLES, HELD_OUT).model is model
     with pytest.raises(ModelError, match="Tanh first"):
@@ -284,6 +307,60 @@ def test_quantize_adapts_and_compares_with_the_original(name: str, tmp_path: Pat
     path = int8.save(tmp_path / "int8.onnx")
     verdict = bd.compare(original, path, samples=tuple(held_out), progress=False)
     assert verdict.result.psnr_between_db > 30
+
+
+@pytest.mark.parametrize(
+    ("act", "approximated", "exact"),
+    [
+        (leaky(0.3), (), {Kind.leaky_relu}),
+        (leaky(0.3), {Kind.leaky_relu}, ()),
+        (prelu(*np.linspace(0, 0.3, FEATURES)), (), {Kind.prelu}),
+        (lambda w, x, name: silu(w, w.node("Relu", f"{name}.r", [x]), name), {Kind.silu}, ()),
+        (gated, {Kind.sigmoid}, ()),
+    ],
+)
+def test_the_gate_counts_the_relus_of_an_adapted_network(
+    act: Act, approximated: Any, exact: Any
+) -> None:
+    """None is reported lost or added, unless one is, even where HardSwish is a ReLU's table."""
+    model = network(act)
+    # On scales of some hundreds all of HardSwish and HardSigmoid that bends is one unit.
+    for values in model.graph.initializer:
+        if values.name == "a.w":
+            weight = 1e4 * onnx.numpy_helper.to_array(values)
+            values.CopyFrom(onnx.numpy_helper.from_array(weight, "a.w"))
+    int8 = quickly(replaced(model, approximated, exact), BARE)
+
+    def relus_off(ops: Any) -> float:
+        host = host_model(dataclasses.replace(int8.core, ops=tuple(ops)), {})
+        return structure_checks(model, host)[0].value
+
+    assert relus_off(int8.core.ops) == 0
+    ops = list(int8.core.ops)
+    for place, op in enumerate(ops):
+        if isinstance(op, IntConv | Add | Pointwise) and op.activation is Activation.relu:
+            lost = dataclasses.replace(op, activation=Activation.none)
+            assert relus_off([*ops[:place], lost, *ops[place + 1 :]]) == 1
+        if isinstance(op, IntConv) and op.activation is Activation.none:
+            added = dataclasses.replace(op, activation=Activation.relu)
+            assert relus_off([*ops[:place], added, *ops[place + 1 :]]) == 1
+
+
+@pytest.mark.parametrize("free", [False, True])
+def test_spatial_attention_is_aligned_and_compensated(free: bool) -> None:
+    """The refusal names `adapt`, and the result is nearer than a network without attention."""
+    model = attention_network(free)
+    with pytest.raises(ModelError, match=r"no whole factor. 'quantize --adapt'"):
+        read_network(model)
+    adapted = adapt(model, SAMPLES, HELD_OUT)
+    assert [row.name for row in adapted.rows] == ["1 spatial attention (ESA)", "1 Sigmoid", "all"]
+    resizes = [op for op in read_network(adapted.model).graph if isinstance(op, Resize)]
+    assert [op.factor for op in resizes] == [4, 2]
+    even = [node.attributes.get("strides") for node in OnnxGraph(adapted.model).nodes]
+    assert [4, 4] in even
+    near = adapted.rows[-1].figures["PSNR to the original, compensated"].value
+    assert near is not None
+    assert near > 40
 
 
 def test_finetuning_learns_from_the_original() -> None:

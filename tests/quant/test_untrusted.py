@@ -158,7 +158,24 @@ def filled(to: str, by: str = "n") -> onnx.NodeProto:
             ],
             "Concat b in untrusted.onnx reads constants only",
         ),
-        ([constant("n", 9, 9), node("Expand", "n", "n")], "reads constants only"),
+        ([constant("n", 9, 9), node("CumSum", "n", "n")], "reads constants only"),
+        (
+            [constant("n", 9), constant("r", 2**20, 2**10), node("Expand", "n", "r")],
+            "1048576 x 1024, but a tensor may have at most",
+        ),
+        (
+            [constant("n", 9), constant("r", 2**14, 2**13), *[node("Expand", "n", "r")] * 3],
+            "'all filled constants' in untrusted.onnx has the size 402653184",
+        ),
+        (
+            [
+                constant("n", *range(9)),
+                constant("r", 999),
+                node("Tile", "n", "r", to="b"),
+                node("Tile", "b", "r"),
+            ],
+            "a size that other nodes compute",
+        ),
         (
             [constant("n", 9, 9), constant("i", 7), node("Gather", "n", "i")],
             "Gather y in untrusted.onnx reads constants only",

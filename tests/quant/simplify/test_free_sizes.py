@@ -90,6 +90,22 @@ class NoiseLevel(nn.Module):
         return result
 
 
+class UnshuffledNoiseLevel(NoiseLevel):
+    """FFDNet whole: on pixels that are unshuffled, the level being repeated over them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.head = nn.Conv2d(5, FEATURES, 3, padding=1)
+        self.tail = nn.Conv2d(FEATURES, 4, 3, padding=1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Images (N, 1, H, W) to the same."""
+        blocks = functional.pixel_unshuffle(image, 2)
+        level = torch.full((1, 1, 1, 1), 0.1).repeat(1, 1, blocks.shape[2], blocks.shape[3])
+        result = self.tail(torch.relu(self.head(torch.cat([blocks, level], 1))))
+        return functional.pixel_shuffle(result, 2)
+
+
 def exported(module: nn.Module) -> onnx.ModelProto:
     """Export a module with drawn weights, its height and width free."""
     generator = torch.Generator().manual_seed(1)
@@ -107,7 +123,7 @@ def exported(module: nn.Module) -> onnx.ModelProto:
     return onnx.load_model_from_string(file.getvalue())
 
 
-@pytest.mark.parametrize("make", [PaddedUNet, ResizedUNet, Gated, NoiseLevel])
+@pytest.mark.parametrize("make", [PaddedUNet, ResizedUNet, Gated, NoiseLevel, UnshuffledNoiseLevel])
 def test_sizes_are_gone_and_results_are_the_same(make: Callable[[], nn.Module]) -> None:
     """Also for sides that are no multiples of 64, as far as the network halves them evenly."""
     model = exported(make())

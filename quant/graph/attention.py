@@ -1,0 +1,83 @@
+"""Spatial attention of RFDN and RLFN (ESA), and the same on whole fractions of a map.
+
+It shrinks a map by an unpadded convolution of stride 2 and an unpadded maximum of stride 3, and
+enlarges what convolutions make of that to the map's size: by a factor that is no whole number.
+
+1. Padded, and with a maximum of stride 4, its inner map has an eighth of the sides.
+2. Two bilinear enlargements, by 4 and by 2, lead back to the map's size.
+
+That is another function, which `quant.adapt` puts in its place, measures and compensates.
+"""
+
+import numpy as np
+
+from beers_deploy.quant.graph.resize import Resizing
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+
+BETWEEN = {"Conv", "LeakyRelu", "PRelu", "Relu"}
+"""What stands between the maximum and the enlargement."""
+
+
+def shrinking(graph: OnnxGraph, node: Node) -> list[Node]:
+    """Return the nodes in front of a Resize that attention has, the strided convolution first.
+
+    Empty if the node is something else.
+    """
+    nodes: list[Node] = []
+    writer = _writer(graph, node.inputs[0]) if node.op_type == "Resize" else None
+    while writer is not None and (not nodes or nodes[0].op_type != "MaxPool"):
+        nodes.insert(0, writer)
+        writer = _writer(graph, writer.inputs[0])
+    if writer is None or not BETWEEN.issuperset(inner.op_type for inner in nodes[1:]):
+        return []
+    pool = nodes[0]
+    weight = graph.value(writer, 1)
+    is_known = (
+        writer.op_type == "Conv"
+        and weight is not None
+        and weight.shape[2:] == (3, 3)
+        and writer.attributes.get("strides") == [2, 2]
+        and pool.attributes.get("kernel_shape") == [7, 7]
+        and pool.attributes.get("strides") == [3, 3]
+        and not any([*writer.attributes.get("pads", []), *pool.attributes.get("pads", [])])
+        and Resizing.of(node, graph).mode == "linear"
+    )
+    return [writer, *nodes] if is_known else []
+
+
+def _writer(graph: OnnxGraph, name: str) -> Node | None:
+    """Return the node that writes a tensor; None if several nodes read its values."""
+    readers = [node for node in graph.readers[name] if node.op_type != "Shape"]
+    return graph.writers.get(name) if len(readers) == 1 else None
+
+
+def aligned(graph: OnnxGraph, node: Node) -> dict[Node, list[Node]]:
+    """Return the nodes that take the place of a Resize and of what shrinks; none of another node.
+
+    Args:
+        graph: that the node belongs to; its constants are extended.
+        node: any node.
+    """
+    nodes = shrinking(graph, node)
+    if not nodes:
+        return {}
+    # 1. Pads put each value in the middle of the eight pixels that it stands for, or next to it.
+    changes = {0: {"pads": [1, 1, 1, 1]}, 1: {"strides": [4, 4], "pads": [1, 1, 2, 2]}}
+    replacements: dict[Node, list[Node]] = {}
+    source = nodes[0].inputs[0]
+    for place, old in enumerate(nodes):
+        # Another name, because it is not the tensor of the original any more.
+        result = f"{old.outputs[0]}.aligned"
+        attributes = {**old.attributes, **changes.get(place, {})}
+        inputs = [source, *old.inputs[1:]]
+        replacements[old] = [Node.new(old.op_type, inputs, result, old.name, **attributes)]
+        source = result
+    # 2.
+    inner = f"{node.outputs[0]}.quarter"
+    modes = {"mode": "linear", "coordinate_transformation_mode": "pytorch_half_pixel"}
+    enlarged = []
+    for factor, name, result in ((4, inner, inner), (2, node.name, node.outputs[0])):
+        scales = graph.add_constant(f"{result}.scales", np.array([1, 1, factor, factor]))
+        enlarged.append(Node.new("Resize", [source, "", scales], result, name, **modes))
+        source = result
+    return replacements | {node: enlarged}

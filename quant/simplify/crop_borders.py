@@ -1,0 +1,47 @@
+"""Write the slices that cut a border off a map as convolutions that each read one pixel.
+
+A U-Net without padding crops its skips to the size of what it enlarged. Of a kernel of three rows
+the first and the last reach the border that is cut; the one in the middle has the only weight, 1.
+It is exact, and needs no size of the image.
+"""
+
+import numpy as np
+
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.simplify.standard_operators import Shapes
+
+
+def convolve_crop(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Return the depthwise convolution that a Slice of rows and columns is.
+
+    Args:
+        shapes: of each float tensor.
+        graph: that the node belongs to; its constants are extended.
+        node: any node.
+
+    Returns:
+        The convolution, None for a Slice that does not cut as much at either side, and for any
+        other node.
+    """
+    size = shapes.get(node.inputs[0], ()) if node.op_type == "Slice" else ()
+    if len(size) != 4 or size[1] < 1:
+        return None
+    starts, ends, axes, steps = (graph.numbers(node, place, "") for place in range(1, 5))
+    if not (starts and ends and axes) or set(steps or [1]) != {1}:
+        return None
+    border_px = {2: 0, 3: 0}
+    for axis, start, end in zip(axes, starts, ends, strict=True):
+        if axis % 4 not in border_px or start <= 0 or end not in (-start, size[axis] - start):
+            return None
+        border_px[axis % 4] = start
+    kernel = [3 if px else 1 for px in border_px.values()]
+    weight = np.zeros((size[1], 1, *kernel))
+    weight[:, :, kernel[0] // 2, kernel[1] // 2] = 1
+    name = node.proto.name or node.outputs[0]
+    attributes = {
+        "kernel_shape": kernel,
+        "dilations": [px or 1 for px in border_px.values()],
+        "group": size[1],
+    }
+    inputs = [node.inputs[0], graph.add_constant(f"{name}.weight", weight)]
+    return [Node.new("Conv", inputs, node.outputs[0], name, **attributes)]
