@@ -162,7 +162,7 @@ def restore(
         require_image_file(path)
     output = None
     if path is not None and not dry_run:
-        how = {"compression": compression, "cog": cog, "resume": resume}
+        how: dict[str, Any] = {"compression": compression, "cog": cog, "resume": resume}
         how["self_check"] = None if self_check is None else Path(self_check)
         output = _output(out, stac, overwrite or resume, fix_detectors or "", **how)
     sensors = sensors_of(sensor)
