@@ -7,6 +7,7 @@ the layout that AMD's NPU flow takes. Reading a host file back gives numbers to 
 
 from beers_deploy.quant.encodings.board import (
     CONFIG,
+    OF_NPU,
     as_on_board,
     board_model,
     required_tile,
@@ -19,6 +20,7 @@ from beers_deploy.quant.encodings.host import encoding_faults, host_model, read_
 __all__ = [
     "BORDER_PX",
     "CONFIG",
+    "OF_NPU",
     "PLACE_PX",
     "as_on_board",
     "board_model",

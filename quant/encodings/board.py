@@ -141,7 +141,7 @@ def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> on
     Raises:
         OptionError: no tile.
     """
-    side_px = required_tile(tile_px)
+    side_px = required_tile(tile_px, OF_NPU)
     parts: list[tuple[IntConv | Op, int]] = []
     for op in core.ops:
         # An operation and its clamp share the scale of the result, so that no bit changes.
@@ -157,13 +157,13 @@ def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> on
     return shape_inference.infer_shapes(model, strict_mode=True)
 
 
-def required_tile(tile_px: int | None) -> int:
-    """Return the side of the tile, or raise OptionError: an NPU's file must be fixed to one."""
+OF_NPU = "an NPU, because its compiler accepts fixed sizes only"
+
+
+def required_tile(tile_px: int | None, use: str) -> int:
+    """Return the side of the tile, or raise OptionError if there is none: `use` needs one."""
     if tile_px is None:
-        raise OptionError(
-            "`tile` must be given for an NPU, because its compiler accepts fixed sizes only. Give "
-            "a side in pixels, such as 640."
-        )
+        raise OptionError(f"`tile` must be given for {use}. Give a side in pixels, such as 640.")
     return tile_px
 
 
