@@ -26,8 +26,8 @@ def export(
     sensor: SensorLike | None = None,
     tile: Annotated[int, Interval(ge=16, le=8192)] | None = None,
     board_file: OutputFile | None = None,
-    target: TargetLike = DEFAULT_TARGET,
     c: OutputFile | None = None,
+    target: TargetLike = DEFAULT_TARGET,
     delta: OutputFile | None = None,
     apply: InputPath | None = None,
 ) -> Path:

@@ -3,8 +3,6 @@
 import math
 from importlib.resources import files
 
-from onnx import shape_inference
-
 from beers_deploy.quant.c_code.layers import LayerWriter, Shape, comment, plain, times
 from beers_deploy.quant.c_code.memory import share_buffers
 from beers_deploy.quant.core import IntCore
@@ -73,8 +71,8 @@ def c_program(core: IntCore, tile_px: int, title: str) -> str:
 
 def _shapes(core: IntCore, tile_px: int) -> dict[str, Shape]:
     """Return channels, rows and columns of all tensors, the planes first."""
-    model = shape_inference.infer_shapes(board_model(core, {}, tile_px), strict_mode=True)
-    values = (*model.graph.value_info, *model.graph.output, *model.graph.input)
+    graph = board_model(core, {}, tile_px).graph
+    values = (*graph.value_info, *graph.output, *graph.input)
     sizes = {
         value.name: tuple(dim.dim_value for dim in value.type.tensor_type.shape.dim[1:])
         for value in values

@@ -15,6 +15,7 @@ from beers_deploy.quant.encodings.board import (
     vint8_model,
 )
 from beers_deploy.quant.encodings.description import BORDER_PX, PLACE_PX
+from beers_deploy.quant.encodings.explicit import implicit_parts
 from beers_deploy.quant.encodings.host import encoding_faults, host_model, read_core
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "board_model",
     "encoding_faults",
     "host_model",
+    "implicit_parts",
     "read_core",
     "required_tile",
     "save_config",
