@@ -9,9 +9,22 @@ from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import board_model
 from beers_deploy.quant.graph import CORRECTION, PLANES
 
-KERNELS = ("common", "window", "convolve", "add", "multiply", "concatenate", "look_up")
-KERNELS += ("pool_maxima", "pool_means", "repeat", "interpolate")
-KERNELS += ("shuffle", "to_pixels", "to_channels")
+KERNELS = (
+    "common",
+    "window",
+    "convolve",
+    "add",
+    "multiply",
+    "concatenate",
+    "look_up",
+    "pool_maxima",
+    "pool_means",
+    "repeat",
+    "interpolate",
+    "shuffle",
+    "to_pixels",
+    "to_channels",
+)
 """The order of the functions in the file."""
 
 

@@ -2,8 +2,6 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -15,21 +13,21 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.c_code import c_program
 from beers_deploy.quant.c_code.layers import LayerWriter
 from beers_deploy.quant.c_code.memory import share_buffers
-from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import CORRECTION, PLANES
 from beers_deploy.quant.integer.reference import run_core
 from beers_deploy.quant.onnx_file import load_onnx
-from tests.quant.c_code.compiled import FAST, SANITIZERS, needs_compiler, run_program
+from benchmarks.executors import run_c
+from tests.quant.c_code.compiled import FAST, SANITIZED, needs_compiler
 from tests.quant.c_code.drawn import KINDS, cores
 from tests.shipped import shipped_pair
 
 
-def assert_equal(core: IntCore, tile_px: int, planes: np.ndarray, flags: list[str]) -> None:
+def assert_equal(core: IntCore, tile_px: int, planes: np.ndarray, compiler: list[str]) -> None:
     expected = run_core(core, planes)[0][CORRECTION]
-    with TemporaryDirectory() as folder:
-        text = c_program(core, tile_px, "network.onnx")
-        result = run_program(text, planes, expected.shape, Path(folder), flags)
+    text = c_program(core, tile_px, "network.onnx")
+    result = run_c(compiler, text, planes, expected.shape[1:])
     np.testing.assert_array_equal(result, expected)
 
 
@@ -47,7 +45,7 @@ def extremes(shape: tuple[int, ...]) -> np.ndarray:
 @settings(max_examples=2)
 def test_each_kind_of_operation_is_the_reference_s(kind: str, data: st.DataObject) -> None:
     core, tile_px = data.draw(cores((kind,), 2))
-    assert_equal(core, tile_px, extremes((1, 3, tile_px, tile_px)), SANITIZERS)
+    assert_equal(core, tile_px, extremes((1, 3, tile_px, tile_px)), SANITIZED)
 
 
 @needs_compiler
@@ -55,7 +53,7 @@ def test_each_kind_of_operation_is_the_reference_s(kind: str, data: st.DataObjec
 @settings(max_examples=6)
 def test_any_network_is_the_reference_s(drawn: tuple[IntCore, int]) -> None:
     core, tile_px = drawn
-    assert_equal(core, tile_px, extremes((1, 3, tile_px, tile_px)), SANITIZERS)
+    assert_equal(core, tile_px, extremes((1, 3, tile_px, tile_px)), SANITIZED)
 
 
 def of_shipped(name: str) -> IntCore:
@@ -73,7 +71,7 @@ def planes_of(core: IntCore, tile_px: int) -> np.ndarray:
 @needs_compiler
 def test_a_shipped_network_is_the_reference_s() -> None:
     core = of_shipped("convbeers-xs")
-    assert_equal(core, 12, planes_of(core, 12), SANITIZERS)
+    assert_equal(core, 12, planes_of(core, 12), SANITIZED)
 
 
 @pytest.mark.slow
@@ -82,12 +80,12 @@ def test_a_shipped_network_is_the_reference_s() -> None:
 def test_every_shipped_network_is_the_reference_s(name: str) -> None:
     core = of_shipped(name)
     assert_equal(core, 64, planes_of(core, 64), FAST)
-    assert_equal(core, 16, planes_of(core, 16), SANITIZERS)
+    assert_equal(core, 16, planes_of(core, 16), SANITIZED)
 
 
 def test_the_file_states_what_it_is_and_no_name_ends_a_comment() -> None:
     core = of_shipped("convbeers-xs")
-    first = replace(core.ops[0], name="*/ int x; /* ??/")
+    first = replace(core.convolutions[0], name="*/ int x; /* ??/")
     text = c_program(replace(core, ops=(first, *core.ops[1:])), 32, "a.onnx */\n int y;")
     assert "int x" not in re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
     assert "int y" not in re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
@@ -103,7 +101,6 @@ def test_the_file_states_what_it_is_and_no_name_ends_a_comment() -> None:
 def test_sums_that_int32_does_not_hold_are_refused() -> None:
     core = of_shipped("convbeers-xs")
     conv = core.convolutions[2]
-    assert isinstance(conv, IntConv)
     # The largest weights and as many channels as make the sums 2^31.
     weight = np.full((1, 1 << 14, 3, 3), 127, np.int8)
     large = replace(conv, weight=weight, bias=conv.bias[:1])
