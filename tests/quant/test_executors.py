@@ -43,6 +43,9 @@ def test_onnxruntime_differs_by_ties_alone(vectors: Vectors) -> None:
     host = vectors.by_onnxruntime_host()
     np.testing.assert_array_equal(host, even[: len(host)])
     assert 0 < vectors.differing(even) < 0.5
+    # The core looks an activation by itself up in a table, which rounds ties up in any case.
+    if not any(isinstance(op, Pointwise) for op in vectors.core.ops):
+        np.testing.assert_array_equal(vectors.by_onnxruntime_board(), even)
 
 
 @pytest.mark.skipif(AIDGE is None, reason="BEERS_AIDGE_PYTHON names no environment of Aidge")
