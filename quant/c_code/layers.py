@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, op_shifts
 from beers_deploy.quant.graph import (
     Activation,
     Add,
@@ -66,12 +66,17 @@ class LayerWriter:
 
     def write(self, number: int, op: IntConv | Op) -> None:
         """Add an operation, the one of this number from 1 on."""
-        sizes = [f"{plain(name)} ({times(self.shapes[name])})" for name in (*op.inputs, op.output)]
+        bits = self.core.frac_bits
+        tensors = [
+            f"{plain(name)} ({times(self.shapes[name])} in units of 2^{-bits[name]})"
+            for name in (*op.inputs, op.output)
+        ]
+        shifts = "".join(f", {name} {value}" for name, value, _ in op_shifts(op, bits, SHIFTS))
         self.calls.append(f"/* Layer {number}, {plain(op.name)} */")
         self.constants.append(
             comment(
-                f"Layer {number}, {plain(op.name)}: {_summary(op)}. "
-                f"Reads {' and '.join(sizes[:-1])}, writes {sizes[-1]}."
+                f"Layer {number}, {plain(op.name)}: {_summary(op)}{shifts}. "
+                f"Reads {' and '.join(tensors[:-1])}, writes {tensors[-1]}."
             )
         )
         _WRITERS[type(op)](self, op, f"_{number}")
