@@ -70,7 +70,7 @@ def c_program(core: IntCore, tile_px: int, title: str) -> str:
         "void run(const int8_t *in, int8_t *out);",
         f"enum {{ LINE_LENGTH = {writer.line_length}, WEIGHTS_LENGTH = {writer.weights_length} }};",
         *(
-            (folder / f"{name}.c").read_text("utf-8").rstrip()
+            (folder / f"{name}.c").read_text(encoding="utf-8").rstrip()
             for name in KERNELS
             if name in writer.kernels
         ),
