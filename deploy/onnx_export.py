@@ -1,14 +1,16 @@
 """Write networks as ONNX files: weights in float32, and INT8 files for another sensor."""
 
+import hashlib
 import logging
 from pathlib import Path
 
 import onnx
 
+from beers_deploy import __version__
 from beers_deploy.float_onnx import about, float_for, require_tile, to_onnx
 from beers_deploy.kit.board_file import save_core
 from beers_deploy.model.exposure import brightened, factors_for
-from beers_deploy.model.io.files import whole_file
+from beers_deploy.model.io.files import whole_file, write_text
 from beers_deploy.model.io.tensors import is_conditioned, read_conditioned, read_plain
 from beers_deploy.model.shipped import SENSOR, SHIPPED
 from beers_deploy.network import Network
@@ -16,7 +18,8 @@ from beers_deploy.network_files import int8_for_delta, int8_for_sensor, warn_out
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.quant.encodings import host_model, read_core
+from beers_deploy.quant.c_code import c_program
+from beers_deploy.quant.encodings import host_model, read_core, required_tile
 from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata, save_onnx
 from beers_deploy.quant.sensor_bank.conditioned import delta_of_file, required_conditioned_core
 
@@ -78,13 +81,21 @@ def export_int8(
     tile: int | None,
     core_file: Path | None,
     target: TargetProfile,
+    c_file: Path | None = None,
 ) -> None:
-    """Write an INT8 network, and its core for a board unless `core_file` is None."""
+    """Write an INT8 network, its core for a board and as C unless the file for it is None."""
     core = read_core(model)
     side_px = tile or fixed_tile_px(model)
     require_tile(side_px, core.host_part.place_px)
     for_board = Network(model, out.stem).core(target, tile) if core_file else None
-    save_onnx(host_model(core, metadata(model), side_px), out)
+    host = host_model(core, metadata(model), side_px)
+    if c_file is not None:
+        digest = hashlib.sha256(host.SerializeToString()).hexdigest()
+        title = f"{out.name}, SHA-256 {digest}, as C by beers-deploy {__version__}"
+        text = c_program(core, required_tile(side_px, "a C file, whose buffers are static"), title)
+        write_text(c_file, text)
+        logger.info("wrote %s: the same integers in C99", c_file)
+    save_onnx(host, out)
     logger.info("wrote %s", out)
     if for_board is not None and core_file is not None:
         save_core(for_board, core_file, target)

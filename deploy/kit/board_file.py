@@ -7,7 +7,7 @@ from pathlib import Path
 from beers_deploy.model.io.files import require_writable
 from beers_deploy.network import Network
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.quant.encodings import CONFIG, required_tile, save_config
+from beers_deploy.quant.encodings import CONFIG, OF_NPU, required_tile, save_config
 
 logger = logging.getLogger(__name__)
 
@@ -25,7 +25,7 @@ def require_core_file(
         inputs: files that are read, and may not be replaced.
     """
     if path is not None and target.npu:
-        required_tile(tile)
+        required_tile(tile, OF_NPU)
         require_writable(path.with_name(CONFIG), inputs=inputs)
 
 

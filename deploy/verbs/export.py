@@ -26,6 +26,7 @@ def export(
     sensor: SensorLike | None = None,
     tile: Annotated[int, Interval(ge=16, le=8192)] | None = None,
     board_file: OutputFile | None = None,
+    c: OutputFile | None = None,
     target: TargetLike = DEFAULT_TARGET,
     delta: OutputFile | None = None,
     apply: InputPath | None = None,
@@ -49,6 +50,7 @@ def export(
         tile: side in pixels of the one tile that the input is fixed to, such as 640 for a board.
         board_file: of an INT8 network: also write its core in the board's encoding, QDQ ONNX or an
             NPU's VINT8.
+        c: of an INT8 network: also write its core as one C99 file for one tile, with integers only.
         target: board or NPU of `board_file`: a name, or a .toml file.
         delta: of an INT8 network: also write what the sensor changes in it, 1 to 3 kB.
         apply: of an INT8 network: condition it on the sensor of this delta, in place of `sensor`.
@@ -84,16 +86,16 @@ def export(
     if board_file is None:
         refuse_without("`board_file`", **given("target"))
     if path.suffix != ".onnx":
-        refuse_without("an INT8 `network`", **given("board_file", "delta", "apply"))
+        refuse_without("an INT8 `network`", **given("board_file", "c", "delta", "apply"))
     if apply is not None:
         refuse_with("`apply`", **given("sensor", "delta"))
-    core = None if board_file is None else Path(board_file)
+    core, c_file = (None if file is None else Path(file) for file in (board_file, c))
     deltas = {} if delta is None else delta_files(Path(delta), sensor or SENSOR)
     inputs = [
         path,
         *(Path(each) for each in (apply, sensor) if isinstance(each, str | os.PathLike)),
     ]
-    require_writable(Path(out), core, *deltas.values(), inputs=inputs)
+    require_writable(Path(out), core, c_file, *deltas.values(), inputs=inputs)
     require_onnx_name(Path(out), core)
     board = TargetProfile.load(target)
     require_core_file(board, core, tile, inputs)
@@ -101,7 +103,7 @@ def export(
         export_float(path, Path(out), sensor, tile)
         return Path(out)
     model = conditioned_int8(path, sensor or SENSOR, None if apply is None else Path(apply))
-    export_int8(model, Path(out), tile, core, board)
+    export_int8(model, Path(out), tile, core, board, c_file)
     for factor, file in deltas.items():
         save_delta(model, sensor or SENSOR, factor, file)
     return Path(out)

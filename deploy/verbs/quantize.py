@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-PAGES = ("report.html", "report.json")
+PAGES = ("report.html", "report.json", "node-data.json")
 """What --report writes into its folder."""
 
 PATCHES = 64
@@ -99,7 +99,8 @@ def quantize(
         seed: seed of the patches.
         board_file: also write the core in the board's encoding: QDQ ONNX, of an NPU VINT8.
         tile: side of the tile in pixels that `board_file` is fixed to; an NPU needs one.
-        report: folder for report.html and report.json: which layers and patches err most.
+        report: folder for report.html and report.json: which layers and patches err most; and
+            node-data.json, by which Google's Model Explorer colours the nodes.
         progress: a function that is called at each step, False for silence, None for a bar or lines
             on standard error.
 
@@ -163,8 +164,7 @@ def quantize(
     notes = _notes(result, adapt)
     rows = list(result.layers)
     if held_out is not None:
-        page = pages[0] if pages else None
-        more, sentence = _judged(result, held_out, page)
+        more, sentence = _judged(result, held_out, pages)
         rows = [*more, *rows]
         notes.append(sentence)
     assert result.origin is not None  # noqa: S101
@@ -239,26 +239,30 @@ def _notes(result: "Network", adapt: bool) -> list[str]:
     return notes
 
 
-def _judged(network: "Network", held_out: "Patches", page: Path | None) -> "tuple[list[Row], str]":
+def _judged(network: "Network", held_out: "Patches", pages: list[Path]) -> "tuple[list[Row], str]":
     """Return what INT8 changes on samples that calibration did not see: rows and a sentence.
 
-    The rows state the price of each restriction of the DPU. With a page there are also rows of
-    layers and of the worst samples, and the page is written.
+    The rows state the price of each restriction of the DPU. With pages there are also rows of
+    layers and of the worst samples, and all pages but report.json are written.
     """
+    from beers_deploy.model.io.files import write_text
     from beers_deploy.quant.price import price_rows
     from beers_deploy.quant.sensitivity import losses
     from beers_deploy.quantization import differences_of, sensitivity_report
+    from beers_deploy.report.node_data import node_data
     from beers_deploy.report.page import write_report
 
     assert network.quantized is not None  # noqa: S101 - it was quantised here
     differences = differences_of(network, held_out)
     prices = price_rows(network.quantized, held_out)
     rows: list[Row] = []
-    if page is not None:
+    if pages:
         rows, report = sensitivity_report(network, held_out, differences, prices)
-        write_report(report, page)
-        logger.info("wrote %s: %s", page, report.headline)
+        write_report(report, pages[0])
+        logger.info("wrote %s: %s", pages[0], report.headline)
     layers = [row for row in rows if row.table == "layers"]
+    if pages:
+        write_text(pages[-1], node_data(layers))
     return [*rows, *prices], losses(network.quantized, differences, held_out, layers)
 
 

@@ -19,6 +19,7 @@ from beers_deploy.model.io.files import write_text
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.encodings.description import BORDER_PX, KEY, PLACE_PX, described_core
+from beers_deploy.quant.encodings.explicit import made_explicit
 from beers_deploy.quant.graph import CORRECTION, PLANES, Activation, Add, Conv, Op, Pointwise
 from beers_deploy.quant.graph.writer import onnx_weight, write_float
 from beers_deploy.quant.host_part import HostPart
@@ -51,7 +52,16 @@ def board_model(
         output = f"{op.output}.float"
         writer.operation(op, feeds, output)
         writer.quantized(op.output, output, core.frac_bits[op.output])
-    return _core_file(writer, core.host_part, about, tile_px)
+    return made_explicit(_core_file(writer, core.host_part, about, tile_px), TEXTS)
+
+
+CORE_NAME = "convbeers-core"
+TEXTS = {
+    CORE_NAME: "The integer core of an INT8 network, as QDQ: each tensor, weight and bias is an "
+    "int8 integer times a power of two. Ties round up on a DPU.",
+    PLANES: "The image, encoded by the host as int8 planes times 2^-7: image, plane, row, column.",
+    CORRECTION: "What the host decodes and adds to the image: image, copy, row, column.",
+}
 
 
 def _core_file(
@@ -71,7 +81,7 @@ def _core_file(
     places |= {BORDER_PX: str(host_part.border_px)} if host_part.border_px else {}
     # This file is the core itself, so it needs no description of one.
     entries = {key: words for key, words in about.items() if key != KEY}
-    return make_model(writer.graph("convbeers-core", [size], [result]), entries | places)
+    return make_model(writer.graph(CORE_NAME, [size], [result]), entries | places)
 
 
 def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:
@@ -141,7 +151,7 @@ def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> on
     Raises:
         OptionError: no tile.
     """
-    side_px = required_tile(tile_px)
+    side_px = required_tile(tile_px, OF_NPU)
     parts: list[tuple[IntConv | Op, int]] = []
     for op in core.ops:
         # An operation and its clamp share the scale of the result, so that no bit changes.
@@ -157,13 +167,13 @@ def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> on
     return shape_inference.infer_shapes(model, strict_mode=True)
 
 
-def required_tile(tile_px: int | None) -> int:
-    """Return the side of the tile, or raise OptionError: an NPU's file must be fixed to one."""
+OF_NPU = "an NPU, because its compiler accepts fixed sizes only"
+
+
+def required_tile(tile_px: int | None, use: str) -> int:
+    """Return the side of the tile, or raise OptionError if there is none: `use` needs one."""
     if tile_px is None:
-        raise OptionError(
-            "`tile` must be given for an NPU, because its compiler accepts fixed sizes only. Give "
-            "a side in pixels, such as 640."
-        )
+        raise OptionError(f"`tile` must be given for {use}. Give a side in pixels, such as 640.")
     return tile_px
 
 

@@ -1,3 +1,4 @@
+import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -161,3 +162,15 @@ def test_the_files_of_exposures_are_refused_before_any_work(tmp_path: Path) -> N
     assert "no profile 'hubble'" in refused(f"{words} {tmp_path}/d --sensor hubble")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["my-x4.delta", "my-x4.toml"]
     assert sensor.read_bytes() == before
+
+
+def test_a_core_is_written_as_c_for_a_tile(tmp_path: Path) -> None:
+    words = f"export --network {SMALL} --out {tmp_path}/int8.onnx --c {tmp_path}/net.c"
+    assert "--tile must be given for a C file" in refused(words)
+    assert list(tmp_path.iterdir()) == []
+    done(f"{words} --tile 32")
+    text = (tmp_path / "net.c").read_text().replace("\n * ", " ")
+    digest = hashlib.sha256((tmp_path / "int8.onnx").read_bytes()).hexdigest()
+    assert f"int8.onnx, SHA-256 {digest}" in text
+    assert "void run(const int8_t *in, int8_t *out)" in text
+    assert "another output" in refused(f"{words.replace('net.c', 'int8.onnx')} --tile 32")

@@ -47,7 +47,7 @@ REFUSED = {
         Refused(("rounding",), without="--conditioned"),
     ],
     "export": [
-        Refused(("board_file", "delta", "apply"), without="--network"),
+        Refused(("board_file", "c", "delta", "apply"), without="--network"),
         Refused(("target",), without="--board-file"),
         Refused(("sensor", "delta"), f"{INT8} --apply APPLY"),
     ],

@@ -58,7 +58,7 @@ def test_quantize_reports_layers(tmp_path: Path) -> None:
     float_file(tmp_path / "f.onnx")
     dn = procedural_scene(640, 700, np.random.default_rng(0)).radiance * 4095 / 400
     write_tiff(tmp_path / "scenes" / "drawn.tif", np.rint(dn).astype(np.uint16))
-    outputs = f"--out {tmp_path}/i.onnx --json {tmp_path}/q.json"
+    outputs = f"--out {tmp_path}/i.onnx --board-file {tmp_path}/core.onnx --json {tmp_path}/q.json"
     patches = f"--images {tmp_path}/scenes --patches 4 --patch 96"
     done(f"quantize {tmp_path}/f.onnx {outputs} --report {tmp_path}/r {patches}")
     document = valid(tmp_path / "q.json")
@@ -79,6 +79,11 @@ def test_quantize_reports_layers(tmp_path: Path) -> None:
     shares = [row["figures"]["share of squared error"]["value"] for row in layers[:-1]]
     assert sum(shares) == pytest.approx(100)
     assert tables.count("worst patches") == 4
+    data = json.loads((tmp_path / "r" / "node-data.json").read_text())
+    assert [result["value"] for result in data["results"].values()] == shares
+    for path in (tmp_path / "i.onnx", tmp_path / "core.onnx"):
+        names = {node.name for node in load_onnx(path).graph.node}
+        assert set(data["results"]) <= names
     assert json.loads((tmp_path / "r" / "report.json").read_text())["rows"] == document["rows"]
     page = (tmp_path / "r" / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 4

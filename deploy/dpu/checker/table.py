@@ -20,6 +20,7 @@ from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.figures import Check, Figure, Row, predicted, unavailable
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.profiles.target import TargetProfile, require_side
+from beers_deploy.quant.encodings import implicit_parts
 from beers_deploy.quant.encodings.description import KEY
 from beers_deploy.quant.graph import refusal
 from beers_deploy.quant.onnx_file import is_quantized, metadata
@@ -108,7 +109,7 @@ def check_network(
         command="check",
         arguments={"target": target.name, "dpu": build.name, "tile": tile_px},
         inputs=(source.input,),
-        rows=tuple(_rows(placement, build, tile_px)),
+        rows=(*_rows(placement, build, tile_px), *_profile_rows(source.model)),
         checks=tuple(checks),
         notes=tuple(_notes(placement, source)),
         headings=HEADINGS,
@@ -125,6 +126,7 @@ HEADINGS = {
     "refusals": "what is refused, by rule",
     "cuts": "tensors that cross between host and DPU",
     "remarks": "also to know",
+    "profile": "what the file leaves open by the draft of ONNX's safety-related profile",
 }
 DETAILS = frozenset({"nodes", "subgraphs", "summary"})
 """Tables for a closer look: a line for each node."""
@@ -181,11 +183,26 @@ def legality(placement: Placement, *, npu: bool = False) -> Check:
     return Check(name, len(failed), 0, "node", detail=first)
 
 
+def _is_for_a_board(model: onnx.ModelProto) -> bool:
+    """Return True if a compiler may be given the file: a float file or a host's is not for one."""
+    return is_quantized(model) and KEY not in metadata(model)
+
+
+def _profile_rows(model: onnx.ModelProto) -> list[Row]:
+    """Return a row for each rule of the safety-related profile about a board's file."""
+    if not _is_for_a_board(model):
+        return []
+    return [
+        Row("profile", rule, {"count": _count(len(names), "place")}, {"first": "".join(names[:1])})
+        for rule, names in implicit_parts(model).items()
+    ]
+
+
 def _file_checks(model: onnx.ModelProto, dpu: Dpu) -> list[Check]:
     """What a VINT8 file must keep as a whole; none of a float file or a host's, which no compiler
     is given.
     """
-    if not is_quantized(model) or KEY in metadata(model):
+    if not _is_for_a_board(model):
         return []
     # ONNX allows both names for its own domain.
     opset = max(entry.version for entry in model.opset_import if entry.domain in ("", "ai.onnx"))

@@ -1,0 +1,298 @@
+"""The operations of a core in C: the constants of each layer, and the call that computes it."""
+
+from collections.abc import Callable, Mapping
+from textwrap import fill
+from typing import Any
+
+import numpy as np
+
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, op_shifts
+from beers_deploy.quant.graph import (
+    Activation,
+    Add,
+    AveragePool,
+    Concat,
+    MaxPool,
+    Mul,
+    Op,
+    Pointwise,
+    Resize,
+    Shuffle,
+    Window,
+)
+from beers_deploy.quant.integer.arithmetic import (
+    LEAKY_OF_256,
+    activated,
+    activation_table,
+    bilinear_weights,
+    bound_of,
+    mean_factor,
+)
+from beers_deploy.quant.integer.reference import rounded, saturated
+
+SUM_BITS = 30
+"""Bits of the largest sum: int32 must also hold the half of a step that rounding adds."""
+LANES = 16
+CHANNELS = 4
+"""As in `kernels/convolve.c`."""
+
+Shape = tuple[int, ...]
+"""Channels, rows, columns."""
+
+
+class LayerWriter:
+    """Collects the C text of operations, and what it needs.
+
+    Attributes:
+        constants: definitions of constants, each behind a comment on its layer.
+        calls: statements, in order.
+        kernels: files in `kernels/`, each named by the function that is called.
+        constant_bytes: of all weights, biases and tables.
+        line_length: values of the longest `line` in `kernels/convolve.c`.
+        weights_length: values of the most `weights` there.
+    """
+
+    def __init__(self, core: IntCore, shapes: Mapping[str, Shape]) -> None:
+        self.core = core
+        self.shapes = shapes
+        self.maps = {name: f"&map_{k}" for k, name in enumerate(shapes)}
+        self.constants: list[str] = []
+        self.calls: list[str] = []
+        self.kernels = {"common", "window"}
+        self.constant_bytes = 0
+        self.line_length = 0
+        self.weights_length = 0
+
+    def write(self, number: int, op: IntConv | Op) -> None:
+        """Add an operation, the one of this number from 1 on."""
+        bits = self.core.frac_bits
+        tensors = [
+            f"{plain(name)} ({times(self.shapes[name])} in units of 2^{-bits[name]})"
+            for name in (*op.inputs, op.output)
+        ]
+        shifts = "".join(f", {name} {value}" for name, value, _ in op_shifts(op, bits, SHIFTS))
+        self.calls.append(f"/* Layer {number}, {plain(op.name)} */")
+        self.constants.append(
+            comment(
+                f"Layer {number}, {plain(op.name)}: {_summary(op)}{shifts}. "
+                f"Reads {' and '.join(tensors[:-1])}, writes {tensors[-1]}."
+            )
+        )
+        _WRITERS[type(op)](self, op, f"_{number}")
+
+    def array(self, kind: type[np.int8 | np.int32], name: str, values: np.ndarray) -> str:
+        """Define a constant array, and return its name."""
+        self.constant_bytes += values.size * np.dtype(kind).itemsize
+        numbers = fill(
+            ", ".join(map(str, values.ravel().tolist())),
+            100,
+            initial_indent="    ",
+            subsequent_indent="    ",
+        )
+        self.constants.append(
+            f"static const {kind.__name__}_t {name}[{values.size}] = {{\n{numbers}\n}};"
+        )
+        return name
+
+    def struct(self, kind: str, name: str, **fields: str | int) -> str:
+        """Define the constants of a layer, and return what points to them."""
+        lines = "".join(f"    .{key} = {value},\n" for key, value in fields.items())
+        self.constants.append(f"static const struct {kind} {name} = {{\n{lines}}};")
+        return f"&{name}"
+
+    def call(self, function: str, first: str | int, op: IntConv | Op) -> None:
+        """Add the call of the function of a kernel on the maps of an operation."""
+        self.kernels.add(function)
+        maps = [self.maps[name] for name in (*op.inputs, op.output)]
+        self.calls.append(f"{function}({', '.join([str(first), *maps])});")
+
+    def rounding(
+        self,
+        op: IntConv | Op,
+        shift: int,
+        bits: float,
+        activation: Activation = Activation.none,
+        frac_bits: int = 0,
+    ) -> str:
+        """Return how sums of `frac_bits` become the result of an operation.
+
+        Args:
+            op: the operation.
+            shift: to the scale of its result.
+            bits: that no sum exceeds, without the sign.
+            activation: of the sums.
+            frac_bits: of the sums.
+
+        Raises:
+            ModelError: sums that are too large for int32.
+        """
+        leak = LEAKY_OF_256 if activation is Activation.leaky_relu else 0
+        needed = max(bits + float(np.log2(max(leak, 1))) - min(shift, 0), shift)
+        if needed > SUM_BITS:
+            raise ModelError(
+                f"The sums of {op.name} need {needed:.1f} bits, but the int32 of a C file holds "
+                f"{SUM_BITS}. Use a network with smaller windows or fewer channels."
+            )
+        # ReLU and ReLU6 only clip. Rounding keeps the order of values, so clipping the result to
+        # the rounded limits is the same as clipping the sum.
+        sums, finer = activated(np.array([-1, 1]) << 40, activation, frac_bits)
+        low, high = saturated(rounded(sums, shift + finer, half_even=False)[0])
+        return f"{{.shift = {shift}, .low = {low}, .high = {high}, .leak = {leak}}}"
+
+
+def plain(name: str) -> str:
+    """Return a name from a file as text that cannot end a comment of C."""
+    return "".join(c if c.isascii() and (c.isalnum() or c in "._- ,:") else "_" for c in name)[:200]
+
+
+def times(shape: Shape) -> str:
+    """Return sizes as text: channels x rows x columns."""
+    return " x ".join(map(str, shape))
+
+
+def comment(*paragraphs: str) -> str:
+    """Return paragraphs as one comment of C."""
+    lines = [fill(each, 97, initial_indent=" * ", subsequent_indent=" * ") for each in paragraphs]
+    return "/*" + "\n".join(lines)[2:] + " */"
+
+
+def _summary(op: IntConv | Op) -> str:
+    kind = type(op).__name__
+    if isinstance(op, IntConv):
+        rows, columns = op.weight.shape[2:]
+        kind = f"{'transposed ' * op.transposed}convolution {rows} x {columns}"
+    activation = getattr(op, "activation", Activation.none)
+    return f"{kind}, {activation.name}" if activation is not Activation.none else kind
+
+
+def _axes(window: Window, kernel: tuple[int, ...]) -> dict[str, str]:
+    sides = zip(kernel, window.strides, window.dilations, window.pads[:2], strict=True)
+    rows, columns = (
+        f"{{.taps = {taps}, .stride = {stride}, .dilation = {dilation}, .before = {before}}}"
+        for taps, stride, dilation, before in sides
+    )
+    return {"rows": rows, "columns": columns}
+
+
+def _conv(w: LayerWriter, op: IntConv, number: str) -> None:
+    window = op.window
+    weight = op.weight
+    spread = 1
+    if op.transposed:
+        # A transposed convolution is one over an input with zeros in between, its weights turned
+        # round; its padding crops, so it takes off the full padding.
+        spread = window.strides[0]
+        weight = weight[:, :, ::-1, ::-1]
+        rows, columns = (side - 1 for side in weight.shape[2:])
+        window = Window(pads=(rows - window.pads[0], columns - window.pads[1], 0, 0))
+    product = op.weight_frac_bits + w.core.frac_bits[op.input]
+    shift = product - op.bias_frac_bits
+    bias = op.bias.astype(np.int64)
+    bias = bias << shift if shift >= 0 else bias >> -shift
+    cut = product - w.core.frac_bits[op.output]
+    layer = w.struct(
+        "convolution",
+        f"layer{number}",
+        **_axes(window, weight.shape[2:]),
+        groups=op.groups,
+        spread=spread,
+        weight=w.array(np.int8, f"weight{number}", weight.transpose(0, 3, 2, 1)),
+        bias=w.array(np.int32, f"bias{number}", bias),
+        rounding=w.rounding(op, cut, bound_of(op, bias), op.activation, product),
+    )
+    w.call("convolve", layer, op)
+    outputs, inputs, rows, columns = weight.shape
+    depth = rows * inputs
+    run = -(-((columns - 1) * window.dilations[1] + 1) * depth // LANES) * LANES
+    line = (w.shapes[op.output][2] - 1) * window.strides[1] * depth + run
+    w.line_length = max(w.line_length, line)
+    channels = -(-outputs // op.groups // CHANNELS) * CHANNELS
+    w.weights_length = max(w.weights_length, channels * run)
+
+
+def _add(w: LayerWriter, op: Add, number: str) -> None:
+    bits = [w.core.frac_bits[name] for name in op.inputs]
+    finest = max(bits)
+    # At the finest scale no input loses a bit, so the result is rounded once.
+    first, second = (1 << (finest - each) for each in bits)
+    shift = finest - w.core.frac_bits[op.output]
+    largest = float(np.log2(128 * (first + second)))
+    rounding = w.rounding(op, shift, largest, op.activation, finest)
+    layer = w.struct("addition", f"layer{number}", first=first, second=second, rounding=rounding)
+    w.call("add", layer, op)
+
+
+def _mul(w: LayerWriter, op: Mul, number: str) -> None:
+    shift = sum(w.core.frac_bits[name] for name in op.inputs) - w.core.frac_bits[op.output]
+    # The largest product is that of -128 and -128.
+    rounding = w.rounding(op, shift, 14.0)
+    w.constants.append(f"static const struct rounding layer{number} = {rounding};")
+    w.call("multiply", f"&layer{number}", op)
+
+
+def _concat(w: LayerWriter, op: Concat, number: str) -> None:  # noqa: ARG001 - of other layers
+    w.kernels.add("concatenate")
+    first = 0
+    for name in op.inputs:
+        w.calls.append(f"concatenate({first}, {w.maps[name]}, {w.maps[op.output]});")
+        first += w.shapes[name][0]
+
+
+def _max_pool(w: LayerWriter, op: MaxPool, number: str) -> None:
+    layer = w.struct("max_pool", f"layer{number}", **_axes(op.window, op.kernel))
+    w.call("pool_maxima", layer, op)
+
+
+def _average_pool(w: LayerWriter, op: AveragePool, number: str) -> None:
+    assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
+    factor, shift = mean_factor(op.kernel)
+    largest = float(np.log2(128 * factor * op.kernel[0] * op.kernel[1]))
+    layer = w.struct(
+        "average_pool",
+        f"layer{number}",
+        **_axes(op.window, op.kernel),
+        factor=factor,
+        rounding=w.rounding(op, shift, largest),
+    )
+    w.call("pool_means", layer, op)
+
+
+def _resize(w: LayerWriter, op: Resize, number: str) -> None:
+    if not op.bilinear:
+        w.call("repeat", op.factor, op)
+        return
+    weight, shift = bilinear_weights(op.factor)
+    layer = w.struct(
+        "interpolation",
+        f"layer{number}",
+        factor=op.factor,
+        weight=w.array(np.int8, f"weight{number}", weight),
+        # The weights of a place sum to 2^shift.
+        rounding=w.rounding(op, shift, 7.0 + shift),
+    )
+    w.call("interpolate", layer, op)
+
+
+def _shuffle(w: LayerWriter, op: Shuffle, number: str) -> None:
+    layer = w.struct("shuffle", f"layer{number}", block=op.block, by_channel=int(op.columns_first))
+    w.kernels.add("shuffle")
+    w.call("to_pixels" if op.up else "to_channels", layer, op)
+
+
+def _pointwise(w: LayerWriter, op: Pointwise, number: str) -> None:
+    table = w.array(np.int8, f"table{number}", activation_table(op, w.core.frac_bits))
+    w.call("look_up", table, op)
+
+
+_WRITERS: dict[type, Callable[..., Any]] = {
+    IntConv: _conv,
+    Add: _add,
+    Mul: _mul,
+    Concat: _concat,
+    MaxPool: _max_pool,
+    AveragePool: _average_pool,
+    Resize: _resize,
+    Shuffle: _shuffle,
+    Pointwise: _pointwise,
+}

@@ -1,0 +1,54 @@
+"""Static buffers for the tensors of a core: tensors that are never needed together share one."""
+
+from collections.abc import Mapping
+
+from beers_deploy.quant.core import IntConv, IntCore
+from beers_deploy.quant.graph import CORRECTION, PLANES, Add, Mul, Op, Pointwise
+
+IN_PLACE = (Add, Mul, Pointwise)
+"""Operations that read of each input only the value at the place that they write."""
+
+
+def share_buffers(core: IntCore, sizes: Mapping[str, int]) -> tuple[dict[str, int], list[int]]:
+    """Return the number of the buffer of each tensor, and the sizes of the buffers in bytes.
+
+    Args:
+        core: the operations, in order.
+        sizes: of the tensors in bytes, by name.
+    """
+    steps = list(enumerate(core.ops))
+    last_use = {PLANES: 0} | {op.output: k for k, op in steps}
+    last_use |= {name: k for k, op in steps for name in op.inputs}
+    last_use[CORRECTION] = len(steps)
+    number = {PLANES: 0}
+    buffers = [sizes[PLANES]]
+    free = set[int]()
+    for k, op in steps:
+        ending = {number[name] for name in op.inputs if last_use[name] == k}
+        chosen = _choose(op, ending, free, buffers, sizes[op.output])
+        number[op.output] = chosen
+        free |= ending | {chosen}
+        if last_use[op.output] > k:
+            free.remove(chosen)
+    return number, buffers
+
+
+def _choose(
+    op: IntConv | Op, ending: set[int], free: set[int], buffers: list[int], size: int
+) -> int:
+    """Return the number of the buffer for a result of `size` bytes, and make it large enough.
+
+    1. An operation that works value by value writes over an input that nothing reads later.
+    2. Others take the smallest free buffer that is large enough,
+    3. or else enlarge the largest free one,
+    4. or else add one.
+    """
+    if isinstance(op, IN_PLACE) and ending:
+        return min(ending)
+    if not free:
+        buffers.append(size)
+        return len(buffers) - 1
+    by_size = sorted(free, key=buffers.__getitem__)
+    chosen = next((k for k in by_size if buffers[k] >= size), by_size[-1])
+    buffers[chosen] = max(buffers[chosen], size)
+    return chosen

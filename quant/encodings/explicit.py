@@ -1,0 +1,93 @@
+"""Files that leave nothing to a default, as the draft of ONNX's safety-related profile asks.
+
+The profile (SONNX, working group of ONNX) forbids default values of attributes (REQ-OP-070) and
+shape inference (REQ-GR-000), and wants inputs and outputs described (REQ-FO-040). Its requirements
+are in onnx/working-groups, safety-related-profile/deliverables/reqs, read at commit 1598dbc.
+"""
+
+from collections.abc import Iterator
+from importlib.metadata import version
+
+import onnx
+from onnx import helper, shape_inference
+
+from beers_deploy.quant.domains import opset_of
+
+WINDOW_DEFAULTS = {
+    "strides": [1, 1],
+    "dilations": [1, 1],
+    "pads": [0, 0, 0, 0],
+    "output_padding": [0, 0],
+}
+"""Defaults that ONNX states in words only, of windows over rows and columns."""
+OPERATORS = frozenset(
+    """Abs Add Cast Clip Concat Constant ConstantOfShape Conv ConvTranspose Div Equal Erf Exp
+    Expand Flatten Gather Gemm GlobalAveragePool GRU HardSwish Identity LeakyRelu Less Log LSTM
+    MatMul Max MaxPool Min Mod Mul Neg Not Pad Pow Range ReduceMean ReduceSum Relu Reshape Resize
+    ScatterND Shape Sigmoid Slice Softmax Softplus Split Sqrt Squeeze Sub Tanh Transpose Unsqueeze
+    Where""".split()  # noqa: SIM905 - it reads as the list that it was copied from
+)
+"""ONNX's operators in the profile's first list (REQ-OP-000)."""
+
+
+def made_explicit(model: onnx.ModelProto, texts: dict[str, str]) -> onnx.ModelProto:
+    """Return a model that computes the same, and states attributes, shapes and its producer.
+
+    Args:
+        model: of ONNX's own operators.
+        texts: descriptions of the graph, its inputs and outputs, by their names.
+    """
+    opset = opset_of(model)
+    for node in model.graph.node:
+        node.attribute.extend(_defaults(node, opset))
+    for part in (model.graph, *model.graph.input, *model.graph.output):
+        part.doc_string = texts[part.name]
+    model.producer_version = version("beers-deploy")
+    return shape_inference.infer_shapes(model, strict_mode=True)
+
+
+def implicit_parts(model: onnx.ModelProto) -> dict[str, list[str]]:
+    """Return what a file leaves open, by the profile's rule: names of nodes and tensors."""
+    graph = model.graph
+    opset = opset_of(model)
+    ends = [*graph.input, *graph.output]
+    sized = {value.name for value in (*graph.value_info, *ends) if _is_sized(value)}
+    tensors = [value.name for value in graph.input]
+    for node in graph.node:
+        tensors += node.output
+    producer = {"name": model.producer_name, "version": model.producer_version}
+    return {
+        "attributes left to a default (REQ-OP-070)": [
+            f"{node.name}: {attribute.name}"
+            for node in graph.node
+            for attribute in _defaults(node, opset)
+        ],
+        "tensors without a stated size (REQ-GR-000)": [t for t in tensors if t not in sized],
+        "inputs and outputs without a description (REQ-FO-040)": [
+            value.name for value in ends if not value.doc_string
+        ],
+        "name or version of the producer missing": [k for k, text in producer.items() if not text],
+        "operators outside the profile's list (REQ-OP-000)": sorted(
+            {node.op_type for node in graph.node} - OPERATORS
+        ),
+    }
+
+
+def _defaults(node: onnx.NodeProto, opset: int) -> Iterator[onnx.AttributeProto]:
+    """Yield the attributes that a node leaves to their defaults."""
+    stated = {attribute.name for attribute in node.attribute}
+    if not onnx.defs.has(node.op_type, node.domain):
+        return
+    for name, attribute in onnx.defs.get_schema(node.op_type, opset).attributes.items():
+        if name in stated:
+            continue
+        if attribute.default_value.name:
+            yield attribute.default_value
+        elif name in WINDOW_DEFAULTS:
+            yield helper.make_attribute(name, WINDOW_DEFAULTS[name])
+
+
+def _is_sized(value: onnx.ValueInfoProto) -> bool:
+    """Return True if a tensor has a type, and a number for each of its sides."""
+    tensor = value.type.tensor_type
+    return bool(tensor.elem_type and all(dim.dim_value for dim in tensor.shape.dim))

@@ -1,0 +1,241 @@
+"""Small cores of integers with every kind of operation, drawn by Hypothesis."""
+
+import math
+
+import numpy as np
+from hypothesis import strategies as st
+
+from beers_deploy.quant.core import INT8_MAX, INT8_MIN, IntConv, IntCore
+from beers_deploy.quant.graph import (
+    CORRECTION,
+    PLANES,
+    Activation,
+    Add,
+    AveragePool,
+    Concat,
+    MaxPool,
+    Mul,
+    Op,
+    Pointwise,
+    Resize,
+    Shuffle,
+    Window,
+)
+from beers_deploy.quant.host_part import HostPart
+
+ACTIVATIONS = (Activation.none, Activation.relu, Activation.relu6, Activation.leaky_relu)
+TABLES = (Activation.hard_sigmoid, Activation.hard_swish, Activation.relu6)
+KINDS = (
+    "convolution",
+    "grouped",
+    "transposed",
+    "add",
+    "mul",
+    "concat",
+    "maximum",
+    "mean",
+    "repeat",
+    "bilinear",
+    "to pixels",
+    "to channels",
+    "table",
+)
+Shape = tuple[int, int, int]
+
+
+class CoreDrawer:
+    """Draws operations one by one, each on tensors that are there."""
+
+    def __init__(self, draw: st.DrawFn, tile_px: int) -> None:
+        self.draw = draw
+        self.generator = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+        self.ops: list[IntConv | Op] = []
+        self.frac_bits = {PLANES: 7}
+        self.shapes: dict[str, Shape] = {PLANES: (3, tile_px, tile_px)}
+
+    def number(self, low: int, high: int) -> int:
+        return self.draw(st.integers(low, high))
+
+    def tensor(self) -> str:
+        """Return a tensor that an operation may read: planes are for convolutions alone."""
+        return self.draw(st.sampled_from([name for name in self.shapes if name != PLANES]))
+
+    def append(self, op: IntConv | Op, shape: Shape, frac_bits: int) -> None:
+        self.ops.append(op)
+        self.shapes[op.output] = shape
+        self.frac_bits[op.output] = frac_bits
+
+    def name(self) -> str:
+        return f"op.{len(self.ops)}*/"
+
+    def result(self) -> str:
+        return f"t{len(self.ops)}"
+
+    def window(self, kernel: tuple[int, int], size: tuple[int, int], plain: bool = False) -> Window:
+        """Draw a window that has at least one place on a map of this size."""
+        pads = tuple(self.number(0, kernel[axis % 2] - 1) for axis in range(4))
+        dilations = (1, 1) if plain else (self.number(1, 2), self.number(1, 2))
+        window = Window((self.number(1, 3), self.number(1, 2)), pads, dilations)  # type: ignore[arg-type]
+        places = [window.output_size(axis, kernel[axis], size[axis]) for axis in (0, 1)]
+        return window if min(places) > 0 else Window()
+
+    def convolution(self, source: str, outputs: int, groups: int = 1) -> None:
+        channels, *size = self.shapes[source]
+        kernel = tuple(self.number(1, min(side, 4)) for side in size)
+        window = self.window(kernel, (size[0], size[1]))  # type: ignore[arg-type]
+        sizes = [window.output_size(axis, kernel[axis], size[axis]) for axis in (0, 1)]
+        self._conv(source, (outputs, channels // groups, *kernel), window, sizes, groups)
+
+    def _transposed(self, source: str) -> None:
+        channels, *size = self.shapes[source]
+        stride = self.number(1, 3)
+        kernel = (self.number(stride, 4), self.number(stride, 4))
+        pads = tuple(self.number(0, (kernel[axis % 2] - 1) // 2) for axis in range(4))
+        window = Window((stride, stride), pads)  # type: ignore[arg-type]
+        sizes = [window.transposed_size(axis, kernel[axis], size[axis]) for axis in (0, 1)]
+        self._conv(source, (self.number(1, 5), channels, *kernel), window, sizes, 1, True)
+
+    def _conv(
+        self,
+        source: str,
+        shape: tuple[int, ...],
+        window: Window,
+        sizes: list[int],
+        groups: int,
+        transposed: bool = False,
+    ) -> None:
+        ends = np.array([INT8_MIN, INT8_MAX])
+        weight = self.generator.integers(INT8_MIN, INT8_MAX + 1, shape)
+        weight = np.where(self.generator.random(shape) < 0.2, self.generator.choice(ends), weight)
+        bias = self.generator.integers(INT8_MIN, INT8_MAX + 1, shape[0])
+        frac_bits = self.number(2, 7)
+        weight_frac_bits = frac_bits + self.number(0, 12) - self.frac_bits[source]
+        bias_frac_bits = weight_frac_bits + self.frac_bits[source] - self.number(-2, 9)
+        op = IntConv(
+            self.name(),
+            source,
+            self.result(),
+            weight.astype(np.int8),
+            weight_frac_bits,
+            bias.astype(np.int8),
+            bias_frac_bits,
+            self.draw(st.sampled_from(ACTIVATIONS)),
+            window,
+            groups,
+            transposed,
+        )
+        self.append(op, (shape[0], sizes[0], sizes[1]), frac_bits)
+
+    def of_kind(self, kind: str) -> None:
+        """Append an operation of a kind, and before it what it needs."""
+        getattr(self, f"_{kind.replace(' ', '_')}")(self.tensor())
+
+    def _convolution(self, source: str) -> None:
+        self.convolution(source, self.number(1, 6))
+
+    def _grouped(self, source: str) -> None:
+        channels = self.shapes[source][0]
+        self.convolution(source, channels * self.number(1, 2), channels)
+
+    def _pair(self, source: str) -> tuple[str, str]:
+        """Return a tensor, and another of the same shape and mostly of another scale."""
+        self._table(source)
+        shape = self.shapes[source]
+        names = [name for name in self.shapes if self.shapes[name] == shape and name != PLANES]
+        return source, self.draw(st.sampled_from(names))
+
+    def _add(self, source: str) -> None:
+        pair = self._pair(source)
+        activation = self.draw(st.sampled_from(ACTIVATIONS))
+        finest = max(self.frac_bits[name] for name in pair)
+        add = Add(self.name(), pair, self.result(), activation)
+        self.append(add, self.shapes[source], finest - self.number(-2, 5))
+
+    def _mul(self, source: str) -> None:
+        pair = self._pair(source)
+        finest = sum(self.frac_bits[name] for name in pair)
+        mul = Mul(self.name(), pair, self.result())
+        self.append(mul, self.shapes[source], finest - self.number(0, 10))
+
+    def _concat(self, source: str) -> None:
+        channels, rows, columns = self.shapes[source]
+        bits = self.frac_bits[source]
+        parts = [
+            name
+            for name, shape in self.shapes.items()
+            if shape[1:] == (rows, columns) and self.frac_bits[name] == bits and name != PLANES
+        ]
+        width = channels + sum(self.shapes[name][0] for name in parts)
+        concat = Concat(self.name(), (*parts, source), self.result())
+        self.append(concat, (width, rows, columns), bits)
+
+    def _maximum(self, source: str) -> None:
+        self._pool(source, MaxPool, plain=False)
+
+    def _mean(self, source: str) -> None:
+        self._pool(source, AveragePool, plain=True)
+
+    def _pool(self, source: str, pool: type[MaxPool | AveragePool], plain: bool) -> None:
+        channels, *size = self.shapes[source]
+        kernel = (self.number(1, min(size[0], 3)), self.number(1, min(size[1], 3)))
+        window = self.window(kernel, (size[0], size[1]), plain)
+        rows, columns = (window.output_size(axis, kernel[axis], size[axis]) for axis in (0, 1))
+        op = pool(self.name(), source, self.result(), kernel, window)
+        self.append(op, (channels, rows, columns), self.frac_bits[source])
+
+    def _enlarge(self, source: str, factor: int, bilinear: bool) -> None:
+        channels, rows, columns = self.shapes[source]
+        resize = Resize(self.name(), source, self.result(), factor, bilinear)
+        shape = (channels, rows * factor, columns * factor)
+        self.append(resize, shape, self.frac_bits[source])
+
+    def _repeat(self, source: str) -> None:
+        self._enlarge(source, self.number(2, 3), False)
+
+    def _bilinear(self, source: str) -> None:
+        self._enlarge(source, self.draw(st.sampled_from((2, 4))), True)
+
+    def _to_pixels(self, source: str) -> None:
+        self.convolution(source, 8)
+        source = self.ops[-1].output
+        _, rows, columns = self.shapes[source]
+        order = self.draw(st.booleans())
+        up = Shuffle(self.name(), source, self.result(), 2, True, order)
+        self.append(up, (2, 2 * rows, 2 * columns), self.frac_bits[source])
+
+    def _to_channels(self, source: str) -> None:
+        channels, rows, columns = self.shapes[source]
+        # Not by repetition, which would make the values of a square equal.
+        self._enlarge(source, 2, bilinear=True)
+        down = Shuffle(self.name(), self.ops[-1].output, self.result(), 2, False, False)
+        self.append(down, (4 * channels, rows, columns), self.frac_bits[source])
+
+    def _table(self, source: str) -> None:
+        activation = self.draw(st.sampled_from(TABLES))
+        table = Pointwise(self.name(), source, self.result(), activation)
+        self.append(table, self.shapes[source], self.number(2, 7))
+
+    def core(self) -> IntCore:
+        """Return the core, whose last operation is a convolution of what was written last."""
+        self.convolution(self.ops[-1].output, 2)
+        last = self.ops.pop()
+        assert isinstance(last, IntConv)
+        fields = {**vars(last), "output": CORRECTION}
+        self.ops.append(IntConv(**fields))
+        self.frac_bits[CORRECTION] = self.frac_bits[last.output]
+        part = HostPart(outputs=2, adds_image=False)
+        return IntCore(tuple(self.ops), self.frac_bits, part)
+
+
+@st.composite
+def cores(draw: st.DrawFn, kinds: tuple[str, ...] = KINDS, most: int = 8) -> tuple[IntCore, int]:
+    """Draw a core with operations of these kinds, and the side of its tile in pixels."""
+    tile_px = draw(st.integers(4, 9))
+    drawer = CoreDrawer(draw, tile_px)
+    drawer.convolution(PLANES, draw(st.integers(1, 6)))
+    for kind in draw(st.lists(st.sampled_from(kinds), min_size=1, max_size=most)):
+        drawer.of_kind(kind)
+        # Enlargements in a row would make a test of seconds.
+        if math.prod(drawer.shapes[drawer.ops[-1].output]) > 1 << 14:
+            break
+    return drawer.core(), tile_px

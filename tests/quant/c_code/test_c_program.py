@@ -1,0 +1,122 @@
+"""A core as C computes the integers of the reference, and any C99 compiler takes it."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from beers_deploy.model.shipped import shipped_names
+from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.c_code import c_program
+from beers_deploy.quant.c_code.layers import LayerWriter
+from beers_deploy.quant.c_code.memory import share_buffers
+from beers_deploy.quant.core import IntCore
+from beers_deploy.quant.encodings import read_core
+from beers_deploy.quant.graph import CORRECTION, PLANES
+from beers_deploy.quant.integer.reference import run_core
+from beers_deploy.quant.onnx_file import load_onnx
+from benchmarks.executors import run_c
+from tests.quant.c_code.compiled import FAST, SANITIZED, needs_compiler
+from tests.quant.c_code.drawn import KINDS, cores
+from tests.shipped import shipped_pair
+
+
+def assert_equal(core: IntCore, tile_px: int, planes: np.ndarray, compiler: list[str]) -> None:
+    expected = run_core(core, planes)[0][CORRECTION]
+    text = c_program(core, tile_px, "network.onnx")
+    result = run_c(compiler, text, planes, expected.shape[1:])
+    np.testing.assert_array_equal(result, expected)
+
+
+def extremes(shape: tuple[int, ...]) -> np.ndarray:
+    """Planes (2, P, H, W): int8 values of all sizes, and its ends alone."""
+    generator = np.random.default_rng(0)
+    planes = generator.integers(-128, 128, (2, *shape[1:]))
+    planes[1] = generator.choice([-128, 127], shape[1:])
+    return planes.astype(np.int8)
+
+
+@needs_compiler
+@pytest.mark.parametrize("kind", KINDS)
+@given(data=st.data())
+@settings(max_examples=2)
+def test_each_kind_of_operation_is_the_reference_s(kind: str, data: st.DataObject) -> None:
+    core, tile_px = data.draw(cores((kind,), 2))
+    assert_equal(core, tile_px, extremes((1, 3, tile_px, tile_px)), SANITIZED)
+
+
+@needs_compiler
+@given(drawn=cores())
+@settings(max_examples=6)
+def test_any_network_is_the_reference_s(drawn: tuple[IntCore, int]) -> None:
+    core, tile_px = drawn
+    assert_equal(core, tile_px, extremes((1, 3, tile_px, tile_px)), SANITIZED)
+
+
+def of_shipped(name: str) -> IntCore:
+    return read_core(load_onnx(shipped_pair(name)[1]))
+
+
+def planes_of(core: IntCore, tile_px: int) -> np.ndarray:
+    """The planes (2, P, H, W) of a tile: those of an image of noise, and the ends of int8."""
+    shape = (1, core.host_part.image_channels, tile_px, tile_px)
+    image = np.random.default_rng(0).random(shape, dtype=np.float32)
+    planes = core.host_part.encode(image)
+    return np.concatenate([planes, extremes(planes.shape)[1:]])
+
+
+@needs_compiler
+def test_a_shipped_network_is_the_reference_s() -> None:
+    core = of_shipped("convbeers-xs")
+    assert_equal(core, 12, planes_of(core, 12), SANITIZED)
+
+
+@pytest.mark.slow
+@needs_compiler
+@pytest.mark.parametrize("name", shipped_names())
+def test_every_shipped_network_is_the_reference_s(name: str) -> None:
+    core = of_shipped(name)
+    assert_equal(core, 64, planes_of(core, 64), FAST)
+    assert_equal(core, 16, planes_of(core, 16), SANITIZED)
+
+
+def test_the_file_states_what_it_is_and_no_name_ends_a_comment() -> None:
+    core = of_shipped("convbeers-xs")
+    first = replace(core.convolutions[0], name="*/ int x; /* ??/")
+    text = c_program(replace(core, ops=(first, *core.ops[1:])), 32, "a.onnx */\n int y;")
+    assert "int x" not in re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
+    assert "int y" not in re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
+    assert "??" not in text
+    assert "#include" not in text.replace("#include <stdint.h>", "")
+    assert not re.search(r"\b(float|double|malloc|free)\b", text)
+    constants = sum(op.weight.size + 4 * op.bias.size for op in core.convolutions)
+    assert f"{constants} bytes of constants" in text
+    buffers = sum(map(int, re.findall(r"^static int8_t buffer_\d+\[(\d+)\];$", text, re.MULTILINE)))
+    assert f"{buffers} bytes of maps" in text.replace("\n * ", " ")
+
+
+def test_sums_that_int32_does_not_hold_are_refused() -> None:
+    core = of_shipped("convbeers-xs")
+    conv = core.convolutions[2]
+    # The largest weights and as many channels as make the sums 2^31.
+    weight = np.full((1, 1 << 14, 3, 3), 127, np.int8)
+    large = replace(conv, weight=weight, bias=conv.bias[:1])
+    writer = LayerWriter(core, dict.fromkeys(core.frac_bits, (1, 8, 8)))
+    with pytest.raises(ModelError, match=r"body.0.first need 3\d\.\d bits"):
+        writer.write(1, large)
+
+
+def test_tensors_that_are_needed_at_once_share_no_buffer() -> None:
+    core = of_shipped("convbeers")
+    size = {PLANES: 4, CORRECTION: 6} | {op.output: 16 for op in core.ops[:-1]}
+    number, buffers = share_buffers(core, size)
+    assert len(buffers) == 5
+    holds = {number[PLANES]: PLANES}
+    for op in core.ops:
+        assert {holds[number[name]] for name in op.inputs} == set(op.inputs)
+        assert buffers[number[op.output]] >= size[op.output]
+        holds[number[op.output]] = op.output
+    assert holds[number[CORRECTION]] == CORRECTION
