@@ -228,7 +228,8 @@ def judged(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
 def report(blocks: np.ndarray) -> str:
     """Say how many blocks (bands, 2, n, m) contradict the raw image."""
     facts = S["self_check"]
-    chi2, sharpening = blocks[:, 0], blocks[:, 1]
+    chi2 = blocks[:, 0]
+    sharpening = blocks[:, 1]
     outside = chi2 > facts["most_chi2"]
     decidable = outside | (sharpening >= facts["least_sharpening"])
     return (

@@ -182,7 +182,9 @@ def _joined(parts: Sequence[Judged], axis: int) -> Judged:
     return Judged(np.concatenate(chi2, axis), np.concatenate(sharpening, axis))
 
 
-WITHIN, OUTSIDE, SMOOTH = 0, 1, 2
+WITHIN = 0
+OUTSIDE = 1
+SMOOTH = 2
 """States of a block in a written map."""
 
 

@@ -221,7 +221,8 @@ class _Reader:
             return ()
         low, high = (float(end.item()) for end in ends if end is not None)
         if self.limits:
-            low, high = max(low, self.limits[0]), min(high, self.limits[1])
+            low = max(low, self.limits[0])
+            high = min(high, self.limits[1])
         return (low, high) if is_range(low, high) and (low, high) != (0, SIX) else ()
 
     def _read(self, node: Node) -> None:

@@ -233,8 +233,9 @@ def test_samples_tell_the_range() -> None:
     image[:, 1] = 2 * image[:, 1] - 1
     image[:, 3] = 25
     samples = read_samples([(image[0], np.empty(0))], 4, None)
-    low, high = image[0, 1].min(), image[0, 1].max()
-    assert samples.ranges == ((0.0, 1.0), (float(low), float(high)), (0.0, 1.0), (0.0, 25.0))
+    low = float(image[0, 1].min())
+    high = float(image[0, 1].max())
+    assert samples.ranges == ((0.0, 1.0), (low, high), (0.0, 1.0), (0.0, 25.0))
     assert "found in the samples" in samples.about["input_range"]
     flat = np.broadcast_to(np.array([0.5, -1, 0.1, 25], np.float32)[:, None, None], (4, 8, 8))
     with pytest.raises(ImageError, match="constant"):
