@@ -25,7 +25,14 @@ SIZES = 1e-6, 65536.0
 
 
 def read_ranges(option: object, channels: int) -> Ranges:
-    """Return the ranges that a user states: LOW,HIGH or such a pair for each channel.
+    """Return the ranges that a user states.
+
+    Args:
+        option: text LOW,HIGH or such a pair for each channel, or an array of the same numbers.
+        channels: the number of the network's channels.
+
+    Returns:
+        One pair for each channel; empty if all are [0, 1].
 
     Raises:
         OptionError: other text, another number of pairs, or ends that are no range.
@@ -48,14 +55,21 @@ def read_ranges(option: object, channels: int) -> Ranges:
 
 
 def require_ranges(ranges: Iterable[tuple[float, ...]]) -> None:
-    """Raise ValueError if a pair is no range, or of no sensible size."""
+    """Raise ValueError if a pair is no range, or of no sensible size.
+
+    Args:
+        ranges: pairs (low, high) in the network's units.
+
+    Raises:
+        ValueError: low is not below high, or the larger of their sizes is outside SIZES.
+    """
     for low, high in ranges:
         if not is_range(low, high):
             raise ValueError(f"a range of {low:g} to {high:g}")
 
 
 def is_range(low: float, high: float) -> bool:
-    """Return True if low is below high, and neither is too large."""
+    """Return True if `low` is below `high` and the larger of their sizes is within SIZES."""
     # NaN fails every comparison, so it is refused as well.
     return low < high and SIZES[0] <= largest_size(low, high) <= SIZES[1]
 
@@ -66,8 +80,16 @@ def largest_size(low: float, high: float) -> float:
 
 
 def ranges_of(images: Iterable[np.ndarray]) -> Ranges:
-    """Return the ranges that images (1, C, H, W) span: a channel in [0, 1] has all of that, and any
-    other one reaches from its smallest value, or 0, to its largest.
+    """Return the ranges that images span.
+
+    A channel whose values are in [0, 1], but for rounding, gets [0, 1], whatever part of it they
+    cover. Another channel reaches from its smallest value, or 0, to its largest, or 0.
+
+    Args:
+        images: at least one image (1, C, H, W) in the network's units.
+
+    Returns:
+        One pair for each channel; empty if all are [0, 1].
     """
     ends = [(image.min((0, 2, 3)), image.max((0, 2, 3))) for image in images]
     low = np.minimum.reduce([low for low, _ in ends])
@@ -80,7 +102,12 @@ def ranges_of(images: Iterable[np.ndarray]) -> Ranges:
 
 
 def to_shares(values: np.ndarray, ranges: Ranges) -> np.ndarray:
-    """Return images or results (..., C, H, W) as shares of the ranges: low is 0 and high is 1."""
+    """Return values as shares of the ranges: low becomes 0 and high becomes 1.
+
+    Args:
+        values: images or results (..., C, H, W) in the network's units.
+        ranges: of the image's channels; empty returns `values` itself.
+    """
     if not ranges:
         return values
     low, high = _ends(values, ranges)
@@ -88,7 +115,12 @@ def to_shares(values: np.ndarray, ranges: Ranges) -> np.ndarray:
 
 
 def from_shares(shares: np.ndarray, ranges: Ranges) -> np.ndarray:
-    """Return the values of which `to_shares` makes these shares."""
+    """Return the values that have these shares of the ranges. This is the inverse of `to_shares`.
+
+    Args:
+        shares: images or results (..., C, H, W), where 0 is low and 1 is high.
+        ranges: of the image's channels; empty returns `shares` itself.
+    """
     if not ranges:
         return shares
     low, high = _ends(shares, ranges)
@@ -96,7 +128,12 @@ def from_shares(shares: np.ndarray, ranges: Ranges) -> np.ndarray:
 
 
 def _ends(values: np.ndarray, ranges: Ranges) -> np.ndarray:
-    """Return low and high (2, C, 1, 1) float32 of the channels of values."""
+    """Return low and high (2, C, 1, 1) float32 of the channels of values.
+
+    Args:
+        values: images or results (..., C, H, W).
+        ranges: of the image's channels, at least one.
+    """
     channels = values.shape[-3]
     # A result has the ranges of the image's first channels, because a map of noise levels comes
     # last. One of more channels than the image has the range of the first.
@@ -105,7 +142,7 @@ def _ends(values: np.ndarray, ranges: Ranges) -> np.ndarray:
 
 
 def in_words(ranges: Ranges) -> str:
-    """Return ranges as messages state them, once where all are equal."""
+    """Return ranges as text for messages, once if all are equal."""
     return ", ".join(
         f"{low:g} to {high:g}" for low, high in (ranges if len(set(ranges)) > 1 else ranges[:1])
     )

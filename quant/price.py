@@ -52,7 +52,13 @@ PER_CHANNEL = (1, 2, 3)
 
 @dataclass(frozen=True)
 class Grid:
-    """The multiples of a scale from `low` to `high` times it, to which a tensor is rounded."""
+    """A uniform quantization grid: the multiples of `scale` from `low` to `high` times it.
+
+    Attributes:
+        scale: distance between neighbouring values of the grid, in the tensor's unit.
+        low: the smallest multiple, or minus infinity if the grid has no lower end.
+        high: the largest multiple, or infinity if the grid has no upper end.
+    """
 
     scale: float
     low: float
@@ -61,15 +67,28 @@ class Grid:
 
 @dataclass(frozen=True)
 class Cost:
-    """What a step has lost: mean absolute difference from float in shares of the input's range, and
-    PSNR to references in dB, NaN without them.
+    """The loss of a step, as the mean over the samples.
+
+    Attributes:
+        mae: mean absolute difference from the float network's result, in shares of the input's
+            range.
+        drop_db: PSNR of the float network less that of the step, in dB against the references; NaN
+            without references.
     """
 
     mae: float
     drop_db: float
 
     def beyond(self, before: "Cost", source: str) -> Figure:
-        """Return what was added, in dB if there are references."""
+        """Return the loss that was added to that of another step.
+
+        Args:
+            before: the loss of the step before this one.
+            source: how both were measured, for the figure.
+
+        Returns:
+            The added loss in dB if both have references, else the added mean absolute difference.
+        """
         if math.isfinite(self.drop_db) and math.isfinite(before.drop_db):
             return measured(self.drop_db - before.drop_db, "dB", source)
         return measured(self.mae - before.mae, SCALE, source)
@@ -93,7 +112,13 @@ class Measured:
 
     @classmethod
     def of(cls, result: Quantized, pairs: Sequence[Pair]) -> "Measured":
-        """Run the float network on the samples."""
+        """Run the float network on the samples, and record its results and its tensors' ranges.
+
+        Args:
+            result: the INT8 network, which knows the float one.
+            pairs: images (1, C, H, W) in the network's units, each with its reference or an empty
+                array.
+        """
         host_part = result.core.host_part
         graph = read_planes(result.network.graph)
         names = tensors(graph)
@@ -110,14 +135,31 @@ class Measured:
         return cls(pairs, floats, dict(zip(names, limits, strict=True)), host_part)
 
     def corrections(self, graph: Graph, grids: Mapping[str, Grid]) -> Iterator[np.ndarray]:
-        """Yield the results of a plane-reading graph whose tensors are rounded to grids."""
+        """Yield the results of a plane-reading graph whose tensors are rounded to grids.
+
+        Args:
+            graph: a float graph that reads the planes instead of the image.
+            grids: the grid of each rounded tensor by name. Other tensors stay in float.
+
+        Yields:
+            The correction of each image, (1, C, H', W') float32, as the graph computes it.
+        """
         model = rounded_model(graph_to_onnx(graph, [CORRECTION], self.host_part.planes), grids)
         session = open_session(model)
         for image, _ in self.pairs:
             yield session.run(None, {PLANES: planes_of(image, self.host_part)})[0]
 
     def cost(self, results: Iterable[np.ndarray]) -> Cost:
-        """Return what restored images lose, in the mean over the samples."""
+        """Return the mean loss of restored images over the samples.
+
+        Args:
+            results: restored images (1, C, H', W') in the network's units, in the order of the
+                samples.
+
+        Returns:
+            The loss against the float network's results. The PSNR drop is NaN if a sample has no
+            reference of the result's shape.
+        """
         maes = []
         drops_db = []
         ranges = self.host_part.input_ranges
@@ -137,8 +179,15 @@ class Measured:
     def cost_of_step(
         self, graph: Graph, axes: tuple[int, ...] | None, zero_point: bool, powers: bool
     ) -> Cost:
-        """Return what a float graph loses whose weights share scales over `axes`, with or without
-        zero points and scales of any size.
+        """Return the loss of a float graph whose weights and tensors are rounded to grids.
+
+        Args:
+            graph: the float network, which reads the image.
+            axes: axes of weights (O, I, kh, kw) over which a scale is shared; None shares one scale
+                over all of them.
+            zero_point: if True, the grid of a tensor reaches from its smallest to its largest
+                value. Otherwise it lies around 0.
+            powers: if True, scales are rounded up to powers of two.
         """
         rounded = tuple(
             replace(op, weight=rounded_weight(op.weight, axes, powers))
@@ -155,7 +204,13 @@ class Measured:
         return self.cost(self.host_part.finish(image, each) for (image, _), each in pairs)
 
     def cost_of_integers(self, result: Quantized, clips: bool) -> Cost:
-        """Return what the INT8 network's own integers lose, in tensors with or without an end."""
+        """Return the loss of the INT8 network's own integers and scales.
+
+        Args:
+            result: the INT8 network.
+            clips: if True, tensors are clipped to int8. Otherwise their integers have no limits, so
+                that the difference of both losses is the loss by clipping.
+        """
         graph = tuple(
             dequantized(op, whole) if isinstance(op, Conv) and isinstance(whole, IntConv) else op
             for op, whole in zip(result.graph, result.core.ops, strict=True)
@@ -168,11 +223,15 @@ class Measured:
 
 
 def price_rows(result: Quantized, held_out: Patches) -> list[Row]:
-    """Return a row for each step, and one for what clipping costs in the last.
+    """Return a row for the loss of each step, and one for what clipping costs in the last.
 
     Args:
         result: the INT8 network, which knows the float one.
-        held_out: samples that calibration did not see.
+        held_out: samples that calibration did not see. At most SAMPLES of them are measured.
+
+    Returns:
+        Rows of the table "price", in the order of the steps. "price" is the loss that a step adds
+        to the step before it.
     """
     samples = Measured.of(result, list(islice(held_out.pairs, SAMPLES)))
     graph = result.network.graph
@@ -202,21 +261,43 @@ def price_rows(result: Quantized, held_out: Patches) -> list[Row]:
 
 
 def rounded_weight(weight: np.ndarray, axes: tuple[int, ...] | None, powers: bool) -> np.ndarray:
-    """Round weights (O, I, kh, kw), with one scale over these axes, or None over all."""
+    """Round weights to a symmetric grid of 8 bits that clips none of them.
+
+    Args:
+        weight: weights (O, I, kh, kw).
+        axes: axes over which a scale is shared; None shares one scale over all of them.
+        powers: if True, scales are rounded up to powers of two.
+
+    Returns:
+        The rounded weights in their own unit, (O, I, kh, kw) float32.
+    """
     largest = np.abs(weight).max(axes, keepdims=True)
+    # Weights that are all zero have no range, so any scale represents them exactly.
     scale = np.where(largest > 0, largest, 1) / (2 ** (BITS - 1) - 1)
     if powers:
+        # Rounding the exponent up keeps the largest weight within 127 steps, so that nothing clips.
         scale = 2.0 ** np.ceil(np.log2(scale))
     return np.asarray(np.rint(weight / scale) * scale, np.float32)
 
 
 def grid_of(low: float, high: float, zero_point: bool, powers: bool) -> Grid:
-    """Return the grid of a tensor with values from `low` to `high`, which does not clip them."""
+    """Return the grid of a tensor with values from `low` to `high`, which does not clip them.
+
+    Args:
+        low: the smallest value of the tensor, at most 0.
+        high: the largest value of the tensor, at least 0.
+        zero_point: if True, the 256 values span `low` to `high`. Otherwise they lie around 0.
+        powers: if True, the scale of a grid around 0 is rounded up to a power of two.
+    """
     steps = 2**BITS - 1
     if zero_point:
         scale = (high - low) / steps or 1.0
+        # The end is rounded to a multiple of the scale, so that 0 is on the grid and padding is
+        # exact.
         first = round(low / scale)
         return Grid(scale, first, first + steps)
+    # Only 127 steps lie above 0, so the larger side must fit these. -128 is the one step more
+    # below.
     end = steps // 2
     scale = max(-low, high) / end or 1.0
     if powers:
@@ -225,7 +306,15 @@ def grid_of(low: float, high: float, zero_point: bool, powers: bool) -> Grid:
 
 
 def rounded_model(model: onnx.ModelProto, grids: Mapping[str, Grid]) -> onnx.ModelProto:
-    """Return a float model that rounds these tensors to their grids, half up as a DPU does."""
+    """Round tensors of a float model to their grids, half up as a DPU does.
+
+    Args:
+        model: a float model, which is changed in place.
+        grids: the grid of each tensor that is rounded, by the tensor's name.
+
+    Returns:
+        The same model, in which the rounded tensors have the original names.
+    """
     nodes = []
     for node in model.graph.node:
         nodes.append(node)
@@ -238,6 +327,8 @@ def rounded_model(model: onnx.ModelProto, grids: Mapping[str, Grid]) -> onnx.Mod
         for key, value in constants.items():
             array = np.array(value, np.float32)
             model.graph.initializer.append(numpy_helper.from_array(array, f"{name}.{key}"))
+        # floor(x / scale + 0.5) rounds ties up. Round of ONNX would round them to the even
+        # neighbour.
         feeds = {
             "Div": ["exact", "scale"],
             "Add": ["Div", "half"],

@@ -43,9 +43,12 @@ class Rounded:
     """A tensor of 8 bits.
 
     Attributes:
-        low_is_relu: whether what is clipped at the lower end would have become zero anyway.
-        counted: which channels count: of a result in several copies the coarse ones, which hold
-            what others clip.
+        name: of the tensor.
+        scale: its scale, zero point and integer type.
+        low_is_relu: True if a ReLU reads the tensor, so that what is clipped at the lower end would
+            have become zero anyway.
+        counted: the channels that count. Of a result in several copies these are the coarse ones,
+            which hold what others clip.
     """
 
     name: str
@@ -55,11 +58,18 @@ class Rounded:
 
     @property
     def lowest(self) -> int:
-        """The smallest number that its 8 bits hold."""
+        """The smallest integer that its 8 bits hold."""
         return int(np.iinfo(self.scale.integer_type).min)
 
     def at_ends(self, values: np.ndarray) -> np.ndarray:
-        """Which of its values (N, C, H, W) lie at an end."""
+        """Return True for each value that lies at an end and may have been clipped.
+
+        Args:
+            values: the tensor's integers, (N, C, H, W) or flat.
+
+        Returns:
+            A mask of the values of the counted channels.
+        """
         channels = values[:, self.counted] if values.ndim > 1 else values
         high = channels == self.lowest + 255
         # At the lower end nothing is lost where it stands for zero or where a ReLU reads it.
@@ -69,10 +79,14 @@ class Rounded:
 
 
 def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> dict[str, float]:
-    """The share, in [0, 1], of each 8-bit tensor's values that lie at an end, over images (N, 1, H,
-    W) in [0, 1].
+    """Return the share of each 8-bit tensor's values that lie at an end.
 
-    Empty where no node rounds to 8 bits.
+    Args:
+        model: an INT8 network in any encoding.
+        images: images as the network reads them, (N, C, H, W) float32.
+
+    Returns:
+        Shares in [0, 1] by the tensor's name; empty if no node rounds to 8 bits.
     """
     tensors = rounded_tensors(model)
     if not tensors:
@@ -94,12 +108,20 @@ def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> di
 
 
 def rounded_tensors(model: onnx.ModelProto) -> list[Rounded]:
-    """What the graph's nodes round to 8 bits, in the graph's order."""
+    """Return the tensors that the graph's nodes round to 8 bits, in the graph's order.
+
+    Args:
+        model: a network in any encoding.
+
+    Raises:
+        ModelError: a graph that contradicts itself.
+    """
     with contradictions("the INT8 network"):
         return _rounded(OnnxGraph(model), _own_core(model))
 
 
 def _own_core(model: onnx.ModelProto) -> IntCore | None:
+    """Return the integer core that a file describes; None if it describes none."""
     try:
         return read_core(model)
     except ModelError:
@@ -108,6 +130,12 @@ def _own_core(model: onnx.ModelProto) -> IntCore | None:
 
 
 def _rounded(graph: OnnxGraph, core: IntCore | None) -> list[Rounded]:
+    """Return the tensors that nodes round to 8 bits, without constants.
+
+    Args:
+        graph: of the INT8 network.
+        core: its integer core, which knows copies of the result; None if the file describes none.
+    """
     host_part = core.host_part if core else ONE_CHANNEL
     counted = host_part.decoding.never_replaced(host_part.outputs)
     read_as = {
@@ -150,7 +178,14 @@ class Relus:
     folded: int
 
     def off_by(self, wanted: int) -> int:
-        """How many of `wanted` ReLUs are surely lost, or how many surely added."""
+        """Return a lower bound of the number of ReLUs that are lost or added.
+
+        A convolution whose 8 bits begin at zero may or may not be a ReLU. The bound assumes the
+        more favourable case.
+
+        Args:
+            wanted: the number of ReLUs that the file should have.
+        """
         return max(wanted - self.explicit - self.folded, self.explicit - wanted, 0)
 
     def __str__(self) -> str:
@@ -162,7 +197,14 @@ class Relus:
 
 
 def count_relus(model: onnx.ModelProto) -> Relus:
-    """The ReLUs of a file."""
+    """Count the ReLUs of a network.
+
+    Args:
+        model: a float or an INT8 network.
+
+    Raises:
+        ModelError: a graph that contradicts itself.
+    """
     with contradictions("the network"):
         graph = OnnxGraph(model)
         core = _own_core(model)
@@ -183,8 +225,15 @@ def _is_hard(op: IntConv | Op) -> bool:
 
 
 def _bent_by_relu(model: onnx.ModelProto, core: IntCore | None) -> int:
-    """Return how many LeakyReLUs and PReLUs of a float network are a ReLU in a second branch of its
-    integers (`quant.adapt`): those that are no LeakyReLU there.
+    """Return the number of LeakyReLUs and PReLUs that the integers compute by a ReLU in a second
+    branch.
+
+    `quant.adapt` replaces them so. They are counted as the LeakyReLUs and PReLUs of the float
+    network less the LeakyReLUs of the integers.
+
+    Args:
+        model: the float network.
+        core: its integer core, or None if the file describes none.
     """
     if core is None:
         return 0
@@ -196,8 +245,12 @@ def _bent_by_relu(model: onnx.ModelProto, core: IntCore | None) -> int:
 
 
 def _is_relu(node: Node, graph: OnnxGraph, tensors: dict[str, Rounded]) -> bool:
-    """Whether it is one, ReLU6, a Max with zero, which in 8 bits is a zero point, or a table of
-    one.
+    """Return True if a node is a ReLU, a ReLU6, a maximum with zero or a table of a ReLU.
+
+    Args:
+        node: any node.
+        graph: that it belongs to.
+        tensors: the tensors of 8 bits by name, whose zero is their zero point.
     """
     constants = [graph.constants[name] for name in node.inputs if name in graph.constants]
     if node.op_type == "Clip":
@@ -213,8 +266,10 @@ def _is_relu(node: Node, graph: OnnxGraph, tensors: dict[str, Rounded]) -> bool:
 
 
 def _is_table_of_relu(table: np.ndarray | None) -> bool:
-    """Whether it is what our files keep a ReLU behind other than a convolution as: nothing below
-    zero.
+    """Return True if a table maps values below zero to zero, and others to values that do not
+    decrease.
+
+    Our files store a ReLU that follows no convolution as such a table of uint8, around ZERO.
     """
     if table is None or table.shape != (TABLE,) or table.dtype != np.uint8:
         return False
@@ -225,7 +280,13 @@ def _is_table_of_relu(table: np.ndarray | None) -> bool:
 
 
 def _begins_at_zero(node: Node, tensors: dict[str, Rounded], convolved: set[str]) -> bool:
-    """Whether a convolution's result is rounded to numbers of which none is below zero."""
+    """Return True if a convolution's result is rounded to numbers of which none is below zero.
+
+    Args:
+        node: any node.
+        tensors: the tensors of 8 bits by name.
+        convolved: names of the results of all convolutions.
+    """
     value = tensors.get(node.outputs[0])
     if value is None or not (node.op_type == "QLinearConv" or node.inputs[0] in convolved):
         return False
@@ -241,8 +302,12 @@ def structure_checks(
     Args:
         float_model: the float network.
         int8: the INT8 network.
-        must_describe: whether a file that does not describe its integers fails; otherwise their
+        must_describe: if True, a file that does not describe its integers fails. Otherwise their
             encoding is left out, because files of other quantisers have no description.
+
+    Returns:
+        The checks of the ReLUs, of the encoding if it is known, of float layers, and of the results
+        with and without optimisations of onnxruntime.
     """
     image = np.random.default_rng(0).random(_odd_size(int8), dtype=np.float32)
     # On a processor without VNNI the unoptimised graph was up to 126 DN off, because onnxruntime's
@@ -271,8 +336,10 @@ def structure_checks(
 
 
 def _odd_size(model: onnx.ModelProto) -> tuple[int, int, int, int]:
-    """Of an image that the network takes, on the lattice of its strides, its
-    sides otherwise odd.
+    """Return the shape (N, C, H, W) of an image that the network accepts.
+
+    Free sides are 97 and 101 pixels, rounded up to multiples of the network's lattice. A fixed side
+    is as the file states it.
     """
     sizes = [side.dim_value for side in model.graph.input[0].type.tensor_type.shape.dim]
     lattice_px = 1 if sizes[2] else tiling_of(model).lattice_px

@@ -67,7 +67,15 @@ EXACT = {
 
 
 def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
-    """Return the kind of operator that a node is; None if it is not replaced."""
+    """Return the kind of operator that a node is.
+
+    Args:
+        graph: that the node belongs to.
+        node: any node.
+
+    Returns:
+        The kind; None if the node is not replaced, such as a Sigmoid that is a part of a SiLU.
+    """
     attributes = node.attributes
     if shrinking(graph, node):
         return Kind.attention
@@ -91,10 +99,16 @@ def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
 
 
 def silu_input(graph: OnnxGraph, node: Node) -> str:
-    """Return the tensor x of which a node computes x * Sigmoid(c x), c a constant or 1.
+    """Return the tensor x if a node computes x * Sigmoid(c x), c a constant or 1.
 
-    Another c is that of the quick GELU, and the runtime writes ONNX's Swish with one. "" if the
-    node computes something else.
+    Another c is that of the quick GELU, and the runtime writes ONNX's Swish with one.
+
+    Args:
+        graph: that the node belongs to.
+        node: any node.
+
+    Returns:
+        The name of x; "" if the node computes something else.
     """
     if node.op_type == "Mul":
         for source, gate in (node.inputs, node.inputs[::-1]):
@@ -108,7 +122,13 @@ def silu_input(graph: OnnxGraph, node: Node) -> str:
 
 
 def _by_constant(graph: OnnxGraph, node: Node, source: str) -> bool:
-    """Return True for the product of a tensor and a constant number."""
+    """Return True if a node multiplies a tensor by a constant number.
+
+    Args:
+        graph: that the node belongs to.
+        node: any node.
+        source: name of the tensor.
+    """
     if node.op_type != "Mul" or source not in node.inputs:
         return False
     factor = node.inputs[1 - node.inputs.index(source)]
@@ -138,9 +158,14 @@ def nodes_by_kind(graph: OnnxGraph) -> dict[Kind, list[Node]]:
 def replaced(
     model: onnx.ModelProto, approximated: Collection[Kind], exact: Collection[Kind]
 ) -> onnx.ModelProto:
-    """Return the network with nodes of some kinds replaced by another function, of others exactly.
+    """Return a copy of a network with some kinds of nodes replaced.
 
     Tensors keep their names, but for those within an exact replacement.
+
+    Args:
+        model: a simplified float network; not changed.
+        approximated: kinds that another function replaces.
+        exact: kinds that are computed exactly by other operators. A kind in both is approximated.
     """
     network = deepcopy(model)
     graph = OnnxGraph(network)
@@ -165,6 +190,13 @@ def replaced(
 
 
 def _approximation(graph: OnnxGraph, node: Node, kind: Kind) -> Node:
+    """Return the node of another function that replaces an activation.
+
+    Args:
+        graph: that the node belongs to.
+        node: the Mul of a SiLU, a Sigmoid, a LeakyReLU or a PReLU.
+        kind: its kind.
+    """
     (output,) = node.outputs
     if kind is Kind.silu:
         return Node.new("HardSwish", [silu_input(graph, node)], output, node.name)
@@ -179,6 +211,7 @@ def _scaled_hard_sigmoid(graph: OnnxGraph, node: Node) -> list[Node]:
     offset = node.attributes.get("beta", 0.5)
     (output,) = node.outputs
     scaled = _times(graph, node.inputs[0], np.array([6 * slope]), f"{output}.scaled")
+    # With z = 6 (slope x + offset - 0.5), clip(z / 6 + 0.5, 0, 1) is the original function.
     shift = graph.add_constant(f"{output}.offset", np.array(6 * (offset - 0.5)))
     shifted = Node.new("Add", [scaled.outputs[0], shift], f"{output}.shifted", f"{output}.shifted")
     hard = Node.new("HardSigmoid", shifted.outputs, output, node.name, alpha=1 / 6, beta=0.5)
@@ -186,9 +219,15 @@ def _scaled_hard_sigmoid(graph: OnnxGraph, node: Node) -> list[Node]:
 
 
 def _two_branches(graph: OnnxGraph, node: Node) -> list[Node]:
-    """Return slopes x + ReLU((1 - slopes) x), negated where a slope above 1 bends the other way."""
+    """Return slopes x + ReLU((1 - slopes) x), negated where a slope above 1 bends the other way.
+
+    Args:
+        graph: that the node belongs to; its constants are extended.
+        node: a LeakyReLU or PReLU with constant slopes.
+    """
     slopes = slopes_of(graph, node)
     assert slopes is not None  # noqa: S101 - `kind_of` has asked
+    # ReLU adds nothing negative, so a slope s above 1 is computed as -(-s x + ReLU((s - 1) x)).
     signs = np.where(slopes > 1, -1, 1)
     source = node.inputs[0]
     (output,) = node.outputs
@@ -215,7 +254,14 @@ def _two_branches(graph: OnnxGraph, node: Node) -> list[Node]:
 
 
 def _times(graph: OnnxGraph, source: str, factors: np.ndarray, output: str) -> Node:
-    """Return the product of a tensor and one number a channel."""
+    """Return the product of a tensor and one number a channel.
+
+    Args:
+        graph: whose constants are extended.
+        source: name of the tensor (N, C, H, W).
+        factors: (C,), or (1,) for all channels.
+        output: name of the product and of its node.
+    """
     shape = (1, -1, 1, 1) if factors.size > 1 else ()
     constant = graph.add_constant(f"{output}.factor", factors.reshape(shape))
     return Node.new("Mul", [source, constant], output, output)

@@ -54,6 +54,12 @@ class LayerWriter:
     """
 
     def __init__(self, core: IntCore, shapes: Mapping[str, Shape]) -> None:
+        """Start without any operation.
+
+        Args:
+            core: the integer core whose operations will be written.
+            shapes: channels, rows and columns of each tensor by name, in the order of the C maps.
+        """
         self.core = core
         self.shapes = shapes
         self.maps = {name: f"&map_{k}" for k, name in enumerate(shapes)}
@@ -65,7 +71,15 @@ class LayerWriter:
         self.weights_length = 0
 
     def write(self, number: int, op: IntConv | Op) -> None:
-        """Add an operation, the one of this number from 1 on."""
+        """Add the constants and the call of an operation.
+
+        Args:
+            number: place of the operation in the core, from 1 on. It makes the names in C unique.
+            op: the operation.
+
+        Raises:
+            ModelError: sums that are too large for int32.
+        """
         bits = self.core.frac_bits
         tensors = [
             f"{plain(name)} ({times(self.shapes[name])} in units of 2^{-bits[name]})"
@@ -82,7 +96,16 @@ class LayerWriter:
         _WRITERS[type(op)](self, op, f"_{number}")
 
     def array(self, kind: type[np.int8 | np.int32], name: str, values: np.ndarray) -> str:
-        """Define a constant array, and return its name."""
+        """Define a constant array.
+
+        Args:
+            kind: the type of its numbers.
+            name: its name in C, which must be unique in the file.
+            values: integers of any shape, stored flat in C order.
+
+        Returns:
+            The name.
+        """
         self.constant_bytes += values.size * np.dtype(kind).itemsize
         numbers = fill(
             ", ".join(map(str, values.ravel().tolist())),
@@ -96,13 +119,28 @@ class LayerWriter:
         return name
 
     def struct(self, kind: str, name: str, **fields: str | int) -> str:
-        """Define the constants of a layer, and return what points to them."""
+        """Define a constant struct with the parameters of a layer.
+
+        Args:
+            kind: the struct's type, as a kernel declares it.
+            name: the name of the constant.
+            fields: the initializer of each field in C.
+
+        Returns:
+            The C expression of a pointer to the struct.
+        """
         lines = "".join(f"    .{key} = {value},\n" for key, value in fields.items())
         self.constants.append(f"static const struct {kind} {name} = {{\n{lines}}};")
         return f"&{name}"
 
     def call(self, function: str, first: str | int, op: IntConv | Op) -> None:
-        """Add the call of the function of a kernel on the maps of an operation."""
+        """Add the call of a kernel's function, and mark the kernel as used.
+
+        Args:
+            function: name of the function, which is also that of the kernel's file.
+            first: its first argument in C, before the maps of the inputs and of the output.
+            op: the operation.
+        """
         self.kernels.add(function)
         maps = [self.maps[name] for name in (*op.inputs, op.output)]
         self.calls.append(f"{function}({', '.join([str(first), *maps])});")
@@ -118,16 +156,22 @@ class LayerWriter:
         """Return how sums of `frac_bits` become the result of an operation.
 
         Args:
-            op: the operation.
-            shift: to the scale of its result.
+            op: the operation, for the message.
+            shift: right shift from the unit of the sums to that of the result. A negative one
+                shifts left.
             bits: that no sum exceeds, without the sign.
             activation: of the sums.
             frac_bits: of the sums.
+
+        Returns:
+            The initializer of a `struct rounding` in C.
 
         Raises:
             ModelError: sums that are too large for int32.
         """
         leak = LEAKY_OF_256 if activation is Activation.leaky_relu else 0
+        # Multiplying by the leak and shifting left enlarge a sum. Rounding adds 2^(shift - 1),
+        # which must fit as well, however small the sums are.
         needed = max(bits + float(np.log2(max(leak, 1))) - min(shift, 0), shift)
         if needed > SUM_BITS:
             raise ModelError(
@@ -152,12 +196,18 @@ def times(shape: Shape) -> str:
 
 
 def comment(*paragraphs: str) -> str:
-    """Return paragraphs as one comment of C."""
+    """Return paragraphs as one comment of C.
+
+    Args:
+        paragraphs: texts that do not contain the end of a C comment. Each begins on a new line and
+            is wrapped at 97 columns.
+    """
     lines = [fill(each, 97, initial_indent=" * ", subsequent_indent=" * ") for each in paragraphs]
     return "/*" + "\n".join(lines)[2:] + " */"
 
 
 def _summary(op: IntConv | Op) -> str:
+    """Return the kind of an operation, and its activation if it has one, as text for a comment."""
     kind = type(op).__name__
     if isinstance(op, IntConv):
         rows, columns = op.weight.shape[2:]
@@ -167,6 +217,13 @@ def _summary(op: IntConv | Op) -> str:
 
 
 def _axes(window: Window, kernel: tuple[int, ...]) -> dict[str, str]:
+    """Return the fields `rows` and `columns` of a windowed layer.
+
+    Args:
+        window: strides, dilations and pads. C needs the pads at the top and on the left only,
+            because the size of the result decides where the window stops.
+        kernel: the number of taps in rows and columns.
+    """
     sides = zip(kernel, window.strides, window.dilations, window.pads[:2], strict=True)
     rows, columns = (
         f"{{.taps = {taps}, .stride = {stride}, .dilation = {dilation}, .before = {before}}}"
@@ -176,6 +233,7 @@ def _axes(window: Window, kernel: tuple[int, ...]) -> dict[str, str]:
 
 
 def _conv(w: LayerWriter, op: IntConv, number: str) -> None:
+    """Write a convolution, and make the buffers `line` and `weights` long enough for it."""
     window = op.window
     weight = op.weight
     spread = 1
@@ -189,6 +247,8 @@ def _conv(w: LayerWriter, op: IntConv, number: str) -> None:
     product = op.weight_frac_bits + w.core.frac_bits[op.input]
     shift = product - op.bias_frac_bits
     bias = op.bias.astype(np.int64)
+    # Sums start at the bias, so it must have their unit. A bias that is finer loses its lowest
+    # bits.
     bias = bias << shift if shift >= 0 else bias >> -shift
     cut = product - w.core.frac_bits[op.output]
     layer = w.struct(
@@ -197,6 +257,8 @@ def _conv(w: LayerWriter, op: IntConv, number: str) -> None:
         **_axes(window, weight.shape[2:]),
         groups=op.groups,
         spread=spread,
+        # The kernel reads column by column, then rows, then channels, which lie side by side in a
+        # map.
         weight=w.array(np.int8, f"weight{number}", weight.transpose(0, 3, 2, 1)),
         bias=w.array(np.int32, f"bias{number}", bias),
         rounding=w.rounding(op, cut, bound_of(op, bias), op.activation, product),
@@ -204,19 +266,24 @@ def _conv(w: LayerWriter, op: IntConv, number: str) -> None:
     w.call("convolve", layer, op)
     outputs, inputs, rows, columns = weight.shape
     depth = rows * inputs
+    # A run also has the columns between dilated taps, whose weights are zero. It is rounded up to
+    # whole LANES, and the last pixel's run ends the line.
     run = -(-((columns - 1) * window.dilations[1] + 1) * depth // LANES) * LANES
     line = (w.shapes[op.output][2] - 1) * window.strides[1] * depth + run
     w.line_length = max(w.line_length, line)
+    # The kernel computes CHANNELS output channels at a time, so the weights of a group are padded.
     channels = -(-outputs // op.groups // CHANNELS) * CHANNELS
     w.weights_length = max(w.weights_length, channels * run)
 
 
 def _add(w: LayerWriter, op: Add, number: str) -> None:
+    """Write an addition: both inputs are shifted left to the finest scale and summed there."""
     bits = [w.core.frac_bits[name] for name in op.inputs]
     finest = max(bits)
     # At the finest scale no input loses a bit, so the result is rounded once.
     first, second = (1 << (finest - each) for each in bits)
     shift = finest - w.core.frac_bits[op.output]
+    # An int8 value is at most 128 in size.
     largest = float(np.log2(128 * (first + second)))
     rounding = w.rounding(op, shift, largest, op.activation, finest)
     layer = w.struct("addition", f"layer{number}", first=first, second=second, rounding=rounding)
@@ -224,6 +291,7 @@ def _add(w: LayerWriter, op: Add, number: str) -> None:
 
 
 def _mul(w: LayerWriter, op: Mul, number: str) -> None:
+    """Write a product of two tensors, whose fractional bits add up."""
     shift = sum(w.core.frac_bits[name] for name in op.inputs) - w.core.frac_bits[op.output]
     # The largest product is that of -128 and -128.
     rounding = w.rounding(op, shift, 14.0)
@@ -232,6 +300,7 @@ def _mul(w: LayerWriter, op: Mul, number: str) -> None:
 
 
 def _concat(w: LayerWriter, op: Concat, number: str) -> None:  # noqa: ARG001 - of other layers
+    """Write a call for each input, which copies it behind the channels of the inputs before it."""
     w.kernels.add("concatenate")
     first = 0
     for name in op.inputs:
@@ -240,13 +309,16 @@ def _concat(w: LayerWriter, op: Concat, number: str) -> None:  # noqa: ARG001 - 
 
 
 def _max_pool(w: LayerWriter, op: MaxPool, number: str) -> None:
+    """Write a maximum over windows, which needs no rounding."""
     layer = w.struct("max_pool", f"layer{number}", **_axes(op.window, op.kernel))
     w.call("pool_maxima", layer, op)
 
 
 def _average_pool(w: LayerWriter, op: AveragePool, number: str) -> None:
+    """Write a mean over windows as the window's sum times an integer factor and a right shift."""
     assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
     factor, shift = mean_factor(op.kernel)
+    # The bound is that of a window full of -128.
     largest = float(np.log2(128 * factor * op.kernel[0] * op.kernel[1]))
     layer = w.struct(
         "average_pool",
@@ -259,6 +331,7 @@ def _average_pool(w: LayerWriter, op: AveragePool, number: str) -> None:
 
 
 def _resize(w: LayerWriter, op: Resize, number: str) -> None:
+    """Write an enlargement, which repeats pixels or interpolates them by integer weights."""
     if not op.bilinear:
         w.call("repeat", op.factor, op)
         return
@@ -275,12 +348,14 @@ def _resize(w: LayerWriter, op: Resize, number: str) -> None:
 
 
 def _shuffle(w: LayerWriter, op: Shuffle, number: str) -> None:
+    """Write a pixel shuffle or its inverse, which moves values only."""
     layer = w.struct("shuffle", f"layer{number}", block=op.block, by_channel=int(op.columns_first))
     w.kernels.add("shuffle")
     w.call("to_pixels" if op.up else "to_channels", layer, op)
 
 
 def _pointwise(w: LayerWriter, op: Pointwise, number: str) -> None:
+    """Write an activation as a table of all 256 int8 values."""
     table = w.array(np.int8, f"table{number}", activation_table(op, w.core.frac_bits))
     w.call("look_up", table, op)
 

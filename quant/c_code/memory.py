@@ -10,15 +10,21 @@ IN_PLACE = (Add, Mul, Pointwise)
 
 
 def share_buffers(core: IntCore, sizes: Mapping[str, int]) -> tuple[dict[str, int], list[int]]:
-    """Return the number of the buffer of each tensor, and the sizes of the buffers in bytes.
+    """Assign a static buffer to each tensor.
+
+    Tensors that are not needed at the same time share a buffer.
 
     Args:
         core: the operations, in order.
         sizes: of the tensors in bytes, by name.
+
+    Returns:
+        The number of each tensor's buffer by name, and the sizes of the buffers in bytes.
     """
     steps = list(enumerate(core.ops))
     last_use = {PLANES: 0} | {op.output: k for k, op in steps}
     last_use |= {name: k for k, op in steps for name in op.inputs}
+    # The result is read after the last operation, when `run` copies it to `out`.
     last_use[CORRECTION] = len(steps)
     number = {PLANES: 0}
     buffers = [sizes[PLANES]]
@@ -28,6 +34,7 @@ def share_buffers(core: IntCore, sizes: Mapping[str, int]) -> tuple[dict[str, in
         chosen = _choose(op, ending, free, buffers, sizes[op.output])
         number[op.output] = chosen
         free |= ending | {chosen}
+        # A result that nothing reads leaves its buffer free at once.
         if last_use[op.output] > k:
             free.remove(chosen)
     return number, buffers
@@ -36,12 +43,19 @@ def share_buffers(core: IntCore, sizes: Mapping[str, int]) -> tuple[dict[str, in
 def _choose(
     op: IntConv | Op, ending: set[int], free: set[int], buffers: list[int], size: int
 ) -> int:
-    """Return the number of the buffer for a result of `size` bytes, and make it large enough.
+    """Return the number of the buffer for a result, and make the buffer large enough.
 
     1. An operation that works value by value writes over an input that nothing reads later.
     2. Others take the smallest free buffer that is large enough,
     3. or else enlarge the largest free one,
     4. or else add one.
+
+    Args:
+        op: the operation that writes the result.
+        ending: buffers of its inputs that no later operation reads.
+        free: buffers that hold no tensor which is read from here on.
+        buffers: the sizes of all buffers in bytes, which are extended in place.
+        size: of the result in bytes.
     """
     if isinstance(op, IN_PLACE) and ending:
         return min(ending)

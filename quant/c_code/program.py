@@ -83,7 +83,16 @@ def c_program(core: IntCore, tile_px: int, title: str) -> str:
 
 
 def _shapes(core: IntCore, tile_px: int) -> dict[str, Shape]:
-    """Return channels, rows and columns of all tensors, the planes first."""
+    """Return the shape of every tensor, without the batch.
+
+    Args:
+        core: the integer core.
+        tile_px: side of the tile of the image in pixels.
+
+    Returns:
+        Channels, rows and columns by name, the planes first and then in the order of the
+        operations.
+    """
     graph = board_model(core, {}, tile_px).graph
     values = (*graph.value_info, *graph.output, *graph.input)
     sizes = {
@@ -94,6 +103,9 @@ def _shapes(core: IntCore, tile_px: int) -> dict[str, Shape]:
 
 
 def _run(writer: LayerWriter) -> str:
+    """Return the C function `run`, which converts the planes, calls every layer and stores the
+    result.
+    """
     lines = [
         f"from_planes(in, {writer.maps[PLANES]});",
         *writer.calls,

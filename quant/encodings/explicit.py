@@ -34,8 +34,11 @@ def made_explicit(model: onnx.ModelProto, texts: dict[str, str]) -> onnx.ModelPr
     """Return a model that computes the same, and states attributes, shapes and its producer.
 
     Args:
-        model: of ONNX's own operators.
+        model: of ONNX's own operators. Its attributes and descriptions are changed in place.
         texts: descriptions of the graph, its inputs and outputs, by their names.
+
+    Returns:
+        A model with the shape of every tensor that ONNX can infer.
     """
     opset = opset_of(model)
     for node in model.graph.node:
@@ -47,7 +50,15 @@ def made_explicit(model: onnx.ModelProto, texts: dict[str, str]) -> onnx.ModelPr
 
 
 def implicit_parts(model: onnx.ModelProto) -> dict[str, list[str]]:
-    """Return what a file leaves open, by the profile's rule: names of nodes and tensors."""
+    """Return what a model leaves implicit, by the rule of the profile that forbids it.
+
+    Args:
+        model: any ONNX model.
+
+    Returns:
+        For each rule the names of the nodes, tensors or operators that do not comply; an empty list
+        if all of them do.
+    """
     graph = model.graph
     opset = opset_of(model)
     ends = [*graph.input, *graph.output]
@@ -74,7 +85,12 @@ def implicit_parts(model: onnx.ModelProto) -> dict[str, list[str]]:
 
 
 def _defaults(node: onnx.NodeProto, opset: int) -> Iterator[onnx.AttributeProto]:
-    """Yield the attributes that a node leaves to their defaults."""
+    """Yield the attributes that a node leaves to their defaults.
+
+    Args:
+        node: any node. One that ONNX does not define has no known defaults.
+        opset: of the model, because defaults depend on it.
+    """
     stated = {attribute.name for attribute in node.attribute}
     if not onnx.defs.has(node.op_type, node.domain):
         return

@@ -21,7 +21,13 @@ BETWEEN = {"Conv", "LeakyRelu", "PRelu", "Relu"}
 def shrinking(graph: OnnxGraph, node: Node) -> list[Node]:
     """Return the nodes in front of a Resize that attention has, the strided convolution first.
 
-    Empty if the node is something else.
+    Args:
+        graph: that the node belongs to.
+        node: any node.
+
+    Returns:
+        The convolution of stride 2, the maximum of stride 3 and the nodes in front of the Resize;
+        empty if the node is something else.
     """
     nodes: list[Node] = []
     writer = _writer(graph, node.inputs[0]) if node.op_type == "Resize" else None
@@ -32,6 +38,7 @@ def shrinking(graph: OnnxGraph, node: Node) -> list[Node]:
         return []
     pool = nodes[0]
     weight = graph.value(writer, 1)
+    # The pads and strides that `aligned` writes fit these kernels and strides only.
     is_known = (
         writer.op_type == "Conv"
         and weight is not None
@@ -52,11 +59,14 @@ def _writer(graph: OnnxGraph, name: str) -> Node | None:
 
 
 def aligned(graph: OnnxGraph, node: Node) -> dict[Node, list[Node]]:
-    """Return the nodes that take the place of a Resize and of what shrinks; none of another node.
+    """Return the nodes that take the place of a Resize and of what shrinks in front of it.
 
     Args:
         graph: that the node belongs to; its constants are extended.
         node: any node.
+
+    Returns:
+        The new nodes of each replaced one; empty if the node is no Resize of attention.
     """
     nodes = shrinking(graph, node)
     if not nodes:

@@ -56,26 +56,39 @@ class BitSlices:
         return planes.min(1).tolist(), planes.max(1).tolist()
 
     def encode(self, image: np.ndarray) -> np.ndarray:
-        """Encode an image (N, C, H, W), at most 1 in size, as planes (N, planes C, H, W) int8.
+        """Encode an image as planes.
 
-        All channels of a plane come before the next plane.
+        Args:
+            image: (N, C, H, W) in shares of full scale. Values outside [0, 1], or outside [-1, 1]
+                if `signed`, are clipped.
+
+        Returns:
+            Planes (N, planes C, H, W) int8. All channels of a plane come before the next plane.
         """
         dn = np.clip(np.rint(image * np.float32(MAX_DN)), self.lowest_dn, MAX_DN) - self.middle
         # Full scale rounds to 128 steps, one more than int8 holds, so the remainder holds more.
         coarse = np.minimum(np.rint(dn / self.step), COARSE_MAX)
+        # dn = step coarse + remainder holds exactly, because all three are small integers.
         remainder = dn - self.step * coarse
         planes = [*[coarse] * self.coarse_planes, remainder, np.rint(remainder / self.part)]
         return np.concatenate(planes, axis=1).astype(np.int8)
 
     def write(self, w: HostWriter, image: str) -> None:
-        """Write the nodes that encode the tensor `image` as `ENCODED`."""
+        """Write the nodes that encode the tensor `image` as `ENCODED`.
+
+        Args:
+            w: gets the nodes.
+            image: name of a tensor (N, C, H, W) in shares of full scale.
+        """
         max_dn = w.scalar("max_dn", MAX_DN)
         scaled = w.node("Mul", "host_front.scale", [image, max_dn])
+        # ONNX's Round rounds ties to even as np.rint does, so the file agrees with `encode`.
         whole = w.node("Round", "host_front.round", [scaled])
         lowest = w.scalar("lowest_dn" if self.signed else "zero", self.lowest_dn)
         dn = w.node("Clip", "host_front.dn", [whole, lowest, max_dn])
         if self.middle:
             dn = w.node("Sub", "host_front.centred", [dn, w.scalar("middle", self.middle)])
+        # Step and part are powers of two, so multiplying by the inverse is as exact as dividing.
         steps = w.node("Mul", "host_front.steps", [dn, w.scalar("one_step", 1 / self.step)])
         rounded = w.node("Round", "host_front.whole_steps", [steps])
         most = w.scalar("coarse_max", COARSE_MAX)
@@ -121,7 +134,12 @@ class Direct:
         return np.clip(np.rint(image * 2.0**PLANES_FRAC_BITS), -128, 127).astype(np.int8)
 
     def write(self, w: HostWriter, image: str) -> None:
-        """Write the nodes that store the tensor `image`."""
+        """Write the nodes that store the tensor `image` as `ENCODED`.
+
+        Args:
+            w: gets the nodes.
+            image: name of a tensor of multiples of 1/128.
+        """
         scaled = w.node(
             "Mul", "host_front.scale", [image, w.scalar("units", 2.0**PLANES_FRAC_BITS)]
         )

@@ -61,7 +61,13 @@ class HostPart:
     def of(
         cls, network: SplitNetwork, decoding: OutputDecoding, input_ranges: Ranges = ()
     ) -> "HostPart":
-        """Return the host's part of a float network that reads the image, for a decoding."""
+        """Return the host's part of a float network that reads the image.
+
+        Args:
+            network: the float network, split into its core and what the host computes.
+            decoding: of the core's result.
+            input_ranges: of the image's channels; empty where all are in [0, 1].
+        """
         channels = network.core_channels
         return cls(
             channels,
@@ -119,7 +125,15 @@ class HostPart:
         return math.prod(shuffle.block for shuffle in self.back)
 
     def encode(self, image: np.ndarray) -> np.ndarray:
-        """Encode an image (N, C, H, W), in the network's units, as the core's planes, int8."""
+        """Encode an image as the core's planes.
+
+        Args:
+            image: (N, C, H, W) in the network's units. Sides are multiples of `place_px`.
+
+        Returns:
+            Planes (N, P, H', W') int8, with P as in `planes`; H' and W' count places of `place_px`
+            pixels, those of the mirrored border included.
+        """
         if self.border_px:
             image = np.pad(image, ((0, 0), (0, 0), *[(self.border_px,) * 2] * 2), "reflect")
         for shuffle in self.front:
@@ -129,19 +143,43 @@ class HostPart:
         return self.encoding.encode(image)
 
     def decode(self, result: np.ndarray, scale: float) -> np.ndarray:
-        """Decode the core's result, multiples of `scale`, in shares of full scale (N, C, H, W)."""
+        """Decode the core's result.
+
+        Args:
+            result: (N, copies C, H, W) float32, multiples of `scale`.
+            scale: the value of one unit of the result.
+
+        Returns:
+            The decoded result (N, C, H, W), in shares of full scale.
+        """
         return np.asarray(self.decoding.decode(result, scale) * np.float32(self.unit))
 
     def unrounded(self, result: np.ndarray) -> np.ndarray:
-        """Decode a float result (N, copies C, H, W), in which no copy is rounded or clipped."""
+        """Decode a float result, in which no copy is rounded or clipped, so that the first one
+        suffices.
+
+        Args:
+            result: (N, copies C, H, W) of a float network.
+        """
         return result[:, : self.outputs] * np.float32(self.decoding.gains[0])
 
     def restore(self, image: np.ndarray, result: np.ndarray, scale: float) -> np.ndarray:
-        """Return the restored image of an image (N, C, H, W) and the core's result."""
+        """Return the restored image.
+
+        Args:
+            image: (N, C, H, W) in the network's units.
+            result: the core's result (N, copies C, H', W') float32, multiples of `scale`.
+            scale: the value of one unit of the result.
+        """
         return self.finish(image, self.decode(result, scale))
 
     def finish(self, image: np.ndarray, decoded: np.ndarray) -> np.ndarray:
-        """Return the restored image of an image (N, C, H, W) and a decoded result."""
+        """Return the restored image of an image and a decoded result.
+
+        Args:
+            image: (N, C, H, W) in the network's units.
+            decoded: (N, C', H', W') before the pixel shuffles of `back`.
+        """
         result = decoded
         for shuffle in self.back:
             result = shuffle(result)
@@ -151,9 +189,14 @@ class HostPart:
         return result
 
     def correction_of(self, image: np.ndarray, restored: np.ndarray) -> np.ndarray:
-        """Return the decoded result from which `finish` makes this restored image, if not clipped.
+        """Return the decoded result from which `finish` makes a restored image, if it does not
+        clip.
 
         It is the inverse of `finish`, from its last step to its first.
+
+        Args:
+            image: (N, C, H, W) in the network's units.
+            restored: the restored image, of the size that `finish` returns.
         """
         result = restored
         for shuffle in reversed(self.last):
@@ -177,7 +220,11 @@ class HostPart:
         return self.limits or (UNIT if adds_unit else ())
 
     def write_front(self, w: HostWriter) -> None:
-        """Write the nodes in front of the core, from the image to planes in uint8."""
+        """Write the nodes in front of the core, from the image to planes in uint8.
+
+        Args:
+            w: gets the nodes.
+        """
         image = IMAGE
         channels = self.image_channels
         if self.border_px:
@@ -191,6 +238,7 @@ class HostPart:
             factors = w.constant("input_factors", (1 / self.full_scale)[None, :, None, None])
             image = w.node("Mul", "host_front.shares", [image, factors])
         self.encoding.write(w, image)
+        # The planes are int8 values stored as uint8 with the zero point ZERO.
         w.node("Add", "host_front.offset", [ENCODED, w.scalar("offset", ZERO)])
         w.node("Cast", PLANES, ["host_front.offset"], to=TensorProto.UINT8)
 
@@ -227,7 +275,12 @@ class HostPart:
 
 
 def image_encoding(margin_px: int, input_ranges: Ranges) -> InputEncoding:
-    """Return the encoding of a network that reads the image itself, of these ranges."""
+    """Return the encoding of a network that reads the image itself.
+
+    Args:
+        margin_px: the pixels by which the image must at least be mirrored beyond its borders.
+        input_ranges: of the image's channels. If one has values below 0, the encoding is signed.
+    """
     signed = any(low < 0 for low, _ in input_ranges)
     return replace(IMAGE_SLICES, margin_px=margin_px, signed=signed)
 

@@ -54,7 +54,13 @@ NEAR = 0.49
 
 
 def to_int8(values: Tensor, low: int = INT8_MIN, high: int = INT8_MAX) -> Tensor:
-    """Round, ties to even, and clip; the slope is 1, and 0 where it is clipped."""
+    """Round, ties to even, and clip; the slope is 1, and 0 where it is clipped.
+
+    Args:
+        values: float32 in units of the result.
+        low: the smallest integer of the result.
+        high: the largest integer of the result.
+    """
     # hardtanh has slope 0 outside its limits, so a value must pass as long as it rounds to an end.
     clipped = functional.hardtanh(values, low - NEAR, high + NEAR)
     # Rounding `data` is unseen by autograd: backwards it counts as the identity.
@@ -102,7 +108,9 @@ class TrainableCore(torch.nn.Module):
         return replace(self._core, ops=tuple(ops), host_part=host_part)
 
     def with_finer_tensors(self, names: Collection[str], by: int) -> "TrainableCore":
-        """Return a copy in which these tensors have `by` more fractional bits."""
+        """Return a copy in which these tensors have `by` more fractional bits, or fewer if it is
+        negative.
+        """
         copy = deepcopy(self)
         frac_bits = self._core.frac_bits
         finer = {name: frac_bits[name] + by for name in names}
@@ -111,7 +119,12 @@ class TrainableCore(torch.nn.Module):
         return copy
 
     def with_finer_weights(self, number: int, by: int) -> "TrainableCore":
-        """Return a copy in which the weights of a convolution have `by` more fractional bits."""
+        """Return a copy in which the weights of a convolution have `by` more fractional bits.
+
+        Args:
+            number: place of the convolution among the core's convolutions.
+            by: fractional bits to add; negative ones make the weights coarser.
+        """
         copy = deepcopy(self)
         op = self._convs[number]
         copy._convs[number] = replace(op, weight_frac_bits=op.weight_frac_bits + by)
@@ -167,11 +180,14 @@ class TrainableCore(torch.nn.Module):
 
 
 def _whole(values: Tensor) -> np.ndarray:
+    """Return parameters as the int8 integers that they round to."""
     return np.asarray(to_int8(values.detach()).numpy().astype(np.int8))
 
 
 def _products(op: IntConv, image: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """Return the sums of a convolution."""
+    """Return the sums of a convolution with zero padding, as floats that autograd can
+    differentiate.
+    """
     window = op.window
     top, left, bottom, right = window.pads
     # torch pads both sides alike; only the surplus of one side costs a copy of the image.
@@ -230,17 +246,20 @@ def _add(op: Add, inputs: Sequence[Tensor], bits: Bits) -> Tensor:
 
 
 def _mul(op: Mul, inputs: Sequence[Tensor], bits: Bits) -> Tensor:
+    """Multiply two tensors; their fractional bits add up, and the product is rounded once."""
     unit = 2.0 ** (bits[op.output] - sum(bits[name] for name in op.inputs))
     return to_int8(inputs[0] * inputs[1] * unit + _lift() * unit)
 
 
 def _max_pool(op: MaxPool, inputs: Sequence[Tensor], _: Bits) -> Tensor:
+    """Return the largest value of each window, which is an integer already."""
     # No int8 value is below -128, so the padding never rises above one.
     wide = _padded(inputs[0], op.window, INT8_MIN)
     return functional.max_pool2d(wide, op.kernel, op.window.strides, 0, op.window.dilations)
 
 
 def _average_pool(op: AveragePool, inputs: Sequence[Tensor], _: Bits) -> Tensor:
+    """Return the mean of each window as the DPU computes it, padded zeros included."""
     assert op.kernel is not None  # noqa: S101 - resolved before anything is quantised
     # The DPU multiplies a window's sum by m / 2^s; torch's own divisor would give other results.
     factor, shift = mean_factor(op.kernel)
@@ -250,6 +269,7 @@ def _average_pool(op: AveragePool, inputs: Sequence[Tensor], _: Bits) -> Tensor:
 
 
 def _padded(image: Tensor, window: Window, fill: float = 0.0) -> Tensor:
+    """Pad an image (N, C, H, W) by the pads of a window with one value."""
     top, left, bottom, right = window.pads
     return (
         functional.pad(image, (left, right, top, bottom), value=fill) if any(window.pads) else image
@@ -257,6 +277,7 @@ def _padded(image: Tensor, window: Window, fill: float = 0.0) -> Tensor:
 
 
 def _resize(op: Resize, inputs: Sequence[Tensor], _: Bits) -> Tensor:
+    """Enlarge by repeating pixels, which is exact, or bilinearly, which is rounded."""
     image = inputs[0]
     if not op.bilinear:
         return functional.interpolate(image, scale_factor=op.factor, mode="nearest")
@@ -268,6 +289,7 @@ def _resize(op: Resize, inputs: Sequence[Tensor], _: Bits) -> Tensor:
 
 
 def _shuffle(op: Shuffle, inputs: Sequence[Tensor], _: Bits) -> Tensor:
+    """Move values as a pixel shuffle or its inverse does."""
     # The operation itself says where each value goes; gathering has the inverse as its slope.
     count, *shape = inputs[0].shape
     order = np.asarray(op(np.arange(math.prod(shape)).reshape(1, *shape)))
@@ -348,6 +370,12 @@ def _window_bias(one: IntConv, decoding: OutputDecoding) -> np.ndarray:
 
 
 def _moved(copies: np.ndarray, shares: np.ndarray, move: np.ndarray) -> np.ndarray:
-    """Move copies, which lie one behind the other, each by its share, in integers."""
+    """Move copies, which lie one behind the other, each by its share, in integers.
+
+    Args:
+        copies: int8 numbers of all copies, the copies' channels in the first axis.
+        shares: (copies,) the share of the move that each copy makes.
+        move: the change of the copy that was trained.
+    """
     moves = np.rint(np.multiply.outer(shares, move)).reshape(copies.shape)
     return np.asarray(np.clip(copies + moves, INT8_MIN, INT8_MAX), np.int8)

@@ -93,7 +93,15 @@ class Sample:
     weight: float
 
     def error(self, correction: Tensor) -> Tensor:
-        """Return the mean squared errors of a correction, added up and weighted."""
+        """Return the weighted error of a correction, which autograd can differentiate.
+
+        Args:
+            correction: (1, C, H', W') in the unit of `floats`.
+
+        Returns:
+            The mean squared difference from the float network's correction, plus that from the
+            reference if there is one, times `weight`.
+        """
         error = (correction - self.floats).square().mean()
         if self.reference is not None:
             error = error + _inner_error(correction, self.reference)
@@ -103,14 +111,20 @@ class Sample:
 def finetune(
     core: IntCore, full: Graph, tuning: Tuning, shifts: Shifts = SHIFTS
 ) -> tuple[IntCore, int]:
-    """Return the core with the integers and scales that erred least on held-out pairs, and the
-    steps taken.
+    """Train the integers and scales of a core.
 
     Args:
-        core: to start from; it comes back as it is if training finds nothing better.
+        core: the core to start from.
         full: the float network that reads all planes.
-        tuning: on what, how long, how fast.
-        shifts: the windows of the target.
+        tuning: the training pairs, the number of steps and the learning rate.
+        shifts: the shift windows of the target.
+
+    Returns:
+        The core that erred least on held-out pairs, which is `core` itself if training finds
+        nothing better, and the number of steps taken.
+
+    Raises:
+        ImageError: a reference of another size than the network's result.
     """
     # 1.
     samples = list(_samples(core.host_part, full, tuning))
@@ -160,13 +174,25 @@ def descend(
     highest_rate: float,
     generator: torch.Generator,
 ) -> Iterator[int]:
-    """Train by Adam for a round; yield the steps that are left, before the first and after each.
+    """Train by Adam for a round.
 
-    The rate of learning falls to 0 as a half cosine: while it is high, numbers turn to and fro at
-    the thresholds of their rounding, and no judgement is of use.
+    The learning rate falls to 0 as a half cosine. While it is high, parameters cross the thresholds
+    of their rounding to and fro, so that a judgement of the rounded core would mean little.
+
+    Args:
+        trainable: the core, whose parameters are changed in place.
+        samples: what it is trained on; each step draws some of them with replacement.
+        steps: the number of gradient steps.
+        highest_rate: the learning rate of the first step, in units of each number's scale.
+        generator: draws the samples.
+
+    Yields:
+        The number of steps that are left, before the first step and after each.
     """
     # Without references errors and gradients are small: Adam's eps must be smaller still.
     optimizer = torch.optim.Adam(trainable.parameters(), eps=1e-15)
+    # The number of samples follows from their size, so that a step costs about the same for any
+    # size.
     batch = max(BATCH_PIXELS // math.prod(samples[0].planes.shape[2:]), 1)
     yield steps
     for taken in range(steps):
@@ -182,7 +208,15 @@ def descend(
 
 
 def loss_of(core: IntCore, samples: Sequence[Sample]) -> float:
-    """Return the mean error of a core, as the host computes it, beyond the float network's own."""
+    """Return the mean error of a core in excess of the float network's own error.
+
+    Args:
+        core: a core, run as the host runs it in an INT8 file.
+        samples: the samples that judge it.
+
+    Returns:
+        The mean of the weighted squared errors, less the mean for the float network's corrections.
+    """
     # Samples are corrections, so the host must stop once it has decoded the copies.
     host_part = replace(core.host_part, back=(), adds_image=False, last=(), limits=())
     session = open_session(host_model(replace(core, host_part=host_part), {}))
@@ -193,6 +227,16 @@ def loss_of(core: IntCore, samples: Sequence[Sample]) -> float:
 
 
 def _samples(host_part: HostPart, full: Graph, tuning: Tuning) -> Iterator[Sample]:
+    """Yield a sample for each pair: its planes, and the corrections that the core should compute.
+
+    Args:
+        host_part: encodes images and turns restored images into corrections.
+        full: the float network that reads all planes.
+        tuning: the pairs, and the original network if there is one.
+
+    Raises:
+        ImageError: a reference of another size than the network's result.
+    """
     session = open_session(graph_to_onnx(full, [CORRECTION], host_part.planes))
     original = None if tuning.original is None else open_any_size(tuning.original)
     for image, reference in tuning.pairs:
@@ -225,7 +269,15 @@ LEAST_ERROR = 1e-9
 
 
 def _inner_error(result: Tensor, target: Tensor) -> Tensor:
-    """Return the mean squared error, but for a border that no network could restore."""
+    """Return the mean squared error without the border, which no network could restore.
+
+    Args:
+        result: a correction (1, C, H', W').
+        target: the correction that it should be, of the same shape.
+
+    Returns:
+        A tensor of one number. A small result is compared as a whole.
+    """
     # In a small result the border would be most of it.
     border_px = BORDER_PX if min(result.shape[2:]) >= 4 * BORDER_PX else 0
     height, width = result.shape[2:]

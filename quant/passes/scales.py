@@ -29,13 +29,18 @@ logger = logging.getLogger(__name__)
 def with_better_scales(
     trainable: TrainableCore, graph: Graph, shifts: Shifts, loss_of: Callable[[IntCore], float]
 ) -> TrainableCore:
-    """Return the core with the scales moved that let it err less.
+    """Return the core with those scales moved by one bit that reduce its error.
+
+    A move that reduces the error is kept before the next one is tried, so that moves add up.
 
     Args:
         trainable: a core in training.
         graph: the float network of the same operations.
-        shifts: the windows of the target.
-        loss_of: the error of a core.
+        shifts: the shift windows of the target. A move that leaves them is not tried.
+        loss_of: returns the error of a core; smaller is better.
+
+    Returns:
+        The core with the least error found; `trainable` itself if no move reduces it.
     """
     least = loss_of(trainable.core())
     tried = 0
@@ -63,11 +68,22 @@ def with_better_scales(
 
 
 def _moves(core: IntCore, graph: Graph) -> Iterator[Callable[..., TrainableCore]]:
-    """Yield what moves each scale of a core by some fractional bits."""
+    """Yield a function for each scale that may move.
+
+    Args:
+        core: the integer core whose scales are moved.
+        graph: the float network of the same operations, which knows the activations.
+
+    Yields:
+        Functions of a `TrainableCore` and of `by`, the fractional bits to add. Each returns a
+        changed copy.
+    """
     # 1.
     links: list[tuple[str, ...]] = [(name,) for name in core.frac_bits]
     for op in core.ops:
         names = (*op.inputs, op.output)
+        # An add of one scale shifts nothing, so it loses no bit. Moving one of its tensors would
+        # end that.
         exact = isinstance(op, Add) and len({core.frac_bits[name] for name in names}) == 1
         if exact or ties_scales(op):
             links.append(names)
@@ -89,8 +105,14 @@ def _moves(core: IntCore, graph: Graph) -> Iterator[Callable[..., TrainableCore]
 
 
 def moved(core: IntCore, other: IntCore) -> int:
-    """Return how many tensors, weights and biases included, have other scales in another form of a
-    core.
+    """Return the number of scales that differ between two forms of a core.
+
+    Args:
+        core: a core.
+        other: the same core, maybe with other scales.
+
+    Returns:
+        The number of tensors, weights and biases that have another number of fractional bits.
     """
     count = sum(core.frac_bits[name] != other.frac_bits[name] for name in core.frac_bits)
     for one, another in zip(core.convolutions, other.convolutions, strict=True):

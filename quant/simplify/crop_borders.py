@@ -31,9 +31,11 @@ def convolve_crop(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | 
         return None
     border_px = {2: 0, 3: 0}
     for axis, start, end in zip(axes, starts, ends, strict=True):
+        # A window without padding cuts as much at either side, so both cuts must be equal.
         if axis % 4 not in border_px or start <= 0 or end not in (-start, size[axis] - start):
             return None
         border_px[axis % 4] = start
+    # Dilated by the border, a kernel of three shortens the map by the border on either side.
     kernel = [3 if px else 1 for px in border_px.values()]
     weight = np.zeros((size[1], 1, *kernel))
     weight[:, :, kernel[0] // 2, kernel[1] // 2] = 1

@@ -100,6 +100,9 @@ def _sized(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> l
         graph: that the node belongs to; its constants are extended.
         node: any node.
         sizes: of each tensor, for the images that are tried.
+
+    Returns:
+        The nodes with the same result; None if the node stays.
     """
     source = node.inputs[0] if node.inputs else ""
     before = sizes.get(source, ())
@@ -133,21 +136,26 @@ def _sized(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> l
 def _unshuffled(
     graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]
 ) -> list[Node] | None:
-    """Return the pixel unshuffle that ends in a Reshape; None if it ends none of one channel.
+    """Return the pixel unshuffle that ends in a Reshape.
 
     Args:
         graph: that the node belongs to.
         node: a Reshape, or another operator that moves no value.
         sizes: of each tensor, for the images that are tried.
+
+    Returns:
+        A SpaceToDepth of the image; None if the nodes are no pixel unshuffle of one channel.
     """
 
     def before_reshapes(name: str) -> str:
+        """Return the tensor that operators which move no value turn into this one."""
         writer = graph.sole_writer(name)
         while writer is not None and writer.op_type in RESHAPING:
             name = writer.inputs[0]
             writer = graph.sole_writer(name)
         return name
 
+    # A pixel unshuffle is a Reshape to (N, C, H, r, W, r), this transposition and another Reshape.
     moved = graph.sole_writer(before_reshapes(node.inputs[0]))
     if moved is None or moved.attributes.get("perm") != [0, 1, 3, 5, 2, 4]:
         return None
@@ -186,6 +194,7 @@ def _with_written_maps(
     names = {}
     for number, (name, value) in enumerate(maps.items()):
         names[name] = f"{node.outputs[0]}.constant_{number}"
+        # With weights of zero the result is the bias alone, in the size of the map that is read.
         weight = np.zeros((value.shape[1], before[1], 1, 1))
         inputs = [
             source,
@@ -198,7 +207,14 @@ def _with_written_maps(
 
 
 def _content(model: onnx.ModelProto) -> tuple[list[bytes], dict[str, bytes]]:
-    """Return all that a network computes with: its nodes and its constants."""
+    """Return what a network computes with, in a form that can be compared.
+
+    Args:
+        model: the network. Serialization is deterministic, so equal networks give equal bytes.
+
+    Returns:
+        The bytes of its nodes in order, and those of its constants by name.
+    """
     nodes = [node.SerializeToString(deterministic=True) for node in model.graph.node]
     constants = {
         tensor.name: tensor.SerializeToString(deterministic=True)

@@ -27,7 +27,16 @@ def is_large(shape: tuple[int, ...]) -> bool:
 
 
 def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Return the parts of a convolution of a large kernel, and their sum; None for any other."""
+    """Return the parts of a convolution with a large kernel, and their sum.
+
+    Args:
+        graph: that the node belongs to; its constants are extended.
+        node: any node.
+
+    Returns:
+        A convolution for each part, their Concat and the convolution that sums them; None if the
+        node is no convolution that is split.
+    """
     if node.op_type != "Conv" or not is_convolution(graph, node):
         return None
     weight = graph.constants[node.inputs[1]]
@@ -36,6 +45,7 @@ def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
     one_group = node.attributes.get("group", 1) == 1
     if not (is_large(weight.shape) and states_pads and one_group and columns <= MOST_POSITIONS):
         return None
+    # A part may have MOST_POSITIONS // columns rows, so this is the least number of parts.
     step = -(-rows // (MOST_POSITIONS // columns))
     pads = node.attributes.get("pads", [0, 0, 0, 0])
     dilations = node.attributes.get("dilations", [1, 1])
@@ -44,6 +54,7 @@ def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
     # 1.
     for first in range(step):
         kernel = weight[:, :, first::step]
+        # The part's last row lies this many rows above the last one of the whole kernel.
         behind = (rows - 1 - first) % step
         part_pads = [
             pads[0] - first * dilations[0],
@@ -65,6 +76,7 @@ def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
             Node.new("Conv", [node.inputs[0], constant], part_name, part_name, **attributes)
         )
     # 2.
+    # The bias is added once, by the convolution that sums, so the parts have none.
     joined = Node.new(
         "Concat", [part.outputs[0] for part in parts], f"{name}.rows", f"{name}.rows", axis=1
     )
