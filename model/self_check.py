@@ -148,6 +148,9 @@ class SelfCheck:
             down: where the rows lie, and which are kept; the kept ones begin at a multiple of
                 BLOCK_PX.
             across: where the columns lie, likewise.
+
+        Returns:
+            The figures of the blocks of the kept pixels, (n, m) each.
         """
         missing = np.isnan(raw) | np.isnan(restored)
         # Only far tails of the kernel see the filling, because pixels near it do not count.
@@ -163,6 +166,8 @@ class SelfCheck:
         counts = self._counts(raw, missing, down, across)[kept]
         y = np.where(counts, raw[kept], 0)
         dark, growth, square = self.variances
+        # The variance is taken at the light of H x. The noise of y is in the residual as well, so
+        # that its own light would bias the quotient.
         light = np.maximum(blurred - self.offset, 0)
         variance = dark + growth * light + square * light**2
         pixels = _block_sums(counts)
@@ -174,20 +179,34 @@ class SelfCheck:
     def _counts(
         self, raw: Image, missing: NDArray[np.bool_], down: Placed, across: Placed
     ) -> NDArray[np.bool_]:
-        """Return which pixels count, (h, w)."""
+        """Return which pixels count, (h, w).
+
+        Args:
+            raw: y, (h, w) pixel values.
+            missing: the pixels that are missing in y or x.
+            down: where the rows lie in the image.
+            across: where the columns lie in the image.
+        """
         unknown = missing | (raw >= self.full_scale)
         reached = unknown
         if unknown.any():
             reached = maximum_filter(unknown, 2 * NEAR_PX + 1, mode="constant")
         inside = []
         for placed, side in zip((down, across), raw.shape, strict=True):
+            # Only the image's own border is left out, so that tiles give the same figures as the
+            # whole image.
             places = np.arange(placed.start, placed.start + side)
             inside.append((places >= NEAR_PX) & (places < placed.size_px - NEAR_PX))
         return np.asarray(~reached & inside[0][:, None] & inside[1])
 
 
 def _beyond(placed: Placed, side: int) -> tuple[int, int]:
-    """Return the pixels of the kernel's reach that lie beyond the image, before and after it."""
+    """Return the pixels of the kernel's reach that lie beyond the image, before and after it.
+
+    Args:
+        placed: where an array lies along one side of the image, and which of its pixels are kept.
+        side: the number of the array's pixels along that side.
+    """
     before = REACH_PX - (placed.keep_start - placed.start)
     return before, REACH_PX - (placed.start + side - placed.keep_stop)
 
@@ -223,7 +242,14 @@ def _filled(pixels: Image, missing: NDArray[np.bool_]) -> Image:
 
 
 def _block_sums(values: NDArray[np.generic]) -> Array:
-    """Return the sums over blocks of BLOCK_PX; the last ones may be narrower."""
+    """Return the sums over blocks of BLOCK_PX pixels a side; the last ones may be narrower.
+
+    Args:
+        values: (h, w), of any type that float64 holds.
+
+    Returns:
+        The sums (n, m) float64, because float32 would lose digits in a block of 4096 pixels.
+    """
     down, across = (np.arange(0, side, BLOCK_PX) for side in values.shape)
     sums = np.add.reduceat(values, down, axis=0, dtype=np.float64)
     return np.asarray(np.add.reduceat(sums, across, axis=1))

@@ -44,7 +44,13 @@ UNITS = {1: S["unit"], **{int(factor): unit for factor, unit in S["exposures"].i
 
 
 def shuffled(x: np.ndarray, r: int, up: bool) -> np.ndarray:
-    """Move pixels (1, C, H, W) into r^2 times the channels; `up`, back."""
+    """Move squares of r x r pixels into the channels, or back.
+
+    Args:
+        x: (1, C, H, W); sides are multiples of r unless `up`.
+        r: the side of a square in pixels.
+        up: if True, move channels back into pixels: (1, C / r^2, r H, r W).
+    """
     _, c, h, w = x.shape
     if up:
         c = c // r**2
@@ -55,7 +61,12 @@ def shuffled(x: np.ndarray, r: int, up: bool) -> np.ndarray:
 
 
 def encoded(image: np.ndarray) -> np.ndarray:
-    """Encode a tile as the core's planes, in multiples of 1/128: coarse steps, remainder, part."""
+    """Encode a tile (1, C, h, w) as the core's planes: coarse steps, remainder and part.
+
+    Returns:
+        Planes (1, P, h', w') float32 in multiples of 1/128, because the core reads int8 at that
+        scale.
+    """
     wide = np.pad(image, ((0, 0), (0, 0), *[(S["border_px"],) * 2] * 2), "reflect")
     places = shuffled(wide, S["front"], up=False)
     shares = places * np.array(S["input_factors"], F)[:, None, None]
@@ -72,7 +83,7 @@ def plain(value: np.ndarray) -> np.ndarray:
 
 
 def fits(fine: np.ndarray) -> np.ndarray:
-    """Return where a fine copy is not clipped."""
+    """Return a mask of the values of a fine copy that are not clipped."""
     return np.asarray(np.abs(fine) <= F(S["fine_max"]))
 
 
@@ -108,7 +119,13 @@ DECODINGS: dict[str, Any] = {
 
 
 def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
-    """Restore a tile (1, C, h, w) by one core: encode it, decode the result, and add both."""
+    """Restore a tile by one core: encode it, decode the result, and add both.
+
+    Args:
+        image: the tile (1, C, h, w) float32.
+        run: computes the core's result (1, copies C', h', w') from the planes.
+        unit: the share of full scale that is 1 in the decoded result.
+    """
     copies = np.split(run(encoded(image)), S["copies"], 1)
     value = shuffled(DECODINGS[S["decoding"]](*copies), S["back"], up=True) * F(unit)
     if S["adds_image"]:
@@ -119,8 +136,11 @@ def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
 
 
 def exposed(factor: int, image: np.ndarray, run: Any) -> np.ndarray:
-    """Multiply the light of a tile by a factor, restore the tile by the core of that factor, and
-    divide it again.
+    """Restore a tile at the exposure of a factor.
+
+    1. Multiply the light of the tile by the factor. The dark offset is no light and stays.
+    2. Restore the tile by the core of that factor.
+    3. Divide the light again.
     """
     if factor == 1:
         return restored(image, run, UNITS[1])
@@ -249,8 +269,12 @@ def extended(x: np.ndarray, margin: int) -> np.ndarray:
 
 
 def summed(x: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """Compute the weighted sum of a window of each block: rows weighted by `row`, columns by
-    `column`.
+    """Compute the weighted sum of a window of each block.
+
+    Args:
+        x: an image (H, W) that reaches beyond the blocks by what the windows need.
+        row: weight of each row of the window.
+        column: weight of each column of the window.
     """
     for weights in (row, column):
         end = x.shape[0] - len(weights) + 1
@@ -294,8 +318,15 @@ def interpolated(blocks: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
-    """Of each tile along a side: where it begins, and the first and last of the pixels that are
-    kept of it.
+    """Return where the tiles along a side lie, so that they overlap by at least two halos.
+
+    Args:
+        size: of the image along the side, in pixels.
+        tile: side of a tile in pixels.
+        halo: pixels at an inner border of a tile that are not kept.
+
+    Returns:
+        For each tile its start, and the start and end (excluded) of its kept pixels, in the image.
     """
     starts = [*range(0, size - tile, tile - 2 * halo), size - tile]
     return [

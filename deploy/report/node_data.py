@@ -11,12 +11,16 @@ GRADIENT = [{"stop": 0, "bgColor": "#ffffff"}, {"stop": 1, "bgColor": "#d73027"}
 
 
 def node_data(layers: Iterable[Row]) -> str:
-    """Return the JSON of one graph: the share of the squared error by the node's name, in percent.
+    """Return the share of the squared error of each node as JSON of one graph.
 
-    The nodes of the float network, of the host's and of the board's file have the layers' names.
+    The nodes of the float network, of the host's and of the board's file have the layers' names, so
+    the same JSON colours all three.
 
     Args:
         layers: rows of layers in int8 by themselves; others are left out.
+
+    Returns:
+        JSON text as Model Explorer reads it, with the shares in percent by the node's name.
     """
     shares = {row.name: row.figures[SHARE].value for row in layers if SHARE in row.figures}
     results = {name: {"value": share} for name, share in shares.items()}

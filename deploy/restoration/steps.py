@@ -38,11 +38,11 @@ OTHER_PIXELS = f"{OFF}: the network makes other pixels or bands"
 
 @dataclass(frozen=True)
 class Around:
-    """Which steps around a network are used where they can be.
+    """The choice of the steps around a network that a run uses where it can.
 
     Attributes:
-        consistency: whether the result is made to agree with the image at low spatial frequencies.
-        exposure: whether dark parts are restored at a higher exposure.
+        consistency: if True, the result is made to agree with the image at low spatial frequencies.
+        exposure: if True, dark parts are restored at a higher exposure.
     """
 
     consistency: bool = True
@@ -53,7 +53,12 @@ BOTH: Around = Around()
 
 
 def exposures_of(network: Network, around: Around) -> Mapping[int, Network]:
-    """Return a network at higher exposures by factor; empty if none is to be used."""
+    """Return the versions of a network for higher exposures, by the factor of the exposure.
+
+    Args:
+        network: a network, with its exposures if it has some.
+        around: the steps that are used. Without exposures the result is empty.
+    """
     return network.exposures if around.exposure else {}
 
 
@@ -70,7 +75,14 @@ class InRange:
     ranges: Ranges
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Run the network, as an `Infer`."""
+        """Run the network on an image in shares of its ranges.
+
+        Args:
+            image: in [0, 1] of the ranges, of the shape that `infer` accepts.
+
+        Returns:
+            The result, also in shares of the ranges.
+        """
         return to_shares(self.infer(from_shares(image, self.ranges)), self.ranges)
 
 
@@ -100,10 +112,16 @@ def exposed_networks(
 
     Args:
         networks: one for all bands or one for each.
-        around: whether higher exposures are used.
+        around: the steps that are used, among them higher exposures.
         tiling: how the networks meet an image.
         full_scale: the pixel value that is 1.0 to a network.
         opened: makes a network ready to run.
+
+    Returns:
+        The networks in the given order. Without exposures a network has the factor 1 alone.
+
+    Raises:
+        ModelError: a network whose ranges were found in samples, so that full scale is not known.
     """
     built = []
     for network in networks:
@@ -120,7 +138,12 @@ def exposed_networks(
 
 
 def offset_of(sensor: Sensor, full_scale: float) -> float:
-    """Return the pixel value of the dark."""
+    """Return the pixel value of the dark.
+
+    Args:
+        sensor: whose middle of the ranges counts.
+        full_scale: the pixel value that is the sensor's largest digital number.
+    """
     instrument = sensor.nominal()
     return instrument.offset_dn * full_scale / instrument.max_dn
 
@@ -132,10 +155,19 @@ def consistency_steps(
     tiling: Tiling,
     full_scale: float,
 ) -> tuple[tuple[Consistency | None, ...], str]:
-    """Build the consistency step, one for all bands or one for each, and say in words whether it is
-    taken.
+    """Build the consistency step, one for all bands or one for each.
 
-    "blind" is the name of no sensor: a band of that name has None.
+    Args:
+        around: the steps that are used.
+        sensors: the sensor of each band. The sensor named "blind" is unknown.
+        raster: the image, whose bands set the order.
+        tiling: how the network meets an image.
+        full_scale: the pixel value that is the largest digital number of a sensor.
+
+    Returns:
+        The steps in the order of the bands, None for a band of an unknown sensor, and a text that
+        states if they are used. No steps are returned if the option is off, no sensor is known, or
+        the network does not return one pixel of the same band for each pixel.
     """
     if not around.consistency:
         return (), OFF
@@ -152,12 +184,18 @@ def consistency_steps(
 
 
 def keeps_pixels(tiling: Tiling) -> bool:
-    """Return True if a network gives one pixel of the same band for each pixel, as the consistency
-    step needs.
+    """Return True if a network returns one pixel of the same band for each pixel.
+
+    The consistency step compares both pixel by pixel.
     """
     return tiling.scale == 1 and tiling.channels_in == tiling.channels_out
 
 
 def step_for(sensor: Sensor, full_scale: float) -> Consistency:
-    """Build the consistency step for the middle of a sensor's ranges and its reference."""
+    """Build the consistency step for the middle of a sensor's ranges and its reference.
+
+    Args:
+        sensor: the sensor that acquired the image.
+        full_scale: the pixel value that is the sensor's largest digital number.
+    """
     return Consistency.of(sensor.nominal(), sensor.reference.nominal(), full_scale)

@@ -93,8 +93,12 @@ class FaultTarget:
 
 
 def make_target(subject: Subject, source: Calibration) -> FaultTarget:
-    """The core as the board stores it, guards that calibration patches teach, and other patches to
-    try it on.
+    """Build what faults are injected into.
+
+    Args:
+        subject: with an INT8 network.
+        source: of the patches. The guards are learnt from some of them. Flips are tried on patches
+            of another seed, so that the guards are not judged on what they were learnt from.
     """
     core = faults.as_stored(subject.core)
     calibration = replace(source, patches=CALIBRATION_PATCHES)
@@ -112,7 +116,7 @@ SETS = ("no guard", "clamped", "all guards")
 
 
 def name_of(memory: str, rate: float) -> str:
-    """The name of the row for a kind of memory and a rate."""
+    """Return the name of the row for a kind of memory and a rate in flips a megabit."""
     return f"{memory}, {rate:g} in a megabit"
 
 
@@ -124,13 +128,13 @@ COSTLY_DB = 0.5
 
 @dataclass(frozen=True)
 class Injection:
-    """What one injection did to a patch.
+    """The effect of one injection on a patch.
 
     Attributes:
         flips: the number of bits.
-        quality: with each set of guards.
-        costly: whether it cost more than COSTLY_DB without a guard, where a block is decidable.
-        detected: whether the self-check finds a block outside its bound, without a guard.
+        quality: PSNR with each set of guards, in dB.
+        costly: True if it cost more than COSTLY_DB without a guard, and some block is decidable.
+        detected: True if the self-check finds a block outside its bound, without a guard.
     """
 
     flips: int
@@ -140,7 +144,17 @@ class Injection:
 
 
 def curve_rows(target: FaultTarget, draws: int, seed: int) -> list[Row]:
-    """A row without flips, and one for every kind of memory and rate."""
+    """Return a row without flips, and one for every kind of memory and rate.
+
+    Args:
+        target: the network, its guards and the patches.
+        draws: injections for each kind of memory and rate; kinds that are seldom hit get a
+            multiple.
+        seed: of the flips.
+
+    Returns:
+        Rows of the table "bit flips", with the PSNR in dB for each set of guards.
+    """
     clean = []
     for image, reference in target.pairs:
         sound = faults.Injected(target.core, SOUND, image, 0)
@@ -164,11 +178,24 @@ def curve_rows(target: FaultTarget, draws: int, seed: int) -> list[Row]:
 def _quality_db(
     injected: faults.Injected, guards: faults.Guards | None, reference: np.ndarray
 ) -> float:
+    """Return the PSNR in dB of a patch that is restored with faults.
+
+    Args:
+        injected: the network and the patch after an injection.
+        guards: the clamps that are in use; None for none.
+        reference: (1, 1, H, W) in [0, 1].
+    """
     return psnr_db(faults.restored(injected, guards), reference, 1.0)
 
 
 def _judged(check: SelfCheck, image: np.ndarray, restored: np.ndarray) -> Judged:
-    """Judge a patch, (1, 1, H, W) raw and restored."""
+    """Judge the blocks of a patch.
+
+    Args:
+        check: the self-check of the patch's sensor.
+        image: the raw patch (1, 1, H, W) in [0, 1].
+        restored: the restored patch, likewise.
+    """
     sides = (Placed(side, 0, 0, side) for side in image.shape[2:])
     return check.judge(image[0, 0].astype(np.float32), restored[0, 0], *sides)
 
@@ -176,7 +203,16 @@ def _judged(check: SelfCheck, image: np.ndarray, restored: np.ndarray) -> Judged
 def _drawn(
     target: FaultTarget, name: str, rate: float, draw: int, seed: int, clean: Quality
 ) -> Injection:
-    """Flip bits of a memory once, and return what that did."""
+    """Flip bits of a memory once, and return what that did.
+
+    Args:
+        target: the network, its guards and the patches.
+        name: of the kind of memory.
+        rate: flips in a megabit.
+        draw: number of the injection, which also chooses the patch.
+        seed: of the flips.
+        clean: PSNR in dB of the same patch without faults, with each set of guards.
+    """
     image, reference = target.pairs[draw % len(target.pairs)]
     memory = faults.MEMORIES[name]
     # Keyed by what is drawn, so that a draw is the same whatever else runs.
@@ -203,6 +239,14 @@ def _drawn(
 
 
 def _curve_row(name: str, draws: Sequence[Injection], kind: str) -> Row:
+    """Return the row of some injections: means of the flips and of the PSNR, and how many were
+    found.
+
+    Args:
+        name: of the row.
+        draws: the injections, at least one.
+        kind: what is counted, such as "draws", for the source of the figures.
+    """
     source = f"integer reference, mean and range of {len(draws)} {kind}"
     flips = measured(float(np.mean([draw.flips for draw in draws])), "bits", source)
     figures = {"flips": flips}
@@ -233,7 +277,14 @@ INSTRUCTIONS = 2
 
 
 def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Row]:
-    """A row a guard and one for all of them, at work for every tile of 640 x 640."""
+    """Return the predicted cost of each guard and of all of them, for every tile of 640 x 640
+    pixels.
+
+    Args:
+        target: the network and its guards.
+        prediction: the time of the network on the board.
+        dpu: the board, whose profile states clock and cores of the host.
+    """
     relus = sum(op.activation is Activation.relu for op in target.core.convolutions)
     # The rate is fitted for one core.
     rate = Constants.of(dpu).host_in_bytes_per_s * dpu.whole("cpu", "cores")
@@ -241,6 +292,7 @@ def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Ro
     copies = len(target.core.host_part.decoding.gains)
     limit_s = INSTRUCTIONS * copies * TILE_PX**2 / AT_ONCE / clock_hz
     scrubbing_s = faults.weight_bits(target.core) / faults.INT8_BITS / rate
+    # A shift is read as one byte from each of the three copies.
     copies_s = 3 * len(faults.shifts_of(target.core)) / rate
     spread = exp(dpu.value("cost", "width_outside"))
     guards = {
@@ -257,6 +309,15 @@ def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Ro
 
 
 def _price_row(name: str, time_s: float, source: str, prediction: Prediction, spread: float) -> Row:
+    """Return the row of a guard.
+
+    Args:
+        name: of the guard.
+        time_s: time of the guard for a tile in seconds.
+        source: how the time was predicted.
+        prediction: the time of the network without the guard.
+        spread: factor by which the time may be off either way.
+    """
     tile_s = prediction.batch_time_s / prediction.batch
     slow, fast = prediction.fps_interval
     # The host prepares the next tile while the DPU runs: only what does not fit beside it costs
@@ -264,6 +325,7 @@ def _price_row(name: str, time_s: float, source: str, prediction: Prediction, sp
     before_s = max(tile_s, prediction.host_s)
     beside_s = max(tile_s, prediction.host_s + time_s)
     times_s = (time_s / spread, time_s * spread)
+    # The share is largest at the highest frame rate, where a tile takes the least time.
     most = 100 * time_s * spread * fast
     figures = {
         "time": predicted(1e3 * time_s, "ms/tile", (1e3 * times_s[0], 1e3 * times_s[1]), source),
@@ -278,12 +340,29 @@ def _price_row(name: str, time_s: float, source: str, prediction: Prediction, sp
 
 
 def flip_curves_svg(networks: Mapping[str, Sequence[Row]]) -> str:
-    """PSNR against bit flips, with all guards and with none; rows by the network's name."""
+    """Return a plot of PSNR against bit flips, with all guards and with none.
+
+    Args:
+        networks: the rows of each network by its name. Only those of the table "bit flips" are
+            drawn.
+
+    Returns:
+        An SVG with a panel for each kind of memory.
+    """
     panels = [(memory, _curves(networks, memory)) for memory in faults.MEMORIES]
     return curves_svg(panels, "bit flips in a megabit", "PSNR, dB (measured)")
 
 
 def _curves(networks: Mapping[str, Sequence[Row]], memory: str) -> list[Curve]:
+    """Return two curves of each network for a kind of memory.
+
+    Args:
+        networks: the rows of each network by its name.
+        memory: the kind of memory.
+
+    Returns:
+        PSNR in dB against the rate of flips, with all guards and, dashed, without guards.
+    """
     curves = []
     for colour, (name, rows) in enumerate(networks.items()):
         by_name = {row.name: row.figures for row in rows if row.table == "bit flips"}
