@@ -24,9 +24,9 @@ from beers_deploy.quant.samples.own import (
     CALIBRATED_ON,
     OwnSamples,
     digest_of,
-    sample_files,
     samples_of,
 )
+from beers_deploy.quant.samples.stored import sample_files
 from beers_deploy.quant.session import open_any_size
 from beers_deploy.quant.structure import saturated_shares
 from beers_deploy.results import Input, Table

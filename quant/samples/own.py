@@ -8,18 +8,15 @@ file may hold what the network should give in addition to what it reads, as `ima
 
 import hashlib
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
 
 from beers_deploy.model.io.files import IMAGE_SUFFIXES
-from beers_deploy.model.raster.images import read_pixels
-from beers_deploy.profiles.arrays import load_arrays
-from beers_deploy.profiles.errors import ImageError, ModelError, OptionError, printable
+from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.input_range import (
     FROM_SAMPLES,
@@ -35,13 +32,19 @@ from beers_deploy.quant.input_range import (
 )
 from beers_deploy.quant.onnx_file import fixed_tile_px
 from beers_deploy.quant.samples.patches import PATCH_PX, Pair, Patches
+from beers_deploy.quant.samples.stored import (
+    IN_MEMORY,
+    NO_REFERENCE,
+    REMEDY,
+    sample_files,
+    samples_in,
+    sizes_of,
+    stored_batch,
+    stored_one,
+)
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from beers_deploy.quant.untrusted import times
 
-ARRAY_SUFFIX = ".npy"
-IN_MEMORY = "samples"
-"""What messages and files call samples that are no file."""
-NO_REFERENCE = np.empty(0, np.float32)
 Named = tuple[str, Pair]
 """A sample with its name, for messages."""
 
@@ -51,8 +54,6 @@ CALIBRATED_ON = "calibration_samples"
 """What an INT8 file calls the digests of the samples that it was calibrated on."""
 DIGEST_DIGITS = 16
 LEAST_CONTRAST = 1 / MAX_DN
-FULL_SCALE_8 = 255
-REMEDY = "See docs/reference/any-network.md for how to give samples."
 
 
 @dataclass(frozen=True)
@@ -155,64 +156,6 @@ def samples_of(
     )
 
 
-def samples_in(given: object) -> list[Pair]:
-    """Return the samples in an array, in a pair of arrays (images, references), or in what gives
-    such one after the other.
-
-    Args:
-        given: a batch (N, C, H, W), or one image (C, H, W), of NumPy or torch; a
-            tuple of two; a simulated pair, which knows its full scale; or an iterable of any of
-            these, such as a DataLoader.
-    """
-    # A simulated pair holds digital numbers, and alone knows its full scale.
-    if hasattr(given, "degraded") and hasattr(given, "reference"):
-        pair: Any = given
-        largest = np.float32(pair.sensor.max_dn)
-        degraded = np.asarray(pair.degraded, np.float32)[None] / largest
-        reference = np.asarray(pair.reference, np.float32)[None] / largest
-        return [(degraded, reference)]
-    if hasattr(given, "ndim"):
-        return [(image, NO_REFERENCE) for image in _batch(given)]
-    if isinstance(given, tuple) and [hasattr(array, "ndim") for array in given] == [True, True]:
-        # A reference may have another size than its image.
-        images = _batch(given[0])
-        references = _plain(given[1])
-        references = references[None] if np.ndim(given[0]) == 3 else references
-        if references.ndim == 0 or len(images) != len(references):
-            raise ImageError(
-                f"`{IN_MEMORY}` must have a reference for each image, got images of "
-                f"{times(images.shape)} and references of {_shape(references)}. {REMEDY}"
-            )
-        return list(zip(images, references, strict=True))
-    if not isinstance(given, Iterable) or isinstance(given, str | bytes | Mapping):
-        raise ImageError(
-            f"`{IN_MEMORY}` must be arrays (N, C, H, W) or a path, got {type(given).__name__}. "
-            f"{REMEDY}"
-        )
-    samples = list[Pair]()
-    for item in given:
-        # A DataLoader gives a batch as a list: of images and references, or of images alone.
-        batch = tuple(item) if isinstance(item, list) and len(item) == 2 else item
-        alone = isinstance(batch, list | tuple) and len(batch) == 1
-        samples += samples_in(batch[0] if alone else batch)
-    return samples
-
-
-def _batch(array: Any) -> np.ndarray:
-    """Return one image or a batch of NumPy or torch as (N, C, H, W)."""
-    batch = _plain(array)
-    if batch.ndim not in (3, 4):
-        raise ImageError(
-            f"`{IN_MEMORY}` must be a batch of (N, C, H, W), got {times(batch.shape)}. {REMEDY}"
-        )
-    return batch if batch.ndim == 4 else batch[None]
-
-
-def _plain(array: Any) -> np.ndarray:
-    # NumPy refuses a tensor of torch that still has a gradient.
-    return np.asarray(array.detach() if hasattr(array, "detach") else array)
-
-
 def read_samples(
     source: Path | Sequence[Pair],
     channels: int,
@@ -247,7 +190,7 @@ def read_samples(
                 f"The images in {label} have values in [0, 1], but `input_range` is "
                 f"{in_words(ranges)}. Give .npy files of what the network reads."
             )
-        items = map(_stored, sample_files(source)) if folder else _stored_batch(source)
+        items = map(stored_one, sample_files(source)) if folder else stored_batch(source)
     else:
         items = ((f"{IN_MEMORY}[{k}]", *pair) for k, pair in enumerate(source))
     samples = list[Named]()
@@ -287,84 +230,6 @@ def _contrast(image: np.ndarray, ranges: Ranges) -> float:
     return float(np.ptp(to_shares(image, ranges), (2, 3)).max())
 
 
-def sample_files(path: Path) -> list[Path]:
-    """Return the files that samples are read from: those of a folder in their order, or the file
-    itself.
-    """
-    if not path.is_dir():
-        return [path]
-    return sorted(
-        file for file in path.iterdir() if file.suffix.lower() in {ARRAY_SUFFIX, *IMAGE_SUFFIXES}
-    )
-
-
-def _stored(file: Path) -> tuple[str, np.ndarray, np.ndarray]:
-    """Return name, image (C, H, W) and reference of the one sample in a file of a folder."""
-    if file.suffix.lower() != ARRAY_SUFFIX:
-        image = _bands_first(file, read_pixels(file))
-    else:
-        image, _ = _arrays(file)
-        if image.ndim != 3:
-            raise ImageError(f"{file} must be one image (C, H, W), got {_shape(image)}. {REMEDY}")
-    return file.name, image, NO_REFERENCE
-
-
-def _stored_batch(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield name, image (C, H, W) and reference of the samples of one file."""
-    images, references = _arrays(path)
-    if images.ndim != 4:
-        raise ImageError(f"{path} must be a batch of (N, C, H, W), got {_shape(images)}. {REMEDY}")
-    if references is NO_REFERENCE:
-        references = np.empty((len(images), 0), np.float32)
-    if references.ndim == 0 or len(references) != len(images):
-        raise ImageError(
-            f"{path} must have a reference for each of its {len(images)} images, got references "
-            f"of {_shape(references)}. {REMEDY}"
-        )
-    for number, pair in enumerate(zip(images, references, strict=True)):
-        yield f"{path.name}[{number}]", *pair
-
-
-def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return the array of a .npy file, mapped rather than read; of a .npz file `image` and
-    `reference`, or its only array.
-
-    Nothing is unpickled.
-    """
-    try:
-        arrays = load_arrays(path)
-    except ValueError as error:
-        raise ImageError(
-            f"Samples are a .npy or .npz file of numbers, or a folder of images, but {path} cannot "
-            f"be read as such: {printable(str(error))}. {REMEDY}"
-        ) from error
-    # One array alone may have any name: `np.savez(file, images)` calls it `arr_0`.
-    image = next(iter(arrays)) if len(arrays) == 1 else "image"
-    if image not in arrays:
-        names = printable(", ".join(arrays)) or "no array"
-        raise ImageError(
-            f"{path} must have arrays named 'image' and 'reference', got {names}. {REMEDY}"
-        )
-    return arrays[image], arrays.get("reference", NO_REFERENCE)
-
-
-def _bands_first(path: Path, pixels: np.ndarray) -> np.ndarray:
-    """Return pixels (H, W) or (H, W, bands) as stored as (C, H, W) of full scale; floats are of
-    full scale already.
-    """
-    bands = pixels[None] if pixels.ndim == 2 else np.moveaxis(pixels, -1, 0)
-    if bands.dtype.kind == "f":
-        return bands
-    if bands.dtype.kind not in "ui":
-        raise ImageError(f"The pixels of {path} must be numbers, got {bands.dtype}. {REMEDY}")
-    # Files state no full scale: pixels of 8 bits use all of them, others are taken for 12 bits.
-    return bands / np.float32(FULL_SCALE_8 if bands.dtype.itemsize == 1 else MAX_DN)
-
-
-def _shape(array: np.ndarray) -> str:
-    return times(array.shape) or "no dimension"
-
-
 def _valid_reference(name: str, reference: np.ndarray) -> np.ndarray:
     """Return a reference as float32; raise ImageError if it is not made of real, finite numbers.
 
@@ -392,7 +257,7 @@ def _valid_image(name: str, image: np.ndarray, channels: int, ranges: Ranges | N
             f"{len(image)} channels of {image.dtype}. {REMEDY}"
         )
     if not image.size:
-        raise ImageError(f"{name} has no pixels: its shape is {_shape(image)}. {REMEDY}")
+        raise ImageError(f"{name} has no pixels: its shape is {sizes_of(image)}. {REMEDY}")
     values = np.asarray(image, np.float32)
     lost = np.count_nonzero(~np.isfinite(values))
     if lost:

@@ -1,0 +1,161 @@
+"""Samples as they are stored: in a .npy or .npz file, in a folder of images, or in arrays."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beers_deploy.model.io.files import IMAGE_SUFFIXES
+from beers_deploy.model.raster.images import read_pixels
+from beers_deploy.profiles.arrays import load_arrays
+from beers_deploy.profiles.errors import ImageError, printable
+from beers_deploy.profiles.instrument import MAX_DN
+from beers_deploy.quant.samples.patches import Pair
+from beers_deploy.quant.untrusted import times
+
+ARRAY_SUFFIX = ".npy"
+IN_MEMORY = "samples"
+"""What messages and files call samples that are no file."""
+NO_REFERENCE = np.empty(0, np.float32)
+FULL_SCALE_8 = 255
+REMEDY = "See docs/reference/any-network.md for how to give samples."
+
+
+def samples_in(given: object) -> list[Pair]:
+    """Return the samples in an array, in a pair of arrays (images, references), or in what gives
+    such one after the other.
+
+    Args:
+        given: a batch (N, C, H, W), or one image (C, H, W), of NumPy or torch; a
+            tuple of two; a simulated pair, which knows its full scale; or an iterable of any of
+            these, such as a DataLoader.
+    """
+    # A simulated pair holds digital numbers, and alone knows its full scale.
+    if hasattr(given, "degraded") and hasattr(given, "reference"):
+        pair: Any = given
+        largest = np.float32(pair.sensor.max_dn)
+        degraded = np.asarray(pair.degraded, np.float32)[None] / largest
+        reference = np.asarray(pair.reference, np.float32)[None] / largest
+        return [(degraded, reference)]
+    if hasattr(given, "ndim"):
+        return [(image, NO_REFERENCE) for image in _batch(given)]
+    if isinstance(given, tuple) and [hasattr(array, "ndim") for array in given] == [True, True]:
+        # A reference may have another size than its image.
+        images = _batch(given[0])
+        references = _plain(given[1])
+        references = references[None] if np.ndim(given[0]) == 3 else references
+        if references.ndim == 0 or len(images) != len(references):
+            raise ImageError(
+                f"`{IN_MEMORY}` must have a reference for each image, got images of "
+                f"{times(images.shape)} and references of {sizes_of(references)}. {REMEDY}"
+            )
+        return list(zip(images, references, strict=True))
+    if not isinstance(given, Iterable) or isinstance(given, str | bytes | Mapping):
+        raise ImageError(
+            f"`{IN_MEMORY}` must be arrays (N, C, H, W) or a path, got {type(given).__name__}. "
+            f"{REMEDY}"
+        )
+    samples = list[Pair]()
+    for item in given:
+        # A DataLoader gives a batch as a list: of images and references, or of images alone.
+        batch = tuple(item) if isinstance(item, list) and len(item) == 2 else item
+        alone = isinstance(batch, list | tuple) and len(batch) == 1
+        samples += samples_in(batch[0] if alone else batch)
+    return samples
+
+
+def _batch(array: Any) -> np.ndarray:
+    """Return one image or a batch of NumPy or torch as (N, C, H, W)."""
+    batch = _plain(array)
+    if batch.ndim not in (3, 4):
+        raise ImageError(
+            f"`{IN_MEMORY}` must be a batch of (N, C, H, W), got {times(batch.shape)}. {REMEDY}"
+        )
+    return batch if batch.ndim == 4 else batch[None]
+
+
+def _plain(array: Any) -> np.ndarray:
+    # NumPy refuses a tensor of torch that still has a gradient.
+    return np.asarray(array.detach() if hasattr(array, "detach") else array)
+
+
+def sample_files(path: Path) -> list[Path]:
+    """Return the files that samples are read from: those of a folder in their order, or the file
+    itself.
+    """
+    if not path.is_dir():
+        return [path]
+    return sorted(
+        file for file in path.iterdir() if file.suffix.lower() in {ARRAY_SUFFIX, *IMAGE_SUFFIXES}
+    )
+
+
+def stored_one(file: Path) -> tuple[str, np.ndarray, np.ndarray]:
+    """Return name, image (C, H, W) and reference of the one sample in a file of a folder."""
+    if file.suffix.lower() != ARRAY_SUFFIX:
+        image = _bands_first(file, read_pixels(file))
+    else:
+        image, _ = _arrays(file)
+        if image.ndim != 3:
+            raise ImageError(f"{file} must be one image (C, H, W), got {sizes_of(image)}. {REMEDY}")
+    return file.name, image, NO_REFERENCE
+
+
+def stored_batch(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yield name, image (C, H, W) and reference of the samples of one file."""
+    images, references = _arrays(path)
+    if images.ndim != 4:
+        raise ImageError(
+            f"{path} must be a batch of (N, C, H, W), got {sizes_of(images)}. {REMEDY}"
+        )
+    if references is NO_REFERENCE:
+        references = np.empty((len(images), 0), np.float32)
+    if references.ndim == 0 or len(references) != len(images):
+        raise ImageError(
+            f"{path} must have a reference for each of its {len(images)} images, got references "
+            f"of {sizes_of(references)}. {REMEDY}"
+        )
+    for number, pair in enumerate(zip(images, references, strict=True)):
+        yield f"{path.name}[{number}]", *pair
+
+
+def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return the array of a .npy file, mapped rather than read; of a .npz file `image` and
+    `reference`, or its only array.
+
+    Nothing is unpickled.
+    """
+    try:
+        arrays = load_arrays(path)
+    except ValueError as error:
+        raise ImageError(
+            f"Samples are a .npy or .npz file of numbers, or a folder of images, but {path} cannot "
+            f"be read as such: {printable(str(error))}. {REMEDY}"
+        ) from error
+    # One array alone may have any name: `np.savez(file, images)` calls it `arr_0`.
+    image = next(iter(arrays)) if len(arrays) == 1 else "image"
+    if image not in arrays:
+        names = printable(", ".join(arrays)) or "no array"
+        raise ImageError(
+            f"{path} must have arrays named 'image' and 'reference', got {names}. {REMEDY}"
+        )
+    return arrays[image], arrays.get("reference", NO_REFERENCE)
+
+
+def _bands_first(path: Path, pixels: np.ndarray) -> np.ndarray:
+    """Return pixels (H, W) or (H, W, bands) as stored as (C, H, W) of full scale; floats are of
+    full scale already.
+    """
+    bands = pixels[None] if pixels.ndim == 2 else np.moveaxis(pixels, -1, 0)
+    if bands.dtype.kind == "f":
+        return bands
+    if bands.dtype.kind not in "ui":
+        raise ImageError(f"The pixels of {path} must be numbers, got {bands.dtype}. {REMEDY}")
+    # Files state no full scale: pixels of 8 bits use all of them, others are taken for 12 bits.
+    return bands / np.float32(FULL_SCALE_8 if bands.dtype.itemsize == 1 else MAX_DN)
+
+
+def sizes_of(array: np.ndarray) -> str:
+    """Return the shape of an array in words."""
+    return times(array.shape) or "no dimension"
