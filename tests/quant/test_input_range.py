@@ -1,4 +1,6 @@
-"""Networks of other ranges than [0, 1]: their integers, their borders, and what is refused."""
+"""Networks of other ranges than [0, 1]: their integers, their borders, and which ranges are
+refused.
+"""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -28,6 +30,10 @@ from tests.quant.quick import quickly
 ENDS = st.floats(-300, 300, width=32)
 PAIRS = st.tuples(ENDS, ENDS).filter(lambda ends: ends[1] - ends[0] > 0.01)
 RANGES = st.lists(PAIRS, min_size=1, max_size=4).map(tuple)
+SIDES = st.integers(3, 11)
+LIMITS = [(-1.0, 1.0), (0.0, 1.0), (0.0, 255.0), (-0.25, 0.5)]
+NO_REFERENCE = np.empty(0)
+MAX_DN = 4095
 
 
 def network(
@@ -45,19 +51,23 @@ def network(
     """
     generator = np.random.default_rng(0)
     w = GraphWriter()
-    factors = np.repeat(np.broadcast_to(gains, channels), block**2)[:, None, None]
-    first = generator.normal(0, 0.3, (6, channels * block**2, 3, 3)) * factors
-    last = generator.normal(0, 0.3, (outputs * block**2, 6, 5, 5))
-    last = last * np.broadcast_to(out_gains, len(last))[:, None, None, None]
+    pixels = block**2
+    factors = np.repeat(np.broadcast_to(gains, channels), pixels)
+    first = generator.normal(0, 0.3, (6, channels * pixels, 3, 3))
+    first *= factors[:, None, None]
+    last = generator.normal(0, 0.3, (outputs * pixels, 6, 5, 5))
+    last *= np.broadcast_to(out_gains, len(last))[:, None, None, None]
     bias = generator.normal(0, 0.3, 6)
     arrays = {"first": first, "bias": bias, "last": last}
-    names = [w.constant(name, value.astype(np.float32)) for name, value in arrays.items()]
+    for name, value in arrays.items():
+        w.constant(name, value.astype(np.float32))
     x = "image"
     if block > 1:
         # ONNX's own operator has another order of the channels than torch, but of one channel.
         x = w.node("SpaceToDepth", "places", [x], blocksize=block)
-    x = w.node("Relu", "relu", [w.node("Conv", "conv_1", [x, *names[:2]], pads=[1] * 4)])
-    x = w.node("Conv", "conv_2", [x, names[2]], pads=[2] * 4)
+    x = w.node("Conv", "conv_1", [x, "first", "bias"], pads=[1] * 4)
+    x = w.node("Relu", "relu", [x])
+    x = w.node("Conv", "conv_2", [x, "last"], pads=[2] * 4)
     if block > 1:
         x = w.node("DepthToSpace", "pixels", [x], blocksize=block)
     if adds_image:
@@ -65,27 +75,38 @@ def network(
     if limits:
         ends = [w.constant(f"limit_{k}", np.array(end, np.float32)) for k, end in enumerate(limits)]
         x = w.node("Clip", "clip", [x, *ends])
+    image = image_info("image", channels, None)
     result = helper.make_tensor_value_info(x, onnx.TensorProto.FLOAT, ["N", outputs, "h", "w"])
-    return make_model(w.graph("net", [image_info("image", channels, None)], [result]), {})
+    graph = w.graph("net", [image], [result])
+    return make_model(graph, {})
 
 
 def shares(channels: int, rows: int = 13, columns: int = 18, count: int = 3) -> list[np.ndarray]:
     """Images (1, C, rows, columns) in [0, 1]."""
     generator = np.random.default_rng(3)
-    return list(generator.uniform(0, 1, (count, 1, channels, rows, columns)).astype(np.float32))
+    images = generator.uniform(0, 1, (count, 1, channels, rows, columns))
+    return list(images.astype(np.float32))
+
+
+def scaled(images: Sequence[np.ndarray], gains: np.ndarray) -> list[np.ndarray]:
+    """Return images whose channels are multiplied by `gains` (C,)."""
+    factors = gains[:, None, None]
+    return [(image * factors).astype(np.float32) for image in images]
 
 
 def patches(images: Sequence[np.ndarray], ranges: Ranges = ()) -> Patches:
+    """Return images, each its own reference, of a range of values."""
     return Patches([(image, image) for image in images], images, ranges=ranges)
 
 
 def same_integers(one: IntCore, other: IntCore) -> bool:
-    return all(
-        np.array_equal(a.weight, b.weight)
-        and np.array_equal(a.bias, b.bias)
-        and a.weight_frac_bits == b.weight_frac_bits
-        for a, b in zip(one.convolutions, other.convolutions, strict=True)
-    )
+    """Return True if two cores have equal weights, biases and scales of weights."""
+    for a, b in zip(one.convolutions, other.convolutions, strict=True):
+        if a.weight_frac_bits != b.weight_frac_bits:
+            return False
+        if not np.array_equal(a.weight, b.weight) or not np.array_equal(a.bias, b.bias):
+            return False
+    return True
 
 
 @settings(max_examples=15, deadline=None)
@@ -93,45 +114,54 @@ def same_integers(one: IntCore, other: IntCore) -> bool:
 def test_a_network_of_scaled_channels_has_the_same_integers(
     exponents: list[int], signed: bool
 ) -> None:
-    """Exactly, where scales are powers of two; a range of both signs has the planes of one sign."""
+    """A network that reads other units has the same integers and the same results.
+
+    It is so exactly, because the scales are powers of two. A range of both signs is encoded in
+    the same planes as a range of one sign.
+    """
     gains = 2.0 ** np.array(exponents)
     count = len(gains)
     images = shares(count)
-    scaled = [(image * gains[:, None, None]).astype(np.float32) for image in images]
-    ranges = tuple((-g if signed else 0.0, float(g)) for g in gains)
+    wide = scaled(images, gains)
+    ranges = tuple((-gain if signed else 0.0, gain) for gain in map(float, gains))
     plain = quickly(network(count, 2), patches(images))
-    other = quickly(network(count, 2, gains=1 / gains), patches(scaled, ranges))
+    other = quickly(network(count, 2, gains=1 / gains), patches(wide, ranges))
     assert same_integers(plain.core, other.core)
-    sessions = [open_session(each.host) for each in (plain, other)]
-    np.testing.assert_array_equal(
-        result_of(sessions[0], images[0]), result_of(sessions[1], scaled[0])
-    )
+    expected = result_of(open_session(plain.host), images[0])
+    actual = result_of(open_session(other.host), wide[0])
+    np.testing.assert_array_equal(actual, expected)
 
 
 @settings(max_examples=25, deadline=None)
 @given(
     ranges=RANGES,
-    sides=st.tuples(st.integers(3, 11), st.integers(3, 11)),
+    sides=st.tuples(SIDES, SIDES),
     block=st.sampled_from([1, 2]),
     adds_image=st.booleans(),
 )
 def test_padding_stays_zero(
     ranges: Ranges, sides: tuple[int, int], block: int, adds_image: bool
 ) -> None:
-    """In float the planes give what the image gives, at borders too, but for the encoding."""
+    """In float the network of planes agrees with the network of the image, but for the encoding.
+
+    It does so at borders too, where a zero of padding must stay a zero in the network's own
+    units.
+    """
     ranges = ranges[:1] if block > 1 else ranges
     channels = len(ranges)
     sizes = np.array([max(map(abs, ends)) for ends in ranges])
     model = network(channels, channels, gains=1 / sizes, block=block, adds_image=adds_image)
     split = read_network(model)
     part = HostPart.of(split, Plain(), ranges)
-    (image,) = shares(channels, block * sides[0], block * sides[1], 1)
-    image = from_shares(image, ranges)
-    result = float_result(read_planes(split.graph, part.full_scale), image, part)
+    rows, columns = sides
+    (share,) = shares(channels, block * rows, block * columns, 1)
+    image = from_shares(share, ranges)
+    graph = read_planes(split.graph, part.full_scale)
+    correction = float_result(graph, image, part)
+    actual = part.finish(image, correction)
+    expected = result_of(open_session(model), image)
     # Half a digital number at each of up to 4 * 9 taps, whose weights are below 1.5.
-    np.testing.assert_allclose(
-        part.finish(image, result), result_of(open_session(model), image), atol=36 * 1.5 * 30 / 8190
-    )
+    np.testing.assert_allclose(actual, expected, atol=36 * 1.5 * 30 / (2 * MAX_DN))
 
 
 @settings(max_examples=20, deadline=None)
@@ -139,77 +169,101 @@ def test_padding_stays_zero(
     ranges=RANGES,
     adds_image=st.booleans(),
     side=st.sampled_from([9, 14]),
-    limits=st.none() | st.sampled_from([(-1.0, 1.0), (0.0, 1.0), (0.0, 255.0), (-0.25, 0.5)]),
+    limits=st.none() | st.sampled_from(LIMITS),
 )
 def test_numpy_onnx_and_description_agree(
     ranges: Ranges, adds_image: bool, side: int, limits: tuple[float, float] | None
 ) -> None:
+    """NumPy, onnxruntime and the description in the file compute the same for any range and limits.
+
+    A board's host is written from the description alone. Limits of the network are kept.
+    """
     channels = len(ranges)
     model = network(channels, channels, gains=0.1, adds_image=adds_image, limits=limits)
     images = [from_shares(image, ranges) for image in shares(channels, side)]
     int8 = quickly(model, patches(images, ranges))
     assert encoding_faults(int8.host) == []
-    assert same_integers(read_core(int8.host), int8.core)
-    part = read_core(int8.host).host_part
+    core = read_core(int8.host)
+    assert same_integers(core, int8.core)
+    part = core.host_part
     assert part == int8.core.host_part
-    assert not any(layer.unequal for layer in agreement(int8.core, int8.host, images[0]).layers)
-    tensors, _ = run_core(int8.core, part.encode(images[0]), half_even=True)
+    image = images[0]
+    layers = agreement(int8.core, int8.host, image).layers
+    assert not any(layer.unequal for layer in layers)
+    tensors, _ = run_core(int8.core, part.encode(image), half_even=True)
     scale = int8.core.scale("correction")
-    result = tensors["correction"].astype(np.float32) * np.float32(scale)
-    restored = result_of(open_session(int8.host), images[0])
-    np.testing.assert_array_equal(part.restore(images[0], result, scale), restored)
+    correction = tensors["correction"].astype(np.float32) * np.float32(scale)
+    restored = result_of(open_session(int8.host), image)
+    np.testing.assert_array_equal(part.restore(image, correction, scale), restored)
     assert part.clip_limits == (limits or ())
     if limits:
         assert limits[0] <= restored.min() <= restored.max() <= limits[1]
 
 
 def test_limits_are_kept_of_images_in_the_usual_range_too() -> None:
-    """But for [0, 1], to which whoever stores an image clips it."""
-    images = shares(1)
-    for limits, expected in (((0.0, 1.0), ()), ((0.25, 0.5), (0.25, 0.5))):
-        part = quickly(network(1, 1, limits=limits), patches(images)).core.host_part
-        assert part.clip_limits == expected
+    """A clip of the network is kept, but for [0, 1], to which whoever stores an image clips it."""
+    usual = (0.0, 1.0)
+    narrow = (0.25, 0.5)
+    assert limits_of(usual) == ()
+    assert limits_of(narrow) == narrow
 
 
-@given(PAIRS, st.integers(0, 4095))
+def limits_of(limits: tuple[float, float]) -> tuple[float, ...]:
+    """Return the limits that the INT8 network keeps of a network with these."""
+    int8 = quickly(network(1, 1, limits=limits), patches(shares(1)))
+    return int8.core.host_part.clip_limits
+
+
+@given(PAIRS, st.integers(0, MAX_DN))
 def test_the_encoding_errs_by_half_a_step(ends: tuple[float, float], dn: int) -> None:
+    """Any value of a range is encoded to half a digital number of 12 bits, relative to its
+    larger end.
+    """
     low, high = map(float, ends)
     part = HostPart(input_ranges=((low, high),), encoding=HostPart().encoding)
     part = host_part_from_json(host_part_to_json(part))
-    value = np.float32(low + (high - low) * dn / 4095)
-    coarse, rest, _ = part.encode(np.full((1, 1, 1, 1), value))[0, :, 0, 0].astype(int)
-    size = max(abs(low), abs(high))
-    assert abs((32 * coarse + rest) * size / 4095 - float(value)) <= 0.501 * size / 4095
+    value = np.float32(low + (high - low) * dn / MAX_DN)
+    planes = part.encode(np.full((1, 1, 1, 1), value))
+    coarse, rest, _ = planes[0, :, 0, 0].astype(int)
+    step = max(abs(low), abs(high)) / MAX_DN
+    decoded = (32 * coarse + rest) * step
+    assert abs(decoded - float(value)) <= 0.501 * step
 
 
 @settings(max_examples=10, deadline=None)
 @given(st.lists(st.integers(1, 9), min_size=1, max_size=4), st.floats(0, 0.01))
 def test_figures_do_not_depend_on_the_unit(exponents: list[int], error: float) -> None:
-    """Networks that differ by `error` are compared with the same figures, whatever the unit."""
+    """Networks that differ by `error` are compared with the same figures, whatever the unit.
+
+    Without this a limit of the gate would mean something else for each network.
+    """
     gains = 2.0 ** np.array(exponents)
     images = shares(len(gains), count=2)
     # The range that is found is that of all samples.
     images[0][..., 0, 0] = 1
     figures = []
-    for unit in (np.ones(len(gains)), gains):
-        in_float, in_int8 = (
-            open_session(network(len(unit), len(unit), gains=1 / unit, out_gains=gain * unit))
-            for gain in (1, 1 + error)
-        )
-        scaled = [(image * unit[:, None, None]).astype(np.float32) for image in images]
-        result = compare(in_float, in_int8, patches(scaled, ranges_of(scaled)))
+    count = len(gains)
+    for unit in (np.ones(count), gains):
+        exact = network(count, count, gains=1 / unit, out_gains=unit)
+        wrong = network(count, count, gains=1 / unit, out_gains=(1 + error) * unit)
+        samples = scaled(images, unit)
+        pairs = patches(samples, ranges_of(samples))
+        result = compare(open_session(exact), open_session(wrong), pairs)
         figures.append((result.mae, result.max_abs, result.psnr_float_db, result.input_change))
     assert figures[0] == pytest.approx(figures[1], rel=1e-6, abs=1e-9)
 
 
 @given(RANGES)
 def test_shares_are_inverse(ranges: Ranges) -> None:
+    """An image that is mapped to its range and back is the image again."""
     image = shares(len(ranges), 4, 5, 1)[0]
-    np.testing.assert_allclose(to_shares(from_shares(image, ranges), ranges), image, atol=1e-3)
+    again = to_shares(from_shares(image, ranges), ranges)
+    np.testing.assert_allclose(again, image, atol=1e-3)
 
 
 @given(RANGES)
 def test_a_stated_range_is_read_as_it_is(ranges: Ranges) -> None:
+    """A range is read the same from text, from pairs, and from one pair for all channels."""
     text = ",".join(f"{end!r}" for pair in ranges for end in map(float, pair))
     assert read_ranges(text, len(ranges)) == ranges
     assert read_ranges(ranges, len(ranges)) == ranges
@@ -217,36 +271,45 @@ def test_a_stated_range_is_read_as_it_is(ranges: Ranges) -> None:
 
 
 def test_the_usual_range_is_none() -> None:
+    """The range [0, 1] is stored as no range, so that files of usual networks stay as they were."""
     assert read_ranges("0,1", 4) == ()
     assert ranges_of(shares(3)) == ()
 
 
 @pytest.mark.parametrize("option", ["", "1", "1,0", "0,0", "0,1,2", "0,nan", "0,inf", "0,1e9", 5])
 def test_what_is_no_range_is_refused(option: object) -> None:
+    """A range that is empty, not finite or too large is refused with the form that is expected."""
     with pytest.raises(OptionError, match="`input_range` must be LOW,HIGH"):
         read_ranges(option, 3)
 
 
 def test_samples_tell_the_range() -> None:
-    """Of each channel that leaves [0, 1]; constant maps are no contrast."""
+    """Samples tell the range of each channel that leaves [0, 1].
+
+    A constant map is a level and no contrast, so samples of constant channels alone are refused.
+    """
     image = shares(4, 8, 8, 1)[0]
     image[:, 1] = 2 * image[:, 1] - 1
     image[:, 3] = 25
-    samples = read_samples([(image[0], np.empty(0))], 4, None)
+    samples = read_samples([(image[0], NO_REFERENCE)], 4, None)
     low = float(image[0, 1].min())
     high = float(image[0, 1].max())
     assert samples.ranges == ((0.0, 1.0), (low, high), (0.0, 1.0), (0.0, 25.0))
     assert "found in the samples" in samples.about["input_range"]
-    flat = np.broadcast_to(np.array([0.5, -1, 0.1, 25], np.float32)[:, None, None], (4, 8, 8))
+    levels = np.array([0.5, -1, 0.1, 25], np.float32)
+    flat = np.broadcast_to(levels[:, None, None], (4, 8, 8))
     with pytest.raises(ImageError, match="constant"):
-        read_samples([(flat, np.empty(0))], 4, None)
+        read_samples([(flat, NO_REFERENCE)], 4, None)
 
 
 def _beyond(_: Path) -> object:
-    return [(2 * shares(1)[0][0], np.empty(0))]
+    """Return a sample whose values reach up to 2."""
+    image = shares(1)[0][0]
+    return [(2 * image, NO_REFERENCE)]
 
 
 def _pictures(folder: Path) -> object:
+    """Write a file of an image into the folder and return the folder."""
     (folder / "a.png").touch()
     return folder
 
@@ -258,6 +321,9 @@ def _pictures(folder: Path) -> object:
 def test_samples_outside_a_stated_range_are_refused(
     write: Callable[[Path], object], message: str, tmp_path: Path
 ) -> None:
+    """Values outside of the stated range are refused, and so are image files, which state their
+    own.
+    """
     with pytest.raises(ImageError, match=message):
         read_samples(write(tmp_path), 1, None, ranges=((-1.0, 1.0),))  # type: ignore[arg-type]
 
@@ -277,6 +343,10 @@ def test_samples_outside_a_stated_range_are_refused(
     ],
 )
 def test_a_damaged_description_is_refused(damage: dict[str, object]) -> None:
+    """A description of ranges that no valid file has is refused, not computed with.
+
+    Files may come from anybody, so the reader trusts none of their numbers.
+    """
     record = {**host_part_to_json(HostPart()), **damage}
     with pytest.raises((BeersError, TypeError, ValueError)):
         host_part_from_json(record)

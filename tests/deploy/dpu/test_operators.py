@@ -1,3 +1,7 @@
+"""Each rule about operators refuses the network that breaks it, and passes the one that follows
+its remedy.
+"""
+
 from pathlib import Path
 
 import pytest
@@ -21,32 +25,66 @@ from tests.deploy.dpu.draws import (
     scaled,
     transposed,
 )
-from tests.deploy.dpu.graphs import IntegerSketch, Sketch
+from tests.deploy.dpu.graphs import IntegerSketch, Sketch, Value
 from tests.deploy.dpu.test_number_graphs import CASES as NUMBER_CASES
 
 DPU = load_dpu("vck190")
+WIDE_ARRAY = "C64B1"
+NARROW_ARRAY = "C32B1"
+
+
+def conv_3x3(**attributes: Value) -> Draw:
+    """Return a draw of a convolution of 3 x 3 from 8 channels to 8."""
+    return conv(8, 8, 3, 3, **attributes)
+
+
+def depthwise(rows: int, columns: int, **attributes: Value) -> Draw:
+    """Return a draw of a convolution of each of 8 channels by itself."""
+    return conv(8, 1, rows, columns, group=8, **attributes)
+
+
+def max_pool(rows: int, columns: int, **attributes: Value) -> Draw:
+    """Return a draw of a maximum over a window."""
+    return node("MaxPool", kernel_shape=[rows, columns], **attributes)
+
+
+def behind_pool(op_type: str, **attributes: Value) -> Draw:
+    """Return a draw of an operator that reads a maximum over 2 x 2."""
+
+    def draw(sketch: Sketch, source: str) -> str:
+        """Write the maximum, and the operator that reads it."""
+        pooled = max_pool(2, 2)(sketch, source)
+        return sketch.node(op_type, pooled, **attributes)
+
+    return draw
+
+
+def pool_of_relu(sketch: Sketch, source: str) -> str:
+    """Write a ReLU, and a maximum over 2 x 2 of it."""
+    relu = sketch.node("Relu", source)
+    return max_pool(2, 2)(sketch, relu)
 
 
 # Each rule with a network that breaks it alone, and the same network with the remedy followed.
 CASES: dict[str, tuple[Draw, Draw]] = {
     "conv kernel": (conv(8, 8, 17, 1), conv(8, 8, 15, 1)),
-    "conv stride": (conv(8, 8, 3, 3, strides=[9, 9]), conv(8, 8, 3, 3, strides=[3, 3])),
-    "conv padding": (conv(8, 8, 3, 3, pads=[3, 1, 1, 1]), conv(8, 8, 3, 3, pads=[2, 1, 1, 1])),
+    "conv stride": (conv_3x3(strides=[9, 9]), conv_3x3(strides=[3, 3])),
+    "conv padding": (conv_3x3(pads=[3, 1, 1, 1]), conv_3x3(pads=[2, 1, 1, 1])),
     # With padding it would be split, so that no part is too large.
     "conv window": (conv(8, 8, 9, 8, pads=[0] * 4), conv(8, 8, 8, 8)),
     "conv dilation": (
         conv(8, 8, 3, 1, dilations=[513, 1], pads=[513, 0, 513, 0]),
         conv(8, 8, 3, 1, dilations=[512, 1], pads=[513, 0, 513, 0]),
     ),
-    "conv groups": (conv(8, 4, 3, 3, group=2), conv(8, 8, 3, 3)),
+    "conv groups": (conv(8, 4, 3, 3, group=2), conv_3x3()),
     "depthwise kernel": (
-        conv(8, 1, 257, 1, group=8, pads=[15, 0, 15, 0]),
-        conv(8, 1, 255, 1, group=8, pads=[0] * 4),
+        depthwise(257, 1, pads=[15, 0, 15, 0]),
+        depthwise(255, 1, pads=[0] * 4),
     ),
-    "depthwise stride": (conv(8, 1, 3, 3, group=8, strides=[257, 1]), conv(8, 1, 3, 3, group=8)),
+    "depthwise stride": (depthwise(3, 3, strides=[257, 1]), depthwise(3, 3)),
     "depthwise padding": (
-        conv(8, 1, 3, 3, group=8, pads=[16, 1, 1, 1]),
-        conv(8, 1, 3, 3, group=8, pads=[15, 1, 9, 9]),
+        depthwise(3, 3, pads=[16, 1, 1, 1]),
+        depthwise(3, 3, pads=[15, 1, 9, 9]),
     ),
     "transposed kernel": (
         transposed(8, 8, 2, 2, strides=[3, 3]),
@@ -60,19 +98,16 @@ CASES: dict[str, tuple[Draw, Draw]] = {
         transposed(8, 8, 2, 2, pads=[3, 0, 0, 0]),
         transposed(8, 8, 2, 2, pads=[2, 0, 0, 0]),
     ),
-    "pool kernel": (node("MaxPool", kernel_shape=[257, 1]), node("MaxPool", kernel_shape=[17, 1])),
+    "pool kernel": (max_pool(257, 1), max_pool(17, 1)),
     "pool stride": (
-        node("MaxPool", kernel_shape=[2, 2], strides=[257, 1]),
-        node("MaxPool", kernel_shape=[2, 2]),
+        max_pool(2, 2, strides=[257, 1]),
+        max_pool(2, 2),
     ),
     "pool padding": (
-        node("MaxPool", kernel_shape=[20, 20], pads=[16, 0, 0, 0]),
-        node("MaxPool", kernel_shape=[20, 20], pads=[15, 0, 0, 0]),
+        max_pool(20, 20, pads=[16, 0, 0, 0]),
+        max_pool(20, 20, pads=[15, 0, 0, 0]),
     ),
-    "activation place": (
-        lambda s, x: s.node("Relu", s.node("MaxPool", x, kernel_shape=[2, 2])),
-        lambda s, x: s.node("MaxPool", s.node("Relu", x), kernel_shape=[2, 2]),
-    ),
+    "activation place": (behind_pool("Relu"), pool_of_relu),
     "activation of sums": (behind_sum("HardSwish"), behind_sum("Relu")),
     "leaky relu alpha": (
         behind_conv("LeakyRelu", alpha=0.1),
@@ -83,14 +118,14 @@ CASES: dict[str, tuple[Draw, Draw]] = {
     "resize mode": (resized(2, mode="cubic"), resized(2, mode="nearest")),
     "resize scale": (resized(3, mode="linear"), resized(2, mode="linear")),
     "shuffle place": (
-        lambda s, x: s.node("DepthToSpace", s.node("MaxPool", x, kernel_shape=[2, 2]), blocksize=1),
+        behind_pool("DepthToSpace", blocksize=1),
         node("DepthToSpace", blocksize=1),
     ),
     "argmax channels": (node("ArgMax", axis=1), behind_conv("Relu")),
     "known operator": (behind_conv("Sigmoid"), behind_conv("HardSigmoid")),
     "operator domain": (
-        lambda s, x: s.node("FusedRelu", s.conv(x), domain="com.microsoft"),
-        lambda s, x: s.node("Relu", s.conv(x)),
+        behind_conv("FusedRelu", domain="com.microsoft"),
+        behind_conv("Relu"),
     ),
 }
 WIDE = {
@@ -99,8 +134,9 @@ WIDE = {
     "depthwise channels",
     "transposed channels",
     "resize channels",
+    "elementwise channels",
+    "shuffle channels",
 }
-WIDE |= {"elementwise channels", "shuffle channels"}
 OTHERS = {"conv area", "int8 operator", "int8 alone", "bias width"}
 """Rules of other boards: tests/deploy/dpu/test_boards.py, test_npu.py."""
 SIZES = {"map exists", "maps aligned", "map in memory"}
@@ -108,14 +144,25 @@ NUMBERS = {case.split(":")[0] for case in NUMBER_CASES} | {"int32 bias", "on int
 
 
 def test_every_rule_has_a_case() -> None:
-    assert {rule_name(rule) for rule in all_rules()} == set(CASES) | WIDE | SIZES | NUMBERS | OTHERS
+    """Every rule of the checker is tested here or in a file that is named here.
+
+    A new rule without a case fails this test.
+    """
+    names = {rule_name(rule) for rule in all_rules()}
+    assert names == set(CASES) | WIDE | SIZES | NUMBERS | OTHERS
 
 
 @pytest.mark.parametrize("rule", CASES)
 def test_each_rule_refuses_its_case_alone_and_following_the_remedy_passes(
     tmp_path: Path, rule: str
 ) -> None:
-    assert [between_convs(tmp_path, draw) for draw in CASES[rule]] == [[rule], []]
+    """A network that breaks one rule is refused by that rule and by no other.
+
+    With the remedy followed it passes, so a user who obeys the message gets on.
+    """
+    breaks, follows = CASES[rule]
+    assert between_convs(tmp_path, breaks) == [rule]
+    assert between_convs(tmp_path, follows) == []
 
 
 @pytest.mark.parametrize(
@@ -129,94 +176,117 @@ def test_each_rule_refuses_its_case_alone_and_following_the_remedy_passes(
     ],
 )
 def test_wide_layers(tmp_path: Path, rule: str, draw: Draw, channels: int) -> None:
+    """A layer of too many channels or weights is refused by the rule about its own kind alone."""
     sketch = Sketch(channels)
-    assert broken_rules(sketch.save(tmp_path / "w.onnx", draw(sketch, "image"))) == [rule]
+    result = draw(sketch, "image")
+    path = sketch.save(tmp_path / "w.onnx", result)
+    assert broken_rules(path) == [rule]
 
 
 def test_too_many_channels_for_sums_and_shuffles(tmp_path: Path) -> None:
+    """Sums and shuffles of too many channels are refused, though each convolution in front is
+    allowed.
+    """
     sketch = Sketch(8)
     half = sketch.conv("image", (2049, 8, 1, 1))
     joined = sketch.node("Concat", half, half, axis=1)
-    assert broken_rules(sketch.save(tmp_path / "w.onnx", sketch.node("Add", joined, joined))) == [
-        "elementwise channels"
-    ]
+    added = sketch.node("Add", joined, joined)
+    path = sketch.save(tmp_path / "w.onnx", added)
+    assert broken_rules(path) == ["elementwise channels"]
     sketch = Sketch(8)
-    deep = sketch.node("DepthToSpace", sketch.conv("image", (4100, 8, 1, 1)), blocksize=2)
-    path = sketch.save(tmp_path / "s.onnx", sketch.conv(deep, (8, 1025, 1, 1)))
+    wide = sketch.conv("image", (4100, 8, 1, 1))
+    deep = sketch.node("DepthToSpace", wide, blocksize=2)
+    result = sketch.conv(deep, (8, 1025, 1, 1))
+    path = sketch.save(tmp_path / "s.onnx", result)
     assert broken_rules(path) == ["conv channels", "shuffle channels"]
 
 
 def test_a_tile_too_small_for_a_window(tmp_path: Path) -> None:
+    """A tile smaller than an unpadded kernel leaves no map, and one of its size leaves one."""
     sketch = Sketch(8)
     # Behind padding, because the image of a network without any is mirrored.
-    unpadded = sketch.conv(sketch.conv("image"), (8, 8, 3, 3), pads=[0] * 4)
+    stream = sketch.conv("image")
+    unpadded = sketch.conv(stream, pads=[0] * 4)
     path = sketch.save(tmp_path / "s.onnx", unpadded)
     assert broken_rules(path, tile_px=2) == ["map exists"]
     assert broken_rules(path, tile_px=3) == []
 
 
 def test_a_tile_that_the_stride_does_not_divide(tmp_path: Path) -> None:
+    """A sum of maps of different sizes is refused: an odd tile halved and doubled is another
+    size.
+    """
     sketch = Sketch(8)
     stream = sketch.conv("image")
     half = sketch.node("MaxPool", stream, kernel_shape=[2, 2], strides=[2, 2])
-    path = sketch.save(
-        tmp_path / "u.onnx", sketch.conv(sketch.node("Add", stream, resized(2)(sketch, half)))
-    )
+    enlarged = resized(2)(sketch, half)
+    added = sketch.node("Add", stream, enlarged)
+    path = sketch.save(tmp_path / "u.onnx", sketch.conv(added))
     assert broken_rules(path, tile_px=21) == ["maps aligned"]
     assert broken_rules(path, tile_px=22) == []
 
 
 def test_a_factor_for_a_whole_channel_meets_any_map(tmp_path: Path) -> None:
+    """A factor of one value a channel, as channel attention has, needs no map of the same size."""
     sketch = Sketch(8)
     stream = sketch.conv("image")
-    factor = sketch.conv(sketch.node("GlobalAveragePool", stream), (8, 8, 1, 1))
-    path = sketch.save(tmp_path / "f.onnx", sketch.conv(sketch.node("Mul", stream, factor)))
+    mean = sketch.node("GlobalAveragePool", stream)
+    factor = sketch.conv(mean, (8, 8, 1, 1))
+    scaled_stream = sketch.node("Mul", stream, factor)
+    path = sketch.save(tmp_path / "f.onnx", sketch.conv(scaled_stream))
     assert broken_rules(path, tile_px=37) == []
 
 
 def test_a_tile_that_the_memory_cannot_hold(tmp_path: Path) -> None:
+    """A tile whose maps exceed the memory is refused, and the remedy's factor makes it fit."""
     sketch = Sketch(1)
-    path = sketch.save(
-        tmp_path / "m.onnx", sketch.conv(sketch.conv("image", (64, 1, 3, 3)), (1, 64, 3, 3))
-    )
-    node = place(read_network(path, 7001), DPU).nodes[0]
-    assert [violation.rule for violation in node.broken] == ["map in memory"]
-    allowed_px = int(7001 * float(node.broken[0].finding.remedy.split()[-4]))
+    wide = sketch.conv("image", (64, 1, 3, 3))
+    path = sketch.save(tmp_path / "m.onnx", sketch.conv(wide, (1, 64, 3, 3)))
+    tile_px = 7001
+    (violation,) = place(read_network(path, tile_px), DPU).nodes[0].broken
+    assert violation.rule == "map in memory"
+    factor = float(violation.finding.remedy.split()[-4])
+    allowed_px = int(tile_px * factor)
     # The remedy states its factor to two digits only.
     assert broken_rules(path, tile_px=allowed_px - 70) == []
     # This DPU has one image at a time in memory.
-    assert broken_rules(path, load_dpu("vck190", "C32B1"), 7001) == []
+    assert broken_rules(path, load_dpu("vck190", NARROW_ARRAY), tile_px) == []
 
 
 def test_all_broken_rules_of_a_node_are_listed(tmp_path: Path) -> None:
+    """All faults of a node are reported at once, so that a user does not find them one by one."""
     draw = conv(8, 4, 17, 9, group=2, strides=[9, 1], pads=[0, 0, 20, 0])
     rules = between_convs(tmp_path, draw)
     assert rules == ["conv kernel", "conv stride", "conv padding", "conv window", "conv groups"]
 
 
 def test_a_wider_array_needs_more_of_the_weight_bank(tmp_path: Path) -> None:
+    """The same weights fit the bank of a narrow array and not that of a wide one."""
     sketch = Sketch(1024)
     path = sketch.save(tmp_path / "w.onnx", sketch.conv("image", (4, 1024, 8, 8)))
-    assert broken_rules(path, load_dpu("vck190", "C32B1")) == []
-    assert broken_rules(path, load_dpu("vck190", "C64B1")) == ["conv weight bank"]
+    assert broken_rules(path, load_dpu("vck190", NARROW_ARRAY)) == []
+    assert broken_rules(path, load_dpu("vck190", WIDE_ARRAY)) == ["conv weight bank"]
 
 
 def test_a_float_convolution_in_a_quantized_file_is_refused(tmp_path: Path) -> None:
+    """A float convolution between integer ones is refused, because a DPU computes no float."""
     sketch = IntegerSketch()
-    first = sketch.qconv(sketch.quantized("image"), (4, 1, 3, 3))
-    path = sketch.save(
-        tmp_path / "f.onnx",
-        sketch.conv(sketch.node("DequantizeLinear", first, *sketch.numbers), (1, 4, 3, 3)),
-    )
+    image = sketch.quantized("image")
+    first = sketch.qconv(image, (4, 1, 3, 3))
+    floating = sketch.node("DequantizeLinear", first, *sketch.numbers)
+    last = sketch.conv(floating, (1, 4, 3, 3))
+    path = sketch.save(tmp_path / "f.onnx", last)
     assert "on integers" in broken_rules(path)
 
 
 def test_rules_read_with_the_targets_limits() -> None:
+    """The text of a rule states the limits of the target and the page that they are from."""
     text = rule_text(conv_kernel, DPU)
     assert text == "Kernel height and width are 1 to 16 (UG1414 3.5, DPUCVDX8G, conv2d)."
 
 
 def test_findings_name_the_numbers_and_a_remedy(tmp_path: Path) -> None:
+    """A finding states the number that broke the rule, the limit, and what to do."""
     sketch = Sketch(8)
     path = sketch.save(tmp_path / "k.onnx", sketch.conv("image", (8, 8, 17, 1)))
     (violation,) = place(read_network(path, TILE_PX), DPU).nodes[0].broken

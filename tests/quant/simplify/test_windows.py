@@ -15,37 +15,48 @@ from beers_deploy.quant.simplify.large_kernels import LARGE_POSITIONS, MOST_POSI
 from beers_deploy.quant.simplify.simplify import simplify
 
 CHANNELS = 3
+OPSET = 17
+
+
+def drawn(generator: np.random.Generator, *shape: int, deviation: float = 1) -> np.ndarray:
+    """Draw normally distributed float32 weights of a shape."""
+    return generator.normal(0, deviation, shape).astype(np.float32)
 
 
 def network(nodes: list[onnx.NodeProto], **constants: np.ndarray) -> onnx.ModelProto:
-    """A network of `CHANNELS` channels from `x` to `y`."""
+    """Return a network of `CHANNELS` channels from `x` to `y`, for images of any size."""
     initializers = [numpy_helper.from_array(value, name) for name, value in constants.items()]
-    sizes: dict[str, list[str | int | None]] = {
-        "x": ["N", CHANNELS, "H", "W"],
-        "y": ["N", "C", "h", "w"],
-    }
-    x, y = (
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, dims) for name, dims in sizes.items()
-    )
-    graph = helper.make_graph(nodes, "g", [x], [y], initializers)
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    image = helper.make_tensor_value_info("x", TensorProto.FLOAT, ["N", CHANNELS, "H", "W"])
+    result = helper.make_tensor_value_info("y", TensorProto.FLOAT, ["N", "C", "h", "w"])
+    graph = helper.make_graph(nodes, "g", [image], [result], initializers)
+    opset = helper.make_opsetid("", OPSET)
+    return helper.make_model(graph, opset_imports=[opset], ir_version=8)
 
 
 def assert_same(model: onnx.ModelProto, short: onnx.ModelProto, rows: int, columns: int) -> None:
     """Check that two networks are equal but for the rounding of float32."""
-    pixels = np.random.default_rng(rows).uniform(0, 1, (2, CHANNELS, rows, columns))
-    before, after = (result_of(open_session(m), pixels.astype(np.float32)) for m in (model, short))
-    np.testing.assert_allclose(after, before, atol=1e-5 * np.abs(before).max())
+    generator = np.random.default_rng(rows)
+    pixels = generator.random((2, CHANNELS, rows, columns), np.float32)
+    before = result_of(open_session(model), pixels)
+    after = result_of(open_session(short), pixels)
+    largest = np.abs(before).max()
+    np.testing.assert_allclose(after, before, atol=1e-5 * largest)
+
+
+def pairs(low: int, high: int) -> st.SearchStrategy[tuple[int, int]]:
+    """Draw a number from `low` to `high` for each of two axes."""
+    sides = st.integers(low, high)
+    return st.tuples(sides, sides)
 
 
 @settings(max_examples=40, deadline=None)
 @given(
-    kernel=st.tuples(st.integers(1, 16), st.integers(1, 16)),
+    kernel=pairs(1, 16),
     pads=st.lists(st.integers(0, 8), min_size=4, max_size=4),
-    strides=st.tuples(st.integers(1, 3), st.integers(1, 3)),
-    dilations=st.tuples(st.integers(1, 2), st.integers(1, 2)),
+    strides=pairs(1, 3),
+    dilations=pairs(1, 2),
     outputs=st.integers(1, 4),
-    size=st.tuples(st.integers(31, 40), st.integers(31, 40)),
+    size=pairs(31, 40),
 )
 def test_a_large_kernel_is_several_small_ones_and_their_sum(
     kernel: tuple[int, int],
@@ -55,58 +66,73 @@ def test_a_large_kernel_is_several_small_ones_and_their_sum(
     outputs: int,
     size: tuple[int, int],
 ) -> None:
-    """Unless parts would begin inside the map."""
+    """A large kernel becomes convolutions of a few of its rows each, and one that adds them.
+
+    The result stays the same, and no part has more positions than every target computes. A kernel
+    whose parts would begin inside the map is left as it is.
+    """
     generator = np.random.default_rng(kernel)
-    weight = generator.normal(0, 1, (outputs, CHANNELS, *kernel)).astype(np.float32)
-    bias = generator.normal(0, 1, outputs).astype(np.float32)
+    weight = drawn(generator, outputs, CHANNELS, *kernel)
+    bias = drawn(generator, outputs)
     windows: dict[str, Any] = {"pads": pads, "strides": strides, "dilations": dilations}
     node = helper.make_node("Conv", ["x", "w", "b"], ["y"], "large", kernel_shape=kernel, **windows)
     model = network([node], w=weight, b=bias)
     short = simplify(model, "a.onnx")
-    convs = [n for n in OnnxGraph(short).nodes if n.op_type == "Conv"]
-    steps = -(-kernel[0] // (MOST_POSITIONS // kernel[1]))
-    may_split = kernel[0] * kernel[1] > LARGE_POSITIONS
-    if may_split and min(pads[0], pads[2]) >= (steps - 1) * dilations[0]:
-        assert len(convs) == steps + 1
-        areas = [np.prod(OnnxGraph(short).constants[n.inputs[1]].shape[2:]) for n in convs]
-        assert max(areas) <= MOST_POSITIONS
+    graph = OnnxGraph(short)
+    convs = [node for node in graph.nodes if node.op_type == "Conv"]
+    rows, columns = kernel
+    rows_of_part = MOST_POSITIONS // columns
+    parts = -(-rows // rows_of_part)
+    may_split = rows * columns > LARGE_POSITIONS
+    # A part that begins inside the map would have negative padding.
+    reach = (parts - 1) * dilations[0]
+    if may_split and min(pads[0], pads[2]) >= reach:
+        assert len(convs) == parts + 1
+        for conv in convs:
+            part = graph.constants[conv.inputs[1]]
+            assert np.prod(part.shape[2:]) <= MOST_POSITIONS
         assert_same(model, short, *size)
     elif any(pads):
         assert len(convs) == 1 or may_split
 
 
 def test_srresnets_kernels_of_9_x_9_are_two_and_a_sum() -> None:
-    weight = np.random.default_rng(0).normal(0, 1, (CHANNELS, CHANNELS, 9, 9)).astype(np.float32)
+    """SRResNet's first layer becomes two parts, their concatenation, and the convolution that sums
+    them.
+
+    The last one keeps the name of the layer and has its ReLU, so that reports name what users know.
+    """
+    weight = drawn(np.random.default_rng(0), CHANNELS, CHANNELS, 9, 9)
     conv = helper.make_node("Conv", ["x", "w"], ["c"], "head", pads=[4] * 4)
-    model = network([conv, helper.make_node("Relu", ["c"], ["y"])], w=weight)
+    relu = helper.make_node("Relu", ["c"], ["y"])
+    model = network([conv, relu], w=weight)
     short = simplify(model, "a.onnx")
-    assert [op.name for op in read_network(short).graph] == [
-        "head.rows_0",
-        "head.rows_1",
-        "head.rows",
-        "head",
-    ]
+    names = [op.name for op in read_network(short).graph]
+    assert names == ["head.rows_0", "head.rows_1", "head.rows", "head"]
     assert_same(model, short, 9, 11)
 
 
 @settings(max_examples=25, deadline=None)
 @given(
-    border=st.tuples(st.integers(0, 6), st.integers(0, 6)),
-    size=st.tuples(st.integers(16, 22), st.integers(16, 22)),
+    border=pairs(0, 6),
+    size=pairs(16, 22),
     pad=st.integers(0, 1),
 )
 def test_a_crop_is_a_convolution_that_reads_one_pixel(
     border: tuple[int, int], size: tuple[int, int], pad: int
 ) -> None:
+    """A Slice that crops both ends of an axis disappears, and the result stays the same.
+
+    Unlike the Slice, a convolution needs no size of the image.
+    """
     cut = {axis: px for axis, px in zip((2, 3), border, strict=True) if px}
     assume(cut)
-    weight = np.random.default_rng(0).normal(0, 1, (CHANNELS, CHANNELS, 3, 3)).astype(np.float32)
-    nodes = [
-        helper.make_node("Slice", ["x", "starts", "ends", "axes"], ["s"], "crop"),
-        helper.make_node("Conv", ["s", "w"], ["y"], "conv", pads=[pad] * 4),
-    ]
+    weight = drawn(np.random.default_rng(0), CHANNELS, CHANNELS, 3, 3)
+    crop = helper.make_node("Slice", ["x", "starts", "ends", "axes"], ["s"], "crop")
+    conv = helper.make_node("Conv", ["s", "w"], ["y"], "conv", pads=[pad] * 4)
+    axes = np.array(list(cut))
     places = np.array(list(cut.values()))
-    model = network(nodes, w=weight, starts=places, ends=-places, axes=np.array(list(cut)))
+    model = network([crop, conv], w=weight, starts=places, ends=-places, axes=axes)
     short = simplify(model, "a.onnx")
     kinds = [node.op_type for node in short.graph.node]
     assert "Slice" not in kinds
@@ -115,15 +141,19 @@ def test_a_crop_is_a_convolution_that_reads_one_pixel(
 
 
 def test_a_u_net_without_padding_crops_its_skip_and_gets_a_mirrored_border() -> None:
-    """So do all published ones, such as waifu2x's; inside the border nothing changes."""
+    """A U-Net of unpadded convolutions is accepted, and its result is as large as its image.
+
+    Published ones, such as waifu2x's, are of this kind. Inside of the border nothing changes.
+    """
     generator = np.random.default_rng(0)
-    tensors = {
-        "w": generator.normal(0, 0.3, (CHANNELS, CHANNELS, 3, 3)),
-        "half": generator.normal(0, 0.3, (CHANNELS, CHANNELS, 2, 2)),
-        "double": generator.normal(0, 0.3, (CHANNELS, CHANNELS, 4, 4)),
+    sides = {"w": 3, "half": 2, "double": 4}
+    constants = {
+        name: drawn(generator, CHANNELS, CHANNELS, side, side, deviation=0.3)
+        for name, side in sides.items()
     }
-    constants = {name: value.astype(np.float32) for name, value in tensors.items()}
-    constants |= {"four": np.array([4, 4]), "less": np.array([-4, -4]), "axes": np.array([2, 3])}
+    constants["four"] = np.array([4, 4])
+    constants["less"] = -constants["four"]
+    constants["axes"] = np.array([2, 3])
     nodes = [
         helper.make_node("Conv", ["x", "w"], ["a"], "a"),
         helper.make_node("Conv", ["a", "half"], ["b"], "b", strides=[2, 2]),
@@ -139,6 +169,8 @@ def test_a_u_net_without_padding_crops_its_skip_and_gets_a_mirrored_border() -> 
     short = simplify(model, "a.onnx")
     assert refusal(short) == ""
     assert read_network(short).border_px == 6
-    pixels = generator.uniform(0, 1, (1, CHANNELS, 40, 44)).astype(np.float32)
-    inner = result_of(open_session(short), pixels)[:, :, 6:-6, 6:-6]
-    np.testing.assert_allclose(inner, result_of(open_session(model), pixels), atol=1e-5)
+    pixels = generator.random((1, CHANNELS, 40, 44), np.float32)
+    expected = result_of(open_session(model), pixels)
+    whole = result_of(open_session(short), pixels)
+    inner = whole[:, :, 6:-6, 6:-6]
+    np.testing.assert_allclose(inner, expected, atol=1e-5)
