@@ -16,6 +16,7 @@ from tests.quant.quick import one_guess
 
 TOP = 50
 """The largest noise level, in digital numbers of 8 bits."""
+OPTION = f"0,1,0,1,0,1,0,{TOP}"
 
 
 def network(largest: float) -> bd.Network:
@@ -33,58 +34,78 @@ def network(largest: float) -> bd.Network:
 
 
 def samples(largest: float, count: int = 8) -> np.ndarray:
+    """Return images (N, 3 + 1, 36, 36) of blocks of colour, each with a map of one noise level."""
     generator = np.random.default_rng(2)
     blocks = generator.uniform(0, 1, (count, 3, 9, 9)).astype(np.float32)
     image = np.kron(blocks, np.ones((4, 4), np.float32))
     levels = largest * generator.uniform(0, 1, (count, 1, 1, 1)).astype(np.float32)
-    return np.concatenate([image, np.broadcast_to(levels, image[:, :1].shape)], 1)
+    level_map = np.broadcast_to(levels, image[:, :1].shape)
+    return np.concatenate([image, level_map], 1)
 
 
 @pytest.mark.parametrize(
     ("largest", "option"),
-    [(75 / 255, None), (TOP, None), (TOP, f"0,1,0,1,0,1,0,{TOP}")],
+    [(75 / 255, None), (TOP, None), (TOP, OPTION)],
     ids=["in the usual range", "found", "stated"],
 )
 def test_a_map_of_noise_levels_is_a_channel_of_its_own_range(
     largest: float, option: str | None
 ) -> None:
+    """The map's range is found in the samples or stated, and the whole tool chain accepts the
+    result.
+
+    The MAE of the gate is a share of a range, and agrees with the network's own results.
+    """
     floating = network(largest)
     given = samples(largest)
     with one_guess():
         int8 = bd.quantize(floating, samples=given, input_range=option, progress=False)
     assert int8.table is not None
     notes = [note for note in int8.table.notes if note.startswith("input range: ")]
-    top = TOP if option else float(given[:, 3].max())
-    assert list(int8.input_ranges) == ([] if largest < 1 else [(0, 1)] * 3 + [(0, top)])
-    assert len(notes) == (largest > 1)
-    assert "found in the samples" in "".join(notes) or largest < 1 or option
+    if largest < 1:
+        assert int8.input_ranges == ()
+        assert notes == []
+    else:
+        top = TOP if option else float(given[:, 3].max())
+        assert list(int8.input_ranges) == [(0, 1)] * 3 + [(0, top)]
+        (note,) = notes
+        assert "found in the samples" in note or option
     verdict = bd.gate(floating, int8, samples=given, max_mae=0.02, progress=False)
     assert verdict
     assert bd.check(int8, tile=64)
     assert bd.bench(int8, tile=64, traditional=False)
-    apart = np.abs(int8(given) - floating(given))
-    assert apart.mean() == pytest.approx(verdict.comparison.result.mae, rel=0.3)
+    difference = np.abs(int8(given) - floating(given))
+    assert difference.mean() == pytest.approx(verdict.comparison.result.mae, rel=0.3)
 
 
 def test_the_file_reads_the_networks_own_units(tmp_path: Path) -> None:
-    """With stock onnxruntime, from the command line."""
+    """The INT8 file that the command line writes reads and gives the network's own units.
+
+    It does so in stock onnxruntime, so a user's code around the network stays as it is.
+    """
     floating = network(TOP)
-    floating.save(tmp_path / "a.onnx")
-    np.save(tmp_path / "x.npy", samples(TOP))
-    arguments = ("quantize", str(tmp_path / "a.onnx"), "--out", str(tmp_path / "b.onnx"))
-    text = done(
-        *arguments,
-        *("--samples", tmp_path / "x.npy", "--input-range", f"0,1,0,1,0,1,0,{TOP}"),
-        *("--effort", "fast"),
-    )
+    given = samples(TOP)
+    float_path = tmp_path / "a.onnx"
+    int8_path = tmp_path / "b.onnx"
+    samples_path = tmp_path / "x.npy"
+    floating.save(float_path)
+    np.save(samples_path, given)
+    arguments = ("quantize", str(float_path), "--out", str(int8_path))
+    options = ("--samples", samples_path, "--input-range", OPTION, "--effort", "fast")
+    text = done(*arguments, *options)
     assert "input range: 0 to 1, 0 to 1, 0 to 1, 0 to 50" in " ".join(text.split())
-    session = ort.InferenceSession(tmp_path / "b.onnx", providers=["CPUExecutionProvider"])
-    result = session.run(None, {"image": samples(TOP)})[0]
-    assert np.abs(result - floating(samples(TOP))).mean() < 0.05
+    session = ort.InferenceSession(int8_path, providers=["CPUExecutionProvider"])
+    result = session.run(None, {"image": given})[0]
+    assert np.abs(result - floating(given)).mean() < 0.05
     assert "has no effect without --samples" in refused(*arguments, "--input-range", "0,255")
 
 
 def test_restore_maps_full_scale_onto_a_stated_range() -> None:
+    """`restore` maps pixels to the stated range and back, and refuses a range that samples alone
+    tell.
+
+    The largest sample is no full scale, so such a range says nothing about other images.
+    """
     floating = network(TOP)
     given = samples(TOP)
     option = ((-1, 1),) * 3 + ((0, TOP),)

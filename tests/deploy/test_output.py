@@ -17,13 +17,14 @@ from tests.quant.quick import one_guess
 
 OUTPUTS = ["restored", "large"]
 PARTS = ["convolution", "relu", "hard-swish", "split gate"]
-SAMPLES = np.kron(
-    np.random.default_rng(1).uniform(0, 1, (4, 1, 4, 4)), np.ones((8, 8), np.float32)
-).astype(np.float32)
+BLOCKS = np.random.default_rng(1).uniform(0, 1, (4, 1, 4, 4)).astype(np.float32)
+SAMPLES = np.kron(BLOCKS, np.ones((8, 8), np.float32))
+SIDES = st.integers(5, 23)
 
 
 @pytest.fixture(scope="module")
 def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write a network with an output of its image's size and one of twice that size."""
     path = tmp_path_factory.mktemp("outputs") / "a.onnx"
     return drawn(path, ["relu"], adds_image=True, clips=True, has_two=True)
 
@@ -31,10 +32,8 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @settings(max_examples=20, deadline=None)
 @given(
     output=st.sampled_from(OUTPUTS),
-    sides=st.tuples(st.integers(5, 23), st.integers(5, 23)),
-    parts=st.lists(
-        st.sampled_from(["convolution", "relu", "hard-swish", "split gate"]), max_size=3
-    ),
+    sides=st.tuples(SIDES, SIDES),
+    parts=st.lists(st.sampled_from(PARTS), max_size=3),
     adds_image=st.booleans(),
 )
 def test_what_is_kept_computes_the_same(
@@ -44,31 +43,47 @@ def test_what_is_kept_computes_the_same(
     parts: list[str],
     adds_image: bool,
 ) -> None:
+    """The network with one output kept gives what the whole network gives there.
+
+    It has fewer nodes, because a board should not compute the output that nobody reads.
+    """
     path = tmp_path_factory.mktemp("drawn") / "a.onnx"
     drawn(path, parts, adds_image=adds_image, clips=False, has_two=True)
+    model = load_onnx(path)
     image = np.random.default_rng(0).random((2, 1, *sides), np.float32)
-    expected = open_session(load_onnx(path)).run([output], {"image": image})[0]
+    expected = open_session(model).run([output], {"image": image})[0]
     kept = bd.Network.load(path).with_output(output)
-    assert [value.name for value in kept.model.graph.output] == [output]
-    assert len(kept.model.graph.node) < len(load_onnx(path).graph.node)
+    graph = kept.model.graph
+    assert [value.name for value in graph.output] == [output]
+    assert len(graph.node) < len(model.graph.node)
     np.testing.assert_allclose(kept(image), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("output", OUTPUTS)
 def test_quantize_gate_and_check_agree_on_an_output(network: Path, output: str) -> None:
+    """Every command that is given the same output judges the same network.
+
+    The INT8 file names its output, so `gate` of the file alone finds the same error.
+    """
     with one_guess():
         int8 = bd.quantize(network, samples=SAMPLES, output=output, progress=False)
     assert bd.check(network, output=output, tile=64)
     verdict = bd.gate(network, int8, samples=SAMPLES, output=output, max_mae=0.1, progress=False)
     again = bd.gate(int8, samples=SAMPLES, max_mae=0.1, progress=False)
     compared = bd.compare(network, int8, samples=SAMPLES, output=output, progress=False)
-    assert verdict.comparison.result.mae == again.comparison.result.mae == compared.result.mae
+    mae = verdict.comparison.result.mae
+    assert again.comparison.result.mae == mae
+    assert compared.result.mae == mae
     assert verdict.arguments["output"] == output
     side_px = 64 if output == "large" else 32
     assert int8(SAMPLES).shape[2:] == (side_px, side_px)
 
 
 def test_an_output_must_be_named(network: Path, tmp_path: Path) -> None:
+    """A network of several outputs is refused until one is named, by the commands and in Python.
+
+    The message lists the outputs. An output other than that of the INT8 file is refused as well.
+    """
     with one_guess():
         int8 = bd.quantize(network, samples=SAMPLES, output="large", progress=False)
     with pytest.raises(ModelError, match=r"it has 2: restored, large\. Name the one to keep"):
@@ -80,8 +95,11 @@ def test_an_output_must_be_named(network: Path, tmp_path: Path) -> None:
     # Of another output than that of the INT8 file the results have another size.
     with pytest.raises(BeersError, match="made from this float network"):
         bd.gate(network, int8, samples=SAMPLES, output="restored", progress=False)
-    np.save(tmp_path / "x.npy", SAMPLES)
-    words = ("quantize", network, "--samples", tmp_path / "x.npy", "--out", tmp_path / "b.onnx")
+    samples_path = tmp_path / "x.npy"
+    int8_path = tmp_path / "b.onnx"
+    np.save(samples_path, SAMPLES)
+    words = ("quantize", network, "--samples", samples_path, "--out", int8_path)
     assert "keep as --output" in refused(*words)
     done(*words, "--output", "restored", "--effort", "fast")
-    assert bd.Network.load(tmp_path / "b.onnx")(SAMPLES).shape == SAMPLES.shape
+    restoring = bd.Network.load(int8_path)
+    assert restoring(SAMPLES).shape == SAMPLES.shape

@@ -23,6 +23,7 @@ from beers_deploy.quant.graph import (
 from beers_deploy.quant.host_part import HostPart
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.integer.trainable import TrainableCore
+from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.quant.passes.finetune import BORDER_PX, Sample, Tuning, finetune
 from beers_deploy.quant.passes.scales import moved as moved_tensors
 from beers_deploy.quant.quantize import Quantized, quantize_model
@@ -36,20 +37,29 @@ def spoilt(core: IntCore) -> IntCore:
     generator = np.random.default_rng(5)
 
     def off(op: IntConv) -> IntConv:
+        """Move the weights by up to 4 units."""
         noise = generator.integers(-4, 5, op.weight.shape)
         return replace(op, weight=np.clip(op.weight + noise, -128, 127).astype(np.int8))
 
-    return replace(core, ops=tuple(off(op) if isinstance(op, IntConv) else op for op in core.ops))
+    ops = tuple(off(op) if isinstance(op, IntConv) else op for op in core.ops)
+    return replace(core, ops=ops)
 
 
 def error(core: IntCore, patches: Patches) -> float:
     """Mean squared difference of the correction from the one that restores wholly."""
     errors = []
     for degraded, reference in patches.pairs:
-        tensors, _ = run_core(core, core.host_part.encode(degraded))
         expected = core.host_part.correction_of(degraded, reference)
-        errors.append(float(np.square(merged_correction(core, tensors) - expected).mean()))
+        actual = correction(core, degraded)
+        errors.append(np.square(actual - expected).mean())
     return float(np.mean(errors))
+
+
+def correction(core: IntCore, degraded: np.ndarray) -> np.ndarray:
+    """Return the correction that the integers of a core compute for an image."""
+    planes = core.host_part.encode(degraded)
+    tensors, _ = run_core(core, planes)
+    return merged_correction(core, tensors)
 
 
 def alone(patches: Patches) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -59,22 +69,21 @@ def alone(patches: Patches) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def trained(core: IntCore, model: onnx.ModelProto, tuning: Tuning) -> IntCore:
+    """Return the core after fine-tuning."""
     return finetune(core, read_planes(correction_graph(model)), tuning)[0]
 
 
 def difference(core: IntCore, other: IntCore, patches: Patches) -> float:
     """Mean squared difference between two cores' corrections."""
-    results = [
-        [
-            merged_correction(variant, run_core(variant, variant.host_part.encode(image))[0])
-            for image in patches.degraded
-        ]
-        for variant in (core, other)
-    ]
-    return float(np.mean([np.square(a - b).mean() for a, b in zip(*results, strict=True)]))
+    errors = []
+    for image in patches.degraded:
+        change = correction(core, image) - correction(other, image)
+        errors.append(np.square(change).mean())
+    return float(np.mean(errors))
 
 
 def test_it_begins_with_the_core_s_own_numbers(quantized: Quantized) -> None:
+    """Without a step of training, the integers are those that went in."""
     unchanged = TrainableCore(quantized.core).core()
     for one, other in zip(quantized.core.convolutions, unchanged.convolutions, strict=True):
         np.testing.assert_array_equal(one.weight, other.weight)
@@ -83,6 +92,10 @@ def test_it_begins_with_the_core_s_own_numbers(quantized: Quantized) -> None:
 
 @given(seed=st.integers(0, 2**32 - 1))
 def test_odd_operations_are_the_reference_s(seed: int) -> None:
+    """Training computes odd shapes and scales as the integer reference does.
+
+    A difference would train another network than the one that runs on the board.
+    """
     generator = np.random.default_rng(seed)
     graph = odd_operations(generator)
     bits = {op.output: int(generator.integers(4, 7)) for op in graph} | {PLANES: 7}
@@ -94,6 +107,9 @@ def test_odd_operations_are_the_reference_s(seed: int) -> None:
 def test_without_references_it_comes_back_towards_the_float_network(
     quantized: Quantized, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
 ) -> None:
+    """Weights that are off come back towards the float network, on images that were not trained
+    on.
+    """
     bad = spoilt(quantized.core)
     tuned = trained(bad, float_onnx, Tuning(alone(patches), 40, rate=0.1))
     assert difference(tuned, quantized.core, unseen) < 0.7 * difference(bad, quantized.core, unseen)
@@ -104,6 +120,7 @@ def test_without_references_it_comes_back_towards_the_float_network(
 def test_moved_scales_pay_on_others_and_are_counted(
     float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
 ) -> None:
+    """Scales that are a bit too coarse are moved and counted, and unseen images gain by it."""
     # All tensors one bit too coarse.
     plain = quickly(float_onnx, patches)
     bits = {name: n - (name != PLANES) for name, n in plain.core.frac_bits.items()}
@@ -111,8 +128,9 @@ def test_moved_scales_pay_on_others_and_are_counted(
     tuned = trained(coarse, float_onnx, Tuning(alone(patches), 1, rate=0.0))
     assert moved_tensors(coarse, tuned) > 0
     assert shift_faults(tuned) == []
-    loss, before = (difference(core, plain.core, unseen) for core in (tuned, coarse))
-    assert loss < 0.8 * before
+    before = difference(coarse, plain.core, unseen)
+    after = difference(tuned, plain.core, unseen)
+    assert after < 0.8 * before
 
 
 @pytest.fixture
@@ -126,6 +144,9 @@ def no_moves(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_comes_out_worse_is_not_kept(
     quantized: Quantized, float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
+    """Training at an absurd rate returns the core that went in: fine-tuning never makes one
+    worse.
+    """
     tuned = trained(quantized.core, float_onnx, Tuning(alone(patches), 2, rate=60.0))
     assert tuned is quantized.core
 
@@ -140,6 +161,9 @@ def test_it_goes_on_by_itself_while_held_out_pairs_gain(
     rate: float,
     steps: int,
 ) -> None:
+    """Without a number of steps it goes on while held-out pairs gain, and stops when they do
+    not.
+    """
     monkeypatch.setattr("beers_deploy.quant.passes.finetune.ROUNDS", (12, 2))
     graph = read_planes(correction_graph(float_onnx))
     tuning = Tuning(alone(patches), None, rate)
@@ -149,6 +173,7 @@ def test_it_goes_on_by_itself_while_held_out_pairs_gain(
 def test_a_reference_of_another_size_is_one_sentence(
     quantized: Quantized, float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
+    """A reference that does not fit its image is refused with both sizes."""
     degraded, reference = patches.pairs[0]
     short = [(degraded, reference[..., :-2])] * 2
     with pytest.raises(
@@ -161,15 +186,17 @@ def test_a_reference_of_another_size_is_one_sentence(
 def test_the_same_seed_gives_the_same_numbers(
     float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
+    """Two runs of one seed write the same bytes, and report their steps."""
+
     def made(seed: int) -> bytes:
+        """Quantize and fine-tune, and return the file."""
         reported: list[Step] = []
         tuning = Tuning(patches.pairs, 3, rate=0.3, seed=seed)
         with reporting(reported.append), progress("calibrating"):
             model = quantize_model(float_onnx, patches, {}, tuning=tuning)
         assert reported[-1].what.startswith("calibrating: fine-tuning, step 3 of 3: ")
-        assert {entry.key: entry.value for entry in model.host.metadata_props}[
-            "finetune"
-        ].startswith(f"3 steps on {len(patches.pairs)} patches, scales of ")
+        record = metadata(model.host)["finetune"]
+        assert record.startswith(f"3 steps on {len(patches.pairs)} patches, scales of ")
         return bytes(model.host.SerializeToString())
 
     assert made(1) == made(1)
@@ -179,6 +206,11 @@ def test_the_same_seed_gives_the_same_numbers(
 def test_the_border_is_the_float_network_s_where_the_reference_cannot_know(
     side: int, looked_at: bool
 ) -> None:
+    """At the border of a patch the float network is the target, because the reference depends on
+    pixels outside of it.
+
+    Small patches are an exception, as little would be left of them.
+    """
     inner = torch.rand((1, 1, side, side + 9), generator=torch.Generator().manual_seed(1))
     edge = inner.clone()
     edge[..., 0, :] += 1
@@ -190,10 +222,10 @@ def test_the_border_is_the_float_network_s_where_the_reference_cannot_know(
 def test_slopes_pass_roundings_and_stop_where_int8_ends(
     quantized: Quantized, patches: Patches
 ) -> None:
+    """Every layer gets a slope through its roundings, and weights that are clipped get none."""
     trainable = TrainableCore(quantized.core)
-    planes = torch.from_numpy(
-        quantized.core.host_part.encode(patches.degraded[0]).astype(np.float32)
-    )
+    encoded = quantized.core.host_part.encode(patches.degraded[0])
+    planes = torch.from_numpy(encoded.astype(np.float32))
     trainable(planes).square().mean().backward()
     assert all(bool(weight.grad.abs().max() > 0) for weight in trainable.weights)
     with torch.no_grad():
@@ -212,6 +244,9 @@ def test_slopes_pass_roundings_and_stop_where_int8_ends(
 def test_the_correction_of_a_result_makes_it(
     backs: list[tuple[int, bool]], adds: bool, seed: int
 ) -> None:
+    """The correction that is computed from a wanted result gives that result, through any
+    shuffles.
+    """
     generator = np.random.default_rng(seed)
     back = tuple(
         Shuffle(f"s{k}", "a", "b", block, True, order) for k, (block, order) in enumerate(backs)
@@ -226,5 +261,6 @@ def test_the_correction_of_a_result_makes_it(
 def test_training_on_references_pays_on_others(
     quantized: Quantized, float_onnx: onnx.ModelProto, patches: Patches, unseen: Patches
 ) -> None:
+    """Training on references restores unseen images better than the network before."""
     tuned = trained(quantized.core, float_onnx, Tuning(patches.pairs, 20, rate=0.3))
     assert error(tuned, unseen) < 0.97 * error(quantized.core, unseen)

@@ -41,6 +41,7 @@ STEPS = [
 
 
 def prices(rows: list[Row]) -> dict[str, float]:
+    """Return the price of each step that has one, by the name of the step."""
     values = {row.name: row.figures["price"].value for row in rows}
     return {name: value for name, value in values.items() if value is not None}
 
@@ -48,6 +49,9 @@ def prices(rows: list[Row]) -> dict[str, float]:
 def test_steps_add_up_to_what_the_gate_measures(
     quantized: Quantized, float_onnx: onnx.ModelProto, unseen: Patches
 ) -> None:
+    """The prices sum to the loss that the gate measures, so none is missing and none is counted
+    twice.
+    """
     rows = price_rows(quantized, unseen)
     assert [row.name for row in rows] == STEPS
     gate = compare(open_session(float_onnx), open_session(quantized.host), unseen)
@@ -59,6 +63,11 @@ def test_steps_add_up_to_what_the_gate_measures(
 
 
 def test_simulated_integers_are_those_of_the_network(quantized: Quantized, unseen: Patches) -> None:
+    """The simulation of INT8 in float errs as the integers in the file do, but for the rounding of
+    ties.
+
+    Without this the step "INT8 as written" would be the price of another network.
+    """
     samples = Measured.of(quantized, unseen.pairs)
     session = open_session(quantized.host)
     written = samples.cost(result_of(session, image) for image in unseen.degraded)
@@ -71,26 +80,41 @@ def test_simulated_integers_are_those_of_the_network(quantized: Quantized, unsee
 def test_of_many_bits_nothing_is_lost(
     quantized: Quantized, unseen: Patches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    few = {row.name: row.figures["MAE"].value or 0 for row in price_rows(quantized, unseen)[:4]}
+    """With 18 bits instead of 8 the steps of the float network lose almost nothing.
+
+    So the prices are those of rounding, and not of a fault in the simulation.
+    """
+    few = float_errors(quantized, unseen)
     monkeypatch.setattr(price, "BITS", 18)
-    many = {row.name: row.figures["MAE"].value or 0 for row in price_rows(quantized, unseen)[:4]}
+    many = float_errors(quantized, unseen)
     for name, mae in many.items():
         assert mae < few[name] / 200
+
+
+def float_errors(quantized: Quantized, unseen: Patches) -> dict[str, float]:
+    """Return the MAE of each of the four steps before the integers."""
+    rows = price_rows(quantized, unseen)[:4]
+    return {row.name: row.figures["MAE"].value or 0 for row in rows}
 
 
 def with_equal_channels(quantized: Quantized) -> Quantized:
     """The network with weights of each output channel that reach as far."""
 
     def equal(op: Conv) -> Conv:
+        """Scale the weights of each output channel to the same largest size."""
         largest = np.abs(op.weight).max((1, 2, 3), keepdims=True)
         return replace(op, weight=(op.weight * (0.25 / largest)).astype(np.float32))
 
-    network = quantized.network
-    graph = tuple(equal(op) if isinstance(op, Conv) else op for op in network.graph)
-    return replace(quantized, network=replace(network, graph=graph))
+    graph = quantized.network.graph
+    ops = tuple(equal(op) if isinstance(op, Conv) else op for op in graph)
+    network = replace(quantized.network, graph=ops)
+    return replace(quantized, network=network)
 
 
 def test_one_scale_for_equal_channels_costs_nothing(quantized: Quantized, unseen: Patches) -> None:
+    """One scale for a layer is free if its channels are of equal size, and the missing zero
+    point still costs.
+    """
     price_of = prices(price_rows(with_equal_channels(quantized), unseen))
     assert price_of["one scale for the weights of a layer"] == pytest.approx(0, abs=1e-3)
     assert abs(price_of["no zero point"]) > 1e-3
@@ -99,6 +123,9 @@ def test_one_scale_for_equal_channels_costs_nothing(quantized: Quantized, unseen
 def test_without_references_prices_are_differences_of_the_mae(
     quantized: Quantized, unseen: Patches
 ) -> None:
+    """Without references there is no PSNR, so prices are MAE against the float network and add
+    up too.
+    """
     rows = price_rows(quantized, alone(unseen))
     assert {row.figures["price"].unit for row in rows} == {"of full scale"}
     assert all("PSNR drop" not in row.figures for row in rows)
@@ -108,11 +135,11 @@ def test_without_references_prices_are_differences_of_the_mae(
 def test_what_clips_nothing_pays_nothing_for_it_and_what_clips_much_does(
     float_onnx: onnx.ModelProto, patches: Patches
 ) -> None:
-    unclipped = quickly(
-        float_onnx,
-        patches,
-        passes=Passes(dual_range=False, least_squares=False, equalization=False),
-    )
+    """The price of clipping is near 0 for scales that clip nothing, and most of the loss for
+    finer ones.
+    """
+    passes = Passes(dual_range=False, least_squares=False, equalization=False)
+    unclipped = quickly(float_onnx, patches, passes=passes)
     images = alone(patches)
     rows = price_rows(unclipped, images)
     # Channels are scaled by a quantile of their sizes, so a few values may be clipped.
@@ -128,6 +155,9 @@ def test_what_clips_nothing_pays_nothing_for_it_and_what_clips_much_does(
 def test_a_grid_holds_its_range_and_zero(
     low: float, high: float, zero_point: bool, powers: bool
 ) -> None:
+    """A grid of 256 steps covers its range to half a step, and has an exact zero, which padding
+    needs.
+    """
     grid = grid_of(low, high, zero_point, powers)
     slack = 0.51 * grid.scale
     assert grid.low * grid.scale <= low + slack
@@ -138,6 +168,9 @@ def test_a_grid_holds_its_range_and_zero(
 
 @given(seed=st.integers(0, 2**32 - 1))
 def test_weights_are_rounded_by_less_than_a_step(seed: int) -> None:
+    """Weights err by half a step of their scale, and by a whole one where scales are powers of
+    two.
+    """
     weight = np.random.default_rng(seed).normal(0, 1, (3, 2, 2, 2)).astype(np.float32)
     weight[0] *= 10
     for axes in ((1, 2, 3), None):

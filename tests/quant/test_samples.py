@@ -14,48 +14,77 @@ from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 from beers_deploy.quant.samples.own import OwnSamples, read_samples, samples_of
 from beers_deploy.quant.samples.patches import Regenerated
 
-RAMP = np.linspace(0, 1, 3 * 2 * 150 * 137, dtype=np.float32).reshape(3, 2, 150, 137)
+SHAPE = (3, 2, 150, 137)
+RAMP = np.linspace(0, 1, np.prod(SHAPE), dtype=np.float32).reshape(SHAPE)
+ONE_CHANNEL = RAMP[:, :1]
+NO_REFERENCE = np.empty(0, np.float32)
 
 
 def test_large_samples_are_cut_to_patches_on_the_lattice(tmp_path: Path) -> None:
-    np.save(tmp_path / "ramp.npy", RAMP)
-    samples = read_samples(tmp_path / "ramp.npy", 2, None, 4).all
+    """Large samples are cut to patches of 128 pixels, small ones to whole steps of the network's
+    lattice.
+
+    A network of a fixed size gets every tile of its size.
+    """
+    large_path = tmp_path / "ramp.npy"
+    np.save(large_path, RAMP)
+    samples = read_samples(large_path, 2, None, 4).all
     assert [image.shape for image in samples.degraded] == [(1, 2, 128, 128)] * 3
     np.testing.assert_array_equal(samples.degraded[1][0], RAMP[1, :, :128, :128])
-    np.save(tmp_path / "small.npy", RAMP[:, :, :50, :37])
-    small = read_samples(tmp_path / "small.npy", 2, None, 4).all
+    small_path = tmp_path / "small.npy"
+    np.save(small_path, RAMP[:, :, :50, :37])
+    small = read_samples(small_path, 2, None, 4).all
     assert small.degraded[0].shape == (1, 2, 48, 36)
-    assert len(read_samples(tmp_path / "ramp.npy", 2, 32).all.pairs) == 3 * 4 * 4
+    tiles = read_samples(large_path, 2, 32).all
+    assert len(tiles.pairs) == 3 * 4 * 4
 
 
 def test_references_stay_with_their_images(tmp_path: Path) -> None:
-    np.savez(tmp_path / "both.npz", image=RAMP[:, :1, :20, :24], reference=RAMP[:, :1, :40, :48])
-    for (image, reference), ramp in zip(
-        read_samples(tmp_path / "both.npz", 1, None).all.pairs, RAMP, strict=True
-    ):
-        np.testing.assert_array_equal(image[0], ramp[:1, :20, :24])
-        np.testing.assert_array_equal(reference[0], ramp[:1, :40, :48])
+    """Each image of a .npz file is paired with its own reference, here one of twice its sides."""
+    path = tmp_path / "both.npz"
+    images = ONE_CHANNEL[:, :, :20, :24]
+    references = ONE_CHANNEL[:, :, :40, :48]
+    np.savez(path, image=images, reference=references)
+    pairs = read_samples(path, 1, None).all.pairs
+    assert len(pairs) == len(images)
+    for number, (image, reference) in enumerate(pairs):
+        np.testing.assert_array_equal(image[0], images[number])
+        np.testing.assert_array_equal(reference[0], references[number])
 
 
 @pytest.mark.parametrize(("kind", "full_scale"), [(np.uint8, 255), (np.uint16, 4095)])
 def test_a_folder_holds_images_and_arrays(
     kind: type[np.generic], full_scale: int, tmp_path: Path
 ) -> None:
-    pixels = (np.arange(40 * 30).reshape(40, 30) % full_scale).astype(kind)
+    """A folder may hold image files and arrays; other files in it are ignored.
+
+    Pixels of image files are divided by full scale, arrays are read as they are.
+    """
+    numbers = np.arange(40 * 30).reshape(40, 30)
+    pixels = (numbers % full_scale).astype(kind)
+    array = ONE_CHANNEL[0, :, :40, :30]
     tifffile.imwrite(tmp_path / "a.tif", pixels)
-    np.save(tmp_path / "b.npy", RAMP[0, :1, :40, :30])
+    np.save(tmp_path / "b.npy", array)
     (tmp_path / "notes.txt").write_text("of no matter")
     first, second = read_samples(tmp_path, 1, None).all.degraded
     np.testing.assert_allclose(first[0, 0] * full_scale, pixels, atol=1e-3)
-    np.testing.assert_array_equal(second[0], RAMP[0, :1, :40, :30])
+    np.testing.assert_array_equal(second[0], array)
 
 
 def test_every_fourth_sample_is_kept_from_calibration(tmp_path: Path) -> None:
-    steps = np.arange(9, dtype=np.float32).reshape(9, 1, 1, 1).repeat(8, 2).repeat(8, 3) / 9
+    """Every fourth sample is held out from calibration, so that the judgement is on unseen images.
+
+    Of fewer than four samples all are used for both, because there would be nothing to judge on.
+    """
+    path = tmp_path / "nine.npy"
+    levels = np.arange(9, dtype=np.float32) / 9
+    steps = np.broadcast_to(levels[:, None, None, None], (9, 1, 8, 8)).copy()
+    # Without an edge the samples would have no contrast.
     steps[..., -1] = 1
-    np.save(tmp_path / "nine.npy", steps)
-    samples = read_samples(tmp_path / "nine.npy", 1, None)
-    assert [round(9 * float(image[0, 0, 0, 0])) for image in samples.unseen.degraded] == [3, 7]
+    np.save(path, steps)
+    samples = read_samples(path, 1, None)
+    unseen = [image[0, 0, 0, 0] for image in samples.unseen.degraded]
+    assert [round(9 * float(level)) for level in unseen] == [3, 7]
     assert len(samples.drawn.pairs) == 7
     assert samples.drawn.digest != samples.unseen.digest
     few = OwnSamples("few", samples.samples[:3])
@@ -63,46 +92,64 @@ def test_every_fourth_sample_is_kept_from_calibration(tmp_path: Path) -> None:
 
 
 def test_samples_without_contrast_are_left_out() -> None:
+    """A constant sample tells nothing of a restoration, so it is left out, and refused if it is
+    alone.
+    """
     flat = np.full((1, 20, 30), 0.5, np.float32)
-    nothing = np.empty(0, np.float32)
-    textured = RAMP[0, :1, :20, :30]
-    samples = read_samples([(flat, nothing), (textured, nothing)], 1, None)
+    constant = (flat, NO_REFERENCE)
+    textured = (ONE_CHANNEL[0, :, :20, :30], NO_REFERENCE)
+    samples = read_samples([constant, textured], 1, None)
     assert samples.all.names == ["samples[1]"]
     with pytest.raises(ImageError, match="constant"):
-        read_samples([(flat, nothing)], 1, None)
+        read_samples([constant], 1, None)
 
 
 def of(array: np.ndarray) -> Callable[[Path], Path]:
+    """Return a writer of an array."""
+
     def write(folder: Path) -> Path:
-        np.save(folder / "x.npy", array)
-        return folder / "x.npy"
+        """Write the array and return its path."""
+        path = folder / "x.npy"
+        np.save(path, array)
+        return path
 
     return write
 
 
 def pickled(folder: Path) -> Path:
-    np.save(folder / "x.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    return folder / "x.npy"
+    """Write an array of Python objects, which only unpickling could read."""
+    path = folder / "x.npy"
+    objects = np.array([{"a": 1}], dtype=object)
+    np.save(path, objects, allow_pickle=True)
+    return path
 
 
 def two_arrays(folder: Path) -> Path:
-    np.savez(folder / "x.npz", first=RAMP, second=RAMP)
-    return folder / "x.npz"
+    """Write a file of two arrays under names that mean nothing here."""
+    path = folder / "x.npz"
+    np.savez(path, first=RAMP, second=RAMP)
+    return path
 
 
 def cut_off(folder: Path) -> Path:
-    np.savez(folder / "x.npz", image=RAMP)
-    content = (folder / "x.npz").read_bytes()
-    (folder / "x.npz").write_bytes(content[: len(content) // 2])
-    return folder / "x.npz"
+    """Write the first half of a file, as a broken download leaves it."""
+    path = folder / "x.npz"
+    np.savez(path, image=RAMP)
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    return path
 
 
 def with_reference(
-    reference: np.ndarray, image: np.ndarray = RAMP[:, :1, :8, :8]
+    reference: np.ndarray, image: np.ndarray = ONE_CHANNEL[..., :8, :8]
 ) -> Callable[[Path], Path]:
+    """Return a writer of images and references."""
+
     def write(folder: Path) -> Path:
-        np.savez(folder / "x.npz", image=image, reference=reference)
-        return folder / "x.npz"
+        """Write both arrays and return the path."""
+        path = folder / "x.npz"
+        np.savez(path, image=image, reference=reference)
+        return path
 
     return write
 
@@ -111,12 +158,12 @@ def with_reference(
     ("write", "message"),
     [
         (of(RAMP), "must have 1 channels of numbers.*got 2"),
-        (of(RAMP[:, :1] * 3e5), "a range of 0 to .*Divide them by full scale"),
+        (of(ONE_CHANNEL * 3e5), "a range of 0 to .*Divide them by full scale"),
         (of(np.full((1, 1, 9, 9), np.nan)), "81 values that are NaN or infinite"),
         (of(RAMP[0, 0]), "a batch of"),
-        (of(RAMP[:, :1, :3, :3]), "at least 4 pixels a side, got 3 x 3"),
-        (of(RAMP[:0, :1]), "contains no sample"),
-        (of(RAMP[:, :1].astype(np.complex64)), "numbers"),
+        (of(ONE_CHANNEL[..., :3, :3]), "at least 4 pixels a side, got 3 x 3"),
+        (of(ONE_CHANNEL[:0]), "contains no sample"),
+        (of(ONE_CHANNEL.astype(np.complex64)), "numbers"),
         (pickled, "a .npy or .npz file of numbers, or a folder.*x\\.npy"),
         (two_arrays, "got first, second"),
         (cut_off, "a .npy or .npz file of numbers"),
@@ -130,7 +177,7 @@ def with_reference(
             with_reference(np.array([0.5, np.nan, np.inf])),
             r"x.npz\[1\] has 1 values that are NaN or infinite",
         ),
-        (with_reference(np.zeros((3, 2)), RAMP[:, :1, :0]), "has no pixels"),
+        (with_reference(np.zeros((3, 2)), ONE_CHANNEL[:, :, :0]), "has no pixels"),
         (lambda folder: folder / "missing.npy", "no such file"),
         (lambda folder: folder, "contains no sample"),
     ],
@@ -138,36 +185,53 @@ def with_reference(
 def test_what_are_no_samples_is_refused(
     write: Callable[[Path], Path], message: str, tmp_path: Path
 ) -> None:
+    """Every kind of wrong input is refused with a message about its own fault, not with a
+    traceback.
+    """
     with pytest.raises(ImageError, match=message):
         read_samples(write(tmp_path), 1, None, 4)
 
 
 def network(channels: int) -> onnx.ModelProto:
+    """Return a network of one ReLU over some channels."""
     writer = GraphWriter()
     writer.node("Relu", "restored", ["image"])
-    ends = [image_info("image", channels, None)], [image_info("restored", channels, None)]
-    return make_model(writer.graph("none", *ends), {})
+    image_in = image_info("image", channels, None)
+    image_out = image_info("restored", channels, None)
+    graph = writer.graph("none", [image_in], [image_out])
+    return make_model(graph, {})
 
 
 def test_networks_that_simulated_patches_do_not_suit_ask_for_samples() -> None:
+    """Simulated patches have one channel, so other networks need the user's own samples.
+
+    So do networks whose fixed size no simulated patch has.
+    """
     assert samples_of(network(1), None) is None
     with pytest.raises(OptionError, match="4 channels"):
         samples_of(network(4), None)
-    samples = samples_of(network(4), np.concatenate([RAMP, RAMP], 1))
+    four_channels = np.concatenate([RAMP, RAMP], 1)
+    samples = samples_of(network(4), four_channels)
     assert samples is not None
     assert samples.all.degraded[0].shape == (1, 4, 128, 128)
     pooled = network(1)
     pooled.graph.node[0].op_type = "GlobalAveragePool"
+    dims: list[str | int | None] = ["N", 1, 32, 32]
     for value in (*pooled.graph.input, *pooled.graph.output):
-        value.CopyFrom(
-            helper.make_tensor_value_info(value.name, TensorProto.FLOAT, ["N", 1, 32, 32])
-        )
+        fixed = helper.make_tensor_value_info(value.name, TensorProto.FLOAT, dims)
+        value.CopyFrom(fixed)
     with pytest.raises(OptionError, match="only images of 32 x 32 pixels"):
         samples_of(pooled, None)
 
 
 def test_a_fault_while_a_patch_is_computed_does_not_end_a_loop() -> None:
+    """An IndexError inside of a patch is raised, though a loop over indices takes it for its end.
+
+    Otherwise a fault would pass as a shorter list of samples.
+    """
+
     def item(number: int) -> int:
+        """Return a number, and raise IndexError after the second."""
         return [0, 1][number]
 
     with pytest.raises(IndexError):

@@ -18,10 +18,27 @@ from beers_deploy.quant.sensitivity import Loss, layer_errors, losses
 from beers_deploy.quant.session import few_crops, open_session, run
 from tests.quant.quick import patches_of, quickly
 
+SPOILT = "body.1.second"
+
 
 @pytest.fixture(scope="module")
 def crops(patches: Patches) -> list[np.ndarray]:
+    """Return three crops of odd sides, which are no whole number of blocks."""
     return [image[..., :61, :53] for image in list(patches.degraded)[:3]]
+
+
+def differences_of(
+    int8: Quantized, float_onnx: onnx.ModelProto, crops: list[np.ndarray]
+) -> list[np.ndarray]:
+    """Return INT8 less float for each crop, both clipped as `restore` clips them."""
+    in_float = open_session(float_onnx)
+    in_int8 = open_session(int8.host)
+    return [clipped(run(in_int8, crop)) - clipped(run(in_float, crop)) for crop in crops]
+
+
+def clipped(restored: np.ndarray) -> np.ndarray:
+    """Clip pixels to [0, 1]."""
+    return np.asarray(np.clip(restored, 0, 1))
 
 
 def test_layers_lose_together_what_the_int8_file_loses_and_adds_hardly_anything(
@@ -29,9 +46,8 @@ def test_layers_lose_together_what_the_int8_file_loses_and_adds_hardly_anything(
 ) -> None:
     """Their squared errors nearly add up; adds of a shared residual scale lose what saturates."""
     layers, together = layer_errors(quantized.graph, quantized.core, crops)
-    sessions = open_session(float_onnx), open_session(quantized.host)
-    differences = [np.subtract(*(np.clip(run(s, crop), 0, 1) for s in sessions)) for crop in crops]
-    assert together.mae == pytest.approx(float(np.mean(np.abs(differences))), rel=1e-3)
+    differences = np.concatenate(differences_of(quantized, float_onnx, crops))
+    assert together.mae == pytest.approx(float(np.abs(differences).mean()), rel=1e-3)
     squared_errors = {layer.name: layer.network.squared for layer in layers}
     assert sum(squared_errors.values()) == pytest.approx(together.squared, rel=0.4)
     adds = sum(squared_errors.pop(op.name) for op in quantized.core.ops if isinstance(op, Add))
@@ -41,11 +57,10 @@ def test_layers_lose_together_what_the_int8_file_loses_and_adds_hardly_anything(
 @pytest.fixture(scope="module")
 def spoilt(quantized: Quantized) -> Quantized:
     """The weights of one layer lose their sign."""
-    spoilt = [op.name == "body.1.second" for op in quantized.core.ops]
-    ops = [
-        replace(op, weight=-op.weight) if bad and isinstance(op, IntConv) else op
-        for op, bad in zip(quantized.core.ops, spoilt, strict=True)
-    ]
+    ops = list(quantized.core.ops)
+    for place, op in enumerate(ops):
+        if op.name == SPOILT and isinstance(op, IntConv):
+            ops[place] = replace(op, weight=-op.weight)
     core = replace(quantized.core, ops=tuple(ops))
     return replace(quantized, core=core, host=host_model(core, {}))
 
@@ -53,39 +68,43 @@ def spoilt(quantized: Quantized) -> Quantized:
 def test_what_is_lost_is_told_and_of_much_also_where(
     float_onnx: onnx.ModelProto, spoilt: Quantized, patches: Patches
 ) -> None:
+    """The sentence about the loss names the layer that errs most if the loss is large.
+
+    It advises fine-tuning then, but not for a network that is fine-tuned already.
+    """
     gate = compare(open_session(float_onnx), open_session(spoilt.host), patches)
     assert gate.worst_drop_db > gate.drop_db
-    little, much = (
-        losses(
-            spoilt, replace(gate, psnr_float_db=40.0, psnr_int8_db=db, worst_drop_db=2.0), patches
-        )
-        for db in (39.9, 39.6)
+    slight = replace(gate, psnr_float_db=40.0, psnr_int8_db=39.9, worst_drop_db=2.0)
+    assert losses(spoilt, slight, patches) == (
+        "INT8 loses 0.10 dB of 40.00, and 2.00 dB where most (6 simulated patches of 128 x 128)"
     )
-    assert (
-        little
-        == "INT8 loses 0.10 dB of 40.00, and 2.00 dB where most (6 simulated patches of 128 x 128)"
-    )
+    strong = replace(slight, psnr_int8_db=39.6)
+    much = losses(spoilt, strong, patches)
     layers, _ = layer_errors(spoilt.graph, spoilt.core, few_crops(patches.degraded, spoilt.host))
     worst = max(layers, key=lambda layer: layer.network.squared)
     assert f": most of it in {worst.name} (" in much
     assert much.endswith("; try `finetune` auto")
     tuned = replace(spoilt, host=host_model(spoilt.core, {"finetune": "3 steps"}))
-    gate = replace(gate, psnr_float_db=40.0, psnr_int8_db=39.6)
-    assert losses(tuned, gate, patches).endswith(" %)")
+    drop = replace(gate, psnr_float_db=40.0, psnr_int8_db=39.6)
+    assert losses(tuned, drop, patches).endswith(" %)")
 
 
 def test_a_spoilt_layer_is_found(spoilt: Quantized, crops: list[np.ndarray]) -> None:
     """It, and no other, gets the error."""
     layers, _ = layer_errors(spoilt.graph, spoilt.core, crops)
     worst = min(layers, key=lambda layer: layer.alone.sqnr_db)
-    assert worst.name == "body.1.second"
+    assert worst.name == SPOILT
     assert worst.alone.sqnr_db < 0
-    assert all(layer.alone.sqnr_db > 10 for layer in layers if layer.name != "body.1.second")
+    assert all(layer.alone.sqnr_db > 10 for layer in layers if layer.name != SPOILT)
 
 
 def test_one_gain_is_attributed_as_two_are(
     float_onnx: onnx.ModelProto, patches: Patches, crops: list[np.ndarray]
 ) -> None:
+    """With one gain the last layer's own error is about its error in the network.
+
+    No layer behind it can change the error, so both figures must agree.
+    """
     int8 = quickly(float_onnx, patches, passes=Passes(dual_range=False))
     layers, _ = layer_errors(int8.graph, int8.core, crops)
     tail = layers[-1]
@@ -93,6 +112,9 @@ def test_one_gain_is_attributed_as_two_are(
 
 
 def test_loss_is_that_of_its_definition() -> None:
+    """MAE, squared error and SQNR are those of all values together, however many parts they come
+    in.
+    """
     target = np.array([3.0, -4.0, 0.5])
     loss = Loss()
     loss.add(target[:2] + 0.1, target[:2])
@@ -108,21 +130,20 @@ def test_loss_is_that_of_its_definition() -> None:
 def test_spread_counts_every_pixel_by_its_difference(
     float_onnx: onnx.ModelProto, quantized: Quantized, crops: list[np.ndarray]
 ) -> None:
-    sessions = open_session(float_onnx), open_session(quantized.host)
-    spread = compare(*sessions, patches_of(crops)).spread
-    difference = np.concatenate(
-        [
-            np.subtract(*(np.clip(run(s, crop), 0, 1) for s in reversed(sessions))).ravel()
-            for crop in crops
-        ]
-    )
+    """The counts, standard deviation and shares of the gate are those of the differences in pixels.
+
+    The worst patches come first, because a report shows them.
+    """
+    in_float = open_session(float_onnx)
+    in_int8 = open_session(quantized.host)
+    spread = compare(in_float, in_int8, patches_of(crops)).spread
+    difference = np.concatenate(differences_of(quantized, float_onnx, crops))
     assert spread.counts.sum() == difference.size
     dn = np.rint(difference * MAX_DN)
     assert spread.std_dn == pytest.approx(float(dn.std()), rel=1e-6)
     for beyond in (0, 1, 5):
-        assert spread.share_beyond(beyond) == pytest.approx(
-            float((np.abs(dn) > beyond).mean()), abs=1e-9
-        )
+        share = float((np.abs(dn) > beyond).mean())
+        assert spread.share_beyond(beyond) == pytest.approx(share, abs=1e-9)
     order = spread.worst(3)
     assert sorted(order) == [0, 1, 2]
     assert spread.mae[order[0]] == spread.mae.max()

@@ -20,12 +20,11 @@ PLANES_OF_NOISE = np.random.default_rng(0).integers(-128, 128, (1, 3, 12, 10)).a
 
 def distance(core: IntCore, target: torch.Tensor) -> float:
     """Mean squared difference of a core's correction of noise from a target."""
-    planes = torch.from_numpy(PLANES_OF_NOISE.astype(np.float32))
-    with torch.no_grad():
-        return float((TrainableCore(core)(planes) - target).square().mean())
+    return float((correction_of(core) - target).square().mean())
 
 
 def correction_of(core: IntCore) -> torch.Tensor:
+    """Return a core's correction of noise."""
     planes = torch.from_numpy(PLANES_OF_NOISE.astype(np.float32))
     with torch.no_grad():
         correction: torch.Tensor = TrainableCore(core)(planes)
@@ -37,6 +36,7 @@ def chain(seed: int) -> tuple[Graph, IntCore]:
     generator = np.random.default_rng(seed)
 
     def conv(name: str, source: str, shape: tuple[int, ...]) -> Conv:
+        """Return a convolution with drawn weights and no bias."""
         weight = generator.normal(0, 1, shape).astype(np.float32)
         return Conv(name, source, name, weight, np.zeros(shape[0], np.float32))
 
@@ -46,6 +46,9 @@ def chain(seed: int) -> tuple[Graph, IntCore]:
 
 @pytest.mark.parametrize("by", [-1, 1])
 def test_a_tensor_whose_scale_was_moved_comes_back(by: int) -> None:
+    """A tensor that is a bit too fine or too coarse gets its old scale back, and with it the old
+    result.
+    """
     graph, core = chain(1)
     start = TrainableCore(core).with_finer_tensors(["a"], by=by)
     target = correction_of(core)
@@ -55,6 +58,9 @@ def test_a_tensor_whose_scale_was_moved_comes_back(by: int) -> None:
 
 
 def test_coarse_weights_become_finer() -> None:
+    """Weights that are a bit too coarse become finer again, although the bits that were lost
+    stay lost.
+    """
     graph, core = chain(2)
     target = correction_of(core)
     start = TrainableCore(core).with_finer_weights(0, by=-1)
@@ -70,6 +76,7 @@ def tried(core: IntCore, graph: Graph, shifts: Shifts = SHIFTS) -> list[IntCore]
     cores = list[IntCore]()
 
     def loss_of(candidate: IntCore) -> float:
+        """Note a core, and return a loss that is lower each time."""
         cores.append(candidate)
         return -len(cores)
 
@@ -79,17 +86,23 @@ def tried(core: IntCore, graph: Graph, shifts: Shifts = SHIFTS) -> list[IntCore]
 
 def exact_adds(core: IntCore) -> set[str]:
     """The names of the adds that have one scale."""
-    return {
-        op.name
-        for op in core.ops
-        if isinstance(op, Add) and len({core.frac_bits[n] for n in (*op.inputs, op.output)}) == 1
-    }
+    names = set[str]()
+    for op in core.ops:
+        scales = {core.frac_bits[name] for name in (*op.inputs, op.output)}
+        if isinstance(op, Add) and len(scales) == 1:
+            names.add(op.name)
+    return names
 
 
 @given(seed=st.integers(0, 2**32 - 1), same=st.booleans())
 def test_every_core_tried_is_legal_and_trained_as_the_reference_runs_it(
     seed: int, same: bool
 ) -> None:
+    """Each core that is tried fits the shifts of the DPU, and keeps the planes and what a ReLU6
+    clips.
+
+    Adds that were exact stay so, and training computes the last core as the reference does.
+    """
     generator = np.random.default_rng(seed)
     graph = odd_operations(generator)
     low, high = (5, 6) if same else (4, 7)
@@ -107,6 +120,7 @@ def test_every_core_tried_is_legal_and_trained_as_the_reference_runs_it(
 
 
 def test_what_shares_a_scale_moves_together() -> None:
+    """Tensors that must share a scale share it in every core, however many moves were kept."""
     graph = odd_operations(np.random.default_rng(3))
     core = build_core(graph, {op.output: 5 for op in graph} | {PLANES: 7})
     after = tried(core, graph)[-1]
@@ -117,6 +131,9 @@ def test_what_shares_a_scale_moves_together() -> None:
 
 
 def test_where_relu6_clips_the_end_of_int8_stays() -> None:
+    """Only the result may move if all else is written by a ReLU6: the end of int8 may stand for
+    its 6.
+    """
     graph = with_relu6(1.0)
     core = build_core(graph, {PLANES: 7, "a": 4, "b": 4, "c": 5, CORRECTION: 5})
     for each in tried(core, graph):
@@ -125,6 +142,7 @@ def test_where_relu6_clips_the_end_of_int8_stays() -> None:
 
 
 def test_a_window_of_shifts_is_kept() -> None:
+    """No move leaves a narrower window of shifts, as other targets have one."""
     graph, core = chain(4)
     cuts = [
         op.weight_frac_bits + core.frac_bits[op.input] - core.frac_bits[op.output]
@@ -138,6 +156,7 @@ def test_a_window_of_shifts_is_kept() -> None:
 
 
 def test_a_worse_core_is_not_kept() -> None:
+    """If every move makes the loss worse, the core is the one before, number by number."""
     graph, core = chain(5)
     losses = iter(range(100))
     same = with_better_scales(TrainableCore(core), graph, SHIFTS, lambda _: next(losses)).core()
