@@ -25,6 +25,9 @@ class Drawn(GraphWriter):
     """Writes a network of drawn weights."""
 
     def __init__(self, pad: int) -> None:
+        """Begin a network whose convolutions are padded by `pad` unless they state another
+        number.
+        """
         super().__init__()
         self._pad = pad
         self._generator = np.random.default_rng(GENERATOR)

@@ -30,12 +30,14 @@ PHONE_PX = 358
 
 
 def float_file(path: Path) -> str:
+    """Write a small float network and return its path."""
     save_onnx(to_onnx(plain(Variant(1, 4)), {}), path)
     return str(path)
 
 
 @pytest.mark.parametrize("text", ["-1", "many", "2.5"])
 def test_steps_of_fine_tuning_are_whole_or_auto(text: str) -> None:
+    """The option `finetune` is 'auto' or a number of steps, and anything else is one sentence."""
     assert (steps_of("auto"), steps_of(20), steps_of("0")) == (None, 20, 0)
     with pytest.raises(
         OptionError, match="`finetune` must be 'auto' or a whole number of steps from 0"
@@ -45,16 +47,23 @@ def test_steps_of_fine_tuning_are_whole_or_auto(text: str) -> None:
 
 @pytest.mark.slow
 def test_a_network_fixed_to_one_tile_is_quantized_reported_and_gated(tmp_path: Path) -> None:
-    paths = tmp_path / "f.onnx", tmp_path / "i.onnx"
-    save_onnx(to_onnx(plain(Variant(1, 4)), {}, tile_px=80), paths[0])
-    options = ["--out", paths[1], "--patches", "2", "--patch", "64", "--report", tmp_path / "r"]
-    done("quantize", paths[0], *options)
-    done("gate --patches 3 --max-mae 0.1", *paths)
-    assert fixed_tile_px(load_onnx(paths[1])) == 80
+    """A network of one tile size is accepted by both commands, and its INT8 file keeps the size."""
+    floating = tmp_path / "f.onnx"
+    int8 = tmp_path / "i.onnx"
+    save_onnx(to_onnx(plain(Variant(1, 4)), {}, tile_px=80), floating)
+    options = ["--out", int8, "--patches", "2", "--patch", "64", "--report", tmp_path / "r"]
+    done("quantize", floating, *options)
+    done("gate --patches 3 --max-mae 0.1", floating, int8)
+    assert fixed_tile_px(load_onnx(int8)) == 80
 
 
 @pytest.mark.slow
 def test_quantize_reports_layers(tmp_path: Path) -> None:
+    """The report has the tables that its page names, and the same numbers in JSON, HTML and node
+    data.
+
+    Node data are for viewers of ONNX files, so their names must be names in both files.
+    """
     float_file(tmp_path / "f.onnx")
     dn = procedural_scene(640, 700, np.random.default_rng(0)).radiance * 4095 / 400
     write_tiff(tmp_path / "scenes" / "drawn.tif", np.rint(dn).astype(np.uint16))
@@ -92,12 +101,16 @@ def test_quantize_reports_layers(tmp_path: Path) -> None:
 
 
 def spread(difference_dn: np.ndarray) -> Spread:
+    """Return the spread of given differences in digital numbers."""
     counts = np.bincount(difference_dn.astype(int) + MAX_DN, minlength=2 * MAX_DN + 1)
     return Spread(counts, np.array([0.1]), np.array([0.2]))
 
 
 @pytest.mark.parametrize("farthest", [0, 1, 40, 41, 137, 4095])
 def test_the_histogram_holds_every_error_in_few_bars(farthest: int) -> None:
+    """Every error is in one of few bars, and 0 is in the middle one, whatever the largest error
+    is.
+    """
     dn = np.array([0, 0, 0, 1, -farthest, farthest])
     centres, shares, wide = bins(spread(dn))
     assert len(centres) <= MOST_BARS
@@ -109,7 +122,9 @@ def test_the_histogram_holds_every_error_in_few_bars(farthest: int) -> None:
 
 
 def test_the_histogram_is_a_picture_for_light_and_dark() -> None:
-    url = histogram_url(spread(np.rint(np.random.default_rng(0).normal(0, 4, 5000))))
+    """The histogram is valid SVG whose colours follow the reader's theme."""
+    dn = np.rint(np.random.default_rng(0).normal(0, 4, 5000))
+    url = histogram_url(spread(dn))
     picture = base64.b64decode(url.removeprefix("data:image/svg+xml;base64,")).decode()
     root = ET.fromstring(picture)  # noqa: S314 - our own picture
     assert root.tag.endswith("svg")
@@ -146,13 +161,17 @@ def test_labels_of_the_histogram_can_be_read_on_the_narrowest_page(farthest: int
 
 
 def test_the_ratio_is_put_into_words() -> None:
+    """The ratio of deviation to MAE is explained, since few readers know what 1.25 means."""
     assert "mostly those of rounding." in kind_of_error(1.27)
     assert "unequal" in kind_of_error(1.5)
     assert "clipping" in kind_of_error(3.0)
 
 
 def test_a_report_on_samples_shows_the_worst_of_them(tmp_path: Path) -> None:
-    save_onnx(to_onnx(plain(Variant(1, 4)), {}), tmp_path / "f.onnx")
+    """A report on a user's own samples names them, and speaks of no PSNR if they have no
+    references.
+    """
+    float_file(tmp_path / "f.onnx")
     np.save(tmp_path / "s.npy", np.random.default_rng(0).random((8, 1, 40, 48), np.float32))
     options = f"--samples {tmp_path}/s.npy --out {tmp_path}/i.onnx --report {tmp_path}/r"
     output = " ".join(done(f"quantize {tmp_path}/f.onnx {options}").split())
@@ -163,7 +182,5 @@ def test_a_report_on_samples_shows_the_worst_of_them(tmp_path: Path) -> None:
     assert output.endswith(losses)
     rows = document["rows"]
     assert [entry["name"] for entry in document["inputs"]] == ["f.onnx", "samples s.npy"]
-    assert {row["name"] for row in rows if row["table"] == "worst samples"} == {
-        "sample 0",
-        "sample 1",
-    }
+    worst = {row["name"] for row in rows if row["table"] == "worst samples"}
+    assert worst == {"sample 0", "sample 1"}

@@ -41,6 +41,7 @@ from tests.model.simulator.stages import plain_sensor
 
 
 def judged(check: SelfCheck, raw: np.ndarray, restored: np.ndarray) -> Judged:
+    """Judge a whole image as one window."""
     whole = [Placed(side, 0, 0, side) for side in raw.shape]
     return check.judge(raw.astype(np.float32), restored.astype(np.float32), *whole)
 
@@ -70,6 +71,11 @@ def noise_of(sensor: Instrument, image: np.ndarray, seed: int = 1) -> np.ndarray
     ],
 )
 def test_the_true_scene_leaves_noise_alone(sensor: Instrument) -> None:
+    """The true scene leaves a chi2 of 1 for each sensor, and no block is found outside of the
+    bound.
+
+    The bound would be of no use if blur, pattern or striping alone could pass it.
+    """
     # Some blurs ring below zero at the edges of the darkest ground, where a converter clips.
     truth = 0.8 * scene() + 400
     image = blurred(truth, sensor)
@@ -83,10 +89,12 @@ def test_the_true_scene_leaves_noise_alone(sensor: Instrument) -> None:
 
 
 def test_the_scale_of_the_pixels_changes_nothing() -> None:
+    """Digital numbers and shares of full scale are judged the same, as users have either."""
     sensor = SENSORS["offset"]
     raw = noisy(blurred(scene(), sensor), sensor)
     own = judged(SelfCheck.of(sensor, REFERENCE), raw, scene())
-    shares = judged(SelfCheck.of(sensor, REFERENCE, 1.0), raw / FULL_SCALE, scene() / FULL_SCALE)
+    of_shares = SelfCheck.of(sensor, REFERENCE, 1.0)
+    shares = judged(of_shares, raw / FULL_SCALE, scene() / FULL_SCALE)
     assert_allclose(shares.chi2, own.chi2, rtol=1e-3)
     assert_allclose(shares.sharpening, own.sharpening, rtol=1e-3)
 
@@ -102,6 +110,9 @@ WRONG: dict[str, Wrong] = {
 
 @pytest.mark.parametrize("name", WRONG)
 def test_what_is_no_restoration_of_the_image_is_found(name: str) -> None:
+    """Wrong images are found in every block with enough texture to tell: one that is not
+    restored, one that is moved, and one that is too sharp.
+    """
     sensor = plain_sensor()
     raw = noisy(blurred(scene(), sensor), sensor)
     check = SelfCheck.of(sensor, REFERENCE)
@@ -112,6 +123,7 @@ def test_what_is_no_restoration_of_the_image_is_found(name: str) -> None:
 
 
 def test_a_broken_block_is_found_where_it_is() -> None:
+    """A single wrong block is found, and blocks out of reach of its light are not blamed."""
     sensor = plain_sensor()
     raw = noisy(blurred(scene(), sensor), sensor)
     broken = scene().copy()
@@ -138,6 +150,9 @@ def spans(size_px: int, cuts: set[int]) -> list[Placed]:
 )
 @settings(max_examples=6, deadline=None)
 def test_windows_give_the_blocks_of_the_whole_image(down: set[int], across: set[int]) -> None:
+    """Windows of any cut give the blocks that the whole image gives, so a large image may be
+    judged in parts.
+    """
     sensor = SENSORS["two axes"]
     check = SelfCheck.of(sensor, REFERENCE)
     raw = noisy(blurred(scene(), sensor), sensor)
@@ -158,6 +173,10 @@ def test_windows_give_the_blocks_of_the_whole_image(down: set[int], across: set[
 
 
 def test_pixels_that_no_residual_is_known_of_do_not_count() -> None:
+    """Missing and saturated pixels change no block out of their reach, and make none fail.
+
+    The value that is stored for a missing pixel does not matter.
+    """
     sensor = plain_sensor()
     check = SelfCheck.of(sensor, REFERENCE)
     image = blurred(scene(), sensor)
@@ -178,13 +197,13 @@ def test_pixels_that_no_residual_is_known_of_do_not_count() -> None:
     # What a missing pixel is stored as is no part of the image.
     hidden_restored = scene().copy()
     hidden_restored[np.isnan(hidden)] = 4000
-    assert_array_equal(
-        judged(check, hidden, hidden_restored).chi2, judged(check, hidden, scene()).chi2
-    )
+    expected = judged(check, hidden, scene())
+    assert_array_equal(judged(check, hidden, hidden_restored).chi2, expected.chi2)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 700), (2 * NEAR_PX, 90), (65, 65), (96, 129)])
 def test_small_images_have_blocks_of_their_own(shape: tuple[int, int]) -> None:
+    """An image of any size has its blocks, and too few pixels make them unknown and not wrong."""
     sensor = plain_sensor()
     image = scene()[: shape[0], : shape[1]] if shape[1] <= COLUMNS else np.full(shape, 900.0)
     result = judged(SelfCheck.of(sensor, REFERENCE), image, image)

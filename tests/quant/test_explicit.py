@@ -13,6 +13,7 @@ ATTRIBUTES, SIZES, TEXTS, PRODUCER, OPERATORS = range(5)
 
 
 def parts_of(model: onnx.ModelProto) -> list[list[str]]:
+    """Return what a file leaves open, in a list for each rule."""
     return list(implicit_parts(model).values())
 
 
@@ -20,6 +21,11 @@ def parts_of(model: onnx.ModelProto) -> list[list[str]]:
 @given(data=st.data())
 @settings(max_examples=3)
 def test_the_file_for_one_tile_states_everything(kind: str, data: st.DataObject) -> None:
+    """The file for a board states all attributes, sizes, texts and its producer, for each
+    operation.
+
+    A reader of it for a critical system must not have to know defaults of ONNX.
+    """
     core, tile_px = data.draw(cores((kind,), 2))
     model = board_model(core, {}, tile_px)
     onnx.checker.check_model(model, full_check=True)
@@ -32,6 +38,7 @@ def test_the_file_for_one_tile_states_everything(kind: str, data: st.DataObject)
 @given(drawn=cores())
 @settings(max_examples=3)
 def test_what_is_left_open_is_named(drawn: tuple[IntCore, int]) -> None:
+    """Each thing that is removed from a file is reported by its name, under its own rule."""
     core, tile_px = drawn
     assert parts_of(board_model(core, {}))[SIZES]
     model = board_model(core, {}, tile_px)
@@ -50,6 +57,7 @@ def test_what_is_left_open_is_named(drawn: tuple[IntCore, int]) -> None:
 @given(drawn=cores())
 @settings(max_examples=1)
 def test_operators_of_other_domains_are_named(drawn: tuple[IntCore, int]) -> None:
+    """An operator that ONNX does not define is reported, because its meaning is open."""
     model = board_model(drawn[0], {})
     model.graph.node[0].domain = "com.example"
     model.graph.node[0].op_type = "Own"

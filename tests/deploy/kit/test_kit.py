@@ -72,15 +72,8 @@ def test_the_host_part_gives_the_host_files_bytes(name: str, tmp_path: Path) -> 
     image = np.random.default_rng(1).random((1, 131, 203), dtype=np.float32)
     image = 2 * image - 1 if name == NORMALISED else image
     np.save(tmp_path / "image.npy", image)
-    command = [
-        sys.executable,
-        "-c",
-        BARE,
-        "-",
-        str(tmp_path / "image.npy"),
-        str(tmp_path / "out.npy"),
-    ]
-    subprocess.run(command, cwd=folder, check=True)
+    files = [str(tmp_path / "image.npy"), str(tmp_path / "out.npy")]
+    subprocess.run([sys.executable, "-c", BARE, "-", *files], cwd=folder, check=True)
     lattice_px = int8.tiling.lattice_px
     scale = int(int8.tiling.scale)
     wide = np.pad(image, [(0, 0), *((0, -side % lattice_px) for side in image.shape[1:])], "edge")
@@ -89,16 +82,20 @@ def test_the_host_part_gives_the_host_files_bytes(name: str, tmp_path: Path) -> 
     assert {"core.onnx", "measure.py", "README.md", "golden"} < {
         path.name for path in folder.iterdir()
     }
-    dims = onnx.load(folder / "golden" / "core.onnx").graph.input[0].type.tensor_type.shape.dim
-    assert [side.dim_value for side in dims][1:] == [
-        *np.load(folder / "golden" / "noise" / "00-planes.npy").shape[1:]
-    ]
+    golden = folder / "golden"
+    dims = onnx.load(golden / "core.onnx").graph.input[0].type.tensor_type.shape.dim
+    planes = np.load(golden / "noise" / "00-planes.npy")
+    assert tuple(side.dim_value for side in dims[1:]) == planes.shape[1:]
 
 
 @pytest.mark.parametrize("shape", [(1, 3, 203), (1, 203, 95), (96, 96)])
 def test_the_host_part_refuses_what_it_cannot_restore(
     shape: tuple[int, ...], tmp_path: Path
 ) -> None:
+    """An image of a wrong shape or too small for a tile is refused in one sentence.
+
+    No file is written, so that a partial result is never taken for a restored image.
+    """
     folder = bd.Board.load("vck190").kit(network(NAME), tmp_path / "kit", tile=TILE_PX)
     np.save(tmp_path / "image.npy", np.full(shape, 0.1, np.float32))
     command = [sys.executable, "host.py", str(tmp_path / "image.npy"), str(tmp_path / "out.npy")]
@@ -139,6 +136,7 @@ def sensor(tmp_path_factory: pytest.TempPathFactory) -> bd.Sensor:
 
 @pytest.fixture(scope="module")
 def kit(sensor: bd.Sensor, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write the kit of a network and a sensor for one board."""
     return bd.Board.load("vck190").kit(
         NAME, tmp_path_factory.mktemp("kit"), tile=TILE_PX, sensor=sensor
     )
@@ -154,6 +152,7 @@ def by_host(folder: Path, image: np.ndarray) -> np.ndarray:
 
 
 def facts(folder: Path) -> dict[str, Any]:
+    """Return the facts that a kit's host.py reads."""
     return dict(json.loads((folder / "host.json").read_text(encoding="utf-8")))
 
 
@@ -169,6 +168,11 @@ def test_the_host_part_restores_as_restore_does(
 
 
 def test_each_exposure_has_a_core_and_a_unit(kit: Path, sensor: bd.Sensor) -> None:
+    """Each exposure factor has a core of its own weights, and a unit of its own for the result.
+
+    The cores are those of the library's networks for the same factors, and the README states the
+    steps.
+    """
     content = facts(kit)
     assert {1, *map(int, content["exposures"])} == FACTORS == {*factors_for(sensor.nominal())}
     assert len({content["unit"], *content["exposures"].values()}) == len(FACTORS)
@@ -205,6 +209,11 @@ def test_the_host_part_chooses_factors_and_takes_the_consistency_step_as_the_lib
 def test_the_host_part_judges_blocks_as_the_library_does(
     kit: Path, sensor: bd.Sensor, image: np.ndarray
 ) -> None:
+    """The kit's self-check gives the library's chi2 and sharpening of each block, and the same
+    count.
+
+    An engineer so sees on the board what `restore` reports on a workstation.
+    """
     by_host(kit, image)
     blocks = np.load(kit / "out-check.npy")
     check = SelfCheck.of(sensor.nominal(), sensor.reference.nominal(), full_scale=1.0)
@@ -220,6 +229,9 @@ def test_the_host_part_judges_blocks_as_the_library_does(
 def test_a_network_in_memory_takes_the_same_steps(
     tmp_path: Path, sensor: bd.Sensor, image: np.ndarray
 ) -> None:
+    """The kit of a network that Python loaded has its exposures, and restores as the library
+    does.
+    """
     in_memory = bd.Network.load("convbeers-half-xs-int8", sensor=sensor)
     folder = bd.Board.load("vck190").kit(in_memory, tmp_path / "kit", tile=TILE_PX, sensor=sensor)
     assert sorted(map(int, facts(folder)["exposures"])) == sorted(in_memory.exposures)
@@ -228,6 +240,10 @@ def test_a_network_in_memory_takes_the_same_steps(
 
 
 def test_a_sensor_that_does_not_exist_or_changes_nothing_is_one_sentence(tmp_path: Path) -> None:
+    """An unknown sensor, and one that the network does not depend on, are refused.
+
+    Nothing is written, so that no kit claims a sensor that it does not know.
+    """
     board = bd.Board.load("vck190")
     in_memory = bd.Network.load(bd.Network.load(NAME).model)
     with pytest.raises(ProfileError, match=r"no profile 'hubble'\. Give one of"):
@@ -244,6 +260,7 @@ def test_a_sensor_that_does_not_exist_or_changes_nothing_is_one_sentence(tmp_pat
 def test_a_network_for_another_sensor_is_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """A mismatch of network and sensor is no error, but one warning that names both sensors."""
     other = bd.Network.load(NAME, sensor="dior-medium")
     with caplog.at_level(logging.WARNING, "beers_deploy"):
         bd.Board.load("vck190").kit(
@@ -254,6 +271,11 @@ def test_a_network_for_another_sensor_is_a_warning(
 
 
 def test_a_record_says_what_a_network_is_and_what_was_checked(tmp_path: Path) -> None:
+    """The record names licence, training images, hashes and checks, and its bill of materials is
+    valid.
+
+    A reviewer can so trace the network without asking its authors.
+    """
     pair = "convbeers-xs", "convbeers-xs-int8"
     done("gate", *pair, "--patches", 2, "--record", tmp_path / "gate")
     record = json.loads((tmp_path / "gate" / RECORD[0]).read_text(encoding="utf-8"))
@@ -268,20 +290,20 @@ def test_a_record_says_what_a_network_is_and_what_was_checked(tmp_path: Path) ->
 
 
 def test_of_a_users_network_nothing_is_made_up(tmp_path: Path) -> None:
+    """Facts that are unknown of a user's network are recorded as unknown."""
     folder = bd.Board.load("zcu102").kit(network("unet"), tmp_path / "kit", tile=32, record=True)
     record = json.loads((folder / "record" / RECORD[0]).read_text(encoding="utf-8"))
     assert record["results"]["command"] == "check"
-    assert (
-        record["training"],
-        record["licence"],
-        record["weights_sha256"],
-        record["sensors_in_range"],
-    ) == (None,) * 4
+    for fact in ("training", "licence", "weights_sha256", "sensors_in_range"):
+        assert record[fact] is None
     assert len(record["says"]["calibration_samples"].split()) == 3
     onnx.checker.check_model(onnx.load(folder / "core.onnx"))
 
 
 def test_for_an_npu_the_core_is_what_its_compiler_reads(tmp_path: Path) -> None:
+    """The kit for an NPU has the configuration of its compiler, golden results rounded as it
+    rounds, and cores that pass the check of the target.
+    """
     folder = bd.Board.load("vek385").kit(
         "convbeers-xs-int8", tmp_path / "kit", tile=48, sensor="dior-medium"
     )

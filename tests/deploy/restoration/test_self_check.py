@@ -53,6 +53,7 @@ def other_network(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(image: Path, out: Path, **options: Any) -> Row:
+    """Restore the image of a known sensor, and return the row of its first band."""
     rows: Sequence[Row] = restore(
         image, out, sensor=NAME, overwrite=True, progress=False, **options
     ).rows
@@ -62,6 +63,10 @@ def run(image: Path, out: Path, **options: Any) -> Row:
 def test_a_right_restoration_is_within_the_bound_and_its_map_lies_over_the_image(
     image: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """A right restoration passes even with `strict`, and its map is georeferenced block by block.
+
+    Missing pixels of one band leave the other band as it is.
+    """
     path = tmp_path / "map.tif"
     row = run(image, tmp_path / "out.tif", network="convbeers-xs", self_check=path, strict=True)
     assert row.figures["self-check outside"].value == 0
@@ -90,6 +95,10 @@ def test_a_right_restoration_is_within_the_bound_and_its_map_lies_over_the_image
 def test_a_network_for_another_sensor_is_found(
     image: Path, other_network: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """A network for a sharper sensor fails the check: a warning, and with `strict` an error.
+
+    After the error neither the image nor the map is left in the folder.
+    """
     out = tmp_path / "out.tif"
     with caplog.at_level(logging.WARNING):
         row = run(image, out, network=other_network)
@@ -102,11 +111,16 @@ def test_a_network_for_another_sensor_is_found(
 
 
 def test_the_traditional_pipeline_is_checked_too(image: Path, tmp_path: Path) -> None:
+    """The check judges results by any method, since it reads the images alone."""
     row = run(image, tmp_path / "out.tif", method="traditional", quality="fast")
     assert row.figures["self-check outside"].value == 0
 
 
 def test_without_a_known_sensor_there_is_no_check(image: Path, tmp_path: Path) -> None:
+    """Without a sensor there is no noise to compare with, so no figure is made up.
+
+    To ask for a map of a check that is not made is an error, and no image is written.
+    """
     (row,) = restore(image, tmp_path / "out.tif", network="convbeers-xs", progress=False).rows
     assert not any("self-check" in name for name in row.figures)
     with pytest.raises(OptionError, match="needs a known sensor"):
@@ -120,6 +134,7 @@ def test_without_a_known_sensor_there_is_no_check(image: Path, tmp_path: Path) -
 
 
 def test_ground_control_points_move_to_the_blocks(image: Path, tmp_path: Path) -> None:
+    """Ground control points of the image are those of the map, in its blocks instead of pixels."""
     with rasterio.open(image) as file:
         pixels = file.read(1)
     points = [

@@ -47,6 +47,7 @@ class CoreDrawer:
     """Draws operations one by one, each on tensors that are there."""
 
     def __init__(self, draw: st.DrawFn, tile_px: int) -> None:
+        """Begin with planes of a tile, and with a generator for the integers."""
         self.draw = draw
         self.generator = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
         self.ops: list[IntConv | Op] = []
@@ -54,6 +55,7 @@ class CoreDrawer:
         self.shapes: dict[str, Shape] = {PLANES: (3, tile_px, tile_px)}
 
     def number(self, low: int, high: int) -> int:
+        """Draw an integer between two ends, both included."""
         return self.draw(st.integers(low, high))
 
     def tensor(self) -> str:
@@ -61,14 +63,17 @@ class CoreDrawer:
         return self.draw(st.sampled_from([name for name in self.shapes if name != PLANES]))
 
     def append(self, op: IntConv | Op, shape: Shape, frac_bits: int) -> None:
+        """Append an operation, and note the shape and the scale of its result."""
         self.ops.append(op)
         self.shapes[op.output] = shape
         self.frac_bits[op.output] = frac_bits
 
     def name(self) -> str:
+        """Return a new name, which has the characters that end a comment of C."""
         return f"op.{len(self.ops)}*/"
 
     def result(self) -> str:
+        """Return the name of the next result."""
         return f"t{len(self.ops)}"
 
     def window(self, kernel: tuple[int, int], size: tuple[int, int], plain: bool = False) -> Window:
@@ -80,6 +85,7 @@ class CoreDrawer:
         return window if min(places) > 0 else Window()
 
     def convolution(self, source: str, outputs: int, groups: int = 1) -> None:
+        """Append a convolution with a kernel that fits its map."""
         channels, *size = self.shapes[source]
         kernel = tuple(self.number(1, min(side, 4)) for side in size)
         window = self.window(kernel, (size[0], size[1]))  # type: ignore[arg-type]
@@ -87,6 +93,7 @@ class CoreDrawer:
         self._conv(source, (outputs, channels // groups, *kernel), window, sizes, groups)
 
     def _transposed(self, source: str) -> None:
+        """Append a transposed convolution whose result is not smaller than its map."""
         channels, *size = self.shapes[source]
         stride = self.number(1, 3)
         kernel = (self.number(stride, 4), self.number(stride, 4))
@@ -104,6 +111,10 @@ class CoreDrawer:
         groups: int,
         transposed: bool = False,
     ) -> None:
+        """Append a convolution with drawn integers and scales.
+
+        At least a fifth of the weights are at the ends of int8, where sums are largest.
+        """
         ends = np.array([INT8_MIN, INT8_MAX])
         weight = self.generator.integers(INT8_MIN, INT8_MAX + 1, shape)
         weight = np.where(self.generator.random(shape) < 0.2, self.generator.choice(ends), weight)
@@ -131,9 +142,11 @@ class CoreDrawer:
         getattr(self, f"_{kind.replace(' ', '_')}")(self.tensor())
 
     def _convolution(self, source: str) -> None:
+        """Append a convolution over all channels."""
         self.convolution(source, self.number(1, 6))
 
     def _grouped(self, source: str) -> None:
+        """Append a depthwise convolution with one or two results a channel."""
         channels = self.shapes[source][0]
         self.convolution(source, channels * self.number(1, 2), channels)
 
@@ -145,6 +158,7 @@ class CoreDrawer:
         return source, self.draw(st.sampled_from(names))
 
     def _add(self, source: str) -> None:
+        """Append a sum, coarser or finer than its inputs."""
         pair = self._pair(source)
         activation = self.draw(st.sampled_from(ACTIVATIONS))
         finest = max(self.frac_bits[name] for name in pair)
@@ -152,12 +166,14 @@ class CoreDrawer:
         self.append(add, self.shapes[source], finest - self.number(-2, 5))
 
     def _mul(self, source: str) -> None:
+        """Append a product, whose bits before rounding are those of both factors."""
         pair = self._pair(source)
         finest = sum(self.frac_bits[name] for name in pair)
         mul = Mul(self.name(), pair, self.result())
         self.append(mul, self.shapes[source], finest - self.number(0, 10))
 
     def _concat(self, source: str) -> None:
+        """Append the channels of all tensors that have the same size and scale."""
         channels, rows, columns = self.shapes[source]
         bits = self.frac_bits[source]
         parts = [
@@ -170,12 +186,15 @@ class CoreDrawer:
         self.append(concat, (width, rows, columns), bits)
 
     def _maximum(self, source: str) -> None:
+        """Append a maximum over windows, which may be dilated."""
         self._pool(source, MaxPool, plain=False)
 
     def _mean(self, source: str) -> None:
+        """Append a mean over windows, which is not dilated."""
         self._pool(source, AveragePool, plain=True)
 
     def _pool(self, source: str, pool: type[MaxPool | AveragePool], plain: bool) -> None:
+        """Append a pooling, which keeps the scale of what it reads."""
         channels, *size = self.shapes[source]
         kernel = (self.number(1, min(size[0], 3)), self.number(1, min(size[1], 3)))
         window = self.window(kernel, (size[0], size[1]), plain)
@@ -184,18 +203,22 @@ class CoreDrawer:
         self.append(op, (channels, rows, columns), self.frac_bits[source])
 
     def _enlarge(self, source: str, factor: int, bilinear: bool) -> None:
+        """Append an enlargement, which keeps the scale of what it reads."""
         channels, rows, columns = self.shapes[source]
         resize = Resize(self.name(), source, self.result(), factor, bilinear)
         shape = (channels, rows * factor, columns * factor)
         self.append(resize, shape, self.frac_bits[source])
 
     def _repeat(self, source: str) -> None:
+        """Append an enlargement that repeats pixels."""
         self._enlarge(source, self.number(2, 3), False)
 
     def _bilinear(self, source: str) -> None:
+        """Append an enlargement that interpolates between pixels."""
         self._enlarge(source, self.draw(st.sampled_from((2, 4))), True)
 
     def _to_pixels(self, source: str) -> None:
+        """Append eight channels and their shuffle to pixels, in either order of ONNX."""
         self.convolution(source, 8)
         source = self.ops[-1].output
         _, rows, columns = self.shapes[source]
@@ -204,6 +227,7 @@ class CoreDrawer:
         self.append(up, (2, 2 * rows, 2 * columns), self.frac_bits[source])
 
     def _to_channels(self, source: str) -> None:
+        """Append an enlarged map and the shuffle of its pixels to channels."""
         channels, rows, columns = self.shapes[source]
         # Not by repetition, which would make the values of a square equal.
         self._enlarge(source, 2, bilinear=True)
@@ -211,6 +235,7 @@ class CoreDrawer:
         self.append(down, (4 * channels, rows, columns), self.frac_bits[source])
 
     def _table(self, source: str) -> None:
+        """Append an activation that is computed as a table of 256 values."""
         activation = self.draw(st.sampled_from(TABLES))
         table = Pointwise(self.name(), source, self.result(), activation)
         self.append(table, self.shapes[source], self.number(2, 7))

@@ -25,6 +25,7 @@ from tests.shipped import shipped_pair
 
 
 def assert_equal(core: IntCore, tile_px: int, planes: np.ndarray, compiler: list[str]) -> None:
+    """Check that the compiled program gives the reference's integers."""
     expected = run_core(core, planes)[0][CORRECTION]
     text = c_program(core, tile_px, "network.onnx")
     result = run_c(compiler, text, planes, expected.shape[1:])
@@ -44,6 +45,10 @@ def extremes(shape: tuple[int, ...]) -> np.ndarray:
 @given(data=st.data())
 @settings(max_examples=2)
 def test_each_kind_of_operation_is_the_reference_s(kind: str, data: st.DataObject) -> None:
+    """Each kind of operation, with few others around it, computes the integers of the reference.
+
+    The compiler's sanitizers watch it, so that no overflow hides in a right result.
+    """
     core, tile_px = data.draw(cores((kind,), 2))
     assert_equal(core, tile_px, extremes((1, 3, tile_px, tile_px)), SANITIZED)
 
@@ -52,11 +57,13 @@ def test_each_kind_of_operation_is_the_reference_s(kind: str, data: st.DataObjec
 @given(drawn=cores())
 @settings(max_examples=6)
 def test_any_network_is_the_reference_s(drawn: tuple[IntCore, int]) -> None:
+    """Kinds in any order compute the integers of the reference, though their maps share buffers."""
     core, tile_px = drawn
     assert_equal(core, tile_px, extremes((1, 3, tile_px, tile_px)), SANITIZED)
 
 
 def of_shipped(name: str) -> IntCore:
+    """Return the core of a shipped network."""
     return read_core(load_onnx(shipped_pair(name)[1]))
 
 
@@ -70,6 +77,7 @@ def planes_of(core: IntCore, tile_px: int) -> np.ndarray:
 
 @needs_compiler
 def test_a_shipped_network_is_the_reference_s() -> None:
+    """A shipped network computes the integers of the reference on an image and on extremes."""
     core = of_shipped("convbeers-xs")
     assert_equal(core, 12, planes_of(core, 12), SANITIZED)
 
@@ -78,12 +86,18 @@ def test_a_shipped_network_is_the_reference_s() -> None:
 @needs_compiler
 @pytest.mark.parametrize("name", shipped_names())
 def test_every_shipped_network_is_the_reference_s(name: str) -> None:
+    """Every shipped network does, in a small tile under sanitizers and in a larger one without."""
     core = of_shipped(name)
     assert_equal(core, 64, planes_of(core, 64), FAST)
     assert_equal(core, 16, planes_of(core, 16), SANITIZED)
 
 
 def test_the_file_states_what_it_is_and_no_name_ends_a_comment() -> None:
+    """Names of a network are no way to write code into the file, and its figures of memory are
+    right.
+
+    The file includes one header of integers only, because a target may have no others.
+    """
     core = of_shipped("convbeers-xs")
     first = replace(core.convolutions[0], name="*/ int x; /* ??/")
     text = c_program(replace(core, ops=(first, *core.ops[1:])), 32, "a.onnx */\n int y;")
@@ -99,6 +113,7 @@ def test_the_file_states_what_it_is_and_no_name_ends_a_comment() -> None:
 
 
 def test_sums_that_int32_does_not_hold_are_refused() -> None:
+    """A layer whose sums exceed int32 is refused by name: signed overflow is undefined in C."""
     core = of_shipped("convbeers-xs")
     conv = core.convolutions[2]
     # The largest weights and as many channels as make the sums 2^31.
@@ -110,6 +125,9 @@ def test_sums_that_int32_does_not_hold_are_refused() -> None:
 
 
 def test_tensors_that_are_needed_at_once_share_no_buffer() -> None:
+    """No buffer is written while its tensor is still read, and few buffers suffice for all
+    tensors.
+    """
     core = of_shipped("convbeers")
     size = {PLANES: 4, CORRECTION: 6} | {op.output: 16 for op in core.ops[:-1]}
     number, buffers = share_buffers(core, size)
