@@ -278,7 +278,10 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
         lambda raw: bd.quantize(Tiny(), samples=raw[None, None, :32, :32].repeat(3, 1)),
         "1 channel",
     ),
-    "not 0..1": (lambda raw: bd.quantize(Tiny(), samples=raw[None, None]), "[Vv]alues"),
+    "outside the stated range": (
+        lambda raw: bd.quantize(Tiny(), samples=raw[None, None], input_range="0,1"),
+        "values of .* must be in `input_range`, 0 to 1",
+    ),
     "INT8 again": (lambda _: bd.quantize(f"{SMALL}-int8"), "an INT8 network"),
     "no INT8 network": (
         lambda _: bd.gate("float.onnx"),
