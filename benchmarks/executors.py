@@ -1,6 +1,6 @@
 """Compare what executors compute of INT8 files with the golden vectors, integer by integer.
 
-    python -m benchmarks.executors int8.onnx --aidge-python aidge/bin/python --clang "zig cc"
+    python -m benchmarks.executors int8.onnx --aidge-python aidge/bin/python --compiler gcc "zig cc"
 
 Prints a Markdown table: the share of the last layer's integers that differ from the golden vectors
 of a DPU, in percent. Without files, it takes the shipped networks. Executors that are not there are
