@@ -30,7 +30,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, maximum_filter
-from scipy.signal import oaconvolve
 
 from beers_deploy.model.blocks import Image, Placed
 from beers_deploy.model.consistency import blur_between, centre
@@ -157,7 +156,10 @@ class SelfCheck:
         x = _filled(restored, missing)
         pads = [_beyond(placed, side) for placed, side in zip((down, across), x.shape, strict=True)]
         kernel = self.rows.T @ self.columns
-        blurred = oaconvolve(np.pad(x, pads, "symmetric"), kernel, mode="valid")
+        wide = np.pad(x, pads, "symmetric")
+        # The transform wraps around, which reaches the first 2 REACH_PX rows and columns alone.
+        spectrum = np.fft.rfft2(wide) * np.fft.rfft2(kernel, wide.shape)
+        blurred = np.fft.irfft2(spectrum, wide.shape)[2 * REACH_PX :, 2 * REACH_PX :]
 
         kept = tuple(
             slice(placed.keep_start - placed.start, placed.keep_stop - placed.start)
