@@ -93,8 +93,8 @@ class BlockMap:
         return (
             f"{self.outside} of {self.decidable} blocks of the result contradict the raw image: "
             f"blurred as the sensor blurs, they differ from it by more than {MOST_CHI2:g} times "
-            "the noise. Check that the network was made for this sensor, with 'check' that its "
-            "file is whole, and `sensor`."
+            "the noise. Check that the network was made for this sensor, that its file is intact, "
+            "and that `sensor` is the one that acquired the image."
         )
 
     def require(self, name: str) -> None:
@@ -121,12 +121,15 @@ def checks_of(
     """
     if tuple(out_shape) != raster.shape or not sensors:
         return {}
-    in_bands = in_order(sensors, raster) * (1 if "" not in sensors else raster.bands)
-    return {
-        band: SelfCheck.of(sensor.nominal(), sensor.reference.nominal(), full_scale)
-        for band, sensor in enumerate(in_bands)
-        if sensor.name != BLIND
-    }
+    # The sensors of all bands may be one, whose check is built once.
+    built = [
+        None
+        if sensor.name == BLIND
+        else SelfCheck.of(sensor.nominal(), sensor.reference.nominal(), full_scale)
+        for sensor in in_order(sensors, raster)
+    ]
+    checks = ((band, built[band % len(built)]) for band in range(raster.bands))
+    return {band: check for band, check in checks if check is not None}
 
 
 def require_checkable(path: Path | None, checks: Mapping[int, SelfCheck]) -> None:
