@@ -11,7 +11,7 @@ from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.gate import Spread
 from beers_deploy.quant.input_range import to_shares
 from beers_deploy.quant.samples.patches import Patches
-from beers_deploy.quant.session import run
+from beers_deploy.quant.session import result_of
 from beers_deploy.report.page import Picture, Report, Section
 from beers_deploy.report.plots import histogram_url
 
@@ -57,8 +57,14 @@ def worst_picture(number: int, patches: Patches, sessions: Sessions, white_dn: f
     degraded = patches.degraded[number]
     given, in_float, in_int8 = (
         np.clip(to_shares(image, patches.ranges), 0, 1)[0, 0] * MAX_DN
-        for image in (degraded, *(run(session, degraded) for session in sessions))
+        for image in (degraded, *(result_of(session, degraded) for session in sessions))
     )
+    # A network may enlarge the image, which is shown at the size of the results.
+    places = (
+        np.arange(after) * before // after
+        for before, after in zip(given.shape, in_float.shape, strict=True)
+    )
+    given = given[np.ix_(*places)]
     images = {"degraded": given, "float": in_float, "INT8": in_int8}
     difference = np.abs(in_int8 - in_float)
     cells = [*strip_row(images.values(), stretch_of(in_float)), *error_row([difference], white_dn)]

@@ -7,6 +7,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
+import onnx
 import pytest
 
 from beers_deploy.float_onnx import to_onnx
@@ -16,10 +17,13 @@ from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.gate import Spread
-from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, save_onnx
+from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, make_model, save_onnx
+from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.sensitivity import kind_of_error
+from beers_deploy.quant.session import open_session
 from beers_deploy.quantization import steps_of
 from beers_deploy.report.plots import FONT_PX, MOST_BARS, bins, histogram_url
+from beers_deploy.report.sensitivity_page import worst_picture
 from tests.deploy.command_line import done
 from tests.deploy.documents import valid
 from tests.deploy.report.svg import style_of, text_width
@@ -43,6 +47,18 @@ def test_steps_of_fine_tuning_are_whole_or_auto(text: str) -> None:
         OptionError, match="`finetune` must be 'auto' or a whole number of steps from 0"
     ):
         steps_of(text)
+
+
+def test_the_patch_of_a_network_that_enlarges_is_shown_at_the_result_s_size() -> None:
+    """The picture stands the patch next to both results, which may have more pixels than it."""
+    image = np.random.default_rng(0).random((1, 1, 9, 7), np.float32)
+    graph = onnx.parser.parse_graph(
+        "enlarge (float[1, 1, H, W] x) => (float[1, 1, H2, W2] y) <float[4] s = {1, 1, 2, 2}> "
+        '{ y = Resize <mode = "nearest"> (x, , s) }'
+    )
+    session = open_session(make_model(graph, {}))
+    picture = worst_picture(0, Patches([], [image]), (session, session), 1.0)
+    assert picture.caption.startswith("MAE 0.00 DN, at most 0 DN")
 
 
 @pytest.mark.slow
