@@ -342,9 +342,9 @@ def _odd_size(model: onnx.ModelProto) -> tuple[int, int, int, int]:
     is as the file states it.
     """
     sizes = [side.dim_value for side in model.graph.input[0].type.tensor_type.shape.dim]
-    lattice_px = 1 if sizes[2] else tiling_of(model).lattice_px
+    alignment_px = 1 if sizes[2] else tiling_of(model).alignment_px
     rows, columns = (
-        fixed or -(-n // lattice_px) * lattice_px
+        fixed or -(-n // alignment_px) * alignment_px
         for fixed, n in zip(sizes[2:], (97, 101), strict=True)
     )
     return 1, sizes[1] or 1, rows, columns

@@ -152,13 +152,13 @@ def _images(
 ) -> dict[str, np.ndarray]:
     """The images (1, C, H, W) of the cases."""
     fixed_px = fixed_tile_px(network.model)
-    lattice_px = fixed_px or network.tiling.lattice_px
-    side = fixed_px or tile or -(-GOLDEN_TILE_PX // lattice_px) * lattice_px
-    if (tile or side) != side or side < 1 or side % lattice_px:
+    alignment_px = fixed_px or network.tiling.alignment_px
+    side = fixed_px or tile or -(-GOLDEN_TILE_PX // alignment_px) * alignment_px
+    if (tile or side) != side or side < 1 or side % alignment_px:
         rule = (
             f"{fixed_px} px, to which the network is fixed"
             if fixed_px
-            else f"a multiple of {lattice_px} px"
+            else f"a multiple of {alignment_px} px"
         )
         raise OptionError(f"`tile` must be {rule}, got {tile} px. Choose another.")
     shape = 1, channels, side, side
@@ -173,7 +173,7 @@ def _images(
     }
     if not fixed_px:
         # `| 1` makes the number of lattice steps odd along both sides.
-        rows, columns = (lattice_px * (side * part // (8 * lattice_px) | 1) for part in (5, 7))
+        rows, columns = (alignment_px * (side * part // (8 * alignment_px) | 1) for part in (5, 7))
         images["odd"] = _scene(channels, rows, columns, generator)
     return images
 

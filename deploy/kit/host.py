@@ -348,7 +348,7 @@ def main(source: str, target: str, runs: dict[int, Any]) -> None:
             f"{source} must hold finite values (C, H, W) of at least {t} x {t} pixels, got "
             f"shape {image.shape}."
         )
-    wide = np.pad(image, [(0, 0)] + [(0, -n % S["lattice_px"]) for n in image.shape[1:]], "edge")
+    wide = np.pad(image, [(0, 0)] + [(0, -n % S["alignment_px"]) for n in image.shape[1:]], "edge")
     down, across = (spans(n, t, S["halo_px"]) for n in wide.shape[1:])
     out = np.empty((S["bands"], *(n * r for n in wide.shape[1:])), F)
     for (y, top, bottom), (x, left, right) in itertools.product(down, across):

@@ -90,7 +90,7 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
         UNIT: part.unit,
         "tile_px": tile_px,
         "halo_px": tiling.halo_px,
-        "lattice_px": tiling.lattice_px,
+        "alignment_px": tiling.alignment_px,
         "scale": int(tiling.scale),
         "bands": tiling.channels_out,
     }

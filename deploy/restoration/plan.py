@@ -56,7 +56,7 @@ class Span:
 
 
 def plan_side(
-    size_px: int, tile_px: int, halo_px: int, lattice_px: int = 1, least_px: int = 1
+    size_px: int, tile_px: int, halo_px: int, alignment_px: int = 1, min_side_px: int = 1
 ) -> list[Span]:
     """The spans along one side of `size_px` pixels, each of `tile_px`, or one of all where that is
     less.
@@ -65,31 +65,31 @@ def plan_side(
         size_px: of the image.
         tile_px: side of a tile; rounded down to the lattice.
         halo_px: a multiple of the lattice.
-        lattice_px: spans begin at its multiples, and read to one.
-        least_px: that a span reads, beyond the image where that has fewer.
+        alignment_px: spans begin at its multiples, and read to one.
+        min_side_px: that a span reads, beyond the image where that has fewer.
     """
-    if tile_px < 2 * halo_px + lattice_px or halo_px < 0:
-        least = f", at least {2 * halo_px + lattice_px} px" if lattice_px > 1 else ""
+    if tile_px < 2 * halo_px + alignment_px or halo_px < 0:
+        least = f", at least {2 * halo_px + alignment_px} px" if alignment_px > 1 else ""
         raise OptionError(
             f"`tile` must be more than twice the halo of {halo_px} px{least}, got {tile_px} px. "
             "Use larger tiles or a smaller halo."
         )
     # The strides of a network sample other pixels in a tile that begins or ends off the lattice.
-    extended_px = _up(max(size_px, least_px), lattice_px)
-    side_px = min(tile_px // lattice_px * lattice_px, extended_px)
+    extended_px = _up(max(size_px, min_side_px), alignment_px)
+    side_px = min(tile_px // alignment_px * alignment_px, extended_px)
     return list(_spans(size_px, extended_px, side_px, halo_px))
 
 
-def _up(size_px: int, lattice_px: int) -> int:
-    return -(-size_px // lattice_px) * lattice_px
+def _up(size_px: int, alignment_px: int) -> int:
+    return -(-size_px // alignment_px) * alignment_px
 
 
-def even_side_px(size_px: int, tile_px: int, halo_px: int, lattice_px: int = 1) -> int:
+def even_side_px(size_px: int, tile_px: int, halo_px: int, alignment_px: int = 1) -> int:
     """The shortest side that needs no more tiles than `tile_px` does."""
     # A last tile that is moved inward computes pixels twice; even tiles compute fewer.
-    count = len(plan_side(size_px, tile_px, halo_px, lattice_px))
-    even_px = -(-(_up(size_px, lattice_px) + 2 * halo_px * (count - 1)) // count)
-    return max(_up(even_px, lattice_px), 2 * halo_px + lattice_px)
+    count = len(plan_side(size_px, tile_px, halo_px, alignment_px))
+    even_px = -(-(_up(size_px, alignment_px) + 2 * halo_px * (count - 1)) // count)
+    return max(_up(even_px, alignment_px), 2 * halo_px + alignment_px)
 
 
 def _spans(image_px: int, size_px: int, tile_px: int, halo_px: int) -> Iterator[Span]:
@@ -230,13 +230,13 @@ def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, tiling: Tiling
     _require_fit(bands, halo_px, tiling)
 
     def side(size_px: int) -> tuple[Span, ...]:
-        lattice_px = tiling.lattice_px
+        alignment_px = tiling.alignment_px
         longest_px = (
-            even_side_px(size_px, tile_px, halo_px, lattice_px)
+            even_side_px(size_px, tile_px, halo_px, alignment_px)
             if tiling.fixed_px is None
             else tile_px
         )
-        return tuple(plan_side(size_px, longest_px, halo_px, lattice_px, tiling.least_px))
+        return tuple(plan_side(size_px, longest_px, halo_px, alignment_px, tiling.min_side_px))
 
     return Plan(
         bands, height_px, width_px, tile_px, halo_px, tiling, side(height_px), side(width_px)
@@ -255,9 +255,9 @@ def _require_fit(bands: int, halo_px: int, tiling: Tiling) -> None:
             f"The network restores {tiling.channels_in} bands together, but the number of bands of "
             f"the image is {bands}. Select bands, or use another network."
         )
-    if halo_px % tiling.lattice_px:
+    if halo_px % tiling.alignment_px:
         raise OptionError(
-            f"`halo` must be a multiple of {tiling.lattice_px} px, after which the strides of the "
+            f"`halo` must be a multiple of {tiling.alignment_px} px, after which the strides of the "
             f"network repeat, got {halo_px} px. A halo of {tiling.halo_px} px is exact for this "
             "network."
         )

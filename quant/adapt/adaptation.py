@@ -167,9 +167,9 @@ def _fit_images(model: onnx.ModelProto, images: Sequence[np.ndarray]) -> list[np
     side_px = fixed_tile_px(model)
     if side_px is None:
         try:
-            lattice_px = tiling_of(model).lattice_px
+            alignment_px = tiling_of(model).alignment_px
         except ModelError:
             # The operator that is to be replaced may be none that can be tiled.
-            lattice_px = FIT_PX
-        side_px = -(-FIT_PX // lattice_px) * lattice_px
+            alignment_px = FIT_PX
+        side_px = -(-FIT_PX // alignment_px) * alignment_px
     return [images[int(k)][..., :side_px, :side_px] for k in places]

@@ -133,7 +133,7 @@ def samples_of(
     channels = int(model.graph.input[0].type.tensor_type.shape.dim[1].dim_value) or 1
     fixed_px = fixed_tile_px(model)
     try:
-        multiple_px = tiling_of(model).lattice_px
+        multiple_px = tiling_of(model).alignment_px
     except ModelError:
         multiple_px = 0
     if given is not None:

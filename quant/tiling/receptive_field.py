@@ -1,8 +1,8 @@
 """How a network's image may be cut into tiles that give the whole image's result, bit for bit.
 
-The contract, of `tiling_of`: cut tiles at multiples of `lattice_px`; read each with `halo_px`
+The contract, of `tiling_of`: cut tiles at multiples of `alignment_px`; read each with `halo_px`
 around what is kept of it, less only where the image ends; extend the image at the bottom and right
-to a multiple of `lattice_px` first, and to `least_px`. Then a kept pixel is computed from the same
+to a multiple of `alignment_px` first, and to `min_side_px`. Then a kept pixel is computed from the same
 numbers in the same places as in the whole image, the zeros that layers pad with included, and the
 output is `scale` times the image's size. (A runtime's float sums are the same too where it adds in
 one order: onnxruntime changes that for maps of fewer than some 80 pixels a thread, see
@@ -40,25 +40,25 @@ class Tiling:
     Attributes:
         halo_px: context around what is kept of a tile: the receptive radius, rounded up to the
             lattice.
-        lattice_px: tiles begin and end at multiples of it; 1 without strides.
+        alignment_px: tiles begin and end at multiples of it; 1 without strides.
         scale: pixels of the output for one of the image, along either side.
         channels_in: bands that the network reads together.
         channels_out: bands that it gives.
         fixed_px: the tile side that the network is fixed to; None where it takes any size.
-        least_px: the shortest side that it takes: one pixel more than what it mirrors at a border.
+        min_side_px: the shortest side that it takes: one pixel more than what it mirrors at a border.
     """
 
     halo_px: int
-    lattice_px: int = 1
+    alignment_px: int = 1
     scale: Fraction = Fraction(1)
     channels_in: int = 1
     channels_out: int = 1
     fixed_px: int | None = None
-    least_px: int = 1
+    min_side_px: int = 1
 
     def whole_px(self, side_px: int) -> int:
         """What a side of an image is extended to, at the bottom and right."""
-        return -(-max(side_px, self.least_px) // self.lattice_px) * self.lattice_px
+        return -(-max(side_px, self.min_side_px) // self.alignment_px) * self.alignment_px
 
     @property
     def words(self) -> str:
@@ -66,7 +66,7 @@ class Tiling:
         bands = f"of {self.channels_in} bands in and {self.channels_out} out"
         return (
             f"{bands}, a result of {self.scale} times the image's size and tiles of "
-            f"multiples of {self.lattice_px} px"
+            f"multiples of {self.alignment_px} px"
         )
 
 
@@ -85,23 +85,23 @@ def tiling_of(model: onnx.ModelProto, where: str = "") -> Tiling:
         rows, columns = (_Walk(graph, axis) for axis in (0, 1))
         channels_in, channels_out = _channels(graph, model)
         fixed_px = fixed_tile_px(model)
-        lattice_px = math.lcm(rows.lattice_px, columns.lattice_px)
+        alignment_px = math.lcm(rows.alignment_px, columns.alignment_px)
         radius_px = max(rows.radius_px, columns.radius_px)
         if rows.scale != columns.scale:
             raise not_tileable(
                 "it must scale rows and columns by one factor, but the factors are "
                 f"{rows.scale} and {columns.scale}"
             )
-        if fixed_px is not None and fixed_px % lattice_px:
+        if fixed_px is not None and fixed_px % alignment_px:
             raise not_tileable(
-                f"the side of a tile must be a multiple of {lattice_px} pixels, but the network is "
+                f"the side of a tile must be a multiple of {alignment_px} pixels, but the network is "
                 f"fixed to {fixed_px} pixels"
             )
         # A tile begins and ends on the lattice, so its context does too.
-        halo_px = -(-radius_px // lattice_px) * lattice_px
-        least_px = max(rows.least_px, columns.least_px)
+        halo_px = -(-radius_px // alignment_px) * alignment_px
+        min_side_px = max(rows.min_side_px, columns.min_side_px)
         return Tiling(
-            halo_px, lattice_px, rows.scale, channels_in, channels_out, fixed_px, least_px
+            halo_px, alignment_px, rows.scale, channels_in, channels_out, fixed_px, min_side_px
         )
 
 
@@ -151,14 +151,14 @@ class _Grid:
     per_px: Fraction
     extra: int
 
-    def in_cell(self, lattice_px: int) -> int:
+    def in_cell(self, alignment_px: int) -> int:
         """Its share of a cell of the lattice."""
-        return int(self.per_px * lattice_px)
+        return int(self.per_px * alignment_px)
 
-    def reach_px(self, first: int, last: int, lattice_px: int) -> int:
+    def reach_px(self, first: int, last: int, alignment_px: int) -> int:
         """How far beyond the lattice's first cell a tile must reach to have these pixels."""
         end_px = math.ceil((last - self.extra + 1) / self.per_px)
-        return max(-math.floor(first / self.per_px), end_px - lattice_px)
+        return max(-math.floor(first / self.per_px), end_px - alignment_px)
 
 
 class _Walk:
@@ -172,7 +172,7 @@ class _Walk:
         self._shapes = {name: value.shape for name, value in graph.constants.items()}
         self._grids = dict.fromkeys(graph.inputs, _Grid(Fraction(1), 0))
         self._steps: list[tuple[Node, AxisMap]] = []
-        self.least_px = 1
+        self.min_side_px = 1
         for node in graph.nodes:
             self._visit(node)
         output = graph.outputs[0]
@@ -185,9 +185,9 @@ class _Walk:
                 "its output must have the image's size or a multiple of it, but it has "
                 f"{extra:+d} pixels a side"
             )
-        self.lattice_px = math.lcm(*(grid.per_px.denominator for grid in self._grids.values()))
+        self.alignment_px = math.lcm(*(grid.per_px.denominator for grid in self._grids.values()))
         period = max(
-            self.lattice_px, *(grid.in_cell(self.lattice_px) for grid in self._grids.values())
+            self.alignment_px, *(grid.in_cell(self.alignment_px) for grid in self._grids.values())
         )
         if period > PERIOD:
             raise not_tileable(
@@ -206,7 +206,7 @@ class _Walk:
                 dict.fromkeys(node.outputs, _Grid(grids[0].per_px * step.growth, step.extra))
             )
             if step.mirrored:
-                self.least_px = max(self.least_px, math.ceil((1 + step.mirrored) / grids[0].per_px))
+                self.min_side_px = max(self.min_side_px, math.ceil((1 + step.mirrored) / grids[0].per_px))
         else:
             # A board's file dequantises its weights by such nodes.
             at.require(node.op_type in KEEPING, "reads constants only (fold them)")
@@ -228,7 +228,7 @@ class _Walk:
 
     def _radius_px(self, output: str) -> int:
         """How far beyond a cell of the lattice lies what its result depends on."""
-        ranges = {output: (0, self._grids[output].in_cell(self.lattice_px) - 1)}
+        ranges = {output: (0, self._grids[output].in_cell(self.alignment_px) - 1)}
         # A tensor's readers stand behind its writer, so backwards each range is complete when the
         # node that writes the tensor is reached.
         for node, step in reversed(self._steps):
@@ -240,12 +240,12 @@ class _Walk:
                 if name not in self._grids:
                     continue
                 grid = self._grids[name]
-                size = grid.in_cell(self.lattice_px) + grid.extra
+                size = grid.in_cell(self.alignment_px) + grid.extra
                 ends = step.reads(first, last, size)
                 ranges[name] = _hull([ends, ranges.get(name, ends)])
         # Inner tensors count too: a tile ends at each of them, and the layers behind pad there.
         return max(
-            self._grids[name].reach_px(*ends, self.lattice_px) for name, ends in ranges.items()
+            self._grids[name].reach_px(*ends, self.alignment_px) for name, ends in ranges.items()
         )
 
 

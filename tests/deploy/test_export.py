@@ -74,7 +74,7 @@ def test_a_network_behind_a_bank_is_exported_for_one_sensor(
     placed = place(network_of(model, 64), load_dpu("vck190", "C32B6"))
     assert [node.op.name for node in placed.nodes if node.broken] == []
     tiling = tiling_of(model)
-    assert tiling.lattice_px == scale
+    assert tiling.alignment_px == scale
     assert tiling.halo_px == radius_px(banked.variant) + (3 if scale == 1 else 4)
 
 

@@ -166,8 +166,8 @@ def test_the_core_is_legal_on_the_dpu(name: str) -> None:
 @pytest.mark.parametrize("name", NETWORKS)
 def test_tiles_of_int8_are_the_whole(name: str) -> None:
     model = quantized(name).host
-    lattice_px = tiling_of(model).lattice_px
-    check_tiles(model, images(name, 1, 64)[0], (16 // lattice_px, 24 // lattice_px))
+    alignment_px = tiling_of(model).alignment_px
+    check_tiles(model, images(name, 1, 64)[0], (16 // alignment_px, 24 // alignment_px))
 
 
 def one_convolution(weight: float, bias: float) -> onnx.ModelProto:

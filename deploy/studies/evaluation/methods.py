@@ -73,7 +73,7 @@ class Method:
     sensor_known: str
     specialise: Specialise | None = None
 
-    def knowing(self, sensor: Instrument) -> "Method":
+    def with_sensor(self, sensor: Instrument) -> "Method":
         """This method with that sensor known; itself where what it does depends on none."""
         if self.specialise is None:
             return self

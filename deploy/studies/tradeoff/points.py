@@ -162,8 +162,8 @@ def _require_tiles(name: str, tiling: Tiling) -> None:
     """Raise OptionError if a network does not restore one band in tiles of any multiple of the
     halo's steps.
     """
-    plain = replace(tiling, lattice_px=1, least_px=1, fixed_px=None) == Tiling(tiling.halo_px)
-    if tiling.fixed_px is not None or not plain or HALO_STEP_PX % tiling.lattice_px:
+    plain = replace(tiling, alignment_px=1, min_side_px=1, fixed_px=None) == Tiling(tiling.halo_px)
+    if tiling.fixed_px is not None or not plain or HALO_STEP_PX % tiling.alignment_px:
         fixed = ", fixed to one tile size" if tiling.fixed_px is not None else ""
         raise OptionError(
             f"`network` must restore one band in tiles of any multiple of {HALO_STEP_PX} px, but "

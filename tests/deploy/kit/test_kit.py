@@ -74,9 +74,9 @@ def test_the_host_part_gives_the_host_files_bytes(name: str, tmp_path: Path) -> 
     np.save(tmp_path / "image.npy", image)
     files = [str(tmp_path / "image.npy"), str(tmp_path / "out.npy")]
     subprocess.run([sys.executable, "-c", BARE, "-", *files], cwd=folder, check=True)
-    lattice_px = int8.tiling.lattice_px
+    alignment_px = int8.tiling.alignment_px
     scale = int(int8.tiling.scale)
-    wide = np.pad(image, [(0, 0), *((0, -side % lattice_px) for side in image.shape[1:])], "edge")
+    wide = np.pad(image, [(0, 0), *((0, -side % alignment_px) for side in image.shape[1:])], "edge")
     expected = int8(wide[None])[0][:, : 131 * scale, : 203 * scale]
     assert np.array_equal(np.load(tmp_path / "out.npy"), expected)
     assert {"core.onnx", "measure.py", "README.md", "golden"} < {

@@ -73,7 +73,7 @@ def whole(path: Path, pixels: np.ndarray) -> np.ndarray:
     height, width = pixels.shape[-2:]
     tiling = tiling_of(model)
     bands = pixels.reshape(-1, height, width)
-    more = [-side % tiling.lattice_px for side in (height, width)]
+    more = [-side % tiling.alignment_px for side in (height, width)]
     image = np.pad(bands, ((0, 0), (0, more[0]), (0, more[1])), mode="edge").astype(np.float32)
     (result,) = tensors_of(open_session(model, 1), None, image[None] / np.float32(4095))
     scale = int(tiling.scale)
@@ -114,7 +114,7 @@ def test_tiled_is_whole_in_files_arrays_and_lazy_arrays(
 def test_one_lattice_less_of_halo_shows_seams(path: Path, tmp_path: Path) -> None:
     tiling = tiling_of(load_onnx(path))
     pixels = noise(path)
-    halo = tiling.halo_px - tiling.lattice_px
+    halo = tiling.halo_px - tiling.alignment_px
     result = by_file(pixels, tmp_path, path, 56, halo=halo, threads=1)
     assert (result != whole(path, pixels)).any()
 

@@ -45,7 +45,7 @@ def test_an_even_side_needs_as_many_tiles_and_none_shorter_does(
 
 def test_a_span_reads_as_many_pixels_as_a_network_needs() -> None:
     assert [
-        (span.start, span.stop, span.keep_stop) for span in plan_side(1, 20, 4, 2, least_px=5)
+        (span.start, span.stop, span.keep_stop) for span in plan_side(1, 20, 4, 2, min_side_px=5)
     ] == [(0, 6, 1)]
 
 

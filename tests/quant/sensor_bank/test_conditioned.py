@@ -294,7 +294,7 @@ def test_tiles_give_the_whole_images_result(pair: Pair) -> None:
     tiling = tiling_of(file)
     at_once = run(session, image)
     halo = tiling.halo_px
-    assert tiling.lattice_px == pair[0].variant.scale
+    assert tiling.alignment_px == pair[0].variant.scale
     for top, left in ((0, 0), (32, 24), (64, 48)):
         bottom = top + 32
         right = left + 32

@@ -270,7 +270,7 @@ def check_tiles(
     """
     tiling = tiling_of(model)
     session = open_session(any_size(model), 1)
-    more = [(0, -n % tiling.lattice_px) for n in image.shape[2:]]
+    more = [(0, -n % tiling.alignment_px) for n in image.shape[2:]]
     image = np.pad(image, ((0, 0), (0, 0), *more), mode="edge")
     expected = result_of(session, image)
     assert expected.shape == (
@@ -279,7 +279,7 @@ def check_tiles(
         *(int(n * tiling.scale) for n in image.shape[2:]),
     )
     for cells in all_cells:
-        kept_px = cells * tiling.lattice_px
+        kept_px = cells * tiling.alignment_px
         rows = []
         sides = [spans(size, kept_px, tiling.halo_px - short_px) for size in image.shape[2:]]
         for top, bottom, low, high in sides[0]:

@@ -87,7 +87,7 @@ EXACT = {
         .add("Slice", *cut((0, 0), -1))
         .model(),
         # Mirrored padding needs as many pixels as it mirrors.
-        Tiling(3, least_px=2),
+        Tiling(3, min_side_px=2),
     ),
     "looks back, copied and moved": (
         looking([2, 2, 0, 0])
@@ -145,7 +145,7 @@ def test_tiled_is_whole_and_no_smaller_halo_does(name: str) -> None:
     check_any(model, (25, 38), cells)
     if tiling.halo_px:
         with pytest.raises(AssertionError, match="Mismatched"):
-            check_any(model, (25, 38), cells, short_px=tiling.lattice_px)
+            check_any(model, (25, 38), cells, short_px=tiling.alignment_px)
 
 
 HEAD = helper.make_node("GlobalAveragePool", ["image"], ["restored"], name="head/pool")
@@ -239,5 +239,5 @@ def check_any(
 def test_random_networks_are_tiled_as_a_whole(
     model: onnx.ModelProto, height: int, width: int
 ) -> None:
-    lattice_px = tiling_of(model).lattice_px
-    check_any(model, (height + 2 * lattice_px, width + lattice_px))
+    alignment_px = tiling_of(model).alignment_px
+    check_any(model, (height + 2 * alignment_px, width + alignment_px))
