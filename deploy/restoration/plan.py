@@ -257,7 +257,7 @@ def _require_fit(bands: int, halo_px: int, tiling: Tiling) -> None:
         )
     if halo_px % tiling.alignment_px:
         raise OptionError(
-            f"`halo` must be a multiple of {tiling.alignment_px} px, after which the strides of the "
-            f"network repeat, got {halo_px} px. A halo of {tiling.halo_px} px is exact for this "
-            "network."
+            f"`halo` must be a multiple of {tiling.alignment_px} px, after which the strides of "
+            f"the network repeat, got {halo_px} px. A halo of {tiling.halo_px} px is exact for "
+            "this network."
         )

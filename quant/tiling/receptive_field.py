@@ -2,10 +2,10 @@
 
 The contract, of `tiling_of`: cut tiles at multiples of `alignment_px`; read each with `halo_px`
 around what is kept of it, less only where the image ends; extend the image at the bottom and right
-to a multiple of `alignment_px` first, and to `min_side_px`. Then a kept pixel is computed from the same
-numbers in the same places as in the whole image, the zeros that layers pad with included, and the
-output is `scale` times the image's size. (A runtime's float sums are the same too where it adds in
-one order: onnxruntime changes that for maps of fewer than some 80 pixels a thread, see
+to a multiple of `alignment_px` first, and to `min_side_px`. Then a kept pixel is computed from the
+same numbers in the same places as in the whole image, the zeros that layers pad with included, and
+the output is `scale` times the image's size. (A runtime's float sums are the same too where it adds
+in one order: onnxruntime changes that for maps of fewer than some 80 pixels a thread, see
 docs/explanation/tiling.md.)
 
 It is found by a walk along the graph and back, once for the rows and once for the columns. On the
@@ -45,7 +45,8 @@ class Tiling:
         channels_in: bands that the network reads together.
         channels_out: bands that it gives.
         fixed_px: the tile side that the network is fixed to; None where it takes any size.
-        min_side_px: the shortest side that it takes: one pixel more than what it mirrors at a border.
+        min_side_px: the shortest side that it accepts: one pixel more than what it mirrors at a
+            border.
     """
 
     halo_px: int
@@ -94,8 +95,8 @@ def tiling_of(model: onnx.ModelProto, where: str = "") -> Tiling:
             )
         if fixed_px is not None and fixed_px % alignment_px:
             raise not_tileable(
-                f"the side of a tile must be a multiple of {alignment_px} pixels, but the network is "
-                f"fixed to {fixed_px} pixels"
+                f"the side of a tile must be a multiple of {alignment_px} pixels, but the network "
+                f"is fixed to {fixed_px} pixels"
             )
         # A tile begins and ends on the lattice, so its context does too.
         halo_px = -(-radius_px // alignment_px) * alignment_px
@@ -206,7 +207,8 @@ class _Walk:
                 dict.fromkeys(node.outputs, _Grid(grids[0].per_px * step.growth, step.extra))
             )
             if step.mirrored:
-                self.min_side_px = max(self.min_side_px, math.ceil((1 + step.mirrored) / grids[0].per_px))
+                side_px = math.ceil((1 + step.mirrored) / grids[0].per_px)
+                self.min_side_px = max(self.min_side_px, side_px)
         else:
             # A board's file dequantises its weights by such nodes.
             at.require(node.op_type in KEEPING, "reads constants only (fold them)")
