@@ -1,5 +1,6 @@
-"""Read NumPy's files, which may come from anyone: nothing is unpickled, and any damage is one
-reason in words.
+"""Read NumPy files from untrusted sources, without unpickling.
+
+Any damage is reported as one reason.
 """
 
 from pathlib import Path
@@ -9,9 +10,9 @@ import numpy as np
 from beers_deploy.profiles.toml import unreadable
 
 ZIP = b"PK"
-"""What an archive begins with, also a truncated one."""
+"""The first bytes of a ZIP archive, which a truncated archive has too."""
 ALONE = ""
-"""Name of the array of a .npy file."""
+"""The name under which the array of a .npy file is returned."""
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:

@@ -1,4 +1,6 @@
-"""The reference of a sensor: what a restoration aims at, in the sensor's digital numbers."""
+"""Define the reference sensor that a restoration aims at, in the digital numbers of the degraded
+one.
+"""
 
 import logging
 import os

@@ -1,4 +1,4 @@
-"""Check what a file states with a pydantic type, and say in one sentence what is wrong with it."""
+"""Validate the content of a file with a pydantic type, and describe an error in one sentence."""
 
 from collections.abc import Collection, Mapping, Sequence
 from difflib import get_close_matches
@@ -11,7 +11,7 @@ from beers_deploy.profiles.errors import ProfileError, printable
 T = TypeVar("T")
 
 CONFIG = ConfigDict(extra="forbid")
-"""Of every model here: a misspelt key is refused, never ignored."""
+"""The configuration of every model: an unknown key is an error and never ignored."""
 
 TABLE_TYPES = ("dataclass_type", "dict_type", "mapping_type", "model_type")
 EXPECTED = {
@@ -19,15 +19,15 @@ EXPECTED = {
     "string_type": ("a text", "Write it in quotes."),
     "tuple_type": ("a list", "Write it in square brackets, with commas between."),
 }
-"""TOML's words for pydantic's types of errors, and what to do; of the others pydantic's own message
-is shown, which names the allowed values.
+"""TOML's names for pydantic's types of errors, and what to do. For other types pydantic's own
+message is shown, which lists the allowed values.
 """
 EXAMPLES = {
     "description": 'description = "our camera"',
     "status": 'status = "measured"',
     "source": 'source = "data sheet, page 3"',
 }
-"""Lines that show how to write a key that is missing."""
+"""Lines that show how to write a missing key."""
 
 
 def validated(kind: type[T], raw: object, label: str, groups: Mapping[str, str] | None = None) -> T:
