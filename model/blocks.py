@@ -1,8 +1,9 @@
-"""Means over the blocks of an image, and bilinear interpolation between the centres of blocks.
+"""Compute means over the blocks of an image, and interpolate bilinearly between the centres of
+blocks.
 
-The blocks are aligned to the image, and every block and pixel is computed by the same float32
-operations in the same order wherever a tile begins. So tiles give the whole image's values bit for
-bit.
+The blocks are aligned to the image. Every block and pixel is computed by the same float32
+operations in the same order wherever a tile begins. Tiles therefore reproduce the values of the
+whole image bit for bit.
 """
 
 from dataclasses import dataclass
@@ -30,13 +31,13 @@ show. With all blocks the outer 8 pixels lost 0.2 dB, with one left out 0.05 dB;
 
 @dataclass(frozen=True)
 class Placed:
-    """Where in an image the pixels of an array lie along one side.
+    """The position of an array in the image, along one side.
 
     Attributes:
-        size_px: of the image.
-        start: place in the image of the array's first pixel.
-        keep_start: first kept pixel, in the image.
-        keep_stop: end of the kept pixels (excluded).
+        size_px: side of the image.
+        start: position in the image of the array's first pixel.
+        keep_start: first pixel of the result, in the image.
+        keep_stop: end of the pixels of the result (excluded).
     """
 
     size_px: int
@@ -46,9 +47,9 @@ class Placed:
 
     @property
     def blocks(self) -> tuple[int, int]:
-        """First and last block that the kept pixels are interpolated from.
+        """The first and the last block from which the pixels of the result are interpolated.
 
-        BORDER_BLOCKS at either end of the image are left out, unless it has no others.
+        The outer BORDER_BLOCKS at either end of the image are excluded, unless it has no others.
         """
         # Pixel p lies between the centres of blocks (p - 4) // 8 and the next: a centre lies at 8 k
         # + 3.5.

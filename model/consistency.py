@@ -69,19 +69,19 @@ Twice as many changed the PSNR by less than 0.01 dB (measured).
 
 
 REACH_PX = BLOCK_PX * (FAR_BLOCKS + BORDER_BLOCKS + 1) - 1
-"""How far from a pixel lie the restored pixels that its correction depends on."""
+"""The correction of a pixel depends on restored pixels up to this distance."""
 
 RAW_REACH_PX = BLOCK_PX * (BORDER_BLOCKS + 1) - 1 + NEAR_PX
-"""How far from a pixel lie the raw pixels that its correction depends on."""
+"""The correction of a pixel depends on raw pixels up to this distance."""
 
 LEAST_SHARE = 0.25
-"""Where fewer of the weights around a pixel lie on usable blocks, the correction fades out instead
-of ending in a step.
+"""If a smaller share of the weights around a pixel lies on usable blocks, the correction fades out
+instead of ending in a step.
 """
 
 GRID = 512
-"""Frequencies along an axis from which H is transformed: wide enough for the far part not to wrap
-around.
+"""The number of frequencies along an axis from which H is computed. It is large enough for the far
+part not to wrap around.
 """
 
 PRODUCTS_PER_PX = (
@@ -92,10 +92,10 @@ PRODUCTS_PER_PX = (
     + (2 * FAR_BLOCKS + 1) ** 2 / BLOCK_PX**2  # The far part.
     + 2 * (1 + 1 / BLOCK_PX)  # Interpolation.
 )
-"""Products, each with its sum, that the step takes for a pixel."""
+"""The number of multiply-accumulate operations of the step per pixel."""
 
 EXCESS_SIGMAS = 6.0
-"""Above so many standard deviations of noise no pixel is clipped at zero."""
+"""Signals of more than this number of standard deviations of noise are never clipped at zero."""
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,9 @@ class Consistency:
         return change
 
     def _near(self, padded: Image) -> Image:
-        """Block means of the near part of H x, from pixels with NEAR_PX more on every side."""
+        """Compute block means of the near part of H x from pixels padded by NEAR_PX on
+        every side.
+        """
         total: Image | None = None
         for row, column in zip(self.rows, self.columns, strict=True):
             term = weighted_sums(weighted_sums(padded, row, 0), column, 1)
@@ -201,9 +203,9 @@ class Consistency:
     def _far(
         self, finite: Image, missing: NDArray[np.bool_] | None, down: Placed, across: Placed
     ) -> Image:
-        """Block means of the far part of H x.
+        """Compute block means of the far part of H x.
 
-        A block with missing pixels counts as the block in the middle does.
+        A block with missing pixels is replaced by the block in the middle.
         """
         around_px = BLOCK_PX * FAR_BLOCKS
         origin = down.start, across.start
@@ -222,7 +224,7 @@ class Consistency:
         )
 
     def _around(self, means: Image) -> Image:
-        """The sum of block means around each block, weighted by `far`."""
+        """Sum the block means around each block, weighted by `far`."""
         side = len(self.far)
         height = means.shape[0] - side + 1
         width = means.shape[1] - side + 1
@@ -234,7 +236,7 @@ class Consistency:
 
 
 def blur_between(sensor: Instrument, reference: Instrument) -> NDArray[np.float64]:
-    """The filter H around its first pixel, (GRID, GRID) float64 of sum 1."""
+    """Compute the filter H, centred on its first pixel, (GRID, GRID) float64 of sum 1."""
     fy = np.fft.fftfreq(GRID)[:, None]
     fx = np.fft.fftfreq(GRID)[None, :]
     ratio = sensor_mtf(fx, fy, sensor) / sensor_mtf(fx, fy, reference)
@@ -242,16 +244,16 @@ def blur_between(sensor: Instrument, reference: Instrument) -> NDArray[np.float6
 
 
 def centre(kernel: NDArray[np.float64], radius: int) -> NDArray[np.float64]:
-    """The middle (2 R + 1, 2 R + 1) of a filter that lies around its first element."""
+    """Cut a filter that is centred on its first element to (2 R + 1, 2 R + 1)."""
     return np.roll(kernel, (radius, radius), (0, 1))[: 2 * radius + 1, : 2 * radius + 1]
 
 
 def _far_weights(kernel: NDArray[np.float64], near: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What each block mean around a block adds to the mean of H x there, the near part left out.
+    """Compute the weights of the surrounding block means in the mean of H x, without the near part.
 
-    The mean over one block of what a filter f makes of another, d blocks away and of constant
-    value, is the sum of f(8 d + e) (8 - |e_y|) (8 - |e_x|) / 64 over the offsets e. What lies
-    beyond the farthest blocks is spread over all of them, so that a constant image stays as it is.
+    A filter f is applied to a block of constant value, d blocks away. The mean of the result over
+    one block is the sum of f(8 d + e) (8 - |e_y|) (8 - |e_x|) / 64 over the offsets e. The weight
+    beyond the farthest blocks is spread over all of them, so that a constant image does not change.
     """
     remainder = kernel.copy()
     offsets = np.arange(-NEAR_PX, NEAR_PX + 1)
@@ -264,11 +266,13 @@ def _far_weights(kernel: NDArray[np.float64], near: NDArray[np.float64]) -> NDAr
 
 
 def _clipped_noise(sensor: Instrument, full_scale: float) -> tuple[Image, Image]:
-    """What the converter's clipping at zero adds to the mean of a dark block: its mean value, and
-    the excess.
+    """Compute how much clipping at zero raises the mean of a dark block.
 
     A signal s with Gaussian noise sigma, clipped at 0, has the mean s + e with e = sigma phi(s /
-    sigma) - s Phi(-s / sigma), phi and Phi being the normal density and distribution.
+    sigma) - s Phi(-s / sigma), where phi and Phi are the normal density and distribution.
+
+    Returns:
+        Mean values of a block after clipping, and the excess e at each.
     """
     gain = sensor.gain_dn_per_radiance
     unit = full_scale / sensor.max_dn

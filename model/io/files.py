@@ -18,8 +18,8 @@ from beers_deploy.profiles.errors import MachineError, OptionError, printable
 TIFF_SUFFIXES = {".tif", ".tiff"}
 IMAGE_SUFFIXES = TIFF_SUFFIXES | {".png", ".jpg", ".jpeg"}
 READ_SUFFIXES = IMAGE_SUFFIXES | {".onnx", ".safetensors", ".pth"}
-"""What a command takes from a folder that it reads; an earlier run's figures may lie there and be
-renewed.
+"""The suffixes of files that a command reads from a folder. Results of an earlier run may lie in
+the same folder and be overwritten.
 """
 
 
@@ -131,7 +131,7 @@ def _part_of(path: Path) -> Path:
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """What all names of a file have in common; None where there is none."""
+    """Return device and inode of a file, which all its names share; None if it cannot be read."""
     try:
         status = path.stat()
     except OSError:
@@ -140,7 +140,9 @@ def _identity(path: Path) -> tuple[int, int] | None:
 
 
 def _files_of(path: Path) -> list[Path]:
-    """An input as files: itself, or those of a folder that a command may read."""
+    """Return an input as a list of files: itself, or the files in a folder that a
+    command may read.
+    """
     if not path.is_dir():
         return [path]
     return [file for file in path.glob("*") if file.suffix.lower() in READ_SUFFIXES]
@@ -165,6 +167,6 @@ def write_text(path: Path, text: str) -> None:
 
 
 def sha256(path: Path) -> str:
-    """Hex digest of a file's bytes, read in pieces."""
+    """Compute the hex digest of a file, read in pieces."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

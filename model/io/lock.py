@@ -1,5 +1,5 @@
-"""One run at a time on one output: the system holds the lock, so that a killed process blocks
-nobody.
+"""Allow one run at a time on one output. The system holds the lock, so that a killed process does
+not block others.
 """
 
 import errno
@@ -14,17 +14,17 @@ from beers_deploy.profiles.errors import MachineError
 
 
 def part_folder(out: Path) -> Path:
-    """The folder beside `out` in which a run keeps what it needs for it."""
+    """Return the folder next to `out` in which a run stores its temporary files."""
     return out.with_name(f".{out.name}.part")
 
 
 NAME = "lock"
 GRACE_S = 0.2
-"""How long to wait for a run that ends just now: it takes the lock's file along, and who waits
-makes a new one.
+"""How long to wait for a run that is just ending. It removes the lock file, and the waiting run
+creates a new one.
 """
 ENOTSUPP = 524
-"""Linux's own number beside ENOTSUP, which some network file systems let out."""
+"""An error number of Linux, in addition to ENOTSUP, that some network file systems return."""
 NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, ENOTSUPP)
 
 
@@ -55,7 +55,7 @@ def only_run(out: Path) -> Iterator[None]:
 
 
 def _take(out: Path, folder: Path) -> BaseFileLock:
-    """The lock, held; where there are no locks it holds nothing."""
+    """Acquire the lock and return it; if the file system has no locks, it is not acquired."""
     # A file that only stands for a lock would outlive a killed run: rather none where the system
     # has none.
     if folder.is_symlink():

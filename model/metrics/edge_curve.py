@@ -129,7 +129,7 @@ class MtfCurve:
     missing_edges: int = 0
 
     def at(self, frequency: float) -> tuple[float, tuple[float, float]]:
-        """Contrast at one of FREQUENCIES, and its interval."""
+        """Return the contrast at the nearest of FREQUENCIES, and its interval."""
         place = int(np.argmin(np.abs(FREQUENCIES - frequency)))
         return float(self.contrast[place]), (float(self.low[place]), float(self.high[place]))
 
@@ -242,11 +242,11 @@ def _softness(edges: Sequence[FittedEdge], weights: np.ndarray) -> tuple[np.ndar
 
 
 def sharpest(values: np.ndarray, errors: np.ndarray) -> float:
-    """The softness of the steps among edges that are steps or softer, never sharper.
+    """Estimate the softness of the steps among edges that are steps or softer, never sharper.
 
-    softness = that of a step + what the edge itself adds, 0 or more + an error: an exponential and
-    a normal distribution added, and few outliers. The most likely value, with weak expectations of
-    both widths.
+    The model is: softness = that of a step + an edge's own softness, 0 or more + an error. The two
+    terms have an exponential and a normal distribution, and few edges are outliers. The maximum of
+    the posterior is returned, with weak priors for both widths.
 
     Args:
         values: (N,) softness.
@@ -378,10 +378,11 @@ def _missing(contrast: np.ndarray, low: np.ndarray, high: np.ndarray, edges: int
 
 
 def apart(own: MtfCurve, other: MtfCurve) -> MtfCurve:
-    """The curve along its axis alone: what leaning edges hold of the other axis is taken out.
+    """Return the curve along its own axis only, by removing the part of the other axis in inclined
+    edges.
 
-    The loss of an edge's normal is sqrt((c loss_own)^2 + (s loss_other)^2), c and s of its angle,
-    as in a profile's formula (`profiles.response.MtfTable`).
+    The loss along an edge's normal is sqrt((c loss_own)^2 + (s loss_other)^2), with c and s the
+    cosine and sine of its angle, as in a profile's formula (`profiles.response.MtfTable`).
     """
     detector = np.sinc(FREQUENCIES)
     own_loss, other_loss = (np.log(detector / curve.contrast) ** 2 for curve in (own, other))

@@ -74,12 +74,12 @@ Fit = EdgeBlur | Refusal
 
 @dataclass(frozen=True)
 class Limits:
-    """What an edge must keep to count.
+    """The limits that an edge must keep to be used.
 
     Attributes:
         step_sigma: least difference of the plateaus over the noise of a pixel. A fainter edge may
-            hide in noise that it is none.
-        misfit: largest root mean square of what the noise does not explain, of the step.
+            be no edge at all.
+        misfit: largest root mean square that the noise does not explain, relative to the step.
         error: largest standard error of gamma; 0.6 is a third of the MTF.
     """
 
@@ -95,11 +95,13 @@ ANY = Limits(0, math.inf, math.inf)
 
 @lru_cache(maxsize=16)
 def _responses(shape: float) -> np.ndarray:
-    """A step of 1 at 0, blurred, for each of GAMMAS and each distance: (101, 2 * REACH_PX * PER_PX
-    + 1).
+    """Compute the image of a step of 1 at 0 for each of GAMMAS and each distance.
 
     It is the sum over f of MTF(f) sin(2 pi f d) / (pi f), by a Fourier transform over f = (k + 1/2)
-    / PERIOD_PX: as a matrix product it occupies every core for far longer than the sum takes.
+    / PERIOD_PX. As a matrix product the sum would occupy every core for far longer.
+
+    Returns:
+        Responses (101, 2 * REACH_PX * PER_PX + 1).
     """
     f = (np.arange(int(HIGHEST_F * PERIOD_PX)) + 0.5) / PERIOD_PX
     waves = np.exp(-np.outer(GAMMAS, f) - shape * f**2) * np.sinc(f) / (math.pi * f * PERIOD_PX)
@@ -189,8 +191,12 @@ class _Solved(NamedTuple):
 
 
 def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fit]:
-    """As `fit_blurs`, for pixels (N, H, W) whose noise is 1, by the curve with one Gaussian part
-    alone.
+    """Fit edges as `fit_blurs` does, with one Gaussian part only.
+
+    Args:
+        pixels: (N, H, W), scaled such that their noise is 1.
+        limits: the limits that an edge must keep.
+        shape: coefficient of the Gaussian part.
     """
     count, height, width = pixels.shape
     fits: list[Fit] = [Refusal("no straight edge near to an axis")] * count
@@ -232,7 +238,7 @@ def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fi
 
 
 def centroids(regions: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> _Lines:
-    """The lines through the centres of what rises in each row of regions (N, H, W)."""
+    """Fit lines through the centroids of the rise in each row of regions (N, H, W)."""
     rise = np.diff(regions, axis=2)
     rise = np.maximum(rise * np.sign(rise.sum((1, 2)))[:, None, None], 0) * np.hamming(
         rise.shape[2]
