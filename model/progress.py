@@ -33,12 +33,12 @@ LINE_EVERY_S = 5.0
 
 @dataclass(frozen=True)
 class Step:
-    """How far a piece of work is.
+    """The progress of a piece of work.
 
     Attributes:
-        what: is being done.
-        done: number of steps that are done.
-        total: number of all steps, or None if that is unknown.
+        what: description of the work.
+        done: the number of steps that are done.
+        total: the number of all steps, or None if unknown.
     """
 
     what: str
@@ -47,8 +47,8 @@ class Step:
 
 
 Progress = bool | Callable[[Step], None] | None
-"""How a caller wants to see progress: a function, False for not at all, None or True for a bar or
-plain lines.
+"""How a caller wants to see progress: a function that is called; False for not at all; None or True
+for a bar or plain lines.
 """
 
 _sink: ContextVar[Progress] = ContextVar("progress", default=None)

@@ -30,29 +30,32 @@ from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.profiles.response import NYQUIST
 
 AXES = ("across", "along")
-"""The track: edges near the vertical show the blur across it."""
+"""The axes relative to the track. Edges near the vertical show the blur across it."""
 SEED = 0
-"""Of the draws of intervals: one image has one result."""
+"""Seed of the draws for intervals, so that one image always gives the same result."""
 
 EDGES = 20
-"""Short edges that suffice along an axis: more would take time and tell no more."""
+"""The number of short edges that suffices along an axis. More would take time without improving the
+result.
+"""
 STEP_PX = 4
 CELL_PX = (8, 4)
 FEW_WINDOWS = 4
-"""Every so many rows are searched for short edges, by such cells. An image of few windows may have
-few edges, so it is searched as thoroughly as by `characterize`.
+"""Only some rows are searched for short edges, in cells of this size. An image of few windows may
+have few edges, so it is searched as thoroughly as by `characterize`.
 """
 CANDIDATES = 6000
 CANDIDATES_OF_WINDOW = 400
-"""Steepest places along an axis that are compared with plain edges, of all windows and of each at
-least.
+"""The number of steepest places along an axis that are compared with plain edges: of all windows,
+and at least of each.
 """
 FITS = 128
 FITS_OF_WINDOW = 8
-"""Squares along an axis that are fitted, of all windows and of each at least: 1 ms each (measured).
+"""The number of squares along an axis that are fitted: of all windows, and at least of each. A fit
+takes 1 ms (measured).
 """
 WINDOWS_AT_ONCE = 4
-"""Whose squares are fitted together: fewer at a time take longer."""
+"""The number of windows whose squares are fitted together; fewer at a time take longer."""
 
 
 def image_blocks(images: Iterable[np.ndarray], clipped_at: float, black_dn: float = 0.0) -> Blocks:

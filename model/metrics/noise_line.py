@@ -53,7 +53,9 @@ EDGE_PERCENT = 2.0
 
 @dataclass(frozen=True)
 class Variance:
-    """Variance of the noise at one value: DN^2, without the rounding, and its 95 % interval."""
+    """Variance of the noise at one value in DN^2, without that of rounding, and its
+    95 % interval.
+    """
 
     value: float
     interval: tuple[float, float]
@@ -91,12 +93,14 @@ class NoiseModel:
     spectrum: tuple[float, ...] = ()
 
     def total(self, dn: np.ndarray) -> np.ndarray:
-        """Variance in the pixels, of the values `dn` of any shape: the rounding included."""
+        """Return the variance of pixels with the values `dn` (any shape), including that of
+        rounding.
+        """
         return np.asarray(self.alpha * np.maximum(dn, 0) + self.beta + ROUNDING)
 
     def at(self, dn: float) -> Variance:
-        """Variance at one value; the further it lies outside what was measured, the wider the
-        interval.
+        """Return the variance at one value and its interval, which is wider outside the measured
+        range.
         """
         value = self.alpha * dn + self.beta
         low, high = np.percentile(self.draws @ (dn, 1.0), [2.5, 97.5])
@@ -185,8 +189,10 @@ def _of_one_level(
 
 
 def _choose(blocks: Blocks) -> tuple[Blocks, np.ndarray]:
-    """The blocks of least structure that are enough, and their fit; what is enough shrinks with the
-    images.
+    """Choose the blocks with the least structure that are numerous enough, and fit them.
+
+    Returns:
+        The blocks and their fit. If no limit leaves enough blocks, those of the last limit.
     """
     for limit in STRUCTURES:
         quiet, fit = _quiet(blocks, limit)
@@ -196,8 +202,9 @@ def _choose(blocks: Blocks) -> tuple[Blocks, np.ndarray]:
 
 
 def _quiet(blocks: Blocks, limit: float) -> tuple[Blocks, np.ndarray]:
-    """The blocks of so little structure whose finest detail is what the others' is, but for chance;
-    and the fit.
+    """Return the blocks with little structure, and their fit.
+
+    Blocks whose finest detail differs from that of the others by more than chance are excluded.
     """
     noise = expected = np.full(blocks.mean.size, max(np.percentile(blocks.fine, 10), ROUNDING))
     for _ in range(PASSES):
@@ -215,8 +222,9 @@ def _quiet(blocks: Blocks, limit: float) -> tuple[Blocks, np.ndarray]:
 
 
 def _fitted(blocks: Blocks, weights: np.ndarray, band: np.ndarray | None = None) -> np.ndarray:
-    """(alpha, beta, leak), none negative, of a band (N,), the finest if none; a mean square
-    scatters by its size.
+    """Fit (alpha, beta, leak), none negative, to a band (N,), by default the finest.
+
+    The scatter of a mean square is proportional to its size, so residuals are weighted by it.
     """
     from scipy.optimize import nnls
 
@@ -237,14 +245,14 @@ def _fitted(blocks: Blocks, weights: np.ndarray, band: np.ndarray | None = None)
 
 
 def _weights(part: np.ndarray, parts: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """How often each block is drawn, (N,), when parts are drawn with replacement."""
+    """Draw parts with replacement, and return how often each block is drawn, (N,)."""
     counts = np.bincount(generator.integers(parts.size, size=parts.size), minlength=parts.size)
     return counts[np.searchsorted(parts, part)].astype(np.float64)
 
 
 def _unrounded(fit: np.ndarray) -> tuple[float, float]:
-    """Alpha and beta of the instrument: the rounding's variance taken off, first of what does not
-    grow.
+    """Return alpha and beta of the instrument, with the variance of rounding
+    subtracted from beta.
     """
     return float(fit[0]), max(float(fit[1]) - ROUNDING, 0.0)
 

@@ -1,4 +1,4 @@
-"""What is known of an image before its pixels are read: size, type, missing pixels, and place."""
+"""Describe an image before its pixels are read: size, type, missing pixels, and place."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -148,7 +148,7 @@ class Raster:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Bands, height and width, (bands, H, W) in pixels."""
+        """The number of bands, height and width, (bands, H, W) in pixels."""
         return self.bands, self.height_px, self.width_px
 
     @property
@@ -181,7 +181,7 @@ class Raster:
 
     @property
     def may_miss(self) -> bool:
-        """Whether any pixel could be missing at all."""
+        """True if any pixel could be missing."""
         return self.dtype.kind == "f" or self.nodata is not None or bool(self.mask_kind)
 
     def fill_margin_px(self, radius_px: int) -> int:

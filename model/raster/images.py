@@ -73,7 +73,7 @@ def image_size_px(path: Path) -> tuple[int, int]:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The image files of a folder, sorted by name."""
+    """List the image files of a folder, sorted by name, or raise ImageError if there are none."""
     # A folder that does not exist has no files either.
     images = sorted(path for path in folder.glob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
     if not images:
@@ -97,15 +97,14 @@ def site_of(name: str) -> str:
 def read_acquisition(
     path: Path, full_scale: float | None = None, remedy: str | None = RESCALE, max_dn: int = MAX_DN
 ) -> np.ndarray:
-    """Digital numbers (H, W) float32 in 0..max_dn of a mono image: of at most 12 bits unless a
-    sensor says otherwise.
+    """Read the digital numbers (H, W) float32 of a mono image, from 0 to max_dn.
 
     Args:
         path: a TIFF, PNG or JPEG file.
         full_scale: the pixel value that is full scale; None lets the pixels' type and values
             decide.
-        remedy: a sentence on what to do about pixels that leave it open; None names `full_scale`.
-        max_dn: the sensor's largest digital number.
+        remedy: a sentence on what to do if full scale is ambiguous; None names `full_scale`.
+        max_dn: the sensor's largest digital number, by default that of 12 bits.
     """
     pixels = read_pixels(path)
     if pixels.ndim != 2:

@@ -28,7 +28,7 @@ from beers_deploy.profiles.errors import ImageError
 
 
 def patch_matrix(image: Tensor, side_px: int) -> Tensor:
-    """Every patch of (H, W): ((H - k + 1) * (W - k + 1), k * k)."""
+    """Return every patch of (H, W) as a row: ((H - k + 1) * (W - k + 1), k * k)."""
     return image.unfold(0, side_px, 1).unfold(1, side_px, 1).reshape(-1, side_px * side_px)
 
 
@@ -48,11 +48,10 @@ def overlap_add(patches: Tensor, shape: torch.Size, side_px: int) -> Tensor:
 def window_distances(
     guide: Tensor, rows: Tensor, columns: Tensor, side_px: int, window_px: int
 ) -> Tensor:
-    """Squared L2 distance of each reference patch to the window_px^2 patches around it.
+    """Compute the squared L2 distance of each reference patch to the window_px^2 patches around it.
 
-    d(p, q) = sum over k * k pixels of (P - Q)^2, as box sums of shifted differences: exact where
-    the expansion
-    |P|^2 - 2 P.Q + |Q|^2 would cancel in float32.
+    d(p, q) = sum over k * k pixels of (P - Q)^2, as box sums of shifted differences. They are
+    exact, whereas the expansion |P|^2 - 2 P.Q + |Q|^2 would cancel in float32.
 
     Args:
         guide: (H, W), wide enough to hold every window.
@@ -62,7 +61,7 @@ def window_distances(
         window_px: number of candidates along each axis, odd; the reference is the middle one.
 
     Returns:
-        (R * C, window_px^2). The reference's distance to itself is -1: it wins every tie.
+        (R * C, window_px^2). The reference's distance to itself is -1, so that it wins every tie.
     """
     half = window_px // 2
     box_rows = _boxes(rows, side_px, guide.dtype)
@@ -87,8 +86,11 @@ def window_distances(
 def window_numbers(
     rows: Tensor, columns: Tensor, grid_columns: int, window_px: int
 ) -> tuple[Tensor, Tensor]:
-    """Patch number of each window's first candidate (R * C, 1), and what to add for the others
-    (window_px^2,).
+    """Compute the patch numbers of the candidates in each window.
+
+    Returns:
+        The number of each window's first candidate (R * C, 1), and the offsets of all candidates
+        (window_px^2,).
     """
     first = (rows[:, None] * grid_columns + columns).reshape(-1, 1)
     steps = torch.arange(window_px, device=rows.device)
@@ -96,16 +98,17 @@ def window_numbers(
 
 
 def _boxes(starts: Tensor, side_px: int, dtype: torch.dtype) -> Tensor:
-    """(R, E) of ones where pixel e lies in the patch of reference r: a box sum at chosen places is
-    a product.
+    """Build a matrix (R, E) that is 1 where pixel e lies in the patch of reference r.
+
+    Box sums at chosen places are then a matrix product.
     """
     offset = torch.arange(int(starts[-1]) + side_px, device=starts.device) - starts[:, None]
     return ((offset >= 0) & (offset < side_px)).to(dtype)
 
 
 TILE_REFERENCES = 24
-"""References along each side of a tile: bounds the memory whatever the image, and keeps a tile near
-the cache.
+"""The number of references along each side of a tile. It bounds the memory for any image, and keeps
+a tile near the cache.
 """
 
 Sums = tuple[Tensor, Tensor]
@@ -118,8 +121,17 @@ Places = tuple[Tensor, Tensor]
 def denoise_pass(
     noisy: Rows, guide: Rows, height: int, noise: Noise, settings: PassSettings, stride_px: int
 ) -> Iterator[Tensor]:
-    """Each pixel's mean over all the estimates of it, in strips (any, W); a pixel without any keeps
-    its value.
+    """Average all estimates of each pixel, and yield the result in strips (any, W).
+
+    A pixel without any estimate keeps its value.
+
+    Args:
+        noisy: rows of the noisy image.
+        guide: rows of the image in which similar patches are searched.
+        height: the number of rows.
+        noise: the noise to remove.
+        settings: of the pass.
+        stride_px: distance of neighbouring references.
     """
     margin = settings.margin_px
     runs = reference_runs(height, stride_px)
@@ -142,8 +154,9 @@ def denoise_pass(
 
 
 def reference_runs(size_px: int, stride_px: int) -> tuple[Tensor, ...]:
-    """Pixels, (n,) a tile, on which references are centred along one axis; the last pixel always
-    has one.
+    """Return the centres of the references along one axis, (n,) per tile.
+
+    The last pixel always has a reference.
     """
     centres = torch.arange(0, size_px + stride_px - 1, stride_px).clamp(max=size_px - 1)
     return torch.split(centres, TILE_REFERENCES)
@@ -157,7 +170,9 @@ def _row_of_tiles(
     settings: PassSettings,
     stride_px: int,
 ) -> Sums:
-    """The sums of one row of tiles over (h, W); `centres` count from the first reference's own."""
+    """Compute the sums of one row of tiles over (h, W); `centres` are relative to the first
+    reference.
+    """
     margin = settings.margin_px
     width = noisy.shape[1]
     columns_around = mirrored(-margin, width + stride_px - 1 + margin, width)
@@ -186,7 +201,7 @@ def _row_of_tiles(
 def _tile(
     noisy: Tensor, guide: Tensor, places: Places, noise: Noise, settings: PassSettings
 ) -> Sums:
-    """The sums over a tile (h, w)."""
+    """Compute the sums over a tile (h, w)."""
     valid = torch.isfinite(noisy)
     if not bool(valid.any()):
         return torch.zeros_like(noisy), torch.zeros_like(noisy)
@@ -211,17 +226,17 @@ def _tile(
 
 
 def _rows_of(matrix: Tensor, numbers: Tensor) -> Tensor:
-    """matrix[numbers], four times faster (measured)."""
+    """Return matrix[numbers], by a method that is four times faster (measured)."""
     return matrix.index_select(0, numbers.reshape(-1)).reshape(*numbers.shape, -1)
 
 
 def similar_groups(
     guide: Tensor, known: Tensor, places: Places, settings: PassSettings
 ) -> Iterator[tuple[Tensor, Tensor | None]]:
-    """Groups of like patches: their numbers (B, N), and which of them count (None: all).
+    """Yield groups of similar patches: their numbers (B, N), and which of them count (None: all).
 
-    The many groups of no more than the usual number come first, without the room that the others
-    need.
+    The many groups of at most the usual size come first, so that they do not need the memory of the
+    larger groups.
     """
     distances = window_distances(guide.nan_to_num(0), *places, settings.side_px, settings.window_px)
     first, steps = window_numbers(
@@ -254,10 +269,10 @@ def _rule_out(distances: Tensor, numbers: Tensor, complete: Tensor) -> None:
 
 
 def nearest_first(distances: Tensor, usual: int, most: int) -> tuple[Tensor, Tensor]:
-    """Columns (B, most) of the smallest of each row, the `usual` smallest among them first, and
-    their values.
+    """Return the columns (B, most) of the smallest values of each row, and these values.
 
-    numpy's partition is over three times faster than torch's topk (measured).
+    The `usual` smallest come first. numpy's partition is over three times faster than torch's topk
+    (measured).
     """
     ends = [k for k in (usual - 1, most - 1) if k < distances.shape[1] - 1]
     if ends:

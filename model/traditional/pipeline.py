@@ -42,11 +42,12 @@ Order = Literal["denoise-first", "deconvolve-first"]
 
 @dataclass(frozen=True)
 class Chain:
-    """How to restore what `degraded` acquired to what `reference` would have, without its noise.
+    """The parameters of a restoration from images of `degraded` to those that `reference` would
+    have acquired without its noise.
 
     `quality` is one of `patch_groups.QUALITIES`. `epsilon` regularises the MTF compensation. With
-    None it is derived from each image: by `restore_traditional` itself, by `fitted_to` for an image
-    that comes in strips.
+    None it is derived from each image: by `restore_traditional` itself, or by `fitted_to` for an
+    image that arrives in strips.
     """
 
     degraded: Instrument
@@ -79,10 +80,9 @@ class Chain:
 
 
 def restore_traditional(dn: Tensor, chain: Chain) -> Tensor:
-    """Digital numbers (H, W) float32 of the degraded sensor to those of the reference, clipped and
-    not rounded.
+    """Restore digital numbers (H, W) float32 of the degraded sensor to those of the reference.
 
-    NaN marks missing pixels, and stays.
+    The result is clipped and not rounded. NaN marks missing pixels, and remains.
     """
     return torch.cat(list(restore_strips([dn], dn.shape[0], chain.fitted_to([dn]))))
 
@@ -119,8 +119,15 @@ def restore_strips(strips: Iterable[Tensor], height: int, chain: Chain) -> Itera
 def denoise_radiance(
     radiance: Iterable[Tensor], height: int, sensor: Instrument, noise: Noise, quality: Quality
 ) -> Iterator[Tensor]:
-    """NL-Bayes on the stabilised scale: strips (any, W) in W/m2/sr/um, of variance alpha L + beta,
-    to the same.
+    """Denoise strips (any, W) in W/m2/sr/um with NL-Bayes on the stabilised scale, and yield
+    strips.
+
+    Args:
+        radiance: strips with noise of the variance alpha L + beta.
+        height: the number of rows of all strips.
+        sensor: its alpha and beta.
+        noise: on the stabilised scale.
+        quality: density of the references and size of the groups.
     """
     scale = noise.sigma
     stable = (stabilise(strip, sensor) * scale for strip in radiance)

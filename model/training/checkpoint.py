@@ -1,6 +1,6 @@
-"""What a run is told, what stops one that has gone wrong, and a run on disk.
+"""Define the parameters of a run, the guards that stop a failing run, and its checkpoint on disk.
 
-That is safetensors, with all that an exact resume needs; nothing is unpickled.
+A checkpoint is a safetensors file with everything that an exact resume needs; nothing is unpickled.
 """
 
 import hashlib
@@ -61,7 +61,7 @@ class TrainingRecipe:
                 )
 
     def rate_at(self, step: int) -> float:
-        """Learning rate of a step: linear warm-up, then a cosine down to zero."""
+        """Return the learning rate of a step: a linear warm-up, then a cosine down to zero."""
         if step < self.warm_up_steps:
             return self.learning_rate * (step + 1) / self.warm_up_steps
         share = (step - self.warm_up_steps) / max(self.steps - self.warm_up_steps, 1)
@@ -69,28 +69,28 @@ class TrainingRecipe:
 
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
-"""What Adam keeps of each parameter, besides its step."""
+"""The state that Adam stores for each parameter, in addition to its step."""
 
 LOWER_RATE = "Lower the learning rate or check the images."
 MAX_BAD_STEPS = 10
 WINDOW_STEPS = 200
 TEST_PLACES = 65
 DIVERGED = 5.0
-"""A mean loss this many times the best one so far is no fluctuation: batches vary by a factor of
-two.
+"""A mean loss of this many times the best one so far is no fluctuation, because batches vary by a
+factor of two.
 """
 
 
 @dataclass
 class Guards:
-    """Counts skipped steps, and compares the loss of each window of steps with the best window so
-    far.
+    """Counts skipped steps, and compares the loss of each window of steps with that of the best
+    window so far.
 
     Attributes:
-        bad_steps: steps whose gradient was not finite: skipped.
+        bad_steps: the number of steps that were skipped because their gradient was not finite.
         best: the lowest mean loss of a window; None before the first.
-        sum: of the losses of the present window.
-        count: of its steps.
+        sum: sum of the losses of the present window.
+        count: the number of its steps.
     """
 
     bad_steps: int = 0
@@ -162,14 +162,16 @@ def checkpoint_sha256(tensors: Mapping[str, Tensor], header: Mapping[str, object
 def read_checkpoint(
     path: Path, network: Network, recipe: TrainingRecipe, data: str = ""
 ) -> tuple[dict[str, Tensor], int, Guards]:
-    """The parts of a checkpoint by name (see `Trainer.save`), its step and its guards, once all is
-    as it must be.
+    """Read and validate a checkpoint, or raise ModelError.
 
     Args:
         path: the file.
         network: a network of the same size.
-        recipe: that it was begun with.
-        data: digest of all that it was begun to learn from.
+        recipe: the recipe with which the training was begun.
+        data: digest of all data that the training learns from.
+
+    Returns:
+        Its tensors by name (see `Trainer.save`), its step and its guards.
     """
     parts, header = read_tensors(path)
     tensors = {name: torch.from_numpy(array) for name, array in parts.items()}

@@ -28,9 +28,9 @@ from beers_deploy.profiles.instrument import MAX_DN
 
 @dataclass(frozen=True)
 class LossWeights:
-    """How much each term counts, one of weight 0 is not computed.
+    """The weight of each term; a term of weight 0 is not computed.
 
-    `coarse` is the share, in all of them, of what the consistency step removes from an error.
+    `coarse` is the share, in all terms, of the part of an error that the consistency step removes.
     """
 
     l1: float = 1.0
@@ -44,8 +44,8 @@ PAPER = LossWeights()
 
 
 class RestorationLoss:
-    """The weighted sum of the terms, in float32 whatever the autocast around it; that of LPIPS
-    where it is given.
+    """The weighted sum of the terms, computed in float32 even within autocast. It includes LPIPS if
+    `perceptual` is given.
     """
 
     def __init__(self, weights: LossWeights = PAPER, perceptual: Lpips | None = None) -> None:
@@ -53,8 +53,10 @@ class RestorationLoss:
         self.perceptual = perceptual if weights.lpips else None
 
     def __call__(self, restored: Tensor, reference: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-        """The loss, and its terms before weighting, of images (N, 1, H, W) in [0, 1] of full scale,
-        not clipped.
+        """Compute the loss, and its terms before weighting, of images (N, 1, H, W) in [0, 1] of
+        full scale.
+
+        The images are not clipped.
         """
         weights = self.weights
         # In bfloat16 the differences of nearly equal images would lose most of their digits.
@@ -76,8 +78,8 @@ class RestorationLoss:
 
 
 def coarse(error: Tensor) -> Tensor:
-    """Means over blocks, interpolated bilinearly between their centres: of (N, 1, H, W), whole
-    blocks, the same.
+    """Average (N, 1, H, W) over whole blocks, and interpolate bilinearly between the centres of the
+    blocks.
     """
     means = avg_pool2d(error, BLOCK_PX)
     interpolated: Tensor = interpolate(
@@ -87,10 +89,10 @@ def coarse(error: Tensor) -> Tensor:
 
 
 def log_mse(restored: Tensor, reference: Tensor) -> Tensor:
-    """Mean over the batch of ln(1 + mean squared error in DN^2 of 12 bits): 10 / ln 10 of it is
-    lost PSNR in dB.
+    """Compute the mean over the batch of ln(1 + mean squared error in DN^2 of 12 bits).
 
-    Of (N, 1, H, W) float32. The 1 keeps it above 0, and forgives what rounding does to a patch.
+    10 / ln 10 of it is lost PSNR in dB. Images are (N, 1, H, W) float32. The 1 keeps the argument
+    above 0, and tolerates the rounding of a patch.
     """
     squares = ((restored - reference) * MAX_DN).square().mean((1, 2, 3))
     distance: Tensor = torch.log1p(squares).mean()
