@@ -1,8 +1,8 @@
-"""What an INT8 file computes in float.
+"""Find the layers that an INT8 file computes in float.
 
-Such a file may hold a whole float network in front of its integer core or behind it: then the two
-networks agree and the gate would pass what no DPU computes. Its metadata cannot be asked, because
-the judged file wrote them.
+Such a file may contain a whole float network before or behind its integer core. Both networks then
+agree, and the gate would pass a file that no DPU computes. Its metadata is no evidence, because the
+judged file wrote it.
 """
 
 import onnx
@@ -33,7 +33,7 @@ LAYERS = {
     "RNN",
     "Scan",
 }
-"""Operators with weights, and those that hold a graph of their own."""
+"""Operators with weights, and those that contain a graph of their own."""
 
 
 def float_nodes(model: onnx.ModelProto) -> list[Node]:

@@ -1,5 +1,5 @@
-"""What INT8 changes: both networks run once on all patches, and are compared with each other and
-with the references.
+"""Measure the effect of INT8: run both networks once on all patches, and compare them with each
+other and with the references.
 """
 
 import math
@@ -21,22 +21,24 @@ from beers_deploy.quant.untrusted import times
 
 SCALE = "of full scale"
 MOST = 0.5
-"""Share of a float network's results that lie in [0, 1] where they are an image, and not of another
-scale.
+"""The least share of a float network's results in [0, 1] from which they count as an image, not as
+values of another scale.
 """
 NEARLY_ALL = 0.99
 AROUND_UNIT = -0.1, 1.1
-"""Where nearly all results of a network lie that returns an image in [0, 1], overshoot included."""
+"""The range of nearly all results of a network that returns an image in [0, 1],
+overshoot included.
+"""
 
 
 @dataclass(frozen=True)
 class Metric:
-    """What a user measures results by.
+    """A metric by which a user judges results.
 
     Attributes:
         unit: of the figure.
-        larger_is_better: whether it is.
-        value: of a result (1, C, H, W) and its reference of the same shape.
+        larger_is_better: whether a larger value is better.
+        value: function of a result (1, C, H, W) and its reference of the same shape.
     """
 
     unit: str
@@ -150,19 +152,19 @@ class GateResult:
 
     @property
     def metric_loss(self) -> float:
-        """What INT8 loses by the user's metric: above 0 it is worse than float."""
+        """The loss of INT8 by the user's metric; above 0 it is worse than float."""
         lost = self.metric_float - self.metric_int8
         return lost if METRICS[self.metric].larger_is_better else -lost
 
     @property
     def source(self) -> str:
-        """Where the figures come from."""
+        """A description of the samples that the figures come from."""
         kind = "simulated patches of 128 x 128" if self.simulated else "samples"
         return f"{self.patches} {kind}"
 
     @property
     def drop_db(self) -> float:
-        """PSNR lost against the reference."""
+        """PSNR that INT8 loses against the reference."""
         return self.psnr_float_db - self.psnr_int8_db
 
     @property
@@ -172,9 +174,10 @@ class GateResult:
 
     @property
     def std_over_mae(self) -> float:
-        """1.25 for rounding, which is Gaussian in the end; clipping drives it up.
+        """Standard deviation over MAE: 1.25 for rounding, whose errors are nearly Gaussian, and
+        more with clipping.
 
-        0 where nothing differs.
+        It is 0 if there is no difference.
         """
         return 0.0 if self.mae == 0 else self.std / self.mae
 

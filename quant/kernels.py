@@ -42,7 +42,7 @@ UINT8_MAX = 255
 
 
 class Way(StrEnum):
-    """How an operator is computed where the fast kernels saturate."""
+    """The way in which an operator is computed if the fast kernels saturate."""
 
     signed = "int8 weights, proven not to saturate"
     unsigned = "uint8 weights"
@@ -51,8 +51,8 @@ class Way(StrEnum):
 
 @dataclass(frozen=True)
 class Places:
-    """Where an operator holds its activations' zero point, its weights, their zero point and its
-    result's.
+    """The inputs at which an operator has its activations' zero point, its weights, their zero
+    point and the zero point of its result.
     """
 
     zero: int
@@ -73,11 +73,13 @@ Activations are the first input; a None result is int32.
 """
 
 FLOAT_OPERATORS = {"Conv": "QLinearConv", "MatMul": "QLinearMatMul", "Gemm": "QLinearMatMul"}
-"""Operators on dequantised tensors (QDQ), and which integer operator onnxruntime makes of each."""
+"""Operators on dequantised tensors (QDQ), and the integer operator that
+onnxruntime makes of each.
+"""
 
 REQUANTISING = {"QLinearConv": 7, "QLinearAdd": 7}
-"""What may write a tensor behind which a ReLU is moved down, and where it holds its result's zero
-point.
+"""Operators whose result may be stored 128 lower if a ReLU follows, and the input that holds the
+zero point of that result.
 """
 
 
@@ -314,7 +316,7 @@ class _Exact(_Rewriting):
 FEWEST_OUTPUTS = 16
 INPUTS_OF = 4
 FIRST_OPSET = 11
-"""From here on Pad and Slice take their places as inputs."""
+"""The first opset in which Pad and Slice have their positions as inputs."""
 
 
 def filled(model: onnx.ModelProto) -> onnx.ModelProto:
@@ -356,8 +358,8 @@ class _ChannelPadding(_Rewriting):
         return middle is not None and not middle.any() and not grouped
 
     def _widen(self, node: onnx.NodeProto, outputs: int, inputs: int) -> None:
-        """Weights of zero; scales and zero points that are a channel's own get more, which matter
-        to nobody.
+        """Pad the weights with zeros, and extend scales and zero points per channel, which have no
+        effect there.
         """
         name = node.output[0]
         weight = self.arrays[node.input[3]]

@@ -1,5 +1,5 @@
-"""The limits of the gate: their defaults, the values that make sense, the TOML file that sets them,
-and a check of each.
+"""Define the limits of the gate: their defaults, their valid values, the TOML file that sets them,
+and the check of each.
 """
 
 import math
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 # Of 17 tampered files this stopped 15, all that cost more than 0.03 dB.
 MAE_GROWTH = 1.05
-"""How many times the MAE of a baseline is allowed where no limit says otherwise."""
+"""The default limit of the MAE, as a multiple of that of a baseline."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def _is_limit(value: object) -> bool:
 
 
 AT_LEAST = "PSNR float-INT8"
-"""The one figure of which a large value is good."""
+"""The only figure for which a larger value is better."""
 
 
 def judge(

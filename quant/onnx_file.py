@@ -1,8 +1,7 @@
-"""ONNX files, read and written without trusting them: one sentence for whatever is not a sound
-model.
+"""Read and write ONNX files without trusting them: an invalid model is reported in one sentence.
 
-Also what a network's file says of itself: its metadata, and the tile that it is fixed to. How an
-image may be cut into tiles for it is `quant.tiling`'s matter.
+This module also reads what a network's file states about itself: its metadata, and the tile that it
+is fixed to. How an image may be cut into tiles is determined in `quant.tiling`.
 """
 
 import re
@@ -69,7 +68,9 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
 
 
 def read_onnx(content: bytes, where: str) -> onnx.ModelProto:
-    """As `load_onnx`, of the bytes of a network that holds all its weights."""
+    """Read a network from bytes as `load_onnx` does from a file; the bytes must contain all
+    weights.
+    """
     return _simplified(parse_onnx(content, where), where, True)
 
 
@@ -90,8 +91,13 @@ def _simplified(model: onnx.ModelProto, where: str, to_run: bool) -> onnx.ModelP
 def parse_onnx(
     content: bytes, where: str, to_run: bool = True, path: Path | None = None
 ) -> onnx.ModelProto:
-    """As `load_onnx`, of a file's bytes, and what is read stays as it is; with a path weights may
-    lie beside it.
+    """Parse and check a model from bytes as `load_onnx` does, without simplifying it.
+
+    Args:
+        content: the bytes of the file.
+        where: name of the network for messages.
+        to_run: whether a runtime will open it.
+        path: of the file, next to which weights may be stored; None if all are in `content`.
     """
     if not content:
         raise ModelError(f"{where} is an empty file. {REMEDY}")
@@ -138,14 +144,20 @@ def save_onnx(model: onnx.ModelProto, path: Path) -> None:
 
 
 def metadata(model: onnx.ModelProto) -> dict[str, str]:
-    """The key-value pairs that a model carries about itself."""
+    """Return the key-value pairs of a model's metadata."""
     return {item.key: item.value for item in model.metadata_props}
 
 
 def make_model(
     graph: onnx.GraphProto, about: dict[str, str], microsoft: bool = False
 ) -> onnx.ModelProto:
-    """A model of our opset around a graph; `microsoft` adds onnxruntime's own operator domain."""
+    """Build a model of this project's opset around a graph.
+
+    Args:
+        graph: the graph.
+        about: metadata of the model.
+        microsoft: whether to add onnxruntime's own operator domain.
+    """
     opsets = [onnx.helper.make_opsetid("", OPSET)]
     opsets += [onnx.helper.make_opsetid(MICROSOFT, 1)] if microsoft else []
     model = onnx.helper.make_model(
@@ -156,10 +168,10 @@ def make_model(
 
 
 class GraphWriter:
-    """Collects the nodes and the constants of a graph; a constant of one name is written once."""
+    """Collects the nodes and the constants of a graph; each constant is stored once by its name."""
 
     domain: str | None = None
-    """Of operators that name none; the empty one is ONNX's own, stated."""
+    """The domain of operators that state none; the empty one is ONNX's own, stated explicitly."""
 
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
@@ -192,20 +204,20 @@ class GraphWriter:
         return name
 
     def unit(self, frac_bits: int) -> str:
-        """The constant 2^-frac_bits: one unit of a tensor."""
+        """Add the constant 2^-frac_bits, one unit of a tensor, and return its name."""
         return self.constant(f"scale_2^{-frac_bits}", np.array(2.0**-frac_bits, np.float32))
 
     def graph(
         self, name: str, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
     ) -> onnx.GraphProto:
-        """The ONNX graph of the nodes and constants collected so far."""
+        """Build the ONNX graph of the nodes and constants collected so far."""
         return onnx.helper.make_graph(
             self.nodes, name, inputs, outputs, list(self.weights.values())
         )
 
 
 def image_info(name: str, channels: int, tile_px: int | None) -> onnx.ValueInfoProto:
-    """An (N, channels, H, W) tensor: a fixed tile of one image, or any number and size."""
+    """Describe a tensor (N, channels, H, W): a fixed tile of one image, or any number and size."""
     shape: list[str | int | None] = (
         [1, channels, tile_px, tile_px] if tile_px else ["N", channels, "H", "W"]
     )
@@ -213,7 +225,7 @@ def image_info(name: str, channels: int, tile_px: int | None) -> onnx.ValueInfoP
 
 
 def with_outputs(model: onnx.ModelProto, kinds: Mapping[str, int]) -> onnx.ModelProto:
-    """The model with these tensors, of these ONNX types, as outputs behind its own."""
+    """Return the model with these tensors, of these ONNX types, as additional outputs."""
     extended = deepcopy(model)
     names = {value.name for value in extended.graph.output}
     extended.graph.output.extend(
@@ -225,7 +237,7 @@ def with_outputs(model: onnx.ModelProto, kinds: Mapping[str, int]) -> onnx.Model
 
 
 OUTPUT = "output"
-"""In the metadata of a network with one of its outputs alone: the name of that."""
+"""The metadata key of the name of the output, in a network with only one of its outputs."""
 
 
 def with_one_output(model: onnx.ModelProto, name: str, where: str) -> onnx.ModelProto:
@@ -255,7 +267,7 @@ def with_one_output(model: onnx.ModelProto, name: str, where: str) -> onnx.Model
 
 
 def fixed_tile_px(model: onnx.ModelProto) -> int | None:
-    """The tile side that a model is fixed to, or None when it takes any size."""
+    """Return the tile side that a model is fixed to, or None if it accepts any size."""
     sizes = []
     if model.graph.input:
         sizes = [d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim]
@@ -269,8 +281,10 @@ def fixed_tile_px(model: onnx.ModelProto) -> int | None:
 
 
 def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
-    """A network of convolutions that is fixed to one tile, for images of any size; any other as it
-    is.
+    """Return a network that is fixed to one tile as a network for any size.
+
+    Only networks whose inputs and outputs have four sizes can be changed; others are returned
+    unchanged.
     """
     if fixed_tile_px(model) is None:
         return model
@@ -288,7 +302,7 @@ def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def is_quantized(model: onnx.ModelProto) -> bool:
-    """Whether any node computes on, makes or reads quantised numbers."""
+    """Return True if any node reads, writes or computes with quantised numbers."""
     kinds = {node.op_type.lower() for node in model.graph.node}
     marks = ("qlinear", "quantizelinear", "integer")
     return any(mark in kind for kind, mark in product(kinds, marks))

@@ -45,7 +45,7 @@ from beers_deploy.quant.session import open_any_size, open_session, planes_of, r
 
 BITS = 8
 SAMPLES = 16
-"""That are measured, of those that calibration did not see."""
+"""The maximum number of measured samples that were held out from calibration."""
 PER_CHANNEL = (1, 2, 3)
 """Axes of weights (O, I, kh, kw) over which a scale for each output channel is shared."""
 

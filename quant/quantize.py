@@ -85,16 +85,16 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 PASSES = "fine_planes, least_squares, shared_residual_scale, equalise, dual_gain"
-"""What a file records as done beyond rounding each tensor, in the words of the first files."""
+"""The record in a file of the applied passes, in the words of the first files."""
 
 FINETUNE = "finetune"
-"""What a file calls its fine-tuning."""
+"""The key of the record of fine-tuning in a file."""
 
 
 @dataclass(frozen=True)
 class Quantized:
-    """One network in integers, also as the host's file, the float graph that was rounded, and the
-    float network as it was read.
+    """One network in integers, also as the host's file, with the float graph that was rounded and
+    the original float network.
     """
 
     host: onnx.ModelProto
@@ -105,15 +105,15 @@ class Quantized:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be quantised.
+    """The parts of a quantisation.
 
     Attributes:
-        graph: that reads the planes, in float.
+        graph: a float graph that reads the planes.
         host_part: the host's part.
         groups: residual groups, each of one scale.
-        singles: what is equalized in addition to the groups, or where there are none.
+        singles: tensors that are equalized in addition to the groups, or without groups.
         shifts: the windows of the target.
-        passes: that reduce the error.
+        passes: the passes that reduce the error.
         effort: of the search for equalization factors.
     """
 

@@ -1,8 +1,8 @@
-"""Which layer costs what: each one in int8 while all others stay in float.
+"""Measure the error of each layer: one in int8 while all others remain in float.
 
-A convolution errs by its int8 weights and bias, and by rounding and clipping its result. An add
-errs by what it does to sums of integers: in a group of one scale nothing, but where it
-saturates. What a layer's inputs had already lost does not count.
+The error of a convolution comes from its int8 weights and bias, and from rounding and clipping its
+result. The error of an add comes from integer sums: in a group of one scale it is zero unless the
+sum saturates. Errors of a layer's inputs do not count.
 """
 
 import math
@@ -45,19 +45,21 @@ from beers_deploy.quant.session import (
 )
 
 IN_INT8 = ".in_int8"
-"""Behind the name of a tensor: as int8 weights and bias make it of float
-inputs, not yet rounded.
+"""Suffix of the name of a tensor: its value computed by int8 weights and bias from float inputs,
+not yet rounded.
 """
 
 WORST = 4
 BEYOND_DN = (1, 2, 4, 8, 16, 32, 64)
 ROUNDING = 1.4
 CLIPPING = 1.6
-"""std / MAE, 1.25 for a Gaussian: up to the first it is rounding, beyond the second clipping."""
+"""Limits of std / MAE, which is 1.25 for a Gaussian: below the first the errors are rounding, above
+the second clipping.
+"""
 
 
 class Loss:
-    """The difference of results from what was wanted, added up array by array."""
+    """The difference between results and targets, accumulated array by array."""
 
     def __init__(self) -> None:
         self._signal = 0.0
@@ -66,7 +68,7 @@ class Loss:
         self._count = 0
 
     def add(self, result: np.ndarray, wanted: np.ndarray, offset: np.ndarray | float = 0.0) -> None:
-        """Count further values; the signal is what was wanted less an offset."""
+        """Count further values; the signal is the target minus an offset."""
         difference = np.subtract(result, wanted, dtype=np.float64)
         self._noise += float(np.square(difference).sum())
         self._signal += float(np.square(np.subtract(wanted, offset, dtype=np.float64)).sum())
@@ -75,8 +77,8 @@ class Loss:
 
     @property
     def sqnr_db(self) -> float:
-        """10 log10 of the signal's energy over that of the difference; infinite where nothing is
-        lost.
+        """10 log10 of the energy of the signal over that of the difference; infinite without a
+        difference.
         """
         return (
             10 * math.log10(self._signal / self._noise)
@@ -86,18 +88,18 @@ class Loss:
 
     @property
     def mae(self) -> float:
-        """Mean size of the difference."""
+        """Return the mean absolute difference."""
         return self._size / self._count
 
     @property
     def squared(self) -> float:
-        """Mean squared difference."""
+        """Return the mean squared difference."""
         return self._noise / self._count
 
 
 @dataclass(frozen=True)
 class LayerError:
-    """What one layer in int8 loses, all others in float.
+    """The error of one layer in int8, with all others in float.
 
     Attributes:
         name: of the layer.
@@ -260,7 +262,7 @@ def sizes_row(spread: Spread) -> Row:
 
 
 MUCH_DB = 0.2
-"""From here on, or below, a network has lost so much that it is worth asking where."""
+"""The loss from which (or the PSNR up to which) the costliest layers are listed."""
 
 
 def losses(
@@ -297,7 +299,7 @@ def losses(
 
 
 MOST = 3
-"""Layers that are named."""
+"""The maximum number of layers that are named."""
 
 
 def _costliest(layers: Sequence[Row]) -> list[tuple[str, float]]:

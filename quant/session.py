@@ -1,7 +1,7 @@
-"""Networks run on onnxruntime: a session, set up once for the whole project, and large images in
+"""Run networks on onnxruntime: a session, set up once for the whole project, and large images in
 tiles.
 
-Looking at every tensor of a network at once costs memory that grows with the image; tiles do not.
+Reading every tensor of a network at once needs memory that grows with the image; tiles do not.
 """
 
 from collections.abc import Iterable, Iterator
@@ -144,7 +144,7 @@ def _unfit(reason: str) -> ModelError:
 
 
 TILE_PX = 128
-"""Side of the largest tile, halo not counted."""
+"""Side of the largest tile, without halo."""
 
 
 def crops(image: np.ndarray, halo_px: int | None = 0) -> list[np.ndarray]:
@@ -217,8 +217,9 @@ def _keeps_lattice(op: Op) -> bool:
 def _places(
     image: np.ndarray, halo_px: int | None
 ) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
-    """(top, bottom) and (left, right) of every tile, all about equally large; without a halo the
-    one that is all.
+    """Return (top, bottom) and (left, right) of every tile, all about equally large.
+
+    Without a halo there is one tile, the whole image.
     """
     counts = [-(-size // TILE_PX) if halo_px is not None else 1 for size in image.shape[-2:]]
     edges = [

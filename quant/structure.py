@@ -1,11 +1,12 @@
-"""What an INT8 file itself shows: results that come to the ends of 8 bits, lost ReLUs, faults of
-its encoding.
+"""Check an INT8 file by itself: results at the ends of 8 bits, lost ReLUs, and faults of its
+encoding.
 
-Saturation: whatever a node rounds to 8 bits is looked at, in any encoding (integer kernels or QDQ),
-as the graph is written; what lies beyond the ends is clipped, and lost. Two ends are no loss: the
-lower one where it stands for zero or where a ReLU reads it, for that is the ReLU, and those of the
-fine copy, which the coarse one is there for (`quant.passes.dual_range`). ReLUs are counted because
-quantisers have been seen to drop them without a word.
+Saturation: every tensor that a node rounds to 8 bits is checked, in any encoding (integer kernels
+or QDQ), as the graph is written. Values beyond the ends are clipped, and lost. Two ends are no
+loss. One is the lower end if it represents zero or if a ReLU reads it, because that is the ReLU.
+The others are the ends of the fine copy, which the coarse copy replaces
+(`quant.passes.dual_range`). ReLUs are counted because quantisers have been seen to drop them
+silently.
 """
 
 from collections.abc import Iterable
@@ -33,9 +34,9 @@ RELUS = ("Relu", "Max")
 HARD = (Activation.hard_sigmoid, Activation.hard_swish)
 BYTES = ("int8", "uint8")
 ENCODING = "faults of the encoding"
-"""The check of an INT8 file that describes its integers."""
+"""The name of the check of an INT8 file that describes its integers."""
 TABLE = 256
-"""Values of 8 bits, each of which a table of ours maps."""
+"""The number of 8-bit values, each of which an activation table maps."""
 
 
 @dataclass(frozen=True)
@@ -166,12 +167,13 @@ def _rounded(graph: OnnxGraph, core: IntCore | None) -> list[Rounded]:
 
 @dataclass(frozen=True)
 class Relus:
-    """How many a file has.
+    """The number of ReLUs in a file.
 
     Attributes:
-        explicit: nodes that are one: Relu, or the larger of a value and zero.
+        explicit: nodes that are a ReLU: Relu, or the larger of a value and zero.
         folded: convolutions whose 8 bits begin at zero, which is a ReLU, unless their results were
-            never below zero; and those of which our file says that saturation is their ReLU.
+            never below zero; and those whose saturation is their ReLU according to the description
+            in the file.
     """
 
     explicit: int

@@ -41,8 +41,8 @@ result.
 STEP_PX = 4
 CELL_PX = (8, 4)
 FEW_WINDOWS = 4
-"""Only some rows are searched for short edges, in cells of this size. An image of few windows may
-have few edges, so it is searched as thoroughly as by `characterize`.
+"""The search for short edges: every STEP_PX-th row, in cells of CELL_PX. An image of at most this
+number of windows may have few edges, so it is searched as thoroughly as by `characterize`.
 """
 CANDIDATES = 6000
 CANDIDATES_OF_WINDOW = 400

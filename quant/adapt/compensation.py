@@ -24,15 +24,17 @@ from beers_deploy.quant.session import open_any_size, tensors_of
 from beers_deploy.quant.simplify.fold_affine import is_convolution
 
 MOST_UNKNOWNS = 2304
-"""Weights of one result, as of 256 channels and 3 x 3; of more the equations take too long."""
+"""The maximum number of weights of one result, as of 256 channels and 3 x 3. The equations of more
+take too long.
+"""
 ROWS_OF_EACH_UNKNOWN = 16
 LEAST_ROWS = 8192
 RIDGE = 1e-5
-"""The penalty on leaving the old weights, in mean squares of what a convolution reads."""
+"""The penalty on changing the weights, relative to the mean square of a convolution's input."""
 FACTORS = np.geomspace(0.6, 3.6, 31)
 """Candidates of k."""
 VALUES = 256
-"""Of a channel that are compared for k, from each image."""
+"""The number of values of a channel, from each image, that are compared for k."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,6 @@
-"""The operations of a core in C: the constants of each layer, and the call that computes it."""
+"""Write the operations of a core in C: the constants of each layer, and the call
+that computes it.
+"""
 
 from collections.abc import Callable, Mapping
 from textwrap import fill

@@ -19,7 +19,7 @@ WINDOW_DEFAULTS = {
     "pads": [0, 0, 0, 0],
     "output_padding": [0, 0],
 }
-"""Defaults that ONNX states in words only, of windows over rows and columns."""
+"""Defaults of windows over rows and columns, which ONNX states in prose only."""
 OPERATORS = frozenset(
     """Abs Add Cast Clip Concat Constant ConstantOfShape Conv ConvTranspose Div Equal Erf Exp
     Expand Flatten Gather Gemm GlobalAveragePool GRU HardSwish Identity LeakyRelu Less Log LSTM

@@ -1,7 +1,7 @@
 """Find the pixel shuffles that exporters write as Reshape and Transpose.
 
-torch writes PixelUnshuffle so, and PixelShuffle in old opsets. What such nodes do is tried out on
-an image of numbered pixels.
+torch writes PixelUnshuffle so, and PixelShuffle in old opsets. The effect of such nodes is
+determined on an image of numbered pixels.
 """
 
 import math
@@ -24,14 +24,15 @@ MOVES: dict[str, tuple[str, Callable[[np.ndarray, list[int]], np.ndarray]]] = {
     "Transpose": ("perm", lambda image, axes: image.transpose(axes or None)),
     "Unsqueeze": ("axes", lambda image, axes: np.expand_dims(image, tuple(axes))),
 }
-"""Operators that only move pixels: what they state, in an input or an attribute, and what they do.
+"""Operators that only move pixels: the name of their parameter, an input or an attribute, and their
+effect.
 """
 ORDERS = {"CRD": True, "DCR": False}
 """The modes of ONNX's DepthToSpace, and whether columns come first."""
 SIDES_PX = 24, 35
-"""Sides of images that moves are tried on: blocks of 2 to 8 fit one of them."""
+"""Sides of the test images: blocks of 2 to 8 fit one of them."""
 VALUES = 1 << 22
-"""The largest image of a stated size that moves are tried on."""
+"""The largest image of a stated size on which nodes are tested."""
 
 
 def with_shuffles(model: onnx.ModelProto) -> OnnxGraph:

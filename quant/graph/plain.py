@@ -1,4 +1,6 @@
-"""Networks of ConvBEERS' kind: what proofs, the stress battery and bit flips accept."""
+"""Read networks of ConvBEERS' kind, the only ones that proofs, the stress battery and bit flips
+accept.
+"""
 
 import onnx
 

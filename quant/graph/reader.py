@@ -1,6 +1,6 @@
 """Read a float ONNX network as the short list of operations, split into host and DPU part.
 
-A file from outside is checked once, here; behind it nothing asks again.
+A file from outside is checked once, here; later code does not check it again.
 """
 
 from copy import deepcopy
@@ -77,7 +77,7 @@ REMEDIES = {
         "(.safetensors)."
     ),
 }
-"""What to do about an operator that no DPU computes."""
+"""Advice for each operator that no DPU computes."""
 OTHER_REMEDY = "Replace it by one that the DPU computes, or cut the network in front of it."
 
 

@@ -1,4 +1,5 @@
-"""The host's part of an INT8 network: both sides of the integer core, in NumPy and as ONNX nodes.
+"""Define the host's part of an INT8 network: both sides of the integer core, in NumPy and as ONNX
+nodes.
 
 image -> pixel unshuffle -> encoding -> core -> decoding -> pixel shuffle -> + image
 
@@ -286,4 +287,4 @@ def image_encoding(margin_px: int, input_ranges: Ranges) -> InputEncoding:
 
 
 ONE_CHANNEL = HostPart()
-"""Of an image of one channel, to which the core's plain result is added."""
+"""The host's part for an image of one channel, to which the core's plain result is added."""

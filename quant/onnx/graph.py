@@ -1,7 +1,8 @@
-"""The one graph of an ONNX file: its nodes, who writes and reads each tensor, and its constants.
+"""Represent the one graph of an ONNX file: its nodes, the writers and readers of each tensor, and
+its constants.
 
-Simplification edits it, tiling walks it, the quantiser reads typed operations from it and the
-checker sized ones. Nothing is refused here.
+Simplification edits it, tiling traverses it, the quantiser reads typed operations from it and the
+checker sized ones. Nothing is rejected here.
 """
 
 from collections import defaultdict
@@ -17,7 +18,7 @@ from beers_deploy.quant.domains import Functions, functions_of, operator_name
 from beers_deploy.quant.onnx.window import Pair, Window
 
 WEIGHTS = {"Conv": 1, "ConvInteger": 1, "ConvTranspose": 1, "QLinearConv": 3}
-"""Operators with weights, and which input holds them."""
+"""Operators with weights, and the input that holds them."""
 
 
 @dataclass(eq=False)
@@ -98,7 +99,7 @@ class Node:
 
 
 Rewriting = Callable[["OnnxGraph", Node], list[Node] | None]
-"""Returns the nodes that take the place of a node; None if it stays."""
+"""A function that returns the nodes that replace a node; None if it stays."""
 
 
 class OnnxGraph:

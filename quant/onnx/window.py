@@ -1,4 +1,4 @@
-"""How a window moves over an image, and how large its result is along each axis."""
+"""Define how a window moves over an image, and compute the size of its result along each axis."""
 
 from dataclasses import dataclass, replace
 

@@ -19,7 +19,7 @@ from beers_deploy.quant.session import values_of
 
 MAX_WINDOWS = 8
 MAX_CHANNELS = 4096
-"""That a convolution of the DPU writes."""
+"""The maximum number of channels that a convolution of the DPU writes."""
 
 
 def can_write_copies(graph: Graph) -> bool:

@@ -33,29 +33,32 @@ class Effort(StrEnum):
 
 
 MOST_GROUPS = {Effort.fast: 0, Effort.normal: 16, Effort.best: 256}
-"""Of the channels of a tensor or residual group, to be tried together."""
+"""The maximum number of groups into which the channels of a tensor or residual
+group are divided.
+"""
 FEWEST_GROUPS = 8
 FEWEST_CROPS = 24
-"""With fewer much of the gain was lost (measured), so that they may exceed the likely work: a
-quarter with 4 groups in a U-Net, all with 12 crops of 64 pixels in a residual network.
+"""With fewer crops much of the gain was lost (measured). This number may therefore exceed the
+likely work: a quarter with 4 groups in a U-Net, all with 12 crops of 64 pixels in a residual
+network.
 """
 LIKELY_WORK = 7e11
 MOST_WORK = 2e12
-"""Multiply-accumulates: what the search should take, and what it must not exceed. On a processor
-without VNNI 1e10 took half a second to a second.
+"""Multiply-accumulates: the work that the search should need, and the work that it must not exceed.
+On a processor without VNNI 1e10 took half a second to a second.
 """
 LEAST_CROPS = 4
 
 RESULT = 64
 LEAKY_RESULT = 512
 WEIGHT = 400
-"""Multiply-accumulates that take as long as rounding a result, computing a LeakyReLU in float64,
-and rounding and loading a weight (measured).
+"""The numbers of multiply-accumulates that take as long as rounding a result, computing a LeakyReLU
+in float64, and rounding and loading a weight (measured).
 """
 TRIED = 0.35
-"""Share of the crops that a candidate is run on before it is given up, on average (measured)."""
+"""The average share of the crops on which a candidate is run before it is rejected (measured)."""
 TURNS = 4
-"""Candidates of a group of channels: larger and smaller, in two sizes."""
+"""The number of candidates for a group of channels: larger and smaller, in two sizes."""
 
 
 def channel_groups(ranges: np.ndarray, most: int) -> list[np.ndarray]:
@@ -89,12 +92,12 @@ class Stage:
 
 @dataclass(frozen=True)
 class Bound:
-    """What a search may take.
+    """The bound of a search.
 
     Attributes:
-        groups: most groups of channels of a tensor or residual group.
-        crops: number of crops that candidates are run on.
-        candidates: most candidates.
+        groups: the maximum number of groups of channels of a tensor or residual group.
+        crops: the number of crops on which candidates are run.
+        candidates: the maximum number of candidates.
         runs: likely work, in runs of the first candidate on all crops.
     """
 

@@ -26,14 +26,14 @@ from beers_deploy.quant.passes.trial import Costs, Trial
 from beers_deploy.quant.session import values_of
 
 QUANTILE = 0.9999
-"""A channel's range: the mean over tiles of this quantile of its sizes.
+"""The range of a channel is the mean over tiles of this quantile of its absolute values.
 
-The maximum would be ruled by outliers.
+Outliers would determine the maximum.
 """
 
 GAMMAS = (0.5, 0.75, 1.0)
 HEADROOM = (0.64, 0.8, 1.0, 1.25)
-"""First guesses tried: gamma, and the widest range as a share of int8's.
+"""Candidates of the first guess: gamma, and the widest range as a share of int8's.
 
 Above 1 the largest values are clipped.
 """
@@ -41,17 +41,17 @@ Above 1 the largest values are clipped.
 FIRST_GUESSES = len(GAMMAS) * len(HEADROOM)
 
 FULL = INT8_MAX * 2.0**-GROUP_FRAC_BITS
-"""Where int8 ends in tensors that are equalised."""
+"""The value at which int8 ends in tensors that are equalised."""
 
 STEPS = (1.5, 1.2)
-"""Factors by which each channel is tried larger and smaller, a sweep each."""
+"""Factors by which each channel is tried larger and smaller, one sweep each."""
 
 FIRST_CROPS = 2
 MARGIN = 0.003
-"""A trial is given up once the crops that it was tried on cost that share more than with the best
-factors so far.
+"""A trial is rejected once its error on the crops tried so far exceeds that of the best factors by
+this share.
 
-Each look doubles the crops. Some 30 % of the runs remain.
+Each check doubles the crops. Some 30 % of the runs remain.
 """
 
 

@@ -43,19 +43,23 @@ from beers_deploy.quant.passes.trial import Costs, Trial, Trials
 
 GAMMAS = (0.0, 0.25, 0.5, 1.0)
 HEADROOM = (0.5, 0.75, 1.0, 1.4)
-"""First guesses tried, as in `quant.passes.equalize`; at 0.5 twice the range still fits."""
+"""Candidates of the first guess, as in `quant.passes.equalize`; at 0.5 twice the
+range still fits.
+"""
 TILES = 0.85
-"""A channel's range is this quantile over the tiles.
+"""The range of a channel is this quantile over the tiles.
 
-The widest tile would set the step of all others: with the brightest ground among the patches, a
-DnCNN lost 1.4 dB by it instead of 0.6 (measured on photographs).
+The widest tile would determine the step of all others: with the brightest ground among the patches,
+a DnCNN lost 1.4 dB instead of 0.6 (measured on photographs).
 """
 FEW_TENSORS = 4
-"""Of a deep network next to a residual group, to be tried one by one."""
+"""The number of tensors of a deep network with a residual group that are tried one by one."""
 
 EVERY = 8
 CLEARLY = 1.1
-"""A guess is tried on one of so many crops first, and dropped where it costs so much more there."""
+"""A guess is tried on a subset of the crops first, and rejected if its error there is larger by
+this factor.
+"""
 
 
 def _guess(ranges: np.ndarray, weights: np.ndarray, gamma: float, headroom: float) -> np.ndarray:
@@ -85,7 +89,7 @@ class SingleTensors:
 
     @property
     def parts(self) -> dict[str, slice]:
-        """The place of each tensor's channels."""
+        """The slice of each tensor's channels."""
         ends = np.cumsum([0, *self.widths]).tolist()
         return dict(zip(self.tensors, map(slice, ends, ends[1:]), strict=True))
 

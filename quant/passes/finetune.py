@@ -36,21 +36,21 @@ from beers_deploy.quant.session import open_any_size, open_session, result_of, t
 from beers_deploy.quant.untrusted import times
 
 HELD_OUT_EVERY = 8
-"""One pair of so many is not trained on, but judges what is kept."""
+"""One of this number of pairs is not trained on, and is used to select the result."""
 MOST_HELD_OUT = 48
 BATCH_PIXELS = 4 * 128**2
-"""Of the planes in one step."""
+"""The number of pixels of the planes in one step."""
 BORDER_PX = 8
-"""Not compared with a reference in a result of at least four times as many a side: there a patch
-ends, and its image goes on. The float network has the same border.
+"""This border is not compared with a reference if the sides of the result are at least four times
+as long. A patch ends there, but its image continues. The float network has the same border.
 """
 ROUNDS = (400, 800, 1600)
-"""Steps of each round of "auto"."""
+"""The number of steps of each round of "auto"."""
 LEAST_GAIN = 0.02
-"""Of what INT8 lost at first: a round that wins back less is the last one."""
+"""A round that recovers less than this share of the initial INT8 loss is the last one."""
 JUDGED_EVERY = 20
 JUDGING = 48
-"""Training pairs on which scales are judged."""
+"""The number of training pairs on which scales are judged."""
 
 
 @dataclass(frozen=True)
@@ -265,7 +265,7 @@ def _samples(host_part: HostPart, full: Graph, tuning: Tuning) -> Iterator[Sampl
 
 
 LEAST_ERROR = 1e-9
-"""Mean squared, of full scale: below it, by 90 dB, a float network is as good as perfect."""
+"""Mean squared error over full scale (90 dB) below which a float network counts as perfect."""
 
 
 def _inner_error(result: Tensor, target: Tensor) -> Tensor:

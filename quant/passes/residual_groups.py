@@ -30,16 +30,16 @@ from beers_deploy.quant.graph import (
 from beers_deploy.quant.graph.operations import SIX, united
 
 GROUP_FRAC_BITS = 8
-"""Any would do: `equalize` scales the group to it."""
+"""The fractional bits of a group. Any value would do, because `equalize` scales the group to it."""
 
 
 ResidualGroup = Mapping[str, slice]
-"""Tensors that have the same factors, channel by channel: each is added to another of them, or is
-such a sum, or what a pool, an enlargement or a concat makes of them. And where in the factors the
-channels of each stand.
+"""Tensors that have the same factors, channel by channel, and the slice of the factors that belongs
+to each. Each tensor is added to another one, or is such a sum, or is derived from them by a pool,
+an enlargement or a concat.
 """
 PASSING = (Concat, MaxPool, AveragePool, Resize)
-"""What hands channels on without mixing them."""
+"""Operations that pass channels on without mixing them."""
 
 
 def only(name: str) -> ResidualGroup:

@@ -1,7 +1,9 @@
-"""Measure what a candidate costs: how far INT8 results lie from float ones on a few crops.
+"""Measure the cost of a candidate: the difference of INT8 results from float ones on a few crops.
 
 1. Restore all crops of the calibration images in float, and order them by their largest correction.
+
 2. Keep the crops with the largest corrections, where int8 clips, and others of all sizes.
+
 3. Run each candidate on these crops, and return its error on each.
 """
 
@@ -28,20 +30,24 @@ from beers_deploy.quant.session import (
 T = TypeVar("T")
 
 SEARCH_CROPS = 16
-"""What equalization is searched on, a quarter of them with the strongest edges: there int8 clips.
-Small crops say less each, so more of them are taken.
+"""The number of crops on which equalization is searched. A quarter of them has the strongest edges,
+where int8 clips. Small crops contain less information, so more of them are used.
 """
 MOST_CROPS = 64
 LEAST_CHANGE = 1e-4
-"""Of full scale, added to what a network changes in a crop: a crop that it leaves as it is must not
-decide alone.
+"""Share of full scale that is added to the change that a network makes in a crop. Otherwise a crop
+that it leaves unchanged would decide alone.
 """
 
 Costs = Callable[[np.ndarray | None], np.ndarray]
-"""The cost of one graph in INT8 on the crops of given numbers, or on all of them: an error each."""
+"""A function that returns the error of one graph in INT8 on each of the crops with the given
+numbers, or on all of them.
+"""
 Trial = Callable[[Graph], Costs]
 Trials = Callable[[Graph, Collection[str]], Trial]
-"""A trial of candidates that differ from a graph only where these tensors are written and read."""
+"""A function that returns a trial of candidates that differ from a graph only where these tensors
+are written and read.
+"""
 Values = dict[str, np.ndarray]
 """Tensors (1, C, h, w) uint8 of an integer core, by name."""
 Targets = list[tuple[np.ndarray, np.ndarray]]

@@ -49,9 +49,9 @@ Named = tuple[str, Pair]
 """A sample with its name, for messages."""
 
 HELD_OUT_EVERY = 4
-"""One sample of so many is held out from calibration, to judge what INT8 changes."""
+"""One of this number of samples is held out from calibration, to measure the effect of INT8."""
 CALIBRATED_ON = "calibration_samples"
-"""What an INT8 file calls the digests of the samples that it was calibrated on."""
+"""The metadata key of the digests of the calibration samples in an INT8 file."""
 DIGEST_DIGITS = 16
 LEAST_CONTRAST = 1 / MAX_DN
 
@@ -89,7 +89,7 @@ class OwnSamples:
 
     @property
     def unseen(self) -> Patches:
-        """Every fourth sample, which calibration does not see."""
+        """Every fourth sample, which calibration does not use."""
         # Fewer than four samples are too few to leave one out of calibration.
         return self._patches(self.samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or self.samples)
 

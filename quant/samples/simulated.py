@@ -31,14 +31,14 @@ from beers_deploy.quant.samples.views import (
 )
 
 HELD_OUT_SEED = 1000
-"""Added to a run's seed where patches must be others than calibration's."""
+"""Added to the seed of a run for patches that must differ from those of calibration."""
 HELD_OUT_PATCHES = 32
 TUNING_SEED = 2000
 """Added to a run's seed for the patches that the integers are trained on."""
 TUNING_PATCHES = 256
 ROLES = "degraded", "reference"
-"""Of the sensors of a pair, each with noise of its own: a degraded patch is the same in a pair and
-alone.
+"""The sensors of a pair, each with its own noise, so that a degraded patch is the same in a pair
+and alone.
 """
 NO_LIGHTING: Lightings = {}
 
@@ -110,7 +110,7 @@ def _simulate(ground: Ground, sensors: Sequence[Instrument], draw: Draw) -> list
 
 @dataclass(frozen=True)
 class Calibration:
-    """Where a run's patches come from."""
+    """The source of a run's patches."""
 
     sensor: Sensor
     images: Path | None

@@ -1,4 +1,4 @@
-"""Samples as they are stored: in a .npy or .npz file, in a folder of images, or in arrays."""
+"""Read stored samples: from a .npy or .npz file, from a folder of images, or from arrays."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -16,7 +16,7 @@ from beers_deploy.quant.untrusted import times
 
 ARRAY_SUFFIX = ".npy"
 IN_MEMORY = "samples"
-"""What messages and files call samples that are no file."""
+"""The name in messages and files of samples that are not from a file."""
 NO_REFERENCE = np.empty(0, np.float32)
 FULL_SCALE_8 = 255
 REMEDY = "See docs/reference/any-network.md for how to give samples."

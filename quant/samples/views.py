@@ -21,15 +21,15 @@ from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.instrument import Instrument
 
 CANDIDATES = 8
-"""Drawn for each view."""
+"""The number of candidates that are drawn for each view."""
 Candidate = TypeVar("Candidate")
 
 DARK = (1 / 20, 1 / 4)
 """Factors on the radiance of patches lit as on a dark day, log-uniform between the two."""
 BRIGHTEST_PIXELS = 0.999
-"""The quantile of a bright patch that comes to lie near full scale."""
+"""The quantile of a bright patch that is placed near full scale."""
 BRIGHT = (0.75, 1.0)
-"""Where that quantile lies, over full scale."""
+"""The range for that quantile, over full scale."""
 SATURATED = (0.005, 0.05)
 """Share of the pixels of a saturated patch whose radiance exceeds full scale."""
 
@@ -73,7 +73,7 @@ class Ground:
 
     @property
     def radiance(self) -> np.ndarray:
-        """In W/m2/sr/um, on the scene's grid: a square of side_px * oversampling."""
+        """The radiance in W/m2/sr/um on the scene's grid: a square of side_px * oversampling."""
         return self.exposure * self._part(1)
 
     @property

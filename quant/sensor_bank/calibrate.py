@@ -59,7 +59,7 @@ from beers_deploy.quant.sensor_bank.filters import (
 )
 
 LIKE = "pleiades-degraded"
-"""The profile that gives gain and bits; all that is computed is a share of full scale."""
+"""The profile whose gain and bits are used; all results are shares of full scale."""
 
 ANALYTIC = "analytic"
 BODY = "body.correction"
@@ -276,7 +276,9 @@ def _plan(weights: Weights, shifts: Shifts, passes: Passes, effort: Effort) -> P
 
 PATCHES = 80
 SNR = (90.0, 165.0)
-"""The range of calibration sensors: their gain is near 1, at which `bank_results` are computed."""
+"""The SNR range of calibration sensors: their gain is near 1, at which
+`bank_results` are computed.
+"""
 
 
 def bank_images(

@@ -205,7 +205,7 @@ def with_delta(core: IntCore, delta: bytes, where: str = "The delta") -> tuple[I
 
 
 LARGEST_DELTA = 1 << 20
-"""In bytes, of the unpacked content."""
+"""The maximum size of the unpacked content, in bytes."""
 
 
 def _read_like(values: np.ndarray, stream: BytesIO) -> np.ndarray:

@@ -29,23 +29,23 @@ PART = BANK_SLICES.part
 IMAGE_STEP_DN = 32
 
 BITS = 7
-"""Fractional bits that a result is stated to have: int8 then stands for -1 to 1, which is 5.3 units
-or half of full scale.
+"""The stated fractional bits of a result: int8 then represents -1 to 1, which is 5.3 units or half
+of full scale.
 """
 
 LARGEST = 2 * 124
-"""Of the sum of two coarse weights before they are rounded: the corrections that make weights sum
-to 0 and copies complete each other still fit int8.
+"""The limit of the sum of two coarse weights before rounding. The corrections that make weights sum
+to 0, and copies complete each other, then still fit int8.
 """
 
 COPIES = (1, 2, 7)
-"""Of the image, of each filter, and of the analytic restoration: 16 channels for each pixel of a
-place.
+"""The numbers of copies of the image, of each filter, and of the analytic restoration: 16 channels
+for each pixel of a place.
 """
 
 GRID_BITS = 16
-"""Fractional bits of the numbers that weights are fitted with: weights are below 2^8, a covariance
-is at most 1, and 49 products are added, so that float64 holds all sums exactly.
+"""Fractional bits of the numbers with which weights are fitted. Weights are below 2^8, a covariance
+is at most 1, and 49 products are added, so that float64 represents all sums exactly.
 """
 
 REACH_PX = 30.0
@@ -57,9 +57,9 @@ class IntegerBank:
     """The first convolution in integers.
 
     Attributes:
-        weight: (O, 4 S^2, k, k) int8 for the planes of an image, all of one kind together.
-        frac_bits: by which a sum of products is shifted to become int8.
-        offsets: (O,) what each channel adds before it is rounded, in steps.
+        weight: (O, 4 S^2, k, k) int8 for the planes of an image, all of one kind consecutively.
+        frac_bits: the right shift that converts a sum of products to int8.
+        offsets: (O,) numbers that each channel adds before it is rounded, in steps.
     """
 
     weight: NDArray[np.int8]

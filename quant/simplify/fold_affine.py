@@ -30,12 +30,12 @@ class Affine:
 
     @property
     def channels(self) -> int:
-        """How many numbers it has."""
+        """The number of channels; 1 if the numbers apply to all channels."""
         return max(len(self.scale), len(self.shift))
 
 
 def add_negated(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Negate the convolution that computes what is subtracted, and add its result (1)."""
+    """Negate the convolution that computes the subtrahend, and add its result (1)."""
     if node.op_type != "Sub" or node.inputs[0] in graph.constants:
         return None
     before = graph.sole_writer(node.inputs[1])
@@ -46,7 +46,7 @@ def add_negated(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
 
 def negate_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Negate what is subtracted by a convolution of its own, and add the result (1).
+    """Negate the subtrahend by a convolution of its own, and add the result (1).
 
     Args:
         shapes: of each float tensor.

@@ -23,16 +23,16 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
 
 MULTIPLE_PX = 64
-"""Six levels of a U-Net halve sides of this many pixels without a remainder."""
+"""Six levels of a U-Net halve sides of this length without a remainder."""
 SIZES_PX = (2 * MULTIPLE_PX, 3 * MULTIPLE_PX), (4 * MULTIPLE_PX, 3 * MULTIPLE_PX)
-"""Rows and columns differ, so that a network that takes one for the other is noticed."""
+"""Rows and columns differ, so that a network that confuses them is detected."""
 SIZED = {"Concat", "Pad", "Resize", "Shape", "Size", "Slice"}
 """Operators that may need the size of an image."""
 RESHAPING = {"Flatten", "Reshape", "Squeeze", "Unsqueeze"}
 """Operators that move no value."""
 
 Fold = Callable[[onnx.ModelProto], onnx.ModelProto]
-"""Folds constants, as onnxruntime does."""
+"""A function that folds constants, as onnxruntime does."""
 
 
 def free_sizes(model: onnx.ModelProto, fold: Fold) -> onnx.ModelProto:

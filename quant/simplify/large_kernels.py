@@ -16,9 +16,9 @@ from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.fold_affine import is_convolution
 
 MOST_POSITIONS = 49
-"""Height times width of a part, 7 x 7: at most 53 are what every target computes."""
+"""Height times width of a part, 7 x 7. Every target computes at most 53."""
 LARGE_POSITIONS = 64
-"""Height times width, 8 x 8, up to which a kernel stays, because some targets compute it."""
+"""Height times width, 8 x 8, up to which a kernel is not split, because some targets compute it."""
 
 
 def is_large(shape: tuple[int, ...]) -> bool:

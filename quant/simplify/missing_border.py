@@ -16,7 +16,7 @@ WINDOWS = {"AveragePool", "Conv", "ConvTranspose", "MaxPool", "Pad"}
 SIZES_PX = (256, 320), (384, 512)
 """Rows and columns of the two images."""
 MOST_PX = 128
-"""A larger border is not what a network without padding lacks."""
+"""The largest border that a network without padding can lack."""
 
 
 def with_missing_border(model: onnx.ModelProto) -> onnx.ModelProto:

@@ -82,22 +82,22 @@ PLAIN = {
     "MaxPool",
     "Relu",
 }
-"""Operators behind which nothing is to be folded, where they read no constants but weights."""
+"""Operators behind which nothing can be folded if they read no constants but weights."""
 
 ALTERING = [
     "CommonSubexpressionElimination",
     "SliceConcatToSpaceToDepthFusion",
     "TransposeOptimizer",
 ]
-"""Optimisers of the runtime's that make other networks: layers of equal weights would be one,
-slices would become a Gather, and pixel shuffles that are spelled out would not be recognised.
+"""Optimisers of onnxruntime that change the network: they merge layers of equal weights, turn
+slices into a Gather, and prevent pixel shuffles from being recognised.
 """
 
 HALVES = (TensorProto.FLOAT16, TensorProto.BFLOAT16)
 
 
 NEEDS_SHAPES = {"Cast", "Gemm", "ReduceMean", "Slice", "Softmax", "Split", "Sub"}
-"""What may be rewritten where shapes are known."""
+"""Operators that may be rewritten if shapes are known."""
 
 
 def simplify(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
@@ -188,7 +188,7 @@ def _is_plain(model: onnx.ModelProto) -> bool:
 
 
 def _widen(model: onnx.ModelProto) -> None:
-    """16-bit floats become float32, where they are weights and wherever they are computed."""
+    """Convert 16-bit floats to float32, in weights and in all computations."""
     graph = model.graph
     for value in (*graph.input, *graph.output, *graph.value_info):
         if value.type.tensor_type.elem_type in HALVES:
@@ -203,7 +203,9 @@ def _widen(model: onnx.ModelProto) -> None:
 
 
 def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
-    """The network as the runtime's basic optimisation leaves it, with operators of our opset."""
+    """Apply onnxruntime's basic optimisation, and return the network with operators of this
+    project's opset.
+    """
     options = ort.SessionOptions()
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_BASIC
     options.intra_op_num_threads = 1
@@ -232,9 +234,7 @@ def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 
 
 def _of_our_opset(model: onnx.ModelProto) -> onnx.ModelProto:
-    """With operators of our opset; as it is where the converter knows no way, or ours has no such
-    operator.
-    """
+    """Convert a network to this project's opset; return it unchanged if that is not possible."""
     version = opset_of(model)
     _replace(model.opset_import, [onnx.helper.make_opsetid("", version)])
     if version == OPSET:
@@ -252,8 +252,9 @@ RESIZE_HAS_MODES = 11
 
 
 def _place_corners(model: onnx.ModelProto) -> None:
-    """What older operators enlarge starts at the corner; the converter leaves the default, half a
-    pixel off.
+    """Set the coordinates of enlargements from older opsets, which start at the corner.
+
+    The converter leaves the default, which is shifted by half a pixel.
     """
     for node in model.graph.node:
         if node.op_type == "Resize":
@@ -264,7 +265,7 @@ def _place_corners(model: onnx.ModelProto) -> None:
 
 
 def _tidy(network: onnx.ModelProto, model: onnx.ModelProto) -> None:
-    """What is said beside the graph is the file's own; constants that nothing reads are dropped."""
+    """Restore the metadata of the original file, and remove constants that no node reads."""
     network.ir_version = IR_VERSION
     network.producer_name = model.producer_name
     network.producer_version = model.producer_version
@@ -284,7 +285,7 @@ def _tidy(network: onnx.ModelProto, model: onnx.ModelProto) -> None:
 
 
 def _replace(field: object, values: object) -> None:
-    """Put other messages in the place of a repeated field's own."""
+    """Replace the messages of a repeated field."""
     messages = list(values)  # type: ignore[call-overload]
     del field[:]  # type: ignore[attr-defined]
     field.extend(messages)  # type: ignore[attr-defined]

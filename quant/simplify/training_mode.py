@@ -1,8 +1,8 @@
-"""Networks that were exported while they were trained, and not to be used: Dropout draws,
+"""Reject networks that were exported in training mode, in which Dropout draws and
 BatchNormalization adapts.
 
-Such a network gives another result for each run or for each tile. It is refused before these nodes
-are folded away.
+Such a network returns another result for each run or for each tile. It is rejected before these
+nodes are folded.
 """
 
 import numpy as np
@@ -14,8 +14,8 @@ from beers_deploy.quant.domains import STANDARD, opset_of
 from beers_deploy.quant.onnx.graph import attributes_of, constants
 
 IS_TEST_UNTIL = 6
-"""The last opset whose operators state by `is_test` whether they are in use; without it they are in
-training.
+"""The last opset whose operators state by `is_test` whether they are in inference mode; without it
+they are in training mode.
 """
 DROPOUT_MODE_INPUT = 2
 

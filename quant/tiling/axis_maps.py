@@ -1,8 +1,8 @@
-"""Which pixels of its source an operator reads, along one axis of the image.
+"""Determine which pixels of its source an operator reads, along one axis of the image.
 
 `AXIS_MAPS` has each operator that reads other pixels than the one in its own place: windows,
-transposed windows, shuffles, enlargements. Sizes are followed as a share of the image's, and what a
-tensor has beyond that share. So it does not matter where pixels were padded and where windows used
+transposed windows, shuffles, enlargements. The size of a tensor is tracked as a share of the
+image's size plus an excess. So it does not matter where pixels were padded and where windows used
 them up.
 """
 
@@ -23,7 +23,7 @@ from beers_deploy.quant.untrusted import times
 
 @dataclass(frozen=True)
 class AxisMap:
-    """What an operator does along one side.
+    """The effect of an operator along one side.
 
     Attributes:
         growth: pixels of its result for one of its source.
@@ -149,7 +149,7 @@ def _transpose(at: AxisNode) -> AxisMap:
 
 
 def _shuffle(at: AxisNode) -> AxisMap:
-    """Channels become squares of pixels, or squares of pixels channels."""
+    """Return the map of a pixel shuffle or its inverse."""
     block = int(at.attribute("blocksize", 1))
     window = Window((block, block))
     if at.node.op_type == "DepthToSpace":
@@ -159,7 +159,7 @@ def _shuffle(at: AxisNode) -> AxisMap:
 
 
 def _pad(at: AxisNode) -> AxisMap:
-    """Padding by itself; less than none cuts off."""
+    """Return the map of a separate Pad; negative padding crops."""
     mode = at.attribute("mode", "constant")
     at.require(mode != "wrap", "joins opposite borders")
     pads = at.numbers(1, "pads")
@@ -172,11 +172,15 @@ def _pad(at: AxisNode) -> AxisMap:
 
 
 FAR = 1 << 30
-"""An end of a slice that stands for the image's own."""
+"""An end of a slice from which on it means the image's own end."""
 
 
 def _slice(at: AxisNode) -> AxisMap:
-    """A part that is counted from the borders, or every n-th pixel."""
+    """Return the map of a Slice that cuts relative to the borders, or that selects every n-th
+    pixel.
+
+    Raises ModelError for a slice at a fixed position.
+    """
     starts = at.numbers(1, "starts")
     ends = at.numbers(2, "ends")
     axes = at.numbers(3, "axes", range(len(starts)))
@@ -191,8 +195,10 @@ def _slice(at: AxisNode) -> AxisMap:
 
 
 def _resize(at: AxisNode) -> AxisMap:
-    """Enlarging by whole factors, or taking every 2nd, 4th, ... pixel; linear where all weights are
-    exact floats.
+    """Return the map of a Resize by an integer factor, or by the inverse of one.
+
+    Linear interpolation is accepted only if all weights are exact floats. Raises ModelError for
+    anything else.
     """
     resizing = Resizing.of(at.node, at.graph)
     at.require(bool(resizing.factors), "resizes to a fixed size")
@@ -238,7 +244,9 @@ AXIS_MAPS: dict[str, Callable[[AxisNode], AxisMap]] = {
     "Pad": _pad,
     "Slice": _slice,
 }
-"""What reads other pixels than the one in its own place; the image is its first input."""
+"""Operators that read other pixels than the one in their own place; the image is
+their first input.
+"""
 
 
 def not_tileable(reason: str) -> ModelError:
