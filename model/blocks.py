@@ -23,8 +23,8 @@ The mean of 64 pixels has an eighth of a pixel's noise. Blocks of 16 and 32 gain
 
 
 BORDER_BLOCKS = 2
-"""Blocks at the image's border that are left out, because H brings light into them that x does not
-show. With all blocks the outer 8 pixels lost 0.2 dB, with one left out 0.05 dB; with two they gain
+"""Blocks at the image's border are excluded, because H spreads light into them from outside the
+image. With all blocks the outer 8 pixels lost 0.2 dB, with one excluded 0.05 dB; with two they gain
 (measured on training places).
 """
 

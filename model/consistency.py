@@ -1,32 +1,31 @@
-"""The consistency step: a restored image that agrees with the raw one at low spatial frequencies.
+"""Make a restored image consistent with the raw one at low spatial frequencies.
 
     x' = x + G (y - H x)
 
 y is the raw image and x the restored one. H is the blur that leads from the reference's MTF to the
 sensor's, H(f) = MTF_sensor(f) / MTF_reference(f), with H(0) = 1. If x is right, y - H x is the
-noise of y. Networks move the mean by some tenths of a per cent and dim faint points. This error
-lies at low frequencies, and the low-pass filter G finds it there and removes it. G averages the
-noise of y, so that little of it comes back.
+noise of y. Networks shift the mean by some tenths of a per cent and dim faint points. This error
+lies at low frequencies, so the low-pass filter G isolates it and the step removes it. G averages
+the noise of y, so that little of it is added.
 
-G takes the mean of y - H x over blocks of BLOCK_PX x BLOCK_PX pixels and interpolates bilinearly
-between the centres of the blocks. So only block means of H x are needed, and they cost a few
-operations a pixel:
+G averages y - H x over blocks of BLOCK_PX x BLOCK_PX pixels and interpolates bilinearly between the
+centres of the blocks. So only block means of H x are needed, and they cost a few operations a
+pixel:
 
 1. Near: the part of H within NEAR_PX is a sum of RANK separable filters, each evaluated for the
-  block means alone.
-2. Far: what the rest of H brings is computed from block means of x, up to FAR_BLOCKS blocks away.
-  The formula's MTF has a kink at frequency 0, so H falls off as 1 / r^3 and may not be cut near its
-  centre: H cut at 8 pixels lost 0.4 dB where the whole H gains 0.05 dB (measured on photographs of
-  training places).
+   block means alone.
+2. Far: the contribution of the rest of H is computed from block means of x, up to FAR_BLOCKS blocks
+   away. The formula's MTF has a kink at frequency 0, so H falls off as 1 / r^3 and may not be cut
+   near its centre. H cut at 8 pixels lost 0.4 dB where the whole H gains 0.05 dB (measured on
+   photographs of training places).
 
 The blocks are aligned to the image, and every pixel is computed by the same float32 operations in
-the same order wherever a tile begins. So tiles give the whole image's result bit for bit, if
-REACH_PX pixels of x and RAW_REACH_PX of y around what is kept are at hand. Blocks that a missing or
-saturated pixel reaches through the near part of H are left out, because the residual of a clipped
-pixel is not noise; the blocks around them are interpolated instead.
+the same order wherever a tile begins. Tiles therefore reproduce the result of the whole image bit
+for bit, if they include REACH_PX pixels of x and RAW_REACH_PX of y around the kept pixels. Blocks
+that a missing or saturated pixel affects through the near part of H are excluded, because the
+residual of a clipped pixel is not noise. They are interpolated from the blocks around them.
 
-Nothing but NumPy runs on pixels here, so that `deploy/kit/host.py` can do the same on a board's
-host.
+Only NumPy runs on pixels here, so that `deploy/kit/host.py` can do the same on a board's host.
 """
 
 from dataclasses import dataclass
@@ -108,8 +107,8 @@ class Consistency:
         columns: weights of the columns, likewise; a term's weight of a pixel is the product of the
             two.
         far: weights (2 FAR_BLOCKS + 1, 2 FAR_BLOCKS + 1) of the block means around a block.
-        means: mean values of a raw block at which `excess` is stated, rising.
-        excess: what clipping the noise at zero has added to them.
+        means: mean values of a raw block at which `excess` is given, ascending.
+        excess: the amount that clipping the noise at zero has added to them.
         full_scale: the pixel value at and above which a raw pixel is saturated.
     """
 

@@ -1,12 +1,12 @@
-"""ConvBEERS: a residual network without batch normalisation that undoes blur and noise (paper,
-section 3.1).
+"""Define ConvBEERS: a residual network without batch normalisation that undoes blur and noise
+(paper, section 3.1).
 
     image -> head -> [conv, ReLU, conv, +] x blocks -> body end, + head
     -> tail -> correction, + image
 
-A variant of scale S rearranges the image in front of its head, S x S pixels into channels, and the
-correction back behind its tail (pixel unshuffle and shuffle; Shi et al., CVPR 2016). The host does
-both; what lies between runs at 1 / S of the resolution.
+A variant of scale S rearranges S x S pixels of the image into channels before its head, and the
+correction back after its tail (pixel unshuffle and shuffle; Shi et al., CVPR 2016). The host does
+both, and the layers in between run at 1 / S of the resolution.
 
 Every convolution is 3 x 3 with stride 1 and zero padding 1. 16 blocks of 64 features make 1.2 M
 parameters.
@@ -15,11 +15,11 @@ Behind the bank of its sensor (`model.bank`) the same body is one network for ev
 
     restored = x + g (w + body([x - 1/2, u])),   w = (W_1 - 1) x / g
 
-What a sensor changes are the filters that make u and w and the unit g, known in closed form, and
-the bias of the head, which is linear in the sensor vector.
+A sensor changes the filters for u and w and the unit g, which are known in closed form, and the
+bias of the head, which is linear in the sensor vector.
 
-A larger network can begin where a smaller one stands (`grow`): wider, deeper or coarser, with the
-same outputs. Trained in the end with its maps rounded as its INT8 file rounds them (`Rounding`), a
+A larger network can start from a smaller one (`grow`): wider, deeper or coarser, with the same
+outputs. If the last part of the training rounds the maps as the INT8 file does (`Rounding`), a
 network loses less in INT8.
 """
 

@@ -176,8 +176,9 @@ def _drawn(recipe: DatasetRecipe, window: Window) -> tuple[dict[str, Any], dict[
 
 
 def _is_drawn(recipe: DatasetRecipe, window: Window, text: str) -> bool:
-    """Return True if a line of the manifest states what the recipe draws: whoever forges it can
-    make its digest.
+    """Return True if a line of the manifest states what the recipe draws.
+
+    A digest alone does not prove that, because whoever forges a line can compute it.
     """
     line: Any = parse_json(text)
     del line[DIGESTS]
@@ -204,18 +205,18 @@ def write_dataset(
 ) -> dict[str, float]:
     """Write a dataset of 12-bit TIFF patches and its manifest.
 
-    Pairs of an earlier run stay if they match the digests in their lines of the manifest; others
-    are made again.
+    Pairs of an earlier run remain if they match the digests in their lines of the manifest; others
+    are simulated again.
 
     Args:
-        recipe: what decides the pixels.
+        recipe: the parameters that determine the pixels.
         out: the dataset's folder.
-        workers: processes here that make patches, or calls that the pool runs at once.
-        resume: whether to go on with a dataset that the folder holds in part.
-        pool: makes them instead of processes here; only this process writes.
+        workers: the number of processes on this host, or of calls that the pool runs at once.
+        resume: whether to continue a dataset that the folder holds in part.
+        pool: runs the calls instead of processes on this host; only this process writes.
 
     Returns:
-        patches, and the share of drawn SNR pairs that were impossible and drawn again.
+        The number of patches, and the share of drawn SNR pairs that were impossible and redrawn.
     """
     # First of all, so that a scene that cannot be read is refused before anything is written.
     windows = plan_windows(recipe)

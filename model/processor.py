@@ -170,8 +170,10 @@ SEEDS = 2**62
 
 
 def require_cores(option: str, asked: int) -> None:
-    """Refuse more threads or processes than this machine has logical cores; 0 is the option's own
-    default.
+    """Raise OptionError if more threads or processes are requested than this machine has logical
+    cores.
+
+    0 stands for the option's default.
     """
     cores = os.cpu_count() or 1
     if not 0 <= asked <= cores:

@@ -16,10 +16,9 @@ ALONE = ""
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a .npz file by name, or that of a .npy file, mapped, under the name
-    `ALONE`.
+    """Load the arrays of a .npz file by name, or that of a .npy file, memory-mapped, as `ALONE`.
 
-    The content tells which of the two a file is, not its name.
+    The content determines which of the two a file is, not its name.
 
     Raises:
         ValueError: a file that holds no arrays, or damaged ones; the message is the reason.

@@ -113,14 +113,14 @@ NEARLY_0 = 1e-12
 
 @plain_dataclass(frozen=True)
 class Limits:
-    """The numbers that a constant can have, both ends included: `Annotated[Constant, Limits(0, 5)]`
-    is a type that pydantic checks.
+    """The valid values of a constant, both ends included: `Annotated[Constant, Limits(0, 5)]` is a
+    type that pydantic checks.
 
     Attributes:
         low: the smallest.
         high: the largest.
         whole: True if the number counts something.
-        single: True if the number defines what others mean, so that there is no range to draw from.
+        single: True if other numbers depend on this one, so that it cannot be a range to draw from.
         hint: a sentence that follows the one about a wrong number.
     """
 

@@ -153,7 +153,9 @@ class FullWell(PixelEffect):
 
 @dataclass(frozen=True)
 class Prnu(PixelEffect):
-    """Relative spread of the detectors' responses, one detector a column; 0 is none."""
+    """Relative standard deviation of the detectors' responses, one detector per
+    column; 0 is none.
+    """
 
     rms: Annotated[float, Limits(0.0, 0.2)]
     acts_on = "radiance"
@@ -173,7 +175,7 @@ class Prnu(PixelEffect):
 
 @dataclass(frozen=True)
 class Dsnu(PixelEffect):
-    """Spread of the detectors' offsets in DN, one detector a column; 0 is none."""
+    """Standard deviation of the detectors' offsets in DN, one detector per column; 0 is none."""
 
     rms_dn: Annotated[float, Limits(0.0, 1e4)]
     acts_on = "DN"

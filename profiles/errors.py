@@ -1,4 +1,4 @@
-"""What can go wrong with what a user hands us.
+"""Define the exceptions for bad input.
 
 BeersError              one sentence, no traceback, exit code 2
   ProfileError          a sensor or target profile
@@ -53,8 +53,8 @@ def printable(text: str, longest: int = LONGEST) -> str:
 
 
 def reason_of(error: BaseException) -> str:
-    """Return the message of a library's error for a sentence of ours: on one line, cut where it is
-    long, and without a full stop.
+    """Return the message of a library's error on one line, shortened and without a full stop, for
+    use in a sentence.
     """
     return printable(" ".join(str(error).split())).rstrip(".")
 
@@ -69,7 +69,7 @@ def one_line(text: str) -> str:
 
 
 def encodable(text: str) -> str:
-    """Return the text with an escape for what UTF-8 cannot hold: bytes of a file's name in another
+    """Return the text with escapes for what UTF-8 cannot encode, such as a file name in another
     encoding.
     """
     return text.encode(errors="backslashreplace").decode()
@@ -110,7 +110,7 @@ class ImageError(BeersError, ValueError):
 
 
 class ModelError(BeersError, ValueError):
-    """A weights or ONNX file that is not what the command needs."""
+    """A weights or ONNX file that the command cannot use."""
 
 
 class OptionError(BeersError, ValueError):

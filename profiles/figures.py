@@ -149,14 +149,13 @@ class Check:
     NaN never passes.
 
     Attributes:
-        name: what is measured, for example "MAE".
-        value: what was found, in `unit`; infinite or NaN where a network gave that.
-        limit: the largest value that passes, or the smallest where `bound` says "at least";
-            infinity for none.
-        unit: of both; a count has the name of what is counted, for example "node".
+        name: of the measured quantity, for example "MAE".
+        value: the measured value, in `unit`; infinite or NaN if a network returned that.
+        limit: the largest value that passes, or the smallest if `bound` is "at least"; infinity for
+            none.
+        unit: of both; a count has the name of the counted objects, for example "node".
         bound: the side of the limit that passes.
-        detail: where the value was found, or where the limit comes from; empty where there is
-            nothing to add.
+        detail: where the value was measured, or where the limit comes from; may be empty.
     """
 
     name: str

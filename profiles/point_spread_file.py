@@ -83,7 +83,7 @@ def _lies_within(folder: Path, name: str) -> bool:
 
 
 def _normalised(where: str, samples: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the samples scaled to a sum of 1, or refuse those that can have none."""
+    """Scale the samples to a sum of 1, or raise ProfileError if that is not possible."""
     finite = bool(np.isfinite(samples).all())
     # The largest is brought to 1 first, because the sum of finite samples may overflow.
     samples = samples / max(float(np.abs(samples).max()), 1e-300) if finite else samples

@@ -45,7 +45,9 @@ R = TypeVar("R", bound="MtfTable | PointSpread")
 
 
 def _require_contrast(response: R) -> R:
-    """Refuse a blur that leaves more contrast at Nyquist than a square detector can, or none."""
+    """Raise ValueError if the contrast at Nyquist is not above 0, or above that of a square
+    detector.
+    """
     limit = float(np.sinc(NYQUIST))
     for axis, contrast in zip(("across", "along"), response.at_nyquist, strict=True):
         if not 0 < contrast <= limit:

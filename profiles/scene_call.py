@@ -55,7 +55,7 @@ class SceneCall:
 
 
 def typical_effects() -> dict[str, Table]:
-    """Return typical values of every optional effect (`profiles/effects.toml`): what `--with NAME`
+    """Return typical values of every optional effect (`profiles/effects.toml`), which `--with NAME`
     adds.
     """
     label, raw = read_toml("", str(HERE / "effects.toml"))

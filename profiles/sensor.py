@@ -57,7 +57,9 @@ def _dark(fields: dict[str, Constant]) -> Constant:
 
 
 def _response(raw: object) -> object:
-    """Read a response from JSON, where its keys say which of the two it is."""
+    """Read a response from JSON; its keys determine whether it is a table or a point-spread
+    function.
+    """
     if raw is None or isinstance(raw, MtfTable | PointSpread):
         return raw
     if not isinstance(raw, Mapping):
@@ -108,7 +110,9 @@ class Sensor:
 
     @model_validator(mode="after")
     def _noise_is_possible(self) -> Self:
-        """Refuse noise that is stated in no way or in both, or that no alpha and beta can have."""
+        """Raise ValueError if the noise is stated in neither way or in both, or is physically
+        impossible.
+        """
         ways = [self.snr_0, self.snr_1], [self.alpha, self.beta]
         begun = [way for way in ways if any(way)]
         if len(begun) != 1 or not all(begun[0]):
@@ -137,7 +141,9 @@ class Sensor:
 
     @model_validator(mode="after")
     def _blur_is_possible(self) -> Self:
-        """Refuse a response with other contrasts, and an anti-alias filter that leaves less."""
+        """Raise ValueError if the response contradicts the contrasts, or if they exceed the
+        anti-alias filter.
+        """
         axes = [self.mtf_nyquist, self.mtf_nyquist_along or self.mtf_nyquist]
         if self.response and not np.allclose([c.low for c in axes], self.response.at_nyquist):
             raise ValueError(
@@ -182,7 +188,7 @@ class Sensor:
         return validated(Sensor, fields, label, GROUPS)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the profile as a TOML file that `load` reads; a point-spread function lies beside
+        """Write the profile as a TOML file that `load` reads, with a point-spread function next to
         it as .npy.
         """
         path = Path(path)
@@ -385,7 +391,7 @@ class Sensor:
         return Instrument(mtf, *noise, gain, bits, effects, mtf_along, radiance_1, self.response)
 
     def _impossible_snr(self) -> str:
-        """Return what is wrong with SNRs that no alpha and beta can have."""
+        """Return the error message for SNRs that no alpha and beta can have."""
         snr_0, snr_1 = self.snr_pair
         low, high = snr_0_bounds(self.radiance_0.low, self.radiance_1.low, snr_1.high)
         return (

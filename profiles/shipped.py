@@ -33,7 +33,7 @@ def shipped_names(kind: str) -> list[str]:
 
 
 def profile_path(kind: str, name: str) -> Path:
-    """Return where a profile lies: in `profiles/KIND/`, or where the user's own path says."""
+    """Return the path of a profile: in `profiles/KIND/`, or the user's own path."""
     return Path(name) if name.endswith(".toml") else HERE / kind / f"{name}.toml"
 
 

@@ -134,7 +134,7 @@ those.
 
 
 def check_limits(place: str, limits: Mapping[str, Limits], table: Mapping[str, Constant]) -> None:
-    """Refuse a number that no board can have.
+    """Raise ValueError if a number is outside its limits.
 
     Args:
         place: the dotted name of the table.

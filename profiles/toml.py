@@ -77,8 +77,8 @@ def parse_json(text: str) -> object:
 
 
 def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
-    """Return an object; raise ValueError for a key that stands in it twice, of which readers take
-    either.
+    """Return an object; raise ValueError if it has a key twice, because readers disagree about its
+    value.
     """
     members = dict(pairs)
     if len(members) < len(pairs):

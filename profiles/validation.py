@@ -31,17 +31,17 @@ EXAMPLES = {
 
 
 def validated(kind: type[T], raw: object, label: str, groups: Mapping[str, str] | None = None) -> T:
-    """Return the value of a type that plain values state.
+    """Convert plain values to a type, or raise ProfileError.
 
     Args:
         kind: any type that pydantic can check.
         raw: plain values, as TOML and JSON hold them.
         label: names the file in messages.
-        groups: the dotted key of a field of the type, where it is not its name; "" for a field that
-            only groups tables of the file.
+        groups: the dotted key of a field of the type, if it differs from its name; "" for a field
+            that only groups tables of the file.
 
     Raises:
-        ProfileError: the file, the dotted key, what is wrong with its value and what to do.
+        ProfileError: the file, the dotted key, the error in its value and what to do.
     """
     try:
         return TypeAdapter(kind).validate_python(raw)
@@ -87,14 +87,14 @@ def check_keys(
     required: Collection[str],
     optional: Collection[str] = (),
 ) -> None:
-    """Refuse a table with an unknown key, or without a required one.
+    """Raise ProfileError if a table has an unknown key, or lacks a required one.
 
-    For tables whose keys depend on more than a type.
+    It is for tables whose keys depend on more than a type.
 
     Args:
         where: names the file and the table in messages.
         raw: the table.
-        required: the keys that it must have; as a mapping also what each can be.
+        required: the keys that it must have; as a mapping also the values that each can have.
         optional: keys that it may have.
     """
     allowed = sorted({*required, *optional})

@@ -1,8 +1,8 @@
-"""Whole files or none, and never over what a run reads or writes elsewhere.
+"""Write files completely or not at all, and never over a file that a run reads or writes elsewhere.
 
-One rule for every output of every command: it is a regular file or a new name, no input and no
-other output. Symbolic links, pipes and devices are refused: what is renamed over them would stand
-in their place.
+One rule applies to every output of every command: it is a regular file or a new name, no input and
+no other output. Symbolic links, pipes and devices are rejected, because a file renamed over them
+would replace them.
 """
 
 import hashlib
@@ -25,7 +25,7 @@ the same folder and be overwritten.
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; rename it to `path` when the block ends well, else
+    """Yield a temporary path next to `path`; rename it to `path` if the block succeeds, otherwise
     remove it.
     """
     require_regular(path)
@@ -48,15 +48,15 @@ def whole_file(path: Path) -> Iterator[Path]:
 def require_writable(
     *paths: Path | None, inputs: Iterable[Path | None] = (), folders: Iterable[Path | None] = ()
 ) -> None:
-    """Find out before long work, not after it, that an output may not or cannot be written; None
-    asks for no output.
+    """Raise an error before long work if an output may not or cannot be written; None means no
+    output.
 
     Args:
         paths: files that are to be written.
-        inputs: files that are read, and folders from which files are; what does not exist is passed
-            over. A hard link or a symbolic link to an input is that input.
-        folders: are to be filled with images whose names are not known yet: no image that is read
-            may lie there.
+        inputs: files that are read, and folders from which files are read; a path that does not
+            exist is ignored. A hard link or a symbolic link to an input is that input.
+        folders: folders that are to be filled with images whose names are not known yet; no image
+            that is read may lie there.
     """
     outputs = [path for path in paths if path is not None]
     image_folders = [path for path in folders if path is not None]
@@ -72,8 +72,8 @@ def require_writable(
 def _require_apart(
     outputs: list[Path], image_folders: list[Path], inputs: Iterable[Path | None]
 ) -> None:
-    """Refuse an output that is an input or another output, and a folder to be filled where images
-    are read.
+    """Raise an error if an output is an input or another output, or a folder to be filled contains
+    inputs.
     """
     sources = [path for path in inputs if path is not None]
     files = list(chain.from_iterable(map(_files_of, sources)))
@@ -95,9 +95,7 @@ def _require_apart(
 
 
 def require_regular(path: Path) -> None:
-    """Refuse an output at which a folder, a link, a pipe or a device stands; a regular file or
-    nothing may.
-    """
+    """Raise MachineError if an output is an existing folder, link, pipe or device."""
     if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
         kind = "is not a regular file"
         if path.is_symlink():
@@ -111,8 +109,8 @@ def require_regular(path: Path) -> None:
 
 
 def _probe(path: Path) -> None:
-    """Try to write below the nearest folder that exists: a new one would outlive a command that is
-    refused later.
+    """Try to write in the nearest existing folder: a new one would remain if the command fails
+    later.
     """
     path = path.absolute()
     folder = next(parent for parent in path.parents if os.path.lexists(parent))

@@ -30,11 +30,12 @@ NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, ENOTSUP
 
 @contextmanager
 def only_run(out: Path) -> Iterator[None]:
-    """Hold the folder where a run keeps what it needs for `out`; in the end it is gone, unless rows
-    were left in it.
+    """Lock the folder in which a run stores its temporary files for `out`, and remove it at the
+    end.
 
-    Folders above it that were made for it are gone then, too, unless something was written there.
-    It locks nothing on a disk that has no locks, as some of networks.
+    The folder remains if it still contains rows. Parent folders that were created for it are
+    removed too, unless something was written there. On a disk without locks, such as some network
+    disks, nothing is locked.
     """
     folder = part_folder(out)
     created = [parent for parent in folder.parents if not parent.exists()]

@@ -104,8 +104,8 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
 
 
 def write_weights(path: Path, weights: Weights) -> None:
-    """Write a network's weights, its variant and recipe; of one that is told its sensor the ranges
-    it knows, too.
+    """Write a network's weights, variant and recipe; for a conditioned network also its sensor
+    ranges.
     """
     header: dict[str, object] = {"variant": asdict(weights.variant), "recipe": weights.recipe}
     if weights.conditioned:
@@ -185,7 +185,9 @@ def _told(header: Mapping[str, object]) -> bool:
 
 
 def _check_like(tensors: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Compare with what a network has."""
+    """Raise ValueError if the tensors differ in shape from those of a network, or are not finite
+    float32.
+    """
     for name, shape in shapes.items():
         if tensors[name].shape != shape:
             raise ValueError(f"{name} has the shape {tensors[name].shape} instead of {shape}")

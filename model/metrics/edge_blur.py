@@ -1,14 +1,14 @@
-"""The blur of an instrument from short straight edges, fitted by the curve that a sensor profile
-states.
+"""Measure the blur of an instrument from short straight edges, fitted by the curve that a sensor
+profile states.
 
 `slanted_edge` measures a whole MTF curve across one long edge. Here a profile's own curve is fitted
-instead, MTF(f) = exp(-gamma f) sinc(f) (`simulator.mtf`): one number an edge, for which 17 x 17
-pixels are enough. All edges together tell how much steeper the curve falls, by a Gaussian part
-exp(-shape f^2).
+instead, MTF(f) = exp(-gamma f) sinc(f) (`simulator.mtf`): one number per edge, for which 17 x 17
+pixels are enough. All edges jointly determine how much more steeply the curve falls, by a Gaussian
+part exp(-shape f^2).
 
-What has been sharpened, or was never a step, does not fit and is told apart by that: of 21 000
-steep places that six sensors saw in ten aerial photographs not one passed. A hedge or a shore is
-softer than any step, and would be taken for blur.
+An edge that was sharpened, or was never a step, does not fit and is excluded. Of 21 000 steep
+places that six sensors saw in ten aerial photographs not one passed. A hedge or a shore is softer
+than any step, and would be mistaken for blur.
 """
 
 import math

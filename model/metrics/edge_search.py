@@ -1,4 +1,4 @@
-"""Edges to measure an MTF on: searched in an image, or the one that crosses a box.
+"""Find edges to measure an MTF on: by searching an image, or the one that crosses a box.
 
 An edge is a square or box of pixels and the line that runs through it; `edge_curve` fits both again
 together with the curve.
@@ -26,12 +26,12 @@ START = weights_of(np.exp(-4.0 * CORNERS))
 """The curve to begin with: 8.6 % at Nyquist."""
 FIRST_PASSES = 6
 MOST_EDGES = 60
-"""The least uneven count; more take time and add little."""
+"""The maximum number of edges, the least uneven first; more take time and improve little."""
 
 SEARCHED = Limits(20, 0.12, 0.8)
 MAX_ROUGHNESS = 0.15
-"""What a square must keep to be fitted: looser than for a target, because its planes and texture
-are fitted too.
+"""Limits for a square to be fitted. They are looser than for a target, because its planes and
+texture are fitted too.
 """
 POINTED_STEP_SIGMA = 10.0
 POINTED_UNEVENNESS = 0.2

@@ -1,10 +1,10 @@
-"""Blur and noise of a sensor, measured on raw images of any scene.
+"""Measure the blur and noise of a sensor on raw images of any scene.
 
 `characterize` writes them into a profile; the sensor check compares them with one.
 
 - Noise: blocks of 16 x 16 pixels (`noise_blocks`), and the line that fits them (`noise_line`).
 - Blur: straight edges along both axes. Short ones give the MTF at Nyquist by the curve that a
-  profile states (`edge_blur`); all together give a curve of any shape (`edge_curve`).
+  profile states (`edge_blur`); all edges jointly give a curve of any shape (`edge_curve`).
 """
 
 import math
@@ -150,7 +150,7 @@ def axis_curves(
 
 
 def _narrow(curve: MtfCurve | Refusal) -> MtfCurve | Refusal:
-    """Return the curve, or why it is too uncertain, and what would help."""
+    """Return the curve; if it is too uncertain, return the reason and what would help."""
     if isinstance(curve, Refusal) or not curve.missing_edges:
         return curve
     value, (low, high) = curve.at(NYQUIST)

@@ -18,9 +18,9 @@ PART_BLOCKS = 4
 SLOW = 0.2
 MIDDLE = 0.5
 FINE = 0.55
-"""Cycles per pixel."""
+"""Limits of the frequency bands, in cycles per pixel."""
 SPECTRUM = (0.3, 0.4, 0.5, 0.55, 0.6, 0.65, 0.7071)
-"""Ends of the bands in which noise is shown, cycles per pixel; the last is the corner of the
+"""Ends of the bands in which noise is reported, in cycles per pixel; the last is the corner of the
 spectrum.
 """
 ROUNDING = 1 / 12

@@ -1,18 +1,17 @@
-"""A slanted edge whose angle is known: how it is drawn as a scene, and the MTF that an image of it
-has.
+"""Draw a slanted edge with a known angle as a scene, and measure the MTF of an image of it.
 
 ISO 12233:2017 with another DC:
 
 1. The angle and the middle are those that the edge was drawn with; a shift along the rows is
-  measured.
-2. Fit the plateaus: they give the step, which is the MTF's DC, and the far tails of the
-  point-spread function.
-3. Take off an edge with these tails, whose MTF is known. Average what it leaves in bins of a
-  quarter pixel, differentiate, window, transform; add the known MTF.
+   measured.
+2. Fit the plateaus. They determine the step, which is the MTF's DC, and the far tails of the
+   point-spread function.
+3. Subtract an edge with these tails, whose MTF is known. Average the residual in bins of a quarter
+   pixel, differentiate, window, transform, and add the known MTF.
 
 ISO 12233 divides by the windowed derivative's own sum instead. With the tails of optics, MTF =
-exp(-gamma f), that sum lacks 4 to 12 % of the step, and the MTF comes out too high by as much. The
-window resolves some 0.1 cycles per pixel: a narrower peak of the curve comes out flatter.
+exp(-gamma f), that sum lacks 4 to 12 % of the step, and the MTF is too high by the same amount. The
+window resolves some 0.1 cycles per pixel: a narrower peak of the curve appears flatter.
 """
 
 import math
@@ -40,17 +39,17 @@ def edge_mtf(image: np.ndarray, angle_deg: float, saturated: float = math.inf) -
     """Measure the MTF at Nyquist across an edge that runs through the middle of an image, dark on
     the left.
 
-    The figure is that along the edge's normal: a square detector keeps 0.6 % more at 15 degrees
-    than along the axis.
+    The figure is that along the edge's normal: the contrast of a square detector is 0.6 % higher at
+    15 degrees than along the axis.
 
     Args:
         image: (H, W) pixels of any linear unit, 12-bit DN or radiance; about 80 x 80.
-        angle_deg: as `slanted_edge` was told, 2 to 15 degrees.
+        angle_deg: the angle given to `slanted_edge`, 2 to 15 degrees.
         saturated: the value at which pixels clip, in the image's unit. They also clip at 0.
 
     Returns:
-        Contrast kept at 0.5 cycles per pixel, below 0 by noise or where contrast is reversed; or
-            why there is none.
+        Contrast at 0.5 cycles per pixel, below 0 by noise or if contrast is reversed; or the reason
+        why there is none.
     """
     pixels = np.asarray(image, np.float64)
     distance = _unusable(pixels, saturated) or _distance(pixels, math.radians(angle_deg))

@@ -27,9 +27,9 @@ than blurred texture.
 """
 
 GRADIENT = 0.08
-"""Standard deviation of what a plane changes away from the edge over HALF_PX, of the step.
+"""Standard deviation of a plane's change over HALF_PX away from the edge, relative to the step.
 
-Far tails of the blur look the same; a wider one lets gradients take their place.
+Far tails of the blur look the same. With a larger value gradients would replace them.
 """
 BOW_PX = 0.3
 """Standard deviation of how far an edge bends off a straight line at its ends:
@@ -44,7 +44,7 @@ MAD = 1.4826
 
 LEVELS = 6
 NUMBERS = 9
-"""Numbers of both planes; with those of the line."""
+"""The number of parameters of both planes; and with those of the line."""
 MAX_STEP = np.array([0.7, 0.1, 0.3])
 """The largest change of place, slope and bow in one pass."""
 SOFTER_PX = 0.05
@@ -67,8 +67,8 @@ class EdgePixels:
 
 
 class EdgeLine(NamedTuple):
-    """Where an edge runs: x = place + slope * y + bow * (2 y / H)^2, from the
-    middle of its pixels.
+    """The line of an edge: x = place + slope * y + bow * (2 y / H)^2, from the middle of its
+    pixels.
     """
 
     place_px: float
@@ -93,16 +93,17 @@ class FittedEdge:
 
     Attributes:
         pixels: of the edge.
-        line: where it runs.
+        line: of the edge.
         levels: (6,) left and right plane: in the middle, change over half the length, change over
             HALF_PX.
-        weights: (P,) one over the standard deviation of each pixel near the edge, texture and
-            Huber's weight in it.
+        weights: (P,) one over the standard deviation of each pixel near the edge, including texture
+            and Huber's weight.
         step: difference of the planes at the edge.
-        unevenness: root mean square of the texture that the planes leave, of the step.
-        normal: (P + 9, 9) derivatives by planes and line, weighted, with what is expected of them.
+        unevenness: root mean square of the residual texture of the planes, relative to the step.
+        normal: (P + 9, 9) weighted derivatives by planes and line, followed by their
+            regularisation.
         curve: (P + 9, PARTS) derivatives by the weights of the curve.
-        rest: (P + 9,) what is left over.
+        rest: (P + 9,) the residual.
         strip: (P,) number of the strip that each pixel lies in.
     """
 

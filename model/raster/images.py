@@ -1,4 +1,4 @@
-"""Read whole images, list those of a folder, and tell frames of one site apart."""
+"""Read whole images, list those of a folder, and determine which of them are frames of one site."""
 
 import re
 from math import prod
@@ -15,18 +15,18 @@ from beers_deploy.profiles.errors import ImageError, MachineError, sizes
 from beers_deploy.profiles.instrument import MAX_DN
 
 CAMERA = r"[_-](?:dji|img|image|dsc[nf]?|fhd|mos|gopr|frame|p)[_-]?"
-"""How cameras and programs begin the names of their files, after the name of a place."""
+"""The parts of file names that cameras and programs add after the name of a place."""
 
 FRAME_NUMBERS = re.compile(
     rf"(?:(?:_|{CAMERA})[0-9a-f]*\d[0-9a-f]*(?:-[0-9]+)*(?:_(?:pre|post)(?=_|$))?)+$", re.IGNORECASE
 )
-"""The end of a name that tells frames of one site apart: _0034, _5dded5bc_23, _DJI_0005, _P1010012,
-_386690-220241, _2016_pre_1. Nothing else can be known by a name: the site is what it begins with.
+"""The end of a name that distinguishes frames of one site: _0034, _5dded5bc_23, _DJI_0005,
+_P1010012, _386690-220241, _2016_pre_1. The rest of the name is the site.
 """
 
 WORKING_COPIES = 12
-"""Float copies of an image that a command may hold at once: reading refuses what would not fit in
-memory.
+"""The number of float copies of an image that a command may hold at once; an image that would not
+fit in memory is rejected.
 """
 
 RESCALE = "Rescale it to the sensor's digital numbers."
@@ -85,7 +85,7 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def site_of(name: str) -> str:
-    """Return the site of an image: its name without the end that tells frames of one site apart.
+    """Return the site of an image: its name without the end that distinguishes frames of one site.
 
     Examples:
         >>> site_of("zebra_DJI_0005.jpg"), site_of("lake_2016_pre_1.tif")

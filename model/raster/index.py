@@ -1,8 +1,7 @@
-"""Untrusted indexes: an XML file that names an image's tiles is read here before GDAL follows it
-anywhere.
+"""Read untrusted indexes, XML files that name an image's tiles, before GDAL follows them.
 
-Whatever a VRT or a DIMAP names must be an image that lies in its folder or below, unless the user
-trusts it. Code in Python is never run: GDAL is told so when it opens one.
+Every file that a VRT or a DIMAP names must be an image in its folder or below, unless the user
+trusts it. Python code in an index is never run, because GDAL opens it with that option off.
 
 Sources: https://gdal.org/en/stable/drivers/raster/vrt.html, and GDAL's
 frmts/dimap/dimapdataset.cpp.
@@ -42,7 +41,7 @@ class _NoDoctype(ET.TreeBuilder):
     """
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:  # noqa: ARG002
-        """Refuse it."""
+        """Raise ValueError, because a document type may declare entities."""
         raise ValueError("it has a document type, which may declare entities")
 
 
@@ -60,13 +59,13 @@ def parse_xml(content: str | bytes) -> ET.Element:
 
 
 def read_xml(path: Path, limit_bytes: int, kind: str, advice: str) -> ET.Element:
-    """Return the root of a file of untrusted XML, of at most `limit_bytes`.
+    """Read a file of untrusted XML, of at most `limit_bytes`, and return its root.
 
     Args:
         path: of the file.
-        limit_bytes: more is refused.
-        kind: what the file should be, for the message.
-        advice: what to do if it is not, a sentence.
+        limit_bytes: a larger file is rejected.
+        kind: the expected kind of file, for the message.
+        advice: a sentence on what to do if it is not of that kind.
 
     Raises:
         ImageError: the file cannot be read as XML.

@@ -37,7 +37,7 @@ LEVELS = {"zlib": {"ZLEVEL": 1}, "zstd": {"ZSTD_LEVEL": 1}}
 
 
 class Pixels(Protocol):
-    """What is written: rows of bands and of the mask, which may be asked for more than once."""
+    """The rows to write, of bands and of the mask; they may be requested more than once."""
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
         """Return rows `start` to `stop` (excluded) of one band, (rows, width)."""
@@ -47,7 +47,7 @@ class Pixels(Protocol):
 
 
 def require_codec(compression: Compression) -> None:
-    """Refuse a compression that the installed GDAL does not have, before a long run."""
+    """Raise OptionError before a long run if the installed GDAL lacks a compression."""
     options = {"driver": "GTiff", "width": 16, "height": 16, "count": 1, "dtype": "uint16"}
     try:
         with gdal(), MemoryFile() as memory:
@@ -93,7 +93,7 @@ def write_raster(
 
 
 def require_equal(path: Path, raster: Raster, pixels: Pixels) -> None:
-    """Raise OSError if bands, mask or alpha of a TIFF differ from what it was written from."""
+    """Raise OSError if bands, mask or alpha of a TIFF differ from the pixels that were written."""
     with disk_errors(), gdal(), rasterio.open(path, driver="GTiff") as file:
         for plane, window, rows in _planes(raster, pixels):
             if plane == MASK:
@@ -173,7 +173,7 @@ def _profile(raster: Raster, compression: Compression) -> dict[str, Any]:
 
 
 def _describe(file: Any, raster: Raster) -> None:
-    """Write the place, and what is known of the bands, into an open TIFF."""
+    """Write the place and the properties of the bands into an open TIFF."""
     if raster.place.area_or_point:
         file.update_tags(AREA_OR_POINT=raster.place.area_or_point)
     if raster.place.rpcs:
@@ -236,10 +236,10 @@ def padded_px(shape: tuple[int, int, int], tile_px: int = TILE_PX) -> int:
 
 
 def cog_bytes(shape: tuple[int, int, int], itemsize: int) -> int:
-    """Return the disk that writing a COG of an image (bands, height, width) takes at most.
+    """Return the maximum disk space for writing a COG of an image (bands, height, width).
 
-    The driver halves the image until it is one block, and writes these overviews into a file of
-    their own first. Nothing is assumed to be compressed.
+    The driver halves the image until it is one block, and writes these overviews into a separate
+    file first. No compression is assumed.
     """
     bands, height, width = shape
     full = padded_px(shape, COG_TILE_PX)

@@ -1,8 +1,9 @@
-"""Non-local Bayes denoising of Gaussian noise (Lebrun, Buades, Morel, IPOL 2013).
+"""Denoise Gaussian noise by non-local Bayes (Lebrun, Buades, Morel, IPOL 2013).
 
-Two passes over a regular grid of reference patches. In each, similar patches form a group, the
-group a Gaussian model, and the model an estimate of every patch of the group; overlapping estimates
-are averaged. The second pass searches, and takes its model, in the result of the first.
+Two passes run over a regular grid of reference patches. In each, similar patches form a group, the
+group determines a Gaussian model, and the model an estimate of every patch of the group.
+Overlapping estimates are averaged. The second pass searches, and fits its model, in the result of
+the first.
 
 `patch_groups` has the estimate of a group, and the published settings.
 """
@@ -285,20 +286,20 @@ def nearest_first(distances: Tensor, usual: int, most: int) -> tuple[Tensor, Ten
 def nl_bayes_strips(
     strips: Iterable[Tensor], height: int, noise: Noise, quality: Quality
 ) -> Iterator[Tensor]:
-    """Remove Gaussian noise from an image that comes and goes in strips of rows, (any, W) float32
-    each.
+    """Remove Gaussian noise from an image that arrives in strips of rows, and yield strips, (any,
+    W) float32 each.
 
-    NaN marks missing pixels; they stay so, and no other sees them. The settings were published for
-    8-bit images: bring the data to a scale where sigma lies within some 5 to 40. Limits: a constant
-    image returns itself, up to rounding; a pixel too near missing ones to lie in any whole patch
-    keeps its value. Any H and W from 1 on; how the strips are cut changes no bit. Holds some 150
-    rows, and the tallest strip.
+    NaN marks missing pixels; they remain missing, and affect no other pixel. The settings were
+    published for 8-bit images: scale the data such that sigma lies within some 5 to 40. Limits: a
+    constant image returns itself, up to rounding. A pixel too near missing ones to lie in any whole
+    patch is not changed. H and W may be any from 1, and the result does not depend on how the
+    strips are cut. Some 150 rows, and the tallest strip, are held in memory.
 
     Args:
         strips: of the image.
-        height: its rows, all strips together.
+        height: the number of rows of all strips.
         noise: to remove.
-        quality: how dense and how large groups are.
+        quality: density of the references and size of the groups.
     """
     # The second pass reads the noisy rows again, behind the first: tee keeps those between.
     as_guide, for_first, for_second = tee(finite_or_missing(strips), 3)

@@ -16,7 +16,7 @@ T = TypeVar("T", int, float)
 
 
 ALIKE_RMS = 4.0
-"""Pass 2 takes every patch within this RMS distance, in grey levels (tau = 16 k^2)."""
+"""Pass 2 includes every patch within this RMS distance, in grey levels (tau = 16 k^2)."""
 
 
 FLAT_GAMMA = 1.05
@@ -109,12 +109,9 @@ def estimate_groups(
     the covariance of the noise.
 
     1. Pass 1: S is the covariance of the noisy patches, signal and noise together.
-
     2. Pass 2: S is the covariance of the guide's patches plus beta Sigma.
-
     3. In a flat group of pass 1 (variance of all its pixels below gamma sigma^2) every pixel
-    becomes their mean.
-
+       becomes their mean.
     4. If S has no Cholesky factor, the noisy patches are returned.
 
     Both S give P_mean + C S^-1 (P - P_mean) with C the signal's covariance, so only S needs an

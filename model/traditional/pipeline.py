@@ -1,9 +1,10 @@
-"""The two traditional pipelines. Every number comes from the two sensors and from the image.
+"""Chain the two traditional pipelines. Every parameter derives from the two sensors and from the
+image.
 
-- denoise first: stabilise, NL-Bayes, inverse, MTF compensation. NL-Bayes meets the white noise that
-  it supposes; what it leaves is amplified afterwards.
-- deconvolve first: MTF compensation, stabilise, NL-Bayes, inverse. The noise that NL-Bayes meets is
-  amplified and coloured by the filter, and it is told how.
+- denoise first: stabilise, NL-Bayes, inverse, MTF compensation. NL-Bayes sees the white noise that
+  it assumes; the residual noise is amplified afterwards.
+- deconvolve first: MTF compensation, stabilise, NL-Bayes, inverse. The noise that NL-Bayes sees is
+  amplified and coloured by the filter, and it is given the colour.
 """
 
 from collections.abc import Iterable, Iterator

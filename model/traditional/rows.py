@@ -59,7 +59,7 @@ def map_tiles(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator
 
 @contextmanager
 def one_thread_per_operation() -> Iterator[int]:
-    """Hold torch to one thread per operation meanwhile; gives the number there was."""
+    """Limit torch to one thread per operation within the block, and yield the previous number."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -72,9 +72,9 @@ def fill_with_local_means(image: Tensor, known: Tensor) -> Tensor:
     """Fill the pixels of (H, W) that are not `known` with the mean of the nearest known ones
     around.
 
-    A pyramid: each level takes its missing pixels from the next, of half the resolution. 0 where
-    nothing is known. scikit-image's biharmonic inpainting gives other values, by up to 117 of 255
-    in a striped photograph (measured).
+    It uses a pyramid: each level fills its missing pixels from the next, of half the resolution.
+    The value is 0 if no pixel is known. scikit-image's biharmonic inpainting gives other values, by
+    up to 117 of 255 in a striped photograph (measured).
     """
     filled = image.where(known, 0.0)
     if bool(known.all()) or max(image.shape) == 1:

@@ -24,19 +24,20 @@ from beers_deploy.profiles.errors import ModelError, OptionError, printable
 
 @dataclass(frozen=True)
 class TrainingRecipe:
-    """The numbers of a run; a checkpoint belongs to one recipe.
+    """The parameters of a run; a checkpoint belongs to one recipe.
 
     Attributes:
-        steps: gradient steps.
-        batch: patches a step, on every worker.
+        steps: the number of gradient steps.
+        batch: patches per step, on every worker.
         learning_rate: the highest, after warm-up.
-        warm_up_steps: of a linear rise from 0.
-        gradient_norm: larger gradients are cut to it; the L1 loss of a restoration is small, far
-            above is a burst.
-        ema_decay: of the running average of the weights, which is what is shipped.
+        warm_up_steps: the number of steps of a linear rise from 0.
+        gradient_norm: larger gradients are clipped to it; the L1 loss of a restoration is small, so
+            that a far larger one is a burst.
+        ema_decay: decay of the running average of the weights, which is shipped.
         loss: weights of the loss's terms.
         seed: of the first weights and of the patches.
-        rounding: the digest of the INT8 file that maps are rounded as; "" rounds none.
+        rounding: the digest of the INT8 file whose rounding is applied to the maps; "" for no
+            rounding.
     """
 
     steps: int
@@ -146,9 +147,9 @@ def require_finite_output(
 
 
 def checkpoint_sha256(tensors: Mapping[str, Tensor], header: Mapping[str, object]) -> str:
-    """Return the hex digest of named tensors and of what the header states beside it.
+    """Return the hex digest of named tensors and of the other content of the header.
 
-    Safetensors has none, and a flipped bit is a plausible weight or another step.
+    Safetensors has no digest, and a flipped bit would be a plausible weight or another step.
     """
     content = {key: value for key, value in header.items() if key != "sha256"}
     digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())

@@ -104,11 +104,11 @@ def within_margin(image: Tensor, margin_px: int) -> Tensor:
 
 
 def looked(spectrum: Tensor, look: Look, fy: Tensor, fx: Tensor) -> Tensor:
-    """Give the ground of a half spectrum a look; its mean changes with the light alone.
+    """Apply a look to the half spectrum of the ground; its mean changes with the light only.
 
     Args:
         spectrum: (H, W // 2 + 1) complex.
-        look: see there.
+        look: the look.
         fy: vertical frequencies (H,) in cycles per target pixel.
         fx: horizontal frequencies (W // 2 + 1,), likewise.
 

@@ -63,13 +63,13 @@ class Stage:
 
     Attributes:
         name: of its folder.
-        steps: gradient steps.
-        batch: patches a step.
+        steps: the number of gradient steps.
+        batch: patches per step.
         learning_rate: the highest; a cosine leads it down to 0.
         rounding: whether maps are rounded as in the INT8 file of the weights that the stage begins
             with.
         precision: of the blocks, float32 or bfloat16.
-        average: decay a step of the running average of the weights, which is what is kept.
+        average: decay per step of the running average of the weights, which is stored.
     """
 
     name: str

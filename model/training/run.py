@@ -169,12 +169,12 @@ def loss_of(run: Run) -> tuple[RestorationLoss, str]:
 
 
 def data_sha256(run: Run, loss: RestorationLoss) -> str:
-    """Return one digest of all that a run learns from: a resumed run must learn from the same, or
-    it is none.
+    """Return one digest of all data that a run learns from, because a resumed run must learn from
+    the same.
 
     Args:
-        run: what the options say.
-        loss: with or without LPIPS, whose weights may be missing at the second time.
+        run: the options.
+        loss: with or without LPIPS, whose weights may be missing when the run is resumed.
     """
     patches = run.patches
     files = list(chain.from_iterable(map(list_images, run.images)))

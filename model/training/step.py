@@ -57,16 +57,16 @@ class Inputs:
 
 
 class Step:
-    """Forward, loss, backward, clipped gradients, Adam and the running average.
+    """One gradient step: forward, loss, backward, clipped gradients, Adam and the running average.
 
     Args:
         network: on its device.
-        loss: of what it gives.
-        forward: the network, or what averages its gradients over workers.
-        gradient_norm: larger gradients are cut to it.
+        loss: function of its output.
+        forward: the network, or a wrapper that averages its gradients over workers.
+        gradient_norm: larger gradients are clipped to it.
         bfloat16: whether the blocks are computed in it.
-        rounding: how maps are rounded; None leaves them as they are.
-        agree: see there; None for a single worker.
+        rounding: how maps are rounded; None does not round them.
+        agree: see `Agree`; None for a single worker.
 
     Attributes:
         average: the running average of the weights by name.

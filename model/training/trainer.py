@@ -142,7 +142,7 @@ class Spent:
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
-        """Count the time of what is done within as waiting."""
+        """Count the time within the block as waiting."""
         begun = time.monotonic()
         yield
         self.waited_s += time.monotonic() - begun
@@ -164,19 +164,19 @@ class Trainer:
 
     Args:
         variant: the network's size.
-        recipe: see there.
-        loss: the loss that the recipe weighs.
+        recipe: the parameters of the run.
+        loss: the loss that the recipe weights.
         worker: this process among those of the run.
-        device: where the steps are computed.
-        start: a network of the same kind and size to go on from; None draws new weights.
-        precision: what the body is computed in; it is the machine's, and a resumed run may take
+        device: on which the steps are computed.
+        start: a network of the same kind and size to continue from; None draws new weights.
+        precision: number format of the body; it depends on the machine, and a resumed run may use
             another.
         conditioned: whether the network is given the sensor of each patch.
-        rounding: of a conditioned network's maps, as its INT8 file rounds them; None leaves them as
-            they are.
+        rounding: of a conditioned network's maps, as its INT8 file rounds them; None does not round
+            them.
 
     Attributes:
-        data: digest of all that the run learns from; a checkpoint belongs to one.
+        data: digest of all data that the run learns from; a checkpoint belongs to one.
     """
 
     def __init__(
@@ -218,9 +218,9 @@ class Trainer:
         """Train to the last step. Ctrl-C leaves a checkpoint of the last whole step.
 
         Args:
-            batches: from a number on, all that follow.
+            batches: function that returns all batches from a number on.
             checkpoint: the file.
-            schedule: see there; of several workers, the first keeps to it.
+            schedule: when to report, validate and save; with several workers, the first does.
         """
         schedule = schedule if self.worker.first else Schedule()
         spent = Spent()
@@ -286,10 +286,10 @@ class Trainer:
         self.step = step
 
     def seen(self) -> list[list[float]]:
-        """Look at what the steps since the last look gave, and stop a run that has gone wrong.
+        """Read the results of the steps since the last call, and stop a failing run.
 
         Returns:
-            Of each step 1 if it was skipped, else 0; its loss; and the loss's terms.
+            For each step 1 if it was skipped, else 0; its loss; and the loss's terms.
         """
         rows: list[list[float]] = torch.stack(self._unseen).tolist() if self._unseen else []
         first = self.step - len(rows) + 1
