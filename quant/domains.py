@@ -12,7 +12,9 @@ from onnx import ModelProto, NodeProto
 
 OPSET = 17
 IR_VERSION = 8
-"""The version of ONNX's file format that this project writes."""
+"""The versions of ONNX's operators (OPSET) and file format (IR_VERSION) that this
+project writes.
+"""
 STANDARD = ("", "ai.onnx")
 MICROSOFT = "com.microsoft"
 SEPARATOR = "::"
@@ -88,7 +90,7 @@ def is_foreign(name: str) -> bool:
 
 
 def foreign_remedy(domain: str, op_type: str) -> str:
-    """Return what a user can do about a foreign operator."""
+    """Return advice for a user about a foreign operator."""
     if op_type.startswith("Dynamic"):
         return FLOAT
     if "QuantizeLinear" in op_type or op_type == "FixNeuron":

@@ -37,8 +37,8 @@ LAYERS = {
 
 
 def float_nodes(model: onnx.ModelProto) -> list[Node]:
-    """Return the nodes that compute in float: all but those on integers and those that only say how
-    to read them.
+    """Return the nodes that compute in float: all except those on integers and those that only
+    define how integers are read.
     """
     graph = OnnxGraph(model)
     integers = Integers(graph)
@@ -58,8 +58,8 @@ def float_layers_check(model: onnx.ModelProto) -> Check:
 def float_note(model: onnx.ModelProto) -> list[str]:
     """Return a note that names the float operators of another quantiser's file.
 
-    In a file of ours they are the host part, which `encoding_faults` compares with the integers
-    node by node.
+    In a file of this project they are the host part, which `encoding_faults` compares with the
+    integers node by node.
     """
     try:
         read_core(model)

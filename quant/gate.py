@@ -90,7 +90,7 @@ class Spread:
         return float(np.sqrt(np.average((dn - mean) ** 2, weights=self.counts)))
 
     def share_beyond(self, dn: int) -> float:
-        """Return the share of the pixels that differ by more than so many whole DN."""
+        """Return the share of the pixels that differ by more than a number of integer DN."""
         return 1 - float(self.counts[MAX_DN - dn : MAX_DN + dn + 1].sum() / self.counts.sum())
 
     def worst(self, count: int) -> list[int]:
@@ -188,25 +188,24 @@ def compare(
     patches: Patches,
     metric: str = "",
 ) -> GateResult:
-    """Run both networks on patches; images are clipped as a file would.
+    """Run both networks on patches; images are clipped as in a file.
 
     Images of other ranges than [0, 1] are compared as shares of these. The patches' own ranges
     count, because an INT8 file that stated a wide one would make its errors small.
 
-    Without references, or where they have another size than what is compared, the PSNRs to them are
-    NaN.
+    Without references, or if they differ in size from the results, the PSNRs to them are NaN.
 
     Args:
         float_session: the float network's.
         int8_session: the INT8 network's.
         patches: that both are run on.
-        metric: one of `METRICS`, by which results are compared with the references too.
+        metric: one of `METRICS`, by which results are also compared with the references.
 
     Raises:
         ModelError: results of different shapes.
-        ImageError: a reference of the results' size outside [0, 1], or a sample without one where
+        ImageError: a reference of the results' size outside [0, 1], or a sample without one if
             others have it.
-        OptionError: references that the metric does not take.
+        OptionError: references that the metric does not accept.
     """
     counts = np.zeros(BINS, np.int64)
     dn_counts = np.zeros(2 * MAX_DN + 1, np.int64)
@@ -338,11 +337,12 @@ def _psnr_db(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 def gate_row(result: GateResult, shares: Mapping[str, float] | None = None) -> Row:
-    """Return what INT8 changes as a row of the table "gate".
+    """Return the effect of INT8 as a row of the table "gate".
 
     Args:
-        result: what was measured.
-        shares: of each layer's results the share at the ends of 8 bits, which a gate also prints.
+        result: the measurements.
+        shares: for each layer the share of its results at the ends of 8 bits, which a gate also
+            prints.
     """
     entries = {
         "MAE": (result.mae, SCALE),
@@ -379,7 +379,7 @@ def _figure(value: float, unit: str, result: GateResult) -> Figure:
 
 
 def _saturation(shares: Mapping[str, float], source: str) -> Figure:
-    """Return the share of results at the ends of 8 bits, in the layer where it is largest."""
+    """Return the largest share of a layer's results at the ends of 8 bits, with the layer."""
     if not shares:
         return unavailable("%", "no result in the file is rounded to 8 bits")
     layer = max(shares, key=lambda name: shares[name])

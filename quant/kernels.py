@@ -1,22 +1,22 @@
-"""INT8 operators that add exactly, also on processors whose fast kernels do not.
+"""Run INT8 operators that add exactly, also on processors whose fast kernels do not.
 
 x86 processors without VNNI multiply unsigned activations by signed weights and add neighbouring
-products in saturating int16 (`vpmaddubsw`). What lies beyond is clipped without a word, which gives
-other numbers than the DPU's. There a session computes each operator in the fastest way that is
-proven exact, chosen as the file is opened:
+products in saturating int16 (`vpmaddubsw`). Values beyond the range are clipped silently, which
+gives other numbers than the DPU's. On such processors a session computes each operator in the
+fastest way that is proven exact, chosen when the file is opened:
 
-1. SIGNED: weights stay as they are, for no two neighbouring products can leave int16, whatever the
-  activations. a. A tensor behind a ReLU is stored as 128..255 around 128. Moved down to 0..127
-  around 0, no weights saturate. b. Otherwise all pairs of weights that a kernel may form are
-  checked.
-2. UNSIGNED: weights stored as uint8, 128 higher and around 128. These kernels add in int32, at half
-  the speed.
-3. CONVERTED: the same for signed activations, which are moved to uint8 before the operator, and
-  back behind it.
+1. SIGNED: weights are not changed, because no two neighbouring products can leave int16, for any
+   activations. a. A tensor behind a ReLU is stored as 128..255 around 128. Moved down to 0..127
+   around 0, no weights saturate. b. Otherwise all pairs of weights that a kernel may form are
+   checked.
+2. UNSIGNED: weights are stored as uint8, 128 higher and around 128. These kernels add in int32, at
+   half the speed.
+3. CONVERTED: the same for signed activations, which are converted to uint8 before the operator, and
+   back behind it.
 
-Each is the same sum of the same integers, so the results are those of an exact processor, bit
-for bit. Float operators between 8-bit tensors (QDQ), of which onnxruntime makes integer ones, are
-checked as what they become.
+Each is the same sum of the same integers, so the results are those of an exact processor, bit for
+bit. Float operators between 8-bit tensors (QDQ), of which onnxruntime makes integer ones, are
+checked as those integer operators.
 """
 
 import hashlib
@@ -92,7 +92,7 @@ class _Rewriting(ABC):
 
     @abstractmethod
     def around(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
-        """Return what replaces a node."""
+        """Return the nodes that replace a node."""
 
     def rewritten(self) -> onnx.ModelProto:
         """Replace every node, and return the model."""
@@ -173,10 +173,10 @@ class _Exact(_Rewriting):
         self.moved: set[str] = set()
 
     def move_relu_down(self, relu: onnx.NodeProto) -> None:
-        """Store what is behind max(result, its zero point) around 0: min(result moved down, what is
-        left of 255).
+        """Store the result of a ReLU, max(result, its zero point), around 0: the result is moved
+        down, and the ReLU becomes a Min.
 
-        Left as it is where anything but the operators above would notice.
+        Nothing is changed if another operator than those above reads the tensor.
         """
         source = relu.input[0]
         result = relu.output[0]
@@ -220,7 +220,7 @@ class _Exact(_Rewriting):
         )
 
     def around(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
-        """Return the node computed in an exact way, with what converts before and behind it."""
+        """Return the node computed in an exact way, with the conversions before and behind it."""
         if node.op_type in FLOAT_OPERATORS:
             return self._between(node)
         places = OPERATORS.get(node.op_type)
@@ -247,7 +247,9 @@ class _Exact(_Rewriting):
         return self._converted(node, places) if signed else [node]
 
     def _between(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
-        """Return a float operator on dequantised weights, after what dequantises uint8 ones."""
+        """Return a float operator on dequantised weights, after the nodes that dequantise uint8
+        ones.
+        """
         source = self.writers.get(node.input[1])
         weight = (
             self.arrays.get(source.input[0])
@@ -281,7 +283,9 @@ class _Exact(_Rewriting):
             node.input[place] = self.constant((value.astype(np.int16) + MIDDLE).astype(np.uint8))
 
     def _converted(self, node: onnx.NodeProto, places: Places) -> list[onnx.NodeProto]:
-        """Return the node on uint8 activations, between what moves these up and its result down."""
+        """Return the node on uint8 activations, between the nodes that convert these and its
+        result.
+        """
         self._lift(node, places.zero)
         before, node.input[0] = self._moved(node.input[0], MIDDLE, TensorProto.UINT8)
         if places.result_zero is None:
@@ -296,7 +300,9 @@ class _Exact(_Rewriting):
     def _moved(
         self, source: str, by: int, kind: int, result: str = ""
     ) -> tuple[list[onnx.NodeProto], str]:
-        """Return what moves an 8-bit tensor to another type of 8 bits, once for all its readers."""
+        """Return the node that converts an 8-bit tensor to another 8-bit type, once for all its
+        readers.
+        """
         result = result or f"{source}.unsigned"
         if result in self.moved:
             return [], result
@@ -336,7 +342,7 @@ class _ChannelPadding(_Rewriting):
         self.wide_inputs = set[str]()
 
     def around(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
-        """Return the node, and what widens its input and narrows its output."""
+        """Return the node, and the nodes that widen its input and narrow its output."""
         weight = self.arrays.get(node.input[3]) if node.op_type == "QLinearConv" else None
         if weight is None or weight.ndim != 4 or not self._takes_zeros(node):
             return [node]

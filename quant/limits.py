@@ -29,18 +29,18 @@ class Limits:
     Attributes:
         mae: mean absolute difference of INT8 from float. The default suits networks that change an
             image as little as ConvBEERS does (0.01 of full scale).
-        p999: 99.9th percentile of the size of the difference.
+        p999: 99.9th percentile of the absolute difference.
         std_over_mae: standard deviation of the difference over the MAE. Rounding alone gives 1.25
             in one image and up to 2.3 over images of all brightnesses, a few clipped edges give 4;
-            clipped ground drives it up.
-        drop_share: PSNR lost against the reference, as a share of what the float network gains over
-            its input. It applies where the float network gains anything and where the references
-            have the size of the results.
+            clipped ground gives more.
+        drop_share: PSNR lost against the reference, as a share of the float network's gain over its
+            input. It applies if the float network has a gain and the references have the size of
+            the results.
         psnr_drop_db: PSNR lost against the reference.
         min_psnr_float_int8_db: smallest PSNR of INT8 against float.
-        metric_loss: what INT8 loses by the metric that is chosen.
-        saturated: share of a layer's results at the ends of 8 bits, of the layer with most.
-        mae_growth: how many times a stored baseline's MAE; 1.05 where there is a baseline and no
+        metric_loss: loss of INT8 by the chosen metric.
+        saturated: largest share of a layer's results at the ends of 8 bits.
+        mae_growth: MAE as a multiple of a stored baseline's; 1.05 if there is a baseline and no
             such limit.
 
     Examples:
@@ -82,7 +82,7 @@ def limits_of(
     given: "Limits | Mapping[str, float] | str | os.PathLike[str] | None",
     max_mae: float | None = None,
 ) -> Limits:
-    """Return the limits of a TOML file or a mapping; what they leave out has its default.
+    """Read the limits of a TOML file or a mapping; limits that are missing have their defaults.
 
     Args:
         given: limits, a mapping or a TOML file such as `mae = 0.0007`; the defaults if None.
@@ -163,11 +163,11 @@ def judge(
     """Check every limit that is set.
 
     Args:
-        result: what INT8 changes.
+        result: the measured effect of INT8.
         limits: the largest values allowed.
         baseline_mae: the MAE of an earlier gate, if there is a baseline.
-        shares: of each layer's results the share at the ends of 8 bits; None leaves them out, and
-            no limit is kept where nothing is 8-bit.
+        shares: for each layer the share of its results at the ends of 8 bits. With None it is not
+            checked; without 8-bit tensors its limit is not met.
     """
     figures: list[tuple[str, float, float | None, str, str]] = [
         ("MAE", result.mae, limits.mae, "of full scale", ""),

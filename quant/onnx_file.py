@@ -42,16 +42,15 @@ REMEDY = (
 
 
 def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
-    """Read an ONNX model, with weights that it keeps beside it: the one way by which a file comes
-    in.
+    """Read an ONNX model with its external weights; every file is read by this function.
 
-    A float network comes as its simplest equal (`quant.simplify`), an INT8 one as it is. One
-    that no runtime may get comes as it is too, where it is only looked at.
+    A float network is simplified (`quant.simplify`), an INT8 one is returned unchanged. So is a
+    model that is only inspected.
 
     Args:
         path: the file.
-        to_run: whether a runtime may get it; False where its nodes are only looked at, whosever
-            they are.
+        to_run: whether a runtime may open it; False if its nodes are only inspected, from any
+            domain.
 
     Raises:
         ModelError: missing, empty, not ONNX, of weights that are not finite, or not to be trusted
@@ -241,7 +240,7 @@ OUTPUT = "output"
 
 
 def with_one_output(model: onnx.ModelProto, name: str, where: str) -> onnx.ModelProto:
-    """Return the network with one of its outputs, and only what that is computed of.
+    """Return the network with one of its outputs, and only the nodes that compute it.
 
     Raises:
         OptionError: no such output.

@@ -115,11 +115,10 @@ class LayerError:
 def layer_errors(
     graph: Graph, core: IntCore, crops: Iterable[np.ndarray]
 ) -> tuple[list[LayerError], Loss]:
-    """Return what each layer of a network loses, and what all lose jointly, over crops (1, C, H,
-    W).
+    """Measure the error of each layer of a network, and of all jointly, over crops (1, C, H, W).
 
     Args:
-        graph: plane-reading, in float: what the core was rounded from.
+        graph: a float graph that reads the planes, from which the core was rounded.
         core: the same operations in integers.
         crops: each passes through the network once for every layer.
     """
@@ -195,7 +194,7 @@ def _in_int8(op: Op, core: IntCore, exact: Mapping[str, np.ndarray]) -> np.ndarr
 
 
 def layer_error_rows(result: Quantized, patches: Patches) -> list[Row]:
-    """Return a row for every layer in int8 by itself, and one for all of them."""
+    """Return a row for every layer that alone is in int8, and one for all of them."""
     crops = few_crops(patches.degraded, result.host)
     layers, together = layer_errors(result.graph, result.core, crops)
     source = f"{len(crops)} patches, all other layers in float"
@@ -224,7 +223,7 @@ def _sqnr(loss: Loss, source: str) -> Figure:
 
 
 def worst_row(number: int, patches: Patches, spread: Spread) -> Row:
-    """Return the errors of a patch; of a simulated one also what it shows through which sensor."""
+    """Return the errors of a patch; for a simulated one also its content and its sensor."""
     errors = {"MAE": spread.mae[number], "max": spread.largest[number]}
     kind = "simulated patch" if patches.views else "sample"
     figures = {
@@ -262,19 +261,20 @@ def sizes_row(spread: Spread) -> Row:
 
 
 MUCH_DB = 0.2
-"""The loss from which (or the PSNR up to which) the costliest layers are listed."""
+"""The PSNR drop above which the costliest layers are listed."""
 
 
 def losses(
     result: Quantized, gate: GateResult, patches: Patches, layers: Sequence[Row] = ()
 ) -> str:
-    """Return the loss of INT8 in a sentence, on the worst patch too; where it is large, also which
-    tensors cost most and what to try.
+    """Describe the loss of INT8 in a sentence, also for the worst patch.
+
+    If the loss is large, the costliest layers and advice are added.
 
     Args:
         result: the network.
         gate: the differences on the patches.
-        patches: that calibration did not see.
+        patches: held out from calibration.
         layers: of `layer_error_rows`, if they were computed before.
     """
     if math.isnan(gate.drop_db):
@@ -321,7 +321,7 @@ def headline(gate: GateResult, layers: Sequence[Row]) -> str:
 
 
 def kind_of_error(std_over_mae: float) -> str:
-    """Return what std / MAE says, in one sentence."""
+    """Return one sentence on the meaning of std / MAE."""
     sentence = f"std / MAE is {std_over_mae:.2f}, where a Gaussian has 1.25"
     if std_over_mae <= ROUNDING:
         return f"{sentence}: the errors are mostly those of rounding."

@@ -46,10 +46,10 @@ class Rounded:
     Attributes:
         name: of the tensor.
         scale: its scale, zero point and integer type.
-        low_is_relu: True if a ReLU reads the tensor, so that what is clipped at the lower end would
+        low_is_relu: True if a ReLU reads the tensor, so that values clipped at the lower end would
             have become zero anyway.
-        counted: the channels that count. Of a result in several copies these are the coarse ones,
-            which hold what others clip.
+        counted: the channels that count. In a result of several copies these are the coarse ones,
+            which hold the values that others clip.
     """
 
     name: str
@@ -186,7 +186,7 @@ class Relus:
         more favourable case.
 
         Args:
-            wanted: the number of ReLUs that the file should have.
+            wanted: the expected number of ReLUs of the file.
         """
         return max(wanted - self.explicit - self.folded, self.explicit - wanted, 0)
 
@@ -282,7 +282,7 @@ def _is_table_of_relu(table: np.ndarray | None) -> bool:
 
 
 def _begins_at_zero(node: Node, tensors: dict[str, Rounded], convolved: set[str]) -> bool:
-    """Return True if a convolution's result is rounded to numbers of which none is below zero.
+    """Return True if a convolution's result is rounded to numbers that are all at least zero.
 
     Args:
         node: any node.
@@ -298,14 +298,14 @@ def _begins_at_zero(node: Node, tensors: dict[str, Rounded], convolved: set[str]
 def structure_checks(
     float_model: onnx.ModelProto, int8: onnx.ModelProto, must_describe: bool = False
 ) -> list[Check]:
-    """Check that the INT8 file keeps its ReLUs, is encoded as meant, and does not depend on
+    """Check that the INT8 file has its ReLUs, is encoded correctly, and does not depend on
     optimisations.
 
     Args:
         float_model: the float network.
         int8: the INT8 network.
         must_describe: if True, a file that does not describe its integers fails. Otherwise their
-            encoding is left out, because files of other quantisers have no description.
+            encoding is not checked, because files of other quantisers have no description.
 
     Returns:
         The checks of the ReLUs, of the encoding if it is known, of float layers, and of the results

@@ -17,7 +17,7 @@ ROUNDS = 4
 range in each.
 """
 FEW = 8
-"""A line with no more pixels than this cannot be measured."""
+"""A line with fewer valid pixels than this cannot be measured."""
 LEVEL_LINES = 9
 """Lines over whose median a line's level is taken, so that its own fault does not matter."""
 REACH = 3

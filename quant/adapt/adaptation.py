@@ -1,10 +1,8 @@
 """Choose how each kind of operator that a DPU lacks is replaced, and measure the loss.
 
 1. Replace each kind by the other function, alone, and compensate.
-
 2. Where that still loses more than `ENOUGH_DB`, use the exact replacement if there is one: it loses
-nothing in float, but needs more operations.
-
+   nothing in float, but needs more operations.
 3. Replace all kinds as chosen, and compensate jointly.
 """
 
@@ -63,10 +61,11 @@ class Adapted:
 
 @dataclass(frozen=True)
 class Trial:
-    """A replacement as it is and compensated, each compared with the original network.
+    """A replacement without and with compensation, each compared with the original network.
 
     Attributes:
-        model: the compensated network, or the one without if that is nearer to the original.
+        model: the compensated network, or the one without compensation if that is nearer to the
+            original.
         before: the difference without compensation.
         after: the difference of `model`.
     """
@@ -77,7 +76,7 @@ class Trial:
 
     @property
     def is_enough(self) -> bool:
-        """Return True if the loss is small enough to do without an exact replacement."""
+        """Return True if the loss is small enough to make an exact replacement unnecessary."""
         if math.isnan(self.after.drop_db):
             return self.after.psnr_between_db >= NEAR_DB
         return self.after.drop_db <= ENOUGH_DB

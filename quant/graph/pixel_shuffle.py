@@ -69,9 +69,9 @@ def _chains(graph: OnnxGraph) -> list[list[Node]]:
 
 
 def _shuffle(chain: list[Node], sizes: tuple[int, ...], graph: OnnxGraph) -> Node | None:
-    """Return the pixel shuffle that a chain makes of an image; 0 stands for free sizes.
+    """Return the pixel shuffle that is equivalent to a chain of nodes; 0 stands for free sizes.
 
-    None if the chain makes no shuffle.
+    None if the chain is no shuffle.
     """
     for side_px in SIDES_PX if len(sizes) == 4 and sizes[1] else ():
         shape = sizes[0] or 1, sizes[1], sizes[2] or side_px, sizes[3] or 2 * side_px

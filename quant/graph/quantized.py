@@ -204,7 +204,7 @@ class Integers:
         return {role: name for role, name in names.items() if name}
 
     def _follow(self, node: Node) -> None:
-        """Work out what a node's results hold, from what its inputs hold."""
+        """Determine the kind of a node's results from the kinds of its inputs."""
         source = node.inputs[0] if node.inputs else ""
         result = node.outputs[0]
         if node.op_type == "DequantizeLinear":

@@ -39,7 +39,7 @@ class Resizing:
 
     @classmethod
     def of(cls, node: Node, graph: OnnxGraph) -> "Resizing":
-        """Return what a node states."""
+        """Read the attributes and inputs of a node."""
         # Before opset 11 the factors are the second input, and places start at the corner.
         old = node.op_type == "Upsample" or len(node.inputs) == 2
         attribute = node.attributes.get

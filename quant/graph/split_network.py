@@ -294,7 +294,7 @@ def channels_of(graph: Graph, given: Mapping[str, int]) -> dict[str, int]:
 
 
 def add_channels(widths: dict[str, int], ops: Iterable[Op]) -> None:
-    """Add the channels of what operations write to those of the tensors that they read."""
+    """Add the numbers of channels of operations' results to those of their inputs."""
     for op in ops:
         unwritten = [name for name in op.inputs if name not in widths]
         if unwritten:

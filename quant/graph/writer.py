@@ -136,7 +136,7 @@ def _resize(w: GraphWriter, op: Resize, feeds: list[str], output: str) -> None:
 
 
 def write_shuffle(w: GraphWriter, op: Shuffle, source: str, output: str, channels: int = 1) -> None:
-    """Write a pixel shuffle, or its inverse, of a tensor of any type with so many channels."""
+    """Write a pixel shuffle, or its inverse, of a tensor of any type."""
     if op.up:
         mode = "CRD" if op.columns_first else "DCR"
         w.node("DepthToSpace", output, [source], op.name, blocksize=op.block, mode=mode)

@@ -241,7 +241,7 @@ class BankSum(DualRange):
 
 
 def _fine_limit(scale: float) -> float:
-    """Return the largest value of a fine copy that counts; half a unit keeps float error out."""
+    """Return the largest valid value of a fine copy, plus half a unit to tolerate float errors."""
     return (FINE_MAX + 0.5) * scale
 
 

@@ -62,12 +62,12 @@ class HostPart:
     def of(
         cls, network: SplitNetwork, decoding: OutputDecoding, input_ranges: Ranges = ()
     ) -> "HostPart":
-        """Return the host's part of a float network that reads the image.
+        """Build the host's part of a float network that reads the image.
 
         Args:
-            network: the float network, split into its core and what the host computes.
+            network: the float network, split into its core and the host's part.
             decoding: of the core's result.
-            input_ranges: of the image's channels; empty where all are in [0, 1].
+            input_ranges: of the image's channels; empty if all are in [0, 1].
         """
         channels = network.core_channels
         return cls(

@@ -22,11 +22,11 @@ LEAKY_OF_256 = 26
 def convolve(
     image: np.ndarray, weight: np.ndarray, window: Window, groups: int = 1, transposed: bool = False
 ) -> np.ndarray:
-    """Return the sums of products of a convolution with zero padding, (N, I, H, W) to
-    (N, O, H', W') int64.
+    """Compute the sums of products of a convolution with zero padding, (N, I, H, W) to (N, O, H',
+    W') int64.
 
-    A product of matrices a strip of rows, in floats that hold its sums exactly: the windows of a
-    whole image would take kh kw times its memory.
+    It computes a matrix product per strip of rows, in floats that represent its sums exactly. The
+    windows of a whole image would need kh kw times its memory.
     """
     if transposed:
         wide, window = _between_zeros(image, weight, window)

@@ -1,14 +1,14 @@
-"""The DPU's arithmetic in integers, as documented, independent of any runtime (facts: UG1414
-3.5, vai_q).
+"""Compute the DPU's arithmetic in integers, as documented and independent of any runtime (facts:
+UG1414 3.5, vai_q).
 
     convolution: int8 products added in int32, plus bias << shift_bias, ReLU,
                  >> shift_cut rounded, to [-128, 127]
     add:         the finer input aligned to the coarser, sum shifted by shift_write rounded,
                  to [-128, 127]
 
-Activations round half up; a runtime that computes in float rounds half to even. Where a shifted sum
-ends in exactly one half the two differ by one unit: `half_even` takes the runtime's rule, so that
-both can be proven and counted.
+Activations round half up; a runtime that computes in float rounds half to even. If a shifted sum
+ends in exactly one half, the two differ by one unit. `half_even` selects the runtime's rule, so
+that both can be proven and counted.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -47,11 +47,11 @@ from beers_deploy.quant.onnx_file import any_size, with_outputs
 from beers_deploy.quant.session import few_crops, open_any_size, open_session, result_of
 
 INT32_BITS = 31
-"""Of an accumulator, without the sign."""
+"""The number of bits of an accumulator, without the sign."""
 
 NARROW_BITS = 23
-"""Of a 24-bit accumulator, without the sign: the documents hint at one (facts on the DPU's rules),
-int32 has 31.
+"""The number of bits of a 24-bit accumulator, without the sign. The documents suggest one (facts on
+the DPU's rules); int32 has 31.
 """
 BITS_SOURCE = "128 times the sum of the weights' sizes, plus the bias: no input exceeds it"
 
@@ -63,8 +63,8 @@ class Faults:
     Attributes:
         shifts: wrong shifts, by operation and field: `shift_cut`, `shift_bias` of a convolution,
             `shift_write` of an add.
-        touch: what becomes of a tensor, by name, between the operation that writes it and those
-            that read it.
+        touch: function by tensor name that changes a tensor between the operation that writes it
+            and those that read it.
     """
 
     shifts: Mapping[tuple[str, str], int] = field(default_factory=dict)
@@ -80,15 +80,15 @@ SOUND = Faults()
 
 @dataclass(frozen=True)
 class LayerReport:
-    """What one operation did on the images that it was run on.
+    """The behaviour of one operation on the images that it was run on.
 
     Attributes:
         name: of the operation.
         peak_bits: bits that the largest accumulator needed, without the sign.
-        proven_bits: bits that no input can exceed: 128 times the sum of the weights' sizes, plus
-            the bias.
-        saturated: share of the results that came to int8's ends.
-        ties: share of the results whose rounding was decided by tie rounding.
+        proven_bits: bits that no input can exceed: 128 times the sum of the weights' absolute
+            values, plus the bias.
+        saturated: share of the results at the ends of int8.
+        ties: share of the results that were decided by tie rounding.
     """
 
     name: str
@@ -141,18 +141,18 @@ many more fractional bits an activation has made these sums longer than the accu
 """
 
 INT8_BITS = 7.0
-"""Of what only moves values, without the sign."""
+"""The number of bits of values that are only moved, without the sign."""
 
 
 def layer_sums(
     core: IntCore, op: IntConv | Op, tensors: Mapping[str, np.ndarray], faults: Faults = SOUND
 ) -> Sums:
-    """Return the sums of an operation before they are rounded to int8.
+    """Compute the sums of an operation before they are rounded to int8.
 
     Args:
         core: of the operation.
         op: the operation.
-        tensors: what it reads, by name.
+        tensors: its inputs, by name.
         faults: wrong shifts.
     """
     inputs = [tensors[name] for name in op.inputs]
@@ -174,7 +174,7 @@ def layer_sums(
 
 
 def _moving(core: IntCore, op: Op, inputs: list[np.ndarray]) -> np.ndarray:
-    """Return values that are handed on, or looked up."""
+    """Return values that are moved or looked up in a table."""
     if isinstance(op, Concat):
         return np.concatenate(inputs, axis=1)
     if isinstance(op, MaxPool):
@@ -294,8 +294,9 @@ def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreem
 def integer_rows(
     model: onnx.ModelProto, core: IntCore, host: onnx.ModelProto, images: Iterable[np.ndarray]
 ) -> tuple[Row, ...]:
-    """Return a row for each integer operation on a crop of a few images (1, C, H, W), and last one
-    for what the DPU's tie rounding changes.
+    """Return a row for each integer operation on a crop of a few images (1, C, H, W).
+
+    The last row is for the effect of the DPU's tie rounding.
     """
     patches = few_crops(images, model)
     agreements = [agreement(core, host, crop) for crop in patches]

@@ -22,7 +22,7 @@ from beers_deploy.quant.untrusted import FILE_BYTES, VALUE_BYTES, check_size
 
 
 def take_in(model: onnx.ModelProto, path: Path) -> None:
-    """Put the weights that a model of this file keeps beside it into the model."""
+    """Load the weights of a model from the file next to it into the model."""
     used_bytes = 0
     for tensor in model.graph.initializer:
         if tensor.data_location == TensorProto.EXTERNAL:
@@ -56,11 +56,10 @@ def network_sha256(path: Path) -> str:
 
 @contextmanager
 def unchanged(path: Path) -> Iterator[str]:
-    """Give the digest of a network's file, and raise ModelError if the file is another one after it
-    was read.
+    """Yield the digest of a network's file; raise ModelError if the file changed while it was read.
 
-    So the digest is that of the bytes that were parsed. It is empty where there is no file, which
-    the reader refuses.
+    The digest is therefore that of the bytes that were parsed. It is empty if there is no file; the
+    reader then raises an error.
     """
     before = network_sha256(path) if path.is_file() else ""
     yield before

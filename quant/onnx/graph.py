@@ -60,7 +60,7 @@ class Node:
         return f"{self.op_type} {self.name}"
 
     def written(self) -> NodeProto:
-        """Return the message of the node as it is now."""
+        """Return the current message of the node."""
         proto = NodeProto()
         proto.CopyFrom(self.proto)
         proto.input[:] = self.inputs
@@ -68,11 +68,11 @@ class Node:
         return proto
 
     def window(self, kernel: Sequence[int] = (), size: Pair = (0, 0)) -> tuple[Pair, Window] | None:
-        """Return its kernel and how that moves over rows and columns; None if the node states none.
+        """Return its kernel and its window; None if the node states none.
 
         Args:
-            kernel: sides of its weights; empty for what the node states itself.
-            size: of the map that it reads, or any that differs by whole strides: for `auto_pad`.
+            kernel: sides of its weights; empty to use the node's own attribute.
+            size: of the map that it reads, or any that differs by integer strides: for `auto_pad`.
         """
         attribute = self.attributes.get
         sides = (
@@ -103,15 +103,15 @@ Rewriting = Callable[["OnnxGraph", Node], list[Node] | None]
 
 
 class OnnxGraph:
-    """The nodes of a model in order, but for those that only hold a constant.
+    """The nodes of a model in order, except those that only hold a constant.
 
     Attributes:
         nodes: in order.
-        constants: initializers and what nodes of the kind Constant hold, by name.
-        inputs: tensors that are no constants, with their sizes, 0 where the file states none.
-        types: ONNX's number of what each input holds.
+        constants: initializers and the values of Constant nodes, by name.
+        inputs: tensors that are no constants, with their sizes, 0 if the file states none.
+        types: ONNX's number of the type of each input.
         outputs: the names of the results.
-        result_sizes: their sizes, 0 where the file states none; empty if it states no rank.
+        result_sizes: their sizes, 0 if the file states none; empty if it states no rank.
         readers: for each tensor the nodes that read it, one as often as it does.
         writers: for each tensor the node that writes it.
     """
@@ -198,7 +198,7 @@ class OnnxGraph:
         return self.writers.get(name) if self.n_reads(name) == 1 else None
 
     def rename(self, result: str, name: str) -> None:
-        """Let a result have the name of the one that it takes the place of."""
+        """Rename a result to that of the tensor that it replaces."""
         writer = self.writers[result]
         self.writers[name] = writer
         writer.outputs = tuple(name if output == result else output for output in writer.outputs)
@@ -216,7 +216,8 @@ class OnnxGraph:
     def numbers(
         self, node: Node, place: int, key: str, otherwise: Sequence[float] = ()
     ) -> list[Any] | None:
-        """Return what a node states in a constant input or, of older opsets, in an attribute.
+        """Return the numbers that a node states in a constant input or, in older opsets, in an
+        attribute.
 
         None if other nodes compute it.
         """
@@ -227,7 +228,7 @@ class OnnxGraph:
 
 
 def constants(model: onnx.ModelProto) -> dict[str, np.ndarray]:
-    """Return the constants of a model by name: initializers, and what Constant nodes hold."""
+    """Return the constants of a model by name: initializers, and the values of Constant nodes."""
     arrays = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
     functions = functions_of(model)
     for node in model.graph.node:

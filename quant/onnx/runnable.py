@@ -1,6 +1,6 @@
 """Check that a runtime may open an ONNX file: operators of ONNX itself, and sizes within bounds.
 
-Only the file's content has been checked before (`quant.untrusted`).
+`quant.untrusted` has checked the file's content before.
 """
 
 import math

@@ -1,9 +1,9 @@
 """Bound the search for equalization factors, and estimate its time before it begins.
 
 1. Count the work of a candidate: the multiply-accumulates of the operations that it runs again, and
-   what rounding and loading its weights takes.
-2. Where the likely work is too much, try fewer groups of channels, then measure on fewer crops.
-3. Where the most work that is possible is too much, go on until it is not.
+   the work of rounding and loading its weights.
+2. If the likely work is too much, try fewer groups of channels, then measure on fewer crops.
+3. If the largest possible work is too much, continue until it is not.
 
 Work is counted and not timed, because the same samples and seed must give the same file.
 """
@@ -20,11 +20,11 @@ from beers_deploy.quant.session import values_of
 
 
 class Effort(StrEnum):
-    """How long the search for equalization factors may take.
+    """The effort of the search for equalization factors.
 
-    - `fast`: first guesses alone.
+    - `fast`: first guesses only.
     - `normal`: groups of channels with similar ranges, within a bound of work.
-    - `best`: each channel by itself, without a bound.
+    - `best`: each channel separately, without a bound.
     """
 
     fast = "fast"
@@ -86,7 +86,7 @@ class Stage:
     channels: int = 0
 
     def candidates(self, groups: int) -> int:
-        """Return the largest number of candidates with so many groups of channels."""
+        """Return the largest number of candidates for a number of groups of channels."""
         return self.guesses + TURNS * min(groups, self.channels)
 
 
@@ -110,13 +110,13 @@ class Bound:
 def bound(
     stages: Sequence[Stage], graph: Graph, work: Sequence[int], crops: int, effort: Effort
 ) -> Bound:
-    """Return what a search may take.
+    """Return the bound of a search.
 
     Args:
         stages: of the search.
         graph: that is searched.
         work: of each operation on one crop.
-        crops: number of crops, if there is no bound.
+        crops: the number of crops, if there is no bound.
         effort: allowed.
     """
 

@@ -1,14 +1,14 @@
-"""Equalize the channels of a residual group, so that one scale suits them all, at no cost in the
-network.
+"""Equalize the channels of a residual group, so that one scale suits them all, without changing the
+float network.
 
 1. Multiply the weights that write channel c of the group by k_c, and divide those that read it: the
-   float network stays the same, to rounding. A channel that uses a fraction of int8's range is
-   rounded finer for a larger k, and one that overflows is clipped less for a smaller k.
-2. Behind ReLU6 raise k until int8 ends at the six, so that its clip stands for that of ReLU6.
+   float network remains the same, to rounding. A channel that uses a fraction of int8's range is
+   rounded more finely for a larger k, and one that overflows is clipped less for a smaller k.
+2. Behind ReLU6 increase k until int8 ends at the six, so that its clip replaces that of ReLU6.
 3. Guess k = range^-gamma for a few gammas, and a few shares of int8's range for the widest channel.
-4. Try channels larger and smaller on crops of calibration images, because what counts is what a
-   channel's rounding does to the output: each by itself, or groups of similar range together. A
-   trial that is worse on the costliest crops is given up.
+4. Try channels larger and smaller on crops of calibration images, because the effect of a channel's
+   rounding on the output counts. Channels are tried separately, or in groups of similar range. A
+   trial that is worse on the costliest crops is rejected.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -130,7 +130,9 @@ def channel_sizes(
 
 
 def above_dead(ranges: np.ndarray) -> np.ndarray:
-    """Return ranges (C,) of which none is next to nothing: a dead channel must not be blown up."""
+    """Raise ranges (C,) that are nearly zero to a minimum, so that dead channels are
+    not amplified.
+    """
     return np.asarray(np.maximum(ranges, 1e-3 * float(ranges.max()) + 1e-12))
 
 
@@ -193,16 +195,16 @@ def stepped(
 
 @dataclass(frozen=True)
 class Best:
-    """The best factors so far, (C,), and what they cost on each crop, (N,)."""
+    """The best factors so far, (C,), and their error on each crop, (N,)."""
 
     factors: np.ndarray
     costs: np.ndarray
 
 
 def race(costs_of: Costs, factors: np.ndarray, best: Best) -> Best:
-    """Return the better of two.
+    """Return the better of two candidates.
 
-    The costliest crops come first: six of seven trials fail, and most of them show it on two.
+    The costliest crops come first: six of seven trials fail, and most of them show it on two crops.
     """
     order = np.argsort(-best.costs, kind="stable")
     costs = np.zeros(len(order))

@@ -1,17 +1,18 @@
-"""Train the integers themselves: weights and biases of the integer core, with roundings and
-clippings in the loop.
+"""Train the integers themselves: weights and biases of the integer core, with rounding and clipping
+in the loop.
 
-Rounding each tensor as well as it can be done leaves errors that meet behind many layers, and noise
-that no rounding takes back. So the core is run as it is, and its numbers follow the slope of its
-result's error (training that sees the quantiser, Jacob et al. 2018): from the reference where there
-is one, and from the float network. Gradients move no scale, because these are powers of two.
+Rounding each tensor optimally leaves errors that accumulate over many layers, and noise that no
+rounding removes. The core is therefore run as it is, and its numbers follow the gradient of its
+result's error (quantisation-aware training, Jacob et al. 2018). The error is measured from the
+reference if there is one, and from the float network. Gradients do not change scales, because these
+are powers of two.
 
 1. Hold out some of the pairs.
-2. Before each round of steps move scales one bit where the core then errs less on pairs that it is
-   trained on (`quant.passes.scales`). The core stays within the windows of the DPU's shifts.
+2. Before each round of steps change scales by one bit if that reduces the error on training pairs
+   (`quant.passes.scales`). The core stays within the windows of the DPU's shifts.
 3. Take steps of gradient descent.
-4. Every few steps round the numbers, and keep the core that errs least on the held-out pairs.
-5. Stop after a round of steps that gained little.
+4. Every few steps round the numbers, and keep the core with the least error on the held-out pairs.
+5. Stop after a round of steps with little gain.
 """
 
 import math
@@ -55,15 +56,16 @@ JUDGING = 48
 
 @dataclass(frozen=True)
 class Tuning:
-    """What to train on, how long and how fast.
+    """The parameters of fine-tuning.
 
     Attributes:
         pairs: images (1, C, H, W) in [0, 1] and their references, which may be empty.
-        steps: gradient steps; None adds rounds of them until pairs that are held out err no less.
-        rate: the highest rate of learning, in units of each number's scale.
+        steps: the number of gradient steps; None adds rounds until the error on held-out pairs
+            stops falling.
+        rate: the highest learning rate, in units of each number's scale.
         seed: of the order of the pairs.
         original: the float network whose results are learnt; None for that of the rounded graph,
-            which is another one where operators were replaced (`quant.adapt`).
+            which differs if operators were replaced (`quant.adapt`).
     """
 
     pairs: Sequence[Pair]
@@ -75,15 +77,15 @@ class Tuning:
 
 @dataclass(frozen=True)
 class Sample:
-    """A pair for the core: an image in, corrections (1, C, H', W') out.
+    """A pair for the core: an image as input, corrections (1, C, H', W') as targets.
 
     Attributes:
         image: (1, C, H, W) in [0, 1].
         planes: of the image, (1, P, H, W) as float32.
         floats: the float network's correction.
-        reference: the correction that would restore it wholly, or None.
-        weight: of its errors: over the float network's own, so that dark and busy patches count
-            alike.
+        reference: the correction that would restore it completely, or None.
+        weight: of its errors: one over the float network's own error, so that dark and busy patches
+            count equally.
     """
 
     image: np.ndarray

@@ -27,9 +27,9 @@ def choose_frac_bits(
 
     Args:
         graph: in float.
-        images: (1, C, H, W) in [0, 1], which are passed over twice.
+        images: (1, C, H, W) in [0, 1], which are read twice.
         host_part: the graph's host part.
-        least_squares: whether finer scales are tried; without, nothing is clipped.
+        least_squares: whether finer scales are tried; if False, nothing is clipped.
     """
     names = tensors(graph)
     shared = tied(graph)

@@ -43,16 +43,16 @@ PASSING = (Concat, MaxPool, AveragePool, Resize)
 
 
 def only(name: str) -> ResidualGroup:
-    """Return the group of a tensor by itself."""
+    """Return a group that consists of one tensor."""
     return {name: slice(None)}
 
 
 def residual_groups(graph: Graph) -> list[ResidualGroup]:
     """Return the groups that can share a scale and be equalized, in the order of the graph.
 
-    Convolutions and adds alone write and read them, and what hands channels on, with nothing
-    between that a factor does not pass; so not where a product, a pixel shuffle or the network's
-    end reads them.
+    Only convolutions, adds and operations that pass channels on write and read them, with nothing
+    in between that blocks a factor. Groups that a product, a pixel shuffle or the network's end
+    reads are excluded.
     """
     # 1.
     linking = [op for op in graph if isinstance(op, (Add, *PASSING))]
@@ -69,9 +69,7 @@ def residual_groups(graph: Graph) -> list[ResidualGroup]:
 
 
 def _placed(linking: Sequence[Op], names: Sequence[str], graph: Graph) -> ResidualGroup:
-    """Return where the channels of these tensors stand; empty if one would have to stand in two
-    places.
-    """
+    """Return the slices of the channels of these tensors; empty if one would need two slices."""
     writers = [op for op in linking if op.output in names]
     # Only a concat puts channels at other places than those of its inputs.
     if not any(isinstance(op, Concat) for op in writers):
@@ -114,7 +112,7 @@ def exceeds_six(graph: Graph, group: ResidualGroup, frac_bits: Mapping[str, int]
 
 
 def single_tensors(graph: Graph) -> list[str]:
-    """Return the tensors of no group that convolutions alone write and read: each of their channels
+    """Return the tensors of no group that only convolutions write and read, so that each channel
     may have a factor.
     """
     # 4.

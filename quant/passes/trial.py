@@ -1,9 +1,7 @@
 """Measure the cost of a candidate: the difference of INT8 results from float ones on a few crops.
 
 1. Restore all crops of the calibration images in float, and order them by their largest correction.
-
 2. Keep the crops with the largest corrections, where int8 clips, and others of all sizes.
-
 3. Run each candidate on these crops, and return its error on each.
 """
 
@@ -55,11 +53,12 @@ Targets = list[tuple[np.ndarray, np.ndarray]]
 
 
 def crop_count(crop: np.ndarray, available: int) -> int:
-    """Return on how many crops of the size of this one (1, C, h, w) a search measures, at most.
+    """Return the maximum number of crops of this size, (1, C, h, w), on which a search measures.
 
     Args:
         crop: one of them.
-        available: about how many there are; images of other sizes than the first may have more.
+        available: the approximate number of crops; images of other sizes than the first may have
+            more.
     """
     height, width = map(int, crop.shape[2:])
     count = max(SEARCH_CROPS * TILE_PX**2 // (height * width), SEARCH_CROPS)
@@ -69,10 +68,10 @@ def crop_count(crop: np.ndarray, available: int) -> int:
 def search_targets(
     graph: Graph, host_part: HostPart, images: Sequence[np.ndarray], count: int
 ) -> Targets:
-    """Return the crops with the largest corrections, and others of all sizes: `count` of them, if
-    there are so many.
+    """Return `count` crops, fewer if there are not enough: those with the largest corrections, and
+    others of all sizes.
 
-    Only the sizes of corrections are stored; the images of the chosen are simulated once more.
+    Only the sizes of corrections are stored; the images of the selected crops are simulated again.
     """
     session = open_session(graph_to_onnx(graph, [CORRECTION], host_part.planes))
     halo_px = 0 if halo_of(graph) is not None else None
@@ -99,8 +98,9 @@ def search_targets(
 
 
 def hardest_and_others(order: Sequence[T], count: int) -> list[T]:
-    """Choose `count` of what is ordered by its largest values, if there are so many: a quarter from
-    the first, where int8 clips, the rest from all of the others.
+    """Select `count` items from a sequence that is ordered by its largest values.
+
+    A quarter are the first ones, where int8 clips; the rest are spread over the others.
     """
     hard = count // 4
     others = order[hard :: max((len(order) - hard) // (count - hard), 1)]
@@ -108,10 +108,10 @@ def hardest_and_others(order: Sequence[T], count: int) -> list[T]:
 
 
 class CropTrials:
-    """Measures what candidates cost on crops, running again only what they change.
+    """Measures the error of candidates on crops, and runs only the changed operations again.
 
-    What lies in front of the first changed operation is computed once. What lies behind the last
-    one stays one session.
+    The part in front of the first changed operation is computed once. The part behind the last one
+    remains one session.
     """
 
     def __init__(self, core_of: Callable[[Graph], IntCore], targets: Targets) -> None:
@@ -152,10 +152,10 @@ class CropTrials:
         """Return a function for the root mean squared difference of an integer network from the
         float one, by crop.
 
-        Squared, because clipping is rare and must count; its root, so that no single crop that
-        clips decides alone. It is relative to what the float network changes in the crop: a loss of
-        PSNR is relative too, and in absolute terms bright crops with large corrections would
-        outweigh the dark ones, where the same step costs most.
+        The difference is squared because clipping is rare and must count. Its root prevents a
+        single crop that clips from deciding alone. It is relative to the change that the float
+        network makes in the crop, as a loss of PSNR is. In absolute terms bright crops with large
+        corrections would outweigh the dark ones, where the same step costs most.
         """
 
         # 3.
@@ -204,10 +204,10 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _on_all_cores(compute: Callable[[int], T], numbers: Iterable[int]) -> list[T]:
-    """Return what is computed for each crop.
+    """Compute a function for each crop, with the crops distributed over the cores.
 
-    Small crops keep cores busier one to each than all on one: threads that share a crop wait for
-    each other.
+    For small crops one core per crop is faster than all cores on one crop, because threads that
+    share a crop wait for each other.
     """
     with ThreadPoolExecutor(os.cpu_count()) as cores:
         return list(cores.map(compute, numbers))

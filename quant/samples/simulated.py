@@ -1,7 +1,7 @@
-"""Simulated patches for calibration, and to judge what INT8 changes.
+"""Simulate patches for calibration, and to judge the effect of INT8.
 
-Patches are simulated anew for each pass over them, which costs a tenth of what the network does
-with them. So memory grows neither with their number nor with their size.
+Patches are simulated again for each pass over them, which costs a tenth of the network's own time.
+Memory therefore grows neither with their number nor with their size.
 """
 
 from collections.abc import Sequence
@@ -57,15 +57,15 @@ def draw_patches(
     brightness.
 
     Args:
-        scenes: that are seen.
-        degraded: the sensors that see them, unless a family does.
-        reference: the sensor of the wanted images.
-        count: of patches.
-        seed: of everything that is drawn.
+        scenes: to draw from.
+        degraded: the sensors that acquire them, unless there is a family.
+        reference: the sensor of the target images.
+        count: the number of patches.
+        seed: of all random draws.
         patch_px: side of a patch.
         family: of sensors with the gain and bits of `degraded`.
         lightings: how the ground is lit, so that the patches cover the sensor's range; without any
-            it is as bright as the scenes show it.
+            it is as bright as in the scenes.
 
     Raises:
         ImageError: no scene holds a patch.
@@ -160,8 +160,8 @@ def unseen_patches(degraded: Sensor, images: Path | None, patches: int, seed: in
 
     Args:
         degraded: the sensor's profile; the reference is the one that belongs to it.
-        images: folder of scenes; None for drawn ones, which are others than calibration's.
-        patches: how many.
+        images: folder of scenes; None for drawn ones, which differ from calibration's.
+        patches: the number of patches.
         seed: of the calibration.
     """
     reference = degraded.reference

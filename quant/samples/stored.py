@@ -23,13 +23,13 @@ REMEDY = "See docs/reference/any-network.md for how to give samples."
 
 
 def samples_in(given: object) -> list[Pair]:
-    """Return the samples in an array, in a pair of arrays (images, references), or in what gives
-    such one after the other.
+    """Return the samples in an array, in a pair of arrays (images, references), or in an iterable
+    of these.
 
     Args:
-        given: a batch (N, C, H, W), or one image (C, H, W), of NumPy or torch; a
-            tuple of two; a simulated pair, which knows its full scale; or an iterable of any of
-            these, such as a DataLoader.
+        given: a batch (N, C, H, W), or one image (C, H, W), of NumPy or torch; a tuple of two; a
+            simulated pair, which has its full scale; or an iterable of any of these, such as a
+            DataLoader.
     """
     # A simulated pair holds digital numbers, and alone knows its full scale.
     if hasattr(given, "degraded") and hasattr(given, "reference"):
@@ -121,8 +121,8 @@ def stored_batch(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
 
 
 def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return the array of a .npy file, mapped rather than read; of a .npz file `image` and
-    `reference`, or its only array.
+    """Return the memory-mapped array of a .npy file, or `image` and `reference` or the only array
+    of a .npz file.
 
     Nothing is unpickled.
     """
@@ -157,5 +157,5 @@ def _bands_first(path: Path, pixels: np.ndarray) -> np.ndarray:
 
 
 def sizes_of(array: np.ndarray) -> str:
-    """Return the shape of an array in words."""
+    """Format the shape of an array."""
     return times(array.shape) or "no dimension"

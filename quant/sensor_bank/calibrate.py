@@ -177,7 +177,8 @@ def bank_host_part(scale: int, decoding: BankSum) -> HostPart:
 def bank_results(
     image: np.ndarray, bank: Bank, vector: Sequence[float], scale: int, kernels: Kernels = "fitted"
 ) -> np.ndarray:
-    """Compute what the body reads of an image (1, 1, H, W) in [0, 1]: (1, C, H / S, W / S) float32.
+    """Compute the input of the body for an image (1, 1, H, W) in [0, 1]: (1, C, H / S, W / S)
+    float32.
 
     These are the bank's results / 128 at a gain of 1, and planes of half of a sensor's values.
     """
@@ -284,13 +285,13 @@ SNR = (90.0, 165.0)
 def bank_images(
     scenes: list[Scene], scale: int, seed: int, kernels: Kernels
 ) -> Sequence[np.ndarray]:
-    """Return what a network behind a bank is calibrated on: scenes as many sensors see them, behind
-    the bank of each.
+    """Return the calibration images of a network behind a bank: scenes acquired by many sensors,
+    after the bank of each.
 
     Args:
         scenes: to simulate images of.
         scale: of the network.
-        seed: of everything that is drawn.
+        seed: of all random draws.
         kernels: of the banks.
     """
     like = Sensor.load(LIKE)

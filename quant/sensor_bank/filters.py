@@ -1,4 +1,5 @@
-"""The integer bank of a sensor: the first convolution of an INT8 network, from the sensor alone.
+"""Compute the integer bank of a sensor: the first convolution of an INT8 network, from the sensor
+alone.
 
 The image enters in the planes of `host_part.BANK_SLICES`: steps of 16 digital numbers (DN) about
 the middle, twice, their remainder, and half of that for finer weights. The first two share a
@@ -6,12 +7,12 @@ filter's weights, which may therefore be twice as large: half the rounding error
 rounded so that they sum to exactly 0, because flat ground must give 0, and so that their errors lie
 where natural images have little energy.
 
-The results of the filters are int8 in steps of 1/24 of a unit of a sensor whose noise is
-`model.bank.SIGMA`. A sensor's own steps are the same share of full scale, within limits
-(`Bank.gain`): the strongest edges are a share of full scale, not of noise, so that noisy sensors
-can have finer steps in their units. Each result comes in several copies, rounded at other places of
-a step: together they are more precise than one. The image itself comes in steps of 32 / gain, about
-the middle.
+The results of the filters are int8 in steps of 1/24 of a unit, for a sensor whose noise is
+`model.bank.SIGMA`. Another sensor's steps are the same share of full scale, within limits
+(`Bank.gain`). The strongest edges are a share of full scale, not of noise, so noisy sensors can
+have finer steps in their units. Each result is written in several copies, rounded at different
+offsets within a step: jointly they are more precise than one. The image itself has steps of 32 /
+gain, about the middle.
 """
 
 from dataclasses import dataclass

@@ -1,13 +1,13 @@
-"""Remove what a network computes from the size of its image: shapes, and what crops, pads or
-enlarges to them.
+"""Remove computations on the size of the image: shapes, and operations that crop, pad or enlarge to
+them.
 
-1. Give the free sizes of the image numbers, so that the runtime folds arithmetic on shapes.
+1. Set the free sizes of the image to numbers, so that the runtime folds arithmetic on shapes.
 2. Write a Resize to a size as one by factors, and the pixel unshuffle of one channel as
-   SpaceToDepth; drop a Pad by nothing and a Slice of the whole map; let a convolution write a map
-   of one number a channel, such as a noise level.
-3. Do both for two sizes. If the networks are equal, the size decides nothing, and theirs is the
-   network of every image whose sides are multiples of `MULTIPLE_PX`. Otherwise the network stays
-   as it is.
+   SpaceToDepth. Remove a Pad by nothing and a Slice of the whole map. Let a convolution write a map
+   of one number per channel, such as a noise level.
+3. Do both for two sizes. If the networks are equal, the size has no effect, and theirs is the
+   network of every image whose sides are multiples of `MULTIPLE_PX`. Otherwise the network is not
+   changed.
 
 Exporters write such arithmetic for a U-Net that pads or enlarges to the size of its skips, for
 `chunk`, and for a number that is repeated over the image.
@@ -36,10 +36,10 @@ Fold = Callable[[onnx.ModelProto], onnx.ModelProto]
 
 
 def free_sizes(model: onnx.ModelProto, fold: Fold) -> onnx.ModelProto:
-    """Return the network without arithmetic on sizes; as it is if the size decides something.
+    """Return the network without arithmetic on sizes; unchanged if the size has an effect.
 
     Args:
-        model: a float network, of our opset; not changed.
+        model: a float network of this project's opset; not changed.
         fold: folds the constants of a network.
     """
     constants = {tensor.name for tensor in model.graph.initializer}
@@ -94,7 +94,7 @@ def _of_size(model: onnx.ModelProto, rows: int, columns: int, fold: Fold) -> onn
 
 
 def _sized(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> list[Node] | None:
-    """Return what takes the place of a node whose input has a known size (2).
+    """Return the nodes that replace a node whose input has a known size (2).
 
     Args:
         graph: that the node belongs to; its constants are extended.
@@ -207,7 +207,7 @@ def _with_written_maps(
 
 
 def _content(model: onnx.ModelProto) -> tuple[list[bytes], dict[str, bytes]]:
-    """Return what a network computes with, in a form that can be compared.
+    """Return the content of a network in a form that can be compared.
 
     Args:
         model: the network. Serialization is deterministic, so equal networks give equal bytes.

@@ -1,9 +1,9 @@
-"""Mirror the image beyond its borders where a network has no padding and makes a smaller result.
+"""Mirror the image beyond its borders if a network has no padding and its result is smaller.
 
-1. Where no layer pads, the sizes of the result for two sizes of image tell how many pixels a side
-   are missing.
-2. A Pad in front of the network mirrors half of them at each border. The result has the size of the
-   image then, or a multiple of it, and is the old one inside its border.
+1. If no layer pads, the sizes of the result for two sizes of image determine how many pixels per
+   side are missing.
+2. A Pad in front of the network mirrors half of them at each border. The result then has the size
+   of the image, or a multiple of it, and is unchanged inside its border.
 """
 
 import numpy as np

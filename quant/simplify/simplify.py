@@ -1,33 +1,33 @@
-"""Turn a float ONNX file as exporters leave it into its simplest equal.
+"""Simplify a float ONNX file as exporters write it, without changing its function.
 
-`quant.onnx_file.load_onnx` does it once for whoever reads a file. Afterwards these hold of a float
-network:
+`quant.onnx_file.load_onnx` does it once for all readers of a file. Afterwards a float network has
+these properties:
 
-1. Constants are initializers, each float32 where it was float16 too, and no initializer is an
-   input.
+1. Constants are initializers, each float32 even if it was float16, and no initializer is an input.
 2. There is no Identity, Constant, Dropout, needless Cast, and no arithmetic on constants.
-3. There is no BatchNormalization, and no Mul, Add, Sub or Div by one constant a channel, behind a
-   convolution that only it reads, nor in front of convolutions where they are exact. A
-   BatchNormalization of images that is left is a depthwise 1 x 1 convolution. Zeros that Pad adds
-   are the convolution's own.
-4. Sub of two maps is Add, Sum is Add, a mean over the image is GlobalAveragePool, HardSwish is
-   itself, ReLU6 is Clip from 0 to 6, and a Clip at 0 alone is ReLU. Nothing splits or crops a map:
-   each part is computed by itself. Padded kernels have at most 64 positions. Nothing is computed
-   from the size of the image, unless it decides something. The channels of the image stand first.
+3. There is no BatchNormalization, and no Mul, Add, Sub or Div by one constant per channel, behind a
+   convolution that only it reads, nor in front of convolutions where folding is exact. A remaining
+   BatchNormalization of images is a depthwise 1 x 1 convolution. Zeros that Pad adds are the
+   convolution's own.
+4. Sub of two maps is Add, Sum is Add, a mean over the image is GlobalAveragePool. HardSwish is one
+   operator, ReLU6 is Clip from 0 to 6, and a Clip at 0 alone is ReLU. Nothing splits or crops a
+   map: each part is computed separately. Padded kernels have at most 64 positions. Nothing is
+   computed from the size of the image, unless the size has an effect. The channels of the image
+   come first.
 5. Operators are those of opset 17, unless one has no form there.
 6. The result of a network without padding has the image's size, or a multiple of it: the image is
    mirrored beyond its borders.
-7. Inputs, outputs, metadata and nodes that stay keep their names, each node has one, and no two
-   convolutions share what was folded into one of them.
+7. Inputs, outputs, metadata and remaining nodes have their original names, and each node has one.
+   No two convolutions share weights into which something was folded.
 
-A network that needs none of it is returned as it is: its results stay the same to the bit. The same
-file gives the same bytes. INT8 files do not come here.
+A network that needs none of it is returned unchanged, so that its results are the same to the bit.
+The same file gives the same bytes. INT8 files are not simplified.
 
-Constants, normalisation behind convolutions, padding and what does nothing are folded by
-onnxruntime's basic optimisation, which every installation has: it keeps to standard operators, and
+Constants, normalisation behind convolutions, padding and nodes without effect are folded by
+onnxruntime's basic optimisation, which every installation has. It uses standard operators only, and
 its own tests run on every release. (onnxsim or onnxscript's optimizer would be further packages for
-the same.) What it leaves is for the passes of this package; onnx's own converter changes the opset.
-Only what `quant.onnx.runnable` has let through may come here: a runtime opens it.
+the same.) The passes of this package do the rest, and onnx's own converter changes the opset. Only
+models that `quant.onnx.runnable` accepted are simplified, because a runtime opens them.
 """
 
 from copy import deepcopy
@@ -101,10 +101,10 @@ NEEDS_SHAPES = {"Cast", "Gemm", "ReduceMean", "Slice", "Softmax", "Split", "Sub"
 
 
 def simplify(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
-    """Return the float network's simplest equal, as the module says.
+    """Simplify a float network as described in the module.
 
     Args:
-        model: what `check_content` and `check_runnable` let through; not changed.
+        model: accepted by `check_content` and `check_runnable`; not changed.
         where: name of the network for messages, such as "a.onnx".
     """
     with contradictions(where):
@@ -136,7 +136,7 @@ def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 
 
 def _run_passes(model: onnx.ModelProto) -> None:
-    """Rewrite the nodes of a network in place; its inputs and outputs keep their names."""
+    """Rewrite the nodes of a network in place, without renaming its inputs and outputs."""
     graph = OnnxGraph(model)
     for rewriting in (
         split_sums,

@@ -24,7 +24,7 @@ def require_inference(model: onnx.ModelProto, where: str) -> None:
     """Raise ModelError if a network has a node in training mode.
 
     Args:
-        model: what `check_content` let through.
+        model: accepted by `check_content`.
         where: name of the network for the message, such as "a.onnx" or "the float network".
 
     Raises:
@@ -61,8 +61,8 @@ def _drops(node: NodeProto, opset: int, values: dict[str, np.ndarray]) -> bool:
 
 
 def _adapts(node: NodeProto, opset: int, _: dict[str, np.ndarray]) -> bool:
-    """Return True if a BatchNormalization takes mean and variance from the image, and gives them as
-    further results.
+    """Return True if a BatchNormalization computes mean and variance from the image, and returns
+    them as further results.
 
     From opset 14 on an attribute states it as well.
     """

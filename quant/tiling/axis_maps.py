@@ -65,7 +65,7 @@ class AxisNode:
         axis: 0 for the rows, 1 for the columns.
         extra: pixels that its source has beyond, or short of, its share of the image.
         graph: the node's.
-        shapes: of all constants, those included that nodes make of others.
+        shapes: of all constants, including those that nodes compute from others.
     """
 
     node: Node
@@ -75,8 +75,8 @@ class AxisNode:
     shapes: Mapping[str, tuple[int, ...]]
 
     def require(self, valid: bool, why: str) -> None:
-        """Raise ModelError unless the node can be tiled; `why` is what it does instead, a verb
-        phrase.
+        """Raise ModelError unless the node can be tiled; `why` is a verb phrase on what it does
+        instead.
         """
         if not valid:
             raise not_tileable(
@@ -89,7 +89,9 @@ class AxisNode:
         return self.node.attributes.get(key, otherwise)
 
     def numbers(self, place: int, key: str, otherwise: Sequence[float] = ()) -> list[Any]:
-        """Return what the node states in an input or, of older opsets, in an attribute."""
+        """Return the numbers that the node states in an input or, in older opsets, in an
+        attribute.
+        """
         values = self.graph.numbers(self.node, place, key, otherwise)
         self.require(values is not None, "has sizes that are computed (fold them)")
         return values or []
