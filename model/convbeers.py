@@ -296,7 +296,7 @@ def initialise(network: Network, generator: torch.Generator) -> None:
             fan_in = module.in_channels * 9
             # Without batch normalisation the stream's variance would double at each block.
             scale = 0.1 if name.endswith(("second", "body_end", "tail")) else 1.0
-            # What is an offset of one channel is a pattern of the pixels of one place.
+            # An offset of one channel would be a pattern of the pixels of one place.
             scale /= network.variant.scale if name == "tail" else 1
             with torch.no_grad():
                 module.weight.normal_(0.0, scale * (2 / fan_in) ** 0.5, generator=generator)

@@ -195,7 +195,7 @@ class SelfCheck:
             reached = maximum_filter(unknown, 2 * NEAR_PX + 1, mode="constant")
         inside = []
         for placed, side in zip((down, across), raw.shape, strict=True):
-            # Only the image's own border is left out, so that tiles give the same figures as the
+            # Only the image's own border is excluded, so that tiles give the same figures as the
             # whole image.
             places = np.arange(placed.start, placed.start + side)
             inside.append((places >= NEAR_PX) & (places < placed.size_px - NEAR_PX))

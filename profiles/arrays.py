@@ -31,7 +31,7 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
             is_archive = stream.read(len(ZIP)) == ZIP
         if not is_archive:
             return {ALONE: np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))}
-        # NumPy leaves a broken archive open, so that the stream is ours to close.
+        # NumPy leaves a broken archive open, so the stream is closed here.
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             return {name: np.asarray(archive[name]) for name in archive.files}
     except (AttributeError, ImportError, NameError):

@@ -147,7 +147,7 @@ class FullWell(PixelEffect):
         return np.asarray(np.minimum(image, self.radiance))
 
     def bound_dn(self, sensor: Digitiser, low: float, high: float) -> float:
-        # What is cut off, and what is spilt, is no more than the excess.
+        # Neither the clipped nor the spread radiance exceeds the excess.
         return sensor.gain_dn_per_radiance * max(high - self.radiance, 0.0)
 
 

@@ -180,7 +180,7 @@ def snr_0_bounds(radiance_0: float, radiance_1: float, snr_1: float) -> tuple[fl
 
     Between them alpha and beta are both at least 0.
     """
-    # Alpha >= 0 asks for sigma_0 <= sigma_1, and beta >= 0 for sigma_0^2 / L_0 >= sigma_1^2 / L_1;
-    # sigma is L / SNR.
+    # Alpha >= 0 requires sigma_0 <= sigma_1, and beta >= 0 requires sigma_0^2 / L_0 >= sigma_1^2 /
+    # L_1; sigma is L / SNR.
     ratio = radiance_0 / radiance_1
     return snr_1 * ratio, snr_1 * math.sqrt(ratio)

@@ -107,7 +107,7 @@ def origins(
 
     An effect that was removed is listed with what removed it.
     """
-    # What is stated wins over what is added.
+    # Stated effects take precedence over added ones.
     sources = dict.fromkeys(add, "`with_`")
     sources |= dict.fromkeys(("mtf", "noise", *profile.effects), f"sensor {profile.name}")
     if scene:

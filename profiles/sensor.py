@@ -329,7 +329,7 @@ class Sensor:
         mtf = number(self.mtf_nyquist)
         noise, rejected = self._draw_noise(number)
         effects = settled(self.effects, parameter)
-        # Drawn last: a profile without it draws what it always drew.
+        # Drawn last, so that a profile without it draws the same numbers as before.
         along = self.mtf_nyquist_along
         mtf_along = None if along is None else number(along)
         return self._instrument(mtf, noise, effects, mtf_along), rejected

@@ -115,7 +115,7 @@ def _missing(where: str, key: str, kind: str = "") -> str:
 def _spelling(key: str, names: Sequence[str], choices: str = "") -> str:
     """Return the key, the keys to choose from, and the one that was meant."""
     stated = "; ".join(filter(None, (printable(repr(key)), choices)))
-    # Most often the unit or the second half of a name is left out.
+    # Most often the unit or the second half of a name is missing.
     for name in names:
         if name.startswith(f"{key}_"):
             return f"{stated}. Write {name!r} (the unit belongs to the name)."

@@ -277,7 +277,7 @@ class _Exact(_Rewriting):
         """Store int8 constants as uint8, 128 higher."""
         for place in places:
             node.input.extend([""] * (place + 1 - len(node.input)))
-            # A zero point that is left out is 0.
+            # A missing zero point is 0.
             value = self.arrays.get(node.input[place], np.zeros((), np.int8))
             # The sum is formed in int16, because int8 wraps around above 127.
             node.input[place] = self.constant((value.astype(np.int16) + MIDDLE).astype(np.uint8))

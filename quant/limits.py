@@ -175,7 +175,7 @@ def judge(
         ("std / MAE", result.std_over_mae, limits.std_over_mae, "ratio", ""),
         ("PSNR drop", result.drop_db, limits.psnr_drop_db, "dB", ""),
     ]
-    # Without references the gain is NaN, and where float gains nothing a share of it says nothing.
+    # Without references the gain is NaN, and without a gain a share of it is meaningless.
     if result.gain_db > 0:
         gained = f"the float network gains {result.gain_db:.2f} dB"
         share = result.drop_db / result.gain_db

@@ -107,7 +107,7 @@ def parse_onnx(
         model.ParseFromString(content)
         if path is not None:
             take_in(model, path)
-        # Before onnx's checker, which looks for the files that weights are said to be in.
+        # Before onnx's checker, which opens the files that hold external weights.
         check_content(model, where)
         sort_nodes(model.graph)
         onnx.checker.check_model(model)

@@ -269,7 +269,7 @@ def _equalized(
     earlier: RoundedConvs = {}
     trials = CropTrials(lambda candidate: plan.core(candidate, frac_bits, earlier), targets)
     graph = plan.singles.scaled(graph, plan.singles.unscaled(frac_bits))
-    # The time is only reported: what is tried depends on counted work alone.
+    # The time is only reported: the candidates depend on counted work alone.
     start = time.perf_counter()
     trials(graph, tensors(graph))(graph)(None)
     seconds = max((time.perf_counter() - start) * limit.runs, 1)

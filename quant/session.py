@@ -57,8 +57,8 @@ def open_session(
     options.enable_mem_pattern = False
     # An error is raised, so onnxruntime need not print it as well.
     options.log_severity_level = 4
-    # Threads that wait for this session's next run take a core from whoever runs meanwhile, for
-    # tens of milliseconds.
+    # Threads that wait for this session's next run occupy a core for tens of milliseconds, which
+    # other work lacks.
     options.add_session_config_entry("session.force_spinning_stop", "1")
     if not optimise:
         options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL

@@ -78,7 +78,7 @@ def _require_apart(
     sources = [path for path in inputs if path is not None]
     files = list(chain.from_iterable(map(_files_of, sources)))
     images = [file for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
-    # What does not exist has no identity, and is in nobody's way.
+    # A path that does not exist has no identity, and cannot collide with another.
     identities = {_identity(file) for file in files} - {None}
     homes = {_identity(image.parent) for image in images} - {None}
     for places, occupied, use in (

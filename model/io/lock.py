@@ -43,8 +43,8 @@ def only_run(out: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        # Removed while it is ours: whoever has opened it finds out and begins again. Windows
-        # removes no open file: there it goes with the release.
+        # Removed while the lock is held: another run that has opened it detects that and begins
+        # again. Windows cannot remove an open file: there it is removed by the release.
         with suppress(OSError):
             (folder / NAME).unlink()
         with suppress(OSError):

@@ -64,7 +64,7 @@ def measure_phases(pixels: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, n
     smooth = convolve1d(convolve1d(pixels, SMOOTH, axis=0), SMOOTH, axis=1)
     inside_border = (slice(EDGE_PX, -EDGE_PX),) * 2
     residuals = (pixels - smooth)[inside_border]
-    # The filter spreads what is no measurement over its reach.
+    # The filter spreads invalid pixels over its reach.
     mask = np.ones(residuals.shape, bool)
     if not valid.all():
         mask = ~maximum_filter(~valid, 2 * EDGE_PX + 1)[inside_border]
@@ -103,8 +103,7 @@ def judge_phases(
             continue
         difference = differences[mask, number]
         error = errors[mask, number]
-        # The squares hold the noise as well. Its variance is taken off, without the factor for
-        # texture.
+        # The squares include the noise. Its variance is subtracted, without the factor for texture.
         power = float(np.mean(np.square(difference) - np.square(error / TEXTURE)))
         strong = np.abs(difference) > SIGNIFICANT * error
         rms = float(np.sqrt(max(power, 0)))

@@ -192,7 +192,7 @@ def _covariance(first: np.ndarray, other: np.ndarray) -> tuple[float, float]:
     of_sum, of_difference = (
         np.square(MAD * np.median(np.abs(values))) for values in (first + other, first - other)
     )
-    # Second differences of neighbouring lines are no independent numbers: half as many count.
+    # Second differences of neighbouring lines are not independent, so half of their number counts.
     error = MAD_ERROR * np.hypot(of_sum, of_difference) / 4 / np.sqrt(max(len(first) / 2, 1))
     return float(of_sum - of_difference) / 4, float(error)
 

@@ -238,8 +238,8 @@ def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
     scatter = np.maximum(chi2.min(0) / [edge.count for edge in shaped], 1.0)
     # The median and not the sum: an edge that another crosses nearby has a shape of its own.
     weights = -len(shaped) / 2 * np.median((chi2 - chi2[0]) / scatter, axis=1)
-    # Before any edge is seen, half of the belief is in the profile's curve: of few edges nothing
-    # else can be said.
+    # The prior gives half of its weight to the profile's curve, because few edges cannot determine
+    # another one.
     belief = np.gradient(SHAPES)
     belief[0] = belief[1:].sum()
     weights = np.exp(weights - weights.max()) * belief

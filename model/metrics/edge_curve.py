@@ -306,7 +306,7 @@ def _drawn_along(
     """
     if edge.unevenness <= EVEN:
         gram, moment = normal_equations(edge, weights)
-        # Noise of 1 in the pixels gives the moments the covariance `gram`.
+        # With noise of 1 in the pixels the moments have the covariance `gram`.
         sizes, axes = np.linalg.eigh(gram)
         noise = axes @ (np.sqrt(np.maximum(sizes, 0.0)) * generator.standard_normal(PARTS))
         return gram, moment + noise

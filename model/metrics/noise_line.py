@@ -113,7 +113,7 @@ class NoiseModel:
         low, high = np.percentile(self.draws @ (dn, 1.0), [2.5, 97.5])
         dark, bright = self.measured_dn
         beyond = max(math.log(dark / dn), math.log(dn / bright), 0.0)
-        # What texture leaked is taken off by a straight line, which may be wrong by a part of it.
+        # A straight line is subtracted for the leaked texture, which may be wrong by a part of it.
         wider = 1 + beyond
         model = 0.04 + 0.2 * self.leak
         low, high = (value + wider * (end - value) for end in (min(low, value), max(high, value)))

@@ -158,7 +158,7 @@ def fit_edge(
         by_levels = np.hstack([plane * (1 - share), plane * share])
         rest = near.values - by_levels @ levels
         scale = max(MAD * float(np.median(np.abs(rest))), 1e-9)
-        # Cars, branches and drains lie beside edges: what departs far counts less.
+        # Cars, branches and drains lie next to edges, so pixels with large residuals count less.
         huber = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(rest), 1e-9))
         # What the noise does not explain is texture, which lowers the weight of the edge.
         texture = max(float(np.average(rest**2, weights=huber)) - float(near.variance.mean()), 0.0)

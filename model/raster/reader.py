@@ -58,7 +58,7 @@ ENVIRONMENT = {
     "GDAL_VRT_ENABLE_PYTHON": "NO",
     # A VRT could show any file of the machine as raw pixels.
     "GDAL_VRT_RAWRASTERBAND_ALLOWED_SOURCE": "NONE",
-    # Otherwise the end of a truncated JPEG is grey, and nothing is said.
+    # Otherwise the end of a truncated JPEG is grey, without any error.
     "GDAL_ERROR_ON_LIBJPEG_WARNING": "TRUE",
     # This way of reading a whole PNG leaves memory as it was where the file ends early.
     "GDAL_PNG_WHOLE_IMAGE_OPTIM": "NO",
@@ -170,7 +170,7 @@ def _files(path: Path, tiles: tuple[Path, ...], dataset: Any, trusted: bool) -> 
         if real.is_file():
             files[file] = None
             resolved.add(real)
-    # A mask beside the image is among GDAL's files only once it has been looked up.
+    # GDAL lists a mask next to the image among its files only after the mask has been read.
     mask = mask_file(path)
     return tuple(files | ({mask: None} if mask.is_file() else {}))
 

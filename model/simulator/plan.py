@@ -172,7 +172,7 @@ def make_plan(sensor: Instrument, stats: SceneStats, tolerance_dn: float = TOLER
     bounds = effect_bounds(sensor, stats)
     spent = 0.0
     negligible = set()
-    # Smallest first: as many effects as the tolerance can pay for are left out.
+    # Smallest first, so that as many effects as the tolerance allows are skipped.
     for name, change in sorted(bounds.items(), key=lambda item: item[1]):
         if change > 0 and spent + change <= tolerance_dn:
             spent += change

@@ -72,7 +72,7 @@ def window_distances(
     centre = guide[half : half + height, None, half : half + width]
     distances = guide.new_empty(len(rows), len(columns), window_px, window_px)
     for dy in range(window_px):
-        # (height, window, width): each shift along the row beside the others.
+        # (height, window, width): all shifts along the row, next to each other.
         shifted = guide[dy : dy + height].unfold(1, width, 1)[:, :window_px]
         squares = (shifted - centre).square_().reshape(height, -1)
         # Two small matrix products add up the k * k squares at the references alone, not at every
@@ -185,7 +185,7 @@ def _row_of_tiles(
         area = slice(int(run[0]), int(run[-1]) + stride_px + 2 * margin)
         rows = centres
         columns = run - run[0]
-        # What is left between missing pixels is narrow: every pixel is a reference there.
+        # Areas between missing pixels are narrow, so every pixel is a reference there.
         if not bool(torch.isfinite(noisy_wide[:, area]).all()):
             rows, columns = (torch.arange(int(place[-1]) + stride_px) for place in (rows, columns))
         return _tile(noisy_wide[:, area], guide_wide[:, area], (rows, columns), noise, settings)

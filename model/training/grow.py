@@ -36,7 +36,7 @@ def grow(network: N, variant: Variant, generator: torch.Generator) -> N:
             weight.copy_(_widened(coarse, weight.shape, generator))
             bias.copy_(_repeated(small[f"{source}.bias"], bias.shape, factor))
         elif name.endswith("second"):
-            # An added block hands on its input until it has learnt something.
+            # An added block passes on its input until it has learnt something.
             weight.zero_()
     # The head's bias is linear in the sensor vector, so that its weights grow with the features.
     if isinstance(large, BankedConvBEERS):

@@ -97,9 +97,9 @@ class PatchSource:
         """
         number, within = divmod(first, self.SHARD_BATCHES)
         threads = min(max((os.cpu_count() or 1) // 2, 1), self.MOST_THREADS)
-        # One core a thread: each would start as many more as there are cores otherwise. A thread
-        # that has not asked for its number before takes the last one that any thread has set: this
-        # one must ask first.
+        # One core per thread: otherwise each would start as many threads as there are cores. A
+        # thread that has not read its number before uses the last one that any thread has set, so
+        # this one must read it first.
         torch.get_num_threads()
         with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as ahead:
             waiting = deque(ahead.submit(self._shard, number + k) for k in range(threads))
@@ -156,8 +156,7 @@ def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -
         return None
     images, sensor = _acquire_pair(scene, recipe, ratio, generator)
     patches = cut(images, recipe.patch_px, generator)
-    # A conditioned network learns that a sensor's axes changed places, and is told so; a plain one
-    # cannot.
+    # A conditioned network is given the swapped axes of a sensor; a plain one cannot learn them.
     mirrors, quarters = sensor.symmetry
     quarter, mirrored = draw_turn(generator, quarters or recipe.family is not None, mirrors)
     if recipe.family is None:

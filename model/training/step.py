@@ -184,7 +184,7 @@ class Step:
             self.optimiser.zero_grad(set_to_none=True)
         torch.cuda.current_stream().wait_stream(stream)
         self._graph = torch.cuda.CUDAGraph()
-        # Other threads simulate patches on the device meanwhile, which a recording forbids unless
-        # told otherwise.
+        # Other threads simulate patches on the device meanwhile, which a recording forbids by
+        # default.
         with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
             self._outputs = self._taken(inputs)

@@ -238,7 +238,7 @@ def _transposed(w: HostWriter, core: IntCore, op: IntConv) -> None:
         f"{op.name}.shuffle", phased.output, f"{op.output}.whole", stride, True, False
     )
     write_shuffle(w, shuffle, shuffle.input, shuffle.output)
-    # Behind the last pixel the phases go on: as many rows and columns as the kernel does not reach
+    # The phases continue behind the last pixel: the rows and columns that the kernel does not reach
     # are cut as well.
     rows, columns = (stride * (reach + 1) - k for k in op.weight.shape[2:])
     ends = [-(op.window.pads[2] + rows), -(op.window.pads[3] + columns)]

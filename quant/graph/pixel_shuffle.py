@@ -77,7 +77,7 @@ def _shuffle(chain: list[Node], sizes: tuple[int, ...], graph: OnnxGraph) -> Nod
         shape = sizes[0] or 1, sizes[1], sizes[2] or side_px, sizes[3] or 2 * side_px
         if math.prod(shape) > VALUES:
             continue
-        # Each pixel has a number of its own, so that the result says where each one went.
+        # Each pixel has a unique number, so that the result shows where each one moved.
         image = np.arange(math.prod(shape)).reshape(shape)
         result = _moved(chain, image, graph)
         growth = _growth(result, shape)

@@ -61,8 +61,8 @@ def stated(node: Node, graph: OnnxGraph) -> Iterator[tuple[str, Scale]]:
         name = node.outputs[0] if place == RESULT else node.inputs[place]
         scales = graph.constants.get(node.inputs[scale], np.zeros(0))
         zeros = graph.value(node, zero_point)
-        # A zero point that is left out is 0, of the constant's own type, of the one that
-        # `output_dtype` asks for, or of ONNX's default, which is uint8.
+        # A missing zero point is 0. Its type is that of the constant, that of `output_dtype`, or
+        # ONNX's default, which is uint8.
         if zeros is None:
             output_dtype = node.attributes.get("output_dtype") or TensorProto.UINT8
             dtype = helper.tensor_dtype_to_np_dtype(output_dtype)

@@ -208,7 +208,7 @@ class BankSum(DualRange):
         fine, coarse, *analytic = np.split(result, self.copies, axis=1)
         fine_sum = np.sum(analytic[: self.fine_copies], 0) * np.float32(self._fine_gain(scale))
         if self.coarse_copies:
-            # The fine copies differ by at most one step, so one of them tells for all.
+            # The fine copies differ by at most one step, so checking one of them suffices.
             coarse_value = analytic[-1] * np.float32(self._coarse_gain(scale))
             fine_sum = np.where(_is_fine(analytic[0], scale), fine_sum, coarse_value)
         return np.asarray(_in_dual_range(fine, coarse, scale) + fine_sum)

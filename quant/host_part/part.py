@@ -80,7 +80,7 @@ class HostPart:
             encoding=image_encoding(network.border_px, input_ranges),
             decoding=decoding,
             input_ranges=input_ranges,
-            # An image in [0, 1] is clipped by whoever stores it.
+            # An image in [0, 1] is clipped when it is stored.
             limits=network.limits if input_ranges or network.limits != UNIT else (),
         )
 

@@ -169,7 +169,8 @@ def layer_sums(
         return *means(inputs[0], op), 0
     if isinstance(op, Resize) and op.bilinear:
         return *enlarged(inputs[0], op.factor), 0
-    # Values that only move keep their scale, and a table's entries are rounded: no shift is left.
+    # Values that only move have the same scale, and a table's entries are rounded, so no shift
+    # remains.
     return _moving(core, op, inputs), 0, INT8_BITS, 0
 
 

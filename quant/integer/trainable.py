@@ -129,7 +129,7 @@ class TrainableCore(torch.nn.Module):
         copy = deepcopy(self)
         op = self._convs[number]
         copy._convs[number] = replace(op, weight_frac_bits=op.weight_frac_bits + by)
-        # What is clipped starts at the end of int8, where its slope is not 0.
+        # Clipped numbers start at the end of int8, where the gradient is not 0.
         copy.weights[number].data.mul_(2.0**by).clamp_(INT8_MIN, INT8_MAX)
         return copy
 
@@ -214,7 +214,8 @@ def _lift(activation: Activation = Activation.none) -> float:
     """Return the offset that is added to sums, in their unit: ties to even become ties up, and
     nothing else changes.
 
-    LeakyReLU divides the unit by 128, and needs an offset that is smaller by a factor of eight.
+    It is smaller for LeakyReLU, which divides the unit by 128 and, by its slope, the offset by
+    about ten.
     """
     # Sums are integers in their unit, so less than 1 moves none but ties across a threshold.
     return 2.0**-5 if activation is Activation.leaky_relu else 2.0**-2
@@ -291,7 +292,8 @@ def _resize(op: Resize, inputs: Sequence[Tensor], _: Bits) -> Tensor:
 
 def _shuffle(op: Shuffle, inputs: Sequence[Tensor], _: Bits) -> Tensor:
     """Move values as a pixel shuffle or its inverse does."""
-    # The operation itself says where each value goes; gathering has the inverse as its slope.
+    # The operation itself determines where each value moves; the gradient of gathering is the
+    # inverse.
     count, *shape = inputs[0].shape
     order = np.asarray(op(np.arange(math.prod(shape)).reshape(1, *shape)))
     places = torch.from_numpy(order.ravel())

@@ -143,7 +143,7 @@ class OnnxGraph:
         for node in nodes:
             for name in node.inputs:
                 self.readers[name].append(node)
-            # A result that is left out has an empty name, which nobody may read.
+            # An omitted result has an empty name, which no node may read.
             self.writers.update((name, node) for name in node.outputs if name)
 
     def rewrite(self, rewriting: Rewriting) -> None:

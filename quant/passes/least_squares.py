@@ -33,7 +33,7 @@ def choose_frac_bits(
     """
     names = tensors(graph)
     shared = tied(graph)
-    # The planes' scale is fixed; -1 stands for the group of what is tied to them.
+    # The planes' scale is fixed; -1 stands for the group of tensors that are tied to them.
     groups = np.array(
         [names.index(shared[name]) if shared[name] in names else -1 for name in names]
     )

@@ -203,8 +203,8 @@ def read_samples(
     stated = ranges is not None
     if ranges is None:
         ranges = _found(label, (image for _, (image, _) in samples))
-    # Any network keeps what is constant, so a mean over such samples would hide errors. A map of
-    # noise levels is constant in each sample.
+    # Any network preserves a constant image, so a mean over such samples would hide errors. A map
+    # of noise levels is constant in each sample.
     textured = [s for s in samples if _contrast(s[1][0], ranges) >= LEAST_CONTRAST]
     if not textured:
         raise ImageError(

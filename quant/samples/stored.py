@@ -58,7 +58,7 @@ def samples_in(given: object) -> list[Pair]:
         )
     samples = list[Pair]()
     for item in given:
-        # A DataLoader gives a batch as a list: of images and references, or of images alone.
+        # A DataLoader returns a batch as a list: of images and references, or of images alone.
         batch = tuple(item) if isinstance(item, list) and len(item) == 2 else item
         alone = isinstance(batch, list | tuple) and len(batch) == 1
         samples += samples_in(batch[0] if alone else batch)

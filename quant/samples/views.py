@@ -114,7 +114,8 @@ def draw_views(
         [size // ratio - 2 * MARGIN_PX for size in scene.radiance.shape] for scene, ratio in places
     ]
     room = np.prod(sides, axis=1)  # target pixels within the margin
-    # One generator draws all of this, so the order of the draws decides what a seed gives.
+    # One generator draws all of this, so the order of the draws must not change: it determines the
+    # result of a seed.
     indices = generator.choice(len(places), CANDIDATES * count, p=room / room.sum())
     grounds = [_ground(places[k], recipe, generator) for k in indices]
     source = recipe.family or recipe.degraded

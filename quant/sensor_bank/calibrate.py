@@ -153,7 +153,7 @@ def _head(weights: Weights) -> Conv:
     # A filter's result of 1 is 128 steps here, where the trained weights count `UNIT_STEPS` as 1.
     units = 2.0**BITS / UNIT_STEPS
     copies = [(0, COPIES[0], 1.0), *((1 + k, COPIES[1], units) for k in range(FILTERS))]
-    # Copies are averaged, so each gets an equal share of the weights of what it stands for.
+    # Copies are averaged, so each gets an equal share of the weights of the result it copies.
     of_copies = chain.from_iterable(
         repeat(trained[:, kernel] * (unit / count), count) for kernel, count, unit in copies
     )

@@ -80,7 +80,7 @@ def _of_size(model: onnx.ModelProto, rows: int, columns: int, fold: Fold) -> onn
             for dim, size in zip(dims, (1, 0, rows, columns), strict=True):
                 if size and not dim.dim_value:
                     dim.dim_value = size
-    # What the file says of other tensors may contradict the numbers.
+    # The sizes of other tensors in the file may contradict the numbers.
     network.graph.ClearField("value_info")
     for value in network.graph.output:
         value.type.tensor_type.ClearField("shape")

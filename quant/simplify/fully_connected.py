@@ -68,7 +68,7 @@ class ConnectByConvolutions:
             return {axis % 4 for axis in operand} == {2, 3}
         if node.op_type != "Reshape" or len(operand) != 2 or node.attributes.get("allowzero", 0):
             return False
-        # In ONNX's Reshape a 0 copies the source's size and -1 stands for whatever is left.
+        # In ONNX's Reshape a 0 copies the source's size and -1 stands for the remaining values.
         rows, columns = operand
         return columns == prod(sizes[1:]) or (columns == -1 and rows in (0, sizes[0]))
 

@@ -90,7 +90,7 @@ def _result_size(model: onnx.ModelProto, size: tuple[int, int]) -> tuple[int, ..
     network.CopyFrom(model)
     network.graph.ClearField("value_info")
     dims = network.graph.input[0].type.tensor_type.shape.dim
-    # A network of one size is left as it is: nobody can tell what its result grows with.
+    # A network of one size is not changed, because the growth of its result is unknown.
     if len(dims) != 4 or any(dim.dim_value for dim in dims[2:]):
         return ()
     for dim, side_px in zip(dims[2:], size, strict=True):

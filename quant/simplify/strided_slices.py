@@ -78,7 +78,7 @@ def _order(graph: OnnxGraph, node: Node, channels: int, block: int) -> np.ndarra
     shape = (1, channels, 4 * block, 6 * block)
     image = np.arange(np.prod(shape)).reshape(shape)
     parts = []
-    # Each pixel has a number of its own, so that the result says where each one went.
+    # Each pixel has a unique number, so that the result shows where each one moved.
     for name in node.inputs:
         part = image
         for each in _origin(graph, name)[1]:

@@ -50,7 +50,7 @@ class AxisMap:
         """
         low = math.ceil(first / self.growth + self.low)
         high = math.floor(last / self.growth + self.high)
-        # Beyond an end of the source stands what is mirrored, or copied, from within.
+        # Pixels beyond an end of the source are mirrored, or copied, from within.
         if self.mirrored:
             return min(low, 2 * (size - 1) - high), max(high, -low)
         return min(low, size - 1), max(high, 0)
@@ -230,7 +230,7 @@ def _resize(at: AxisNode) -> AxisMap:
     exact = not linear or growth.numerator & (growth.numerator - 1) == 0
     at.require(exact, f"resizes by {growth} with weights whose rounding depends on the position")
     ways = (math.floor, math.ceil) if linear else (ROUNDINGS[resizing.rounding],)
-    # The offsets repeat after as many pixels as one pixel of the source becomes.
+    # The offsets repeat after the number of pixels that one pixel of the source becomes.
     pixels = range(growth.numerator)
     places = [(k / growth, PLACES[resizing.where](k, float(growth))) for k in pixels]
     offsets = [way(place) - share for way, (share, place) in product(ways, places)]
