@@ -273,6 +273,11 @@ def cut_filter(whole: NDArray[np.float64], radius_px: int, total: float) -> NDAr
 
     The sum is set to `total` by adding a smooth window, which changes frequencies near 0 only.
     Dividing by the sum would raise all other frequencies.
+
+    Args:
+        whole: the filter, centred on its first pixel.
+        radius_px: R.
+        total: the sum of the result.
     """
     side_px = 2 * radius_px + 1
     kernel = np.roll(whole, (radius_px, radius_px), (0, 1))[:side_px, :side_px]

@@ -78,7 +78,7 @@ def extend(
 
     Args:
         image: pixels (h, w) of a part of the image.
-        sides: where its rows and its columns lie, and which are kept.
+        sides: the positions of its rows and its columns in the image.
         origin: row and column in the image of its first pixel.
         around_px: pixels beyond the blocks on every side.
     """
@@ -144,7 +144,7 @@ def reached_blocks(flags: Image, reach_px: int) -> Image:
 
 
 def interpolate(blocks: Image, down: Placed, across: Placed) -> Image:
-    """Interpolate bilinearly between the centres of blocks, at the kept pixels."""
+    """Interpolate bilinearly between the centres of blocks, at the pixels of the result."""
     return _along(_along(blocks, down).T, across).T
 
 

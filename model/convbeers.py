@@ -50,9 +50,9 @@ class ResidualBlock(nn.Module):
     def forward(
         self, x: Tensor, step: Tensor | None = None, inner_step: Tensor | None = None
     ) -> Tensor:
-        """Add the block's correction to x (N, F, H, W); the shape is kept.
+        """Add the block's correction to x (N, F, H, W); the shape does not change.
 
-        Given steps, the maps are rounded.
+        Given step sizes, the maps are rounded.
         """
         inner = torch.relu(self.first(x))
         if step is not None and inner_step is not None:
@@ -268,8 +268,11 @@ Network = ConvBEERS | BankedConvBEERS
 def told(network: Network, vector: Tensor, bank: Bank | None = None) -> ConvBEERS | OfOneSensor:
     """Return a network that accepts images only.
 
-    A network behind a bank is conditioned on the sensor of the vector (4,). A plain network is
-    returned unchanged.
+    Args:
+        network: a network behind a bank is conditioned on the sensor; a plain one is returned
+            unchanged.
+        vector: the sensor vector (4,).
+        bank: of the sensor; None builds it from the vector.
     """
     return OfOneSensor(network, vector, bank) if isinstance(network, BankedConvBEERS) else network
 

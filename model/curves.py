@@ -56,7 +56,10 @@ def draw_table(across: float, along: float, generator: np.random.Generator) -> M
 
 
 def _drawn_optics(generator: np.random.Generator) -> Callable[[float], Curve]:
-    """Draw a kind of optics: its contrast at FREQUENCIES, for a wanted contrast at Nyquist."""
+    """Draw a kind of optics, and return a function of the contrast at Nyquist.
+
+    The function returns the contrast at FREQUENCIES.
+    """
     kind = generator.choice(["Gaussian", "pupil", "bent"], p=[0.25, 0.35, 0.4])
     share = FREQUENCIES / NYQUIST
     if kind == "Gaussian":

@@ -59,7 +59,10 @@ def profiles_for(
 ) -> tuple[Sensor, Sensor]:
     """Return the profiles of the degraded and the reference images.
 
-    They are those of the recipe if there is one, otherwise the named ones or the defaults.
+    Args:
+        sensor: the named sensor; None for that of the recipe, or the default.
+        reference: the named reference, likewise.
+        recipe: of the pairs; a named sensor must agree with it. None if there is none.
     """
     if recipe is None:
         degraded = Sensor.load(sensor or SENSOR)

@@ -28,12 +28,12 @@ LONGEST_MESSAGE = 2400
 
 
 class BeersError(Exception):
-    """Bad input: a message for the person who gave it.
+    """Bad input, with a message for the person who gave it.
 
     Args:
-        message: a sentence that says what is wrong, with the value and the file or the parameter,
-            and one that says what to do. Names of parameters stand in backquotes: the command line
-            replaces them by its options.
+        message: a sentence on what is wrong, with the value and the file or the parameter, and one
+            on what to do. Names of parameters stand in backquotes: the command line replaces them
+            by its options.
 
     Examples:
         >>> try:

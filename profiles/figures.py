@@ -89,6 +89,12 @@ def predicted(value: float, unit: str, interval: tuple[float, float], source: st
     """Build a figure that a model computed, with its uncertainty interval.
 
     It is unavailable if the value or an end of the interval is not finite.
+
+    Args:
+        value: the number.
+        unit: its unit.
+        interval: the range in which the true value is expected.
+        source: the model.
     """
     if not all(math.isfinite(number) for number in (value, *interval)):
         return unavailable(unit, f"{NOT_FINITE} ({float(value)}): {source}")

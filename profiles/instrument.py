@@ -179,6 +179,11 @@ def snr_0_bounds(radiance_0: float, radiance_1: float, snr_1: float) -> tuple[fl
     """Return the SNRs at `radiance_0` for which alpha = 0 (lower bound) and beta = 0 (upper bound).
 
     Between them alpha and beta are both at least 0.
+
+    Args:
+        radiance_0: the darker radiance, in W/m2/sr/um.
+        radiance_1: the brighter radiance, in the same unit.
+        snr_1: the SNR at `radiance_1`.
     """
     # Alpha >= 0 requires sigma_0 <= sigma_1, and beta >= 0 requires sigma_0^2 / L_0 >= sigma_1^2 /
     # L_1; sigma is L / SNR.

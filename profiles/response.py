@@ -159,8 +159,8 @@ class MtfTable:
         frequency = np.array(self.frequency)
         # Rounded tables exceed the detector's own contrast by a little at low frequencies.
         loss = np.maximum(-np.log(np.array(contrast) / np.sinc(frequency)), 0.0)
-        # Gamma is constant beyond the last frequency, and towards 0, where it cannot be divided by
-        # f.
+        # Gamma is constant beyond the last frequency, and towards 0, where the loss cannot be
+        # divided by f.
         inside = np.clip(radius, frequency[1], frequency[-1])
         return np.asarray(np.interp(inside, frequency, loss) / inside)
 

@@ -105,7 +105,7 @@ def origins(
 ) -> dict[str, str]:
     """Return, by name of the effect, where each effect of `calling_for`'s profile comes from.
 
-    An effect that was removed is listed with what removed it.
+    An effect that was removed is listed with the sensor, scene or option that removed it.
     """
     # Stated effects take precedence over added ones.
     sources = dict.fromkeys(add, "`with_`")

@@ -81,8 +81,9 @@ class Shifts:
     """The shift windows of the DPU's arithmetic (UG1414 3.5 and the quantiser's source, Vitis-AI
     3.0).
 
-    The quantiser writes within these windows. `deploy.dpu.checker.number_rules` defines what any
-    file is checked against, which allows a little more (a bias finer than the accumulator).
+    The quantiser writes within these windows. Files are checked against
+    `deploy.dpu.checker.number_rules`, which allows a little more (a bias finer than the
+    accumulator).
 
     Attributes:
         cut: fractional bits of a convolution's weight and input minus those of its result.

@@ -321,8 +321,12 @@ def _name(patches: Patches, number: int) -> str:
 
 
 def unfit_reference(patches: Patches, number: int, purpose: str) -> ImageError:
-    """Return the error of a reference of another size than the network's results, which `purpose`
-    needs.
+    """Return the error of a reference that differs in size from the network's results.
+
+    Args:
+        patches: the samples.
+        number: of the sample.
+        purpose: that needs the reference, for the message.
     """
     shape = patches.pairs[number][1].shape
     fault = f"its reference has {times(shape[1:])}" if math.prod(shape) else "it has none"

@@ -185,8 +185,15 @@ class GraphWriter:
         domain: str | None = None,
         **attributes: int | float | str | list[int],
     ) -> str:
-        """Append an operator of one result, named as its result unless it has a name; returns the
-        result's.
+        """Append an operator with one result, and return the name of the result.
+
+        Args:
+            kind: the operator.
+            output: name of the result.
+            inputs: names of its inputs.
+            name: of the node; that of the result if empty.
+            domain: of the operator; None for the domain of the writer.
+            attributes: of the node.
         """
         node = onnx.helper.make_node(
             kind, inputs, [output], name=name or output, domain=domain or self.domain

@@ -88,7 +88,13 @@ def contradictions(where: str) -> Iterator[None]:
 
 
 def check_size(name: str, sizes: Iterable[float], where: str) -> None:
-    """Raise ModelError if a file states an absurd size of a tensor; 0 and -1 are open sizes."""
+    """Raise ModelError if a file states an absurd size of a tensor.
+
+    Args:
+        name: of the tensor, for the message.
+        sizes: its sizes; 0 and -1 are open sizes.
+        where: name of the network, for the message.
+    """
     sizes = list(sizes)
     allowed = len(sizes) <= RANK and min(sizes, default=0) >= -1
     # Written so that NaN is refused as well: it compares as False.

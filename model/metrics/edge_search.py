@@ -74,6 +74,11 @@ def centre_line(region: np.ndarray) -> EdgeLine:
 def edge_in(region: np.ndarray, noise: Noise, label: str) -> Edge | Refusal:
     """Find the one near-vertical edge that crosses a region (H, W) from top to bottom.
 
+    Args:
+        region: pixels.
+        noise: variance of the noise of the pixels.
+        label: names the edge to the user.
+
     Returns:
         The edge, or the reason why there is none.
     """

@@ -34,13 +34,12 @@ def psnr_db(image: np.ndarray, reference: np.ndarray, data_range: float) -> floa
 
 
 def ssim(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
-    """Mean structural similarity (Wang et al.
+    """Compute the mean structural similarity (Wang et al. 2004) by scikit-image: 1 for identical
+    images, without a unit.
 
-    2004), by scikit-image: 1 for identical images, without a unit.
-
-    With the paper's Gaussian window of 11 x 11 pixels, sigma 1.5, and the biased covariance; the
-    mean is over the pixels that the whole window fits around, NaN where one of the images is not
-    finite.
+    It uses the paper's Gaussian window of 11 x 11 pixels, sigma 1.5, and the biased covariance. The
+    mean is over the pixels around which the whole window fits. It is NaN if one of the images is
+    not finite.
 
     Args:
         image: (H, W), at least 11 pixels a side.
@@ -69,6 +68,12 @@ def fidelity_db(
     reference.
 
     The true values of clipped pixels are unknown. If all pixels are clipped, all are used.
+
+    Args:
+        dn: digital numbers of the restored image.
+        reference: those of the reference.
+        degraded: those of the input of the restoration.
+        max_dn: full scale.
     """
     sound = (reference < max_dn) & (degraded < max_dn)
     return (

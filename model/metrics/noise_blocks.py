@@ -81,6 +81,11 @@ def cut_pair(first: np.ndarray, second: np.ndarray, clipped_at: float) -> Blocks
 
     A block is the difference of the images over the root of 2 (photon transfer). The scene cancels,
     and so do the fixed deviations of each detector.
+
+    Args:
+        first: digital numbers.
+        second: those of the other image.
+        clipped_at: blocks with a value from here on, or of 0, are excluded.
     """
     ones, part = _side_by_side(first)
     others, _ = _side_by_side(second)

@@ -71,20 +71,20 @@ class Variance:
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Variance of the noise in DN^2, alpha * DN + beta, the rounding taken off.
+    """Variance of the noise in DN^2, alpha * DN + beta, without that of rounding.
 
     Attributes:
         alpha: DN.
         beta: DN^2.
         draws: (D, 2) alpha and beta of each draw of the bootstrap.
-        blocks: how many were used.
-        measured_dn: means that the blocks reach from and to.
-        leak: share of texture in the corners of the spectrum, taken off.
+        blocks: the number of blocks that were used.
+        measured_dn: the smallest and the largest mean of the blocks.
+        leak: share of texture in the corners of the spectrum, which was subtracted.
         colour: noise at middle frequencies over that at the finest; 1 for white noise. The line is
             that of the stronger of the two.
-        white: whether the two are equal, but for chance.
-        one_level: whether it was seen at one level of light alone, so that how it grows with light
-            is assumed.
+        white: whether the two are equal within chance.
+        one_level: whether noise was measured at only one level of light, so that its growth with
+            light is assumed.
         spectrum: noise in the bands of SPECTRUM over that beyond FINE.
     """
 

@@ -171,8 +171,12 @@ def not_found(network: str) -> str:
 
 
 def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbone:
-    """Load a `Backbone` with its parameters from a file, by name; other tensors in it
-    are ignored.
+    """Load a `Backbone` with its parameters from a file, by name; other tensors in it are ignored.
+
+    Args:
+        network: "squeeze" or "vgg".
+        path: the weights file.
+        l2_pool: whether to use DISTS's pooling.
     """
     backbone = Backbone(network, l2_pool=l2_pool)
     parameters = backbone.state_dict()
@@ -238,12 +242,12 @@ MIN_NORM = 1e-3
 
 
 class Lpips(nn.Module):
-    """Learned perceptual image patch similarity (Zhang et al.
+    """Learned perceptual image patch similarity (Zhang et al. 2018, v0.1): 0 for identical images,
+    no upper bound.
 
-    2018, v0.1): 0 for identical images, no upper bound.
-
-    Name it with its network, "LPIPS-squeeze" (`label`): the networks' figures do not compare with
-    each other. The heads (C,), one for each compared layer, say how much each channel counts.
+    Name it with its network, "LPIPS-squeeze" (`label`), because figures of different networks
+    cannot be compared. The heads (C,), one for each compared layer, are the weights of the
+    channels.
     """
 
     heads: Tensor
@@ -278,12 +282,11 @@ class Lpips(nn.Module):
 
 
 class Dists(nn.Module):
-    """Deep image structure and texture similarity (Ding et al.
+    """Deep image structure and texture similarity (Ding et al. 2020): 0 for identical images, at
+    most 1.
 
-    2020): 0 for identical images, at most 1.
-
-    Over VGG16 with L2 pooling. `alpha` (1475,) says how much the mean (texture) of the image and of
-    each of its channels counts, `beta` (1475,) how much their covariance (structure).
+    It uses VGG16 with L2 pooling. `alpha` (1475,) weights the mean (texture) of the image and of
+    each of its channels, `beta` (1475,) their covariance (structure).
     """
 
     label = "DISTS"

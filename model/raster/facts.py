@@ -229,7 +229,13 @@ def require_numbers(name: str, dtype: np.dtype[Any]) -> np.dtype[Any]:
 
 
 def require_small_offset(name: str, offset: float, scale: float) -> None:
-    """Raise ImageError if pixel value 0 is far from no light: value = scale x pixel + offset."""
+    """Raise ImageError if pixel value 0 is far from no light: value = scale x pixel + offset.
+
+    Args:
+        name: of the image, for the message.
+        offset: of the pixels.
+        scale: of the pixels.
+    """
     if abs(offset) > OFFSET_DN * abs(scale):
         dark = -offset / (scale or 1)
         raise ImageError(

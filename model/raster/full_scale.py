@@ -80,8 +80,9 @@ def check_scale(full_scale: float, kind: str) -> None:
 
 
 def remedy_outside(low: float, high: float, remedy: str) -> str:
-    """Return a sentence on what to do about values from `low` to `high` that no sensor gives:
-    `remedy` if they are only too large.
+    """Return a sentence of advice about values from `low` to `high` that no sensor produces.
+
+    It is `remedy` if they are only too large.
     """
     if not np.isfinite([low, high]).all():
         return (

@@ -72,13 +72,13 @@ def write_raster(
 
     Args:
         path: of the TIFF; its folder exists.
-        raster: what the file states of the image.
-        pixels: gives the rows to write.
+        raster: the properties that the file states.
+        pixels: the rows to write.
         compression: of the tiles.
         software: the program that the file names.
 
     Raises:
-        OSError: a disk that cannot be written, or a file that differs from what was written.
+        OSError: a disk that cannot be written, or a file that differs from the given pixels.
     """
     with disk_errors(), gdal(GDAL_CACHEMAX=LEAST_CACHE_BYTES, GDAL_TIFF_INTERNAL_MASK="YES"):
         with rasterio.open(path, "w", **_profile(raster, compression)) as file:
@@ -202,14 +202,14 @@ def _describe_bands(file: Any, bands: Sequence[BandInfo]) -> None:
 
 
 def write_cog(plain: Path, cog: Path, compression: Compression, about: Mapping[str, str]) -> None:
-    """Write a TIFF again as a Cloud-Optimised GeoTIFF: tiles, overviews, and a head that says where
-    they lie (https://gdal.org/en/stable/drivers/raster/cog.html).
+    """Rewrite a TIFF as a Cloud-Optimised GeoTIFF: tiles, overviews, and a header with their
+    positions (https://gdal.org/en/stable/drivers/raster/cog.html).
 
     Args:
         plain: the TIFF; `about` is added to its metadata.
         cog: the file to write.
         compression: of the tiles.
-        about: metadata items that say what was done to the image.
+        about: metadata items on the processing of the image.
     """
     options: dict[str, Any] = {
         "COMPRESS": CODECS[compression],

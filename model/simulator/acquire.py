@@ -117,6 +117,14 @@ def simulate_pair(
 ) -> Pair:
     """Simulate two acquisitions of a scene (..., H, W) in W/m2/sr/um, each with its own noise.
 
+    Args:
+        radiance: the scene.
+        degraded: the sensor of the first image.
+        reference: the sensor of the second image.
+        oversampling: r, scene pixels per target pixel.
+        draw: seed and patch number of the random effects.
+        margin_px: target pixels cropped on each side.
+
     Returns:
         The pair, each (..., H / r - 2 margin, W / r - 2 margin).
     """
@@ -188,11 +196,11 @@ def acquire_three(
 def acquire_padded(
     radiance: np.ndarray, sensor: Instrument, oversampling: int, draw: Draw, role: str
 ) -> np.ndarray:
-    """Acquire a scene (H, W) whole, (ceil(H / r), ceil(W / r)): a mirror image lies where the
-    margin is cut off.
+    """Acquire a whole scene (H, W), (ceil(H / r), ceil(W / r)): the margin is a mirror image of the
+    scene.
 
-    Pixel n covers scene pixels r*n to r*n + r - 1: a place x of the scene, pixel i from i to i + 1,
-    lies at x / r.
+    Pixel n covers scene pixels r*n to r*n + r - 1. A position x of the scene, with pixel i from i
+    to i + 1, is mapped to x / r.
     """
     margin_px = MARGIN_PX * oversampling
     # The last target pixel may lack scene pixels: size % -oversampling is minus their number.
@@ -204,8 +212,12 @@ def acquire_padded(
 def fitting_oversampling(
     radiance: np.ndarray, oversamplings: Iterable[int], side_px: int
 ) -> int | None:
-    """Return the first oversampling that leaves `side_px` target pixels within the
-    margin, or None.
+    """Return the first oversampling that leaves `side_px` target pixels within the margin, or None.
+
+    Args:
+        radiance: the scene (H, W).
+        oversamplings: candidates, in order of preference.
+        side_px: the least side without margins.
     """
     target_px = side_px + 2 * MARGIN_PX
     return next(

@@ -91,6 +91,14 @@ def behind(name: str, change_dn: float, sensor: Instrument) -> float:
 
     Blooming adds its share, PRNU its largest gain, and noise changes with the signal: |sqrt(a) -
     sqrt(b)| <= min(sqrt|a - b|, |a - b| / (2 sqrt(beta))).
+
+    Args:
+        name: of the effect.
+        change_dn: the largest change by the effect itself.
+        sensor: the instrument.
+
+    Returns:
+        The bound in DN.
     """
     gain = sensor.gain_dn_per_radiance
     change = change_dn
@@ -168,7 +176,13 @@ class Plan:
 
 
 def make_plan(sensor: Instrument, stats: SceneStats, tolerance_dn: float = TOLERANCE_DN) -> Plan:
-    """Decide about every effect of a sensor for a scene with these statistics."""
+    """Decide about every effect of a sensor for a scene with these statistics.
+
+    Args:
+        sensor: the instrument.
+        stats: of the scene.
+        tolerance_dn: the largest change by all effects that are skipped as negligible.
+    """
     bounds = effect_bounds(sensor, stats)
     spent = 0.0
     negligible = set()

@@ -37,7 +37,7 @@ WATER = 16.0
 
 
 def procedural_scene(height_px: int, width_px: int, generator: np.random.Generator) -> Scene:
-    """Draw a scene of that many pixels, a 10 cm world: a car is some 40 pixels long."""
+    """Draw a scene of this size, with pixels of 10 cm: a car is some 40 pixels long."""
     canvas = Image.new("F", (width_px, height_px), GRASS)
     draw = ImageDraw.Draw(canvas)
     _fields(draw, canvas.size, generator)

@@ -77,6 +77,11 @@ def compensation_kernel(blur_from: Blur, blur_to: Blur, epsilon: float) -> Tenso
     float64, sum 1.
 
     The gain is exact at DC and at frequencies above some cycles per 2 R pixels.
+
+    Args:
+        blur_from: blur of the image, as in `compensation_gain`.
+        blur_to: the blur to reach, likewise.
+        epsilon: regularisation, 0 or more.
     """
     # Sampled this finely, the slow tail folds back onto the filter little.
     side = 8 * RADIUS_PX

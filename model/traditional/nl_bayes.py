@@ -34,7 +34,7 @@ def patch_matrix(image: Tensor, side_px: int) -> Tensor:
 
 
 def overlap_add(patches: Tensor, shape: torch.Size, side_px: int) -> Tensor:
-    """Add every patch of the matrix onto its place in an image of `shape` (H, W): the adjoint of
+    """Add every patch of the matrix at its place in an image of `shape` (H, W): the adjoint of
     `patch_matrix`.
     """
     height, width = shape
@@ -88,6 +88,12 @@ def window_numbers(
     rows: Tensor, columns: Tensor, grid_columns: int, window_px: int
 ) -> tuple[Tensor, Tensor]:
     """Compute the patch numbers of the candidates in each window.
+
+    Args:
+        rows: (R,) top row of each reference's window.
+        columns: (C,) leftmost column of it.
+        grid_columns: the number of patches in a row of the image.
+        window_px: the number of candidates along each axis.
 
     Returns:
         The number of each window's first candidate (R * C, 1), and the offsets of all candidates
@@ -234,10 +240,19 @@ def _rows_of(matrix: Tensor, numbers: Tensor) -> Tensor:
 def similar_groups(
     guide: Tensor, known: Tensor, places: Places, settings: PassSettings
 ) -> Iterator[tuple[Tensor, Tensor | None]]:
-    """Yield groups of similar patches: their numbers (B, N), and which of them count (None: all).
+    """Yield groups of similar patches.
 
     The many groups of at most the usual size come first, so that they do not need the memory of the
     larger groups.
+
+    Args:
+        guide: (h, w), in which similar patches are searched.
+        known: (h, w) bool, False where a pixel is missing.
+        places: rows and columns of the search windows.
+        settings: of the pass.
+
+    Yields:
+        The patch numbers (B, N) of groups, and a mask of those that count (None: all).
     """
     distances = window_distances(guide.nan_to_num(0), *places, settings.side_px, settings.window_px)
     first, steps = window_numbers(
@@ -272,8 +287,12 @@ def _rule_out(distances: Tensor, numbers: Tensor, complete: Tensor) -> None:
 def nearest_first(distances: Tensor, usual: int, most: int) -> tuple[Tensor, Tensor]:
     """Return the columns (B, most) of the smallest values of each row, and these values.
 
-    The `usual` smallest come first. numpy's partition is over three times faster than torch's topk
-    (measured).
+    numpy's partition is over three times faster than torch's topk (measured).
+
+    Args:
+        distances: (B, M).
+        usual: this number of smallest values comes first.
+        most: the number of columns to return.
     """
     ends = [k for k in (usual - 1, most - 1) if k < distances.shape[1] - 1]
     if ends:

@@ -61,7 +61,7 @@ class Chain:
         """Return the pipeline with the epsilon for an image in strips (any, W) of digital numbers,
         NaN where missing.
 
-        A chain that has an epsilon is returned as it is, and no strip is read.
+        A chain that has an epsilon is returned unchanged, and no strip is read.
         """
         if self.epsilon is not None:
             return self
@@ -89,11 +89,11 @@ def restore_traditional(dn: Tensor, chain: Chain) -> Tensor:
 
 
 def restore_strips(strips: Iterable[Tensor], height: int, chain: Chain) -> Iterator[Tensor]:
-    """Restore as `restore_traditional`, bit for bit, an image that comes and goes in strips of
-    rows, (any, W) each.
+    """Restore an image that arrives in strips of rows, (any, W) each, with the same bits as
+    `restore_traditional`.
 
-    The chain needs an epsilon (see `Chain.fitted_to`), because the strips are read only once. Holds
-    some 700 rows of the image, and the tallest strip.
+    The chain needs an epsilon (see `Chain.fitted_to`), because the strips are read only once. Some
+    700 rows of the image, and the tallest strip, are held in memory.
     """
     radiance = (to_radiance(strip, chain.degraded) for strip in finite_or_missing(strips))
     # The converter's rounding adds a twelfth of a squared DN, which NL-Bayes must know of.

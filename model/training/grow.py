@@ -21,6 +21,11 @@ def grow(network: N, variant: Variant, generator: torch.Generator) -> N:
     among the copies (Net2Net, Chen et al. 2016). Added blocks are distributed evenly between the
     others. Their second convolution is zero, so that each initially passes on its input. At a
     larger scale each feature becomes one for each pixel of a place (see `_coarser`).
+
+    Args:
+        network: the smaller network.
+        variant: the size of the new one.
+        generator: of the shares by which weights are divided.
     """
     sources = _sources(network.variant, variant)
     large = type(network)(variant)

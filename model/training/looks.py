@@ -66,4 +66,4 @@ class Looks:
 
 
 ORDINARY = Looks()
-"""Photographs as they are, on days of different light."""
+"""Unchanged photographs, on days of different light."""

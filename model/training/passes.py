@@ -74,6 +74,11 @@ def prepare(scene: Scene, multiple: int, device: torch.device | str = "cpu") -> 
 def folded_signals(scene: Visited, sensors: tuple[Instrument, ...], made: Pass) -> list[Tensor]:
     """Compute the blurred and sampled radiance (h, w) of each sensor on the target grid, without
     the margin.
+
+    Args:
+        scene: with its spectrum.
+        sensors: the instruments.
+        made: the parameters of the pass.
     """
     height, width = scene.sides
     device = scene.spectrum.device
@@ -200,6 +205,12 @@ def detected(
 ) -> Tensor:
     """Simulate the detector for a sampled signal (h, w), and return digital numbers over full
     scale.
+
+    Args:
+        signal: radiance in W/m2/sr/um.
+        sensor: the instrument.
+        role: "degraded" or "reference", so that the two draws of a pair differ.
+        generator: of the seed of the noise.
     """
     seed = int(generator.integers(2**31))
     if any(pixel_effects(sensor.effects, acts_on) for acts_on in ("radiance", "DN")):

@@ -60,8 +60,12 @@ def draw_turn(
     """Draw the number of quarter turns, and whether to mirror afterwards.
 
     An odd number of quarter turns swaps rows and columns. A plain network learns one sensor. If its
-    two axes differ, they must not be swapped, and `quarters` is False: four symmetries remain. If
-    its blur is asymmetric, `mirrors` is False, and patches are not changed at all.
+    two axes differ, they must not be swapped: four symmetries remain.
+
+    Args:
+        generator: of the draws.
+        quarters: whether odd quarter turns are allowed.
+        mirrors: False if the blur is asymmetric; patches are then not changed at all.
     """
     # Both are drawn whatever is allowed: the generator goes on in the same way.
     quarter = int(generator.integers(4))

@@ -90,7 +90,13 @@ class Run:
 
 
 def train(run: Run, resume: bool, worker: Worker) -> None:
-    """Run or resume a training to its end, and log whether LPIPS is part of the loss."""
+    """Run or resume a training to its end, and log whether LPIPS is part of the loss.
+
+    Args:
+        run: the options.
+        resume: whether to continue from the checkpoint of the run.
+        worker: this process among those of the run.
+    """
     variant = variant_named(run.variant)
     require_whole_places(run, variant)
     loss, message = loss_of(run)

@@ -218,7 +218,9 @@ def _told_of(sensor: Instrument, factor: int, quarter: int, mirrored: bool) -> t
 
 
 def cut(images: Tensor, patch_px: int, generator: np.random.Generator) -> Tensor:
-    """Cut (C, H, W) into as many whole patches as fit, from a random corner: (N, C, P, P)."""
+    """Cut (C, H, W) into the largest number of whole patches, from a random corner:
+    (N, C, P, P).
+    """
     top, left = (int(generator.integers(size % patch_px + 1)) for size in images.shape[-2:])
     windows = images[:, top:, left:].unfold(1, patch_px, patch_px).unfold(2, patch_px, patch_px)
     return windows.permute(1, 2, 0, 3, 4).reshape(-1, len(images), patch_px, patch_px)

@@ -66,7 +66,9 @@ class Networks:
         return weight, np.zeros(len(weight), np.float32) if bias is None else bias
 
     def set_weights(self, node: Node, weight: np.ndarray, bias: np.ndarray) -> None:
-        """Give a convolution weights of its own, in the model too."""
+        """Set the weights and bias of a convolution in graph and model, without changing those of
+        other nodes.
+        """
         numbers = {"weight": weight, "bias": bias}
         names = [self.graph.add_constant(f"{node.name}.{role}", v) for role, v in numbers.items()]
         node.inputs = (node.inputs[0], *names)

@@ -32,7 +32,14 @@ SHRINK = "Shrink by a pool or a strided convolution, or cut the network in front
 
 
 def require(condition: bool, node: Node, rule: str, remedy: str = REMEDY) -> None:
-    """Raise ModelError unless a node meets a rule: "must ..." or "has ..."."""
+    """Raise ModelError unless a condition holds.
+
+    Args:
+        condition: whether the node meets the rule.
+        node: that the message names.
+        rule: a verb phrase for the message: "must ..." or "has ...".
+        remedy: a sentence on what to do.
+    """
     if not condition:
         raise unsupported(f"{node} {rule}.", remedy)
 

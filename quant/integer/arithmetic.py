@@ -27,6 +27,13 @@ def convolve(
 
     It computes a matrix product per strip of rows, in floats that represent its sums exactly. The
     windows of a whole image would need kh kw times its memory.
+
+    Args:
+        image: integers (N, I, H, W).
+        weight: integers (O, I / groups, kh, kw).
+        window: strides, pads and dilations.
+        groups: 1, or the number of channels of a depthwise convolution.
+        transposed: whether strides enlarge and pads crop.
     """
     if transposed:
         wide, window = _between_zeros(image, weight, window)
@@ -100,7 +107,16 @@ def bound_of(op: IntConv, bias: np.ndarray) -> float:
 
 
 def activated(sums: np.ndarray, activation: Activation, frac_bits: int) -> tuple[np.ndarray, int]:
-    """Return the sums behind an activation, and the fractional bits that they have gained."""
+    """Apply an activation to sums.
+
+    Args:
+        sums: integers.
+        activation: of the operation.
+        frac_bits: of the sums.
+
+    Returns:
+        The results, and the number of fractional bits by which they are finer than the sums.
+    """
     if activation is Activation.relu:
         return np.maximum(sums, 0), 0
     if activation is Activation.relu6:

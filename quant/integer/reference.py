@@ -101,8 +101,16 @@ class LayerReport:
 def run_core(
     core: IntCore, planes: np.ndarray, half_even: bool = False, faults: Faults = SOUND
 ) -> tuple[dict[str, np.ndarray], list[LayerReport]]:
-    """Return every tensor of the core for its int8 planes (N, P, H, W), as int16, and a report a
-    layer.
+    """Run a core on int8 planes (N, P, H, W).
+
+    Args:
+        core: the integer core.
+        planes: its input.
+        half_even: whether ties are rounded to even, as onnxruntime does, instead of up.
+        faults: that are injected.
+
+    Returns:
+        Every tensor by name, as int16, and one report per operation.
     """
     tensors = {PLANES: faults.touch(PLANES, planes.astype(np.int16))}
     reports = []
@@ -120,8 +128,9 @@ def run_core(
 
 
 def correction(core: IntCore, planes: np.ndarray, half_even: bool = False) -> np.ndarray:
-    """Return the correction (N, C, H, W) for int8 planes (N, P, H, W), all its copies, as float32
-    multiples of its scale.
+    """Return the correction (N, C, H, W) for int8 planes (N, P, H, W), with all its copies.
+
+    It is float32, in multiples of its scale. `half_even` rounds ties to even, as onnxruntime does.
     """
     tensors, _ = run_core(core, planes, half_even)
     return np.asarray(tensors[CORRECTION] * np.float32(core.scale(CORRECTION)), np.float32)
@@ -220,7 +229,16 @@ def _add(core: IntCore, op: Add, inputs: list[np.ndarray], faults: Faults) -> Su
 
 
 def rounded(sums: np.ndarray, shift: int, half_even: bool) -> tuple[np.ndarray, float]:
-    """Return sums divided by 2^shift and rounded, not clipped; and the share that lay half-way."""
+    """Divide sums by 2^shift and round them, without clipping.
+
+    Args:
+        sums: integers.
+        shift: right shift; a negative one shifts left.
+        half_even: whether ties are rounded to even instead of up.
+
+    Returns:
+        The integers, and the share of ties.
+    """
     if shift <= 0:
         return sums << min(-shift, 8), 0.0  # by 8 all but 0 lies beyond int8
     half = 1 << (shift - 1)

@@ -123,7 +123,16 @@ def channel_sizes(
     host_part: HostPart = ONE_CHANNEL,
     quantile: float = QUANTILE,
 ) -> Iterator[list[np.ndarray]]:
-    """Yield a quantile of each channel's sizes, (C,) a tensor, for every tile of the images."""
+    """Yield, for every tile of the images, a quantile of the absolute values of each channel: (C,)
+    per tensor.
+
+    Args:
+        graph: a float graph that reads the planes.
+        names: of the tensors.
+        images: (1, C', H, W).
+        host_part: of the graph.
+        quantile: of the absolute values.
+    """
     for results in values_of(graph, names, images, host_part):
         sizes = [np.abs(r[0]).reshape(r.shape[1], -1) for r in results]
         yield [np.quantile(size, quantile, axis=1).astype(np.float64) for size in sizes]
@@ -137,7 +146,14 @@ def above_dead(ranges: np.ndarray) -> np.ndarray:
 
 
 def first_guess(ranges: np.ndarray, gamma: float, headroom: float) -> np.ndarray:
-    """Return factors that equalize the ranges, and fit the widest into int8."""
+    """Return factors that equalize the ranges, and scale the widest to int8.
+
+    Args:
+        ranges: of the channels, (C,).
+        gamma: exponent of the equalization; 0 leaves the ratios of the ranges unchanged, 1 makes
+            all equal.
+        headroom: the widest range as a share of int8's.
+    """
     factors = (ranges.max() / ranges) ** gamma
     return np.asarray(factors * headroom * FULL / (ranges * factors).max())
 
@@ -177,7 +193,13 @@ def search(
 def stepped(
     costs_of: Callable[[np.ndarray], Costs], channels: Sequence[np.ndarray], best: "Best"
 ) -> "Best":
-    """Return the best factors once these channels have been tried larger and smaller."""
+    """Try groups of channels larger and smaller, and return the best factors.
+
+    Args:
+        costs_of: returns the trial of some factors.
+        channels: the numbers of the channels of each group.
+        best: the best factors so far.
+    """
     trials = list(product(STEPS, channels))
     with steps("groups of channels", len(trials)) as bar:
         for size, together in trials:
@@ -205,6 +227,11 @@ def race(costs_of: Costs, factors: np.ndarray, best: Best) -> Best:
     """Return the better of two candidates.
 
     The costliest crops come first: six of seven trials fail, and most of them show it on two crops.
+
+    Args:
+        costs_of: returns the error of the new factors on some crops.
+        factors: the new factors, (C,).
+        best: the best factors so far.
     """
     order = np.argsort(-best.costs, kind="stable")
     costs = np.zeros(len(order))

@@ -186,7 +186,9 @@ def equalize_single(
     parts = singles.parts
 
     def guessed(best: Best, names: Sequence[str], costs_of: Callable[[np.ndarray], Costs]) -> Best:
-        """Return the best of the first guesses for these tensors, the others as they are."""
+        """Return the best of the first guesses for these tensors, with the factors of the others
+        unchanged.
+        """
         shapes = list(product(GAMMAS, HEADROOM))
         with steps("first guesses", len(shapes)) as bar:
             for shape in shapes:

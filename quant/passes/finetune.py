@@ -178,12 +178,12 @@ def descend(
 ) -> Iterator[int]:
     """Train by Adam for a round.
 
-    The learning rate falls to 0 as a half cosine. While it is high, parameters cross the thresholds
-    of their rounding to and fro, so that a judgement of the rounded core would mean little.
+    The learning rate falls to 0 as a half cosine. While it is high, parameters cross their rounding
+    thresholds back and forth, so that evaluating the rounded core would mean little.
 
     Args:
         trainable: the core, whose parameters are changed in place.
-        samples: what it is trained on; each step draws some of them with replacement.
+        samples: to train on; each step draws some of them with replacement.
         steps: the number of gradient steps.
         highest_rate: the learning rate of the first step, in units of each number's scale.
         generator: draws the samples.

@@ -102,7 +102,9 @@ def _links(op: Op, widths: Mapping[str, int]) -> list[tuple[str, str, int]]:
 
 
 def exceeds_six(graph: Graph, group: ResidualGroup, frac_bits: Mapping[str, int]) -> bool:
-    """Return True if a ReLU6 writes to it, and int8 ends beyond the six in one of its tensors."""
+    """Return True if a ReLU6 writes to a group, and int8 ends beyond the six in one
+    of its tensors.
+    """
     clipped = any(
         isinstance(op, Conv) and op.activation is Activation.relu6 and op.output in group
         for op in graph

@@ -68,10 +68,16 @@ def crop_count(crop: np.ndarray, available: int) -> int:
 def search_targets(
     graph: Graph, host_part: HostPart, images: Sequence[np.ndarray], count: int
 ) -> Targets:
-    """Return `count` crops, fewer if there are not enough: those with the largest corrections, and
-    others of all sizes.
+    """Choose crops, and restore them in float: those with the largest corrections, and others of
+    all sizes.
 
     Only the sizes of corrections are stored; the images of the selected crops are simulated again.
+
+    Args:
+        graph: a float graph that reads the planes.
+        host_part: of the graph.
+        images: (1, C, H, W).
+        count: the number of crops; fewer are returned if there are not enough.
     """
     session = open_session(graph_to_onnx(graph, [CORRECTION], host_part.planes))
     halo_px = 0 if halo_of(graph) is not None else None

@@ -56,7 +56,7 @@ class SampleRange:
         )
 
     def to_words(self) -> str:
-        """Return the range as it stands in the metadata of an INT8 file."""
+        """Return the range as text for the metadata of an INT8 file."""
         return json.dumps({name: round(value, 6) for name, value in asdict(self).items()})
 
     def row(self, name: str, source: str) -> Row:

@@ -91,8 +91,8 @@ def draw_patches(
 
 
 def _simulate(ground: Ground, sensors: Sequence[Instrument], draw: Draw) -> list[np.ndarray]:
-    """Return what the degraded sensor, and the reference if given, produce from the same ground:
-    patches (1, 1, P, P).
+    """Simulate patches (1, 1, P, P) of the same ground by the degraded sensor and, if given, the
+    reference.
     """
     radiance = ground.radiance
     spectrum = scene_spectrum(radiance)

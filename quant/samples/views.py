@@ -148,8 +148,16 @@ def stratified(
     count: int,
     generator: np.random.Generator,
 ) -> list[Candidate]:
-    """Return one of each of `count` equal groups of the candidates ordered by `key`, in random
-    order.
+    """Divide the candidates, sorted by `key`, into equal groups, and draw one of each.
+
+    Args:
+        candidates: at least `count` of them.
+        key: by which they are sorted.
+        count: the number of groups.
+        generator: of the draws.
+
+    Returns:
+        One candidate of each group, in random order.
     """
     ranked = sorted(candidates, key=key)
     size = len(candidates) // count

@@ -181,6 +181,13 @@ def bank_results(
     float32.
 
     These are the bank's results / 128 at a gain of 1, and planes of half of a sensor's values.
+
+    Args:
+        image: the image.
+        bank: of the sensor.
+        vector: the sensor vector (4,).
+        scale: S of the network.
+        kernels: of the bank.
     """
     integers = integer_bank(bank, scale, 1, kernels)
     planes = bank_host_part(scale, BankSum()).encode(image)

@@ -125,7 +125,7 @@ def required_conditioned_core(model: onnx.ModelProto) -> ConditionedCore:
 
 
 def bank_layer(bank: Bank, scale: int, shifts: Shifts, kernels: Kernels) -> IntConv:
-    """Return the first convolution of a network of that scale, for one sensor."""
+    """Return the first convolution of a network of the given scale, for one sensor."""
     integers = integer_bank(bank, scale, bank.gain, kernels)
     # The offsets put each copy of a result at another place of a rounding step.
     bias = quantize_bias(integers.offsets * 2.0**-BITS, integers.frac_bits + BITS, shifts)

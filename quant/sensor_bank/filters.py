@@ -92,7 +92,14 @@ def spread_over_a_step(count: int) -> list[float]:
 
 
 def integer_bank(bank: Bank, scale: int, gain: float, kernels: Kernels = "fitted") -> IntegerBank:
-    """Quantise a bank for a network of that scale, in steps finer by `gain`."""
+    """Quantise a bank for a network.
+
+    Args:
+        bank: of the sensor.
+        scale: of the network.
+        gain: the factor by which the steps of the results are finer.
+        kernels: of the bank.
+    """
     steps = np.concatenate([bank.kernels, bank.kernels[-1:] / WIDE])
     # The kernels multiply shares of full scale, but the planes hold digital numbers.
     steps *= gain * UNIT_STEPS / MAX_DN

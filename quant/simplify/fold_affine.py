@@ -109,7 +109,7 @@ def fold_in_front(graph: OnnxGraph, shapes: Shapes) -> None:
 
 
 def convolve_normalisation(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a normalisation of images that is left by a depthwise convolution (4)."""
+    """Replace a remaining normalisation of images by a depthwise convolution (4)."""
     # The normalisation in front may just have become a convolution, which takes this one in.
     replacement = fold_behind(graph, node)
     match = affine_of(graph, node) if node.op_type == NORMALISATION else None

@@ -97,7 +97,9 @@ class AxisNode:
         return values or []
 
     def own(self, numbers: Sequence[Any], axes: Sequence[int], otherwise: Any) -> Any:
-        """Return this side's number, of some for these axes of (N, C, H, W)."""
+        """Return the number for this side from numbers for `axes` of (N, C, H, W), or `otherwise`
+        if it has none.
+        """
         # A negative axis counts from the last one.
         by_axis = dict(zip((int(axis) % 4 for axis in axes), numbers, strict=True))
         return by_axis.get(2 + self.axis, otherwise)
