@@ -175,7 +175,7 @@ def _page(judged: Table, record: dict[str, Any]) -> Report:
     )
 
 
-def bill_of(said: dict[str, Any]) -> str:
+def bill_of(document: dict[str, Any]) -> str:
     """A bill of materials in CycloneDX 1.6; the library has no model cards yet, so facts are
     properties.
     """
@@ -193,12 +193,12 @@ def bill_of(said: dict[str, Any]) -> str:
             type=kind, name=text, bom_ref=f"{kind.value}:{text}:{digest}", hashes=hashes, **more
         )
 
-    network = said["network"]
-    tool = said["tool"]
+    network = document["network"]
+    tool = document["tool"]
     # A serial number made of the content gives the same record the same number.
-    bom = Bom(serial_number=uuid5(NAMESPACE_URL, json.dumps(said)))
-    facts = said["says"] | {
-        key: said[key]
+    bom = Bom(serial_number=uuid5(NAMESPACE_URL, json.dumps(document)))
+    facts = document["says"] | {
+        key: document[key]
         for key in ("training", "sensors_in_range", "limitations", "passed", "licence")
     }
     properties = [
@@ -215,7 +215,7 @@ def bill_of(said: dict[str, Any]) -> str:
     bom.metadata.tools.components.add(maker)
     files = [
         component(ComponentType.FILE, entry["name"], entry["sha256"])
-        for entry in said["results"]["inputs"]
+        for entry in document["results"]["inputs"]
     ]
     bom.components.update(files)
     bom.register_dependency(bom.metadata.component, files)

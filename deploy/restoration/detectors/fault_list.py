@@ -94,11 +94,11 @@ class FaultList:
         return np.array(places, np.int64).reshape(-1, 3)
 
 
-def list_beside(out: Path, wanted: str) -> Path | None:
+def list_beside(out: Path, source: str) -> Path | None:
     """Return where the list of found faults is written, beside the restored image; None if none are
     searched for.
     """
-    return out.with_name(f"{out.stem}.detectors.csv") if wanted == FOUND else None
+    return out.with_name(f"{out.stem}.detectors.csv") if source == FOUND else None
 
 
 def write_list(faults: FaultList, path: Path | None) -> None:

@@ -64,7 +64,7 @@ class Hits:
     objects: np.ndarray
 
 
-def find_hits(truths: Sequence[Boxes], found: Sequence[Boxes], classes: int) -> Hits:
+def find_hits(truths: Sequence[Boxes], detected: Sequence[Boxes], classes: int) -> Hits:
     """Match what was found with what is labelled, once for all figures, by the rules of the COCO
     evaluation.
 
@@ -76,15 +76,15 @@ def find_hits(truths: Sequence[Boxes], found: Sequence[Boxes], classes: int) -> 
     Args:
         truths: labelled boxes of each image; images without any belong to them: what is found there
             is false.
-        found: what was found on each image, in the same px, of the same classes.
+        detected: what was found on each image, in the same px, of the same classes.
         classes: how many there are.
     """
-    scores = np.concatenate([boxes.scores for boxes in found])
-    kinds = np.concatenate([boxes.classes for boxes in found])
+    scores = np.concatenate([boxes.scores for boxes in detected])
+    kinds = np.concatenate([boxes.classes for boxes in detected])
     # Stable, so that equal scores keep the order of the images.
     order = np.argsort(-scores, kind="stable")
-    image = np.repeat(np.arange(len(found)), [len(boxes) for boxes in found])
-    matches = [match(truth, boxes)[:2] for truth, boxes in zip(truths, found, strict=True)]
+    image = np.repeat(np.arange(len(detected)), [len(boxes) for boxes in detected])
+    matches = [match(truth, boxes)[:2] for truth, boxes in zip(truths, detected, strict=True)]
     hits, ignored = (
         np.concatenate(parts, axis=-1)[..., order] for parts in zip(*matches, strict=True)
     )
@@ -103,7 +103,7 @@ def _of_other_size(boxes: Boxes) -> np.ndarray:
     return np.array([(sides < low) | (sides >= high) for low, high in SIZES_PX.values()])
 
 
-def match(truth: Boxes, found: Boxes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def match(truth: Boxes, detected: Boxes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Match the N boxes found on an image with its M labelled ones, by `SIZES_PX` and `OVERLAPS`.
 
     Returns:
@@ -111,13 +111,13 @@ def match(truth: Boxes, found: Boxes) -> tuple[np.ndarray, np.ndarray, np.ndarra
             taken, (S, 10, M).
     """
     uncounted = np.repeat((truth.ignored | _of_other_size(truth))[:, None], len(OVERLAPS), axis=1)
-    ignored = np.repeat(_of_other_size(found)[:, None], len(OVERLAPS), axis=1)
+    ignored = np.repeat(_of_other_size(detected)[:, None], len(OVERLAPS), axis=1)
     hits = np.zeros_like(ignored)
     matched = np.zeros_like(uncounted)
-    overlaps = iou(found.corners, truth.corners, truth.ignored) * (
-        found.classes[:, None] == truth.classes
+    overlaps = iou(detected.corners, truth.corners, truth.ignored) * (
+        detected.classes[:, None] == truth.classes
     )
-    for one in np.argsort(-found.scores, kind="stable"):
+    for one in np.argsort(-detected.scores, kind="stable"):
         if overlaps[one].max(initial=0) < OVERLAPS[0]:
             continue
         # An object is found once; an ignored box may hold any number of detections.

@@ -292,18 +292,20 @@ def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -
     return strips
 
 
-def evaluation_report(found: Evaluation, strips: Sequence[Picture]) -> Report:
+def evaluation_report(evaluation: Evaluation, strips: Sequence[Picture]) -> Report:
     """Return the page: pictures, means, sites, and the sweep where there was one.
 
     Tables of single images are for the document alone.
     """
     tables = []
-    for name, rows in by_table(found.rows).items():
+    for name, rows in by_table(evaluation.rows).items():
         if not name.startswith("images"):
             heading = HEADINGS.get(name, name)
             title = f"{heading[0].upper()}{heading[1:]}"
             tables.append(Section(title, rows, caption_of(name)))
-    return Report(found.title, headline(found.rows), tables, strips, (*NOTES, *found.notes))
+    return Report(
+        evaluation.title, headline(evaluation.rows), tables, strips, (*NOTES, *evaluation.notes)
+    )
 
 
 def caption_of(table: str) -> str:
