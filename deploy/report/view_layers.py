@@ -238,11 +238,11 @@ def _ends(stretches: Sequence[Stretch], unit: str) -> tuple[tuple[str, str], ...
 def _notes(raw: Raster, made: Raster, bands: int) -> str:
     """Return sentences that say what is shown and how."""
     low, high = STRETCH
-    sentences = [
-        f"{raw.width_px} x {raw.height_px} pixels. Raw and restored have one stretch: black and "
-        f"white are the percentiles {low:g} and {high:g} of the raw image, with a gamma of "
-        f"{1 / GAMMA:g}."
-    ]
+    stretch = (
+        f"Raw and restored have one stretch: black and white are the percentiles {low:g} and "
+        f"{high:g} of the raw image, with a gamma of {1 / GAMMA:g}."
+    )
+    sentences = [f"{raw.width_px} x {raw.height_px} pixels.", stretch]
     if bands == 3:
         sentences.append("Bands 1, 2 and 3 are shown red, green and blue.")
     elif raw.bands > 1:
