@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from beers_deploy.restoration.output import Output
     from beers_deploy.restoration.prepare import NetworkPipeline, Pipeline
     from beers_deploy.restoration.radiometry import Reading
+    from beers_deploy.restoration.run import Run
     from beers_deploy.results import Table
 
 
@@ -194,7 +195,7 @@ def restore(
     if output is None:
         return _preview(path, network_pipeline(), reading)
     run = restore_file(path, output, reading, load)
-    _write_documents(path, output, stac, view, force)
+    _write_documents(path, run, output, stac, view, force)
     return run
 
 
@@ -238,6 +239,7 @@ def _output(
     """
     from beers_deploy.restoration.detectors.fault_list import list_beside
     from beers_deploy.restoration.output import Output
+    from beers_deploy.restoration.stac_network import network_paths
 
     if out is None:
         raise OptionError(
@@ -248,16 +250,23 @@ def _output(
         raise OptionError(
             f"{path} exists already. Add `overwrite` to replace it, or choose another name."
         )
-    if documents[0] is not None:
+    named = [None if document is None else Path(document) for document in documents]
+    if named[0] is not None:
         optional("pystac", "stac")
+        (item,) = network_paths(named[0], 1)
+        named += [item, item.with_suffix(".onnx")]
     # The list of faults is an output of its own where they are searched for.
     listed = list_beside(path, fix_detectors)
-    named = [None if document is None else Path(document) for document in documents]
     return Output(path, others=(*named, listed, how["self_check"]), **how)
 
 
 def _write_documents(
-    image: Path, output: "Output", stac: OutputFile | None, view: OutputFile | None, force: bool
+    image: Path,
+    run: "Run",
+    output: "Output",
+    stac: OutputFile | None,
+    view: OutputFile | None,
+    force: bool,
 ) -> None:
     """Write the STAC item and the view of a run, where they are asked for."""
     from beers_deploy.report.view import write_view
@@ -266,9 +275,9 @@ def _write_documents(
     # Rasters over the same place as the output, by name.
     maps = {} if output.self_check is None else {"self-check": output.self_check}
     if stac is not None:
-        write_item(output.path, Path(stac))
+        write_item(run, Path(stac), maps)
     if view is not None:
-        write_view(Path(view), image, output.path, maps, force)
+        write_view(Path(view), image, run.path, maps, force)
 
 
 def _preview(image: Path, pipeline: "NetworkPipeline", reading: "Reading") -> "Table":
