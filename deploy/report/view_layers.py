@@ -130,23 +130,16 @@ def read_planes(source: Source, bands: Sequence[int], factor: int) -> Planes:
     parts = []
     for start, stop in strips(raster.height_px, rows_px):
         stored = source.read(start, stop)[list(bands)]
-        pixels = np.ma.getdata(stored).astype(np.float32)
-        pixels[raster.missing(stored)] = np.nan
-        parts.append(_reduced(pixels, factor))
+        # Blocks at the right and at the bottom may have fewer pixels.
+        beyond = ((0, 0), (0, (start - stop) % factor), (0, -raster.width_px % factor))
+        known = np.ma.array(
+            np.pad(np.ma.getdata(stored), beyond),
+            np.float32,
+            mask=np.pad(raster.missing(stored), beyond, constant_values=True),
+        )
+        blocks = known.reshape(len(bands), known.shape[1] // factor, factor, -1, factor)
+        parts.append(blocks.mean(axis=(2, 4)).filled(np.nan))
     return np.concatenate(parts, axis=1)
-
-
-def _reduced(pixels: Planes, factor: int) -> Planes:
-    if factor == 1:
-        return pixels
-    bands, height, width = pixels.shape
-    beyond = ((0, 0), (0, -height % factor), (0, -width % factor))
-    blocks = np.pad(pixels, beyond, constant_values=np.nan)
-    blocks = blocks.reshape(bands, -1, factor, blocks.shape[2] // factor, factor)
-    known = np.isfinite(blocks)
-    count = known.sum(axis=(2, 4))
-    total = np.where(known, blocks, 0).sum(axis=(2, 4))
-    return np.where(count, total / np.maximum(count, 1), np.nan).astype(np.float32)
 
 
 def _sample(plane: Planes) -> Planes:
@@ -165,7 +158,7 @@ def _stretch_of(plane: Planes) -> Stretch:
 def _stretched(planes: Planes, stretches: Sequence[Stretch]) -> Pixels:
     """Return planes as grey or colour; missing pixels are black."""
     shown = [
-        stretch.to_bytes(np.where(np.isfinite(plane), plane, stretch.black))
+        stretch.to_bytes(np.nan_to_num(plane, nan=stretch.black))
         for plane, stretch in zip(planes, stretches, strict=True)
     ]
     return _picture(shown)

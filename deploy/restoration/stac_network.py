@@ -8,7 +8,6 @@ each run and has no file, so it is written as ONNX.
 import json
 import os
 import re
-from collections.abc import Sequence
 from datetime import datetime
 from fractions import Fraction
 from importlib import import_module
@@ -60,22 +59,26 @@ def write_network_item(network: Network, path: Path, when: datetime) -> None:
         datetime=when,
         properties={"description": "a network that restores images; datetime is the time of a run"},
     )
+    tiling = network.tiling
     tasks = [mlm.TaskType.REGRESSION]
-    if network.tiling.scale > 1:
+    if tiling.scale > 1:
         tasks.append(mlm.TaskType.SUPER_RESOLUTION)
-    about = metadata(network.model)
-    variant = about.get("variant", "")
-    facts = {"precision": network.precision}
-    if network.sensor:
-        facts["sensor"] = network.sensor
+    reads = _array(tiling.channels_in, tiling.fixed_px, Fraction(1))
+    gives = _array(tiling.channels_out, tiling.fixed_px, tiling.scale)
+    scale = "pixel values over the value that is full scale"
+    variant = metadata(network.model).get("variant", "")
     mlm.MLMExtension.ext(item, add_if_missing=True).apply(
         name=network.name if NAME.fullmatch(network.name) else "network",
         architecture="ConvBEERS" if variant.startswith("convbeers") else "unknown",
         tasks=tasks,
-        input=[_input(network, mlm)],
-        output=[_output(network, mlm, tasks)],
+        input=[mlm.ModelInput.create("image", [], mlm.InputStructure.create(**reads), scale)],
+        output=[
+            mlm.ModelOutput.create("restored", tasks, mlm.ResultStructure.create(**gives), scale)
+        ],
         framework="ONNX",
-        hyperparameters=mlm.Hyperparameters.create(**facts),
+        hyperparameters=mlm.Hyperparameters.create(
+            precision=network.precision, sensor=network.sensor or "not stated"
+        ),
     )
     # As null, which pystac writes, it would say that the network was trained from scratch.
     del item.properties["mlm:pretrained_source"]
@@ -93,31 +96,7 @@ def write_network_item(network: Network, path: Path, when: datetime) -> None:
     write_text(path, json.dumps(content, indent=1) + "\n")
 
 
-def _input(network: Network, mlm: Any) -> Any:
-    tiling = network.tiling
-    return mlm.ModelInput.create(
-        name=network.model.graph.input[0].name,
-        bands=[],
-        input=mlm.InputStructure.create(
-            _shape(tiling.channels_in, tiling.fixed_px, Fraction(1)), AXES, "float32"
-        ),
-        description="pixel values over the value that is full scale",
-    )
-
-
-def _output(network: Network, mlm: Any, tasks: Sequence[Any]) -> Any:
-    tiling = network.tiling
-    return mlm.ModelOutput.create(
-        name=network.model.graph.output[0].name,
-        tasks=list(tasks),
-        result=mlm.ResultStructure.create(
-            _shape(tiling.channels_out, tiling.fixed_px, tiling.scale), AXES, "float32"
-        ),
-        description="restored pixel values over the value that is full scale",
-    )
-
-
-def _shape(channels: int, side_px: int | None, scale: Fraction) -> list[int]:
-    """Return the shape of an array (N, C, H, W), with ANY for a free side."""
+def _array(channels: int, side_px: int | None, scale: Fraction) -> dict[str, Any]:
+    """Return shape, axes and type of images of a network; a free side is ANY."""
     side = ANY if side_px is None else int(side_px * scale)
-    return [ANY, channels, side, side]
+    return {"shape": [ANY, channels, side, side], "dim_order": AXES, "data_type": "float32"}

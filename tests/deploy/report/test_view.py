@@ -256,7 +256,8 @@ def test_the_line_parts_left_from_right_at_the_width_of_a_desk_and_of_a_telephon
     write_view(site / "view.html", image, restored, {SELF_CHECK: blocks}, False)
     script = LOOK.replace("WIDTHS", json.dumps(WIDTHS_PX))
     for look in driven(site, script, tmp_path / "profile"):
-        (left, right), width = look["halves"], look["width"]
+        left, right = look["halves"]
+        width = look["width"]
         assert right[0] > left[0] + 20, (width, look)
         assert look["restored"] == [right, right], (width, look)
         assert look["raw"] == [left, left], (width, look)

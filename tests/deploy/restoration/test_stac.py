@@ -136,7 +136,8 @@ def network_item(path: Path) -> Any:
     model = mlm.MLMExtension.ext(item)
     assert re.fullmatch(r"[a-zA-Z][a-zA-Z0-9_.\-\s]+[a-zA-Z0-9]", model.mlm_name)
     assert model.tasks
-    (image,), (restored,) = model.input, model.output
+    (image,) = model.input
+    (restored,) = model.output
     assert len(image.input.shape) == len(image.input.dim_order) == len(restored.result.shape)
     return item
 
