@@ -22,7 +22,7 @@ from beers_deploy.model.self_check import BLOCK_PX, OUTSIDE, SMOOTH, WITHIN
 SIDE_PX = 4096
 """The longest side of a layer in pixels."""
 
-STRIP_PX = 1 << 23
+STRIP_PX = 1 << 20
 """Pixels that are read at a time, if that is a row of blocks at least."""
 
 SAMPLE_PX = 1024
@@ -138,7 +138,7 @@ def read_planes(source: Source, bands: Sequence[int], factor: int) -> Planes:
             mask=np.pad(raster.missing(stored), beyond, constant_values=True),
         )
         blocks = known.reshape(len(bands), known.shape[1] // factor, factor, -1, factor)
-        parts.append(blocks.mean(axis=(2, 4)).filled(np.nan))
+        parts.append(blocks.mean(axis=(2, 4)).filled(np.nan).astype(np.float32))
     return np.concatenate(parts, axis=1)
 
 

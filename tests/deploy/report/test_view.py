@@ -14,6 +14,7 @@ import rasterio
 from numpy.testing import assert_array_equal
 from PIL import Image
 
+from beers_deploy.model.raster.reader import open_raster
 from beers_deploy.model.self_check import BLOCK_PX, OUTSIDE, SMOOTH, WITHIN
 from beers_deploy.profiles.errors import MachineError, OptionError
 from beers_deploy.report import view_layers
@@ -78,7 +79,7 @@ def test_a_large_image_is_reduced_to_means_of_known_pixels(
     raw[4:8, :4] = 0
     raw[3, 3] = 1234
     image = write(tmp_path / "raw.tif", raw, nodata=0)
-    with view_layers.open_raster(image) as source:
+    with open_raster(image) as source:
         factor = view_layers.reduction(source.raster)
         (plane,) = view_layers.read_planes(source, [0], factor)
     assert factor == 4
@@ -113,8 +114,10 @@ def test_an_enlarged_image_covers_the_same_place_and_has_no_difference(tmp_path:
 
 def test_blocks_show_the_worst_state_of_all_bands(tmp_path: Path) -> None:
     """The map of a run has two planes for each band, chi2 and state; NaN is clear."""
-    states = np.float32([[[WITHIN, SMOOTH, np.nan]], [[OUTSIDE, WITHIN, np.nan]]])
-    planes = np.stack([np.ones((1, 3)), states[0], np.ones((1, 3)), states[1]]).astype(np.float32)
+    chi2 = np.ones((1, 3))
+    blue = np.array([[WITHIN, SMOOTH, np.nan]])
+    red = np.array([[OUTSIDE, WITHIN, np.nan]])
+    planes = np.stack([chi2, blue, chi2, red]).astype(np.float32)
     blocks = write(tmp_path / "blocks.tif", planes, nodata=np.nan)
     image = write(tmp_path / "raw.tif", noise(BLOCK_PX, 3 * BLOCK_PX))
     (*_, layer), _ = layers_of(image, image, {SELF_CHECK: blocks}, False)
@@ -245,7 +248,7 @@ def test_the_line_parts_left_from_right_at_the_width_of_a_desk_and_of_a_telephon
 
     The line is moved by keys, and nothing is loaded from elsewhere.
     """
-    raw = np.tile(np.uint16([1000, 1000, 1000, 400, 3000]), (HEIGHT, WIDTH))[:, :WIDTH]
+    raw = np.tile(np.array([1000, 1000, 1000, 400, 3000], np.uint16), (HEIGHT, WIDTH))[:, :WIDTH]
     raw[100:500] = 1000
     image = write(tmp_path / "raw.tif", raw)
     restored = write(tmp_path / "restored.tif", raw + 300)
