@@ -239,7 +239,7 @@ def _output(
     """
     from beers_deploy.restoration.detectors.fault_list import list_beside
     from beers_deploy.restoration.output import Output
-    from beers_deploy.restoration.stac_network import network_paths
+    from beers_deploy.restoration.stac.network import network_paths
 
     if out is None:
         raise OptionError(
@@ -270,10 +270,11 @@ def _write_documents(
 ) -> None:
     """Write the STAC item and the view of a run, where they are asked for."""
     from beers_deploy.report.view import write_view
-    from beers_deploy.restoration.stac import write_item
+    from beers_deploy.restoration.stac.item import write_item
 
-    # Rasters over the same place as the output, by name.
-    maps = {} if output.self_check is None else {"self-check": output.self_check}
+    # Rasters over the same place as the output, by the name of their layer and asset.
+    written = {"self-check": output.self_check}
+    maps = {name: raster for name, raster in written.items() if raster is not None}
     if stac is not None:
         write_item(run, Path(stac), maps)
     if view is not None:

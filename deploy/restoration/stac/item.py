@@ -1,7 +1,7 @@
 """The STAC item of a Cloud-Optimised GeoTIFF: its place, and how it was made.
 
 It is of STAC 1.1 (https://stacspec.org) with the extensions processing 1.2, of which pystac has no
-class, and file 2.1. A network is an item of its own, which the item links to (`stac_network`): the
+class, and file 2.1. A network is an item of its own, which the item links to (`network`): the
 fields of the machine-learning-model extension make an item that of a model.
 """
 
@@ -21,7 +21,7 @@ from beers_deploy.model.io.files import write_text
 from beers_deploy.model.raster.reader import OFFLINE, gdal
 from beers_deploy.profiles.figures import Row
 from beers_deploy.restoration.run import Run
-from beers_deploy.restoration.stac_network import network_paths, write_network_item
+from beers_deploy.restoration.stac.network import network_paths, write_network_item
 
 LONGITUDE_LATITUDE = "EPSG:4326"
 WHEN = (
