@@ -19,7 +19,8 @@ from beers_deploy.tables.columns import columns_of, missing, words_of
 INTERVAL = re.compile(r"\[[^\[\]]*\]")
 
 
-def _template() -> jinja2.Template:
+def template(name: str) -> jinja2.Template:
+    """Return a template of this folder; what it is given is escaped."""
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     # A name that the template misspells raises an error instead of writing nothing.
     strict = jinja2.StrictUndefined
@@ -34,7 +35,7 @@ def _template() -> jinja2.Template:
         finalize=_shown,
     )
     environment.filters["unbroken"] = _unbroken
-    return environment.get_template("report.html")
+    return environment.get_template(name)
 
 
 def _unbroken(text: str) -> Markup:
@@ -87,7 +88,7 @@ class Report:
 def render(report: Report) -> str:
     """The report as one HTML file, pictures embedded."""
     tables = [_grid(table, upright=report.sorts) for table in report.tables]
-    return _template().render(report=report, tables=tables, version=__version__)
+    return template("report.html").render(report=report, tables=tables, version=__version__)
 
 
 def write_report(report: Report, path: Path) -> None:
