@@ -4,14 +4,14 @@ On board the raw image is restored, rounded to the sensor's bits and compressed.
 raw image is compressed to the same rate, decompressed and restored. Both are compared with the
 same reference.
 
-The codec is OpenJPEG in Pillow: JPEG 2000 with the 9/7 wavelet. CCSDS 122, which flies, has
-that wavelet and a simpler coder.
+The codec is JPEG 2000 with the 9/7 wavelet (OpenJPEG in Pillow). CCSDS 122, the standard for
+satellites, has the same wavelet and a simpler coder.
 
-The ground is told the noise that compression adds. The encoder knows the mean squared error of
-each image, and one number an image costs no rate. A method is then given the sensor with the
-variance beta + share * error / gain^2. The whole error is too much: much of it is detail and noise
-that the codec removed, which a restoration cannot smooth away again. So four shares are tried, and
-an image is restored with the one that is best in the mean over the other sites.
+Restoration on the ground uses a sensor profile with the noise that compression adds. The encoder
+knows the mean squared error of each image, and may send this one number with the image. The
+profile then has the variance beta + share * error / gain^2. With the whole error a restoration
+smooths too much, because much of the error is detail and noise that the codec removed. So four
+shares are tried, and each image is restored with the share that is best on the other sites.
 """
 
 from collections.abc import Iterable, Sequence
@@ -38,18 +38,18 @@ RATE = "bit/px"
 """Unit of a rate."""
 
 SHARES = (0.0, 0.25, 0.5, 1.0)
-"""Shares of the compression's error that a method may be told: none first, all last."""
+"""Shares of the compression's error that may count as noise: none first, all last."""
 
 CONTAINER_BITS = 16
 """Bits of the integers that Pillow writes."""
 CODE_BLOCK_PX = 32
 """Side of a block that is coded by itself.
 
-OpenJPEG's 64 leaves small images few rates to choose from; 32 costs 0.15 dB of the error.
+With blocks of 64, small images have few rates to choose from. 32 raise the error by 2 %.
 """
 REQUESTS = tuple(np.linspace(0.975, 1.025, 11).tolist())
-"""Multiples of a rate that are requested: a code has a whole number of coding passes, so that none
-has exactly the rate.
+"""Multiples of a rate that are requested. A code consists of whole coding passes, so it rarely has
+the requested rate, and the nearest code counts.
 """
 
 
@@ -101,15 +101,15 @@ def decompressed(dn: np.ndarray, rate: float, bits: int) -> Decompressed:
 
     Args:
         dn: digital numbers (H, W), which are rounded.
-        rate: in bits per pixel; of the codes that are tried, the nearest counts.
+        rate: in bits per pixel.
         bits: of a digital number.
     """
-    # In the upper bits of the container the codec controls the rate more finely; the error at a
-    # rate is the same to 0.5 %.
+    # OpenJPEG controls the rate more finely if the upper bits of the container are used. The error
+    # at a rate is the same within 0.5 %.
     unit = 2 ** (CONTAINER_BITS - bits)
     image = _rounded(dn, bits) * np.uint16(unit)
     codes = [
-        # Pillow wants the ratio to the container instead of the rate.
+        # Pillow expects the compression ratio of the container.
         _code(
             image,
             irreversible=True,
@@ -132,19 +132,19 @@ def _rounded(dn: np.ndarray, bits: int) -> np.ndarray:
 def _code(image: np.ndarray, **options: object) -> bytes:
     buffer = BytesIO()
     block = (CODE_BLOCK_PX, CODE_BLOCK_PX)
-    # Without the JP2 boxes, which no downlink has.
+    # The code stream alone: the boxes of a JP2 file would count as rate.
     Image.fromarray(image).save(buffer, "JPEG2000", no_jp2=True, codeblock_size=block, **options)
     return buffer.getvalue()
 
 
-def told(sensor: Instrument, error_dn2: float) -> Instrument:
+def with_noise(sensor: Instrument, variance_dn2: float) -> Instrument:
     """Return a sensor with more noise, the same at every radiance.
 
     Args:
         sensor: as it is.
-        error_dn2: variance that is added, in DN^2.
+        variance_dn2: of the noise that is added.
     """
-    return replace(sensor, beta=sensor.beta + error_dn2 / sensor.gain_dn_per_radiance**2)
+    return replace(sensor, beta=sensor.beta + variance_dn2 / sensor.gain_dn_per_radiance**2)
 
 
 @dataclass(frozen=True)
@@ -153,8 +153,8 @@ class Trial:
 
     Attributes:
         board_db: PSNR of the images restored on board, (N,).
-        ground_db: PSNR of those restored on the ground, by the share that is told, (S, N); of a
-            method that cannot be told, S is 1.
+        ground_db: PSNR of those restored on the ground, by the share of the error that counts as
+            noise, (S, N); of a method that uses no sensor profile, S is 1.
         rates: of the codes on board and on the ground, in bits per pixel, (2, N).
         error_dn2: mean squared error of the images that reach the ground, (N,).
         sites: of the images, (N,).
@@ -190,16 +190,16 @@ class Trial:
                 float(gain.mean()), "dB", f"{source}, {words}", interval
             )
         }
-        psnr = {
-            "restored on board": self.board_db,
-            "restored on the ground": ground,
-            "on the ground, no noise told": self.ground_db[0],
-            "on the ground, whole error told": self.ground_db[-1],
+        means = {
+            "restored on board": (self.board_db, "dB"),
+            "restored on the ground": (ground, "dB"),
+            "on the ground, sensor as it is": (self.ground_db[0], "dB"),
+            "on the ground, whole error as noise": (self.ground_db[-1], "dB"),
+            "rate on board": (self.rates[0], RATE),
+            "rate on the ground": (self.rates[1], RATE),
         }
-        for key, values in psnr.items():
-            figures[key] = measured(float(values.mean()), "dB", source)
-        for key, values in zip(("rate on board", "rate on the ground"), self.rates, strict=True):
-            figures[key] = measured(float(values.mean()), RATE, source)
+        for key, (values, unit) in means.items():
+            figures[key] = measured(float(values.mean()), unit, source)
         apart = np.abs(self.rates[0] / self.rates[1] - 1).max()
         figures["rates of an image differ by up to"] = measured(
             100 * float(apart), "%", f"largest of {len(gain)} pairs"
@@ -207,7 +207,7 @@ class Trial:
         error_dn = float(np.sqrt(self.error_dn2.mean()))
         figures["error of compression"] = measured(error_dn, "DN", f"root of the {source}")
         used = sorted({f"{SHARES[number]:.0%}" for number in shares})
-        return Row(GAIN, name, figures, {"share told": ", ".join(used)})
+        return Row(GAIN, name, figures, {"share of the error as noise": ", ".join(used)})
 
 
 def run_compression(
@@ -273,7 +273,9 @@ def try_method(
         board[number] = _psnr_db(sent[number].dn, pair, sensor)
         errors[number] = np.mean((image.dn - pair.degraded) ** 2, dtype=np.float64)
         for k, share in enumerate(shares):
-            knowing = method.knowing(told(sensor, share * errors[number])) if share else method
+            knowing = (
+                method.knowing(with_noise(sensor, share * errors[number])) if share else method
+            )
             ground[k, number] = _psnr_db(knowing.restore(image.dn), pair, sensor)
     rates = [[image.rate for image in images] for images in (sent, raw)]
     return Trial(board, ground, np.array(rates), errors, [pair.site for pair in pairs])

@@ -343,9 +343,9 @@ TARGETS_CAPTION = (
 )
 GAIN_CAPTION = (
     "Inner PSNR against the reference, without its noise where that is known. On board: restored, "
-    "then compressed by JPEG 2000. On the ground: compressed to the same rate, then restored by a "
-    "method that is given the sensor with more noise, a share of the mean squared error that "
-    "compression left in the image. The share is the best in the mean over the other sites."
+    "then compressed by JPEG 2000. On the ground: compressed to the same rate, then restored with "
+    "a sensor profile that has more noise: a share of the mean squared error of compression is "
+    "added to the variance. The share is the one that is best on the other sites."
 )
 LOSSLESS_CAPTION = "Bits per pixel of lossless JPEG 2000, of the raw and of the restored images."
 SITES_CAPTION = (

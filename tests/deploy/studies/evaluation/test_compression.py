@@ -1,4 +1,4 @@
-"""Restoration before and after compression: the codec, the noise that is told, and the tables."""
+"""Restoration before and after compression: the codec, the noise of the profile, and the tables."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -22,8 +22,8 @@ from beers_deploy.studies.evaluation.compression import (
     decompressed,
     lossless_rate,
     run_compression,
-    told,
     try_method,
+    with_noise,
 )
 from beers_deploy.studies.evaluation.methods import Method
 from beers_deploy.studies.evaluation.pairs import NamedPair
@@ -142,7 +142,7 @@ def telling(given: list[Instrument]) -> Method:
     return Method("telling", lambda dn: dn, "known", specialise)
 
 
-def test_the_noise_that_is_told_is_the_error_that_was_measured() -> None:
+def test_the_noise_of_the_profile_grows_by_shares_of_the_measured_error() -> None:
     given: list[Instrument] = []
     pairs = [seen("a", 0), seen("b", 1)]
     trial = trial_of(telling(given), pairs)
@@ -158,8 +158,8 @@ def test_the_noise_that_is_told_is_the_error_that_was_measured() -> None:
     assert trial.error_dn2 * SHARES[-1] == pytest.approx(expected[2::3])
 
 
-def test_more_noise_is_told_at_every_radiance() -> None:
-    noisier = told(SENSOR, 100.0)
+def test_noise_is_added_at_every_radiance() -> None:
+    noisier = with_noise(SENSOR, 100.0)
     for radiance in (0, 25, 100):
         variances = (gain_dn2(sensor.noise_sigma(radiance)) for sensor in (noisier, SENSOR))
         assert next(variances) - next(variances) == pytest.approx(100)
@@ -179,16 +179,16 @@ def trial(ground: list[list[float]], sites: str, board: float = 40.0) -> Trial:
 
 
 @pytest.mark.parametrize(
-    ("sites", "all_told_at_a", "chosen"),
+    ("sites", "whole_at_a", "chosen"),
     [
         ("aabcd", 38.0, [1, 1, 1, 1, 1]),
         ("aabcd", 0.0, [1, 1, 0, 0, 0]),
         ("aaaaa", 0.0, [0, 0, 0, 0, 0]),
     ],
 )
-def test_other_sites_choose_the_share(sites: str, all_told_at_a: float, chosen: list[int]) -> None:
-    """Site a is best without noise told, whatever the others need; one site alone decides."""
-    ground = [[39.0] * 2 + [30.0] * 3, [all_told_at_a] * 2 + [33.0] * 3]
+def test_other_sites_choose_the_share(sites: str, whole_at_a: float, chosen: list[int]) -> None:
+    """Site a is best without more noise, whatever the others need; one site alone decides."""
+    ground = [[39.0] * 2 + [30.0] * 3, [whole_at_a] * 2 + [33.0] * 3]
     assert trial(ground, sites).chosen.tolist() == chosen
 
 
@@ -198,9 +198,9 @@ def test_the_interval_of_the_gain_is_that_of_differences_on_the_same_images() ->
     assert gain.value == pytest.approx(1)
     assert gain.interval == pytest.approx((1, 1))
     assert row.figures["restored on board"].interval is None
-    told_all = row.figures["on the ground, whole error told"]
-    assert told_all.value == pytest.approx(48)
-    assert row.text == {"share told": "0%"}
+    whole = row.figures["on the ground, whole error as noise"]
+    assert whole.value == pytest.approx(48)
+    assert row.text == {"share of the error as noise": "0%"}
 
 
 def test_rates_that_differ_are_reported() -> None:
@@ -211,7 +211,7 @@ def test_rates_that_differ_are_reported() -> None:
 
 
 @pytest.mark.parametrize("specialised", [True, False])
-def test_a_method_that_knows_no_sensor_is_told_nothing(specialised: bool) -> None:
+def test_a_method_without_a_sensor_is_run_once(specialised: bool) -> None:
     method = telling([]) if specialised else Method("telling", lambda dn: dn, "blind")
     assert len(trial_of(method, [seen("a", 0)]).ground_db) == (len(SHARES) if specialised else 1)
 
