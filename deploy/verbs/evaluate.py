@@ -148,7 +148,7 @@ def evaluate(
     sensors = _sensors(sensor, reference, stored, in_memory)
     rates = list[float]()
     if bits_per_pixel is not None:
-        refuse_with("`methods` of degraded alone", bits_per_pixel=len(named) == 1)
+        refuse_with("`methods` degraded", bits_per_pixel=len(named) == 1)
         rates = check_rates(
             numbers_of("bits_per_pixel", bits_per_pixel, "1,2,3"), sensors[0].nominal().bits
         )
