@@ -6,5 +6,6 @@
 - `target_scenes`: edges, flat fields, points and patterns whose truth is known; `targets`:
   figures of one method on them;
 - `run`: an evaluation of several, and its page; `sweep`: the same under other sensors, known as
-  they are or wrongly.
+  they are or wrongly; `compression`: restoration on board before compression, or on the ground
+  after it.
 """
