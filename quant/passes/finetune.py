@@ -9,8 +9,9 @@ is one, and from the float network. Gradients move no scale, because these are p
 1. Hold out some of the pairs.
 2. Before each round of steps move scales one bit where the core then errs less on pairs that it is
    trained on (`quant.passes.scales`). The core stays within the windows of the DPU's shifts.
-3. Take steps of gradient descent.
-4. Every few steps round the numbers, and keep the core that errs least on the held-out pairs.
+3. Take steps of gradient descent, and average the numbers over the last steps: single ones cross
+   the thresholds of their rounding to and fro.
+4. Every few steps round the averages, and keep the core that errs least on the held-out pairs.
 5. Stop after a round of steps that gained little.
 """
 
@@ -21,6 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import onnx
 import torch
+from torch.optim.swa_utils import AveragedModel
 
 from beers_deploy.model.progress import step
 from beers_deploy.profiles.errors import ImageError
@@ -44,11 +46,13 @@ BORDER_PX = 8
 """Not compared with a reference in a result of at least four times as many a side: there a patch
 ends, and its image goes on. The float network has the same border.
 """
-ROUNDS = (400, 800, 1600)
+ROUNDS = (500, 1000, 2000, 4000)
 """Steps of each round of "auto"."""
+DECAY = 0.98
+"""Of the running average of the numbers."""
 LEAST_GAIN = 0.02
 """Of what INT8 lost at first: a round that wins back less is the last one."""
-JUDGED_EVERY = 20
+JUDGED_EVERY = 50
 JUDGING = 48
 """Training pairs on which scales are judged."""
 
@@ -68,7 +72,7 @@ class Tuning:
 
     pairs: Sequence[Pair]
     steps: int | None = None
-    rate: float = 0.02
+    rate: float = 0.3
     seed: int = 0
     original: onnx.ModelProto | None = None
 
@@ -159,10 +163,12 @@ def finetune(
             trainable, full, shifts, lambda candidate: loss_of(candidate, judging)
         )
         # 3.
+        average = AveragedModel(trainable, avg_fn=_averaged)
         for left in descend(trainable, training, steps, tuning.rate, generator):
+            average.update_parameters(trainable)
             # 4. Counted from the end, so that the last step is judged, where the rate is near 0.
             if left % JUDGED_EVERY == 0 or left == steps:
-                candidate = trainable.core()
+                candidate = average.module.core()
                 loss = loss_of(candidate, held_out)
                 if loss < least:
                     core = candidate
@@ -227,6 +233,13 @@ def _batches(samples: Sequence[Sample]) -> list[Sample]:
         kind = sample.planes.shape, sample.reference is None
         batches.setdefault(kind, []).append(sample)
     return [Sample.batch(alike) for alike in batches.values()]
+
+
+def _averaged(average: Tensor, number: Tensor, count: Tensor | int) -> Tensor:
+    """Return the running average after one more step, of which `count` are in it already."""
+    # Early steps leave the start behind sooner, so that short rounds train at all.
+    decay = min(DECAY, (int(count) + 1) / (int(count) + 10))
+    return average.lerp(number, 1 - decay)
 
 
 def loss_of(core: IntCore, samples: Sequence[Sample]) -> float:
