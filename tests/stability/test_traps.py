@@ -1,4 +1,4 @@
-"""traps.md, next to this file, is complete; and the controls that other tests lack: the trap itself,
+"""The list in traps.md is complete, and the controls that other tests lack: the trap itself,
 sprung.
 """
 
