@@ -12,7 +12,8 @@ is one, and from the float network. Gradients move no scale, because these are p
 3. Take steps of gradient descent, and average the numbers over the last steps: single ones cross
    the thresholds of their rounding to and fro.
 4. Every few steps round the averages, and keep the core that errs least on the held-out pairs.
-5. Stop after a round of steps that gained little.
+5. After a round of steps that gained little go on from the best core, more slowly; stop when the
+   slowest rate gains little.
 """
 
 import math
@@ -50,8 +51,13 @@ ROUNDS = (500, 1000, 2000, 4000)
 """Steps of each round of "auto"."""
 DECAY = 0.98
 """Of the running average of the numbers."""
+SLOWER = 4.0
+"""The rate is divided by it, SLOWDOWNS times at most. Which rate is best depends on the network: a
+depthwise one gains most at the first, one with a global add may gain only at the last.
+"""
+SLOWDOWNS = 2
 LEAST_GAIN = 0.02
-"""Of what INT8 lost at first: a round that wins back less is the last one."""
+"""Of what INT8 lost at first: a round that wins back less gained little."""
 JUDGED_EVERY = 50
 JUDGING = 48
 """Training pairs on which scales are judged."""
@@ -156,6 +162,7 @@ def finetune(
     judging = hardest_and_others(order, JUDGING)
     first = least = before = loss_of(core, held_out)
     done = 0
+    slowdowns = 0
     for steps in rounds:
         # 2.
         step("fine-tuning: trying other scales")
@@ -164,7 +171,8 @@ def finetune(
         )
         # 3.
         average = AveragedModel(trainable, avg_fn=_averaged)
-        for left in descend(trainable, training, steps, tuning.rate, generator):
+        rate = tuning.rate / SLOWER**slowdowns
+        for left in descend(trainable, training, steps, rate, generator):
             average.update_parameters(trainable)
             # 4. Counted from the end, so that the last step is judged, where the rate is near 0.
             if left % JUDGED_EVERY == 0 or left == steps:
@@ -180,7 +188,10 @@ def finetune(
         done += steps
         # 5.
         if before - least < LEAST_GAIN * first:
-            break
+            if slowdowns == SLOWDOWNS:
+                break
+            slowdowns += 1
+            trainable = TrainableCore(core)
         before = least
     return core, done
 
