@@ -27,7 +27,7 @@ _loaded, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> Any:
-    """What is offered under a name, loaded now."""
+    """Load and return the public object with this name."""
     try:
         return _loaded(name)
     except ImportError as error:
