@@ -1,5 +1,5 @@
-"""What the DPU demands of pools, activations, element-wise operators and moves of pixels: one rule,
-one function.
+"""The DPU's rules for pools, activations, element-wise operators and data movement operators, one
+function for each rule.
 """
 
 import math
@@ -24,7 +24,7 @@ MANUAL = {
     "HardSigmoid": "hard-sigmoid",
     "HardSwish": "hard-swish",
 }
-"""The activations of ONNX as manuals name them."""
+"""The names that manuals use for the activations of ONNX."""
 PLACE = {
     "conv": "conv",
     "transposed": "conv",
@@ -33,7 +33,9 @@ PLACE = {
     "add": "sum",
     "mul": "sum",
 }
-"""Behind which operations something may be fused, and under which name a profile lists it."""
+"""The operations after which an activation may be fused, and the key under which a profile lists
+it.
+"""
 INSTEAD = {
     "Sub": "fold the minus sign into the weights before it, and add",
     "Neg": "fold the minus sign into the weights before it",
