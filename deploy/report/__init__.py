@@ -1,5 +1,5 @@
 """Reports: one self-contained HTML file, pictures embedded, every number with its mode.
 
 - `page` renders figures, tables and pictures; `plots` draws with matplotlib;
-- `sensitivity_page` says what stands on the page of `quantize --report`.
+- `sensitivity_page` composes the page of `quantize --report`.
 """
