@@ -29,10 +29,10 @@ BLUR_FACTOR = 1.15
 """The factors of the noise's variance (NOISE_FACTOR) and of the MTF (BLUR_FACTOR)."""
 SMOOTH = 0.45
 QUIET_PERCENT = 10.0
-"""The percentile of blocks in which the noise is compared with the profile's. Noise below the
-stated share there indicates a filter.
+"""A filter was applied if this percentage of the blocks has less than the share SMOOTH of the stated
+variance of the noise.
 
-By chance the quietest blocks have 0.6 of the stated variance.
+By chance the quietest blocks have 0.6 of it.
 """
 FILTERED = ": restored, resampled or compressed before, or of another gain"
 SNR = "measured SNR"
