@@ -29,8 +29,8 @@ BLUR_FACTOR = 1.15
 """The factors of the noise's variance (NOISE_FACTOR) and of the MTF (BLUR_FACTOR)."""
 SMOOTH = 0.45
 QUIET_PERCENT = 10.0
-"""A filter was applied if this percentage of the blocks has less than the share SMOOTH of the stated
-variance of the noise.
+"""A filter was applied if this percentage of the blocks has less than the share SMOOTH of the
+stated variance of the noise.
 
 By chance the quietest blocks have 0.6 of it.
 """

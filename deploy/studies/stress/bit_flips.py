@@ -1,7 +1,7 @@
-"""`stress --bit-flips`: what bit flips cost, and what guards buy back and cost.
+"""`stress --bit-flips`: measure the cost of bit flips, and the benefit and cost of guards.
 
-Flips are injected into weights, shifts, feature maps or the image, one kind of memory at a time;
-the DPU's arithmetic then runs in whole numbers.
+Flips are injected into weights, shifts, feature maps or the image, one kind of memory at a time.
+Then the DPU's arithmetic runs in integers.
 """
 
 import statistics
@@ -50,13 +50,13 @@ GUARD_NOTE = (
 
 
 def flip_table(subject: Subject, source: Calibration, board: TargetProfile) -> Table:
-    """Return quality against flips, and what guards cost.
+    """Return quality against flips, and the cost of guards.
 
     Args:
         subject: with an INT8 network.
-        source: of the patches that flips are tried on, one an injection into each kind of memory at
-            each rate.
-        board: whose cost model predicts the cost of the guards.
+        source: of the patches that flips are tried on, one for each injection into each kind of
+            memory at each rate.
+        board: the board whose cost model predicts the cost of the guards.
     """
     # A file without an integer core is refused before anything is drawn.
     _ = subject.core
@@ -77,7 +77,7 @@ def flip_table(subject: Subject, source: Calibration, board: TargetProfile) -> T
 
 @dataclass(frozen=True)
 class FaultTarget:
-    """What faults are injected into.
+    """The target of fault injection.
 
     Attributes:
         core: the network as the board stores it.
@@ -93,12 +93,12 @@ class FaultTarget:
 
 
 def make_target(subject: Subject, source: Calibration) -> FaultTarget:
-    """Build what faults are injected into.
+    """Build the target of fault injection.
 
     Args:
         subject: with an INT8 network.
         source: of the patches. The guards are learnt from some of them. Flips are tried on patches
-            of another seed, so that the guards are not judged on what they were learnt from.
+            of another seed, so that the guards are not evaluated on their training data.
     """
     core = faults.as_stored(subject.core)
     calibration = replace(source, patches=CALIBRATION_PATCHES)
@@ -123,7 +123,7 @@ def name_of(memory: str, rate: float) -> str:
 Quality = tuple[float, float, float]
 """PSNR in dB with each set of guards."""
 COSTLY_DB = 0.5
-"""A flip that costs an unguarded patch more is one that the self-check ought to find."""
+"""A flip that costs an unguarded patch more than this should be found by the self-check."""
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ def _quality_db(
 
 
 def _judged(check: SelfCheck, image: np.ndarray, restored: np.ndarray) -> Judged:
-    """Judge the blocks of a patch.
+    """Check the blocks of a patch.
 
     Args:
         check: the self-check of the patch's sensor.
@@ -203,7 +203,7 @@ def _judged(check: SelfCheck, image: np.ndarray, restored: np.ndarray) -> Judged
 def _drawn(
     target: FaultTarget, name: str, rate: float, draw: int, seed: int, clean: Quality
 ) -> Injection:
-    """Flip bits of a memory once, and return what that did.
+    """Flip bits of a memory once, and return the effect.
 
     Args:
         target: the network, its guards and the patches.
@@ -239,8 +239,8 @@ def _drawn(
 
 
 def _curve_row(name: str, draws: Sequence[Injection], kind: str) -> Row:
-    """Return the row of some injections: means of the flips and of the PSNR, and how many were
-    found.
+    """Return the row of some injections: means of the flips and of the PSNR, and the number of
+    those detected.
 
     Args:
         name: of the row.
