@@ -1,8 +1,8 @@
 """Make a shipped network from its recipe: stage after stage, its INT8 file, and its model card.
 
-    OUT/1-float/      checkpoint, logs, pictures and weights of the first stage
-    OUT/2-rounded/    of the second; start-int8.onnx is the INT8 file whose roundings it trains with
-    OUT/NAME.safetensors  OUT/NAME-int8.onnx  OUT/NAME.md
+OUT/1-float/      checkpoint, logs, pictures and weights of the first stage
+OUT/2-rounded/    of the second; start-int8.onnx is the INT8 file whose roundings it trains with
+OUT/NAME.safetensors  OUT/NAME-int8.onnx  OUT/NAME.md
 """
 
 import hashlib
