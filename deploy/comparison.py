@@ -218,7 +218,7 @@ def compared(
         patches = unseen_patches(data.sensor, data.images, data.patches, data.seed)
     else:
         patches = own.all
-        # The INT8 file says which samples it was calibrated on, but it may not choose its judges.
+        # The INT8 file states its calibration samples, but may not choose those of the comparison.
         calibrated = set(metadata(int8.model).get(CALIBRATED_ON, "").split())
         count = sum(digest_of(degraded) in calibrated for degraded in patches.degraded)
         if count:

@@ -160,7 +160,7 @@ def _scene(
     from beers_deploy.model.simulator.sampling import read_scene, scene_of
 
     if scene is None:
-        # The Fourier transform of the blur wraps around: the margin keeps the far border out.
+        # The Fourier transform of the blur wraps around. The margin excludes the opposite border.
         side_px = (size_px + 2 * MARGIN_PX) * ratio
         return procedural_scene(side_px, side_px, Draw(seed).generator("drawn scene"))
     if isinstance(scene, str | os.PathLike):

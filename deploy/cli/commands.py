@@ -91,7 +91,7 @@ class Group(TyperGroup):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Note whether the results go to standard output."""
-        # Once parsed, Click keeps the words in an attribute that has another name in each of its
+        # After parsing, Click stores the words in an attribute whose name differs between its
         # versions.
         self.results_on_stdout = ("--json", "-") in pairwise(args) or "--json=-" in args
         return super().parse_args(ctx, args)

@@ -65,7 +65,7 @@ class Command:
     @property
     def help(self) -> str:
         """The text above the options: what the verb does."""
-        # Without a long description the parser leaves an empty line behind the short one.
+        # Without a long description the parser leaves an empty line after the short one.
         return (self.doc.description or "").strip()
 
 

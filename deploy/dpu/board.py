@@ -61,7 +61,7 @@ class Dpu:
             name: {k: self.constants.get(k, v) for k, v in self.target.tables.get(name, {}).items()}
             for name in SIZED
         }
-        # A table that the target lacks stays away: rules ask which constants a target states.
+        # A table that the target lacks is left out, because rules check which constants exist.
         return {**self.target.tables, **{name: table for name, table in sized.items() if table}}
 
     @property

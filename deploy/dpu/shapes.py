@@ -118,7 +118,7 @@ def _inferred(node: Node, inputs: list[Shape], constants: Mapping[str, np.ndarra
             types[name] = helper.make_tensor_type_proto(
                 helper.np_dtype_to_tensor_dtype(value.dtype), value.shape
             )
-            # Weights are longer, and say nothing of sizes.
+            # Weights are longer, and do not determine sizes.
             if value.size <= LIST_VALUES:
                 data[name] = numpy_helper.from_array(value)
         elif (shape := next(shapes, None)) is not None:

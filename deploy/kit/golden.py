@@ -264,7 +264,7 @@ def _index(path: Path) -> tuple[dict[str, dict[str, str]], bool]:
         if (document["schema"], document["schema_version"]) != (SCHEMA, SCHEMA_VERSION):
             raise ValueError(f"the schema {document['schema']}")
         digests = {str(case): dict(files) for case, files in document["cases"].items()}
-        # A case is a folder beside the index: another path would lead to files that nobody named.
+        # A case is a folder next to the index. Another path would lead to files that nobody named.
         foreign = [case for case in digests if case in ("", ".", "..") or set(case) & set("/\\:")]
         if foreign:
             raise ValueError(f"the case {foreign[0]!r}")

@@ -138,7 +138,7 @@ def _unseen_before(core: IntCore, name: str, outputs: Collection[str]) -> int:
     """Return the number of operations between a tensor and those that a board returned."""
     needed = {name}
     count = 0
-    # From the last operation back, until every path ends at a tensor that was handed out.
+    # Go back from the last operation until every path ends at a tensor that was returned.
     for op in reversed(core.ops):
         if op.output in needed and (op.output == name or op.output not in outputs):
             needed |= set(op.inputs)

@@ -192,7 +192,7 @@ def bill_of(said: dict[str, Any]) -> str:
 
     network = said["network"]
     tool = said["tool"]
-    # A serial number made of the content gives the same record the same number.
+    # The serial number is derived from the content, so the same record has the same number.
     bom = Bom(serial_number=uuid5(NAMESPACE_URL, json.dumps(said)))
     facts = said["says"] | {
         key: said[key]

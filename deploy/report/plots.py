@@ -65,7 +65,7 @@ SERIES = ("mark0", "mark1", "mark2", "mark3", "mark4", "ink")
 
 LOOK = {
     "svg.fonttype": "none",
-    # Ids follow from what they name: the same figure gives the same bytes.
+    # Ids are derived from the content, so that the same figure gives the same bytes.
     "svg.hashsalt": "beers-deploy",
     "text.parse_math": False,  # a dollar in a file's name is a dollar
     "font.size": FONT_PX,

@@ -276,7 +276,7 @@ class Checkpoint:
 
     def _remove_outputs(self) -> None:
         (self.folder / PLAIN).unlink(missing_ok=True)
-        # GDAL writes overviews into a file beside the COG first.
+        # GDAL first writes overviews into a file next to the COG.
         for path in self.folder.glob(f"{COG}*"):
             path.unlink()
 

@@ -134,7 +134,7 @@ def _written_out(add: onnx.NodeProto) -> list[onnx.NodeProto]:
     b, *b_scale = add.input[3:6]
     scale = add.input[6:8]
     name = add.output[0]
-    # Max with 0 changes no uint8, but keeps OpenVINO from fusing the convolution before the add,
+    # Max with 0 changes no uint8, but prevents OpenVINO from fusing the convolution into the add,
     # which would lose the rounding between the two.
     return [
         helper.make_node("Max", [a, LOWEST], [f"{name}.a"]),

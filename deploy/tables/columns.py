@@ -78,7 +78,7 @@ def missing(rows: Sequence[Row]) -> list[str]:
         rows_of.setdefault((reason, ", ".join(keys)), []).append(name)
     lines = []
     for (reason, keys_text), names in rows_of.items():
-        # Where most rows lack a figure, their names say nothing.
+        # If most rows lack a figure, their names are no information.
         of_rows = f" of {', '.join(names)}" if len(names) < len(rows) / 2 else ""
         lines.append(f"{keys_text}{of_rows}: {reason}")
     return lines

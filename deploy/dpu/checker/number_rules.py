@@ -282,5 +282,5 @@ def _kind(values: np.ndarray | None) -> str:
 def _spare_bits(values: np.ndarray) -> int:
     """Return the number of low bits that are 0 in every value, or 0 if all values are 0."""
     bits = int(np.bitwise_or.reduce(values, axis=None))
-    # `bits & -bits` keeps the lowest bit that is set.
+    # `bits & -bits` isolates the lowest bit that is set.
     return (bits & -bits).bit_length() - 1 if bits else 0

@@ -184,7 +184,7 @@ def activation_place(op: Operation, dpu: Dpu) -> Finding | None:
     """
     place = PLACE.get(op.follows or "")
     fused = dpu.target.activations[place].value if place else ()
-    # What stands behind a sum is judged by `activation_of_sums`.
+    # An activation after a sum is checked by `activation_of_sums`.
     if place == "sum" or MANUAL[op.op_type] in (*fused, *dpu.target.activations["alone"].value):
         return None
     remedy = (

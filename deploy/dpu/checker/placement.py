@@ -153,7 +153,7 @@ def _parts(network: SizedGraph) -> list[Part]:
     for op in operations:
         leads = op.output not in behind
         trails = op.output not in before
-        # What no processor here computes is not the host's either.
+        # An operator that no processor here computes is not the host's either.
         if is_foreign(op.op_type):
             parts.append("dpu-core")
         elif leads and _is_host_front(op, network, trails=trails):
@@ -244,8 +244,8 @@ def _subgraphs(operations: tuple[Operation, ...], devices: list[Device]) -> list
     parents: dict[str, str] = {}
     for op, device in zip(operations, devices, strict=True):
         on_dpu = device == "DPU"
-        # A level counts the changes of device on the way here: what comes back to the DPU has
-        # another level than what left it, so that the two are never one piece.
+        # A level counts the changes of device up to this node. Nodes after a return to the DPU
+        # have another level than those before it, so the two are never one subgraph.
         levels = (depth[name] for name in op.inputs if name in depth)
         steps = [changes + (was_on_dpu != on_dpu) for was_on_dpu, changes in levels]
         level = (on_dpu, max(steps, default=0))
@@ -263,7 +263,7 @@ def _root(parents: dict[str, str], name: str) -> str:
     root = name
     while parents.get(root, root) != root:
         root = parents[root]
-    # The way is walked once: in a long chain each node would walk all of it again.
+    # Path compression: without it, each node of a long chain would follow all of it again.
     while name != root:
         parent = parents[name]
         parents[name] = root

@@ -132,7 +132,7 @@ class _Found:
             pixels: (h, w), NaN where they are missing.
             full_scale: the value at and above which a pixel is not a measurement.
         """
-        # The converter clips at both ends, where a pixel no longer follows its gain.
+        # The converter clips at 0 and at full scale, where a pixel no longer follows its gain.
         valid = (pixels > 0) & (pixels < full_scale)
         inner = valid[within]
         self._columns.append(measure_lines(pixels[within], inner))

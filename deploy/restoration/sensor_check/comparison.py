@@ -98,7 +98,7 @@ def compare_noise(
     """
     if isinstance(line, Refusal):
         return unavailable("ratio", line.reason), _smoothed(blocks, stated)
-    # The geometric mean of the two ends is the middle of the levels that were measured.
+    # The geometric mean of the two limits is the middle of the measured levels.
     value = math.sqrt(math.prod(line.measured_dn))
     variance = line.at(value)
     expected = stated.variances(value)

@@ -48,7 +48,7 @@ def restored_already(source: Source, networks: Sequence[onnx.ModelProto], full_s
     """
     if not all(metadata(network).get("sensor") for network in networks):
         return ""
-    # Satellite products are mostly denoised before delivery: their noise gives them away.
+    # Most satellite products are denoised before delivery, which their noise reveals.
     shares = [_noise_share(windows, full_scale) for windows in band_windows(source)]
     quiet = [k for k, share in enumerate(shares, 1) if share is not None and share < FAR_BELOW]
     if not quiet:

@@ -276,8 +276,8 @@ class Restorer:
     ) -> np.ndarray:
         """Return a window with its missing pixels filled, as far as the image reaches."""
         radius_px = self.tiling.halo_px
-        # Beyond the last pixel a slice ends by itself; before the first one it would begin at the
-        # other end.
+        # A slice stops at the last pixel by itself, but a negative start would count from the
+        # end.
         left = max(columns.start - strip.left - radius_px, 0)
         right = columns.stop - strip.left + radius_px
         top = max(rows.start - radius_px, 0) - strip.top

@@ -124,7 +124,7 @@ def restore_rows(
                     waiting[0].span.keep_stop + reach_px, plan.height_px
                 ):
                     done_px = waiting[0].span.keep_stop
-                    # A name for the row would keep it in memory while the next is made.
+                    # A variable for the row would hold it in memory while the next is computed.
                     yield _finished(waiting.popleft(), buffer, plan, restorer, pool)
                     buffer.forget_above((done_px - reach_px) * scale)
         finally:
@@ -174,7 +174,7 @@ def _tiles(
     strip: Strip, row: Span, plan: Plan, restorer: Restorer, pool: Executor
 ) -> Iterator[Tile]:
     """Return an iterator over the tiles of one row, in the order of `places`."""
-    # Written into the caller's loop, the lambda would take the strip and the row of the next one.
+    # Within the caller's loop, the lambda would use the strip and the row of the next iteration.
     return pool.map(lambda place: restorer.tile(strip, place[0], row, place[1]), places(plan))
 
 

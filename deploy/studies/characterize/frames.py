@@ -151,9 +151,9 @@ def _look(path: Path) -> _Look:
     step = step if apart else 1
     count = int((values == largest).sum())
     below = int((values == largest - step).sum())
-    # Values stored in 8 bits do not tell the bits of the digitiser, clipped or not.
+    # Values stored in 8 bits do not reveal the bits of the digitiser, clipped or not.
     piled = count >= max(CLIPPED_PIXELS, PILE * below) and pixels.dtype.itemsize > 1
-    # 0 stands for a missing pixel too, so that it tells nothing of the dark.
+    # 0 also stands for a missing pixel, so it says nothing about the dark.
     present = values[values > 0]
     darkest, middle = np.percentile(present, [DARKEST_PERCENT, 50]) if present.size else (0.0, 0.0)
     return _Look(step, largest, piled, float(darkest), float(middle))

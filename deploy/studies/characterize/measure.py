@@ -111,7 +111,7 @@ def _require_one_sensor(frames: Frames, frame_blocks: Sequence[Blocks], dn: floa
             variances[path.name] = line.at(dn)
     if not variances:
         return
-    # The ends of the intervals are compared, so that frames which may be alike pass.
+    # The limits of the intervals are compared, so that frames which may be equal pass.
     least = min(variances, key=lambda name: variances[name].interval[1])
     most = max(variances, key=lambda name: variances[name].interval[0])
     if variances[most].interval[0] > NOISE_FACTOR * variances[least].interval[1]:

@@ -229,7 +229,7 @@ def _mtf_table(sensor: Measurement, images: str) -> dict[str, object]:
         why = "no edge shows it; the middle of the range that networks are trained for"
         return {"mtf_nyquist": _constant(float(f"{middle:.4g}"), "assumed", why)}
     table: dict[str, object] = {"frequency": [float(f) for f in FREQUENCIES]}
-    # An axis without edges has the curve of the other one, and its source says so.
+    # An axis without edges has the curve of the other one, and its source states that.
     other = next(iter(sensor.curves))
     for axis in AXES:
         source_axis = axis if axis in sensor.curves else other
@@ -272,7 +272,7 @@ def _noise_table(sensor: Measurement, images: str) -> dict[str, object]:
             f"{_blocks(sensor.noise)} in {images}, 95 % interval {snr.interval[0]:.3g} to "
             f"{snr.interval[1]:.3g}"
         )
-        # No block has this radiance: the interval is wider, and the source says so.
+        # No block has this radiance, so the interval is wider, and the source states that.
         if snr.extrapolated:
             source += f"; extrapolated from {dark:.3g} to {bright:.3g} W/m2/sr/um"
         if not model.white:

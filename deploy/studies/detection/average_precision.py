@@ -203,7 +203,7 @@ def score(
         [precisions(hits, kind, weights, ALL, every).mean(axis=-1) for kind in range(len(names))]
     )
     curves = _confidence_curves(hits, weights)
-    # The confidence is a level of its own grid: the margin keeps rounding from taking the next one.
+    # The confidence lies on the grid. The margin prevents that rounding selects the next level.
     fixed = np.searchsorted(CONFIDENCES, np.nan_to_num(confidence) - 1e-9)
     # It is 0 where nothing is labelled, and there the curves are NaN.
     own = np.argmax(curves[2], axis=-1)

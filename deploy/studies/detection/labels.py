@@ -184,7 +184,7 @@ def _read_voc_tree(folder: Path, split: str | None) -> list[_File]:
     stems = list(images)
     list_name = split or "test"
     if list_name in lists:
-        # A list of one class has a number behind each name.
+        # A list of one class has a number after each name.
         stems = sorted({line.split()[0] for line in _lines(lists[list_name])})
     elif split:
         raise OptionError(

@@ -187,7 +187,7 @@ def _compared(
     rows = {REFERENCE: None, **methods}
     boxes: dict[str, list[Boxes]] = {row: [] for row in rows}
     with steps(f"detecting, {sensors.degraded.name}", len(scenes) * len(rows)) as bar:
-        # Each scene is let go of after its rows: thousands would fill the memory.
+        # Each scene is released after its rows, because thousands would fill the memory.
         for scene in acquired(scenes, sensors, seed):
             for row, method in rows.items():
                 boxes[row].append(scene.boxes(detector, method))

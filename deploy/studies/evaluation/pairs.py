@@ -123,7 +123,7 @@ def simulate_pairs(
         if ratio is None:
             small.append(scene.name)
             continue
-        # A scene that is left out takes a number too: the draws of the others do not depend on it.
+        # A scene that is left out has a number too, so the draws of the others do not change.
         draw = Draw(seed, number)
         camera, aim = (
             source if isinstance(source, Instrument) else source.draw(draw.generator("sensor"))

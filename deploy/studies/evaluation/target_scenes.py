@@ -207,7 +207,7 @@ def _zone_plates() -> list[tuple[str, np.ndarray, np.ndarray]]:
     frequency = _radius_px(ZONE_PX, 1) / (2 * ZONE_NYQUIST_PX)
     ring = (frequency >= ZONE_BAND[0]) & (frequency <= ZONE_BAND[1])
     radius_px = _radius_px(ZONE_PX, OVERSAMPLING)
-    # It ends at the radius where it reaches Nyquist: beyond it the sampling would alias.
+    # The pattern ends at the radius where it reaches Nyquist, because it would alias beyond.
     chirp = np.cos(math.pi / 2 * radius_px**2 / ZONE_NYQUIST_PX) * (radius_px < ZONE_NYQUIST_PX)
     return [
         (f"zone plate of {contrast:.0%}", contrast * chirp, ring) for contrast in ZONE_CONTRASTS

@@ -184,7 +184,7 @@ def _transfers(restored: np.ndarray, pattern: Pattern) -> list[float]:
         columns = slice(right * width // 2, (right + 1) * width // 2)
         mask = pattern.measured[rows, columns]
         truth = pattern.wanted[rows, columns][mask].astype(np.float64)
-        # Without the mean the slope tells contrast alone, whatever the level of the image.
+        # Without the mean, the slope depends only on contrast, not on the level of the image.
         truth -= truth.mean()
         slopes.append(float(truth @ restored[rows, columns][mask] / (truth @ truth)))
     return slopes

@@ -252,8 +252,8 @@ def _curve_row(name: str, draws: Sequence[Injection], kind: str) -> Row:
     figures = {"flips": flips}
     by_guards = zip(*(draw.quality for draw in draws), strict=True)
     for guards, values in zip(SETS, by_guards, strict=True):
-        # Exact before it is rounded once: the mean of the same values is the same, however often
-        # each stands there.
+        # The sum is exact and rounded once, so the mean of equal values does not depend on their
+        # number.
         figures[guards] = measured(
             statistics.mean(values), "dB", source, (min(values), max(values))
         )
@@ -320,12 +320,12 @@ def _price_row(name: str, time_s: float, source: str, prediction: Prediction, sp
     """
     tile_s = prediction.batch_time_s / prediction.batch
     slow, fast = prediction.fps_interval
-    # The host prepares the next tile while the DPU runs: only what does not fit beside it costs
-    # frames.
+    # The host prepares the next tile while the DPU runs. Only the time beyond that reduces the
+    # frame rate.
     before_s = max(tile_s, prediction.host_s)
     beside_s = max(tile_s, prediction.host_s + time_s)
     times_s = (time_s / spread, time_s * spread)
-    # The share is largest at the highest frame rate, where a tile takes the least time.
+    # The share is largest at the highest frame rate, where a tile needs the least time.
     most = 100 * time_s * spread * fast
     figures = {
         "time": predicted(1e3 * time_s, "ms/tile", (1e3 * times_s[0], 1e3 * times_s[1]), source),

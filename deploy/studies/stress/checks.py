@@ -90,7 +90,7 @@ def gain(
 def change(work: Work, source: np.ndarray, result: np.ndarray, nudge: np.ndarray) -> float:
     """Return the largest change of any pixel (H, W), in DN, for a nudge (H, W) of -1, 0 or 1 DN."""
     target = source + nudge
-    # Turned round where it would leave the converter's range.
+    # Reverse the nudge where it would leave the converter's range.
     nudged = np.where((target < 0) | (target > FULL_DN), source - nudge, target)
     return float(np.abs(work(np.asarray(nudged, np.float32)) - result).max())
 
@@ -118,7 +118,7 @@ def fidelity(image: np.ndarray, result: np.ndarray, radius_px: int, flat: bool) 
     inner = inside(result, radius_px)
     measures = [ringing(inner, inside(image, radius_px), radius_px, RINGING_PERCENT)]
     if flat:
-        # All that is lost at the border of flat ground is the padding's doing.
+        # On flat ground, any error at the border is caused by the padding.
         border = Measure("border", float(np.abs(result - image).max()), 2 * FLAT_DN)
         shift_dn = abs(float(np.mean(inner, dtype=np.float64) - np.mean(image, dtype=np.float64)))
         measures += [Measure("mean moved", shift_dn, FLAT_DN), border]

@@ -212,8 +212,9 @@ LARGE_CORE_PX = 250
 
 
 def float32(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
-    """The float network in float32, and against float64 where it is plain convolutions, on an image
-    (H, W) in DN.
+    """Check the float network in float32, and against float64 if it has only convolutions.
+
+    The image is (H, W) in DN.
     """
     network = subject.float32
     graph = subject.graph
@@ -230,7 +231,7 @@ def float32(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Meas
 
 
 def int8(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
-    """The INT8 network by onnxruntime's integer kernels, on an image (H, W) in DN."""
+    """Check the INT8 network with onnxruntime's integer kernels on an image (H, W) in DN."""
     network = subject.quantized
     measures = restoration(network, case, image, INT8_GAIN_DN)
     if case.pixels == "sound" and not case.large:
@@ -263,7 +264,7 @@ def restoration(
 
 
 def reference(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
-    """The INT8 network in whole numbers alone, on 48 x 48 pixels of larger images (H, W)."""
+    """Check the INT8 network in integer arithmetic, on 48 x 48 pixels of larger images (H, W)."""
     core = subject.core
     network = subject.quantized
     if case.pixels != "sound":
@@ -299,8 +300,9 @@ def _fractions(image: np.ndarray) -> np.ndarray:
 
 
 def tiling(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
-    """Both networks, tiled by several plans, against the whole image (H, W); plans refuse unsound
-    pixels.
+    """Compare both networks, tiled by several plans, with the whole image (H, W).
+
+    A plan must refuse pixels that are infinite or beyond 12 bits.
     """
     measures = []
     cores_px = (LARGE_CORE_PX,) if case.large else CORES_PX

@@ -118,7 +118,7 @@ class Comparison:
         # Differences on the same images: how the images differ from one another drops out.
         pairs = zip(a.images, b.images, strict=True)
         differences = [(x[PSNR] or 0.0) - (y[PSNR] or 0.0) for x, y in pairs]
-        # The same pictures are equal on however few sites: no bootstrap is needed to tell.
+        # Identical images need no bootstrap, however few the sites are.
         if not any(differences):
             return measured(0.0, "dB", "the same pictures", (0.0, 0.0))
         interval, words = site_interval(differences, self.sites, np.random.default_rng(self.seed))

@@ -200,7 +200,7 @@ def _draw_limits(axes: "Axes", study: Plotted) -> None:
         if limit.key == study.cost and low <= limit.limit <= high:
             axes.axvline(limit.limit, **style)
             words = f"{AT_MOST if limit.at_most else AT_LEAST} {limit.in_words(limit.limit)}"
-            # The axis is logarithmic: its middle is the geometric mean of its ends.
+            # The axis is logarithmic, so its middle is the geometric mean of its limits.
             right = limit.limit > np.sqrt(low * high)
             place: dict[str, Any] = {"ha": "right" if right else "left", "va": "bottom"}
             axes.annotate(

@@ -174,7 +174,7 @@ PREVIEW_RUNS = 3
 def preview(study: Study) -> Table:
     """Return the planned measurements and an estimate of their duration, from a crop timed here."""
     benchmark, _ = benchmark_of(study)
-    # A float network stands for its INT8 one: to quantise it would take longer than the answer.
+    # A float network stands for its INT8 one, because quantising would take too long here.
     points = points_for(study, require_quantizable)
     methods = _methods([point.variant for point in points], benchmark)
     first = benchmark.pairs[0]
@@ -289,7 +289,7 @@ def _measured(
     medians_s = {variant: times["host p50"].value or 1.0 for variant, times in host.items()}
     for point, result in zip(points, results, strict=True):
         here_s = medians_s[point.variant]
-        # Where the chain itself was not timed, the board's stated time stands as it is.
+        # If the chain itself was not timed, the board's stated time is used as it is.
         slower = here_s / medians_s.get(Variant(CHAIN), here_s)
         runs = benchmark.runs(point) if point.dpu is not None else 1.0
         figures = host[point.variant] | board_figures(point, swath, slower, runs)
