@@ -287,8 +287,8 @@ def pair_of(
         VARIANT if float_network is None else float_network, sensor=sensor, int8=False
     )
     int8 = Network.load(int8_network, sensor=sensor, int8=True)
-    require_quantized(floating.model, floating.label, wanted=False)
-    require_quantized(int8.model, int8.label, wanted=True)
+    require_quantized(floating.model, floating.label, expected=False)
+    require_quantized(int8.model, int8.label, expected=True)
     # The INT8 file of 'quantize' has one output, whatever its float network has.
     its_output = output if len(int8.model.graph.output) > 1 else None
     return floating.with_output(output), int8.with_output(its_output)

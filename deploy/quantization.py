@@ -119,7 +119,7 @@ def quantized(
             "Leave `adapt` out."
         )
     origin = Network.load(network, sensor=data.sensor).with_output(output)
-    require_quantized(origin.model, origin.label, wanted=False)
+    require_quantized(origin.model, origin.label, expected=False)
     with faults_named(origin.label):
         if weights:
             int8 = quantize_conditioned(

@@ -137,7 +137,7 @@ class ConvBEERS(Layers):
 
 
 @dataclass(frozen=True)
-class Told:
+class Condition:
     """What a network behind a bank is told of the sensors of N images, float32.
 
     Attributes:
@@ -153,7 +153,7 @@ class Told:
     gains: Tensor
 
     @classmethod
-    def of(cls, vectors: Tensor, banks: Sequence[Bank]) -> "Told":
+    def of(cls, vectors: Tensor, banks: Sequence[Bank]) -> "Condition":
         """Of the sensor vectors (N, 4) and as many banks."""
         filters = torch.from_numpy(np.stack([bank.filters for bank in banks])).to(vectors)
         units = vectors.new_tensor([bank.unit for bank in banks])
@@ -165,17 +165,17 @@ class Told:
         """All of it, in its order."""
         return self.vectors, self.filters, self.units, self.gains
 
-    def to(self, device: torch.device) -> "Told":
+    def to(self, device: torch.device) -> "Condition":
         """The same on a device."""
-        return Told(*(part.to(device, non_blocking=True) for part in self.parts))
+        return Condition(*(part.to(device, non_blocking=True) for part in self.parts))
 
-    def repeated(self, count: int) -> "Told":
+    def repeated(self, count: int) -> "Condition":
         """What is told of one image, for as many."""
-        return Told(*(part.expand(count, *part.shape[1:]) for part in self.parts))
+        return Condition(*(part.expand(count, *part.shape[1:]) for part in self.parts))
 
-    def some(self, which: slice | Tensor) -> "Told":
+    def some(self, which: slice | Tensor) -> "Condition":
         """What is told of some of the images."""
-        return Told(*(part[which] for part in self.parts))
+        return Condition(*(part[which] for part in self.parts))
 
 
 class BankedConvBEERS(Layers):
@@ -194,7 +194,7 @@ class BankedConvBEERS(Layers):
     def forward(
         self,
         image: Tensor,
-        told: Told,
+        condition: Condition,
         bfloat16: bool = False,
         steps: Sequence[Tensor] = (),
     ) -> Tensor:
@@ -202,19 +202,19 @@ class BankedConvBEERS(Layers):
 
         Args:
             image: (N, 1, H, W).
-            told: of the sensor of each.
+            condition: of the sensor of each.
             bfloat16: for the blocks alone.
             steps: that the maps are rounded to, see `Rounding.steps`; without any they stay as they
                 are.
         """
-        filtered = each_by_its_own(image, told.filters)
-        planes, analytic = self._held(filtered, told.gains)
+        filtered = each_by_its_own(image, condition.filters)
+        planes, analytic = self._held(filtered, condition.gains)
         inputs = pixel_unshuffle(torch.cat([image - 0.5, planes], 1), self.variant.scale)
-        shallow = (self.head(inputs) + self.bias(told.vectors)[:, :, None, None]).contiguous(
+        shallow = (self.head(inputs) + self.bias(condition.vectors)[:, :, None, None]).contiguous(
             memory_format=torch.channels_last
         )
         correction = self.corrected(shallow, bfloat16, steps)
-        restored: Tensor = image + told.units[:, None, None, None] * (analytic + correction)
+        restored: Tensor = image + condition.units[:, None, None, None] * (analytic + correction)
         return restored
 
     def _held(self, filtered: Tensor, gains: Tensor) -> tuple[Tensor, Tensor]:
@@ -245,7 +245,7 @@ class OfOneSensor(nn.Module):
     def forward(self, image: Tensor) -> Tensor:
         """Restore (N, 1, H, W)."""
         bank = self.bank or bank_of_vector(tuple(self.vector.tolist()), self.network.kernels)
-        condition = Told.of(self.vector[None], [bank])
+        condition = Condition.of(self.vector[None], [bank])
         restored: Tensor = self.network(image, condition.repeated(len(image)))
         return restored
 
@@ -254,7 +254,9 @@ Network = ConvBEERS | BankedConvBEERS
 """What can be trained and kept: a plain network, or one for every sensor in range."""
 
 
-def told(network: Network, vector: Tensor, bank: Bank | None = None) -> ConvBEERS | OfOneSensor:
+def for_sensor(
+    network: Network, vector: Tensor, bank: Bank | None = None
+) -> ConvBEERS | OfOneSensor:
     """A network that takes images alone: one behind a bank told the sensor of a vector (4,), a
     plain one as it is.
     """

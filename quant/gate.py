@@ -151,8 +151,8 @@ class GateResult:
     @property
     def metric_loss(self) -> float:
         """What INT8 loses by the user's metric: above 0 it is worse than float."""
-        lost = self.metric_float - self.metric_int8
-        return lost if METRICS[self.metric].larger_is_better else -lost
+        drop = self.metric_float - self.metric_int8
+        return drop if METRICS[self.metric].larger_is_better else -drop
 
     @property
     def source(self) -> str:

@@ -172,7 +172,7 @@ def _page(judged: Table, record: dict[str, Any]) -> Report:
     )
 
 
-def bill_of(said: dict[str, Any]) -> str:
+def bill_of(document: dict[str, Any]) -> str:
     """Return a bill of materials in CycloneDX 1.6. The library has no model cards yet, so facts are
     properties.
     """
@@ -190,12 +190,12 @@ def bill_of(said: dict[str, Any]) -> str:
             type=kind, name=text, bom_ref=f"{kind.value}:{text}:{digest}", hashes=hashes, **more
         )
 
-    network = said["network"]
-    tool = said["tool"]
+    network = document["network"]
+    tool = document["tool"]
     # The serial number is derived from the content, so the same record has the same number.
-    bom = Bom(serial_number=uuid5(NAMESPACE_URL, json.dumps(said)))
-    facts = said["says"] | {
-        key: said[key]
+    bom = Bom(serial_number=uuid5(NAMESPACE_URL, json.dumps(document)))
+    facts = document["says"] | {
+        key: document[key]
         for key in ("training", "sensors_in_range", "limitations", "passed", "licence")
     }
     properties = [
@@ -212,7 +212,7 @@ def bill_of(said: dict[str, Any]) -> str:
     bom.metadata.tools.components.add(maker)
     files = [
         component(ComponentType.FILE, entry["name"], entry["sha256"])
-        for entry in said["results"]["inputs"]
+        for entry in document["results"]["inputs"]
     ]
     bom.components.update(files)
     bom.register_dependency(bom.metadata.component, files)

@@ -17,7 +17,8 @@ from beers_deploy.tables.columns import columns_of, missing, words_of
 INTERVAL = re.compile(r"\[[^\[\]]*\]")
 
 
-def _template() -> jinja2.Template:
+def template(name: str) -> jinja2.Template:
+    """Return a template of this folder; what it is given is escaped."""
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     # A name that the template misspells raises an error instead of writing nothing.
     strict = jinja2.StrictUndefined
@@ -32,7 +33,7 @@ def _template() -> jinja2.Template:
         finalize=_shown,
     )
     environment.filters["unbroken"] = _unbroken
-    return environment.get_template("report.html")
+    return environment.get_template(name)
 
 
 def _unbroken(text: str) -> Markup:
@@ -85,7 +86,7 @@ class Report:
 def render(report: Report) -> str:
     """Render the report as one HTML file with embedded pictures."""
     tables = [_grid(table, upright=report.sorts) for table in report.tables]
-    return _template().render(report=report, tables=tables, version=__version__)
+    return template("report.html").render(report=report, tables=tables, version=__version__)
 
 
 def write_report(report: Report, path: Path) -> None:

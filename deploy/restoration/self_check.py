@@ -20,7 +20,10 @@ from beers_deploy.model.self_check import (
     BLOCK_PX,
     LEAST_SHARPENING,
     MOST_CHI2,
+    OUTSIDE,
     REACH_PX,
+    SMOOTH,
+    WITHIN,
     Judged,
     SelfCheck,
 )
@@ -183,12 +186,6 @@ def _judge_rows(check: SelfCheck, raw: np.ndarray, restored: np.ndarray, down: P
 def _joined(parts: Sequence[Judged], axis: int) -> Judged:
     chi2, sharpening = zip(*((part.chi2, part.sharpening) for part in parts), strict=True)
     return Judged(np.concatenate(chi2, axis), np.concatenate(sharpening, axis))
-
-
-WITHIN = 0
-OUTSIDE = 1
-SMOOTH = 2
-"""The states of a block in a written map."""
 
 
 def write_map(path: Path, blocks: BlockMap, raster: Raster) -> None:

@@ -94,11 +94,11 @@ class FaultList:
         return np.array(places, np.int64).reshape(-1, 3)
 
 
-def list_beside(out: Path, wanted: str) -> Path | None:
+def list_beside(out: Path, source: str) -> Path | None:
     """Return the path of the list of found faults next to the restored image, or None if no faults
     are searched for.
     """
-    return out.with_name(f"{out.stem}.detectors.csv") if wanted == FOUND else None
+    return out.with_name(f"{out.stem}.detectors.csv") if source == FOUND else None
 
 
 def write_list(faults: FaultList, path: Path | None) -> None:

@@ -175,11 +175,11 @@ def _blocks(noise: Noise) -> str:
     return f"{noise.model.blocks} blocks of 16 x 16{still}"
 
 
-def profile_toml(found: Measurement) -> str:
+def profile_toml(measurement: Measurement) -> str:
     """Return the profile as TOML. The source of each measured value includes its interval, and any
     doubt.
     """
-    frames = found.frames
+    frames = measurement.frames
     images = printable(frames.name)
     bits_source = (
         "given"
@@ -194,18 +194,18 @@ def profile_toml(found: Measurement) -> str:
     )
     tables: dict[str, dict[str, object]] = {
         "grid": {
-            "gsd_m": _given(found.stated.gsd_m, GSD_M, "no pixel depends on it; state it"),
+            "gsd_m": _given(measurement.stated.gsd_m, GSD_M, "no pixel depends on it; state it"),
             "oversampling": _constant(
                 OVERSAMPLING, "assumed", "for simulations alone: scene pixels a pixel"
             ),
         },
-        "mtf": _mtf_table(found, images),
-        "noise": _noise_table(found, images),
+        "mtf": _mtf_table(measurement, images),
+        "noise": _noise_table(measurement, images),
         "digitiser": {
             "bits": _constant(
                 frames.bits, "stated" if frames.bits_stated else "measured", bits_source
             ),
-            "gain_dn_per_radiance": _given(found.stated.gain, found.gain, gain_source),
+            "gain_dn_per_radiance": _given(measurement.stated.gain, measurement.gain, gain_source),
         },
     }
     if frames.black_dn:

@@ -67,27 +67,27 @@ class Hits:
     objects: np.ndarray
 
 
-def find_hits(truths: Sequence[Boxes], found: Sequence[Boxes], classes: int) -> Hits:
+def find_hits(truths: Sequence[Boxes], detected: Sequence[Boxes], classes: int) -> Hits:
     """Match detections with labels, once for all figures, by the rules of the COCO evaluation.
 
     The detection with the best score is matched first, with the free object of its class that it
     overlaps most. Detections in an ignored box count neither as hits nor as false. The same holds
-    for objects of another size, and for detections of another size that found none. Every detection
-    counts, while COCO uses the best 100 of a class, because aerial images contain more objects than
-    photographs do.
+    for objects of another size, and for detections of another size that found none. Every
+    detection counts, while COCO uses the best 100 of a class, because aerial images contain more
+    objects than photographs do.
 
     Args:
-        truths: labelled boxes of each image. Images without any are included: detections there are
-            false.
-        found: the detections on each image, in the same px, of the same classes.
+        truths: labelled boxes of each image. Images without any are included: detections there
+            are false.
+        detected: the detections on each image, in the same px, of the same classes.
         classes: the number of classes.
     """
-    scores = np.concatenate([boxes.scores for boxes in found])
-    kinds = np.concatenate([boxes.classes for boxes in found])
+    scores = np.concatenate([boxes.scores for boxes in detected])
+    kinds = np.concatenate([boxes.classes for boxes in detected])
     # Stable, so that equal scores keep the order of the images.
     order = np.argsort(-scores, kind="stable")
-    image = np.repeat(np.arange(len(found)), [len(boxes) for boxes in found])
-    matches = [match(truth, boxes)[:2] for truth, boxes in zip(truths, found, strict=True)]
+    image = np.repeat(np.arange(len(detected)), [len(boxes) for boxes in detected])
+    matches = [match(truth, boxes)[:2] for truth, boxes in zip(truths, detected, strict=True)]
     hits, ignored = (
         np.concatenate(parts, axis=-1)[..., order] for parts in zip(*matches, strict=True)
     )
@@ -106,7 +106,7 @@ def _of_other_size(boxes: Boxes) -> np.ndarray:
     return np.array([(sides < low) | (sides >= high) for low, high in SIZES_PX.values()])
 
 
-def match(truth: Boxes, found: Boxes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def match(truth: Boxes, detected: Boxes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Match the N boxes found on an image with its M labelled ones, by `SIZES_PX` and `OVERLAPS`.
 
     Returns:
@@ -114,13 +114,13 @@ def match(truth: Boxes, found: Boxes) -> tuple[np.ndarray, np.ndarray, np.ndarra
         the objects that are matched, (S, 10, M).
     """
     uncounted = np.repeat((truth.ignored | _of_other_size(truth))[:, None], len(OVERLAPS), axis=1)
-    ignored = np.repeat(_of_other_size(found)[:, None], len(OVERLAPS), axis=1)
+    ignored = np.repeat(_of_other_size(detected)[:, None], len(OVERLAPS), axis=1)
     hits = np.zeros_like(ignored)
     matched = np.zeros_like(uncounted)
-    overlaps = iou(found.corners, truth.corners, truth.ignored) * (
-        found.classes[:, None] == truth.classes
+    overlaps = iou(detected.corners, truth.corners, truth.ignored) * (
+        detected.classes[:, None] == truth.classes
     )
-    for one in np.argsort(-found.scores, kind="stable"):
+    for one in np.argsort(-detected.scores, kind="stable"):
         if overlaps[one].max(initial=0) < OVERLAPS[0]:
             continue
         # An object is found once; an ignored box may hold any number of detections.

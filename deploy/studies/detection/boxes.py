@@ -117,23 +117,23 @@ def iou(one: np.ndarray, other: np.ndarray, ignored: np.ndarray | bool = False) 
     return np.asarray(np.divide(shared, union, out=np.zeros_like(shared), where=union > 0))
 
 
-def suppress(found: Boxes) -> Boxes:
+def suppress(boxes: Boxes) -> Boxes:
     """Return the boxes of a detector after non-maximum suppression within each class, best score
     first.
     """
-    candidates = np.argsort(-found.scores, kind="stable")[:CANDIDATES]
+    candidates = np.argsort(-boxes.scores, kind="stable")[:CANDIDATES]
     selection = list[int]()
     while len(candidates) and len(selection) < MOST:
         best = int(candidates[0])
         candidates = candidates[1:]
         selection.append(best)
         # Boxes of other classes stay: overlaps are computed within the class alone.
-        crowded = found.classes[candidates] == found.classes[best]
+        crowded = boxes.classes[candidates] == boxes.classes[best]
         crowded[crowded] = (
-            iou(found.corners[best][None], found.corners[candidates[crowded]])[0] > OVERLAP
+            iou(boxes.corners[best][None], boxes.corners[candidates[crowded]])[0] > OVERLAP
         )
         candidates = candidates[~crowded]
-    return found[np.array(selection, np.int64)]
+    return boxes[np.array(selection, np.int64)]
 
 
 class Letterbox:

@@ -152,11 +152,11 @@ def _require_layout(model: onnx.ModelProto, task: Any, classes: int, path: Path)
     if task == "detect" and channels == [3] and len(outputs) == 1 and _is_read(outputs[0], classes):
         return
     shapes = ", ".join(" x ".join(map(str, sizes)) for sizes in outputs)
-    found = f"task {task}, {' '.join(map(str, channels))} channels, output {shapes}"
+    facts = f"task {task}, {' '.join(map(str, channels))} channels, output {shapes}"
     raise ModelError(
         f"{path} must have a detector's output as Ultralytics exports it for RGB, "
         f"1 x {4 + classes} x anchors for {classes} classes (raw) or 1 x N x 6 (nms=True or "
-        f"end2end), but it has {printable(found)}. {REMEDY}"
+        f"end2end), but it has {printable(facts)}. {REMEDY}"
     )
 
 
@@ -239,12 +239,12 @@ def letters(name: str) -> str:
     return "".join(c for c in name.casefold() if c.isalnum())
 
 
-def class_names(found: Any) -> tuple[str, ...]:
+def class_names(names: Any) -> tuple[str, ...]:
     """Return class names from a list, or from a table by number from 0, or none for any other
     value.
     """
     names = (
-        [found.get(number) for number in range(len(found))] if isinstance(found, dict) else found
+        [names.get(number) for number in range(len(names))] if isinstance(names, dict) else names
     )
     if not isinstance(names, list) or not all(
         isinstance(name, str) and letters(name) for name in names

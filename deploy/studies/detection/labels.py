@@ -119,7 +119,7 @@ def _labelled_set(files: Sequence[_File], notes: Sequence[str] = ()) -> Labelled
     names = sorted(sorted({name for name, *_ in boxes}), key=letters)
     number = {name: i for i, name in enumerate(names)}
     images = []
-    lost = list[str]()
+    outside = list[str]()
     for one in sorted(files, key=lambda one: one.image.name):
         labelled = Boxes.of(
             [corners for _, corners, _ in one.boxes],
@@ -127,14 +127,14 @@ def _labelled_set(files: Sequence[_File], notes: Sequence[str] = ()) -> Labelled
             ignored=[ignored for *_, ignored in one.boxes],
         )
         inside = labelled[areas(labelled.corners) > 0].clipped(*_size_px(one))
-        lost += [one.source.name] * (len(labelled) - len(inside))
+        outside += [one.source.name] * (len(labelled) - len(inside))
         images.append((one.image, inside))
     if not any(len(truth) for _, truth in images):
         raise OptionError(
             f"The labels must have at least one object, but they have none on {len(images)} "
             "images. Check the labels."
         )
-    remarks = [*notes, *_remarks([truth for _, truth in images], lost)]
+    remarks = [*notes, *_remarks([truth for _, truth in images], outside)]
     return LabelledSet(images, names, remarks)
 
 
@@ -152,15 +152,15 @@ def _size_px(one: _File) -> tuple[int, int]:
     return height, width
 
 
-def _remarks(truths: Sequence[Boxes], lost: Sequence[str]) -> list[str]:
+def _remarks(truths: Sequence[Boxes], outside: Sequence[str]) -> list[str]:
     empty = sum(not len(truth) for truth in truths)
     ignored = sum(int(truth.ignored.sum()) for truth in truths)
     remarks = []
     if empty:
         count = f"{empty} of {len(truths)}"
         remarks.append(f"Images without a labelled object, all found there is false: {count}.")
-    if lost:
-        count = f"{len(lost)}, the first in {lost[0]}"
+    if outside:
+        count = f"{len(outside)}, the first in {outside[0]}"
         remarks.append(f"Boxes left out, without area inside their image: {count}.")
     if ignored:
         kinds = "difficult, a crowd or visible by less than 30 %"

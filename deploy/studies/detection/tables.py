@@ -60,21 +60,23 @@ def detection_table(
     )
 
 
-def detection_rows(found: Comparison) -> list[Row]:
+def detection_rows(comparison: Comparison) -> list[Row]:
     """Return the tables of one sensor: the main result, each row at its own confidence, by class
     and by size.
     """
     # A class without a labelled object has no average precision.
     labelled = [
-        name for name in found.names if not isnan(found.figures[REFERENCE][f"mAP50 of {name}"][0])
+        name
+        for name in comparison.names
+        if not isnan(comparison.figures[REFERENCE][f"mAP50 of {name}"][0])
     ]
     by_class = {name: f"mAP50 of {name}" for name in labelled}
     by_size = {name: f"mAP50 {name}" for name in list(SIZES_PX)[1:]}
-    rows = [_main_row(found, row) for row in found.methods]
-    rows += [_own_row(found, row) for row in found.methods]
+    rows = [_main_row(comparison, row) for row in comparison.methods]
+    rows += [_own_row(comparison, row) for row in comparison.methods]
     for table, keys in ((BY_CLASS, by_class), (BY_SIZE, by_size)):
-        name = f"{table}, {found.name}"
-        rows += [Row(name, row, _values(found, row, keys)) for row in found.methods]
+        name = f"{table}, {comparison.name}"
+        rows += [Row(name, row, _values(comparison, row, keys)) for row in comparison.methods]
     return rows
 
 

@@ -36,7 +36,7 @@ from beers_deploy.restoration.sensor_check.check import check_windows
 from beers_deploy.restoration.sensor_check.windows import WINDOW_PX
 from beers_deploy.restoration.steps import Around
 from beers_deploy.results import Input, Table
-from beers_deploy.studies.evaluation import scores, target_scenes, targets
+from beers_deploy.studies.evaluation import compression, scores, target_scenes, targets
 from beers_deploy.studies.evaluation.methods import (
     Method,
     method_named,
@@ -84,6 +84,7 @@ class Plan:
         given: pairs in memory; None if there are none.
         lpips: weights for LPIPS, or None.
         factors: of the scenes' radiance; the first is 1.
+        rates: bits per pixel to which images are compressed before or after restoration.
         sweep: True to compare other blurs, noises and gains too.
         strict: True to refuse stored pairs that contradict the sensor.
         around: the steps around networks that are used.
@@ -97,6 +98,7 @@ class Plan:
     given: Sequence[Pair] | None
     lpips: Path | None
     factors: Sequence[float]
+    rates: Sequence[float]
     sweep: bool
     strict: bool
     around: Around
@@ -126,6 +128,7 @@ def run_evaluation(plan: Plan) -> Evaluation:
         for method in methods:
             scored = scores.score(method, dimmed, instruments, seed)
             rows += [replace(row, table=table_at(factor, row.table)) for row in scored]
+    rates = compression.run_compression(methods, loaded, nominal, plan.rates, seed)
     swept = list[Row]()
     for factor in plan.factors if plan.sweep else ():
         swept += run_sweep(methods, plan.scenes, *sensors, seed, factor).rows
@@ -133,7 +136,7 @@ def run_evaluation(plan: Plan) -> Evaluation:
     few = too_few(len({pair.site for pair in loaded}))
     notes = [note for note in (few, scores.inner_note(loaded), *remarks) if note]
     names = f"{sensors[0].name} -> {sensors[1].name}"
-    every = (*_in_order([*rows, *scores.paper_rows()]), *sensor_rows, *swept)
+    every = (*_in_order([*rows, *scores.paper_rows()]), *sensor_rows, *rates, *swept)
     return Evaluation(
         title=f"{names}, {len(loaded)} image{'' if len(loaded) == 1 else 's'}",
         arguments={
@@ -291,18 +294,20 @@ def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -
     return strips
 
 
-def evaluation_report(found: Evaluation, strips: Sequence[Picture]) -> Report:
+def evaluation_report(evaluation: Evaluation, strips: Sequence[Picture]) -> Report:
     """Return the page: pictures, means, sites, and the sweep if there was one.
 
     Tables of single images are only in the document.
     """
     tables = []
-    for name, rows in by_table(found.rows).items():
+    for name, rows in by_table(evaluation.rows).items():
         if not name.startswith("images"):
             heading = HEADINGS.get(name, name)
             title = f"{heading[0].upper()}{heading[1:]}"
             tables.append(Section(title, rows, caption_of(name)))
-    return Report(found.title, headline(found.rows), tables, strips, (*NOTES, *found.notes))
+    return Report(
+        evaluation.title, headline(evaluation.rows), tables, strips, (*NOTES, *evaluation.notes)
+    )
 
 
 def caption_of(table: str) -> str:
@@ -311,7 +316,8 @@ def caption_of(table: str) -> str:
         return MEAN_CAPTION if table == "mean" else DIMMED_CAPTION
     if table == targets.TARGETS:
         return TARGETS_CAPTION
-    return SWEEP_CAPTION if table.startswith("sweep") else SITES_CAPTION
+    captions = {compression.GAIN: GAIN_CAPTION, compression.LOSSLESS: LOSSLESS_CAPTION}
+    return captions.get(table, SWEEP_CAPTION if table.startswith("sweep") else SITES_CAPTION)
 
 
 MEAN_CAPTION = (
@@ -336,6 +342,13 @@ TARGETS_CAPTION = (
     "contrast of the scene (amplitude over background). Zone plates are measured from "
     f"{target_scenes.ZONE_BAND[0]} to {target_scenes.ZONE_BAND[1]} cycles per pixel."
 )
+GAIN_CAPTION = (
+    "Inner PSNR against the reference, without its noise where that is known. On board: restored, "
+    "then compressed by JPEG 2000. On the ground: compressed to the same rate, then restored with "
+    "a sensor profile that has more noise: a share of the mean squared error of compression is "
+    "added to the variance. The share is the one that is best on the other sites."
+)
+LOSSLESS_CAPTION = "Bits per pixel of lossless JPEG 2000, of the raw and of the restored images."
 SITES_CAPTION = (
     "PSNR is over full scale and leaves out pixels that clipped in the input or the reference. The "
     "bias of the mean is that of inner pixels against the reference."

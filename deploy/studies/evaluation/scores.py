@@ -103,18 +103,21 @@ def inner(image: np.ndarray) -> np.ndarray:
 
 
 def bias_percent(
-    dn: np.ndarray, wanted: np.ndarray, unclipped: np.ndarray | None = None, offset_dn: float = 0.0
+    dn: np.ndarray,
+    reference_dn: np.ndarray,
+    unclipped: np.ndarray | None = None,
+    offset_dn: float = 0.0,
 ) -> float:
     """Return the difference of the mean of the inner pixels from the wanted one, in %, or NaN for a
     black image.
 
     Args:
         dn: the restored image (H, W), digital numbers.
-        wanted: the reference, likewise.
+        reference_dn: the reference, likewise.
         unclipped: True where pixels count, (H, W); None if all of them do.
         offset_dn: the digital number of the dark.
     """
-    images = [inner(image) for image in (dn, wanted)]
+    images = [inner(image) for image in (dn, reference_dn)]
     if unclipped is not None and inner(unclipped).any():
         images = [image[inner(unclipped)] for image in images]
     mean_dn, level = (float(image.mean(dtype=np.float64)) - offset_dn for image in images)

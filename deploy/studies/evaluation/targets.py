@@ -96,17 +96,17 @@ def _middle(image: np.ndarray) -> np.ndarray:
     return image[top : top + EDGE_PX, left : left + EDGE_PX]
 
 
-def mtf_figure(found: Sequence[float | Refusal]) -> Figure:
+def mtf_figure(edges: Sequence[float | Refusal]) -> Figure:
     """Return the mean over the edges with its 90 % interval; unavailable if most edges were
     refused.
     """
-    values = [100 * edge for edge in found if not isinstance(edge, Refusal)]
-    refusals = [edge for edge in found if isinstance(edge, Refusal)]
+    values = [100 * edge for edge in edges if not isinstance(edge, Refusal)]
+    refusals = [edge for edge in edges if isinstance(edge, Refusal)]
     if len(values) < max(len(refusals), 2):
         return unavailable(
-            "%", f"{len(refusals)} of {len(found)} edges refused: {refusals[0].reason}"
+            "%", f"{len(refusals)} of {len(edges)} edges refused: {refusals[0].reason}"
         )
-    source = f"{len(values)} of {len(found)} simulated slanted edges, 90 % interval of the mean"
+    source = f"{len(values)} of {len(edges)} simulated slanted edges, 90 % interval of the mean"
     return measured(float(np.mean(values)), "%", source, interval_of_mean(values))
 
 

@@ -144,7 +144,7 @@ def open_subject(
         subject = Subject(*map(Runner, pair_of(float_network, int8_network, profile)))
     else:
         floating = Network.load(float_network, sensor=profile, int8=False)
-        require_quantized(floating.model, floating.label, wanted=False)
+        require_quantized(floating.model, floating.label, expected=False)
         subject = Subject(Runner(floating))
     for network in subject.by_name.values():
         # A network that cannot be tiled is refused before anything runs.

@@ -184,20 +184,20 @@ def within(
     return [point for point in placed(points, cost) if not _violation(point, constraints)]
 
 
-def choose(kept: Sequence[Measured], asked: Question) -> tuple[Measured, Measured]:
+def choose(candidates: Sequence[Measured], asked: Question) -> tuple[Measured, Measured]:
     """Choose among points that comply with the constraints, sorted by increasing cost, at least
     one.
 
     Returns:
         The chosen point, and the one with the best PSNR.
     """
-    best = max(kept, key=lambda point: point.value(PSNR))
+    best = max(candidates, key=lambda point: point.value(PSNR))
     # A need without a budget asks for the cheapest point, however good it is.
     if asked.need and not asked.budget:
-        return kept[0], best
+        return candidates[0], best
     # They are sorted by cost: the first that is not significantly worse is the cheapest such.
     return next(
-        point for point in kept if not significant(asked.compare.difference(best, point))
+        point for point in candidates if not significant(asked.compare.difference(best, point))
     ), best
 
 
