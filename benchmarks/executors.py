@@ -1,10 +1,10 @@
-"""Compare what executors compute of INT8 files with the golden vectors, integer by integer.
+"""Compare the results of executors for INT8 files with the golden vectors, integer by integer.
 
     python -m benchmarks.executors int8.onnx --aidge-python aidge/bin/python --compiler gcc "zig cc"
 
-Prints a Markdown table: the share of the last layer's integers that differ from the golden vectors
-of a DPU, in percent. Without files, it takes the shipped networks. Executors that are not there are
-left out. Eclipse Aidge lives in an environment of its own:
+The script prints a Markdown table: the share of the last layer's integers that differ from the
+golden vectors of a DPU, in percent. Without files, it compares the shipped networks. Executors
+that are not available are left out. Eclipse Aidge is installed in an environment of its own:
 
     python3 -m venv aidge
     aidge/bin/pip install aidge-core==0.10.1 aidge-onnx==0.10.1 aidge-backend-cpu==0.10.1

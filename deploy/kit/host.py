@@ -188,8 +188,8 @@ def brightest_around(pixels: np.ndarray, radius: int) -> np.ndarray:
 def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return x + G (raw - H x) of one band (H, W), clipped to [0, 1].
 
-    H is the sensor's blur relative to the reference. G takes the means of blocks and interpolates
-    between their centres, which keeps low spatial frequencies only.
+    H is the sensor's blur relative to the reference. G computes the means of blocks and
+    interpolates between their centres, which retains only low spatial frequencies.
     """
     rows, columns, far, means, excess = (
         np.array(S["consistency"][name], F)

@@ -18,7 +18,7 @@ INTERVAL = re.compile(r"\[[^\[\]]*\]")
 
 
 def template(name: str) -> jinja2.Template:
-    """Return a template of this folder; what it is given is escaped."""
+    """Return a template of this folder, which escapes the values inserted into it."""
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     # A name that the template misspells raises an error instead of writing nothing.
     strict = jinja2.StrictUndefined

@@ -62,7 +62,7 @@ def flip_table(subject: Subject, source: Calibration, board: TargetProfile) -> T
     _ = subject.core
     dpu = dpu_of(board)
     prediction = predict_network(subject.quantized.source, dpu, TILE_PX)
-    # So is a board that cannot price the guards.
+    # A board that cannot predict the cost of the guards is refused as well.
     dpu.limit("cpu", "clock_ghz")
     target = make_target(subject, source)
     curves = curve_rows(target, source.patches, source.seed)
