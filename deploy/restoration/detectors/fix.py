@@ -111,7 +111,7 @@ def band_number(band: int, raster: Raster) -> int:
 
 
 def _replaced(stripes: Stripes) -> list[int]:
-    """Return the lines whose interpolation is better than their own values."""
+    """Return the dead lines, and those whose gain error exceeds WRONG_GAIN."""
     return [*stripes.dead, *(line.index for line in stripes.off if abs(line.gain) > WRONG_GAIN)]
 
 

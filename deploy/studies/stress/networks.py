@@ -302,7 +302,7 @@ def _fractions(image: np.ndarray) -> np.ndarray:
 def tiling(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
     """Compare both networks, tiled by several plans, with the whole image (H, W).
 
-    A plan must refuse pixels that are infinite or beyond 12 bits.
+    Each plan must refuse pixels that are infinite or beyond 12 bits.
     """
     measures = []
     cores_px = (LARGE_CORE_PX,) if case.large else CORES_PX

@@ -212,8 +212,9 @@ def network_points(variant: Variant, boards: Sequence[TargetProfile], whole: Swa
 
 
 def _on_board(variant: Variant, board: TargetProfile, swath: Swath) -> list[Point]:
-    """Return the fastest tile in each configuration. In the default one, also return the paper's
-    tile and smaller halos.
+    """Return a point in each configuration, with the fastest tile of the default one.
+
+    In the default configuration there are also points with the paper's tile and smaller halos.
     """
     default = dpu_of(board)
     others = [dpu_of(board, name) for name in board.configurations if name != default.name]
