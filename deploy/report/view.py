@@ -1,7 +1,7 @@
 """A view of a run: raw and restored image in one HTML file, to swipe, zoom and compare.
 
-The page needs no server and asks the network for nothing. OpenSeadragon, which is in it with its
-licence, draws tiles that are data: addresses, so that a browser decodes those alone that are seen.
+The page needs no server and no network access. It contains OpenSeadragon with its licence, which
+draws tiles that are data: addresses. A browser therefore decodes only the visible tiles.
 """
 
 import base64
@@ -20,7 +20,7 @@ from beers_deploy.report.view_layers import SELF_CHECK, Layer, layers_of
 
 TILE_PX = 512
 QUALITY = 90
-"""Of the JPEG tiles: a level of 8 bits is off by about one."""
+"""Quality of the JPEG tiles, with which 8-bit levels are off by about one."""
 
 VIEWER = Path(__file__).parent / "openseadragon"
 
@@ -28,14 +28,14 @@ VIEWER = Path(__file__).parent / "openseadragon"
 def write_view(
     path: Path, image: Path, restored: Path, maps: Mapping[str, Path], trusted: bool
 ) -> None:
-    """Write the view of a run, whole or not at all.
+    """Write the view of a run, atomically.
 
     Args:
         path: of the HTML file.
         image: the raw image.
         restored: the image that was made from it.
         maps: further layers; see `layers_of`.
-        trusted: whether an index may name files outside its folder.
+        trusted: True if an index may name files outside its folder.
     """
     layers, notes = layers_of(image, restored, maps, trusted)
     page = template("view.html").render(
@@ -52,7 +52,7 @@ def write_view(
 
 
 def _described(layer: Layer, raw: Layer) -> dict[str, Any]:
-    """Return what the page's script has of a layer."""
+    """Return the description of a layer for the page's script."""
     height, width = layer.pixels.shape[:2]
     return {
         "name": layer.name,

@@ -23,10 +23,10 @@ SIDE_PX = 4096
 """The longest side of a layer in pixels."""
 
 STRIP_PX = 1 << 20
-"""Pixels that are read at a time, if that is a row of blocks at least."""
+"""The number of pixels that are read at a time, but at least a row of blocks."""
 
 SAMPLE_PX = 1024
-"""The longest side of the sample that a stretch is measured on."""
+"""The longest side of the sample from which a stretch is computed."""
 
 STRETCH = (2.0, 98.0)
 """Percentiles of the raw image that are shown black and white."""
@@ -42,14 +42,17 @@ STATES = {
     OUTSIDE: ("#f0562b", "contradicts it"),
     SMOOTH: ("#9aa4b0", "too smooth to decide"),
 }
-"""Colour and meaning of each state in a map of the self-check, which colour-blind eyes tell apart.
+"""Colour and meaning of each state in a map of the self-check. Colour-blind people can distinguish
+the colours.
 """
 
 BLOCK_ALPHA = 96
-"""Opacity of a block's colour over the image, of 255."""
+"""Opacity of a block's colour over the image, out of 255."""
 
 SHARP_PX = 4
-"""Pixels of the image that one of a block's colour covers: a larger one would be smoothed."""
+"""The largest number of image pixels per pixel of a block's colour. A larger one would be
+smoothed.
+"""
 
 Pixels = NDArray[np.uint8]
 Planes = NDArray[np.float32]
@@ -63,7 +66,7 @@ class Layer:
         name: as the page calls it.
         pixels: (H, W) grey, (H, W, 3) colour, or (H, W, 4) colour with opacity.
         pixel_px: columns of the raw image that one column covers.
-        legend: colours (CSS) and what they mean.
+        legend: colours (CSS) and their meanings.
     """
 
     name: str
@@ -82,7 +85,7 @@ def layers_of(
         restored: the image that was made from it.
         maps: further rasters over the same place, by the name of the layer: SELF_CHECK is a map of
             blocks, others are images.
-        trusted: whether an index may name files outside its folder.
+        trusted: True if an index may name files outside its folder.
     """
     with ExitStack() as stack:
         raw = stack.enter_context(open_raster(image, trusted))
@@ -143,7 +146,7 @@ def read_planes(source: Source, bands: Sequence[int], factor: int) -> Planes:
 
 
 def _sample(plane: Planes) -> Planes:
-    """Return known pixels of a plane on a coarse grid; one zero where none is known."""
+    """Return the known pixels of a plane on a coarse grid, or one zero if there are none."""
     step = -(-max(plane.shape) // SAMPLE_PX)
     sample = plane[::step, ::step]
     known = sample[np.isfinite(sample)]
@@ -156,7 +159,7 @@ def _stretch_of(plane: Planes) -> Stretch:
 
 
 def _stretched(planes: Planes, stretches: Sequence[Stretch]) -> Pixels:
-    """Return planes as grey or colour; missing pixels are black."""
+    """Return planes as grey or colour. Missing pixels are black."""
     shown = [
         stretch.to_bytes(np.nan_to_num(plane, nan=stretch.black))
         for plane, stretch in zip(planes, stretches, strict=True)
@@ -169,7 +172,7 @@ def _picture(shown: Sequence[Pixels]) -> Pixels:
 
 
 def _difference(before: Planes, after: Planes, unit: str, pixel_px: float) -> Layer:
-    """Return restored less raw: mid-grey is no change, black and white are equal changes."""
+    """Return restored minus raw: mid-grey is no change, and black and white are equal changes."""
     sample = np.concatenate([_sample(x - y) for x, y in zip(after, before, strict=True)])
     most = float(np.percentile(np.abs(sample), MOST_CHANGE))
     shown = []
@@ -188,7 +191,7 @@ def _map_layer(name: str, source: Source, raw: Raster) -> Layer:
     """Return a raster over the same place as a layer."""
     raster = source.raster
     if name == SELF_CHECK:
-        # The planes are chi2 and state of each band that was judged.
+        # The planes are chi2 and state of each band that was checked.
         states = read_planes(source, range(1, raster.bands, 2), 1)
         times = max(1, BLOCK_PX // (SHARP_PX * reduction(raw)))
         shown = _blocks(states).repeat(times, axis=0).repeat(times, axis=1)
@@ -200,7 +203,7 @@ def _map_layer(name: str, source: Source, raw: Raster) -> Layer:
 
 
 def _blocks(states: Planes) -> Pixels:
-    """Return the states (bands, n, m) of blocks as colours: the worst of all bands."""
+    """Return the states (bands, n, m) of blocks as colours. The worst state of all bands counts."""
     picture = np.zeros((*states.shape[1:], 4), np.uint8)
     # A block that no band has a state for stays clear.
     for state in (SMOOTH, WITHIN, OUTSIDE):
@@ -210,12 +213,14 @@ def _blocks(states: Planes) -> Pixels:
 
 
 def _pixel_px(raster: Raster, raw: Raster) -> float:
-    """Return how many columns of the raw image one shown column of another image covers."""
+    """Return the number of columns of the raw image that one displayed column of another image
+    covers.
+    """
     return reduction(raster) * raw.width_px / raster.width_px
 
 
 def _unit(raster: Raster) -> str:
-    """Return the unit of the stored pixels: what the file states, else digital numbers."""
+    """Return the unit of the stored pixels as the file states it, else digital numbers."""
     band = raster.band_info[0] if raster.band_info else BandInfo()
     scaled = (band.scale, band.offset) != (1, 0)
     return "DN" if scaled or not band.unit else band.unit
@@ -229,7 +234,7 @@ def _ends(stretches: Sequence[Stretch], unit: str) -> tuple[tuple[str, str], ...
 
 
 def _notes(raw: Raster, made: Raster, bands: int) -> str:
-    """Return sentences that say what is shown and how."""
+    """Return sentences on what is shown and how."""
     low, high = STRETCH
     stretch = (
         f"Raw and restored have one stretch: black and white are the percentiles {low:g} and "

@@ -3,8 +3,8 @@
 `model.raster` reads an image by rows. It passes, in this order:
 
     bands        a sensor, and so a network, for each band
-    plan         how it is cut into tiles; memory: what that takes
-    radiometry   how its pixels are understood: which value is full scale, and who states it
+    plan         how it is cut into tiles; memory: the memory that this needs
+    radiometry   how its pixels are interpreted: the full scale, and its origin
     detectors    faults of detectors; a list of them, whose pixels are replaced
     sensor_check the comparison with its sensor, and whether it is raw at all
     runtime      the network, on onnxruntime or OpenVINO, here or by the workers of a `cluster`

@@ -67,7 +67,7 @@ class Decompressed:
 
 
 def check_rates(rates: Iterable[float], bits: int) -> list[float]:
-    """Return the rates, each once.
+    """Return the rates without duplicates.
 
     Args:
         rates: in bits per pixel.
@@ -173,7 +173,7 @@ class Trial:
         numbers = np.empty(len(sites), int)
         for site in np.unique(sites):
             here = sites == site
-            # One site has no others: its own images choose, which favours the ground.
+            # A single site has no others, so its own images choose, which favours the ground.
             judges = here if here.all() else ~here
             numbers[here] = self.ground_db[:, judges].mean(1).argmax()
         return numbers
@@ -220,9 +220,9 @@ def run_compression(
     """Restore images on board and on the ground, at each rate.
 
     Args:
-        methods: of which the degraded input is left out.
+        methods: the methods; the degraded input is left out.
         pairs: of images.
-        sensor: that acquired the images.
+        sensor: the sensor that acquired the images.
         rates: in bits per pixel; without any, no row is returned.
         seed: of the bootstrap.
 
@@ -257,12 +257,12 @@ def try_method(
     """Compare both orders of a method at one rate.
 
     Args:
-        method: that restores.
+        method: the method that restores.
         pairs: of images.
         restored: the degraded images of the pairs, restored.
         raw: the same images, decompressed.
         rate: in bits per pixel.
-        sensor: that acquired the images.
+        sensor: the sensor that acquired the images.
     """
     sent = _all_decompressed(restored, rate, sensor)
     shares = SHARES if method.specialise else SHARES[:1]

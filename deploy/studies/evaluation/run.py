@@ -1,7 +1,7 @@
-"""`evaluate`: restorations compared on the same pairs, from names, networks and functions to rows
+"""`evaluate`: compare restorations on the same pairs, from names, networks and functions to rows
 and a page.
 
-The page has the tables, and the same crops of every method with their errors beside the reference.
+The page has the tables, and the same crops of every method with their errors next to the reference.
 """
 
 import os
@@ -53,13 +53,12 @@ from beers_deploy.studies.evaluation.sweep import run_sweep
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Evaluation(Table):
-    """Methods compared on the same pairs: means, sites, images, and other sensors where they were
-    asked for.
+    """Methods compared on the same pairs: means, sites, images, and other sensors if requested.
 
     Attributes:
         sensors: of the degraded and of the reference images.
         methods: as they were run.
-        pairs: that they were run on.
+        pairs: the pairs that they were run on.
     """
 
     sensors: tuple[Sensor, Sensor]
@@ -67,7 +66,7 @@ class Evaluation(Table):
     pairs: Sequence[NamedPair]
 
     def report(self, folder: str | os.PathLike[str]) -> Path:
-        """Write report.html and pictures into a folder; returns the page's path."""
+        """Write report.html and pictures into a folder, and return the page's path."""
         page = Path(folder) / "report.html"
         write_report(evaluation_report(self, pictures(self.pairs, self.methods, page.parent)), page)
         return page
@@ -75,7 +74,7 @@ class Evaluation(Table):
 
 @dataclass(frozen=True)
 class Plan:
-    """What is compared, and how.
+    """The settings of a comparison.
 
     Attributes:
         methods: names, networks or functions, by the name of their row.
@@ -85,10 +84,10 @@ class Plan:
         given: pairs in memory; None if there are none.
         lpips: weights for LPIPS, or None.
         factors: of the scenes' radiance; the first is 1.
-        rates: in bits per pixel, to which images are compressed before or after restoration.
-        sweep: whether other blurs, noises and gains are compared too.
-        strict: whether stored pairs that contradict the sensor are refused.
-        around: which steps around networks are used.
+        rates: bits per pixel to which images are compressed before or after restoration.
+        sweep: True to compare other blurs, noises and gains too.
+        strict: True to refuse stored pairs that contradict the sensor.
+        around: the steps around networks that are used.
         seed: of every random draw.
     """
 
@@ -107,7 +106,7 @@ class Plan:
 
 
 def run_evaluation(plan: Plan) -> Evaluation:
-    """Compare restorations on the same pairs and targets; the degraded input is always a row."""
+    """Compare restorations on the same pairs and targets. The degraded input is always a row."""
     sensors = plan.sensors
     seed = plan.seed
     methods = [_method(name, source, sensors, plan.around) for name, source in plan.methods.items()]
@@ -204,7 +203,7 @@ def _sensor_row(pairs: Sequence[NamedPair], sensor: Sensor, name: str, strict: b
 
 
 def _inputs(plan: Plan) -> Iterator[Path | Input]:
-    """Yield what the figures rest on: networks, weights of LPIPS, scenes or pairs."""
+    """Yield the inputs of the figures: networks, weights of LPIPS, scenes or pairs."""
     for source in plan.methods.values():
         if isinstance(source, Network):
             yield source.input
@@ -245,11 +244,11 @@ SITES = 4
 CROP_PX = 96
 ZOOM = 2
 CHECKED_IMAGES = 16
-"""Images at most that are compared with the sensor."""
+"""The largest number of images that are compared with the sensor."""
 
 
 def chosen_pairs(pairs: Sequence[NamedPair]) -> list[NamedPair]:
-    """The first pair of each of the first few sites."""
+    """Return the first pair of each of the first few sites."""
     first = dict[str, NamedPair]()
     for pair in pairs:
         first.setdefault(pair.site, pair)
@@ -257,7 +256,7 @@ def chosen_pairs(pairs: Sequence[NamedPair]) -> list[NamedPair]:
 
 
 def strip_of(pair: NamedPair, methods: Sequence[Method]) -> tuple[np.ndarray, float]:
-    """Crops of every method and the reference, and below them the size of the errors.
+    """Draw crops of every method and the reference, with the absolute errors below them.
 
     Returns:
         The picture (h, w) uint8, and the error in DN that is shown white.
@@ -281,7 +280,7 @@ def strip_of(pair: NamedPair, methods: Sequence[Method]) -> tuple[np.ndarray, fl
 
 
 def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -> list[Picture]:
-    """A strip for each of a few sites, also written to OUT/SITE.png."""
+    """Draw a strip for each of a few sites, and also write it to OUT/SITE.png."""
     strips = []
     for pair in chosen_pairs(pairs):
         strip, white = strip_of(pair, methods)
@@ -296,9 +295,9 @@ def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -
 
 
 def evaluation_report(evaluation: Evaluation, strips: Sequence[Picture]) -> Report:
-    """Return the page: pictures, means, sites, and the sweep where there was one.
+    """Return the page: pictures, means, sites, and the sweep if there was one.
 
-    Tables of single images are for the document alone.
+    Tables of single images are only in the document.
     """
     tables = []
     for name, rows in by_table(evaluation.rows).items():
