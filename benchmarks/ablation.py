@@ -1,11 +1,11 @@
-"""What each accuracy pass of the quantiser buys, in dB: the loss with all passes, and how much
-larger it is when one is left out.
+"""Measure what each accuracy pass of the quantiser gains, in dB: the loss with all passes, and how
+much larger it is when one is left out.
 
     python -m benchmarks.ablation --images aerial-train/ --held-out aerial-test/ --keep networks/
 
-The small networks are those of `benchmarks.small_networks`, trained briefly. Shipped
-networks are quantised over their range of sensors and judged on `pleiades-degraded`. Prints a
-Markdown table; samples that judge were seen by neither training nor calibration.
+The small networks are those of `benchmarks.small_networks`, trained briefly. Shipped networks are
+quantised over their range of sensors and evaluated on `pleiades-degraded`. The script prints a
+Markdown table. The samples it evaluates on were seen by neither training nor calibration.
 """
 
 import argparse
@@ -28,23 +28,23 @@ from beers_deploy.quantization import family_model
 from benchmarks.small_networks import NETWORKS, Small, folder_of, names_in, options, prepared
 
 Loss = Callable[[Passes], float]
-"""Quantises a network with these passes; the mean loss of PSNR in dB."""
+"""Quantise a network with these passes and return its mean loss of PSNR in dB."""
 UNSEEN = 64
-"""Patches that judge a shipped network."""
+"""The number of patches on which a shipped network is evaluated."""
 NOT_BEHIND_A_BANK = {"dual_range"}
-"""Passes without effect there: the result has two ranges of its own."""
+"""Passes without effect behind a filter bank, because its result has two ranges of its own."""
 SAME_DB = 5e-4
-"""A smaller change is none: it is printed as 0.000."""
+"""Smaller changes count as none and are printed as 0.000."""
 
 
 def ablations() -> Iterator[tuple[str, Passes]]:
-    """Return the passes with each single one left out, by its name."""
+    """Yield all passes, then the passes with each single one left out, by name."""
     for field in fields(Passes):
         yield field.name, replace(ALL, **{field.name: False})
 
 
 def row(loss_of: Loss, behind_bank: bool = False) -> list[str]:
-    """Return the loss with all passes, and what each one buys: the loss without it, less the loss
+    """Return the loss with all passes, and the gain of each one: the loss without it minus the loss
     with it.
     """
     loss = loss_of(ALL)
@@ -90,7 +90,7 @@ def shipped(name: str, arguments: argparse.Namespace) -> Loss:
 
 
 def main() -> None:
-    """Print a row a network, as each is done."""
+    """Print one row for each network as soon as it is done."""
     arguments = options(__doc__).parse_args()
     print(f"| network | all | {' | '.join(field.name for field in fields(Passes))} |")
     print("|---" * (len(fields(Passes)) + 2) + "|")

@@ -1,4 +1,4 @@
-"""Sensors, scenes and acquisitions that the benchmarks of measurements on images share."""
+"""Sensors, scenes and acquisitions shared by the benchmarks that measure on images."""
 
 import math
 from collections.abc import Sequence
@@ -21,13 +21,15 @@ from beers_deploy.profiles.sensor import Sensor
 
 LIKE = Sensor.load("pleiades-degraded").nominal()
 RATIO = 4
-"""Scene pixels a pixel."""
+"""Scene pixels per sensor pixel along each axis."""
 LEAST_SIDE_PX = 140
 MTF_RANGE = (0.02, 0.12)
 
 
 def photographs(folders: Sequence[Path], *ratios: int) -> list[Scene]:
-    """Read the photographs that are large enough for one of the ratios, RATIO if none."""
+    """Read the photographs that are large enough for at least one of the ratios (default:
+    RATIO).
+    """
     paths = chain.from_iterable(map(list_images, folders))
     scenes = [read_scene(path, LIKE) for path in paths]
     return [
@@ -52,19 +54,19 @@ def draw_sensor(generator: np.random.Generator, other_curve: bool = False) -> In
 def acquired(
     radiance: np.ndarray, sensor: Instrument, number: int, ratio: int = RATIO
 ) -> np.ndarray:
-    """Return the digital numbers (h, w) that a sensor makes of a scene (H, W)."""
+    """Return the digital numbers (h, w) of an acquisition of a scene (H, W) by a sensor."""
     scene = np.ascontiguousarray(crop_divisible(radiance, ratio), np.float32)
     return to_uint16(acquire_padded(scene, sensor, ratio, Draw(number), "degraded"))
 
 
 def as_source(image: np.ndarray) -> ArraySource:
-    """Return an image (H, W) as the checks read it."""
+    """Wrap an image (H, W) as the source that the checks read."""
     height_px, width_px = image.shape
     return ArraySource(image[None], Raster(1, height_px, width_px, image.dtype))
 
 
 def texture(generator: np.random.Generator, side_px: int = 1024) -> np.ndarray:
-    """Draw the radiance of a rough surface: Gaussian, its spectrum falling as 1 / f^p with p from
+    """Draw the radiance of a rough surface: Gaussian, with a spectrum that falls as 1 / f^p, p from
     0.8 to 2.
     """
     f = np.hypot(np.fft.fftfreq(side_px)[:, None], np.fft.rfftfreq(side_px)[None])

@@ -12,7 +12,9 @@ import numpy as np
 
 
 def main(model: str, planes: str, result: str) -> None:
-    """Compute each tile of the planes (N, P, H, W) by itself, as the file is for one."""
+    """Compute each tile of the planes (N, P, H, W) separately, because the file has a batch of
+    one.
+    """
     tiles = np.load(planes)
     graph = aidge_onnx.load_onnx(model)
     graph.set_backend("cpu")

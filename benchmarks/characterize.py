@@ -1,11 +1,11 @@
-"""Errors of `characterize` on simulated images of known sensors, and how often its intervals hold
-the truth.
+"""Measure the errors of `characterize` on simulated images of known sensors, and how often its
+intervals contain the truth.
 
     python -m benchmarks.characterize --images aerial-train/ --seed 7 --sensors 10
 
-Each sensor sees twelve photographs, and then the same with a checkerboard laid into one of them (60
-m a side at 0.5 m, two by two fields, as calibration sites have). Every other sensor has another MTF
-curve than the formula's.
+Each sensor sees twelve photographs, and then the same ones with a checkerboard placed in one of
+them (60 m a side at 0.5 m, two by two fields, as calibration sites have). Every other sensor has an
+MTF curve that differs from the formula's.
 """
 
 import argparse
@@ -45,7 +45,9 @@ def with_checkerboard(radiance: np.ndarray) -> np.ndarray:
 def judged(
     figures: Mapping[str, Figure], sensor: Instrument
 ) -> Iterator[tuple[str, float, tuple[float, float], float]]:
-    """Yield name, value, interval and truth of each measured figure; contrasts in percent."""
+    """Yield the name, value, interval and truth of each measured figure. Contrasts are in
+    percent.
+    """
     truths = dict[str, float]()
     for words, frequency in SHOWN_CPX.items():
         across = sensor_mtf([[frequency]], [[0.0]], sensor)

@@ -1,11 +1,11 @@
-"""What makes code hard to own, counted: tokens, density, packed statements, comments, and helpers
+"""Count what makes code hard to maintain: tokens, density, packed statements, comments, and helpers
 with one caller.
 
     python benchmarks/counts.py [--check]
 
-Tokens are Python's own: names, operators, numbers and strings, without docstrings, comments and
-line breaks; lines are all of a file's. `--check` ends with 1 where density or paired assignments
-have risen above the limits below; whoever lowers them lowers the limits as well.
+Tokens are Python's own (names, operators, numbers and strings), without docstrings, comments and
+line breaks. Lines are all lines of a file. `--check` exits with 1 if the density or the paired
+assignments exceed the limits below. Whoever lowers a figure lowers its limit as well.
 """
 
 import argparse
@@ -34,9 +34,9 @@ LAYOUT = {
     tokenize.ENDMARKER,
 }
 DENSITY_LIMITS = {"source": 5.86, "tests": 8.3}
-"""Tokens a line that may land."""
+"""The maximum number of tokens per line."""
 PAIRED_LIMITS = {"source": 1, "tests": 1}
-"""Paired assignments that may land."""
+"""The maximum number of paired assignments."""
 
 
 class Counts(NamedTuple):
@@ -52,12 +52,12 @@ class Counts(NamedTuple):
 
     @property
     def density(self) -> float:
-        """Tokens a line."""
+        """Return the number of tokens per line."""
         return self.tokens / self.lines
 
 
 def main() -> None:
-    """Print a column for each part, and check the limits."""
+    """Print one column for each part, and check the limits."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -90,7 +90,7 @@ def table(counts: dict[str, Counts]) -> dict[str, list[str]]:
 
 
 def over(counts: dict[str, Counts]) -> Iterator[str]:
-    """Return a sentence for each limit that is passed."""
+    """Yield a sentence for each limit that is exceeded."""
     for name, limit in DENSITY_LIMITS.items():
         density = round(counts[name].density, 2)
         if density > limit:
@@ -102,7 +102,7 @@ def over(counts: dict[str, Counts]) -> Iterator[str]:
 
 
 def counted(folders: tuple[str, ...]) -> Counts:
-    """Count all Python files below some folders of the project."""
+    """Count all Python files below the given folders of the project."""
     nodes = list[ast.AST]()
     totals = Counter[str]()
     for folder in folders:
@@ -131,28 +131,30 @@ def measured(text: str, tree: ast.AST) -> Counter[str]:
 
 
 def docstring_places(tree: ast.AST) -> set[tuple[int, int]]:
-    """Return line and column where each string begins that is a statement of its own."""
+    """Return the line and column of each string that is a statement by itself."""
     statements = (node for node in ast.walk(tree) if isinstance(node, ast.Expr))
     strings = (node.value for node in statements if isinstance(node.value, ast.Constant))
     return {(node.lineno, node.col_offset) for node in strings if isinstance(node.value, str)}
 
 
 def is_paired(node: ast.AST) -> bool:
-    """Return True if a statement assigns several values that are written out to several names."""
+    """Return True if a statement assigns several written-out values to several names."""
     if not isinstance(node, ast.Assign) or not isinstance(node.value, ast.Tuple):
         return False
     return any(isinstance(target, ast.Tuple) for target in node.targets)
 
 
 def is_nested_conditional(node: ast.AST) -> bool:
-    """Return True if an expression with `if` has another one in it."""
+    """Return True if a conditional expression contains another one."""
     return isinstance(node, ast.IfExp) and any(
         isinstance(part, ast.IfExp) for part in ast.walk(node) if part is not node
     )
 
 
 def lone_helpers(nodes: list[ast.AST]) -> int:
-    """Return how many private functions are named once besides where they are defined."""
+    """Return the number of private functions whose name occurs only once outside their
+    definition.
+    """
     functions = (node.name for node in nodes if isinstance(node, ast.FunctionDef))
     private = Counter(name for name in functions if name.startswith("_") and name[-2:] != "__")
     mentions = Counter(node.id for node in nodes if isinstance(node, ast.Name))

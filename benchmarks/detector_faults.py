@@ -1,10 +1,12 @@
-"""How often `restore` reports faults of detectors that are none, and which it detects.
+"""Measure how often `restore` reports detector faults that do not exist, and which real ones it
+detects.
 
     python -m benchmarks.detector_faults --images aerial-test/ --images aerial-train/ --faulty 25
 
-Each image is seen by a sensor that networks are trained for: photographs, random textures, drawn
-towns, and drawn scenes whose edges lie along the columns and rows; at 1/20 to twice the light, with
-the sensor's noise or a fifth of it. Then faults are put into photographs.
+Each image is seen by a sensor that networks are trained for. The scenes are photographs, random
+textures, drawn towns, and drawn scenes whose edges lie along the columns and rows. The light is
+1/20 to twice the nominal, with the sensor's noise or a fifth of it. Then faults are put into
+photographs.
 """
 
 import argparse
@@ -35,11 +37,11 @@ from benchmarks.acquisitions import (
 SIDE_PX = 2048
 RATIOS = (4, 2)
 STACKED = 4
-"""Photographs below one another."""
+"""The number of photographs that are stacked vertically."""
 LIGHTS = (1.0, 1.0, 0.25, 0.05, 2.0)
 NOISES = (1.0, 1.0, 0.2)
 PIXELS = 10
-"""Faulty pixels of an image."""
+"""The number of faulty pixels in an image."""
 
 
 def along_the_axes(generator: np.random.Generator) -> np.ndarray:
@@ -70,7 +72,7 @@ DRAWN: Mapping[str, Callable[[np.random.Generator], np.ndarray]] = {
 
 
 def look(image: np.ndarray, sensor: Instrument) -> BandFaults:
-    """Look for faults in an image (H, W)."""
+    """Detect faults in an image (H, W)."""
     return look_at_detectors(as_source(image), sensor.max_dn)[0]
 
 
@@ -82,7 +84,7 @@ def has_faults(faults: BandFaults) -> bool:
 
 
 def false_alarms(scenes: Sequence[Scene], count: int, generator: np.random.Generator) -> None:
-    """Print how many clean images have a fault."""
+    """Print the number of clean images in which a fault is reported."""
     images = Counter[str]()
     alarms = Counter[str]()
     family = SensorFamily(LIKE, other_curves=0.3)
@@ -105,11 +107,11 @@ def false_alarms(scenes: Sequence[Scene], count: int, generator: np.random.Gener
 
 
 Fault = Callable[[np.ndarray, Instrument, np.random.Generator], float]
-"""Puts a fault into an image (H, W), and returns the share of it that is detected."""
+"""Put a fault into an image (H, W), and return the share of it that is detected."""
 
 
 def look_at_stored(image: np.ndarray, sensor: Instrument) -> BandFaults:
-    """Look for faults in an image of floats, as it would be stored."""
+    """Detect faults in an image of floats, after rounding it as it would be stored."""
     stored = np.clip(np.rint(image), 0, sensor.max_dn).astype(np.uint16)
     return look(stored, sensor)
 
@@ -128,7 +130,9 @@ def column(
     sensor: Instrument,
     generator: np.random.Generator,
 ) -> float:
-    """Change one column, given over full scale."""
+    """Replace one column by `change` of it, in units of full scale. Return 1 if it is reported,
+    else 0.
+    """
     place = int(generator.integers(3, image.shape[1] - 3))
     image[:, place] = change(image[:, place] / sensor.max_dn) * sensor.max_dn
     columns = look_at_stored(image, sensor).columns
@@ -138,7 +142,9 @@ def column(
 def pixels(
     sigmas: float, image: np.ndarray, sensor: Instrument, generator: np.random.Generator
 ) -> float:
-    """Brighten single pixels by some standard deviations of the noise; 0 makes them dead."""
+    """Brighten single pixels by `sigmas` standard deviations of the noise, or make them dead if it
+    is 0. Return the share of them that is reported.
+    """
     places = generator.integers(3, np.array(image.shape) - 3, (PIXELS, 2))
     for place in map(tuple, places):
         gain = sensor.gain_dn_per_radiance
@@ -166,8 +172,8 @@ FAULTS: Mapping[str, Fault] = {
 
 
 def detections(scenes: Sequence[Scene], count: int, generator: np.random.Generator) -> None:
-    """Print the share of the faults that is detected, in one photograph and in several below one
-    another.
+    """Print the share of the faults that is detected, in one photograph and in several stacked
+    vertically.
     """
     print(f"| fault | one photograph | {STACKED} below one another |\n|---|---|---|")
     family = SensorFamily(LIKE)

@@ -1,10 +1,10 @@
-"""Compare what executors compute of INT8 files with the golden vectors, integer by integer.
+"""Compare the results of executors for INT8 files with the golden vectors, integer by integer.
 
     python -m benchmarks.executors int8.onnx --aidge-python aidge/bin/python --compiler gcc "zig cc"
 
-Prints a Markdown table: the share of the last layer's integers that differ from the golden vectors
-of a DPU, in percent. Without files, it takes the shipped networks. Executors that are not there are
-left out. Eclipse Aidge lives in an environment of its own:
+The script prints a Markdown table: the share of the last layer's integers that differ from the
+golden vectors of a DPU, in percent. Without files, it compares the shipped networks. Executors
+that are not available are left out. Eclipse Aidge is installed in an environment of its own:
 
     python3 -m venv aidge
     aidge/bin/pip install aidge-core==0.10.1 aidge-onnx==0.10.1 aidge-backend-cpu==0.10.1
@@ -60,13 +60,13 @@ int main(void)
 def run_c(
     compiler: Sequence[str], text: str, planes: np.ndarray, shape: Sequence[int]
 ) -> np.ndarray:
-    """Compile a program of `export --c`, and return what it writes for planes (N, P, H, W).
+    """Compile a program of `export --c`, and return its output for planes (N, P, H, W).
 
     Args:
         compiler: its command and flags, in addition to all warnings as errors.
-        text: of the program.
+        text: the source of the program.
         planes: int8.
-        shape: (C, H', W') of what it writes for one tile.
+        shape: (C, H', W') of the output for one tile.
 
     Raises:
         RuntimeError: the program does not compile or run, with the messages.
@@ -83,7 +83,7 @@ def run_c(
 
 
 def _done(command: Sequence[object], content: bytes) -> bytes:
-    """Return what a command writes, or raise RuntimeError with its messages."""
+    """Return the output of a command, or raise RuntimeError with its messages."""
     done = subprocess.run([*map(str, command)], input=content, capture_output=True)  # noqa: S603
     if done.returncode:
         raise RuntimeError(done.stderr.decode()[-3000:])
@@ -91,10 +91,10 @@ def _done(command: Sequence[object], content: bytes) -> bytes:
 
 
 def run_aidge(python: Path, board: onnx.ModelProto, planes: np.ndarray) -> np.ndarray:
-    """Return what Eclipse Aidge computes of a board's file, in the scale of its result.
+    """Return the result of Eclipse Aidge for a board's file, in the scale of its output.
 
     Raises:
-        RuntimeError: Aidge does not take the file, with its messages.
+        RuntimeError: Aidge does not accept the file, with its messages.
     """
     script = Path(__file__).with_name("aidge_executor.py")
     with TemporaryDirectory() as folder:
@@ -107,11 +107,11 @@ def run_aidge(python: Path, board: onnx.ModelProto, planes: np.ndarray) -> np.nd
 
 @dataclass(frozen=True)
 class Vectors:
-    """Golden vectors of a network for one tile.
+    """The golden vectors of a network for one tile.
 
     Attributes:
         host: the INT8 file.
-        core: its integers.
+        core: its integer core.
         tile_px: side of the tile.
         planes: of all cases, (N, P, H, W) int8.
         result: of all cases, (N, C, H', W').
@@ -127,7 +127,7 @@ class Vectors:
 
     @classmethod
     def of(cls, network: Network, tile_px: int) -> "Vectors":
-        """Write the golden vectors of a network, and read them; of its own tile if it has one."""
+        """Write and read the golden vectors of a network, at its own tile size if it has one."""
         tile_px = fixed_tile_px(network.model) or tile_px
         with TemporaryDirectory() as folder:
             golden = read_golden(write_golden(network, folder, tile=tile_px))
@@ -147,26 +147,26 @@ class Vectors:
         return self.planes * np.float32(self.core.scale(PLANES))
 
     def integers(self, result: np.ndarray) -> np.ndarray:
-        """Return a result of the board's file as integers."""
+        """Return a result of the board's file converted to integers."""
         return np.rint(result / self.core.scale(CORRECTION)).astype(np.int16)
 
     def by_c(self, compiler: Sequence[str]) -> np.ndarray:
-        """Return what the C file computes."""
+        """Return the result of the C program."""
         text = c_program(self.core, self.tile_px, "network")
         return run_c(compiler, text, self.planes, self.result.shape[1:])
 
     def by_aidge(self, python: Path) -> np.ndarray:
-        """Return what Aidge computes of the board's file."""
+        """Return the result of Aidge for the board's file."""
         board = board_model(self.core, {}, self.tile_px)
         return self.integers(run_aidge(python, board, self.board_feed()))
 
     def by_onnxruntime_board(self) -> np.ndarray:
-        """Return what onnxruntime computes of the board's file."""
+        """Return the result of onnxruntime for the board's file."""
         session = open_session(board_model(self.core, {}))
         return self.integers(session.run(None, {PLANES: self.board_feed()})[0])
 
     def by_onnxruntime_host(self) -> np.ndarray:
-        """Return what onnxruntime computes of the host's file, for the cases with an image."""
+        """Return the result of onnxruntime for the host's file, for the cases with an image."""
         model = with_outputs(any_size(self.host), {CORRECTION: TensorProto.UINT8})
         session = open_session(model)
         name = session.get_inputs()[0].name
@@ -174,7 +174,7 @@ class Vectors:
         return np.concatenate(stored).astype(np.int16) - ZERO
 
     def half_even(self) -> np.ndarray:
-        """Return what the integer core gives where ties go to even, as in onnxruntime."""
+        """Return the result of the integer core if ties are rounded to even, as in onnxruntime."""
         return run_core(self.core, self.planes, half_even=True)[0][CORRECTION]
 
     def differing(self, result: np.ndarray) -> float:
@@ -186,7 +186,7 @@ Executor = Callable[[Vectors], np.ndarray]
 
 
 def executors(aidge: Path | None, compilers: Sequence[str]) -> dict[str, Executor]:
-    """Return the executors that are there, by name."""
+    """Return the executors that are available, by name."""
     found: dict[str, Executor] = {}
     for compiler in compilers:
         command = [*shlex.split(compiler), "-O2"]

@@ -3,12 +3,12 @@
     python -m benchmarks.int8_peers --images aerial-train/ --held-out aerial-test/ \
         --quark-python quark/bin/python
 
-Prints a Markdown table: the PSNR in dB that samples lose which neither training nor calibration
-saw, in the mean and the worst one. With --tuned, also once our integers are fine-tuned on eight
-times the samples, and Quark's weights are rounded by AdaRound.
+The script prints a Markdown table: the mean and the worst loss of PSNR in dB, over samples that
+neither training nor calibration saw. With --tuned it adds our integers fine-tuned on eight times
+the samples, and Quark's weights rounded by AdaRound.
 
-Quark wants other versions of its libraries, so it lives in its own environment. Without the CPU
-build of torch, pip would fetch gigabytes of CUDA packages:
+Quark needs other versions of its libraries, so it is installed in an environment of its own.
+Without the CPU build of torch, pip would fetch gigabytes of CUDA packages:
 
     python3 -m venv quark
     quark/bin/pip install torch==2.13.0 --index-url https://download.pytorch.org/whl/cpu
@@ -35,9 +35,9 @@ from benchmarks.small_networks import (
 )
 
 MORE = 8
-"""Fine-tuned on so many times the samples."""
+"""The factor by which fine-tuning uses more samples."""
 ADAROUND_STEPS = 1000
-"""A layer's, Quark's own default."""
+"""AdaRound steps per layer, Quark's own default."""
 Quantize = Callable[[Small, Path], object]
 
 
@@ -66,7 +66,7 @@ def quark(python: Path, adaround_steps: int, network: Small, out: Path) -> None:
 
 
 def main() -> None:
-    """Print a row a network, as each is done."""
+    """Print one row for each network as soon as it is done."""
     parser = options(__doc__)
     parser.add_argument("--tuned", action="store_true", help="fine-tune as well; minutes a network")
     parser.add_argument("--quark-python", type=Path, help="interpreter that has AMD Quark")

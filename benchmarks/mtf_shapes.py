@@ -1,9 +1,10 @@
-"""Networks and the traditional pipeline under sensors of one contrast at Nyquist and other curves.
+"""Compare networks and the traditional pipeline under sensors with one contrast at Nyquist and
+different MTF curves.
 
     python benchmarks/mtf_shapes.py --images aerial-test/ [--networks convbeers-s-int8]
 
-Each curve is stated as a table up to Nyquist, where it is 7 %, and all methods are given it. Prints
-the inner PSNR against the reference without noise.
+Each curve is given as a table up to Nyquist, where it is 7 %, and all methods receive it. The
+script prints the PSNR of inner pixels against the reference without noise.
 """
 
 import argparse
@@ -22,7 +23,7 @@ CONTRAST = 0.07
 MIDDLE_CPX = 0.22
 WIDTH_CPX = 0.12
 DEPTH = 0.10
-"""Of the sag and of the bulge: middle and width in cycles per pixel, and the change."""
+"""The sag and the bulge: middle and width in cycles per pixel, and the change of contrast."""
 
 
 def curves() -> dict[str, Curve]:
@@ -41,7 +42,7 @@ def curves() -> dict[str, Curve]:
 
 
 def main() -> None:
-    """Evaluate under each curve."""
+    """Evaluate the methods under each curve."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--images", type=Path, required=True)
     parser.add_argument("--networks", default="convbeers-s-int8")

@@ -1,10 +1,10 @@
-"""NL-Bayes on nine standard cells: quality and time beside those of the authors' own C++ program.
+"""NL-Bayes on nine standard cells: quality and time next to those of the authors' own C++ program.
 
     python benchmarks/nl_bayes.py [--quality standard]
 
-The C++ figures are published (IPOL program, one thread of a 2-core EPYC); ours are measured here on
-one thread. So the ratio of times is worth what the two machines have in common; the PSNRs compare
-exactly.
+The C++ figures are published (IPOL program, one thread of a 2-core EPYC). Ours are measured here on
+one thread. The ratio of times is therefore only as good as the two machines are alike. The PSNRs
+compare exactly.
 """
 
 import argparse
@@ -32,7 +32,7 @@ CPP = {
     ("astronaut", 20): (32.40, 0.65),
     ("astronaut", 30): (30.24, 1.65),
 }
-"""PSNR in dB and time in s, 512 x 512, white noise of seed 0 without clipping."""
+"""PSNR in dB and time in s, for 512 x 512 pixels and white noise of seed 0 without clipping."""
 
 
 def images() -> Iterator[tuple[str, np.ndarray]]:
@@ -43,7 +43,7 @@ def images() -> Iterator[tuple[str, np.ndarray]]:
 
 
 def main() -> None:
-    """Print a line a cell, then the means."""
+    """Print one line for each cell, then the means."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

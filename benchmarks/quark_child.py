@@ -1,9 +1,10 @@
-"""Quantise one ONNX file to XINT8 with AMD Quark: `int8_peers.py` runs it in Quark's environment.
+"""Quantise one ONNX file to XINT8 with AMD Quark. `int8_peers.py` runs this script in Quark's
+environment.
 
     PYTHON quark_child.py FLOAT SAMPLES OUT ADAROUND_STEPS
 
-Imports nothing of ours. SAMPLES is an .npy file (K, C, H, W) of images, and no steps are no
-AdaRound.
+The script imports nothing of this project. SAMPLES is an .npy file (K, C, H, W) of images. With 0
+steps there is no AdaRound.
 """
 
 import sys
@@ -15,7 +16,7 @@ from quark.onnx import AdaRoundConfig, ModelQuantizer, QConfig, QLayerConfig, XI
 
 
 class Reader(CalibrationDataReader):
-    """One sample after the other, and again from the first once rewound."""
+    """A reader that returns one sample after the other, and starts again once it is rewound."""
 
     def __init__(self, name: str, samples: np.ndarray) -> None:
         self.name = name
@@ -23,17 +24,17 @@ class Reader(CalibrationDataReader):
         self.rewind()
 
     def get_next(self) -> dict[str, np.ndarray] | None:
-        """Return the next sample, or None."""
+        """Return the next sample, or None after the last one."""
         sample = next(self.rest, None)
         return None if sample is None else {self.name: sample[None]}
 
     def rewind(self) -> None:
-        """Begin again."""
+        """Start again from the first sample."""
         self.rest = iter(self.samples)
 
 
 def main() -> None:
-    """Quantise."""
+    """Quantise the file with the arguments of the command line."""
     network, samples, out, steps = sys.argv[1:]
     rounding = [AdaRoundConfig(num_iterations=int(steps))] if int(steps) else []
     layers = QLayerConfig(activation=XInt8Spec(), weight=XInt8Spec())

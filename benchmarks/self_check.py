@@ -1,14 +1,14 @@
-"""What the self-check of `restore` finds, and what it does not.
+"""Measure which errors the self-check of `restore` finds, and which it misses.
 
     python -m benchmarks.self_check --images aerial-test/ [--flips 200] [--networks ...] [--sweep]
 
-It prints three tables, measured on simulated acquisitions of the images:
+The script prints three tables, measured on simulated acquisitions of the images:
 
-1. Right restorations at 1, 1/4 and 1/20 of the radiance, with `--sweep` also under every sensor of
-   the sweep: the number of blocks, of decidable ones, and of those outside the bound.
+1. Correct restorations at 1, 1/4 and 1/20 of the radiance, with `--sweep` also under every sensor
+   of the sweep: the number of blocks, of decidable ones, and of those outside the bound.
 2. A file for another sensor, whose MTF at Nyquist is 30 % too low or too high.
-3. Single bit flips in the weights of INT8 networks: of those that cost a block more than 0.5 dB,
-   how many are found, by the block's sharpening.
+3. Single bit flips in the weights of INT8 networks: the share that is found of those that cost a
+   block more than 0.5 dB, by the block's sharpening.
 """
 
 import argparse
@@ -37,7 +37,7 @@ WRONG = (0.7, 1.3)
 RADIANCES = (1.0, 0.25, 0.05)
 COSTLY_DB = 0.5
 CLASSES = (0, 10, 20, 30, 40, 60, 100, np.inf)
-"""Of the sharpening, for the tables."""
+"""The limits of the classes of sharpening in the tables."""
 PEAK_DN = 4095
 
 NOMINAL = Sensor.load("pleiades-degraded")
@@ -45,12 +45,14 @@ REFERENCE = Sensor.load("pleiades-reference").nominal()
 
 
 def judged(check: SelfCheck, raw: np.ndarray, restored: np.ndarray) -> Judged:
-    """Judge a whole image."""
+    """Check a whole image."""
     return check.judge(raw, restored, *(Placed(side, 0, 0, side) for side in raw.shape))
 
 
 def restorer(name: str, sensor: Instrument) -> Restore:
-    """Return what restores digital numbers by a shipped network conditioned on a sensor."""
+    """Return a function that restores digital numbers by a shipped network conditioned on a
+    sensor.
+    """
     profile = profile_of(sensor, NOMINAL)
     return network_restore(Network.load(name, sensor=profile), profile, REFERENCE, BOTH)
 
@@ -72,7 +74,7 @@ def flat(parts: list[Judged]) -> Judged:
 
 
 def by_class(blocks: Judged) -> str:
-    """Return the share of blocks outside the bound, by sharpening."""
+    """Return the share of blocks outside the bound, by class of sharpening."""
     words = []
     for low, high in pairwise(CLASSES):
         inside = (blocks.sharpening >= low) & (blocks.sharpening < high)
@@ -83,7 +85,7 @@ def by_class(blocks: Judged) -> str:
 
 
 def right(images: Path, names: list[str], seed: int, *, sweep: bool) -> Iterator[str]:
-    """Yield a line for each network: what is flagged of right restorations."""
+    """Yield a line for each network: the blocks of correct restorations that are flagged."""
     instrument = NOMINAL.nominal()
     cases = [(instrument, radiance) for radiance in RADIANCES]
     if sweep:
@@ -105,7 +107,7 @@ def right(images: Path, names: list[str], seed: int, *, sweep: bool) -> Iterator
 
 
 def wrong(images: Path, names: list[str], seed: int) -> Iterator[str]:
-    """Yield a line for each network and wrong MTF: what is found, by sharpening."""
+    """Yield a line for each network and wrong MTF: the share that is found, by sharpening."""
     sensor = NOMINAL.nominal()
     check = SelfCheck.of(sensor, REFERENCE.in_units_of(sensor))
     pairs = pairs_at(images, sensor, 1.0, seed)
@@ -125,7 +127,7 @@ def block_db(restored: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def flips(images: Path, name: str, count: int, seed: int) -> str:
-    """Return a line: of the flips that cost a block too much, how many are found."""
+    """Return a line: the share that is found of the flips that cost a block too much."""
     sensor = NOMINAL.nominal()
     reference = REFERENCE.in_units_of(sensor)
     check = SelfCheck.of(sensor, reference)

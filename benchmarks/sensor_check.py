@@ -1,9 +1,11 @@
-"""How often `restore --sensor` warns that an image is from another sensor, and how often wrongly.
+"""Measure how often `restore --sensor` warns correctly that an image is from another sensor, and
+how often wrongly.
 
     python -m benchmarks.sensor_check --images aerial-test/ [--acquisitions 40]
 
 Each acquisition draws a sensor and a photograph, a texture without edges, and a town. The image is
-compared with the right profile and with wrong ones, and changed images with the right one.
+compared with the right profile and with wrong ones, and changed images are compared with the right
+one.
 """
 
 import argparse
@@ -31,7 +33,9 @@ SIDE_PX = 2048
 def profile(
     sensor: Instrument, mtf: float = 1, noise: float = 1, gain: float = 1, bits: int = 12
 ) -> Sensor:
-    """Return the profile of a sensor with other bits, and MTF, noise and gain off by a factor."""
+    """Return the profile of a sensor with another bit depth, and with MTF, noise and gain off by a
+    factor.
+    """
     changed = replace(
         sensor,
         mtf_nyquist=sensor.mtf_nyquist * mtf,

@@ -1,7 +1,7 @@
-"""Thirteen small networks, trained briefly: what `benchmarks.int8_peers` and `benchmarks.ablation`
+"""Thirteen small networks, trained briefly, which `benchmarks.int8_peers` and `benchmarks.ablation`
 quantise.
 
-What each learns from stands in `examples.samples`.
+`examples.samples` defines the task that each one learns.
 """
 
 import argparse
@@ -29,26 +29,26 @@ from examples.samples import batches_of
 SIDE_PX = 64
 SEPARABLE = 32
 DENSE = 16
-"""Features of networks with depthwise convolutions, and of those without."""
+"""The number of features of networks with depthwise convolutions (SEPARABLE) and of those without
+(DENSE)."""
 BATCH = 4
 RATE = 2e-3
 FAST = 5e-3
-"""Samples of a step, and learning rates: of all networks, and of those that the image itself passes
-through.
-"""
+"""Samples per step (BATCH), and the learning rates of most networks (RATE) and of those without a
+global add (FAST)."""
 
 
 def conv(
     inputs: int, outputs: int, act: nn.Module, kernel: int = 3, dilation: int = 1, groups: int = 1
 ) -> nn.Module:
-    """A convolution that keeps the size, and an activation."""
+    """Return a convolution that preserves the size, followed by an activation."""
     padding = dilation * (kernel // 2)
     inner = nn.Conv2d(inputs, outputs, kernel, padding=padding, dilation=dilation, groups=groups)
     return nn.Sequential(inner, act)
 
 
 def depthwise(act: nn.Module, dilation: int = 1) -> nn.Module:
-    """A depthwise convolution with one of 1 x 1 behind it, without a global add."""
+    """Return a network with a depthwise and a 1 x 1 convolution, without a global add."""
     separable = (
         conv(SEPARABLE, SEPARABLE, act, dilation=dilation, groups=SEPARABLE),
         conv(SEPARABLE, SEPARABLE, act, 1),
@@ -57,27 +57,27 @@ def depthwise(act: nn.Module, dilation: int = 1) -> nn.Module:
 
 
 def plain(layers: int, dilation: int = 1) -> nn.Module:
-    """Convolutions with ReLU, without a global add."""
+    """Return a stack of convolutions with ReLU, without a global add."""
     middle = [conv(DENSE, DENSE, nn.ReLU(), dilation=dilation) for _ in range(layers - 2)]
     return nn.Sequential(conv(1, DENSE, nn.ReLU()), *middle, nn.Conv2d(DENSE, 1, 3, padding=1))
 
 
 class Added(nn.Module):
-    """What a network gives, added to what it gets."""
+    """A module that adds the output of its layers to their input."""
 
     def __init__(self, *inner: nn.Module) -> None:
         super().__init__()
         self.inner = nn.Sequential(*inner)
 
     def forward(self, x: Tensor) -> Tensor:
-        """The same shape."""
+        """Return the sum, of the shape of `x`."""
         output: Tensor = self.inner(x)
         return x + output
 
 
 def inverted(inputs: int, outputs: int) -> nn.Module:
-    """MobileNetV2's block: widened twofold, filtered channel by channel, narrowed without an
-    activation.
+    """Return MobileNetV2's block: a 1 x 1 convolution to twice the channels, a depthwise one, and a
+    1 x 1 projection without an activation.
     """
     wide = 2 * inputs
     block = [
@@ -89,8 +89,8 @@ def inverted(inputs: int, outputs: int) -> nn.Module:
 
 
 class MobileUNet(nn.Module):
-    """Two levels of inverted residuals, pooled down, enlarged up, the skip concatenated; a global
-    add.
+    """A U-Net with two levels of inverted residuals: max pooling, upsampling, a concatenated skip
+    connection and a global add.
     """
 
     def __init__(self, features: int = 8) -> None:
@@ -103,7 +103,7 @@ class MobileUNet(nn.Module):
         self.tail = nn.Conv2d(features, 1, 3, padding=1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Images (N, 1, H, W) of even sides to the same."""
+        """Map images (N, 1, H, W) of even sides to the same shape."""
         fine = self.fine(self.head(image))
         deep = self.deep(self.down(functional.max_pool2d(fine, 2)))
         up = functional.interpolate(deep, scale_factor=2.0, mode="nearest")
@@ -112,7 +112,9 @@ class MobileUNet(nn.Module):
 
 
 def transposed() -> nn.Module:
-    """Down by a stride, up by a transposed convolution, with a global add."""
+    """Return a network that downsamples by a stride and upsamples by a transposed convolution, with
+    a global add.
+    """
     down = nn.Sequential(nn.Conv2d(1, DENSE, 4, stride=2, padding=1), nn.ReLU())
     up = nn.ConvTranspose2d(DENSE, DENSE, 4, stride=2, padding=1)
     inner = [conv(DENSE, DENSE, nn.ReLU()) for _ in range(2)]
@@ -120,7 +122,7 @@ def transposed() -> nn.Module:
 
 
 def residual() -> nn.Module:
-    """Four residual blocks, with a global add."""
+    """Return a network of four residual blocks with a global add."""
     blocks = [
         Added(conv(DENSE, DENSE, nn.ReLU()), conv(DENSE, DENSE, nn.Identity())) for _ in range(4)
     ]
@@ -128,8 +130,8 @@ def residual() -> nn.Module:
 
 
 class Distillation(nn.Module):
-    """RFDN's block: three times a part of the features is put aside, and all parts are joined (Liu
-    et al., 2020), without its attention and with the DPU's slope.
+    """RFDN's block: three times a part of the features is distilled, and all parts are joined (Liu
+    et al., 2020). It has no attention, and its slope is the one that the DPU supports.
     """
 
     def __init__(self, features: int = DENSE) -> None:
@@ -143,7 +145,7 @@ class Distillation(nn.Module):
         self.act = act
 
     def forward(self, x: Tensor) -> Tensor:
-        """The same shape."""
+        """Return a tensor of the shape of `x`."""
         parts = []
         for aside, refine in zip(self.aside, self.refine, strict=True):
             parts.append(aside(x))
@@ -153,7 +155,9 @@ class Distillation(nn.Module):
 
 
 class RFDN(nn.Module):
-    """Two blocks of distillation, their results joined, a long residual and a global add."""
+    """A network of two distillation blocks whose results are joined, with a long residual and a
+    global add.
+    """
 
     def __init__(self, features: int = DENSE) -> None:
         super().__init__()
@@ -164,7 +168,7 @@ class RFDN(nn.Module):
         self.tail = nn.Conv2d(features, 1, 3, padding=1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Images (N, 1, H, W) to the same."""
+        """Map images (N, 1, H, W) to the same shape."""
         head = self.head(image)
         x = head
         results = []
@@ -176,8 +180,8 @@ class RFDN(nn.Module):
 
 
 class Gated(nn.Module):
-    """NAFNet's block without layer normalisation and attention: half of the features times the
-    other half (Chen et al., 2022).
+    """NAFNet's block without layer normalisation and attention: one half of the features is
+    multiplied by the other (Chen et al., 2022).
     """
 
     def __init__(self, features: int = DENSE) -> None:
@@ -190,7 +194,7 @@ class Gated(nn.Module):
         self.end = nn.Conv2d(features, features, 1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """The same shape."""
+        """Return a tensor of the shape of `x`."""
         first, second = self.filter(self.spread(x)).chunk(2, 1)
         x = x + self.narrow(first * second)
         first, second = self.mix(x).chunk(2, 1)
@@ -199,7 +203,7 @@ class Gated(nn.Module):
 
 
 def gated() -> nn.Module:
-    """NAFNet's blocks at one size, with a global add."""
+    """Return a network of NAFNet's blocks at one size, with a global add."""
     tail = nn.Conv2d(DENSE, 1, 3, padding=1)
     return Added(nn.Conv2d(1, DENSE, 3, padding=1), Gated(), Gated(), tail)
 
@@ -219,7 +223,8 @@ NETWORKS: dict[str, tuple[str, Callable[[], nn.Module]]] = {
     "RFDN": ("dncnn", RFDN),
     "NAF-like": ("dncnn", gated),
 }
-"""By name, what each learns from (`examples.samples`) and how it is made."""
+"""By name, the task that each network learns (`examples.samples`) and the function that makes
+it."""
 
 
 @dataclass(frozen=True)
@@ -231,7 +236,7 @@ class Drawn:
 
     @classmethod
     def of(cls, kind: str, folder: Path | None, seed: int, batches: int) -> "Drawn":
-        """So many batches of what the examples learn from."""
+        """Draw `batches` batches of samples of the kind that the examples train on."""
         samples = list(islice(batches_of(kind, folder, seed), batches))
         images, references = (torch.cat(tensors).numpy() for tensors in zip(*samples, strict=True))
         return cls(images, references)
@@ -239,7 +244,9 @@ class Drawn:
 
 @torch.no_grad()
 def drawn(network: nn.Module, generator: torch.Generator) -> nn.Module:
-    """The network with weights and biases drawn as torch draws them, from a generator."""
+    """Draw weights and biases with the generator, from torch's default distribution, and return the
+    network.
+    """
     for module in network.modules():
         if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
             bound = module.weight[0].numel() ** -0.5
@@ -249,7 +256,7 @@ def drawn(network: nn.Module, generator: torch.Generator) -> nn.Module:
 
 
 def trained(name: str, folder: Path | None, count: int) -> nn.Module:
-    """The network of that name after so many steps of Adam."""
+    """Train the named network with `count` steps of Adam."""
     kind, make = NETWORKS[name]
     network = drawn(make(), torch.Generator().manual_seed([*NETWORKS].index(name))).train()
     optimiser = torch.optim.Adam(
@@ -266,7 +273,7 @@ def trained(name: str, folder: Path | None, count: int) -> nn.Module:
 
 
 def save(network: nn.Module, side_px: int, path: Path) -> None:
-    """Export as users do, for one size of image, and fold."""
+    """Export for one image size as users do, and fold the batch normalisation."""
     names: dict[str, Any] = {"input_names": ["input"], "output_names": ["output"]}
     names["dynamic_axes"] = {"input": {0: "batch"}}
     image = torch.zeros(1, 1, side_px, side_px)
@@ -278,14 +285,14 @@ def save(network: nn.Module, side_px: int, path: Path) -> None:
 
 @dataclass(frozen=True)
 class Small:
-    """A trained network: its file, samples to calibrate on, and samples that judge it."""
+    """A trained network: its file, samples for calibration, and held-out samples."""
 
     path: Path
     samples: Drawn
     held_out: Drawn
 
     def losses_db(self, int8: Path) -> np.ndarray:
-        """Return the PSNR that each held-out sample loses in INT8, (K,)."""
+        """Return the loss of PSNR in INT8 for each held-out sample, (K,)."""
         sessions = [open_session(load_onnx(path)) for path in (self.path, int8)]
         values = []
         for image, reference in zip(self.held_out.images, self.held_out.references, strict=True):
@@ -321,7 +328,7 @@ def folder_of(arguments: argparse.Namespace) -> Iterator[Path]:
 
 
 def prepared(name: str, arguments: argparse.Namespace, folder: Path) -> Small:
-    """Train a network unless the folder has it, and draw its samples."""
+    """Train a network unless the folder contains it, and draw its samples."""
     kind, _ = NETWORKS[name]
     path = folder / f"{slug(name)}.onnx"
     if not path.exists():
@@ -341,5 +348,5 @@ def names_in(arguments: argparse.Namespace, *more: str) -> list[str]:
 
 
 def slug(name: str) -> str:
-    """Return a name for a file."""
+    """Return the name of a network as part of a file name."""
     return name.lower().replace(",", "").replace(" ", "-")

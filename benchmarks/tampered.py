@@ -1,10 +1,11 @@
-"""Seventeen ways to tamper with the integers of an INT8 file, and which of them the gate stops.
+"""Tamper with the integers of an INT8 file in seventeen ways, and report which of them the gate
+stops.
 
     python benchmarks/tampered.py float.onnx int8.onnx
 
-Each tampered file is consistent in itself: its host part, ReLUs and scales fit its integers, so
-only its results can give it away. Prints a Markdown table: the PSNR that it loses over the
-untampered file, and what the gate says with the default limits and with a baseline.
+Each tampered file is consistent in itself: its host part, ReLUs and scales match its integers, so
+only its results can reveal it. The script prints a Markdown table: the loss of PSNR relative to the
+untampered file, and the verdict of the gate with the default limits and with a baseline.
 """
 
 import argparse
@@ -28,7 +29,9 @@ Numbers = Literal["weight", "bias"]
 
 
 def strongest_times(factor: int, axis: int = 0) -> Change:
-    """Return a change that multiplies the strongest filter, or the strongest input, by a factor."""
+    """Return a change that multiplies the strongest filter (axis 0) or the strongest input (axis 1)
+    by a factor.
+    """
 
     def change(weight: np.ndarray) -> np.ndarray:
         others = tuple(k for k in range(weight.ndim) if k != axis)
@@ -63,7 +66,8 @@ TAMPERINGS: list[tuple[str, float, Numbers, Change]] = [
     ("weights clipped to 6 bits, middle layer", 0.5, "weight", lambda w: np.clip(w, -32, 31)),
     ("weights - 1, last layer", 1.0, "weight", lambda w: w - 1),
 ]
-"""Name, place of the layer from 0 (first) to 1 (last), and the change of its int64 numbers."""
+"""The name, the place of the layer from 0 (first) to 1 (last), and the change of its int64
+numbers."""
 
 
 def tampered(core: IntCore, place: float, numbers: Numbers, change: Change) -> IntCore:

@@ -1,9 +1,9 @@
-"""Patches a second that a training run simulates, and that it trains on.
+"""Measure how many patches a second a training run simulates, and how many it trains on.
 
     python benchmarks/training.py --variant convbeers-s
 
-Simulated patches are those of photographs, and varied as recipes vary them. Steps run on patches
-simulated beforehand, in float32 and in bfloat16.
+The simulated patches are those of photographs, varied as recipes vary them. The steps run on
+patches simulated beforehand, in float32 and in bfloat16.
 """
 
 import argparse
@@ -51,7 +51,7 @@ def patch_recipes() -> dict[str, PatchRecipe]:
 
 
 def timed(name: str, batches: Iterable[Batch]) -> None:
-    """Print the patches a second of some batches."""
+    """Print the number of patches per second of some batches."""
     started_s = time.perf_counter()
     count = sum(len(batch.degraded) for batch in batches)
     print(f"{name}: {count / (time.perf_counter() - started_s):.0f} patches a second", flush=True)

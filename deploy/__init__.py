@@ -11,7 +11,7 @@ values, and write files only where they are given an output; each is a command t
 - `restoration`: images of any size through a network or the traditional pipeline;
 - `dpu`: the checker of operators and the cost model; `performance`: times, predicted and measured;
 - `results`: figures as one table, JSON document and page; `tables` and `report` show them;
-- `studies`: what takes long: evaluation, trade-off, stress, detection, a sensor from its images,
+- `studies`: long-running work: evaluation, trade-off, stress, detection, a sensor from its images,
   and the recipes that make the shipped networks.
 """
 
@@ -27,7 +27,7 @@ _loaded, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> Any:
-    """What is offered under a name, loaded now."""
+    """Load and return the public object with this name."""
     try:
         return _loaded(name)
     except ImportError as error:

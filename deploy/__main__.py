@@ -1,17 +1,18 @@
-"""The command line's entry: `beers-deploy`, or `python -m beers_deploy` where scripts are not on
-the PATH.
+"""Entry point of the command line: `beers-deploy`, or `python -m beers_deploy` if scripts are not
+on the PATH.
 """
 
 import sys
 import traceback
 
 CRASHED = 70
-"""As in `profiles.errors`, which NumPy is loaded for: it may be what does not load."""
+"""The same as in `profiles.errors`. That module loads NumPy, which may be the library that does not
+load."""
 
 
 def main() -> None:
-    """Run the command line; a library that does not load ends with 70, because 1 means that a gate
-    failed.
+    """Run the command line. A library that does not load ends it with 70, because 1 means that a
+    gate failed.
     """
     try:
         from beers_deploy.cli.commands import app

@@ -1,4 +1,4 @@
-"""What INT8 changes: a float and an INT8 network on samples that calibration did not see."""
+"""Compare a float and an INT8 network on samples that were not used for calibration."""
 
 import hashlib
 import json
@@ -36,12 +36,12 @@ if TYPE_CHECKING:
 
 HEADINGS = {"gate": "float against INT8", "samples": "what the samples cover"}
 IN_MEMORY = "in memory"
-"""What arguments and inputs call samples that are no file."""
+"""The name of samples that are not in a file, in arguments and inputs."""
 
 
 @dataclass(frozen=True)
 class Data:
-    """What a network is calibrated or judged on.
+    """The data on which a network is calibrated or evaluated.
 
     Attributes:
         sensor: of the simulated patches.
@@ -49,7 +49,7 @@ class Data:
         images: folder of scenes for the patches; None for drawn ones.
         patches: number of patches.
         seed: of the patches.
-        patch_px: their side; those of a gate have 128 pixels.
+        patch_px: side of a patch. Those of a gate have 128 pixels.
         input_range: of the samples, as the user states it; None to find it.
     """
 
@@ -62,7 +62,7 @@ class Data:
     input_range: object = None
 
     def own(self, network: Network) -> OwnSamples | None:
-        """Read the user's samples for a network; None for simulated patches."""
+        """Read the user's samples for a network, or return None for simulated patches."""
         with faults_named(network.label):
             return samples_of(network.model, self.samples, self.input_range)
 
@@ -76,7 +76,7 @@ class Data:
 
     @property
     def arguments(self) -> dict[str, object]:
-        """The arguments that say what float and INT8 are compared on."""
+        """The arguments that describe the data of the comparison."""
         samples = self.samples
         if isinstance(samples, str | os.PathLike):
             samples = os.fspath(samples)
@@ -92,7 +92,7 @@ class Data:
 
     @property
     def inputs(self) -> list[Input]:
-        """The images and the samples in files, as what figures rest on."""
+        """The images and samples in files, as inputs of the figures."""
         inputs = []
         if self.images is not None:
             inputs.append(_files_input("scenes", self.images, list_images(self.images)))
@@ -103,14 +103,14 @@ class Data:
 
 
 def sensor_input(sensor: Sensor) -> Input:
-    """Return a sensor as what figures rest on: its name, and the digest of its numbers."""
+    """Return a sensor as an input of the figures: its name, and the digest of its values."""
     text = json.dumps(numbers_of(sensor), sort_keys=True, default=str)
     return Input(f"sensor {sensor.name}", hashlib.sha256(text.encode()).hexdigest())
 
 
 def _files_input(kind: str, path: Path, files: Iterable[Path]) -> Input:
-    """Return a file, or the files of a folder that are read: others that lie there change no
-    figure.
+    """Return a file, or those files of a folder that are read, as an input. Other files in the
+    folder change no figure.
     """
     if path.is_file():
         return Input(f"{kind} {path.name}", sha256(path))
@@ -125,14 +125,15 @@ def _files_input(kind: str, path: Path, files: Iterable[Path]) -> Input:
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Comparison(Table):
-    """What INT8 changes, and how many results inside the INT8 network saturate.
+    """The differences between a float and an INT8 network, and the share of saturated values inside
+    the INT8 network.
 
     Attributes:
         result: the differences.
-        shares: of each layer's results the share at the ends of 8 bits.
+        shares: for each layer, the share of its results at the limits of 8 bits.
         floating: the float network.
         int8: the INT8 network.
-        rests_on: what the figures rest on besides the networks.
+        rests_on: the inputs of the figures in addition to the networks.
     """
 
     result: GateResult
@@ -155,26 +156,26 @@ def compare(
     output: str | None = None,
     progress: Progress = None,
 ) -> Comparison:
-    """Compare a float and an INT8 network on samples that calibration did not see.
+    """Compare a float and an INT8 network on samples that were not used for calibration.
 
     Args:
         float_network: the float network. The name of a shipped pair, or an INT8 network that was
             quantised in this process, stands for both.
         int8_network: its INT8 network.
-        samples: a path, arrays or whatever `quantize` accepts; simulated patches if None.
+        samples: a path, arrays or any input that `quantize` accepts; simulated patches if None.
         sensor: of the simulated patches and of shipped networks.
         images: folder of scenes for the patches; drawn ones if None.
         patches: number of simulated patches, 128 x 128 pixels each.
         seed: of the patches.
         metric: psnr, ssim or mae: also compare the results with the references.
-        output: name of the output to compare, of a network that has several.
+        output: name of the output to compare, if a network has several.
         progress: a function that is called at each step, False for silence, None for a bar or lines
             on standard error.
 
     Raises:
-        ModelError: a file that is not what it should be.
-        OptionError: no INT8 network, or an unknown metric.
-        ImageError: samples that the networks do not accept.
+        ModelError: a file is not a valid network of the expected kind.
+        OptionError: there is no INT8 network, or the metric is unknown.
+        ImageError: the networks do not accept the samples.
 
     Examples:
         >>> table = bd.compare("convbeers-xs", patches=2)
@@ -200,14 +201,14 @@ def compare(
 def compared(
     floating: Network, int8: Network, data: Data, own: OwnSamples | None, metric: str
 ) -> Comparison:
-    """Run both networks, and return what INT8 changes.
+    """Run both networks, and return their differences.
 
     Args:
         floating: the float network.
         int8: the INT8 network.
-        data: what they are compared on.
+        data: the data they are compared on.
         own: the user's samples, as `data` reads them; None for simulated patches.
-        metric: by which results are compared with the references too; empty for none.
+        metric: also compare the results with the references by this metric; empty for none.
     """
     notes = []
     if own is None:
@@ -217,7 +218,7 @@ def compared(
         patches = unseen_patches(data.sensor, data.images, data.patches, data.seed)
     else:
         patches = own.all
-        # The INT8 file says which samples it was calibrated on, but it may not choose its judges.
+        # The INT8 file states its calibration samples, but may not choose those of the comparison.
         calibrated = set(metadata(int8.model).get(CALIBRATED_ON, "").split())
         count = sum(digest_of(degraded) in calibrated for degraded in patches.degraded)
         if count:
@@ -270,12 +271,12 @@ def pair_of(
         float_network: the float network. If no INT8 one is given: an INT8 network that was
             quantised in this process, or the name of a shipped pair; the default pair if None.
         int8_network: the INT8 network, or None.
-        sensor: that shipped networks are conditioned on.
-        output: of a network that has several, the one that is compared.
+        sensor: the sensor that shipped networks are conditioned on.
+        output: the output to compare, if a network has several.
 
     Raises:
-        OptionError: no INT8 network, or no such output.
-        ModelError: a float network in the place of the INT8 one, or the other way round.
+        OptionError: there is no INT8 network, or no such output.
+        ModelError: the float and the INT8 network are swapped.
     """
     if int8_network is None and isinstance(float_network, Network) and float_network.origin:
         return float_network.origin.with_output(output), float_network
@@ -286,15 +287,15 @@ def pair_of(
         VARIANT if float_network is None else float_network, sensor=sensor, int8=False
     )
     int8 = Network.load(int8_network, sensor=sensor, int8=True)
-    require_quantized(floating.model, floating.label, wanted=False)
-    require_quantized(int8.model, int8.label, wanted=True)
+    require_quantized(floating.model, floating.label, expected=False)
+    require_quantized(int8.model, int8.label, expected=True)
     # The INT8 file of 'quantize' has one output, whatever its float network has.
     its_output = output if len(int8.model.graph.output) > 1 else None
     return floating.with_output(output), int8.with_output(its_output)
 
 
 def _shipped_int8(network: NetworkLike | None) -> str:
-    """Return the name of the INT8 network of a shipped pair, of which any name is given."""
+    """Return the name of the INT8 network of a shipped pair, given the name of either network."""
     if network is None:
         return f"{VARIANT}{INT8}"
     label = type(network).__name__

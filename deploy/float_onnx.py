@@ -1,8 +1,8 @@
 """ConvBEERS as ONNX: `image` (N, 1, H, W) in [0, 1] to `restored`, written node by node under
 readable names.
 
-Also how any float network is had as ONNX: from an ONNX file or from weights, which may need to be
-told a sensor.
+The module also converts any float network to ONNX, from an ONNX file or from weights, which may
+need to be conditioned on a sensor.
 """
 
 from pathlib import Path
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 
 
 def float_for(path: Path, name: str, sensor: Sensor, tile_px: int | None = None) -> onnx.ModelProto:
-    """A network that is told its sensor as an ONNX model for the middle of a profile.
+    """Return a network conditioned on the middle of a sensor profile, as an ONNX model.
 
     Args:
-        path: of its weights.
-        name: that it is listed under.
-        sensor: whose images it is to restore.
+        path: the path of its weights.
+        name: the name that it is listed under.
+        sensor: the sensor whose images it is to restore.
         tile_px: as in `to_onnx`.
     """
     weights = read_conditioned(path)
@@ -42,8 +42,8 @@ def float_for(path: Path, name: str, sensor: Sensor, tile_px: int | None = None)
 def to_onnx(
     network: "Weights | ConvBEERS", about: dict[str, str], tile_px: int | None = None
 ) -> onnx.ModelProto:
-    """A plain network as an ONNX model; `tile_px` fixes one square image, None leaves number and
-    size free.
+    """Convert a plain network to an ONNX model. `tile_px` fixes one square image; None leaves
+    number and size free.
     """
     scale = network.variant.scale
     require_tile(tile_px, scale)
@@ -59,16 +59,16 @@ def to_onnx(
 def banked_to_onnx(
     weights: Weights, sensor: Instrument, about: dict[str, str], tile_px: int | None = None
 ) -> onnx.ModelProto:
-    """A network behind the bank of a sensor as an ONNX model: its filters are the first
-    convolution.
+    """Convert a network behind the filter bank of a sensor to an ONNX model. The filters of the
+    bank are its first convolution.
 
-    That convolution gives the image, the planes and the analytic restoration; the last one reads
-    what the body gives and, at one tap, the analytic restoration, which another convolution picks.
-    The image's borders are mirrored in front.
+    That convolution returns the image, the planes and the analytic restoration. Another convolution
+    picks the analytic restoration, which the last one reads at one tap, together with the output of
+    the body. The borders of the image are mirrored before the first convolution.
 
     Args:
-        weights: of a `BankedConvBEERS`.
-        sensor: whose images are restored.
+        weights: the weights of a `BankedConvBEERS`.
+        sensor: the sensor whose images are restored.
         about: metadata.
         tile_px: side of a fixed square image, or None for any number and size.
     """
@@ -118,14 +118,14 @@ def banked_to_onnx(
 
 
 def _held(writer: GraphWriter, name: str, source: str, most: float) -> str:
-    """Write what holds a tensor within so many units."""
+    """Write a Clip node that limits a tensor to [-most, most]."""
     ends = [(f"{name}.low", -most), (f"{name}.high", most)]
     limits = [writer.constant(end, np.array(value, np.float32)) for end, value in ends]
     return writer.node("Clip", name, [source, *limits])
 
 
 def _deep(writer: GraphWriter, blocks: int, source: str) -> str:
-    """Head, blocks and the end of the body."""
+    """Write the head, the blocks and the end of the body."""
     stream = head = _conv(writer, "head", source)
     for k in range(blocks):
         inner = writer.node("Relu", f"body.{k}.relu", [_conv(writer, f"body.{k}.first", stream)])
@@ -138,7 +138,7 @@ def _deep(writer: GraphWriter, blocks: int, source: str) -> str:
 def _ended(
     writer: GraphWriter, correction: str, scale: int, about: dict[str, str], tile_px: int | None
 ) -> onnx.ModelProto:
-    """The model that adds a correction to the image."""
+    """Return the model that adds a correction to the image."""
     shuffled = _moved(writer, "DepthToSpace", "shuffled", correction, scale)
     writer.node("Add", "restored", ["image", shuffled])
     graph = writer.graph(
@@ -162,14 +162,16 @@ def _conv(writer: GraphWriter, name: str, source: str) -> str:
 
 
 def _moved(writer: GraphWriter, operator: str, name: str, source: str, scale: int) -> str:
-    """Pixels into channels or back, in an order in which ONNX and torch agree: the image has one
-    channel.
+    """Write the node that moves pixels into channels or back. ONNX and torch agree in the order
+    because the image has one channel.
     """
     return writer.node(operator, name, [source], blocksize=scale) if scale > 1 else source
 
 
 def float_model(path: Path) -> onnx.ModelProto:
-    """A float network as ONNX: from an .onnx file, or from the .safetensors file of a plain one."""
+    """Load a float network as ONNX, from an .onnx file or from the .safetensors file of a plain
+    one.
+    """
     if path.suffix != ".safetensors":
         return load_onnx(path)
     weights = read_plain(path)
@@ -177,7 +179,9 @@ def float_model(path: Path) -> onnx.ModelProto:
 
 
 def about(variant: str, recipe: dict[str, object], sensor: str | None = None) -> dict[str, str]:
-    """What an exported file says of itself; `sensor` is the name of the one that it was told."""
+    """Return the metadata of an exported file. `sensor` is the name of the sensor that it was
+    conditioned on.
+    """
     return {
         "variant": variant,
         "sensor": sensor if sensor is not None else str(recipe.get("degraded", "")),

@@ -1,4 +1,4 @@
-"""`Network`: an ONNX network and where it comes from, as the library passes it on."""
+"""`Network`: an ONNX network and its origin, as the library passes it on."""
 
 import hashlib
 import io
@@ -59,23 +59,22 @@ NetworkLike = Union["Network", onnx.ModelProto, "torch.nn.Module", str, os.PathL
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Network:
-    """An ONNX network and where it comes from.
+    """An ONNX network and its origin.
 
-    `Network.load` makes one of whatever holds a network.
+    `Network.load` accepts any kind of network.
 
     Attributes:
         model: the network.
         name: the stem of its file, or the name that it is shipped under.
-        path: the file that holds it; None of one that is in memory alone.
-        origin: the float network that it was quantised from, where that was done here.
-        layers: of a network that was quantised here, a row for each replaced operator and each
-            integer layer.
-        quantised: its integers and the graph that they were rounded from, where it was quantised
-            here by itself.
-        file_sha256: of the file as it was read; empty of one that is in memory alone.
-        weights: of a network that is conditioned on its sensor: what it was made from.
+        path: the file that holds it; None if it is only in memory.
+        origin: the float network that it was quantised from, if that was done here.
+        layers: if it was quantised here, a row for each replaced operator and each integer layer.
+        quantised: its integer core and the graph that it was rounded from, if it was quantised here
+            by itself.
+        file_sha256: of the file as it was read; empty if it is only in memory.
+        weights: if it is conditioned on its sensor, the weights that it was made from.
         profile: the sensor that such a network is conditioned on.
-        table: what `quantize` reports of it.
+        table: the report of `quantize`.
 
     Examples:
         >>> bd.Network.load("convbeers-s-int8").precision
@@ -103,22 +102,23 @@ class Network:
         example: Sequence[int] = (1, 1, 64, 64),
         to_run: bool = True,
     ) -> "Network":
-        """A network from an ONNX or safetensors file, a shipped name, a ModelProto or a module of
-        torch.
+        """Load a network from an ONNX or safetensors file, a shipped name, a ModelProto or a torch
+        module.
 
         Args:
-            network: a shipped name has -int8 behind it for INT8; a `Network` is returned as it is;
-                None is convbeers-s-int8.
-            sensor: that a shipped network is told: a `Sensor`, a name or a .toml file.
-            int8: which precision of a conditioned network is meant; None leaves it to the name.
-            example: shape (N, C, H, W) of an image that a module of torch takes; number and size
+            network: the network. A shipped name ends in -int8 for INT8. A `Network` is returned as
+                it is. None is convbeers-s-int8.
+            sensor: the sensor that a shipped network is conditioned on: a `Sensor`, a name or a
+                .toml file.
+            int8: the precision of a conditioned network; None leaves it to the name.
+            example: shape (N, C, H, W) of an image that a torch module accepts; number and size
                 stay free.
-            to_run: whether a runtime may get it; False where a file's nodes are only looked at,
-                whosever they are.
+            to_run: True if a runtime may open the network; False if only the nodes of a file are
+                inspected, whoever defines them.
 
         Raises:
-            ModelError: no such network, or one that no runtime may get.
-            MissingExtraError: a module of torch, and no torch to export it.
+            ModelError: there is no such network, or it is one that no runtime may open.
+            MissingExtraError: `network` is a torch module, and torch is not installed to export it.
         """
         if isinstance(network, Network):
             return network
@@ -146,25 +146,25 @@ class Network:
         """Return a network conditioned on a sensor.
 
         Args:
-            weights: of the network.
-            sensor: of which the middle of each range counts.
-            int8: whether in INT8 or in float32.
+            weights: the weights of the network.
+            sensor: the sensor, of which the middle of each range is used.
+            int8: True for INT8, False for float32.
 
         Raises:
-            ModelError: INT8 of weights that have no INT8 file.
+            ModelError: INT8 is requested, and the weights have no INT8 file.
         """
         name = f"{weights.name}{INT8}" if int8 else weights.name
         return cls(weights.model(sensor, int8), name, weights=weights, profile=sensor)
 
     def with_output(self, name: str | None) -> "Network":
-        """Return the network with one of its outputs alone.
+        """Return the network with only one of its outputs.
 
         Args:
-            name: of the output; None for the only one.
+            name: the name of the output; None for the only one.
 
         Raises:
-            ModelError: several outputs and no name, or several inputs.
-            OptionError: no such output.
+            ModelError: there are several outputs and no name, or several inputs.
+            OptionError: there is no such output.
         """
         model = self.model if name is None else with_one_output(self.model, name, self.label)
         weights = {tensor.name for tensor in model.graph.initializer}
@@ -175,9 +175,10 @@ class Network:
 
     @cached_property
     def exposures(self) -> Mapping[int, "Network"]:
-        """The network for sensors of so many times the gain, by factor above 1.
+        """The network conditioned on the sensor at higher gain, by the factor of the gain, which is
+        above 1.
 
-        Empty if the network is not conditioned on its sensor, and if the sensor's noise allows no
+        Empty if the network is not conditioned on its sensor, or if the sensor's noise allows no
         factor.
         """
         if self.weights is None or self.profile is None:
@@ -190,25 +191,26 @@ class Network:
         }
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the network as an ONNX file, whole or not at all."""
+        """Write the network as an ONNX file, atomically."""
         save_onnx(self.model, Path(path))
         return Path(path)
 
     def core(
         self, board: TargetProfile | str = DEFAULT_TARGET, tile: int | None = None
     ) -> "Network":
-        """The part of an INT8 network that the DPU or NPU computes, in the encoding that a board's
-        tools read.
+        """Return the part of an INT8 network that the DPU or NPU computes, in the encoding that a
+        board's tools read.
 
         Args:
-            board: whose tools; those of an NPU read VINT8, of one tile.
+            board: the board whose tools read the file. Those of an NPU read VINT8, of one tile.
             tile: side in pixels of the image that it is fixed to; the network's own, or any, if
                 None.
 
         Raises:
-            ModelError: a float network, or an INT8 one that was not quantised under the DPU's rules
+            ModelError: the network is float, or INT8 that was not quantised under the DPU's rules
                 here.
-            OptionError: an NPU and no tile, or one that the network cannot rearrange.
+            OptionError: the board has an NPU and no tile is given, or the network cannot rearrange
+                the tile.
         """
         core = read_core(self.model)
         side_px = tile or fixed_tile_px(self.model)
@@ -217,7 +219,7 @@ class Network:
         return Network(write(core, metadata(self.model), side_px), f"{self.name}-core")
 
     def __call__(self, images: Any) -> np.ndarray:
-        """What the network makes of images (N, C, H, W), in its own units: (N, C', H', W')."""
+        """Run the network on images (N, C, H, W), in its own units, and return (N, C', H', W')."""
         return result_of(self._session, np.ascontiguousarray(images, np.float32))
 
     @cached_property
@@ -226,28 +228,30 @@ class Network:
 
     @property
     def input_ranges(self) -> Ranges:
-        """(low, high) of each channel that an INT8 network reads; empty where all are in [0, 1]."""
+        """(low, high) of each channel that an INT8 network reads; empty if all are in [0, 1]."""
         if CORE not in metadata(self.model):
             return ()
         return read_core(self.model).host_part.input_ranges
 
     @property
     def precision(self) -> str:
-        """float32 or int8."""
+        """The precision, "float32" or "int8"."""
         return "int8" if is_quantized(self.model) else "float32"
 
     @cached_property
     def tiling(self) -> Tiling:
-        """How an image may be cut into tiles: halo, alignment, scale, bands in and out.
+        """The tiling geometry: halo, alignment, scale, bands in and out.
 
         Raises:
-            ModelError: a network that cannot be tiled.
+            ModelError: the network cannot be tiled.
         """
         return tiling_of(self.model, self.label)
 
     @property
     def sensor(self) -> str:
-        """The name of the sensor that it was told or made for; empty where the file names none."""
+        """The name of the sensor that it is conditioned on or made for; empty if the file names
+        none.
+        """
         return metadata(self.model).get("sensor", "")
 
     @cached_property
@@ -257,12 +261,12 @@ class Network:
 
     @property
     def input(self) -> Input:
-        """What results say of it."""
+        """The network as an input of results: its name and digest."""
         return Input(self.path.name if self.path else f"{self.name}.onnx", self.sha256)
 
     @property
     def label(self) -> str:
-        """What messages call it."""
+        """The name that messages use."""
         return str(self.path or self.name)
 
     def __eq__(self, other: object) -> bool:
@@ -285,7 +289,8 @@ class Network:
 def other_precision(network: Network) -> Network | None:
     """Return a shipped network of the same variant in the other precision, or None.
 
-    Its weights may be others: time depends on the shapes alone, so those of any sensor will do.
+    Its weights may be others. Time depends only on the shapes, so the weights of any sensor will
+    do.
     """
     variant = metadata(network.model).get("variant", "")
     if variant not in shipped_names():
@@ -294,7 +299,7 @@ def other_precision(network: Network) -> Network | None:
 
 
 def exported(module: Any, example: Sequence[int]) -> onnx.ModelProto:
-    """A module of torch as ONNX, for any number and size of images."""
+    """Export a torch module to ONNX, for any number and size of images."""
     if not hasattr(module, "state_dict"):
         raise ModelError(
             "`network` must be a Network, a ModelProto, a torch.nn.Module, a file or a shipped "

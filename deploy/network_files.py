@@ -1,8 +1,8 @@
-"""What a command means by the name of a network, and a network for a sensor.
+"""Resolve the name of a network on the command line, and condition a network on a sensor.
 
 A shipped network is one set of weights, and one INT8 file, for every sensor in range. NAME is that
-network in float32 and NAME-int8 in INT8, each conditioned on one sensor: its filters, written in
-milliseconds from the profile alone.
+network in float32 and NAME-int8 in INT8. Each is conditioned on one sensor: its filters are
+computed in milliseconds from the profile alone.
 """
 
 import logging
@@ -37,14 +37,16 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Conditioned:
-    """Weights of a network that is conditioned on its sensor, and the name it is listed under."""
+    """Weights of a network that is conditioned on its sensor, and the name that it is listed
+    under.
+    """
 
     name: str
     weights: Path
 
     @property
     def kernels(self) -> Kernels:
-        """What the kernels of its banks are."""
+        """The kernels of its filter banks."""
         return read_conditioned(self.weights).kernels
 
     def model(self, sensor: Sensor, int8: bool) -> onnx.ModelProto:
@@ -62,7 +64,7 @@ class Conditioned:
 
 
 def conditioned(given: Path) -> Conditioned | None:
-    """Return the conditioned network that a name or a file stands for; None for any other file."""
+    """Return the conditioned network for a name or a file, or None for any other file."""
     if _is_shipped(given):
         name = given.name.removesuffix(INT8)
         return Conditioned(name, shipped_weights(name))
@@ -74,7 +76,7 @@ def conditioned(given: Path) -> Conditioned | None:
 
 
 def weights_file(given: Path) -> Path:
-    """Return the path of a file, or of the shipped network of that name; nothing is read."""
+    """Return the path of a file, or of the shipped network of that name. Nothing is read."""
     if not _is_shipped(given):
         return given
     return (
@@ -83,14 +85,16 @@ def weights_file(given: Path) -> Path:
 
 
 def _is_shipped(path: Path) -> bool:
-    """Return True if a path is the name of a shipped network, with INT8 behind it or without."""
+    """Return True if a path is the name of a shipped network, with or without the suffix for
+    INT8.
+    """
     # A file of that name goes before the shipped network.
     is_name = path == Path(path.name) and path.name.removesuffix(INT8) in shipped_names()
     return is_name and not path.exists()
 
 
 def require_known(given: Path) -> Path:
-    """Return a path that may be a file or a shipped name; refuse any other."""
+    """Return a path that may be a file or a shipped name. Raise an error for any other."""
     if given.suffix or given.exists() or _is_shipped(given):
         return given
     raise ModelError(
@@ -103,8 +107,8 @@ def warn_outside(sensor: Sensor, kernels: Kernels) -> None:
     """Log a warning for each parameter of a sensor outside the range that a network was trained on.
 
     Args:
-        sensor: of which the middle of each range counts.
-        kernels: of the network's banks.
+        sensor: the sensor, of which the middle of each range is used.
+        kernels: the kernels of the network's banks.
     """
     instrument = sensor.nominal()
     for sentence in (*sensor_vector(instrument).outside, departure(instrument, kernels)):
@@ -113,9 +117,7 @@ def warn_outside(sensor: Sensor, kernels: Kernels) -> None:
 
 
 def other_sensor(model: onnx.ModelProto, sensor: Sensor) -> str:
-    """Return a warning if a network was made for another sensor than the named one; else
-    nothing.
-    """
+    """Return a warning if a network was made for another sensor than the given one, else ""."""
     own = metadata(model).get("sensor", "")
     if own in ("", BLIND, BLIND_PROFILE, sensor.name):
         return ""
@@ -125,12 +127,11 @@ def other_sensor(model: onnx.ModelProto, sensor: Sensor) -> str:
 def int8_for_sensor(
     model: onnx.ModelProto, sensor: Sensor, more: Mapping[str, str] | None = None
 ) -> onnx.ModelProto:
-    """Return a conditioned INT8 network for another sensor: filters, unit and biases are written
-    anew.
+    """Return a conditioned INT8 network for another sensor: filters, unit and biases are replaced.
 
     Args:
         model: for any sensor.
-        sensor: of which the middle of each range is taken.
+        sensor: the sensor, of which the middle of each range is used.
         more: metadata to add.
     """
     stored = required_conditioned_core(model)
@@ -144,8 +145,8 @@ def int8_for_sensor(
 
 
 def int8_for_delta(model: onnx.ModelProto, delta: Path) -> onnx.ModelProto:
-    """Return a conditioned INT8 network for the sensor of a delta, a file that `export --delta`
-    wrote.
+    """Return a conditioned INT8 network for the sensor of a delta, a file written by `export
+    --delta`.
     """
     try:
         packed = delta.read_bytes()

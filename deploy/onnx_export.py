@@ -27,16 +27,16 @@ logger = logging.getLogger(__name__)
 
 
 def export_float(path: Path, out: Path, sensor: SensorLike | None, tile: int | None) -> None:
-    """Write weights as float ONNX, your own after a comparison with torch.
+    """Write weights as float ONNX. The user's own weights are compared with torch first.
 
     Args:
-        path: of the weights.
+        path: the path of the weights.
         out: file to write.
-        sensor: that conditioned weights are for; pleiades-degraded if None.
+        sensor: the sensor that conditioned weights are for; pleiades-degraded if None.
         tile: side in pixels of the one tile that the input is fixed to; None for any size.
 
     Raises:
-        ModelError: a sensor for weights that are for one sensor.
+        ModelError: a sensor is given for weights that are for one sensor.
     """
     profile = Sensor.load(sensor or SENSOR) if is_conditioned(path) else None
     if profile is not None:
@@ -83,7 +83,9 @@ def export_int8(
     target: TargetProfile,
     c_file: Path | None = None,
 ) -> None:
-    """Write an INT8 network, its core for a board and as C unless the file for it is None."""
+    """Write an INT8 network. Also write its core for a board and its C program, unless their files
+    are None.
+    """
     core = read_core(model)
     side_px = tile or fixed_tile_px(model)
     require_tile(side_px, core.host_part.place_px)

@@ -1,5 +1,5 @@
-"""Simulated pairs for notebooks and scripts: what a sensor sees of a scene, and what a better one
-would have seen.
+"""Simulated pairs for notebooks and scripts: an image as a sensor sees a scene, and as a better one
+would have seen it.
 """
 
 import json
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Pair:
-    """Two acquisitions of one scene in the same digital numbers; it unpacks into both.
+    """Two acquisitions of one scene in the same digital numbers. A pair unpacks into both images.
 
     Attributes:
-        degraded: what the sensor sees, (H, W) uint16.
-        reference: what the better sensor sees, (H, W) uint16.
+        degraded: the image of the sensor, (H, W) uint16.
+        reference: the image of the better sensor, (H, W) uint16.
         clean: the reference without noise and rounding, (H, W) float32.
-        sensor: the sensor, every number settled.
+        sensor: the sensor, with a value drawn from each range.
         profiles: the two sensors that were drawn from.
 
     Examples:
@@ -51,19 +51,20 @@ class Pair:
         return iter((self.degraded, self.reference))
 
     def psnr(self, image: np.ndarray) -> float:
-        """Peak signal-to-noise ratio in dB of an image (H, W) beside the reference, over the
-        sensor's full scale.
+        """Compute the peak signal-to-noise ratio in dB of an image (H, W) against the reference,
+        over the sensor's full scale.
 
         Raises:
-            ImageError: an image of another shape.
+            ImageError: the image has another shape.
         """
         return psnr_db(self._alike(image), self.reference, self.sensor.max_dn)
 
     def ssim(self, image: np.ndarray) -> float:
-        """Structural similarity of an image (H, W) and the reference, over the sensor's full scale.
+        """Compute the structural similarity of an image (H, W) and the reference, over the sensor's
+        full scale.
 
         Raises:
-            ImageError: an image of another shape, or smaller than the window of 11 pixels.
+            ImageError: the image has another shape, or is smaller than the window of 11 pixels.
         """
         return ssim(self._alike(image), self.reference, self.sensor.max_dn)
 
@@ -77,8 +78,8 @@ class Pair:
         return pixels
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
-        """Write both images as 12-bit TIFFs that `beers-deploy evaluate --pairs` reads, and what
-        made them.
+        """Write both images as 12-bit TIFFs that `beers-deploy evaluate --pairs` reads, and a
+        record of how they were simulated.
         """
         out = Path(folder)
         for role, image in (("degraded", self.degraded), ("reference", self.reference)):
@@ -113,12 +114,12 @@ def simulated_pair(
     ratio: int,
     seed: int,
 ) -> Pair:
-    """Simulate what two sensors see of one scene.
+    """Simulate the images that two sensors acquire of one scene.
 
     Args:
         scene: an image file or its pixels: 8 bits, 16-bit digital numbers, or float radiance in
             W/m2/sr/um; one is drawn if None.
-        degraded: the sensor; each of its ranges is drawn from.
+        degraded: the sensor. A value is drawn from each of its ranges.
         reference: the better sensor, which is converted to the digital numbers of `degraded`.
         size_px: side of the images of a drawn scene.
         radiance_scale: factor of the scene's radiance.
@@ -126,7 +127,7 @@ def simulated_pair(
         seed: of every random draw.
 
     Raises:
-        ImageError: a scene that cannot be read, or too small for the margin that the blur needs.
+        ImageError: the scene cannot be read, or is too small for the margin that the blur needs.
     """
     from beers_deploy.model.simulator.acquire import acquire_three, prepare_scene
     from beers_deploy.model.simulator.detector import Draw, to_uint16
@@ -159,7 +160,7 @@ def _scene(
     from beers_deploy.model.simulator.sampling import read_scene, scene_of
 
     if scene is None:
-        # The Fourier transform of the blur wraps around: the margin keeps the far border out.
+        # The Fourier transform of the blur wraps around. The margin excludes the opposite border.
         side_px = (size_px + 2 * MARGIN_PX) * ratio
         return procedural_scene(side_px, side_px, Draw(seed).generator("drawn scene"))
     if isinstance(scene, str | os.PathLike):

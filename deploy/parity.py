@@ -1,4 +1,4 @@
-"""An exported network held to the one of torch that it was made of."""
+"""Compare an exported network with the torch network that it was exported from."""
 
 from pathlib import Path
 from typing import cast
@@ -21,12 +21,14 @@ from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.quant.session import open_session, run
 
 MAX_DIFFERENCE = 1e-5
-"""Of full scale: a twentieth of a digital number, above what float32 summation order explains."""
+"""As a share of full scale: a twentieth of a digital number, more than float32 summation order
+explains.
+"""
 
 
 def torch_network(path: Path, sensor: Instrument | None = None) -> ConvBEERS | OfOneSensor:
-    """The network of torch that an exported one must compute as: of weights, for a sensor where
-    they need one.
+    """Return the torch network that an exported one must agree with, conditioned on a sensor if the
+    weights need one.
     """
     network = network_of(read_plain(path) if sensor is None else read_conditioned(path))
     if sensor is not None and isinstance(network, BankedConvBEERS):
@@ -38,16 +40,16 @@ def torch_network(path: Path, sensor: Instrument | None = None) -> ConvBEERS | O
 def require_parity(
     network: ConvBEERS | OfOneSensor, model: Path | onnx.ModelProto, side_px: int
 ) -> float:
-    """Largest absolute difference between torch and onnxruntime on one random image, in [0, 1] of
-    full scale.
+    """Return the largest absolute difference between torch and onnxruntime on one random image, in
+    [0, 1] of full scale.
 
     Args:
-        network: of torch.
-        model: exported from it.
-        side_px: of the image, to be raised to the next multiple of the network's scale.
+        network: the torch network.
+        model: the network that was exported from it.
+        side_px: side of the image, which is rounded up to the next multiple of the network's scale.
 
     Raises:
-        ModelError: pixels that are not finite, or more than MAX_DIFFERENCE.
+        ModelError: pixels are not finite, or differ by more than MAX_DIFFERENCE.
     """
     side_px += -side_px % network.variant.scale
     image = np.random.default_rng(0).random((1, 1, side_px, side_px), dtype=np.float32)

@@ -1,4 +1,6 @@
-"""The steps of `quantize`: calibration, alone or over a family of sensors, and where INT8 errs."""
+"""The steps of `quantize`: calibration, for one network or over a family of sensors, and the
+analysis of the INT8 error.
+"""
 
 import os
 from collections.abc import Sequence
@@ -55,7 +57,7 @@ if TYPE_CHECKING:
     from beers_deploy.quant.samples.simulated import Calibration
 
 Source: TypeAlias = "Calibration | OwnSamples"
-"""Where patches come from: simulated ones, or a user's own."""
+"""The source of patches: simulated ones, or the user's own."""
 
 MOST_DIGITS = 9
 
@@ -83,24 +85,25 @@ def quantized(
     adapts: bool = False,
     output: str | None = None,
 ) -> tuple[Network, "Patches | None"]:
-    """Quantise a float network; the INT8 one knows its `origin`.
+    """Quantise a float network. The INT8 network refers to it as its `origin`.
 
-    Also returned are the samples that calibration did not see; None of a network that is calibrated
-    over the family of sensors.
+    The samples held out from calibration are also returned. They are None for a network that is
+    calibrated over the family of sensors.
 
     Args:
         network: float network, a shipped name, or weights that are conditioned on a sensor.
-        data: what it is calibrated on.
-        target: whose rules count.
+        data: the data it is calibrated on.
+        target: the board whose rules apply.
         finetune: steps that train the integers, or "auto".
         effort: of the search for equalization factors.
         adapts: replace operators that the DPU lacks.
-        output: name of the output that is kept; None for the only one.
+        output: name of the output to retain; None for the only one.
 
     Raises:
-        ModelError: an operation that the DPU does not compute.
-        OptionError: samples or fine-tuning of a network that is conditioned on its sensor.
-        ImageError: samples that the network does not accept.
+        ModelError: the DPU does not compute an operation.
+        OptionError: samples or fine-tuning are given for a network that is conditioned on its
+            sensor.
+        ImageError: the network does not accept the samples.
     """
     weights = conditioned(Path(network)) if isinstance(network, str | os.PathLike) else None
     steps = steps_of(finetune)
@@ -116,7 +119,7 @@ def quantized(
             "Leave `adapt` out."
         )
     origin = Network.load(network, sensor=data.sensor).with_output(output)
-    require_quantized(origin.model, origin.label, wanted=False)
+    require_quantized(origin.model, origin.label, expected=False)
     with faults_named(origin.label):
         if weights:
             int8 = quantize_conditioned(
@@ -141,8 +144,8 @@ def quantize_alone(
     Args:
         origin: the float network.
         calibration: patches or samples.
-        target: whose rules count.
-        steps: of fine-tuning; None while it helps, 0 for none.
+        target: the board whose rules apply.
+        steps: of fine-tuning; None to continue while it helps, 0 for none.
         effort: of the search for equalization factors.
         adapts: replace operators that the DPU lacks. The result is compared with `origin` as it is.
     """
@@ -189,8 +192,8 @@ def quantize_conditioned(
         network: its weights.
         origin: the float network for `sensor`.
         calibration: patches on which the integer layers are described.
-        sensor: that the result is conditioned on.
-        target: whose rules count.
+        sensor: the sensor that the result is conditioned on.
+        target: the board whose rules apply.
         effort: of the search for equalization factors.
     """
     images = [] if calibration.images is None else [calibration.images]
@@ -210,11 +213,11 @@ def _shifts_of(target: TargetProfile) -> Shifts:
 
 
 def differences_of(network: Network, held_out: "Patches") -> GateResult:
-    """Return what INT8 changes in a network that was quantised here.
+    """Return the differences between INT8 and float for a network that was quantised here.
 
     Args:
         network: the INT8 one.
-        held_out: samples that calibration did not see.
+        held_out: the samples held out from calibration.
     """
     assert network.origin is not None  # noqa: S101
     return compare(open_any_size(network.origin.model), open_any_size(network.model), held_out)
@@ -223,13 +226,14 @@ def differences_of(network: Network, held_out: "Patches") -> GateResult:
 def sensitivity_report(
     network: Network, held_out: "Patches", differences: GateResult, prices: Sequence[Row]
 ) -> tuple[list[Row], Report]:
-    """Return where INT8 errs on samples that calibration did not see: rows, and a page.
+    """Return the sources of the INT8 error on the samples held out from calibration, as rows and a
+    page.
 
     Args:
-        network: that was quantised here.
+        network: a network that was quantised here.
         held_out: the samples.
-        differences: that were measured on them.
-        prices: of `price_rows`, which the page shows as well.
+        differences: the differences measured on them.
+        prices: the rows of `price_rows`, which the page shows as well.
     """
     assert network.origin is not None and network.quantized is not None  # noqa: S101, PT018
     worst = differences.spread.worst(WORST)
@@ -255,7 +259,7 @@ def rounding_of(int8: Path, weights: Path) -> "Rounding":
     """Return how the INT8 file of a conditioned network rounds its maps.
 
     Raises:
-        ModelError: it was made of other weights.
+        ModelError: it was made from other weights.
     """
     import torch
 
@@ -287,12 +291,12 @@ def family_model(
     middle of the family.
 
     Args:
-        network: of weights that 'train --conditioned' wrote.
-        images: folders of photographs; about as many drawn scenes are added. Drawn scenes alone if
-            empty.
+        network: weights that 'train --conditioned' wrote.
+        images: folders of photographs, to which about the same number of drawn scenes is added. If
+            empty, only drawn scenes are used.
         seed: of the patches.
-        shifts: the windows of the target.
-        passes: that reduce the error.
+        shifts: the shift limits of the target.
+        passes: the passes that reduce the error.
         effort: of the search for equalization factors.
     """
     # This loads SciPy, which samples of one's own do without.

@@ -1,4 +1,4 @@
-"""`Table`: what a verb found, with where each figure comes from.
+"""`Table`: the result of a verb, with the origin of each figure.
 
 It is shown on a terminal, as HTML and as Markdown, and saved as one kind of JSON document.
 """
@@ -47,13 +47,13 @@ def input_of(path: Path) -> Input:
 
 
 def inputs_of(*paths: Path | None) -> tuple[Input, ...]:
-    """Return name and digest of each file that exists: taken before the files are read."""
+    """Return name and digest of each file that exists. Call it before the files are read."""
     return tuple(input_of(path) for path in paths if path is not None and path.is_file())
 
 
 def require_same(before: Iterable[Input], *paths: Path | None) -> None:
-    """Raise OptionError if a file was replaced since `inputs_of`: the digest would be that of
-    another one.
+    """Raise OptionError if a file was replaced since `inputs_of`, because the digest would be that
+    of another file.
     """
     # A file that is gone meanwhile has no digest, so the lists may differ in length.
     for then, now in zip(before, inputs_of(*paths), strict=False):
@@ -66,7 +66,7 @@ def require_same(before: Iterable[Input], *paths: Path | None) -> None:
 
 @dataclass(frozen=True, repr=False)
 class Table:
-    """The figures of a verb, its checks, and where they come from.
+    """The figures of a verb, its checks, and their origins.
 
     A table is true if all its checks passed. Iterating over it yields its rows.
 
@@ -75,7 +75,7 @@ class Table:
         arguments: of the verb.
         inputs: files and networks that the figures rest on.
         rows: the figures, each with its value, unit, mode, interval and source.
-        checks: what a verb judges; the command exits with 1 if one of them failed.
+        checks: the checks of the verb; the command exits with 1 if one of them failed.
         notes: sentences that a reader must know.
         title: heading of the whole.
         headings: the heading of each table of rows, if its name is not clear enough by itself.
@@ -108,7 +108,7 @@ class Table:
 
     @property
     def verdict(self) -> str:
-        """A sentence that says whether the checks passed; empty without checks."""
+        """A sentence that states whether the checks passed; empty without checks."""
         if not self.checks:
             return ""
         if self.failed:
@@ -121,7 +121,7 @@ class Table:
         """Return the rows of each table that is shown, by its heading.
 
         Args:
-            details: whether to include what is for a closer look.
+            details: if True, include tables, figures and words that are shown only in detail.
         """
         tables: dict[str, list[Row]] = {}
         for name, rows in by_table(self.rows).items():
@@ -141,7 +141,7 @@ class Table:
 
         Args:
             console: of rich; standard output if None.
-            details: whether to include what is for a closer look.
+            details: if True, include tables, figures and words that are shown only in detail.
         """
         console = console or default_console()
         if self.title:
@@ -159,12 +159,12 @@ class Table:
 
     @property
     def sentences(self) -> list[str]:
-        """What stands below the tables: each check with its outcome, the notes, the verdict."""
+        """The sentences below the tables: each check with its outcome, the notes, the verdict."""
         checks = [f"{'ok    ' if check.passed else 'FAILED'} {check}" for check in self.checks]
         return [*checks, *self.notes, *filter(None, (self.verdict,))]
 
     def to_dict(self) -> dict[str, object]:
-        """Return the table as the schema of results documents wants it."""
+        """Return the table in the schema of results documents."""
         inputs = [item if isinstance(item, Input) else input_of(item) for item in self.inputs]
         checks = [check.to_json() for check in self.checks]
         verdict = "passed" if self else "failed"
@@ -196,7 +196,7 @@ class Table:
         return json.dumps(self.to_dict(), indent=1) + "\n"
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the table as a JSON file, whole or not at all, and return its path."""
+        """Write the table as a JSON file, atomically, and return its path."""
         write_text(Path(path), self.to_json())
         return Path(path)
 
@@ -214,9 +214,9 @@ class Table:
         """Return the figures as a pandas DataFrame.
 
         Args:
-            tidy: one line a figure with value, unit, mode, low, high and source. Otherwise one line
-                a row, a column for each figure and for the words beside them; `attrs["units"]` has
-                the units.
+            tidy: if True, one line for each figure with value, unit, mode, low, high and source.
+                Otherwise one line for each row, with a column for each figure and each text;
+                `attrs["units"]` has the units.
 
         Raises:
             MissingExtraError: pandas is not installed.
@@ -252,13 +252,13 @@ class Table:
         return f"{type(self).__name__}({self.command}: {len(self.rows)} rows: {printable(names)})"
 
     def __str__(self) -> str:
-        """Return what `print` prints, without colours."""
+        """Return the same text as `print`, without colours."""
         stream = io.StringIO()
         self.print(Console(file=stream, width=PIPE_WIDTH, force_jupyter=False))
         return "\n".join(line.rstrip() for line in stream.getvalue().splitlines())
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: each table, checks and notes."""
+        """Return the HTML that a notebook shows: each table, checks and notes."""
         tables = []
         for heading, rows in self.shown().items():
             tables.append(html_table(heading, rows))
@@ -269,7 +269,9 @@ class Table:
 
 
 def host() -> dict[str, object]:
-    """Return the machine that measured figures were measured on; None for what is unknown."""
+    """Return a description of the machine that measured the figures, with None for unknown
+    values.
+    """
     import psutil
 
     return {
@@ -287,7 +289,7 @@ def host() -> dict[str, object]:
 
 
 def _encodable(value: object) -> object:
-    """Return a value of a document with text that any reader of JSON takes."""
+    """Return a value of a document with text that any JSON reader accepts."""
     if isinstance(value, dict):
         return {encodable(key): _encodable(item) for key, item in value.items()}
     if isinstance(value, list):

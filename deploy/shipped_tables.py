@@ -1,4 +1,4 @@
-"""What is shipped, as tables: sensors, scenes, boards, networks, and the constants of a profile."""
+"""The shipped data as tables: sensors, scenes, boards, networks, and the constants of a profile."""
 
 from collections.abc import Mapping
 
@@ -23,7 +23,7 @@ from beers_deploy.results import Table
 
 
 def boards() -> Table:
-    """Return the shipped boards with a DPU: its configurations, and where its rules come from.
+    """Return the shipped boards with a DPU: their configurations, and the sources of their rules.
 
     Examples:
         >>> bd.boards().to_pandas().index.to_list()
@@ -40,7 +40,7 @@ def boards() -> Table:
 
 
 def sensors() -> Table:
-    """Return the shipped sensors: contrast at Nyquist, SNR, bits, and what each is.
+    """Return the shipped sensors: contrast at Nyquist, SNR, bits, and a description.
 
     Examples:
         >>> bd.sensors().to_pandas().index.to_list()[2:]
@@ -57,7 +57,7 @@ def sensors() -> Table:
 
 
 def _figure(constant: Constant, unit: str) -> Figure:
-    """Return a constant as a figure: a range is the interval about its middle."""
+    """Return a constant as a figure, in which a range is the interval around its middle."""
     interval = None if constant.low == constant.high else (constant.low, constant.high)
     mode: Mode = "measured" if constant.status == "measured" else "published"
     return Figure(
@@ -97,7 +97,7 @@ def list_of_profiles() -> Table:
 
 
 def text_of_profile(name: str) -> str:
-    """Return the TOML of a profile that can be read as one."""
+    """Return the TOML text of a profile, which is a valid profile file by itself."""
     kind, _ = _profile(name)
     return profile_path(kind, name).read_text(encoding="utf-8")
 
@@ -109,7 +109,9 @@ def table_of_profile(name: str) -> Table:
 
 
 def _profile(name: str) -> tuple[str, Table]:
-    """Return the folder of a profile, and its table; tried as sensor, scene and target in turn."""
+    """Return the folder of a profile, and its table. It is tried as sensor, scene and target in
+    turn.
+    """
     if _is(name, "sensors", sensor_names(), "mtf"):
         sensor = Sensor.load(name)
         return "sensors", _table(sensor.name, sensor.description, _sensor_rows(sensor))
@@ -132,7 +134,7 @@ def _profile(name: str) -> tuple[str, Table]:
 
 
 def _is(name: str, kind: str, shipped: list[str], key: str) -> bool:
-    """Return True if a profile is of a kind: by its name, or by a key that its file has."""
+    """Return True if a profile is of a kind, by its name or by a key in its file."""
     return name in shipped or (name.endswith(".toml") and key in read_toml(kind, name)[1])
 
 
@@ -150,7 +152,7 @@ def _sensor_rows(sensor: Sensor) -> list[Row]:
 
 
 def _response(sensor: Sensor) -> list[Row]:
-    """Return a table's numbers, or what a point-spread function is made of."""
+    """Return a table's numbers, or the components of a point-spread function."""
     response = sensor.response
     words = {"status": sensor.mtf_nyquist.status, "source": sensor.mtf_nyquist.source}
     if response is None:

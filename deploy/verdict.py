@@ -43,11 +43,11 @@ from beers_deploy.quant.structure import ENCODING, structure_checks
 from beers_deploy.results import SCHEMA_PATH, Input, Table
 
 JUNIT_CHARACTERS = 2000
-"""Of a message in JUnit XML, at most."""
+"""The largest number of characters of a message in JUnit XML."""
 
 LITTLE_CHANGE = 0.02
-"""Mean absolute change of the input, over full scale, up to which the default limit of the MAE
-suits a network. ConvBEERS changes it by 0.008.
+"""The largest mean absolute change of the input, over full scale, for which the default limit of
+the MAE suits a network. ConvBEERS changes it by 0.008.
 """
 
 LEAST_CONTRAST = 0.0014
@@ -57,10 +57,10 @@ default limit of the MAE.
 
 
 PATCHES = ("sensor", "images", "patches", "seed", "samples", "output")
-"""The arguments that say on what INT8 and float are compared, and by which output."""
+"""The arguments that define the data and the output by which INT8 and float are compared."""
 
 SAME_DB = 0.01
-"""Between the PSNRs of one float network on two processors: most differ by less
+"""The largest difference of the PSNRs of one float network on two processors. Most differ by less
 than a thousandth.
 """
 
@@ -68,7 +68,7 @@ REMAKE = "Make it again with 'gate --json' and these arguments."
 
 
 def read_document(path: Path) -> dict[str, object]:
-    """Read a results document; refuse what does not follow the schema."""
+    """Read a results document. Raise an error if it does not follow the schema."""
     try:
         document = read_json(path)
         schema = Draft202012Validator(json.loads(SCHEMA_PATH.read_text(encoding="utf-8")))
@@ -94,7 +94,7 @@ class Baseline:
         path: of its document.
         mae: over full scale.
         psnr_float_db: of the float network against the references; NaN without any.
-        digests: SHA-256 of what it rested on, by name; two networks may have one file name.
+        digests: SHA-256 of its inputs, by name; two networks may have one file name.
         checks: names of its checks.
     """
 
@@ -107,14 +107,14 @@ class Baseline:
     def require_same(
         self, float_sha256: str, psnr_float_db: float, inputs: Iterable[Input]
     ) -> None:
-        """Raise OptionError if the baseline is of another float network, sensor, or of other images
-        or samples.
+        """Raise OptionError if the baseline is of another float network or sensor, or of other
+        images or samples.
 
         Args:
-            float_sha256: digest of the float network that is judged now.
+            float_sha256: digest of the float network that is checked now.
             psnr_float_db: its PSNR, by which the network is recognised if it was saved again as
                 another file.
-            inputs: everything else that the comparison rests on, networks left out.
+            inputs: all other inputs of the comparison, without networks.
         """
         # A network that was saved again has another digest, but the same PSNR.
         same_psnr = abs(psnr_float_db - self.psnr_float_db) < SAME_DB
@@ -141,9 +141,9 @@ def read_baseline(path: Path, arguments: Mapping[str, Any]) -> Baseline:
         arguments: of the gate that is to be compared with it.
 
     Raises:
-        OptionError: a file that is no results document, of another command, of a gate that failed
-            or of one on other patches, one that contradicts itself, or one without an MAE that was
-            measured over full scale.
+        OptionError: the file is not a results document, or is one of another command, of a gate
+            that failed or of a gate on other patches. The same holds if it contradicts itself, or
+            has no MAE that was measured over full scale.
     """
     document: Any = read_document(path)
     if document["command"] != "gate":
@@ -186,7 +186,7 @@ def read_baseline(path: Path, arguments: Mapping[str, Any]) -> Baseline:
 
 
 def _contradiction(checks: Iterable[Mapping[str, Any]], rows: int, mae: float) -> str:
-    """Return what in a document contradicts itself, in words; empty if nothing does."""
+    """Return the contradiction within a document, in words, or "" if there is none."""
     if rows > 1:
         return f"{rows} rows of the table gate"
     for check in checks:
@@ -202,8 +202,8 @@ def _contradiction(checks: Iterable[Mapping[str, Any]], rows: int, mae: float) -
 
 
 def _plain(name: str, value: object) -> str:
-    """Return an argument as text; of a folder of images its name, because the folder may lie
-    elsewhere.
+    """Return an argument as text. Of a folder of images only the name is used, because the folder
+    may be elsewhere.
     """
     return encodable(
         Path(str(value)).name if name in ("images", "samples", "sensor") else str(value)
@@ -217,7 +217,7 @@ class Verdict(Table):
     comparison: Comparison
 
     def raise_if_failed(self) -> None:
-        """Raise GateFailedError if a limit is broken: for a test."""
+        """Raise GateFailedError if a limit is exceeded. Use this in a test."""
         if not self:
             raise GateFailedError(self.verdict)
 
@@ -240,7 +240,7 @@ class Verdict(Table):
 
 
 class GateFailedError(AssertionError):
-    """An INT8 network breaks a limit. That is no bad input, and so no `BeersError`."""
+    """An INT8 network exceeds a limit. This is not bad input, so it is not a `BeersError`."""
 
 
 def baseline_for(
@@ -249,7 +249,7 @@ def baseline_for(
     """Return the baseline of a gate, if there is one.
 
     Raises:
-        OptionError: a limit that needs a baseline or a metric, and none is given; a baseline of
+        OptionError: a limit needs a baseline or a metric and none is given, or the baseline is of
             other patches.
     """
     if path is None and limits.mae_growth is not None:
@@ -288,14 +288,14 @@ def judged(
 
     Args:
         comparison: of the float and the INT8 network.
-        limits: that the differences may not exceed.
+        limits: the limits of the differences.
         baseline: of an earlier gate, or None.
-        target: whose rules the INT8 file must obey.
+        target: the board whose rules apply to the INT8 file.
         own: the user's samples that both were compared on; None for simulated patches.
 
     Raises:
-        OptionError: samples with too little contrast for the limits, a baseline of other networks
-            or samples.
+        OptionError: the samples have too little contrast for the limits, or the baseline is of
+            other networks or samples.
     """
     result = comparison.result
     if result.contrast < LEAST_CONTRAST:
@@ -336,7 +336,9 @@ def judged(
 
 
 def _mae_note(result: GateResult, limits: Limits, checks: Sequence[Check]) -> list[str]:
-    """Return a note if the MAE broke its default limit and that does not suit the network."""
+    """Return a note if the MAE exceeded its default limit and that limit does not suit the
+    network.
+    """
     broken = any(check.name == "MAE" and not check.passed for check in checks)
     if not broken or limits.mae != Limits().mae or result.input_change <= LITTLE_CHANGE:
         return []
@@ -377,7 +379,7 @@ def junit_text(title: str, checks: Sequence[Check]) -> str:
 
 
 def junit_error(title: str, message: str) -> str:
-    """Return JUnit XML that says that nothing could be judged, and why."""
+    """Return JUnit XML with one error: nothing could be judged, and the reason."""
     return _junit(title, "error", ["gate"], {"gate": printable(message, JUNIT_CHARACTERS)})
 
 

@@ -1,12 +1,12 @@
-"""Nine networks of the kinds that users bring, and their export: small, but with the operators of
-the real ones.
+"""Nine networks of the kinds that users bring, and their export. They are small, but have the
+operators of the real ones.
 
     network = build("unet", torch.Generator().manual_seed(0))
     model = to_onnx("unet", network)
 
-Images are (N, C, H, W) float32, in [0, 1] of full scale. The graphs are what torch's own exporter
-makes of the modules, with all that it leaves behind: batch normalisation folded or not, Constant
-nodes, ReLU6 as Clip, pixel unshuffling as Reshape and Transpose.
+Images are (N, C, H, W) float32, in [0, 1] of full scale. The graphs are those that torch's own
+exporter produces from the modules, with all its artefacts: batch normalisation folded or not,
+Constant nodes, ReLU6 as Clip, pixel unshuffling as Reshape and Transpose.
 """
 
 import io
@@ -21,17 +21,17 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 DPU_SLOPE = 26 / 256
-"""The only slope of a LeakyReLU that the DPU has."""
+"""The only slope of a LeakyReLU that the DPU supports."""
 
 CORRECTIONS = ("second", "project", "tail")
-"""Convolutions whose output is added to what came in start small, and a network starts near the
-identity.
+"""The convolutions whose output is added to their block's input. They start with small weights, so
+that a network starts near the identity.
 """
 
 
 class DnCNN(nn.Module):
-    """Convolutions with batch normalisation that find the noise; the image minus it (Zhang et al.,
-    2017).
+    """Convolutions with batch normalisation that estimate the noise, which is subtracted from the
+    image (Zhang et al., 2017).
     """
 
     def __init__(self, layers: int = 8, features: int = 32) -> None:
@@ -41,18 +41,18 @@ class DnCNN(nn.Module):
         self.tail = nn.Conv2d(features, 1, 3, padding=1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Restore images (N, 1, H, W); the shape is kept."""
+        """Restore images (N, 1, H, W). The shape is preserved."""
         noise: Tensor = self.tail(self.body(image))
         return image - noise
 
 
 class FFDNet(nn.Sequential):
-    """Works at half the sampling between pixel unshuffling and shuffling, without a global add
+    """A network at half the sampling, between pixel unshuffling and shuffling, without a global add
     (Zhang et al., 2018).
 
-    Its map of noise levels is left out, one sensor is one level, and so is batch normalisation,
-    whose statistics of a batch would hide how bright each image is. Images (N, 1, H, W) of even
-    sides to the same.
+    Its map of noise levels is left out, because one sensor is one level. Batch normalisation is
+    left out too, because its batch statistics would hide how bright each image is. It maps images
+    (N, 1, H, W) of even sides to the same shape.
     """
 
     def __init__(self, layers: int = 6, features: int = 32) -> None:
@@ -65,10 +65,10 @@ class FFDNet(nn.Sequential):
 
 
 class ESPCN(nn.Sequential):
-    """Twice the sampling from one pixel shuffle at the end (Shi et al., 2016), with ReLU in the
-    place of tanh.
+    """A network that doubles the sampling by one pixel shuffle at the end (Shi et al., 2016), with
+    ReLU in place of tanh.
 
-    Images (N, 1, H, W) to (N, 1, 2 H, 2 W).
+    It maps images (N, 1, H, W) to (N, 1, 2 H, 2 W).
     """
 
     def __init__(self) -> None:
@@ -78,10 +78,10 @@ class ESPCN(nn.Sequential):
 
 
 class SESR(nn.Module):
-    """Twice the sampling, two long residuals (Bhardwaj et al., 2022), with ReLU in the place of
-    PReLU.
+    """A network that doubles the sampling, with two long residuals (Bhardwaj et al., 2022), and
+    ReLU in place of PReLU.
 
-    Each convolution is what a linear block of theirs collapses to once it is trained.
+    Each convolution corresponds to one of their linear blocks, collapsed after training.
     """
 
     def __init__(self, layers: int = 5, features: int = 16) -> None:
@@ -94,8 +94,8 @@ class SESR(nn.Module):
         self.shuffle = nn.PixelShuffle(2)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Images (N, 1, H, W) to (N, 1, 2 H, 2 W); the image is added to each
-        of the four phases.
+        """Map images (N, 1, H, W) to (N, 1, 2 H, 2 W). The image is added to each of the four
+        phases.
         """
         shallow = self.head(image)
         enlarged: Tensor = self.shuffle(self.tail(shallow + self.body(shallow)) + image)
@@ -103,8 +103,8 @@ class SESR(nn.Module):
 
 
 class UNet(nn.Module):
-    """Three levels: max pooling down, transposed convolutions up, skips concatenated (Ronneberger
-    et al., 2015).
+    """A network of three levels: max pooling down, transposed convolutions up, concatenated skips
+    (Ronneberger et al., 2015).
     """
 
     def __init__(self, features: int = 16) -> None:
@@ -123,7 +123,7 @@ class UNet(nn.Module):
         self.tail = nn.Conv2d(one, 1, 1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Restore images (N, 1, H, W) of sides that are multiples of 4; the shape is kept."""
+        """Restore images (N, 1, H, W) of sides that are multiples of 4. The shape is preserved."""
         first = self.down_one(image)
         second = self.down_two(self.pool(first))
         third = self.up_two(self.bottom(self.pool(second)))
@@ -133,8 +133,8 @@ class UNet(nn.Module):
 
 
 class EDSR(nn.Module):
-    """Residual blocks without batch normalisation over four bands at once (Lim et al., 2017,
-    without enlarging).
+    """Residual blocks without batch normalisation over four bands jointly (Lim et al., 2017,
+    without upsampling).
     """
 
     def __init__(self, bands: int = 4, blocks: int = 4, features: int = 32) -> None:
@@ -144,7 +144,7 @@ class EDSR(nn.Module):
         self.tail = nn.Conv2d(features, bands, 3, padding=1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Restore images (N, bands, H, W); the shape is kept."""
+        """Restore images (N, bands, H, W). The shape is preserved."""
         correction: Tensor = self.tail(self.body(self.head(image)))
         return image + correction
 
@@ -158,7 +158,7 @@ class ResidualBlock(nn.Module):
         self.second = nn.Conv2d(features, features, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Features (N, F, H, W) to the same shape."""
+        """Map features (N, F, H, W) to the same shape."""
         correction: Tensor = self.second(self.first(x))
         return x + correction
 
@@ -175,14 +175,14 @@ class Mobile(nn.Module):
         self.tail = nn.Conv2d(features, 1, 3, padding=1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Restore images (N, 1, H, W); the shape is kept."""
+        """Restore images (N, 1, H, W). The shape is preserved."""
         correction: Tensor = self.tail(self.body(self.head(image)))
         return image + correction
 
 
 class InvertedResidual(nn.Module):
-    """Widened twofold point by point, filtered channel by channel, narrowed again, added to the
-    input.
+    """A 1 x 1 convolution to twice the channels, a depthwise one, and a 1 x 1 projection, added to
+    the input.
     """
 
     def __init__(self, features: int) -> None:
@@ -193,14 +193,14 @@ class InvertedResidual(nn.Module):
         self.norm = nn.BatchNorm2d(features)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Features (N, F, H, W) to the same shape."""
+        """Map features (N, F, H, W) to the same shape."""
         correction: Tensor = self.norm(self.project(self.depthwise(self.expand(x))))
         return x + correction
 
 
 class Segment(nn.Module):
-    """Two classes for each pixel: strides and a dilation down, bilinear and nearest enlarging up,
-    HardSwish.
+    """A segmentation network with two classes for each pixel: strides and a dilation down, bilinear
+    and nearest upsampling, HardSwish.
     """
 
     def __init__(self, features: int = 16) -> None:
@@ -213,7 +213,7 @@ class Segment(nn.Module):
         self.classes = nn.Conv2d(features, 2, 1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Images (N, 1, H, W) of sides that are multiples of 4 to logits (N, 2, H, W)."""
+        """Map images (N, 1, H, W) of sides that are multiples of 4 to logits (N, 2, H, W)."""
         shallow = self.shallow(image)
         deep = self.narrow(self.context(self.deep(shallow)))
         merged = self.merge(
@@ -225,7 +225,7 @@ class Segment(nn.Module):
 def _activated(
     inputs: int, outputs: int, activation: nn.Module, stride: int = 1, dilation: int = 1
 ) -> nn.Sequential:
-    """A 3 x 3 convolution and what follows it."""
+    """Return a 3 x 3 convolution followed by an activation."""
     conv = nn.Conv2d(inputs, outputs, 3, stride=stride, padding=dilation, dilation=dilation)
     return nn.Sequential(conv, activation)
 
@@ -238,7 +238,7 @@ def _batch_normed(
     stride: int = 1,
     groups: int = 1,
 ) -> nn.Sequential:
-    """A convolution without bias, batch normalisation and an activation."""
+    """Return a convolution without bias, followed by batch normalisation and an activation."""
     conv = nn.Conv2d(
         inputs, outputs, kernel, stride=stride, padding=kernel // 2, groups=groups, bias=False
     )
@@ -246,22 +246,22 @@ def _batch_normed(
 
 
 def _twice(inputs: int, outputs: int) -> nn.Sequential:
-    """Two 3 x 3 convolutions, each with the LeakyReLU that the DPU has."""
+    """Return two 3 x 3 convolutions, each followed by the LeakyReLU that the DPU supports."""
     first = _activated(inputs, outputs, nn.LeakyReLU(DPU_SLOPE))
     return nn.Sequential(first, _activated(outputs, outputs, nn.LeakyReLU(DPU_SLOPE)))
 
 
 @dataclass(frozen=True)
 class Example:
-    """What has to be known of a network to use it.
+    """The facts about a network that are needed to use it.
 
     Attributes:
-        module: makes it, with weights of no meaning yet.
+        module: creates it, with untrained weights.
         inputs: channels of its input.
         outputs: channels of its output.
         scale: output pixels a side for each input pixel.
-        multiple_px: sides of an input are multiples of it.
-        restores: whether the output is the input image, restored or enlarged.
+        multiple_px: the sides of an input are multiples of this.
+        restores: True if the output is the input image, restored or enlarged.
     """
 
     module: Callable[[], nn.Module]
@@ -285,7 +285,7 @@ NETWORKS = {
 
 
 def build(name: str, generator: torch.Generator) -> nn.Module:
-    """The network of that name in evaluation mode, with weights drawn from `generator`."""
+    """Return the network of that name in evaluation mode, with weights drawn from `generator`."""
     network = NETWORKS[name].module()
     with torch.no_grad():
         for path, module in network.named_modules():
@@ -300,7 +300,9 @@ def build(name: str, generator: torch.Generator) -> nn.Module:
 
 
 def _draw_statistics(norm: nn.BatchNorm2d, generator: torch.Generator) -> None:
-    """As if it had seen images: far enough from the identity that an error in folding shows."""
+    """Draw the statistics of batch normalisation as if it had seen images, far enough from the
+    identity that an error in folding shows.
+    """
     tensors = norm.state_dict()
     for positive in ("weight", "running_var"):
         tensors[positive].uniform_(0.5, 1.5, generator=generator)
@@ -309,11 +311,11 @@ def _draw_statistics(norm: nn.BatchNorm2d, generator: torch.Generator) -> None:
 
 
 def to_onnx(name: str, network: nn.Module, fold: bool = True, opset: int = 17) -> onnx.ModelProto:
-    """Export a network as users do: `input` to `output`, batch free, and height and width where
-    they may be.
+    """Export a network as users do: `input` to `output`, with free batch, and free height and width
+    if possible.
 
-    `fold` is the exporter's default for a network in evaluation mode: batch normalisation goes into
-    the convolution before it. Without, it stays as the nodes that it is.
+    `fold` is the exporter's default for a network in evaluation mode: batch normalisation is folded
+    into the convolution before it. Otherwise it remains as nodes.
     """
     example = NETWORKS[name]
     axes = {0: "batch", 2: "height", 3: "width"}

@@ -1,8 +1,8 @@
 """`beers-deploy restore` in the processing toolbox of QGIS.
 
 Choose Scripts, Add Script to Toolbox, then this file. QGIS has a Python of its own, and this tool
-another one, so the script starts the program and imports nothing of it. Names of methods are QGIS's
-(https://docs.qgis.org/latest/en/docs/user_manual/processing/scripts.html).
+another one, so the script starts the program and imports nothing of it. The names of methods are
+QGIS's (https://docs.qgis.org/latest/en/docs/user_manual/processing/scripts.html).
 """
 
 import os
@@ -29,19 +29,19 @@ class RestoreImage(QgsProcessingAlgorithm):
     """The command `beers-deploy restore IMAGE OUT --cog`."""
 
     def name(self) -> str:
-        """In models and in `qgis_process`."""
+        """Return the name in models and in `qgis_process`."""
         return "restoreimage"
 
     def displayName(self) -> str:  # noqa: N802
-        """In the toolbox."""
+        """Return the name in the toolbox."""
         return "Restore a raw satellite image"
 
     def createInstance(self) -> "RestoreImage":  # noqa: N802
-        """Another one: QGIS runs each in a thread."""
+        """Return a new instance, because QGIS runs each one in a thread."""
         return RestoreImage()
 
     def initAlgorithm(self, configuration: Any = None) -> None:  # noqa: N802, ARG002
-        """The fields of its form."""
+        """Add the fields of the form."""
         self.addParameter(QgsProcessingParameterRasterLayer(IMAGE, "Raw image"))
         self.addParameter(
             QgsProcessingParameterString(SENSOR, "Sensor (empty: not known)", optional=True)
@@ -57,7 +57,7 @@ class RestoreImage(QgsProcessingAlgorithm):
         context: QgsProcessingContext,
         feedback: QgsProcessingFeedback,
     ) -> dict[str, Any]:
-        """Restore; the last line of the program's messages is the error of QGIS.
+        """Restore the image. The last line of the program's messages becomes the error of QGIS.
 
         Raises:
             QgsProcessingException: the program ended with an error, or cannot be started.

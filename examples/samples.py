@@ -1,12 +1,12 @@
-"""What the example networks learn from, and are calibrated and judged on: images, and what should
-become of them.
+"""Draw the samples on which the example networks are trained, calibrated and evaluated: images, and
+the expected outputs.
 
     python -m examples.samples unet --count 64 --out samples.npz
 
-Those that restore get pairs of `pleiades-degraded` and its reference, of drawn scenes or of the
-photographs of a folder. The segmentation network finds what is bright in them. Writes a .npz file
-as `beers-deploy quantize --samples` reads it: `image` (N, C, H, W) in [0, 1] and, for networks that
-restore, `reference`.
+Networks that restore get pairs of `pleiades-degraded` and its reference, from drawn scenes or from
+the photographs of a folder. The segmentation network finds bright areas in them. The script writes
+a .npz file as `beers-deploy quantize --samples` reads it: `image` (N, C, H, W) in [0, 1] and, for
+networks that restore, `reference`.
 """
 
 import argparse
@@ -33,32 +33,34 @@ from beers_deploy.profiles.sensor import Sensor
 from examples.networks import NETWORKS
 
 BATCH = 8
-"""Images of a batch."""
+"""The number of images in a batch."""
 PATCH_PX = 64
 """Side of an image."""
 RECIPE = PatchRecipe(Sensor.load("pleiades-degraded"), Sensor.load("pleiades-reference"), PATCH_PX)
 
 GAINS = (0.7, 0.9, 1.0, 1.2)
-"""Four bands of one ground, each as bright as this."""
+"""The relative brightness of four bands of one ground."""
 BRIGHT = 0.2
-"""A pixel is bright where the mean of the square around it, in the reference, is above this share
-of full scale.
+"""A pixel is bright if the mean of the square around it, in the reference, is above this share of
+full scale.
 """
 AROUND_PX = 9
 """Side of that square."""
 MIXED = 4
-"""Passes over scenes whose patches of four bands are mixed."""
+"""The number of passes over scenes whose patches of four bands are mixed."""
 MOST = 64
-"""The most patches that one of these passes gives."""
+"""The largest number of patches from one of these passes."""
 
 Batch = tuple[Tensor, Tensor]
-"""What a network gets, (N, C, H, W) in [0, 1], and what it should give: as much, or classes of
-pixels.
+"""The input of a network, (N, C, H, W) in [0, 1], and its target: images of the output's shape, or
+classes of pixels.
 """
 
 
 def batches(name: str, scenes: Sequence[Scene], seed: int) -> Iterator[Batch]:
-    """Endless batches for the network of that name; the same for the same seed."""
+    """Return an endless iterator over batches for the network of that name. The same seed gives the
+    same batches.
+    """
     example = NETWORKS[name]
     if example.inputs == len(GAINS):
         return banded(scenes, np.random.default_rng(seed))
@@ -73,8 +75,8 @@ def batches(name: str, scenes: Sequence[Scene], seed: int) -> Iterator[Batch]:
 
 
 def bright(reference: Tensor) -> Tensor:
-    """The class of each pixel, (N, H, W): 1 where the reference (N, 1, H, W) is bright around it,
-    else 0.
+    """Return the class of each pixel, (N, H, W): 1 where the reference (N, 1, H, W) is bright
+    around it, else 0.
     """
     mean = functional.avg_pool2d(
         reference, AROUND_PX, stride=1, padding=AROUND_PX // 2, count_include_pad=False
@@ -83,8 +85,8 @@ def bright(reference: Tensor) -> Tensor:
 
 
 def banded(scenes: Sequence[Scene], generator: np.random.Generator) -> Iterator[Batch]:
-    """Endless batches of pairs of four bands, (N, 4, P, P): one ground and phase, each band its
-    gain and noise.
+    """Yield batches of pairs of four bands, (N, 4, P, P), endlessly. The bands share ground and
+    phase, and each has its own gain and noise.
     """
     ready = [prepare(scene, math.lcm(*RECIPE.oversamplings)) for scene in scenes]
     passes = [pair for pair in product(ready, RECIPE.oversamplings) if _fits(*pair)]
@@ -108,13 +110,13 @@ def _fits(scene: Visited, ratio: int) -> bool:
 
 
 def _mixed(patches: Tensor, generator: np.random.Generator) -> Tensor:
-    """Patches (N, C, P, P) in another order."""
+    """Return patches (N, C, P, P) in random order."""
     return patches[torch.from_numpy(generator.permutation(len(patches)))]
 
 
 def _acquire_bands(scene: Visited, ratio: int, generator: np.random.Generator) -> Tensor:
-    """The patches of one pass over a scene, (N, 8, P, P) in [0, 1]: four degraded bands, then their
-    references.
+    """Return the patches of one pass over a scene, (N, 8, P, P) in [0, 1]: four degraded bands,
+    then their references.
     """
     phase_y, phase_x = (float(offset) for offset in generator.uniform(-ratio / 2, ratio / 2, 2))
     look = Look(float(generator.uniform(*RECIPE.looks.exposures)))
@@ -131,19 +133,19 @@ def _acquire_bands(scene: Visited, ratio: int, generator: np.random.Generator) -
 
 
 def batches_of(name: str, folder: Path | None, seed: int) -> Iterator[Batch]:
-    """As `batches`, of the photographs of a folder, or of drawn scenes."""
+    """Return `batches` from the photographs of a folder, or from drawn scenes."""
     return batches(name, load_scenes(folder, RECIPE.degraded.nominal(), seed), seed)
 
 
 def positive(text: str) -> int:
-    """A count from the command line."""
+    """Parse a positive count from the command line."""
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"expected a whole number from 1 on, got {text}")
     return int(text)
 
 
 def reported(work: Callable[[], None]) -> int:
-    """The exit code of some work: 2 with one sentence where what was given is at fault."""
+    """Run some work and return the exit code: 2, with one sentence, if the input is at fault."""
     try:
         work()
     except BeersError as error:
@@ -153,7 +155,7 @@ def reported(work: Callable[[], None]) -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Draw, write, say so; the exit code."""
+    """Draw and write the samples, print a summary, and return the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -173,9 +175,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def write_samples(name: str, count: int, out: Path, folder: Path | None, seed: int) -> None:
-    """Write so many samples of the network of that name; references beside them
-    where it restores.
-    """
+    """Write `count` samples for the network of that name, with references if it restores."""
     if out.suffix != ".npz":
         raise OptionError(f"--out must be a name that ends in .npz, got {out.name}.")
     require_writable(out)

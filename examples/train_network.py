@@ -1,10 +1,11 @@
-"""Train one of the example networks on simulated images: minutes make it mean something, none of
-them is a product.
+"""Train one of the example networks on simulated images. Minutes of training give meaningful
+results, but none of the networks is a product.
 
     python -m examples.train_network unet --steps 2000 --out unet.onnx
 
-What each learns from stands in `examples.samples`. Writes FILE.onnx, its weights beside it as
-FILE.safetensors, and says what came out on scenes that were not trained on.
+`examples.samples` defines the task that each one learns. The script writes FILE.onnx and the
+weights as FILE.safetensors next to it, and prints the results on scenes that were not used for
+training.
 """
 
 import argparse
@@ -28,13 +29,13 @@ from examples.networks import NETWORKS, build, to_onnx
 from examples.samples import Batch, batches_of, positive, reported
 
 JUDGED = 16
-"""Batches that a trained network is judged on."""
+"""The number of batches on which a trained network is evaluated."""
 LEARNING_RATE = 2e-3
 
 
 def train(name: str, source: Iterator[Batch], count: int, seed: int) -> nn.Module:
-    """The network of that name after `count` steps of Adam over batches of `source`, in evaluation
-    mode.
+    """Train the network of that name with `count` steps of Adam over batches of `source`. Return it
+    in evaluation mode.
     """
     network = build(name, torch.Generator().manual_seed(seed))
     error = criterion(name)
@@ -54,19 +55,19 @@ def train(name: str, source: Iterator[Batch], count: int, seed: int) -> nn.Modul
 
 
 def criterion(name: str) -> Callable[[Tensor, Tensor], Tensor]:
-    """What training makes small: the mean absolute error of an image, the cross
-    entropy of classes.
+    """Return the loss function: the mean absolute error of an image, or the cross entropy of
+    classes.
     """
     return functional.l1_loss if NETWORKS[name].restores else functional.cross_entropy
 
 
 def judge(name: str, network: nn.Module, source: Iterator[Batch]) -> tuple[float, float, str]:
-    """How good the outputs are on further batches, how good they would be without the network, and
+    """Return the quality of the outputs on further batches, the quality without the network, and
     the unit.
 
-    For images PSNR in dB over full scale, beside that of the input (enlarged bilinearly where the
-    network enlarges); for classes the percentage that is right, beside that of the class that is
-    most frequent.
+    For images it is the PSNR in dB over full scale, compared with that of the input (upsampled
+    bilinearly if the network enlarges). For classes it is the percentage of correct pixels,
+    compared with that of the most frequent class.
     """
     with torch.inference_mode():
         outcomes = [
@@ -89,7 +90,7 @@ def judge(name: str, network: nn.Module, source: Iterator[Batch]) -> tuple[float
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Train, write, report; the exit code."""
+    """Train a network, write it, report the result, and return the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -117,8 +118,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(
     name: str, count: int, out: Path, folders: tuple[Path | None, Path | None], seed: int
 ) -> None:
-    """Train on the images of the first folder, judge on those of the second, write both files,
-    print one line.
+    """Train on the images of the first folder, evaluate on those of the second, write both files,
+    and print one line.
     """
     if out.suffix != ".onnx":
         raise OptionError(f"--out must be a name that ends in .onnx, got {out.name}.")

@@ -145,7 +145,7 @@ class ConvBEERS(Layers):
 
 
 @dataclass(frozen=True)
-class Told:
+class Condition:
     """The description of the sensors of N images on which a network behind a bank is conditioned,
     float32.
 
@@ -162,7 +162,7 @@ class Told:
     gains: Tensor
 
     @classmethod
-    def of(cls, vectors: Tensor, banks: Sequence[Bank]) -> "Told":
+    def of(cls, vectors: Tensor, banks: Sequence[Bank]) -> "Condition":
         """Build the description from sensor vectors (N, 4) and N banks."""
         filters = torch.from_numpy(np.stack([bank.filters for bank in banks])).to(vectors)
         units = vectors.new_tensor([bank.unit for bank in banks])
@@ -174,17 +174,17 @@ class Told:
         """All tensors, in the order of the attributes."""
         return self.vectors, self.filters, self.units, self.gains
 
-    def to(self, device: torch.device) -> "Told":
+    def to(self, device: torch.device) -> "Condition":
         """Return the same description on a device."""
-        return Told(*(part.to(device, non_blocking=True) for part in self.parts))
+        return Condition(*(part.to(device, non_blocking=True) for part in self.parts))
 
-    def repeated(self, count: int) -> "Told":
+    def repeated(self, count: int) -> "Condition":
         """Repeat the description of one image `count` times."""
-        return Told(*(part.expand(count, *part.shape[1:]) for part in self.parts))
+        return Condition(*(part.expand(count, *part.shape[1:]) for part in self.parts))
 
-    def some(self, which: slice | Tensor) -> "Told":
+    def some(self, which: slice | Tensor) -> "Condition":
         """Return the descriptions of the images that `which` selects."""
-        return Told(*(part[which] for part in self.parts))
+        return Condition(*(part[which] for part in self.parts))
 
 
 class BankedConvBEERS(Layers):
@@ -203,7 +203,7 @@ class BankedConvBEERS(Layers):
     def forward(
         self,
         image: Tensor,
-        told: Told,
+        condition: Condition,
         bfloat16: bool = False,
         steps: Sequence[Tensor] = (),
     ) -> Tensor:
@@ -211,19 +211,19 @@ class BankedConvBEERS(Layers):
 
         Args:
             image: (N, 1, H, W).
-            told: description of the sensor of each image.
+            condition: description of the sensor of each image.
             bfloat16: whether the blocks compute in bfloat16.
             steps: step sizes to which the maps are rounded, see `Rounding.steps`; without steps
                 they are not rounded.
         """
-        filtered = each_by_its_own(image, told.filters)
-        planes, analytic = self._held(filtered, told.gains)
+        filtered = each_by_its_own(image, condition.filters)
+        planes, analytic = self._held(filtered, condition.gains)
         inputs = pixel_unshuffle(torch.cat([image - 0.5, planes], 1), self.variant.scale)
-        shallow = (self.head(inputs) + self.bias(told.vectors)[:, :, None, None]).contiguous(
+        shallow = (self.head(inputs) + self.bias(condition.vectors)[:, :, None, None]).contiguous(
             memory_format=torch.channels_last
         )
         correction = self.corrected(shallow, bfloat16, steps)
-        restored: Tensor = image + told.units[:, None, None, None] * (analytic + correction)
+        restored: Tensor = image + condition.units[:, None, None, None] * (analytic + correction)
         return restored
 
     def _held(self, filtered: Tensor, gains: Tensor) -> tuple[Tensor, Tensor]:
@@ -256,7 +256,7 @@ class OfOneSensor(nn.Module):
     def forward(self, image: Tensor) -> Tensor:
         """Restore (N, 1, H, W)."""
         bank = self.bank or bank_of_vector(tuple(self.vector.tolist()), self.network.kernels)
-        condition = Told.of(self.vector[None], [bank])
+        condition = Condition.of(self.vector[None], [bank])
         restored: Tensor = self.network(image, condition.repeated(len(image)))
         return restored
 
@@ -265,7 +265,9 @@ Network = ConvBEERS | BankedConvBEERS
 """A network that can be trained and saved: a plain one, or one for every sensor in range."""
 
 
-def told(network: Network, vector: Tensor, bank: Bank | None = None) -> ConvBEERS | OfOneSensor:
+def for_sensor(
+    network: Network, vector: Tensor, bank: Bank | None = None
+) -> ConvBEERS | OfOneSensor:
     """Return a network that accepts images only.
 
     Args:

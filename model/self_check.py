@@ -65,6 +65,11 @@ MOST_CHI2 = 1.3
 LEAST_SHARPENING = 40.0
 """An MTF that is 30 % wrong moves chi2 by more than 0.3 in blocks above it (measured)."""
 
+WITHIN = 0
+OUTSIDE = 1
+SMOOTH = 2
+"""States of a block in a written map."""
+
 
 @dataclass(frozen=True)
 class Judged:

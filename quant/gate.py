@@ -153,8 +153,8 @@ class GateResult:
     @property
     def metric_loss(self) -> float:
         """The loss of INT8 by the user's metric; above 0 it is worse than float."""
-        lost = self.metric_float - self.metric_int8
-        return lost if METRICS[self.metric].larger_is_better else -lost
+        drop = self.metric_float - self.metric_int8
+        return drop if METRICS[self.metric].larger_is_better else -drop
 
     @property
     def source(self) -> str:

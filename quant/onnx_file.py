@@ -329,11 +329,11 @@ def faults_named(label: str) -> Iterator[None]:
         raise ModelError(f"{label}: {error}") from error
 
 
-def require_quantized(model: onnx.ModelProto, name: str, wanted: bool) -> None:
+def require_quantized(model: onnx.ModelProto, name: str, expected: bool) -> None:
     """Raise ModelError if the float and the INT8 network are swapped."""
-    if is_quantized(model) != wanted:
+    if is_quantized(model) != expected:
         kinds = ("a float network", "an INT8 network")
         raise ModelError(
-            f"{name} must be {kinds[wanted]}, but it is {kinds[not wanted]}. Give the float model "
-            "first, the INT8 model second."
+            f"{name} must be {kinds[expected]}, but it is {kinds[not expected]}. Give the float "
+            "model first, the INT8 model second."
         )

@@ -67,11 +67,11 @@ class Loss:
         self._size = 0.0
         self._count = 0
 
-    def add(self, result: np.ndarray, wanted: np.ndarray, offset: np.ndarray | float = 0.0) -> None:
+    def add(self, result: np.ndarray, target: np.ndarray, offset: np.ndarray | float = 0.0) -> None:
         """Count further values; the signal is the target minus an offset."""
-        difference = np.subtract(result, wanted, dtype=np.float64)
+        difference = np.subtract(result, target, dtype=np.float64)
         self._noise += float(np.square(difference).sum())
-        self._signal += float(np.square(np.subtract(wanted, offset, dtype=np.float64)).sum())
+        self._signal += float(np.square(np.subtract(target, offset, dtype=np.float64)).sum())
         self._size += float(np.abs(difference).sum())
         self._count += difference.size
 

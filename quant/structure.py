@@ -179,16 +179,16 @@ class Relus:
     explicit: int
     folded: int
 
-    def off_by(self, wanted: int) -> int:
+    def off_by(self, expected: int) -> int:
         """Return a lower bound of the number of ReLUs that are lost or added.
 
         A convolution whose 8 bits begin at zero may or may not be a ReLU. The bound assumes the
         more favourable case.
 
         Args:
-            wanted: the expected number of ReLUs of the file.
+            expected: the expected number of ReLUs of the file.
         """
-        return max(wanted - self.explicit - self.folded, self.explicit - wanted, 0)
+        return max(expected - self.explicit - self.folded, self.explicit - expected, 0)
 
     def __str__(self) -> str:
         return (

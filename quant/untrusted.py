@@ -157,11 +157,11 @@ def _check_finite(tensor: TensorProto, where: str) -> None:
     if tensor.data_type not in FLOATS:
         return
     values = numpy_helper.to_array(tensor)
-    lost = np.isnan(values) if not tensor.dims else ~np.isfinite(values)
-    if lost.any():
+    missing = np.isnan(values) if not tensor.dims else ~np.isfinite(values)
+    if missing.any():
         name = printable(tensor.name) or "a constant"
         raise ModelError(
-            f"The weights of {where} must be finite, but {name} has {np.count_nonzero(lost)} "
+            f"The weights of {where} must be finite, but {name} has {np.count_nonzero(missing)} "
             "NaN or infinite values. Train or export the network again."
         )
 

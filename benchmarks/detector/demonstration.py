@@ -1,8 +1,10 @@
-"""What restoration gains for the small detector, on synthetic scenes: docs/results/detection.md.
+"""Measure the gain of restoration for the small detector, on synthetic scenes
+(docs/results/detection.md).
 
     python -m benchmarks.detector.demonstration [--out detection/] [--json detection.json]
 
-Prints the tables, and writes their page into the folder: three minutes on two cores.
+The script prints the tables and writes their page into the folder. It takes three minutes on two
+cores.
 """
 
 import argparse
@@ -21,14 +23,13 @@ from benchmarks.detector.network import DETECTOR
 from benchmarks.detector.scenes import synthetic_scene
 
 SIDE_PX = 768
-"""Of a synthetic scene: 256 pixels a side of a sensor that makes one of three, the input of the
-small detector.
-"""
+"""Side of a synthetic scene. A sensor makes one pixel of three, which gives 256 pixels a side, the
+input of the small detector."""
 
 
 def synthetic_labelled(number: int, seed: int) -> LabelledScene:
-    """Draw the synthetic scene of a number, a site of its own; no two numbers or seeds share a
-    generator.
+    """Draw the synthetic scene with this number. Each scene is a site of its own, and no two
+    numbers or seeds share a generator.
     """
     radiance, truth = synthetic_scene(np.random.default_rng([seed, number]), SIDE_PX, SIDE_PX)
     name = f"synthetic {number}"
@@ -36,7 +37,7 @@ def synthetic_labelled(number: int, seed: int) -> LabelledScene:
 
 
 def main() -> None:
-    """Draw scenes, run the detector on them, and show what it finds."""
+    """Draw scenes, run the detector on them, and show the result."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,10 +1,10 @@
-"""Make the small detector: synthetic pictures, training, its file, and what it finds.
+"""Make the small detector: draw synthetic pictures, train, write its file, and evaluate it.
 
     OMP_NUM_THREADS=1 python -m benchmarks.detector.make [FILE]
 
-The file is detector.onnx in this folder, or FILE; the same bytes on the same machine. The training
-is most of it: see detector.md for how long it took. --steps, --pictures and --held-out make it
-shorter, to try it.
+The file is detector.onnx in this folder, or FILE. The same machine produces the same bytes.
+Training takes most of the time: detector.md reports how long. --steps, --pictures and --held-out
+shorten it for a trial.
 """
 
 import argparse
@@ -34,7 +34,7 @@ RECIPE = DetectorRecipe(precision="bfloat16")
 
 
 def main() -> None:
-    """Draw, train, judge."""
+    """Draw the pictures, train the detector and evaluate it."""
     parser = argparse.ArgumentParser()
     parser.add_argument("file", nargs="?", type=Path, default=DETECTOR)
     parser.add_argument("--pictures", type=int, default=400, help="drawn for training")
@@ -60,7 +60,7 @@ def main() -> None:
 
 
 def drawn(seed: int, count: int) -> list[Picture]:
-    """Pictures of the reference sensor."""
+    """Draw `count` pictures as the reference sensor sees them."""
     pictures = list[Picture]()
     with steps("drawing", count) as bar:
         for number in range(count):
@@ -70,7 +70,7 @@ def drawn(seed: int, count: int) -> list[Picture]:
 
 
 def judge(pictures: Sequence[Picture], file: Path) -> None:
-    """Print average precisions with intervals, over pictures that nothing was trained on."""
+    """Print the average precisions with intervals, on pictures that were not used for training."""
     truths = [Boxes.of(picture.corners, picture.classes) for picture in pictures]
     detector = open_detector(file, 1)
     detections = [

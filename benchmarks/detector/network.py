@@ -1,12 +1,12 @@
-"""A detector of 100 k parameters from convolutions, ReLU, an enlargement and a concatenation, and
-its ONNX file.
+"""A detector with 100 k parameters and its ONNX file. It consists of convolutions, ReLU, an
+upsampling and a concatenation.
 
     image -> 2 strided convolutions -> fine (stride 4)
     fine -> strided -> coarse (stride 8) -> enlarged, + fine -> head
 
-Every cell of 4 x 4 input pixels says, for an object whose centre it may be, the centre and the size
-of its box, and how likely each class is: anchor-free, as CenterNet (Zhou et al., 2019, arXiv
-1904.07850). All of it but the decoding of the last map is legal on a DPU.
+Each cell of 4 x 4 input pixels predicts, for an object centred in it, the centre and size of its
+box and the probability of each class. The detector is anchor-free, like CenterNet (Zhou et al.,
+2019, arXiv 1904.07850). Everything except the decoding of the last map is legal on a DPU.
 """
 
 import io
@@ -21,19 +21,19 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 DETECTOR = Path(__file__).with_name("detector.onnx")
-"""The small detector, trained: it finds vehicles, ships, aircraft and tanks of synthetic scenes."""
+"""The trained small detector. It finds vehicles, ships, aircraft and tanks in synthetic scenes."""
 
 STRIDE_PX = 4
-"""Input pixels a side of a cell."""
+"""Side of a cell in input pixels."""
 MULTIPLE_PX = 8
-"""Sides of an input are multiples of it."""
+"""The sides of an input are multiples of this."""
 PRIOR = 0.02
-"""What every class is likely at the start (focal loss, Lin et al., 2017, arXiv 1708.02002)."""
+"""The initial probability of each class (focal loss, Lin et al., 2017, arXiv 1708.02002)."""
 
 
 class DetectorNetwork(nn.Module):
-    """Images (N, 3, H, W) RGB in [0, 1] to a map (N, 4 + classes, H / 4, W / 4) that `decoded`
-    reads.
+    """A network that maps images (N, 3, H, W), RGB in [0, 1], to (N, 4 + classes, H / 4, W / 4).
+    `decoded` decodes the first four channels.
     """
 
     def __init__(self, classes: int) -> None:
@@ -46,7 +46,7 @@ class DetectorNetwork(nn.Module):
         self.tail = nn.Conv2d(32, 4 + classes, 1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """The map of boxes and logits, not decoded."""
+        """Return the map of boxes and logits, not decoded."""
         fine = self.fine(image)
         coarse = functional.interpolate(self.coarse(fine), scale_factor=2.0, mode="nearest")
         joined: Tensor = self.tail(self.join(torch.cat([fine, coarse], dim=1)))
@@ -54,10 +54,11 @@ class DetectorNetwork(nn.Module):
 
 
 def decoded(boxes: Tensor) -> Tensor:
-    """Boxes in input pixels from the first four channels of the map: (N, 4, h, w) to cx, cy, w, h
-    of that shape.
+    """Decode boxes from the first four channels of the map: (N, 4, h, w) to cx, cy, w, h in input
+    pixels, of the same shape.
 
-    The centre is told from the middle of the cell, in cells; the size as the logarithm of cells.
+    The centre is encoded as the offset from the middle of the cell, in cells. The size is encoded
+    as the logarithm of its number of cells.
     """
     rows, columns = (torch.arange(side, dtype=boxes.dtype) + 0.5 for side in boxes.shape[2:])
     x = boxes[:, :1] + columns
@@ -66,8 +67,8 @@ def decoded(boxes: Tensor) -> Tensor:
 
 
 class Decoding(nn.Module):
-    """As a file holds it: (N, 3, H, W) to (N, 4 + classes, A), which are cx, cy, w, h in input
-    pixels and scores.
+    """The network with its decoding, as a file stores it: (N, 3, H, W) to (N, 4 + classes, A). The
+    channels are cx, cy, w, h in input pixels, then the scores.
     """
 
     def __init__(self, network: DetectorNetwork) -> None:
@@ -75,14 +76,14 @@ class Decoding(nn.Module):
         self.network = network
 
     def forward(self, image: Tensor) -> Tensor:
-        """What Ultralytics calls the raw output, a column for each of the A cells."""
+        """Return what Ultralytics calls the raw output, with one column for each of the A cells."""
         output = self.network(image)
         return torch.cat([decoded(output[:, :4]), torch.sigmoid(output[:, 4:])], dim=1).flatten(2)
 
 
 def initialise(network: DetectorNetwork, generator: torch.Generator) -> None:
-    """He-normal weights; small ones at the end, where every class starts out as
-    unlikely as it is.
+    """Draw He-normal weights. Scale down those of the last layer, and set its biases so that every
+    class starts with probability `PRIOR`.
     """
     for module in network.modules():
         if isinstance(module, nn.Conv2d):
@@ -95,7 +96,7 @@ def initialise(network: DetectorNetwork, generator: torch.Generator) -> None:
 
 
 def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
-    """A 3 x 3 convolution, batch normalisation and ReLU."""
+    """Return a 3 x 3 convolution followed by batch normalisation and ReLU."""
     conv = nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1, bias=False)
     return nn.Sequential(conv, nn.BatchNorm2d(outputs), nn.ReLU())
 
@@ -103,8 +104,8 @@ def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
 def detector_to_onnx(
     network: DetectorNetwork, names: Sequence[str], side_px: int, about: Mapping[str, str]
 ) -> onnx.ModelProto:
-    """A detector as ONNX: `images` (1, 3, S, S) RGB in [0, 1] to `output0` (1, 4 + classes, S * S /
-    16).
+    """Export a detector to ONNX: `images` (1, 3, S, S), RGB in [0, 1], to `output0` (1, 4 +
+    classes, S * S / 16).
 
     Layout and metadata are those of Ultralytics' exporter (ultralytics/engine/exporter.py, read for
     its format; no code is taken from it). A column of the output holds cx, cy, w, h in input
@@ -112,8 +113,8 @@ def detector_to_onnx(
     convolutions.
 
     Args:
-        network: trained.
-        names: of the classes, in the network's order.
+        network: the trained network.
+        names: the names of the classes, in the network's order.
         side_px: S, a multiple of 8.
         about: further metadata.
     """

@@ -1,4 +1,4 @@
-"""Objects of synthetic scenes: polygons in metres around (0, 0), the nose along x.
+"""Objects of synthetic scenes: polygons in metres around (0, 0), with the nose along x.
 
 They have the sizes of common types: cars of 3.8 to 5.2 m, lorries and buses to 14 m, ships of 9 to
 70 m, aircraft of 12 to 38 m span, tanks of 5 to 15 m radius.
@@ -13,15 +13,17 @@ from beers_deploy.model.simulator import procedural as drawing
 from beers_deploy.model.simulator.procedural import Point
 
 PAINTS = [18.0, 60.0, 110.0, 190.0, 280.0]
-"""Radiances of vehicles, black to white: those of the procedural scene."""
+"""Radiances of vehicles from black to white, the same as in the procedural scene."""
 
 
 Part = tuple[list[Point], float]
-"""A polygon in metres and its radiance; of several the first is the lowest."""
+"""A polygon in metres and its radiance. In a list of several, the first is the lowest."""
 
 
 def vehicle(generator: np.random.Generator) -> list[Part]:
-    """A car, or with 1 in 5 a lorry or bus: the body and, of cars, the windscreen."""
+    """Draw a car, or with probability 1/5 a lorry or bus: the body, and for a car the
+    windscreen.
+    """
     paint = generator.choice(PAINTS)
     if generator.random() < 0.2:
         return [
@@ -33,7 +35,7 @@ def vehicle(generator: np.random.Generator) -> list[Part]:
 
 
 def ship(generator: np.random.Generator) -> list[Part]:
-    """A hull with a bow, its hatches or a long deck, and the bridge astern."""
+    """Draw a ship: a hull with a bow, its hatches or a long deck, and the bridge astern."""
     half = 0.5 * math.exp(generator.uniform(math.log(9), math.log(70)))
     wide = half / generator.uniform(3, 5)
     hull = generator.uniform(50, 160)
@@ -49,7 +51,7 @@ def ship(generator: np.random.Generator) -> list[Part]:
 
 
 def aircraft(generator: np.random.Generator) -> list[Part]:
-    """Swept wings, tailplane, engines and, on top, the fuselage."""
+    """Draw an aircraft: swept wings, tailplane, engines and, on top, the fuselage."""
     half = 0.5 * math.exp(generator.uniform(math.log(12), math.log(38)))
     paint = generator.uniform(170, 270)
     long = half * generator.uniform(0.9, 1.15)
@@ -68,7 +70,9 @@ def aircraft(generator: np.random.Generator) -> list[Part]:
 
 
 def tank(radius_m: float, generator: np.random.Generator) -> list[Part]:
-    """A round tank with a rim and a roof a little darker or brighter, the stair's hatch on it."""
+    """Draw a round tank with a rim, a slightly darker or brighter roof, and the hatch of the
+    stair.
+    """
     paint = generator.uniform(110, 250)
     angle = generator.uniform(0, math.tau)
     hatch = 0.6 * radius_m * math.cos(angle), 0.6 * radius_m * math.sin(angle)
@@ -80,8 +84,8 @@ def tank(radius_m: float, generator: np.random.Generator) -> list[Part]:
 
 
 def _swept(front: float, half_span: float, chord: float, sweep: float) -> list[Point]:
-    """A wing from tip to tip: its leading edge at x = front in the middle, `sweep` further back at
-    the tips.
+    """Return the polygon of a wing from tip to tip. Its leading edge lies at x = front in the
+    middle, and `sweep` further back at the tips.
     """
     tip = front - sweep
     return [

@@ -1,8 +1,8 @@
 """Synthetic scenes with known objects: vehicles, ships, aircraft and tanks on plots of ground
 between streets.
 
-The world is that of the simulator's procedural scene, its radiances and its texture, drawn at 0.25
-m a pixel and turned as a whole: of three scene pixels a sensor makes one of 0.75 m, in which a car
+Radiances and texture are those of the simulator's procedural scene. The scene is drawn at 0.25 m a
+pixel and rotated as a whole. A sensor makes one pixel of 0.75 m from three scene pixels, so a car
 is 6 pixels long.
 """
 
@@ -23,11 +23,11 @@ CLASSES = ("vehicle", "ship", "aircraft", "tank")
 VEHICLE, SHIP, AIRCRAFT, TANK = range(len(CLASSES))
 
 SCENE_GSD_M = 0.25
-"""Ground that a scene pixel covers."""
+"""Ground sampling distance of the scene."""
 GAP_PX = 3
-"""Scene pixels that stay free around an object and its shadow."""
+"""The number of scene pixels that stay free around an object and its shadow."""
 TRIES = 4
-"""Times that a place is looked for before an object is left out."""
+"""The number of attempts to find a place before an object is left out."""
 PLOT_M = 96.0
 STREET_M = 9.0
 KERB_M = 2.0
@@ -36,13 +36,13 @@ KERB_M = 2.0
 def synthetic_scene(
     generator: np.random.Generator, height_px: int, width_px: int
 ) -> tuple[np.ndarray, Boxes]:
-    """Draw a scene of that many pixels of 0.25 m, the same for the same generator state.
+    """Draw a scene of `height_px` x `width_px` pixels of 0.25 m. The same generator state gives the
+    same scene.
 
     Returns:
-        Radiance (H, W) float32 in W/m2/sr/um, and the boxes of its objects, of `CLASSES`: exactly
-            their pixels, their
-        shadows left out. Every object lies whole within the scene, touches no other, and nothing
-            covers it.
+        Radiance (H, W) float32 in W/m2/sr/um, and the boxes of its objects, of `CLASSES`. A box
+        covers exactly the object's pixels, without its shadow. Every object lies completely within
+        the scene, touches no other, and nothing covers it.
     """
     canvas = Canvas(height_px, width_px, generator)
     angle = generator.uniform(-0.5, 0.5)
@@ -68,7 +68,9 @@ def synthetic_scene(
 
 
 class Canvas:
-    """A scene being drawn, in metres around its centre: the radiance, and the objects on it."""
+    """A scene that is being drawn, in metres around its centre: the radiance, and the objects on
+    it.
+    """
 
     def __init__(self, height_px: int, width_px: int, generator: np.random.Generator) -> None:
         self.generator = generator
@@ -80,18 +82,20 @@ class Canvas:
         self.draw = ImageDraw.Draw(self._image)
 
     def textured(self) -> np.ndarray:
-        """The radiance (H, W) float32 with the ground's texture."""
+        """Return the radiance (H, W) float32 with the ground's texture."""
         width, height = self.size
         texture = drawing.texture(height, width, self.generator)
         return np.asarray(np.asarray(self._image) * texture, np.float32)
 
     def is_free(self, left: float, top: float, right: float, bottom: float) -> bool:
-        """Whether no object stands in a rectangle, in pixels."""
+        """Return True if no object stands in a rectangle, in pixels."""
         box = math.floor(left), math.floor(top), math.floor(right), math.floor(bottom)
         return self._occupied.crop(box).getbbox() is None
 
     def put(self, kind: int, polygons: list[Part], shadow_px: float) -> None:
-        """Draw an object of polygons in pixels, over the shadow that it throws right and down."""
+        """Draw an object from polygons in pixels, over the shadow that it casts to the right and
+        downwards.
+        """
         for polygon, _ in polygons:
             self.draw.polygon(
                 [drawing.shift(point, shadow_px) for point in polygon], fill=drawing.SHADOW
@@ -108,7 +112,7 @@ class Canvas:
 
 @dataclass(frozen=True)
 class Plot:
-    """A square of ground: `place` takes metres around its centre to metres on the canvas."""
+    """A square plot of ground. `place` maps metres around its centre to metres on the canvas."""
 
     canvas: Canvas
     place: Callable[[float, float], Point]
@@ -116,14 +120,14 @@ class Plot:
 
     @property
     def random(self) -> np.random.Generator:
-        """The canvas's own generator."""
+        """The generator of the canvas."""
         return self.canvas.generator
 
     def rectangle(
         self, x: float, y: float, width: float, height: float, radiance: float, by: float = 0
     ) -> None:
-        """Fill a rectangle of the plot from its corner (x, y), moved right and down in the scene
-        `by` pixels.
+        """Fill a rectangle of the plot from its corner (x, y), shifted right and down in the scene
+        by `by` pixels.
         """
         corners = [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
         outline = [drawing.shift(self._pixel(*corner), by) for corner in corners]
@@ -150,8 +154,8 @@ class Plot:
     def put(
         self, kind: int, parts: list[Part], x: float, y: float, turned: float, height_m: float
     ) -> bool:
-        """Put an object at (x, y), turned, if it lies whole within plot and scene and clear of
-        others.
+        """Put a rotated object at (x, y) if it lies completely within plot and scene and clear of
+        others. Return True if it does.
         """
         own = drawing.turn(x, y, turned)
         shadow_px = height_m / SCENE_GSD_M
@@ -176,7 +180,9 @@ class Plot:
         return True
 
     def scatter(self, count: int, put: Callable[[float, float], bool]) -> None:
-        """Put several objects somewhere on the plot, each where it finds room."""
+        """Put up to `count` objects at random places on the plot. An object that finds no room is
+        left out.
+        """
         for _ in range(count):
             any(put(*self.random.uniform(-self.half_m, self.half_m, 2)) for _ in range(TRIES))
 
@@ -204,7 +210,7 @@ def _traffic(strip: Plot) -> None:
 
 
 def _harbour(plot: Plot) -> None:
-    """Water, a quay along one side, a pier, and ships beside them or under way."""
+    """Draw water, a quay along one side, a pier, and ships moored or under way."""
     plot.pad(drawing.WATER)
     half = plot.half_m
     plot.rectangle(-half, -half, 2 * half, 7.0, drawing.CONCRETE)
@@ -229,7 +235,7 @@ def _harbour(plot: Plot) -> None:
 
 
 def _apron(plot: Plot) -> None:
-    """Concrete slabs, a taxi line, aircraft parked at any angle, and what serves them."""
+    """Draw concrete slabs, a taxi line, aircraft parked at any angle, and service vehicles."""
     plot.pad(drawing.CONCRETE * plot.random.uniform(0.6, 1.0))
     half = plot.half_m
     for position in np.arange(-half, half, 7.5):
@@ -242,7 +248,7 @@ def _apron(plot: Plot) -> None:
 
 
 def _tank_farm(plot: Plot) -> None:
-    """Gravel, bunds around each tank, and tanks of one or two sizes."""
+    """Draw gravel, bunds around each tank, and tanks of one or two sizes."""
     plot.pad(drawing.SOIL * plot.random.uniform(0.8, 1.3))
     radius = plot.random.uniform(5, 15)
     step = 2.9 * radius + 3
@@ -266,7 +272,7 @@ def _tank_farm(plot: Plot) -> None:
 
 
 def _car_park(plot: Plot) -> None:
-    """Rows of stalls between lanes, some 60 % taken, a few trees in between."""
+    """Draw rows of stalls between lanes, partly occupied, with a few trees in between."""
     plot.pad(drawing.ASPHALT * plot.random.uniform(0.9, 1.6))
     half = plot.half_m
     occupancy = plot.random.uniform(0.2, 0.9)
@@ -281,7 +287,7 @@ def _car_park(plot: Plot) -> None:
 
 
 def _houses(plot: Plot) -> None:
-    """Gable roofs and flat halls in gardens, trees, cars in the gaps between the rows of houses."""
+    """Draw gable roofs and flat halls in gardens, trees, and cars between the rows of houses."""
     half = plot.half_m
     for y in np.arange(14.0 - half, half - 8, 24.0):
         for x in np.arange(12.0 - half, half - 8, 20.0):
@@ -309,8 +315,8 @@ def _scatter(
     counts: tuple[int, int],
     height_m: float,
 ) -> None:
-    """Some objects of a kind anywhere on a plot, turned anyhow; `counts` are the least and the
-    most.
+    """Put objects of one kind at random places and angles on a plot. `counts` are the minimum and
+    maximum number.
     """
     plot.scatter(
         int(plot.random.integers(*counts, endpoint=True)),

@@ -1,8 +1,8 @@
-"""Training of the small detector: the pictures, what its map should say of them, and the steps.
+"""Training of the small detector: the pictures, the targets of its map, and the optimiser steps.
 
-The same seed and pictures give the same weights on one machine. Centres are Gaussian bumps, as wide
-as the object; the boxes of all cells within a bump are held to the object's, each weighed by the
-bump: it is what makes training quick (TTFNet: Liu et al., AAAI 2020, arXiv 1909.00700).
+The same seed and pictures give the same weights on one machine. Centres are Gaussian bumps as wide
+as the object. All cells within a bump are trained on the object's box, weighted by the bump, which
+makes training quick (TTFNet: Liu et al., AAAI 2020, arXiv 1909.00700).
 """
 
 import math
@@ -25,18 +25,18 @@ from benchmarks.detector.network import STRIDE_PX, DetectorNetwork, decoded, ini
 from benchmarks.detector.scenes import synthetic_scene
 
 OVERSAMPLING = 3
-"""Scene pixels a pixel of a drawn picture."""
+"""Scene pixels per pixel of a drawn picture along each axis."""
 STREAM = 0x64726177
-"""Keeps the scenes of training apart from those that a study draws, whatever the seeds."""
+"""Seed word that separates the training scenes from those that a study draws, for any seed."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An image as the detector reads it, and what is on it.
+    """An image as the detector reads it, and the objects in it.
 
     Attributes:
         image: (3, H, W) uint8.
-        corners: (N, 4) float64, x1, y1, x2, y2 in its pixels, pixel i from i to i + 1.
+        corners: (N, 4) float64, x1, y1, x2, y2 in its pixels. Pixel i extends from i to i + 1.
         classes: (N,) int64.
     """
 
@@ -46,13 +46,13 @@ class Picture:
 
 
 def picture_of(rgb: np.ndarray, corners: np.ndarray, classes: np.ndarray) -> Picture:
-    """A picture of an image (3, H, W) float32 in [0, 1]."""
+    """Return a picture from an image (3, H, W) float32 in [0, 1]."""
     return Picture(np.rint(255 * rgb).astype(np.uint8), corners, classes)
 
 
 def drawn_picture(side_px: int, seed: int, number: int) -> Picture:
-    """The synthetic scene of a number as the reference sensor sees it, stretched by itself,
-    `side_px` a side.
+    """Simulate the synthetic scene with this number as the reference sensor sees it. The picture
+    has its own contrast stretch and is `side_px` pixels a side.
     """
     side = side_px * OVERSAMPLING
     sensor = Sensor.load(REFERENCE).nominal()
@@ -63,17 +63,17 @@ def drawn_picture(side_px: int, seed: int, number: int) -> Picture:
 
 
 SPREAD = 0.54
-"""TTFNet's alpha: half the width of a bump over half the object's."""
+"""TTFNet's alpha: half the width of a bump divided by half the width of the object."""
 LEAST_SIGMA = 0.35
-"""In cells: an object smaller than a cell is learnt in one."""
+"""The smallest sigma in cells. An object smaller than a cell is trained in one cell."""
 BOX_WEIGHT = 5.0
-"""Of the boxes' loss against that of the classes, as in TTFNet."""
+"""The weight of the box loss relative to the class loss, as in TTFNet."""
 
 
 @dataclass(frozen=True)
 class Targets:
-    """For a batch: bumps (N, classes, h, w) in [0, 1], boxes (N, 4, h, w) in input pixels, weights
-    (N, 1, h, w).
+    """The targets of a batch: bumps (N, classes, h, w) in [0, 1], boxes (N, 4, h, w) in input
+    pixels, and weights (N, 1, h, w).
     """
 
     bumps: Tensor
@@ -84,10 +84,10 @@ class Targets:
 def targets_of(
     corners: np.ndarray, classes: np.ndarray, count: int, height: int, width: int
 ) -> list[np.ndarray]:
-    """The targets of one image of height x width cells with boxes (N, 4) in its pixels: bumps,
-    boxes, weights.
+    """Return bumps, boxes and weights of one image of height x width cells with boxes (N, 4) in its
+    pixels.
 
-    Where two objects claim a cell, the smaller one has its box.
+    Where two objects claim a cell, the cell has the box of the smaller one.
     """
     bumps = np.zeros((count, height, width), np.float32)
     weights = np.zeros((1, height, width), np.float32)
@@ -110,8 +110,8 @@ def targets_of(
 
 
 def _bump(corners: np.ndarray, height: int, width: int) -> tuple[tuple[slice, slice], np.ndarray]:
-    """The cells around the centre of a box in cells, and the Gaussian there: 1 in the cell that
-    holds the centre.
+    """Return the slices of the cells around a box's centre, and the Gaussian there. The box is in
+    cells. The Gaussian is 1 in the cell that holds the centre.
     """
     middle = (corners[:2] + corners[2:]) / 2
     half = SPREAD * (corners[2:] - corners[:2]) / 2
@@ -127,12 +127,14 @@ def _bump(corners: np.ndarray, height: int, width: int) -> tuple[tuple[slice, sl
 
 
 def loss_of(output: Tensor, targets: Targets) -> tuple[Tensor, Tensor]:
-    """The losses of classes and boxes, () each, of a map (N, 4 + classes, h, w)."""
+    """Return the loss of the classes and the loss of the boxes, each of shape (), for a map (N, 4 +
+    classes, h, w).
+    """
     return focal_loss(output[:, 4:], targets.bumps), BOX_WEIGHT * box_loss(output[:, :4], targets)
 
 
 def focal_loss(logits: Tensor, bumps: Tensor) -> Tensor:
-    """CenterNet's penalty-reduced focal loss, over the number of objects."""
+    """Compute CenterNet's penalty-reduced focal loss, divided by the number of objects."""
     score = torch.sigmoid(logits)
     centre = bumps.eq(1)
     at_centre = (1 - score) ** 2 * functional.logsigmoid(logits) * centre
@@ -142,8 +144,8 @@ def focal_loss(logits: Tensor, bumps: Tensor) -> Tensor:
 
 
 def box_loss(boxes: Tensor, targets: Targets) -> Tensor:
-    """1 less the generalised overlap (GIoU: Rezatofighi et al., 2019, arXiv
-    1902.09630), weighed.
+    """Compute 1 minus the generalised IoU (GIoU: Rezatofighi et al., 2019, arXiv 1902.09630),
+    averaged by the weights.
     """
     centre, size = torch.tensor_split(decoded(boxes), 2, dim=1)
     corners = torch.cat([centre - size / 2, centre + size / 2], dim=1)
@@ -152,7 +154,7 @@ def box_loss(boxes: Tensor, targets: Targets) -> Tensor:
 
 
 def generalised_iou(one: Tensor, other: Tensor) -> Tensor:
-    """GIoU (N, 1, h, w) of boxes x1, y1, x2, y2 along dimension 1."""
+    """Compute the GIoU (N, 1, h, w) of boxes given as x1, y1, x2, y2 along dimension 1."""
     low = torch.maximum(one[:, :2], other[:, :2])
     high = torch.minimum(one[:, 2:], other[:, 2:])
     shared = (high - low).clamp(min=0).prod(1, keepdim=True)
@@ -167,16 +169,16 @@ def generalised_iou(one: Tensor, other: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class DetectorRecipe:
-    """How a detector is trained.
+    """The settings with which a detector is trained.
 
     Attributes:
-        steps: of the optimiser, AdamW.
-        batch: pictures a step.
-        learning_rate: at its height, behind a twentieth of the steps of warm-up and before a cosine
-            to zero.
-        weight_decay: AdamW's.
-        seed: of the weights, and of the order and the turning of the pictures.
-        precision: of the convolutions; the losses are in float32.
+        steps: the number of steps of the optimiser, AdamW.
+        batch: pictures per step.
+        learning_rate: the peak, after a warm-up over a twentieth of the steps and before a cosine
+            decay to zero.
+        weight_decay: the weight decay of AdamW.
+        seed: determines the weights, and the order, rotation and mirroring of the pictures.
+        precision: of the convolutions. The losses are computed in float32.
     """
 
     steps: int = 2000
@@ -187,7 +189,7 @@ class DetectorRecipe:
     precision: Literal["float32", "bfloat16"] = "float32"
 
     def rate_at(self, step: int) -> float:
-        """The learning rate of a step."""
+        """Return the learning rate of a step."""
         warm = max(self.steps // 20, 1)
         return self.learning_rate * min(
             (step + 1) / warm, 0.5 + 0.5 * math.cos(math.pi * step / self.steps)
@@ -200,19 +202,19 @@ def train_detector(
     recipe: DetectorRecipe,
     tick: Callable[[float], None] = lambda _: None,
 ) -> DetectorNetwork:
-    """Train a detector, each picture turned and mirrored anew at each visit.
+    """Train a detector. Each picture is rotated and mirrored at random whenever it is drawn.
 
     Args:
         pictures: all of one size, sides multiples of 8.
-        classes: how many there are.
-        recipe: the steps.
-        tick: called after each step with its loss.
+        classes: the number of classes.
+        recipe: the settings of the training.
+        tick: is called after each step with its loss.
 
     Returns:
-        The running average of the weights, in evaluation mode.
+        The network with the running average of the weights, in evaluation mode.
 
     Raises:
-        ModelError: the loss is no finite number.
+        ModelError: the loss is not finite.
     """
     network = DetectorNetwork(classes)
     initialise(network, torch.Generator().manual_seed(recipe.seed))
@@ -257,7 +259,9 @@ def _step(
 
 
 def _average(average: dict[str, Tensor], network: DetectorNetwork, step: int) -> None:
-    """Follow the weights fast at first, or the first random ones would stay for long."""
+    """Update the running average, fast at first. Otherwise the random initial weights would persist
+    for long.
+    """
     decay = min(0.998, (1 + step) / (10 + step))
     for name, value in network.state_dict().items():
         if value.is_floating_point():
@@ -267,7 +271,7 @@ def _average(average: dict[str, Tensor], network: DetectorNetwork, step: int) ->
 def _batch(
     pictures: Sequence[Picture], classes: int, count: int, generator: np.random.Generator
 ) -> tuple[Tensor, Targets]:
-    """Pictures drawn with replacement, each in one of the square's eight symmetries, a little
+    """Draw pictures with replacement, each in one of the square's eight symmetries and slightly
     lighter or darker.
     """
     batch = [
@@ -285,13 +289,13 @@ def _batch(
 
 
 def _lit(image: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """An image (3, H, W) uint8 as float32 in [0, 1], its curve bent by a power near 1."""
+    """Return an image (3, H, W) uint8 as float32 in [0, 1], raised to a random power near 1."""
     power = np.float32(math.exp(generator.normal(0, 0.1)))
     return np.asarray((image.astype(np.float32) / 255) ** power)
 
 
 def turned(picture: Picture, generator: np.random.Generator) -> Picture:
-    """A picture of equal sides in one of the square's eight symmetries, its boxes with it."""
+    """Return a square picture, with its boxes, in one of the square's eight symmetries."""
     image = picture.image
     corners = picture.corners
     height, width = image.shape[1:]

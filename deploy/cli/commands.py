@@ -1,4 +1,4 @@
-"""Which verbs are commands, and the entry of the program."""
+"""The verbs that are commands, and the entry point of the program."""
 
 import sys
 from collections.abc import Iterator, Mapping
@@ -64,7 +64,7 @@ def made(spelling: str) -> Any:
 
 
 class Commands(Mapping[str, Any]):
-    """The commands of Typer by spelling. Each is made when it is asked for: to make all of them
+    """The commands of Typer by spelling. Each one is made on demand, because making all of them
     takes a third of the time of `restore --help`.
     """
 
@@ -79,7 +79,9 @@ class Commands(Mapping[str, Any]):
 
 
 class Group(TyperGroup):
-    """Keeps standard output for the results document where it is asked for there."""
+    """A group that reserves standard output for the results document if the user asks for it
+    there.
+    """
 
     results_on_stdout = False
 
@@ -89,13 +91,13 @@ class Group(TyperGroup):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Note whether the results go to standard output."""
-        # Once parsed, Click keeps the words in an attribute that has another name in each of its
+        # After parsing, Click stores the words in an attribute whose name differs between its
         # versions.
         self.results_on_stdout = ("--json", "-") in pairwise(args) or "--json=-" in args
         return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the chosen command; output that was lost ends it with 70 when all is done."""
+        """Run the chosen command. If output was lost, exit with 70 at the end."""
         closed = sys.stdout is None
         with lasting_streams(self.results_on_stdout) as out:
             result = super().invoke(ctx)
@@ -126,7 +128,7 @@ def main(
         False, "-v", "--verbose", help="With --version: the system and the libraries too."
     ),
 ) -> None:
-    """Print the version or the help where no command is given."""
+    """Print the version, or the help if no command is given."""
     if version or context.invoked_subcommand is None:
         typer.echo(f"beers-deploy {__version__}" if version else context.get_help())
         for line in _installation() if version and verbose else ():

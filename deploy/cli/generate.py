@@ -59,13 +59,13 @@ class Command:
 
     @property
     def has_table(self) -> bool:
-        """True if the command writes results documents: all do but those that return a path."""
+        """True if the command writes results documents. All do, except those that return a path."""
         return inspect.signature(self.verb).return_annotation is not Path
 
     @property
     def help(self) -> str:
         """The text above the options: what the verb does."""
-        # Without a long description the parser leaves an empty line behind the short one.
+        # Without a long description the parser leaves an empty line after the short one.
         return (self.doc.description or "").strip()
 
 
@@ -76,7 +76,7 @@ def parameters_of(verb: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
 
 
 def generated(command: Command, run: Callable[..., None]) -> Callable[..., None]:
-    """Return a function that Typer makes a command of.
+    """Return a function that Typer turns into a command.
 
     Args:
         command: the verb, and how it is listed.
@@ -132,7 +132,7 @@ def _for_typer(parameter: inspect.Parameter, text: str) -> inspect.Parameter:
 
 
 def _default(parameter: inspect.Parameter, hint: Any, repeated: bool) -> Any:
-    """Return the default on the command line; empty of what must be given."""
+    """Return the default on the command line, or the empty default if the parameter is required."""
     written = marker(parameter, Written)
     if written is not None and written.required:
         return inspect.Parameter.empty
@@ -146,8 +146,8 @@ def _default(parameter: inspect.Parameter, hint: Any, repeated: bool) -> Any:
 def read_as(annotation: Any) -> tuple[Any, bool]:
     """Return the type that the command line reads a parameter as, and whether it may be repeated.
 
-    A type that only Python has, such as a mapping of limits, is a path or a text, whichever its
-    annotation names first.
+    A type that only Python has, such as a mapping of limits, is read as a path or a text, whichever
+    its annotation names first.
     """
     parts = list(parts_of(annotation))
     repeated = next((part for part in parts if get_origin(part) is Sequence), None)
@@ -160,7 +160,7 @@ def read_as(annotation: Any) -> tuple[Any, bool]:
 
 
 def spellings_of(parameter: inspect.Parameter) -> list[str]:
-    """Return the spellings of an option: a switch that is on by default is turned off by --no-."""
+    """Return the spellings of an option. A switch that is on by default is turned off by --no-."""
     name = option_of(parameter.name)
     if parameter.default is True:
         return [f"{name}/--no-{name[2:]}"]
@@ -170,17 +170,17 @@ def spellings_of(parameter: inspect.Parameter) -> list[str]:
 
 
 def option_of(name: str) -> str:
-    """Return the option of a parameter's name; `with_` stands for --with."""
+    """Return the option for a parameter name; `with_` stands for --with."""
     return f"--{name.rstrip('_').replace('_', '-')}"
 
 
 def metavar_of(parameter: inspect.Parameter) -> str:
-    """Return the name of an argument on the command line: capitals."""
+    """Return the name of an argument on the command line, in capitals."""
     return parameter.name.upper()
 
 
 def _completion(completed: Completed) -> Callable[[str], list[str]]:
-    """Return what completes names, and paths where no name fits."""
+    """Return a function that completes names, and paths if no name fits."""
 
     def complete(incomplete: str) -> list[str]:
         # Several names are separated by commas.
@@ -196,7 +196,7 @@ def _completion(completed: Completed) -> Callable[[str], list[str]]:
 
 
 PYTHON_SENTENCE = re.compile(r"\s*(?:\bIn Python\b[^.]*\.|; in Python\b[^.;]*)")
-"""A sentence, or a part behind a semicolon, that says what Python accepts too."""
+"""A sentence, or a part after a semicolon, that describes what Python accepts too."""
 
 
 def text_for_command(text: str, verb: Callable[..., Any]) -> str:
@@ -206,11 +206,11 @@ def text_for_command(text: str, verb: Callable[..., Any]) -> str:
 
 
 def in_options(text: str, verb: Callable[..., Any]) -> str:
-    """Return text with the parameters of a verb as the command line names them.
+    """Return the text with parameter names replaced by the options of the command line.
 
     Args:
-        text: has parameters in backquotes.
-        verb: whose parameters they are.
+        text: a text with parameters in backquotes.
+        verb: the function that has the parameters.
     """
     parameters = parameters_of(verb)
 

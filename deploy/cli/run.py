@@ -1,4 +1,4 @@
-"""A verb run as a command: what it returns is printed, and what ends it gets an exit code."""
+"""Run a verb as a command: print its result, and map errors to exit codes."""
 
 import logging
 import sys
@@ -40,7 +40,7 @@ def run(
 ) -> None:
     """Run a verb, print its result, and exit with 1 if a check failed.
 
-    What a user can correct ends it with 2, anything else with 70.
+    An error that the user can correct exits with 2, any other with 70.
     """
     try:
         with reporting(False if quiet else None), logged(command, quiet, verbose):
@@ -71,7 +71,9 @@ def _given(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _write_junit(command: Command, given: dict[str, Any], json: Path | None, message: str) -> None:
-    """Write why a gate could not judge to its JUnit file, if no output is refused."""
+    """Write the reason why a gate could not judge to its JUnit file, unless an output path is
+    refused.
+    """
     from beers_deploy.model.io.files import write_text
     from beers_deploy.verdict import junit_error
 
@@ -95,7 +97,9 @@ def _result(command: Command, options: dict[str, Any], json: Path | None) -> Any
 
 
 def table_of(result: Any) -> Any:
-    """Return the table of a result: itself, or what a network or a sensor found on the way."""
+    """Return the table of a result: the result itself, or the table attached to a network or
+    sensor.
+    """
     from beers_deploy.results import Table
 
     return result if isinstance(result, Table) else getattr(result, "table", None)
@@ -151,7 +155,7 @@ class Lines(logging.Handler):
         self._warned: set[str] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print a record; a warning says that it is one, and is printed once."""
+        """Print a record. Warnings are marked as such, and each is printed once."""
         # The names of files that are inserted into a message stay as they are.
         message = copy(record)
         message.msg = in_options(str(record.msg), self._command.verb)
@@ -170,7 +174,7 @@ class Lines(logging.Handler):
 
 
 def ending(error: BaseException, command: Command) -> tuple[str, int]:
-    """Return what is printed of an error that ends a command, and the exit code."""
+    """Return the message of an error that ends a command, and the exit code."""
     if isinstance(error, ImportError) and not isinstance(error, BeersError):
         error = missing_extra(error, command.name)
     if isinstance(error, BeersError):
@@ -184,8 +188,8 @@ def ending(error: BaseException, command: Command) -> tuple[str, int]:
 
 
 def _library_of(error: BaseException) -> list[str]:
-    """Return name and version of the library in which an error arose; nothing if it arose in this
-    program.
+    """Return the name and version of the library that raised an error, or nothing if this program
+    raised it.
     """
     from importlib.metadata import packages_distributions, version
 

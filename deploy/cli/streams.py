@@ -1,4 +1,4 @@
-"""Standard output and error of a command: a stream that breaks ends no run."""
+"""Standard output and standard error that do not end a run if they break."""
 
 import io
 import os
@@ -18,20 +18,21 @@ SCHEMA_NAME = "beers-deploy/results"
 """The same as in `deploy.results`, which is imported late."""
 
 HEAD_BYTES = 200
-"""Of a results document: it begins with the name of its schema."""
+"""Bytes of a results document in which the name of its schema appears."""
 
 STDOUT = Path("-")
-"""What --json takes for standard output; tables and notes then go to standard error."""
+"""The value of --json that stands for standard output. Tables and notes then go to standard
+error."""
 
 _results: ContextVar[TextIO | None] = ContextVar("results", default=None)
 
 
 class Stream:
-    """Standard output or error that ends no run: what cannot be written is left out, and `lost`
-    says why.
+    """Standard output or error that does not end a run. Text that cannot be written is dropped, and
+    `lost` states the reason.
 
-    A stream that was closed at the start takes everything and loses nothing, as nobody asked for
-    it.
+    A stream that was closed at the start accepts everything and loses nothing, because nobody asked
+    for its text.
     """
 
     def __init__(self, stream: Any) -> None:
@@ -42,7 +43,7 @@ class Stream:
             self.stream.reconfigure(errors="backslashreplace")
 
     def write(self, text: str) -> int:
-        """Write and flush, or leave it out."""
+        """Write the text and flush it, or drop it if that fails."""
         if not self.lost:
             try:
                 self.stream.write(text)
@@ -55,7 +56,7 @@ class Stream:
         return len(text)
 
     def flush(self) -> None:
-        """Do nothing: each write flushes."""
+        """Do nothing, because each write flushes."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.stream, name)
@@ -63,11 +64,11 @@ class Stream:
 
 @contextmanager
 def lasting_streams(results_on_stdout: bool) -> Iterator[Stream]:
-    """Replace the standard streams by lasting ones while a command runs, and return the output.
+    """Replace the standard streams by lasting ones while a command runs, and yield the output.
 
     Args:
-        results_on_stdout: whether standard output is for the results document alone: then all else
-            that is printed goes to standard error.
+        results_on_stdout: if True, standard output is for the results document alone, and
+            everything else that is printed goes to standard error.
     """
     out = Stream(sys.stdout)
     sys.stdout = cast(TextIO, out)
@@ -84,15 +85,15 @@ def lasting_streams(results_on_stdout: bool) -> Iterator[Stream]:
 
 
 def delete_results(path: Path, inputs: Iterable[Path]) -> None:
-    """Delete an older results document: it must not pass for the result of a run that is refused.
+    """Delete an older results document, so that it is not mistaken for the result of a refused run.
 
     Args:
-        path: of the document that will be written.
-        inputs: what the run reads.
+        path: the path of the document that will be written.
+        inputs: the files that the run reads.
 
     Raises:
-        OptionError: another file stands there, which a run may read without naming it, such as a
-            tile of an index.
+        OptionError: the path is an existing file of another kind. A run may read such a file
+            without naming it, for example a tile of an index.
     """
     from beers_deploy.model.io.files import require_writable
 
@@ -110,7 +111,7 @@ def delete_results(path: Path, inputs: Iterable[Path]) -> None:
 
 
 def save_results(table: "Table", path: Path | None) -> None:
-    """Write a table where --json asks for it: to a file, to standard output for `-`, or nowhere."""
+    """Write a table to the destination of --json: a file, standard output for `-`, or nowhere."""
     if path == STDOUT:
         (_results.get() or sys.stdout).write(table.to_json())
     elif path is not None:

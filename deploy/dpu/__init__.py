@@ -1,4 +1,4 @@
-"""The DPUCVDX8G from the outside: what it can run, where each node goes, how long it takes, at what
+"""A model of the DPUCVDX8G: what it can run, where each node goes, how long it takes, and at what
 power.
 
 - `board`: a configuration with its constants; `graph`: a network as the DPU sees it;

@@ -37,19 +37,17 @@ def boards_of(board: BoardLike | Sequence[BoardLike]) -> list[TargetProfile]:
 REQUIRED = ("cores", "batch_handlers", "cpb", "peak_tops")
 """Constants that every configuration must have."""
 SIZED = ("array", "memory", "elementwise")
-"""Tables whose constants a configuration may override, by their names, because a smaller array has
-smaller banks.
-"""
+"""Tables whose constants a configuration may override by name, because a smaller array has smaller
+banks."""
 
 
 @dataclass(frozen=True)
 class Dpu:
-    """A DPU configuration: C32B3 has 3 batch handlers, each of 32 AI engines and 32 output channels
-    at a time.
+    """A configuration of the DPU. C32B3, for example, has 3 batch handlers, each with 32 AI engines
+    and 32 output channels at a time.
 
-    A board may hold several cores of it, which share its memory and nothing else: three of the
-    ZCU102's B4096, each with one batch handler, run three images at once and load the weights three
-    times.
+    A board may have several cores, which share only its memory. The three of the ZCU102's B4096,
+    each with one batch handler, run three images at once and load the weights three times.
     """
 
     target: TargetProfile
@@ -63,22 +61,24 @@ class Dpu:
             name: {k: self.constants.get(k, v) for k, v in self.target.tables.get(name, {}).items()}
             for name in SIZED
         }
-        # A table that the target lacks stays away: rules ask which constants a target states.
+        # A table that the target lacks is left out, because rules check which constants exist.
         return {**self.target.tables, **{name: table for name, table in sized.items() if table}}
 
     @property
     def cores(self) -> int:
-        """Number of compute units, each with instructions, maps and weights of its own."""
+        """The number of compute units, each with its own instructions, feature maps and weights."""
         return int(self.constants["cores"].low)
 
     @property
     def handlers(self) -> int:
-        """Number of images that a core processes at once."""
+        """The number of images that a core processes at once."""
         return int(self.constants["batch_handlers"].low)
 
     @property
     def batch(self) -> int:
-        """Number of images that are processed at once: one for each batch handler of every core."""
+        """The number of images that are processed at once: one for each batch handler of every
+        core.
+        """
         return self.cores * self.handlers
 
     @property
@@ -88,19 +88,19 @@ class Dpu:
 
     @property
     def input_parallel(self) -> int:
-        """Number of input channels that a batch handler reads at a time."""
+        """The number of input channels that a batch handler reads at a time."""
         return self.whole("array", "input_channel_parallel")
 
     @property
     def output_parallel(self) -> int:
-        """Number of output channels that a batch handler computes at a time."""
+        """The number of output channels that a batch handler computes at a time."""
         return int(self.constants["cpb"].low)
 
     @property
     def engine_ops_per_s(self) -> float:
-        """Peak int8 operations a second of one batch handler; a multiply-accumulate counts as two.
+        """Peak int8 operations a second of one batch handler. A multiply-accumulate counts as two.
 
-        The configuration's peak is that of all cores together.
+        The peak of the configuration is that of all cores together.
         """
         return self.peak_ops_per_s / self.batch
 
@@ -111,13 +111,13 @@ class Dpu:
 
     @property
     def lane_steps_per_s(self) -> float:
-        """Values per second that an engine in programmable logic reads."""
+        """The number of values per second that an engine in programmable logic reads."""
         channels = self.value("elementwise", "channels_per_cycle")
         lanes = channels * self.value("elementwise", "pixels_per_cycle")
         return lanes * self.value("array", "pl_clock_hz")
 
     def limit(self, table: str, key: str) -> Constant:
-        """Return a constant with both ends of its range; a single limit is both."""
+        """Return a constant with both limits of its range. A single limit stands for both."""
         constant = self.tables.get(table, {}).get(key)
         return self.target.constant(table, key) if constant is None else constant
 
@@ -126,7 +126,7 @@ class Dpu:
         return self.limit(table, key).low
 
     def whole(self, table: str, key: str) -> int:
-        """Return the value of a constant that is a count."""
+        """Return the value of a constant that is a count, as an int."""
         return int(self.value(table, key))
 
 
@@ -144,7 +144,8 @@ def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
 
     Raises:
         OptionError: the board has no DPU.
-        ProfileError: no such configuration, or a profile that lacks a constant or its documents.
+        ProfileError: there is no such configuration, or the profile lacks a constant or its
+            documents.
     """
     if not profile.configurations:
         raise OptionError(

@@ -1,5 +1,5 @@
-"""A network as the DPU sees it: a short list of operations, whatever encoding its ONNX file is
-written in.
+"""A network as the DPU sees it: a short list of operations, independent of the encoding of its ONNX
+file.
 """
 
 from collections.abc import Mapping
@@ -18,10 +18,10 @@ CONVOLUTIONS = frozenset({"conv", "grouped conv", "depthwise", "transposed"})
 
 @dataclass(frozen=True)
 class Operation:
-    """One node: what it computes, on which activations, with which numbers.
+    """One node: the operation, the activations that it reads and writes, and its numbers.
 
-    `inputs` and `outputs` name activations; `integer` says that the file already computes it on
-    integers.
+    `inputs` and `outputs` name activations. `integer` is True if the file already computes the node
+    on integers.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Operation:
 
     @property
     def operations(self) -> int:
-        """int8 operations for one image: 2 kh kw ic oc h w, per group; 0 where no product is
+        """The int8 operations for one image: 2 kh kw ic oc h w, per group, or 0 if no products are
         summed.
         """
         if self.kind not in CONVOLUTIONS:
@@ -71,7 +71,7 @@ class Operation:
 
 @dataclass(frozen=True)
 class SizedGraph:
-    """Operations in order; the names and shapes of the inputs; the names of the outputs."""
+    """Operations in order, the names and shapes of the inputs, and the names of the outputs."""
 
     operations: tuple[Operation, ...]
     inputs: Mapping[str, Shape]

@@ -1,10 +1,10 @@
-"""From an ONNX file to the DPU's short list of operations, whichever of three encodings it uses.
+"""Convert an ONNX file to the DPU's short list of operations. Three encodings are supported.
 
 1. float: Conv, Relu, Add.
 2. integer kernels: QLinearConv, com.microsoft QLinearAdd, Relu (or Max with the zero point), float
-  host nodes around.
-3. QDQ: QuantizeLinear and DequantizeLinear around float operators. The pairs are notation: they are
-  dissolved, and only those at the border, which really convert, stay as operations.
+   host nodes around.
+3. QDQ: QuantizeLinear and DequantizeLinear around float operators. These pairs are notation and are
+   removed. Only those at the border, which really convert, remain as operations.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,27 +31,29 @@ BANK_REACHES = (
     np.outer([LARGEST, WIDE * LARGEST], 1 / BANK_GAINS).astype(np.float32).ravel().tolist()
 )
 BANK_ENDS = [[-reach, reach] for reach in BANK_REACHES]
-"""Of the planes, and of the analytic restoration, of a float network behind a bank, for each gain
-of a sensor.
+"""The clipping limits of the planes and of the analytic restoration in a float network behind a
+bank, for each gain of a sensor.
 """
 
 PLACE_MAX_PX = 64
-"""Beyond what any network rearranges: a place of more pixels is a damaged file."""
+"""The largest side of a place that is accepted. No network rearranges more pixels, so the file is
+damaged.
+"""
 
 
 def read_network(path: Path, tile_px: int | None = 640) -> SizedGraph:
-    """Read an ONNX file as a network for one image with sides of `tile_px`; None is the size that
-    it is fixed to.
+    """Read an ONNX file as a network for one image with sides of `tile_px`; if None, of the size
+    that it is fixed to.
 
-    The image is the whole network's: of a core that reads places of 2 x 2 pixels, planes have half
-    of its sides.
+    The image is that of the whole network. If a core reads places of 2 x 2 pixels, its planes have
+    half the sides of the image.
     """
     return network_of(load_onnx(path, to_run=False), tile_px, str(path))
 
 
 def own_tile_px(model: onnx.ModelProto) -> int | None:
-    """The side of the tile that a network is fixed to, in pixels of the image; None where it takes
-    any.
+    """Return the side of the tile that a network is fixed to, in pixels of the image, or None if it
+    accepts any.
     """
     dims = model.graph.input[0].type.tensor_type.shape.dim
     side = max((d.dim_value for d in dims[2:]), default=0)
@@ -62,8 +64,8 @@ def own_tile_px(model: onnx.ModelProto) -> int | None:
 
 
 def _places(model: onnx.ModelProto) -> tuple[int, int]:
-    """What a board's file says of its planes: a place's side in pixels, and how far they reach
-    beyond the image.
+    """Return what a board's file states about its planes: the side of a place in pixels, and how
+    far they extend beyond the image.
     """
     place_px, border_px = (
         int(metadata(model).get(key, least)) for key, least in ((PLACE_PX, 1), (BORDER_PX, 0))
@@ -76,7 +78,9 @@ def _places(model: onnx.ModelProto) -> tuple[int, int]:
 def network_of(
     model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model"
 ) -> SizedGraph:
-    """As `read_network`, of a model in memory; a host's file is read as the board gets it."""
+    """Convert a model in memory like `read_network`. A host's file is read as the board receives
+    it.
+    """
     model = as_on_board(model)
     if not model.graph.node:
         raise ModelError(
@@ -89,7 +93,7 @@ def network_of(
 
 
 def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str) -> dict[str, Shape]:
-    """The inputs of a file as it stands, by name: (C, H, W) in places, for a tile or as the file
+    """Return the inputs of a file as it is, by name: (C, H, W) in places, for a tile or as the file
     states them.
     """
     return _inputs(OnnxGraph(model), tile_px, _places(model), where)
@@ -105,9 +109,7 @@ def _inputs(
 
 
 class _Reader:
-    """Walks the nodes once, in their topological order, carrying shapes and
-    number formats along.
-    """
+    """Visits the nodes once in topological order, and propagates shapes and number formats."""
 
     def __init__(self, graph: OnnxGraph, inputs: dict[str, Shape]) -> None:
         self.graph = graph
@@ -117,7 +119,7 @@ class _Reader:
         self.integers = Integers(graph)
 
     def network(self) -> SizedGraph:
-        """The operations, the notation of quantisation dissolved."""
+        """Return the operations, without the notation of quantisation."""
         operations = tuple(chain.from_iterable(map(self._read, self.graph.nodes)))
         outputs = tuple(map(self.integers.resolve, self.graph.outputs))
         return SizedGraph(operations, self.inputs, outputs, self.integers.present)
@@ -158,8 +160,10 @@ class _Reader:
         )
 
     def _is_activation(self, node: Node) -> bool:
-        """max(q, zero point), the ReLU of integers; Clip from 0 to 6, ReLU6; and a bank's, where
-        int8 saturates.
+        """Return True for the activations of integer files and banks.
+
+        These are max(q, zero point), which is the ReLU of integers, Clip from 0 to 6, which is
+        ReLU6, and the Clip of a bank at the limits where int8 saturates.
         """
         constants = [
             value
@@ -176,7 +180,7 @@ class _Reader:
     def _constant_shape(
         self, node: Node, kind: Kind, inputs: Sequence[str]
     ) -> tuple[int, ...] | None:
-        """Shape of the constant operand of an element-wise operator."""
+        """Return the shape of the constant operand of an element-wise operator, or None."""
         if len(inputs) != 1 or (kind not in ("add", "mul") and node.op_type not in ("Sub", "Div")):
             return None
         value = self.integers.operand(node)
@@ -208,14 +212,15 @@ def _channels(
 def _input_shape(
     name: str, sizes: Sequence[int], tile_px: int | None, places: tuple[int, int], where: str
 ) -> Shape:
-    """(C, tile, tile) of an input (N, C, H, W), in places; without a tile (C, H, W) as the file
-    states them.
+    """Return (C, tile, tile) of an input (N, C, H, W), in places; without a tile (C, H, W) as the
+    file states them.
 
     Args:
-        name: the input's.
-        sizes: that the file states, 0 where it states none.
+        name: the name of the input.
+        sizes: the sizes that the file states, 0 where it states none.
         tile_px: side of the tile in pixels of the image.
-        places: a place's side in pixels, and how many of them the planes reach beyond the image.
+        places: the side of a place in pixels, and the number of pixels by which the planes extend
+            beyond the image.
         where: the file, in messages.
     """
     if len(sizes) != 4 or sizes[1] < 1:
@@ -256,5 +261,7 @@ def _input_shape(
 
 
 def _side_px(size: int, places: tuple[int, int]) -> int | str:
-    """A side of the image, from that of an input of such places; any where the file states none."""
+    """Return the side of the image from that of an input in places, or "any" if the file states
+    none.
+    """
     return size * places[0] - 2 * places[1] if size else "any"

@@ -1,4 +1,4 @@
-"""What kind of operation a node of an ONNX file is, and the shape of what it computes."""
+"""The kind of operation of an ONNX node, and the shape of its result."""
 
 from collections.abc import Mapping, Sequence
 from typing import Literal
@@ -57,7 +57,7 @@ WINDOWED = ("conv", "grouped conv", "depthwise", "transposed", "pool")
 
 
 def kind_of(node: Node, weight: np.ndarray | None) -> Kind:
-    """Return what a node is; convolutions are told apart by their weights."""
+    """Return the kind of a node. Convolutions are distinguished by their weights."""
     kind = KINDS.get(node.op_type, "other")
     if kind != "conv" or weight is None or node.attributes.get("group", 1) == 1:
         return kind
@@ -73,14 +73,14 @@ def out_shape(
     channels: int,
     constants: Mapping[str, np.ndarray],
 ) -> Shape | None:
-    """Return the shape (C, H, W) of a node's first result; None if it cannot be known.
+    """Return the shape (C, H, W) of a node's first result, or None if it cannot be inferred.
 
     Args:
         node: the node.
-        kind: what it computes.
+        kind: its kind of operation.
         shapes: of the tensors that it reads.
         kernel: of a convolution or pool.
-        window: how the kernel moves.
+        window: strides, pads and dilations of the kernel.
         channels: of a convolution's result.
         constants: the file's, for operators that read sizes from them.
     """
@@ -118,7 +118,7 @@ def _inferred(node: Node, inputs: list[Shape], constants: Mapping[str, np.ndarra
             types[name] = helper.make_tensor_type_proto(
                 helper.np_dtype_to_tensor_dtype(value.dtype), value.shape
             )
-            # Weights are longer, and say nothing of sizes.
+            # Weights are longer, and do not determine sizes.
             if value.size <= LIST_VALUES:
                 data[name] = numpy_helper.from_array(value)
         elif (shape := next(shapes, None)) is not None:

@@ -1,4 +1,4 @@
-"""What a board's engineer is handed.
+"""The kit that a board's engineer receives.
 
 - `board`: a board, and the folder that is written for it; `board_file`: the core of a network;
 - `golden`: what every layer must write; `golden_results`: what a board wrote, compared with that;

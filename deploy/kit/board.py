@@ -1,4 +1,4 @@
-"""A board, and the kit that its engineer is handed."""
+"""A board, and the kit for its engineer."""
 
 import json
 import logging
@@ -52,9 +52,9 @@ class Board(TargetProfile):
 
         `core.onnx` is the part that the DPU computes, fixed to a tile. `measure.py` times it there
         and writes `board.json`, which `bench` accepts as `measured`. `input.npy` and `expected.npy`
-        are one input of the core and what onnxruntime makes of it on this processor. `host.py` is
-        the host's part around it in plain NumPy, `golden` has what every layer must write, and
-        README.md says what to do there.
+        are one input of the core and its result from onnxruntime on this processor. `host.py` is
+        the host part in plain NumPy, and `golden` contains the expected output of every layer.
+        README.md explains what to do on the board.
 
         With a sensor, `host.py` takes the same steps around the network as `restore`: the
         consistency step, and for a shipped network the exposures, whose cores are `core-x4.onnx`
@@ -64,17 +64,17 @@ class Board(TargetProfile):
             int8: the network, quantised under this board's rules.
             out: the folder.
             tile: side of a tile in pixels.
-            record: whether a record of evidence is added: what the network is, and what `check`
-                says of it.
-            sensor: that acquires the images: a `Sensor`, a name or a .toml file. A shipped network
-                is conditioned on it; None is the middle of the sensors that it knows, and leaves
-                the steps around the network out.
+            record: whether to add a record of evidence: what the network is, and the result of
+                `check`.
+            sensor: the sensor that acquires the images: a `Sensor`, a name or a .toml file. A
+                shipped network is conditioned on it. None stands for the middle of the sensors that
+                the network supports, and omits the steps around the network.
 
         Raises:
-            MissingExtraError: a record, and cyclonedx-python-lib is not installed.
-            ModelError: a float network, or one that was not quantised under a DPU's rules here.
-            OptionError: a sensor that would change nothing.
-            ProfileError: no such sensor.
+            MissingExtraError: a record is requested, and cyclonedx-python-lib is not installed.
+            ModelError: the network is float, or was not quantised under a DPU's rules here.
+            OptionError: the sensor would change nothing.
+            ProfileError: there is no such sensor.
         """
         profile = None if sensor is None else Sensor.load(sensor)
         network = Network.load(int8, sensor=BLIND if profile is None else profile)
@@ -123,7 +123,7 @@ class Board(TargetProfile):
 
 
 def _write_example(core: Network, folder: Path) -> None:
-    """Write one input of a core, and what onnxruntime makes of it on this processor."""
+    """Write one input of a core, and the result of onnxruntime for it on this processor."""
     session = open_session(core.model)
     shape = [side if isinstance(side, int) else 1 for side in session.get_inputs()[0].shape]
     kind = np.int8 if "int8" in session.get_inputs()[0].type else np.float32

@@ -15,12 +15,12 @@ logger = logging.getLogger(__name__)
 def require_core_file(
     target: TargetProfile, path: Path | None, tile: int | None, inputs: Iterable[Path | None]
 ) -> None:
-    """Raise an error if a core cannot be written: of an NPU it needs a tile, and room for what its
-    compiler reads.
+    """Raise an error if a core cannot be written. The core of an NPU needs a tile, and its
+    compiler's files must be writable.
 
     Args:
-        target: whose encoding the core has.
-        path: of the core; None if none is written.
+        target: the board whose encoding the core has.
+        path: the path of the core; None if none is written.
         tile: side that it is fixed to, or None.
         inputs: files that are read, and may not be replaced.
     """
@@ -30,7 +30,7 @@ def require_core_file(
 
 
 def save_core(core: Network, path: Path, target: TargetProfile) -> None:
-    """Write a core for a board, and next to it what the compiler of an NPU reads."""
+    """Write a core for a board, and next to it the configuration for the compiler of an NPU."""
     core.save(path)
     logger.info("wrote %s: the same numbers in the board's encoding", path)
     if target.npu:

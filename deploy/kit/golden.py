@@ -1,7 +1,8 @@
-"""Golden vectors: what every layer of an INT8 network must write on a board.
+"""Golden vectors: the expected output of every layer of an INT8 network on a board.
 
 A folder holds the network (int8.onnx), golden.json and, for each case, its image and the int8
-tensors of all layers as .npy files (N, C, H, W), numbered in the order in which they are computed.
+tensors of all layers. These are .npy files (N, C, H, W), numbered in the order in which they are
+computed.
 """
 
 import hashlib
@@ -41,7 +42,7 @@ INDEX = "golden.json"
 NETWORK = "int8.onnx"
 PICTURE = "image.npy"
 SCENE_PX = 8
-"""Pixels of the drawn scene for one of an image."""
+"""Pixels of the drawn scene per pixel of an image, along each axis."""
 
 
 def write_golden(
@@ -57,7 +58,7 @@ def write_golden(
         int8: the network, quantised under a board's rules.
         out: the folder.
         tile: side of a tile in pixels; the network's own if it has one, else 64.
-        target: whose way to round ties is used.
+        target: the board whose rounding of ties is used.
     """
     network = Network.load(int8, int8=True)
     folder = Path(out)
@@ -105,8 +106,8 @@ def vectors_table(folder: Path) -> Table:
 
 
 def _remove_older(folder: Path) -> None:
-    """Delete the golden vectors that a folder holds: files of layers that are not written again
-    would stay.
+    """Delete the golden vectors in a folder. Otherwise files of layers that are not written again
+    would remain.
     """
     index = folder / INDEX
     if not index.is_file():
@@ -122,7 +123,7 @@ def _remove_older(folder: Path) -> None:
 
 
 def files_of(core: IntCore) -> dict[str, str]:
-    """The file of every tensor of a core, in the order in which they are computed."""
+    """Return the file name of every tensor of a core, in the order in which they are computed."""
     tensors = [PLANES, *(op.output for op in core.ops)]
     return {
         name: f"{k:02d}-{re.sub(r'[^A-Za-z0-9._-]+', '_', name)}.npy"
@@ -143,14 +144,14 @@ def _layers(core: IntCore, names: Mapping[str, str]) -> list[dict[str, object]]:
 
 
 EXTREMES = "extremes"
-"""The case whose planes are int8's ends in random order, which no image makes."""
+"""The case whose planes are -128 and 127 in random order, which no image produces."""
 CASES = ("scene", "noise", "steps", "black", "white", "odd", EXTREMES)
 
 
 def _images(
     network: Network, channels: int, tile: int | None, generator: np.random.Generator
 ) -> dict[str, np.ndarray]:
-    """The images (1, C, H, W) of the cases."""
+    """Return the images (1, C, H, W) of the cases, by name."""
     fixed_px = fixed_tile_px(network.model)
     alignment_px = fixed_px or network.tiling.alignment_px
     side = fixed_px or tile or -(-GOLDEN_TILE_PX // alignment_px) * alignment_px
@@ -179,7 +180,7 @@ def _images(
 
 
 def _scene(channels: int, rows: int, columns: int, generator: np.random.Generator) -> np.ndarray:
-    """A drawn scene (1, C, rows, columns) in [0, 1], each channel a little darker than the one
+    """Draw a scene (1, C, rows, columns) in [0, 1], each channel slightly darker than the one
     before.
     """
     # This loads SciPy, which no other case needs.
@@ -193,7 +194,7 @@ def _scene(channels: int, rows: int, columns: int, generator: np.random.Generato
 
 
 def save_array(path: Path, values: np.ndarray) -> None:
-    """Write an array as .npy, whole or not at all."""
+    """Write an array as .npy, atomically."""
     with whole_file(path) as temporary, temporary.open("wb") as stream:
         np.save(stream, values)
 
@@ -204,12 +205,12 @@ def _digest(values: np.ndarray) -> str:
 
 @dataclass(frozen=True)
 class Golden:
-    """A folder of golden vectors, read.
+    """A folder of golden vectors that was read.
 
     Attributes:
-        core: the network's integers.
-        half_even: how ties are rounded.
-        cases: every sound tensor of each case.
+        core: the network's integer core.
+        half_even: True if ties are rounded to even.
+        cases: every golden tensor of each case.
         network: name and digest of the network's file in the folder.
     """
 
@@ -220,12 +221,11 @@ class Golden:
 
 
 def read_golden(folder: Path) -> Golden:
-    """Read a folder that `write_golden` made; its tensors are computed again and compared with
-    their digests.
+    """Read a folder that `write_golden` wrote. Its tensors are recomputed and compared with their
+    digests.
 
     Raises:
-        OptionError: a folder without an index, with a damaged one, or with other numbers than were
-            written.
+        OptionError: the folder has no index, a damaged one, or other numbers than were written.
     """
     digests, half_even = _index(folder / INDEX)
     network = Network.load(folder / NETWORK)
@@ -258,13 +258,13 @@ AGAIN = "Write the folder again with 'beers-deploy golden'."
 
 
 def _index(path: Path) -> tuple[dict[str, dict[str, str]], bool]:
-    """Return the digests of the files of each case, and whether ties were rounded to even."""
+    """Return the digests of the files of each case, and True if ties were rounded to even."""
     try:
         document: Any = read_json(path)
         if (document["schema"], document["schema_version"]) != (SCHEMA, SCHEMA_VERSION):
             raise ValueError(f"the schema {document['schema']}")
         digests = {str(case): dict(files) for case, files in document["cases"].items()}
-        # A case is a folder beside the index: another path would lead to files that nobody named.
+        # A case is a folder next to the index. Another path would lead to files that nobody named.
         foreign = [case for case in digests if case in ("", ".", "..") or set(case) & set("/\\:")]
         if foreign:
             raise ValueError(f"the case {foreign[0]!r}")

@@ -1,7 +1,8 @@
-"""What a board wrote, compared with golden vectors: the first layer that differs, how much, where.
+"""Compare a board's results with golden vectors: the first layer that differs, by how much, and
+where.
 
-The results are files of the golden vectors' names in folders of their cases' names, as many of them
-as the board can hand out. What a pattern usually means: docs/how-to/board.md.
+The results are files with the golden vectors' names, in folders with their cases' names, as many as
+the board can return. docs/how-to/board.md explains what a pattern usually means.
 """
 
 import os
@@ -21,30 +22,33 @@ from beers_deploy.results import Table
 
 @dataclass(frozen=True)
 class Written:
-    """One tensor in one case, (N, C, H, W) int16: what is sound, and what a board wrote."""
+    """One tensor in one case, (N, C, H, W) int16: the golden values, and those that a board
+    wrote.
+    """
 
     sound: np.ndarray
     board: np.ndarray
 
     @property
     def differs(self) -> np.ndarray:
-        """Which values differ, (N, C, H, W)."""
+        """A mask of the values that differ, (N, C, H, W)."""
         return np.asarray(self.sound != self.board)
 
 
 Results = Mapping[str, list[Written]]
-"""What a board wrote of each tensor that it handed out, in the order in which they are computed: an
+"""The values that a board wrote for each tensor, in the order in which they are computed, with one
 entry for each case.
 """
 
 
 def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[str]) -> Table:
-    """Compare what a board wrote with golden vectors. The table is false if a layer differs.
+    """Compare the results of a board with golden vectors. The table is false if a layer differs.
 
     Args:
-        folder: of the golden vectors.
-        results: folders of the cases' names with files of the layers' names, any of them: int8,
-            uint8 around 128, or float multiples of the tensor's scale; channels first, or last.
+        folder: the folder of the golden vectors.
+        results: folders with the cases' names that contain files with the layers' names, any of
+            them. Values are int8, uint8 around 128, or float multiples of the tensor's scale, with
+            the channels first or last.
     """
     golden = read_golden(Path(folder))
     results_folder = Path(results)
@@ -67,7 +71,7 @@ def compare_golden(folder: str | os.PathLike[str], results: str | os.PathLike[st
 
 
 def _results(golden: Golden, folder: Path) -> Results:
-    """Read what a board wrote; raise OptionError for a file that is no result."""
+    """Read the results of a board. Raise OptionError for a file that is not a result."""
     files = files_of(golden.core)
     paths = [path for path in folder.glob("*/*.npy") if path.name != PICTURE]
     unknown = [
@@ -91,7 +95,7 @@ def _results(golden: Golden, folder: Path) -> Results:
 
 
 def _integers(path: Path, shape: tuple[int, ...], frac_bits: int) -> np.ndarray:
-    """Read what a board wrote of a tensor, as int16 (N, C, H, W)."""
+    """Read a tensor that a board wrote, as int16 (N, C, H, W)."""
     values = read_array(path)
     if (
         values.shape != shape
@@ -131,10 +135,10 @@ def _layer(core: IntCore, name: str) -> str:
 
 
 def _unseen_before(core: IntCore, name: str, outputs: Collection[str]) -> int:
-    """Return how many operations lie between a tensor and those that a board handed out."""
+    """Return the number of operations between a tensor and those that a board returned."""
     needed = {name}
     count = 0
-    # From the last operation back, until every path ends at a tensor that was handed out.
+    # Go back from the last operation until every path ends at a tensor that was returned.
     for op in reversed(core.ops):
         if op.output in needed and (op.output == name or op.output not in outputs):
             needed |= set(op.inputs)
@@ -143,7 +147,7 @@ def _unseen_before(core: IntCore, name: str, outputs: Collection[str]) -> int:
 
 
 def _row(core: IntCore, name: str, cases: list[Written]) -> Row:
-    """Return share and size of the differences of a layer, and where they lie."""
+    """Return the share and size of the differences of a layer, and where they lie."""
     # Differences of uint8 or int8 would wrap around, so the tensors are int16.
     errors = [np.abs(case.board - case.sound) for case in cases]
     values = sum(error.size for error in errors)
@@ -158,7 +162,7 @@ def _row(core: IntCore, name: str, cases: list[Written]) -> Row:
 
 
 def where(differs: np.ndarray) -> str:
-    """Return where in tiles (N, C, H, W) values differ: nowhere (""), in one channel, along the
+    """Return where values of tiles (N, C, H, W) differ: nowhere (""), in one channel, along the
     border, in some rows or columns, or everywhere.
     """
     if not differs.any():

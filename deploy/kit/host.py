@@ -1,19 +1,21 @@
 #!/usr/bin/env python3
-"""The host's part of a network on a board: python3 host.py image.npy restored.npy, float32 (C, H,
-W) as the network reads them, in [0, 1] unless host.json has other factors.
+"""Run the host part of a network on a board.
 
-The script needs NumPy, host.json and, for the cores, onnxruntime. On a board, replace the runners
-in `cores`.
+    python3 host.py image.npy restored.npy
+
+Images are float32 (C, H, W) as the network reads them, in [0, 1] unless host.json has other
+factors. The script needs NumPy, host.json and, for the cores, onnxruntime. On a board, replace the
+runners in `cores`.
 
 1. Each tile goes to one core or several (`factors`, `exposed`): core.onnx restores the tile as it
-  is. Where host.json has exposures, core-x4.onnx restores the dark pixels of a tile that was
-  multiplied by 4, and so on.
+   is. Where host.json has exposures, core-x4.onnx restores the dark pixels of a tile that was
+   multiplied by 4, and so on.
 2. Around a core (`restored`), the host encodes the tile as int8 planes, decodes the core's result
-  and adds it to the tile.
+   and adds it to the tile.
 3. After the last tile, the consistency step (`consistent`) makes the restored image agree with the
-  raw one at low spatial frequencies, if host.json has its weights.
-4. Then the self-check (`judged`) blurs it as the sensor blurs and compares it with the raw image,
-  block by block. restored-check.npy holds its two figures of each block.
+   raw one at low spatial frequencies, if host.json has its weights.
+4. Then the self-check (`judged`) blurs the result as the sensor blurs and compares it with the raw
+   image, block by block. restored-check.npy holds its two figures of each block.
 """
 
 from __future__ import annotations
@@ -29,14 +31,14 @@ import numpy as np
 F = np.float32
 CHECK = 64
 CLOSE = 16
-"""Pixels: the side of a block of the self-check, and how close to a saturated pixel or the border
-none counts.
+"""Pixels: the side of a block of the self-check (CHECK), and the distance (CLOSE) from a saturated
+pixel or the border within which no pixel counts.
 """
 HERE = Path(__file__).parent
 BLOCK = 8
 NEAR = 8
-"""Pixels: the side of a block of the consistency step, and the radius of the
-near part of its blur.
+"""Pixels: the side of a block of the consistency step (BLOCK), and the radius of the near part of
+its blur (NEAR).
 """
 S = json.loads((HERE / "host.json").read_text(encoding="utf-8"))
 UNITS = {1: S["unit"], **{int(factor): unit for factor, unit in S["exposures"].items()}}
@@ -78,7 +80,7 @@ def encoded(image: np.ndarray) -> np.ndarray:
 
 
 def plain(value: np.ndarray) -> np.ndarray:
-    """Return the only copy of a result."""
+    """Return the only copy of a result unchanged."""
     return value
 
 
@@ -93,7 +95,7 @@ def dual_range(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
 
 
 def offset_windows(coarse: np.ndarray, *windows: np.ndarray) -> np.ndarray:
-    """Choose the last window that holds a value, and the coarse copy where none does."""
+    """Choose the last window that contains a value, and the coarse copy if none does."""
     value = coarse * F(S["gain"])
     for window, offset in zip(windows, S["offsets"]):  # noqa: B905 - a board's Python may be old
         value = np.where(fits(window), window + np.array(offset, F)[:, None, None], value)
@@ -115,7 +117,9 @@ DECODINGS: dict[str, Any] = {
     "offset windows": offset_windows,
     "bank sum": bank_sum,
 }
-"""How the copies that a core writes of each channel become one value, by the name in host.json."""
+"""The functions that decode the copies that a core writes of each channel, by the name in
+host.json.
+"""
 
 
 def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
@@ -138,9 +142,9 @@ def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
 def exposed(factor: int, image: np.ndarray, run: Any) -> np.ndarray:
     """Restore a tile at the exposure of a factor.
 
-    1. Multiply the light of the tile by the factor. The dark offset is no light and stays.
+    1. Multiply the light of the tile by the factor. The dark offset is not light and stays.
     2. Restore the tile by the core of that factor.
-    3. Divide the light again.
+    3. Divide the light by the factor again.
     """
     if factor == 1:
         return restored(image, run, UNITS[1])
@@ -184,8 +188,8 @@ def brightest_around(pixels: np.ndarray, radius: int) -> np.ndarray:
 def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return x + G (raw - H x) of one band (H, W), clipped to [0, 1].
 
-    H is the sensor's blur relative to the reference. G takes the means of blocks and interpolates
-    between their centres, which keeps low spatial frequencies only.
+    H is the sensor's blur relative to the reference. G computes the means of blocks and
+    interpolates between their centres, which retains only low spatial frequencies.
     """
     rows, columns, far, means, excess = (
         np.array(S["consistency"][name], F)
@@ -217,8 +221,8 @@ def judged(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return two figures (2, n, m) of each block of CHECK pixels a side of one band (H, W).
 
     The first is chi2, the mean of (raw - H x)^2 / variance of the noise. The second is the mean of
-    (x - H x)^2 / variance, which tells whether a wrong restoration would show. Both are NaN where
-    too few pixels count.
+    (x - H x)^2 / variance, which shows whether a wrong restoration would be detected. Both are NaN
+    where too few pixels count.
     """
     facts = S["self_check"]
     kernel = np.array(facts["rows"], F).T @ np.array(facts["columns"], F)
@@ -246,7 +250,9 @@ def judged(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def report(blocks: np.ndarray) -> str:
-    """Say how many blocks (bands, 2, n, m) contradict the raw image."""
+    """Return a sentence with the number of blocks (bands, 2, n, m) that contradict the raw
+    image.
+    """
     facts = S["self_check"]
     chi2 = blocks[:, 0]
     sharpening = blocks[:, 1]
@@ -323,10 +329,11 @@ def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
     Args:
         size: of the image along the side, in pixels.
         tile: side of a tile in pixels.
-        halo: pixels at an inner border of a tile that are not kept.
+        halo: pixels at an inner border of a tile that are discarded.
 
     Returns:
-        For each tile its start, and the start and end (excluded) of its kept pixels, in the image.
+        For each tile its start, and the start and end (excluded) of its retained pixels, in the
+        image.
     """
     starts = [*range(0, size - tile, tile - 2 * halo), size - tile]
     return [
@@ -372,7 +379,9 @@ def main(source: str, target: str, runs: dict[int, Any]) -> None:
 
 
 def cores() -> dict[int, Any]:
-    """Open the core of each factor in onnxruntime: what a board's own runners replace."""
+    """Open the core of each factor in onnxruntime. On a board, replace this by the board's own
+    runners.
+    """
     import onnxruntime as ort
 
     # onnxruntime's fused kernels may saturate.

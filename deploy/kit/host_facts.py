@@ -1,5 +1,5 @@
-"""What `host.py` must know of a network: its pre- and post-processing, its exposures and the
-consistency step.
+"""The facts about a network that `host.py` needs: its pre- and post-processing, its exposures and
+the consistency step.
 """
 
 from collections.abc import Mapping
@@ -26,17 +26,16 @@ def host_facts(
     sensor: Sensor | None = None,
     brighter: Mapping[int, Network] | None = None,
 ) -> Facts | None:
-    """Return the content of host.json; None for a network whose host part is not what `host.py`
-    computes.
+    """Return the content of host.json, or None if `host.py` cannot compute the network's host part.
 
     Args:
         network: in INT8.
         tile_px: side of a tile.
-        sensor: that acquires the images; None leaves the steps around the network out.
+        sensor: the sensor that acquires the images; None omits the steps around the network.
         brighter: the network for higher exposures, by factor.
 
     Raises:
-        OptionError: a sensor that would change nothing.
+        OptionError: the sensor would change nothing.
     """
     facts = host_constants(network, tile_px)
     others = brighter or {}
@@ -55,11 +54,11 @@ def host_facts(
 
 
 def host_constants(network: Network, tile_px: int) -> Facts | None:
-    """Return the constants of the host's part around one core.
+    """Return the constants of the host part around one core.
 
     Returns:
-        None for a network whose result is no image, or whose pixels are rearranged in another way
-            than in `host.py`.
+        None if the network's result is not an image, or if its pixels are rearranged in another way
+        than in `host.py`.
     """
     core = read_core(network.model)
     part = core.host_part
@@ -97,8 +96,8 @@ def host_constants(network: Network, tile_px: int) -> Facts | None:
 
 
 def _unit(facts: Facts, brighter: Network, tile_px: int) -> object:
-    """Return the unit of the network for another exposure, in which nothing else of the host's part
-    may differ.
+    """Return the unit of the network for another exposure. Nothing else of the host part may
+    differ.
     """
     own = host_constants(brighter, tile_px)
     assert own is not None  # noqa: S101 - the same network for another sensor
@@ -107,8 +106,8 @@ def _unit(facts: Facts, brighter: Network, tile_px: int) -> object:
 
 
 def exposure_facts(sensor: Sensor | None, units: Mapping[str, object]) -> Facts:
-    """Return the unit of each factor above 1, and what decides which factor a pixel gets; shares of
-    full scale.
+    """Return the unit of each factor above 1, and the constants that decide which factor a pixel
+    gets, as shares of full scale.
     """
     instrument = None if sensor is None or sensor.name == BLIND else sensor.nominal()
     offset = instrument.offset_dn / instrument.max_dn if instrument else 0.0
@@ -116,7 +115,9 @@ def exposure_facts(sensor: Sensor | None, units: Mapping[str, object]) -> Facts:
 
 
 def self_check_facts(sensor: Sensor) -> Facts:
-    """Return what the self-check needs of a sensor for pixels that are shares of full scale."""
+    """Return the sensor's constants for the self-check, for pixels that are shares of full
+    scale.
+    """
     check = SelfCheck.of(sensor.nominal(), sensor.reference.nominal(), full_scale=1.0)
     return {
         "rows": check.rows.tolist(),
@@ -132,7 +133,7 @@ def consistency_facts(network: Network, sensor: Sensor) -> Facts | None:
 
     Returns:
         None if no sensor is known, or if the network changes the grid of pixels or bands: `restore`
-            leaves the step out there too. A network of another range than [0, 1] has none either.
+        omits the step there too. A network of another range than [0, 1] has none either.
     """
     tiling = network.tiling
     if sensor.name == BLIND or not keeps_pixels(tiling) or network.input_ranges:

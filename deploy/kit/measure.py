@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
-"""Measure a network on a board, and write what `beers-deploy bench --measured board.json` reads.
+"""Measure a network on a board, and write the file that `beers-deploy bench --measured board.json`
+reads.
 
-Needs Python 3.8, numpy and onnxruntime with the board's execution provider; nothing of
+The script needs Python 3.8, numpy and onnxruntime with the board's execution provider, but not
 beers-deploy. Copy this file and the model to the board, then:
 
     python3 measure.py core.onnx --provider VitisAIExecutionProvider \
@@ -34,7 +35,9 @@ LATENCY_CALLS = 20
 
 
 def main() -> int:
-    """Open, compare, measure, write; 0 when done, 2 for what the user can correct."""
+    """Open, compare, measure and write. Return 0 when done, and 2 for an error that the user can
+    correct.
+    """
     options = arguments()
     try:
         entry = measure(options)
@@ -47,7 +50,7 @@ def main() -> int:
 
 
 def arguments() -> argparse.Namespace:
-    """What the user asks for."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -74,7 +77,7 @@ def arguments() -> argparse.Namespace:
 
 
 def measure(given: argparse.Namespace) -> dict[str, object]:
-    """One run, as an entry of the list."""
+    """Measure one run, and return it as an entry of the list."""
     session = open_session(
         given.model, given.provider, dict(option.split("=", 1) for option in given.option)
     )
@@ -103,10 +106,10 @@ def measure(given: argparse.Namespace) -> dict[str, object]:
 
 
 def open_session(model: Path, provider: str, options: dict[str, str]) -> ort.InferenceSession:
-    """A session that really runs on the provider.
+    """Open a session that really runs on the provider.
 
     Raises:
-        ValueError: the provider is not there, or onnxruntime fell back to another.
+        ValueError: the provider is not available, or onnxruntime fell back to another.
     """
     if provider not in ort.get_available_providers():
         raise ValueError(
@@ -125,8 +128,8 @@ def open_session(model: Path, provider: str, options: dict[str, str]) -> ort.Inf
 
 
 def make_feed(session: ort.InferenceSession, batch: int, tile_px: int) -> dict[str, np.ndarray]:
-    """Noise that survives quantisation unchanged: multiples of 2^-7, or int8 itself; the same at
-    every run.
+    """Return noise that quantisation leaves unchanged: multiples of 2^-7, or int8 itself. It is the
+    same in every run.
     """
     random = np.random.default_rng(0)
     feed = {}
@@ -146,8 +149,8 @@ def make_feed(session: ort.InferenceSession, batch: int, tile_px: int) -> dict[s
 
 
 def compare(model: Path, session: ort.InferenceSession, feed: dict[str, np.ndarray]) -> None:
-    """Print how far the outputs lie from the CPU provider's: what compiles may still compute other
-    numbers.
+    """Print how much the outputs differ from the CPU provider's. A model that compiles may still
+    compute other values.
     """
     expected = ort.InferenceSession(str(model), providers=["CPUExecutionProvider"]).run(None, feed)
     for tensor, ours, reference in zip(session.get_outputs(), session.run(None, feed), expected):  # noqa: B905
@@ -165,8 +168,8 @@ def run_threads(
     threads: int,
     power_files: list[Path],
 ) -> tuple[list[float], list[float]]:
-    """When each of so many calls ended, in seconds, several in flight at a time; and watts
-    meanwhile.
+    """Run `calls` calls, several at a time. Return the time at which each ended, in seconds, and
+    the power in watts meanwhile.
     """
     stamps: list[float] = []
     # All threads share this iterator: one step of it is not interrupted by another thread.
@@ -190,10 +193,11 @@ def run_threads(
 
 
 def throughput(stamps: list[float], batch: int) -> float:
-    """Frames a second: (N - 1) / (t_N - t_1) calls, free of the latency of the first.
+    """Return the frames per second: (N - 1) / (t_N - t_1) calls, which excludes the latency of the
+    first.
 
     Raises:
-        ValueError: fewer than two calls.
+        ValueError: there are fewer than two calls.
     """
     if len(stamps) < 2:
         raise ValueError(
@@ -203,7 +207,7 @@ def throughput(stamps: list[float], batch: int) -> float:
 
 
 def write_entry(entry: dict[str, object], path: Path) -> None:
-    """Add a run to the list in a file."""
+    """Add a run to the list in a JSON file."""
     runs = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
     if not isinstance(runs, list):
         raise ValueError(

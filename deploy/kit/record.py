@@ -41,11 +41,11 @@ LIMITATIONS = (
     ),
 )
 BULKY = {KEY, SENSOR_BIASES}
-"""Of what a file says of itself: numbers, not words."""
+"""Metadata of a file that holds long lists of numbers, which the record omits."""
 
 
 def recorded(folder: Path) -> list[Path]:
-    """Return the files of a record."""
+    """Return the paths of the files of a record."""
     return [folder / name for name in RECORD]
 
 
@@ -59,14 +59,13 @@ def require_library() -> None:
 def write_record(
     judged: Table, network: Network, sensor: Sensor, folder: Path, floating: Network | None = None
 ) -> None:
-    """Write what is known of a network, and what a verb found of it, as JSON, a page and CycloneDX
-    1.6.
+    """Write a record of a network, with the result of a verb, as JSON, a page and CycloneDX 1.6.
 
     Args:
         judged: figures and checks, with the inputs that they rest on.
-        network: the INT8 network that they speak of.
-        sensor: that it is conditioned on.
-        folder: of the three files.
+        network: the INT8 network that they describe.
+        sensor: the sensor that it is conditioned on.
+        folder: the folder of the three files.
         floating: the float network that it was compared with.
     """
     record = record_of(judged, network, sensor, floating)
@@ -79,10 +78,10 @@ def write_record(
 def record_of(
     judged: Table, network: Network, sensor: Sensor, floating: Network | None = None
 ) -> dict[str, Any]:
-    """Return the record as one document; what is not known is null.
+    """Return the record as one document, in which unknown values are null.
 
-    The INT8 file may claim anything: its claims stand under "says". Weights, their training, their
-    licence and the range of sensors that they were trained on are stated only where the weights are
+    The INT8 file may claim anything: its claims are under "says". Weights, their training, their
+    licence and the range of sensors that they were trained on are stated only if the weights are
     verified.
     """
     about = metadata(network.model)
@@ -109,9 +108,7 @@ def record_of(
 
 
 def _has_family(network: Network) -> bool:
-    """Return True if the file holds what conditions it on other sensors; a damaged one conditions
-    it on none.
-    """
+    """Return True if the file can be conditioned on other sensors. A damaged file cannot."""
     try:
         return conditioned_core(network.model) is not None
     except ModelError:
@@ -119,7 +116,7 @@ def _has_family(network: Network) -> bool:
 
 
 def code_sha256() -> str:
-    """Return the SHA-256 of all sources of this package, names and bytes in their order."""
+    """Return the SHA-256 of all sources of this package: their names and bytes, in order."""
     root = Path(__file__).parents[1]
     digest = hashlib.sha256()
     # In this order and with these slashes the digest is the same on every system.
@@ -130,7 +127,7 @@ def code_sha256() -> str:
 
 def _verified_weights(network: Network, sensor: Sensor, floating: Network | None) -> Path | None:
     """Return the shipped weights that an INT8 file claims, if its float network or its integers are
-    made of them.
+    derived from them.
     """
     claimed = metadata(network.model).get(WEIGHTS)
     name = next(
@@ -175,8 +172,8 @@ def _page(judged: Table, record: dict[str, Any]) -> Report:
     )
 
 
-def bill_of(said: dict[str, Any]) -> str:
-    """A bill of materials in CycloneDX 1.6; the library has no model cards yet, so facts are
+def bill_of(document: dict[str, Any]) -> str:
+    """Return a bill of materials in CycloneDX 1.6. The library has no model cards yet, so facts are
     properties.
     """
     from cyclonedx.model import HashAlgorithm, HashType, Property
@@ -193,12 +190,12 @@ def bill_of(said: dict[str, Any]) -> str:
             type=kind, name=text, bom_ref=f"{kind.value}:{text}:{digest}", hashes=hashes, **more
         )
 
-    network = said["network"]
-    tool = said["tool"]
-    # A serial number made of the content gives the same record the same number.
-    bom = Bom(serial_number=uuid5(NAMESPACE_URL, json.dumps(said)))
-    facts = said["says"] | {
-        key: said[key]
+    network = document["network"]
+    tool = document["tool"]
+    # The serial number is derived from the content, so the same record has the same number.
+    bom = Bom(serial_number=uuid5(NAMESPACE_URL, json.dumps(document)))
+    facts = document["says"] | {
+        key: document[key]
         for key in ("training", "sensors_in_range", "limitations", "passed", "licence")
     }
     properties = [
@@ -215,7 +212,7 @@ def bill_of(said: dict[str, Any]) -> str:
     bom.metadata.tools.components.add(maker)
     files = [
         component(ComponentType.FILE, entry["name"], entry["sha256"])
-        for entry in said["results"]["inputs"]
+        for entry in document["results"]["inputs"]
     ]
     bom.components.update(files)
     bom.register_dependency(bom.metadata.component, files)

@@ -1,5 +1,7 @@
 """Reports: one self-contained HTML file, pictures embedded, every number with its mode.
 
 - `page` renders figures, tables and pictures; `plots` draws with matplotlib;
-- `sensitivity_page` says what stands on the page of `quantize --report`.
+- `sensitivity_page` composes the page of `quantize --report`;
+- `view` shows a restored image and its raw one, from the pictures of `view_layers`; OpenSeadragon
+  draws them. `openseadragon/` contains it unchanged, with its licence.
 """

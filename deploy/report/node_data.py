@@ -7,17 +7,17 @@ from beers_deploy.profiles.figures import Row
 
 SHARE = "share of squared error"
 GRADIENT = [{"stop": 0, "bgColor": "#ffffff"}, {"stop": 1, "bgColor": "#d73027"}]
-"""From the smallest value to the largest."""
+"""Colours from the smallest value to the largest."""
 
 
 def node_data(layers: Iterable[Row]) -> str:
     """Return the share of the squared error of each node as JSON of one graph.
 
-    The nodes of the float network, of the host's and of the board's file have the layers' names, so
+    The nodes in the float network, the host's file and the board's file have the layers' names, so
     the same JSON colours all three.
 
     Args:
-        layers: rows of layers in int8 by themselves; others are left out.
+        layers: rows with a single layer in int8; other rows are left out.
 
     Returns:
         JSON text as Model Explorer reads it, with the shares in percent by the node's name.

@@ -1,6 +1,4 @@
-"""Render a report: tables of rows and pictures, in one HTML file that asks the
-network for nothing.
-"""
+"""Render a report: tables of rows and pictures, in one HTML file that needs no network access."""
 
 import re
 from collections.abc import Sequence
@@ -19,7 +17,8 @@ from beers_deploy.tables.columns import columns_of, missing, words_of
 INTERVAL = re.compile(r"\[[^\[\]]*\]")
 
 
-def _template() -> jinja2.Template:
+def template(name: str) -> jinja2.Template:
+    """Return a template of this folder, which escapes the values inserted into it."""
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     # A name that the template misspells raises an error instead of writing nothing.
     strict = jinja2.StrictUndefined
@@ -34,7 +33,7 @@ def _template() -> jinja2.Template:
         finalize=_shown,
     )
     environment.filters["unbroken"] = _unbroken
-    return environment.get_template("report.html")
+    return environment.get_template(name)
 
 
 def _unbroken(text: str) -> Markup:
@@ -45,12 +44,12 @@ def _unbroken(text: str) -> Markup:
 
 
 def _shown(value: object) -> object:
-    """Return a value as a page shows it: text from files without control characters."""
+    """Return a value as a page shows it. Control characters are removed from text of files."""
     return visible(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
 WIDE = 8
-"""Columns that fit on a page beside the names of the rows."""
+"""The number of columns that fit on a page next to the names of the rows."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture as a data: address, and what it shows."""
+    """A picture as a data: address, with its title and caption."""
 
     title: str
     source: str
@@ -73,7 +72,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Report:
-    """What a page holds, in reading order."""
+    """The content of a page, in reading order."""
 
     title: str
     headline: str
@@ -81,23 +80,23 @@ class Report:
     pictures: Sequence[Picture]
     notes: Sequence[str]
     sorts: bool = False
-    """Whether a press on a heading sorts its table."""
+    """If True, a click on a heading sorts its table."""
 
 
 def render(report: Report) -> str:
-    """The report as one HTML file, pictures embedded."""
+    """Render the report as one HTML file with embedded pictures."""
     tables = [_grid(table, upright=report.sorts) for table in report.tables]
-    return _template().render(report=report, tables=tables, version=__version__)
+    return template("report.html").render(report=report, tables=tables, version=__version__)
 
 
 def write_report(report: Report, path: Path) -> None:
-    """Write the page, whole or not at all."""
+    """Write the page, atomically."""
     write_text(path, render(report))
 
 
 def _grid(table: Section, *, upright: bool) -> dict[str, object]:
-    """Header and lines of a table; unless it stays upright, rows and columns change places where
-    that fits better.
+    """Return header and lines of a table. Rows and columns are swapped if that fits the page
+    better, unless `upright`.
     """
     rows = list(table.rows)
     figures = columns_of(rows)

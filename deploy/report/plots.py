@@ -1,8 +1,8 @@
-"""Plots by matplotlib in one look, as SVG files that are light or dark as the reader's screen is.
+"""Plots by matplotlib in one style, as SVG files that follow the reader's light or dark mode.
 
-Figures are drawn in the colours LIGHT and measured in pixels, 72 of them an inch, so that
-matplotlib's points are pixels too. In the SVG each colour becomes a variable that a style sheet
-sets for light and for dark screens.
+Figures are drawn in the colours LIGHT and measured in pixels, 72 per inch, so that matplotlib's
+points are pixels too. In the SVG each colour becomes a variable that a style sheet sets for light
+and for dark screens.
 """
 
 import base64
@@ -45,8 +45,8 @@ LIGHT = {
     "mark3": "#b4558d",
     "mark4": "#a87000",
 }
-"""Colours by what they are for; the marks' are Okabe and Ito's, darkened where white would swallow
-them.
+"""Colours by purpose. Those of the marks are Okabe and Ito's, darkened where they would be too
+faint on white.
 """
 
 DARK = {
@@ -61,11 +61,11 @@ DARK = {
     "mark4": "#e69f00",
 }
 SERIES = ("mark0", "mark1", "mark2", "mark3", "mark4", "ink")
-"""The colours that series of points take in turn."""
+"""The colours assigned to series of points, in turn."""
 
 LOOK = {
     "svg.fonttype": "none",
-    # Ids follow from what they name: the same figure gives the same bytes.
+    # Ids are derived from the content, so that the same figure gives the same bytes.
     "svg.hashsalt": "beers-deploy",
     "text.parse_math": False,  # a dollar in a file's name is a dollar
     "font.size": FONT_PX,
@@ -94,8 +94,8 @@ LOOK = {
 
 @contextmanager
 def look() -> Iterator[None]:
-    """What is drawn and saved within has the look of our plots, whatever the user set for
-    matplotlib's own.
+    """Apply the style of our plots to everything drawn and saved within, independent of the user's
+    own matplotlib style.
     """
     from matplotlib import style
 
@@ -107,7 +107,7 @@ def look() -> Iterator[None]:
 
 
 def new_figure(width_px: float, height_px: float) -> "Figure":
-    """An empty figure of that size, for use within `look`."""
+    """Return an empty figure of that size, for use within `look`."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_px / PX_PER_INCH, height_px / PX_PER_INCH), dpi=PX_PER_INCH)
@@ -118,9 +118,7 @@ LEAST_TICKS = 3
 
 
 def set_ticks(axis: "Axis", most: int) -> None:
-    """Put at most so many ticks at round values within an axis' limits, and write the values beside
-    them.
-    """
+    """Place at most `most` ticks at round values within an axis' limits, and label them."""
     low, high = sorted(axis.get_view_interval())
     values = round_values(low, high, most, logarithmic=axis.get_scale() == "log")
     axis.set_ticks(values, labels=[number(value, 12) for value in values])
@@ -128,8 +126,8 @@ def set_ticks(axis: "Axis", most: int) -> None:
 
 
 def round_values(low: float, high: float, most: int, *, logarithmic: bool) -> list[float]:
-    """Round values from `low` to `high`, at most `most`; evenly spaced where a logarithmic axis
-    holds too few.
+    """Return at most `most` round values from `low` to `high`. They are evenly spaced if a
+    logarithmic axis contains too few.
     """
     from matplotlib.ticker import LogLocator, MaxNLocator
 
@@ -157,12 +155,12 @@ XLINK = "http://www.w3.org/1999/xlink"
 
 
 def svg_of(figure: "Figure", name: str, titles: Mapping[str, str] | None = None) -> Markup:
-    """A figure as an SVG file, light or dark as its reader's screen is.
+    """Return a figure as an SVG file that follows the reader's light or dark mode.
 
     Args:
         figure: drawn within `look`, in colours of LIGHT.
-        name: what a screen reader calls it.
-        titles: what appears when the pointer rests on the artists of a group id (`set_gid`).
+        name: the label for screen readers.
+        titles: the tooltips of the artists, by group id (`set_gid`).
     """
     stream = io.BytesIO()
     with look():
@@ -191,7 +189,9 @@ def svg_of(figure: "Figure", name: str, titles: Mapping[str, str] | None = None)
 
 
 def _name(group: ET.Element, titles: Mapping[str, str]) -> None:
-    """A class for a group id of ours (matplotlib's own have a _), and its title."""
+    """Replace a group id of ours by a class, and add its title. The ids of matplotlib contain "_"
+    and are dropped.
+    """
     kind = group.attrib.pop("id", "_")
     if "_" not in kind:
         group.set("class", "dot" if kind in titles else kind)
@@ -202,7 +202,7 @@ def _name(group: ET.Element, titles: Mapping[str, str]) -> None:
 
 
 def plot_style() -> str:
-    """The style sheet of plots: their colours, light and dark."""
+    """Return the style sheet of plots with their colours, light and dark."""
     light, dark = (
         " ".join(f"--{name}: {colour};" for name, colour in colours.items())
         for colours in (LIGHT, DARK)
@@ -214,14 +214,14 @@ def plot_style() -> str:
 
 
 def data_url(svg: str) -> str:
-    """An SVG file as a data: address."""
+    """Return an SVG file as a data: address."""
     return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Points (x, y), x above 0 on a logarithmic axis; curves of one name look
-    alike in all panels.
+    """Points (x, y), with x above 0 on a logarithmic axis. Curves of one name look the same in all
+    panels.
     """
 
     name: str
@@ -236,10 +236,12 @@ ABOVE_PX = 40
 BELOW_PX = 81
 X_TITLE_PX = 37
 LEGEND_PX = 6
-"""Of panels: room above and below; and from below how high the axis' title and the legend stand."""
+"""Layout in pixels: the space above and below the panels, and the height of the axis' title and of
+the legend above the lower edge.
+"""
 LEGEND_NAMES = 4
 LEGEND_ROW_PX = 22
-"""In a row of the legend, at most, and how high a row is."""
+"""The maximum number of names in a row of the legend, and the height of a row."""
 
 
 def curves_svg(
@@ -249,17 +251,17 @@ def curves_svg(
     *,
     logarithmic: bool = True,
 ) -> str:
-    """Panels side by side that share the axis upwards, each with an axis of its own to the right.
+    """Draw panels side by side that share the y axis. Each has an x axis of its own.
 
     Args:
         panels: curves that share axes, under a title.
-        x_title: of the axis to the right.
-        y_title: of the axis upwards.
-        logarithmic: whether the axis to the right is, with a dot at each point; else lines alone
+        x_title: of the x axis.
+        y_title: of the y axis.
+        logarithmic: if True, the x axis is logarithmic and each point has a dot; else only lines
             are drawn.
 
     Returns:
-        An SVG file, light or dark as its reader's screen is.
+        An SVG file that follows the reader's light or dark mode.
     """
     # Curves of one name share an entry of the legend.
     names = {curve.name for curve in chain.from_iterable(curves for _, curves in panels)}
@@ -299,8 +301,8 @@ def curves_svg(
 
 
 HISTOGRAM_PX = (358, 240)
-"""No wider than a telephone shows: a wider picture would be scaled down there,
-its labels with it.
+"""No wider than the screen of a telephone. A wider picture would be scaled down there, with its
+labels.
 """
 HISTOGRAM_FRAME = (0.225, 0.2, 0.72, 0.77)
 LABELS = 5
@@ -308,8 +310,8 @@ MOST_BARS = 81
 
 
 def histogram_url(spread: "Spread") -> str:
-    """Shares of pixels by error, on a logarithmic scale, and a Gaussian of the same deviation, as a
-    data: address.
+    """Draw the shares of pixels by error on a logarithmic scale, with a Gaussian of the same
+    deviation. Return a data: address.
     """
     centres, shares, wide = bins(spread)
     # A share of one pixel is the least that a bar can have.
@@ -336,8 +338,8 @@ def histogram_url(spread: "Spread") -> str:
 
 
 def bins(spread: "Spread") -> tuple[np.ndarray, np.ndarray, int]:
-    """Centres in DN, shares of the pixels, and the width in DN of at most MOST_BARS bins that hold
-    every error.
+    """Return centres in DN, shares of the pixels, and the width in DN of at most MOST_BARS bins
+    that contain every error.
     """
     farthest = int(np.abs(np.flatnonzero(spread.counts) - MAX_DN).max())
     wide = 1

@@ -1,4 +1,4 @@
-"""The page that says where INT8 errs: by size, by patch and by layer."""
+"""The page that shows the INT8 error by size, by patch and by layer."""
 
 from collections.abc import Sequence
 
@@ -19,8 +19,8 @@ Sessions = tuple[ort.InferenceSession, ort.InferenceSession]
 
 ZOOM = 2
 WHITE_SHARE = 0.999
-"""The size of error shown white, the same in all patches, is the one that this share of all pixels
-stays below.
+"""The error that is shown in white is the same in all patches: this share of all pixels stays below
+it.
 """
 
 
@@ -32,13 +32,13 @@ def sensitivity_page(
     sessions: Sessions,
     worst: Sequence[int],
 ) -> Report:
-    """The histogram, the worst patches, and every table.
+    """Compose the page of the histogram, the worst patches, and every table.
 
     Args:
-        headline: what it comes to, in one or two sentences.
+        headline: the result, in one or two sentences.
         rows: of all tables, in reading order.
         spread: of the errors on the patches.
-        patches: that neither network was calibrated on.
+        patches: samples that neither network was calibrated on.
         sessions: the float and the INT8 network.
         worst: the numbers of the patches to show.
     """
@@ -53,7 +53,7 @@ def sensitivity_page(
 
 
 def worst_picture(number: int, patches: Patches, sessions: Sessions, white_dn: float) -> Picture:
-    """A patch as it is given, in float, in INT8, and the size of the difference."""
+    """Draw one patch as given, in float and in INT8, and the absolute difference."""
     degraded = patches.degraded[number]
     given, in_float, in_int8 = (
         np.clip(to_shares(image, patches.ranges), 0, 1)[0, 0] * MAX_DN

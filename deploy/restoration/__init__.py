@@ -3,8 +3,8 @@
 `model.raster` reads an image by rows. It passes, in this order:
 
     bands        a sensor, and so a network, for each band
-    plan         how it is cut into tiles; memory: what that takes
-    radiometry   how its pixels are understood: which value is full scale, and who states it
+    plan         how it is cut into tiles; memory: the memory that this needs
+    radiometry   how its pixels are interpreted: the full scale, and its origin
     detectors    faults of detectors; a list of them, whose pixels are replaced
     sensor_check the comparison with its sensor, and whether it is raw at all
     runtime      the network, on onnxruntime or OpenVINO, here or by the workers of a `cluster`
@@ -16,7 +16,7 @@
     figures      the figures of a run
     checkpoint   the finished rows on the disk and their journal, from which a later run continues
     output       from the finished rows to the TIFF, plain or cloud-optimised
-    stac         the STAC item of a cloud-optimised output
+    stac         the STAC items of a cloud-optimised output and of its networks
     run          all of this for one file: `restore_file`
     arrays       all of this for an array in memory: `restore_array`
     method       a network as a method that studies compare

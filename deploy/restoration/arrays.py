@@ -1,6 +1,6 @@
-"""Arrays of NumPy, torch, Dask and xarray restored in memory.
+"""Restore arrays of NumPy, torch, Dask and xarray in memory.
 
-The pixels are those that `restore` writes of the same image in a file.
+The pixels are the same as those that `restore` writes for the same image in a file.
 """
 
 from collections.abc import Callable
@@ -32,10 +32,11 @@ def restore_array(image: Any, reading: Reading, load: Callable[[], Pipeline]) ->
     """Restore an array of any kind, and return the same kind.
 
     Args:
-        image: (H, W) or (bands, H, W); of NumPy (masked or not) and torch it is restored at once;
-            of Dask the result is lazy. An xarray.DataArray keeps coordinates and attributes.
-        reading: how its pixels are understood.
-        load: returns what restores it.
+        image: (H, W) or (bands, H, W). Arrays of NumPy (masked or not) and torch are restored at
+            once; for Dask the result is lazy. An xarray.DataArray retains coordinates and
+            attributes.
+        reading: how its pixels are interpreted.
+        load: returns the pipeline that restores it.
     """
     # Arrays of xarray and torch are recognised by their attributes, so that neither is imported.
     if hasattr(image, "coords") and hasattr(image, "dims"):
@@ -49,8 +50,8 @@ def restore_array(image: Any, reading: Reading, load: Callable[[], Pipeline]) ->
 
 
 def _restore_labelled(image: Any, reading: Reading, load: Callable[[], Pipeline]) -> Any:
-    """An xarray.DataArray; bands may stand behind the rows and columns where their dimension says
-    so.
+    """Restore an xarray.DataArray. The bands may follow the rows and columns if the name of their
+    dimension identifies them.
     """
     if hasattr(image, "data_vars"):
         names = ", ".join(map(str, image.data_vars)) or "none"
@@ -74,7 +75,9 @@ def _restore_labelled(image: Any, reading: Reading, load: Callable[[], Pipeline]
 
 
 def _restore_masked(image: Any, reading: Reading, load: Callable[[], Pipeline]) -> Any:
-    """A masked array, whose masked pixels are missing and stay masked, enlarged with the image."""
+    """Restore a masked array. Masked pixels are missing and stay masked. The mask is enlarged with
+    the image.
+    """
     restored = _restore(image, reading, load)
     mask = np.ma.getmaskarray(image)
     scale = restored.shape[-1] // mask.shape[-1]
@@ -107,8 +110,8 @@ def _restore(image: Any, reading: Reading, load: Callable[[], Pipeline]) -> Any:
 
 
 def _labelled(image: Any, pixels: Any) -> Any:
-    """Restored pixels with an xarray.DataArray's labels; where they are more than it had, those of
-    their places.
+    """Return restored pixels with the labels of an xarray.DataArray. If the number of pixels
+    changed, the coordinates are interpolated.
     """
     if pixels.shape == image.shape:
         return image.copy(data=pixels)
@@ -130,8 +133,8 @@ def _labelled(image: Any, pixels: Any) -> Any:
 
 
 def _between(places: np.ndarray, count: int) -> np.ndarray | None:
-    """The middles of `count` pixels over those at `places`, evenly between; None where these are no
-    two numbers.
+    """Return the centres of `count` evenly spaced pixels over those at `places`, or None if these
+    are not at least two numbers.
     """
     if len(places) < 2 or places.dtype.kind not in "iuf":
         return None
@@ -154,8 +157,8 @@ def _restore_now(
 
 BAND_DIMS = ("band", "bands", "channel", "wavelength")
 FEW = 4
-"""Bands of a photograph: a last axis of no more, behind two longer ones, holds bands and no
-columns.
+"""The largest number of bands of a photograph. A last axis of at most this length after two longer
+ones holds bands, not columns.
 """
 
 

@@ -1,7 +1,7 @@
-"""Bands of several sensors: `B0=a.toml,B1=b.toml` gives each band a network of its own.
+"""Bands of several sensors: `B0=a.toml,B1=b.toml` gives each band its own network.
 
-Where the image names its bands, each is found by its name; else by the number that names end in, or
-in the order given.
+If the image names its bands, each is found by its name. Otherwise they are sorted by the number at
+the end of their names, or used in the order given.
 """
 
 import logging
@@ -23,7 +23,8 @@ Each = TypeVar("Each")
 
 
 def sensors_of(sensor: SensorLike | Mapping[str, Sensor]) -> dict[str, Sensor]:
-    """Return the sensor of each band by the band's name; under no name where one is for all.
+    """Return the sensor of each band by the band's name, or under "" if one sensor is for all
+    bands.
 
     Args:
         sensor: one for all bands, a mapping, or BAND=PROFILE,BAND=PROFILE.
@@ -44,7 +45,7 @@ def sensors_of(sensor: SensorLike | Mapping[str, Sensor]) -> dict[str, Sensor]:
 
 
 def is_unknown(sensors: Mapping[str, Sensor]) -> bool:
-    """Return True if one sensor is for all bands, and that is unknown."""
+    """Return True if one sensor is for all bands, and it is unknown."""
     return list(sensors) == [""] and sensors[""].name == BLIND
 
 
@@ -55,12 +56,12 @@ def networks_of(
 
     Args:
         network: for all bands; the default one if None.
-        sensors: by band, or one under no name.
-        full_scale: that the user states, or None.
+        sensors: by band, or one under "".
+        full_scale: the value that the user states, or None.
 
     Raises:
-        OptionError: several sensors of a network that was made for one, or sensors of different
-            bits and no full scale.
+        OptionError: there are several sensors for a network that was made for one, or sensors of
+            different bit depths and no full scale.
     """
     networks = {band: Network.load(network, sensor=sensor) for band, sensor in sensors.items()}
     first = next(iter(networks.values()))
@@ -96,7 +97,7 @@ def _log_network(network: Network, sensors: Mapping[str, Sensor]) -> None:
 
 
 def in_order(given: Mapping[str, Each], raster: Raster) -> list[Each]:
-    """What was given for each band, in the order of the image's bands; what is for all of them
+    """Return the given items in the order of the image's bands. An item for all bands is returned
     alone.
     """
     if "" in given:
@@ -114,7 +115,9 @@ def in_order(given: Mapping[str, Each], raster: Raster) -> list[Each]:
 
 
 def _by_number(names: Iterable[str]) -> tuple[str, ...]:
-    """Names that end in a number, such as B2, in the order of these; others as they are given."""
+    """Sort names that end in a number, such as B2, by that number. Leave other names in the given
+    order.
+    """
     matches = {name: re.fullmatch(r"\D*(\d{1,6})", name) for name in names}
     ordinals = {name: int(match[1]) for name, match in matches.items() if match}
     return tuple(
@@ -125,7 +128,7 @@ def _by_number(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def require_alike(networks: Sequence[Network]) -> None:
-    """Refuse networks of several bands that one plan of tiles cannot serve."""
+    """Raise an error if one tiling plan cannot serve the networks of several bands."""
     tilings = [network.tiling for network in networks]
     if len(networks) > 1 and (len(set(map(repr, tilings))) > 1 or tilings[0].channels_in != 1):
         raise ModelError(

@@ -1,7 +1,7 @@
-"""The finished rows of a run on the disk, so that a run that is killed at any moment can go on.
+"""The finished rows of a run on the disk, so that a run that is killed at any moment can continue.
 
-A run that goes on with `resume` trusts nothing that it finds on the disk. The journal has a digest
-of its own, and each row of tiles is compared with what the journal states of it.
+A run with `resume` trusts nothing that it finds on the disk. The journal has a digest of its own,
+and each row of tiles is compared with the journal's digest for it.
 """
 
 import hashlib
@@ -29,7 +29,7 @@ PLAIN = "out.tif"
 COG = "cog.tif"
 """Files of a checkpoint in which the output is written before it is renamed into place."""
 ROWS_FILES = ("journal.json", "journal.new", "rows.raw")
-"""Files of a checkpoint; the journal first, because it counts on the rows."""
+"""Files of a checkpoint. The journal is the first, because it refers to the rows."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class FinishedRow:
         rows_px: rows of pixels, the same for each band.
         size_bytes: of the pixels of all bands.
         sha256: hex digest of these bytes, band after band.
-        tally: what was seen of these pixels.
+        tally: the statistics of these pixels.
     """
 
     rows_px: int
@@ -53,7 +53,7 @@ def journal_text(job: Mapping[str, object], finished: Sequence[FinishedRow]) -> 
     """Return the content of a journal.
 
     Args:
-        job: all that decides the pixels.
+        job: all parameters that determine the pixels.
         finished: the stored rows of tiles, from the top.
     """
     content = {
@@ -68,14 +68,14 @@ def read_journal(path: Path, job: Mapping[str, object]) -> list[FinishedRow]:
     """Read the finished rows of a journal.
 
     Args:
-        path: of the journal.
-        job: that it must belong to.
+        path: the path of the journal.
+        job: the job that it must belong to.
 
     Raises:
-        ValueError: a damaged journal, or one of another job.
-        LookupError: a journal without one of its keys.
-        TypeError: a value of another type.
-        OSError: a journal that cannot be read.
+        ValueError: the journal is damaged, or belongs to another job.
+        LookupError: the journal lacks one of its keys.
+        TypeError: a value has another type.
+        OSError: the journal cannot be read.
     """
     document: Any = read_json(path)
     content: dict[str, Any] = dict(document)
@@ -93,14 +93,14 @@ def read_journal(path: Path, job: Mapping[str, object]) -> list[FinishedRow]:
 
 
 def _possible(row: FinishedRow) -> bool:
-    """Return True if counts are integers, and nothing that is counted or summed is below zero."""
+    """Return True if counts are integers, and no count or sum is negative."""
     tally = zip(astuple(row.tally), astuple(Tally()), strict=True)
     numbers = all(isinstance(value, int | type(zero)) and value >= 0 for value, zero in tally)
     return numbers and isinstance(row.rows_px, int) and row.rows_px > 0
 
 
 def _digest(content: Mapping[str, object]) -> str:
-    """Return the hex digest of a journal without its own digest."""
+    """Return the hex digest of a journal's content except its own digest."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
@@ -109,11 +109,11 @@ class Checkpoint:
     their digests.
 
     Attributes:
-        rows: how many are finished.
-        tally: what was seen of them.
-        job: all that decides the pixels.
-        damaged_rows: how many an earlier run finished that no longer match its journal, and those
-            below them.
+        rows: the number of finished rows.
+        tally: their statistics.
+        job: all parameters that determine the pixels.
+        damaged_rows: the number of rows of an earlier run that no longer match its journal, and of
+            those below them.
     """
 
     def __init__(
@@ -126,16 +126,17 @@ class Checkpoint:
         cog_bytes: int = 0,
         row_ends: Sequence[int] = (),
     ) -> None:
-        """Begin, or go on with what an earlier run left.
+        """Start a checkpoint, or continue the one of an earlier run.
 
         Args:
             out: the image to write in the end.
             shape: (bands, height, width).
             dtype: of the pixels.
-            job: all that decides the pixels; a run is resumed only by one of the same job.
-            resume: go on; where nothing was left, begin.
-            cog_bytes: of disk that the output takes beside the rows and the plain TIFF.
-            row_ends: at which row of pixels each row of tiles ends; a journal of other rows is
+            job: all parameters that determine the pixels; a run is resumed only by one of the same
+                job.
+            resume: continue an earlier run; start if there is none.
+            cog_bytes: disk space that the output needs in addition to the rows and the plain TIFF.
+            row_ends: the row of pixels at which each row of tiles ends; a journal of other rows is
                 refused.
         """
         self.out = out
@@ -162,7 +163,7 @@ class Checkpoint:
             (self.folder / "rows.raw").touch()
 
     def append(self, row: RestoredRow) -> None:
-        """Keep a row of tiles, which must follow those that are kept."""
+        """Store a row of tiles, which must follow those that are stored."""
         with self.disk():
             with (self.folder / "rows.raw").open("r+b") as stream:
                 digest = hashlib.sha256()
@@ -183,8 +184,8 @@ class Checkpoint:
             self._write_journal()
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
-        """Finished rows `start` to `stop` (excluded) of one band, (rows, width) as they will be
-        written.
+        """Read finished rows `start` to `stop` (excluded) of one band, (rows, width) as they will
+        be written.
         """
         count = (stop - start) * self.shape[2]
         pixels = np.fromfile(
@@ -193,7 +194,7 @@ class Checkpoint:
         return pixels.reshape(-1, self.shape[2])
 
     def remove(self) -> None:
-        """Throw the rows away; the journal first, so that nothing is left that counts on them."""
+        """Delete the rows, the journal first, so that no journal refers to missing rows."""
         # The journal is the first of these, because it counts on the rows.
         for name in ROWS_FILES:
             (self.folder / name).unlink(missing_ok=True)
@@ -201,7 +202,7 @@ class Checkpoint:
 
     @contextmanager
     def disk(self) -> Iterator[None]:
-        """One sentence for what a disk may do."""
+        """Convert an OSError of the disk within to one sentence for the user."""
         try:
             yield
         except OSError as error:
@@ -233,8 +234,8 @@ class Checkpoint:
         )
 
     def _matching(self, finished: list[FinishedRow]) -> list[FinishedRow]:
-        """Return the rows of tiles down to the first one whose pixels are not those that the
-        journal states.
+        """Return the rows of tiles above the first one whose pixels differ from the journal's
+        digest.
         """
         matching = list[FinishedRow]()
         top = 0
@@ -246,8 +247,8 @@ class Checkpoint:
         return matching
 
     def _stored(self, top: int, rows_px: int) -> tuple[int, str]:
-        """Return the size in bytes and the digest of rows of pixels that are stored; fewer bytes
-        where it ends.
+        """Return the size in bytes and the digest of stored rows of pixels. The size is smaller if
+        the file ends before.
         """
         size_bytes = 0
         digest = hashlib.sha256()
@@ -275,7 +276,7 @@ class Checkpoint:
 
     def _remove_outputs(self) -> None:
         (self.folder / PLAIN).unlink(missing_ok=True)
-        # GDAL writes overviews into a file beside the COG first.
+        # GDAL first writes overviews into a file next to the COG.
         for path in self.folder.glob(f"{COG}*"):
             path.unlink()
 
@@ -294,7 +295,7 @@ class Checkpoint:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make a renaming in `folder` last; not every system can."""
+    """Make a renaming in `folder` durable. Not every system can."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

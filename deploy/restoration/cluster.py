@@ -1,4 +1,4 @@
-"""The workers of a Dask scheduler: they compute, and this process alone reads arguments and writes
+"""The workers of a Dask scheduler. They only compute; this process alone reads arguments and writes
 results.
 """
 
@@ -14,13 +14,15 @@ from beers_deploy.profiles.errors import MachineError, optional, printable, reas
 
 ANSWER_S = 10
 JOIN_S = 30
-"""How long a scheduler may take to answer, and a first worker to be there."""
+"""Seconds that a scheduler may take to answer, and that a first worker may take to appear."""
 POLL_S = 5
 WORKERLESS_S = 60
-"""While a result is waited for: how often workers are counted, and how long there may be none."""
+"""Seconds while waiting for a result: the interval at which workers are counted, and how long there
+may be none.
+"""
 PACKAGES = ("beers-deploy", "numpy", "onnxruntime", "scipy")
-"""Workers compute with these, so every worker must have the versions of this process: they decide
-the last bits.
+"""The packages that workers compute with. Every worker must have the versions of this process,
+because they determine the last bits.
 """
 
 T = TypeVar("T")
@@ -40,22 +42,22 @@ class Cluster:
 
     @property
     def slots(self) -> int:
-        """Calls that run at once: the threads of all workers."""
+        """The number of calls that run at once: the threads of all workers."""
         try:
             return sum(self._client.nthreads().values())
         except OSError as error:
             raise _lost(UNCONNECTED, "Start it again") from error
 
     def share(self, value: T) -> T:
-        """What stands for a value in calls: it is sent once, and again where all workers that held
-        it died.
+        """Return a future that stands for a value in calls. The value is sent once, and again if
+        all workers that had it died.
         """
         # A call that is given this future receives its result.
         standing: T = self._client.submit(_itself, value, pure=False)
         return standing
 
     def result(self, call: "Future[T]") -> T:
-        """What a call returns, as soon as it has."""
+        """Wait for a call and return its result."""
         seen_s = time.monotonic()
         while True:
             try:
@@ -75,7 +77,7 @@ def _itself(value: T) -> T:
 
 @contextmanager
 def open_cluster(scheduler: str | None) -> Iterator[Cluster | None]:
-    """The workers of a scheduler by its address; None where no address is given."""
+    """Yield the workers of a scheduler, given its address, or None if no address is given."""
     if scheduler is None:
         yield None
         return
@@ -121,8 +123,8 @@ def _connect(distributed: Any, address: str) -> Any:
 
 
 def _require_same_versions(client: Any) -> None:
-    """Ask every worker by a function that any Python has: one of ours would kill a worker without
-    our package.
+    """Raise an error unless every worker has our versions. The function that asks is plain Python,
+    because one of ours would kill a worker without our package.
     """
     for package in PACKAGES:
         here = version(package)
@@ -136,7 +138,7 @@ def _require_same_versions(client: Any) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without Dask's own messages: what goes wrong becomes one sentence of ours."""
+    """Suppress Dask's own messages, because errors become one sentence of ours."""
     loggers = [logging.getLogger(name) for name in ("distributed", "distributed.client")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:

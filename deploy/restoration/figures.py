@@ -1,4 +1,4 @@
-"""Figures of a restoration: how the image is cut, and the error of seams where there are any."""
+"""Figures of a restoration: how the image is cut, and the error of seams if there are any."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from beers_deploy.restoration.tiles.engine import Restorer
 
 
 def plan_figures(plan: Plan) -> dict[str, Figure]:
-    """How an image is cut: known, but not measured."""
+    """Return the figures of how an image is cut. They are known in advance, not measured."""
     numbers = {"tiles": plan.tiles, "work factor": plan.work_factor}
     source = "arithmetic on the plan of tiles"
     return {
@@ -18,10 +18,11 @@ def plan_figures(plan: Plan) -> dict[str, Figure]:
 
 
 def seam_figures(source: Source, plan: Plan, restorer: Restorer) -> dict[str, Figure]:
-    """The error of seams, where the halo leaves any: of a tile in the middle, in digital numbers.
+    """Measure the error of seams on a tile in the middle, in digital numbers, if the halo leaves
+    seams.
 
-    The same kept pixels are restored twice: from the tile's own window, and from one with the whole
-    radius around.
+    The same retained pixels are restored twice: from the tile's own window, and from one with the
+    whole radius around it.
     """
     keys = "seam error max", "seam error mean"
     if plan.halo_px >= plan.radius_px or len(plan.rows) == len(plan.columns) == 1:
@@ -50,11 +51,11 @@ def seam_figures(source: Source, plan: Plan, restorer: Restorer) -> dict[str, Fi
 
 
 def _widened(span: Span, radius_px: int, size_px: int) -> Span:
-    """The same kept pixels with the whole radius around them, as far as the image goes, with its
-    extension.
+    """Return a span of the same retained pixels with the whole radius around them, as far as the
+    image and its extension reach.
 
-    What is kept ends on the network's lattice, or with the image: then what is read ends with the
-    extension too.
+    The retained part ends on the network's lattice or with the image. In the second case the span
+    that is read ends with the extension.
     """
     start = max(span.keep_start - radius_px, 0)
     stop = min(span.keep_stop + radius_px, size_px)

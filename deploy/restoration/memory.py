@@ -1,4 +1,4 @@
-"""The memory that a run will take, checked before it begins, and the most that it took."""
+"""The memory that a run will need, checked before it starts, and the peak that it used."""
 
 import sys
 from contextlib import suppress
@@ -13,18 +13,19 @@ from beers_deploy.profiles.figures import Figure, measured, unavailable
 from beers_deploy.restoration.plan import Plan
 
 STATUS = Path("/proc/self/status")
-"""Linux's own counts of this process."""
+"""Linux's own statistics of this process."""
 
 FLOAT_BYTES = np.dtype(np.float32).itemsize
 
 
 def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
-    """Memory that rows of the image will take beyond what is held now.
+    """Estimate the memory that rows of the image will need in addition to what is used now.
 
-    Three strips as read: two in work and one on its way. Three rows of tiles in float32, as the
-    network gave them: one waits for the row below it, and one more is begun. Two finished rows, and
-    what the source holds. Once the run has `begun`, the first strip and the source's share are
-    there already. Where pixels may be missing, each has a flag, and one more while flags are made.
+    There are three strips as read: two in work and one being read. There are three rows of tiles in
+    float32, as the network returned them: one waits for the row below it, and one more is started.
+    Add two finished rows and the memory of the source. Once the run has `begun`, the first strip
+    and the source's share are already allocated. If pixels may be missing, each has a flag, and one
+    more while flags are computed.
     """
     raster = source.raster
     row_px = raster.bands * raster.width_px
@@ -39,12 +40,13 @@ def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
 
 
 def check_memory(rows: int, budget_bytes: int | None, bulky: bool) -> int:
-    """The process's peak memory in bytes: what it holds now, and the rows to come.
+    """Return the process's peak memory in bytes: what it uses now, plus the rows to come. Raise
+    MachineError if that exceeds the budget.
 
     Args:
-        rows: bytes that rows of the image will take.
-        budget_bytes: None allows what is free.
-        bulky: most of them for the sake of an image in large strips.
+        rows: bytes that rows of the image will need.
+        budget_bytes: None allows all free memory.
+        bulky: True if most of them are due to large strips of the image.
     """
     resident_bytes = psutil.Process().memory_info().rss
     # What this process holds already is not part of what is free.
@@ -69,13 +71,13 @@ def check_memory(rows: int, budget_bytes: int | None, bulky: bool) -> int:
 
 
 def is_bulky(source: Source, plan: Plan) -> bool:
-    """Whether most of the memory is for the image's own strips or tiles."""
+    """Return True if most of the memory is needed for the image's own strips or tiles."""
     return source.held_bytes(1) > rows_bytes(source, plan) / 2
 
 
 def peak_memory() -> Figure:
-    """Most resident memory of this process since it began, in GB; unavailable where the system does
-    not count it.
+    """Return the peak resident memory of this process since it started, in GB; unavailable if the
+    system does not count it.
     """
     peak = _peak_bytes()
     if peak is None:

@@ -1,7 +1,7 @@
-"""A network as a method that restores images in memory, with the steps around it: what studies
+"""A network, with the steps around it, as a method that restores images in memory and that studies
 compare.
 
-The pixels are those that `restore` writes.
+The pixels are the same as those that `restore` writes.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,7 +20,7 @@ from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 from beers_deploy.restoration.tiles.rows import restore_dn
 
 Restore = Callable[[np.ndarray], np.ndarray]
-"""Degraded digital numbers (H, W) float32 to restored ones."""
+"""Maps degraded digital numbers (H, W) float32 to restored ones."""
 
 
 def network_method(
@@ -31,15 +31,15 @@ def network_method(
     reference: Instrument | None = None,
     plan_of: Callable[[tuple[int, ...]], Plan] | None = None,
 ) -> Restore:
-    """Build a method: digital numbers of 0 to `max_dn` become whole ones, as `restore` writes them.
+    """Build a method that maps digital numbers of 0 to `max_dn` to integers, as `restore` writes
+    them.
 
     Args:
         model: the network.
         max_dn: the largest digital number.
-        brighter: the same network for sensors of so many times the gain, by factor; none leaves
-            exposure out.
-        sensor: that acquired the images; None leaves the consistency step out.
-        reference: that the restoration aims at; needed with `sensor`.
+        brighter: the same network for sensors of higher gain, by factor; none omits exposure.
+        sensor: the sensor that acquired the images; None omits the consistency step.
+        reference: the sensor that the restoration aims at; needed with `sensor`.
         plan_of: returns the tiles of an image (H, W); the default ones, or those that the network
             is fixed to, if None.
     """

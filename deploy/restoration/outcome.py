@@ -1,8 +1,8 @@
 """Compare a restored image with its raw image, so that a network of another scale does not write a
 white image.
 
-A restoration keeps the mean and most of the contrast, and leaves few pixels at 0 or at full scale.
-Small departures give a warning. Departures that no restoration has are refused.
+A restoration preserves the mean and most of the contrast, and leaves few pixels at 0 or at full
+scale. Small departures give a warning. Departures that no restoration has are refused.
 """
 
 import math

@@ -1,10 +1,11 @@
-"""How an image is cut into tiles with exact seams, and what that costs: known before the run.
+"""How an image is cut into tiles with exact seams, and the cost of that, which is known before the
+run.
 
-A tile is read with a halo of `halo_px` pixels around what is kept of it. Where the halo is the
-network's receptive radius, the result is the whole image's, bit for bit (`quant.tiling`). A network
-with strides is given tiles that begin and end at multiples of its lattice; the last ones reach
-beyond an image that is no multiple of it, which is extended there by copies of its last row and
-column.
+A tile is read with a halo of `halo_px` pixels around its retained part. If the halo is the
+network's receptive radius, the result is the same as for the whole image, bit for bit
+(`quant.tiling`). For a network with strides, tiles begin and end at multiples of its lattice. If
+the image is not a multiple of the lattice, the last tiles reach beyond it, and the image is
+extended there by copies of its last row and column.
 """
 
 from collections.abc import Iterator
@@ -18,7 +19,7 @@ from beers_deploy.quant.tiling.receptive_field import Tiling
 
 @dataclass(frozen=True)
 class Tiles:
-    """How an image is to be cut.
+    """The user's choice of how to cut an image.
 
     Attributes:
         side_px: longest side of a tile.
@@ -30,7 +31,7 @@ class Tiles:
 
 
 def parse_halo(halo: str, radius_px: int) -> int:
-    """Return the halo in pixels that a user asks for: 'exact' is the network's receptive radius."""
+    """Return the halo in pixels that a user requests. 'exact' is the network's receptive radius."""
     if halo == "exact":
         return radius_px
     if halo.isdecimal():
@@ -43,10 +44,10 @@ def parse_halo(halo: str, radius_px: int) -> int:
 
 @dataclass(frozen=True)
 class Span:
-    """One side of a tile: what it reads, and the part of it that is kept, in image pixels (end
-    excluded).
+    """One side of a tile: the part that it reads, and the part of it that is retained, in image
+    pixels (end excluded).
 
-    What it reads may end beyond the image, by less than the network's lattice.
+    The part that is read may end beyond the image, by less than the network's lattice.
     """
 
     start: int
@@ -58,15 +59,15 @@ class Span:
 def plan_side(
     size_px: int, tile_px: int, halo_px: int, alignment_px: int = 1, min_side_px: int = 1
 ) -> list[Span]:
-    """The spans along one side of `size_px` pixels, each of `tile_px`, or one of all where that is
-    less.
+    """Return the spans along one side of `size_px` pixels, each of `tile_px`, or a single span if
+    the side is shorter.
 
     Args:
         size_px: of the image.
         tile_px: side of a tile; rounded down to the lattice.
         halo_px: a multiple of the lattice.
-        alignment_px: spans begin at its multiples, and read to one.
-        min_side_px: that a span reads, beyond the image where that has fewer.
+        alignment_px: spans begin and end at multiples of this.
+        min_side_px: the minimum length of a span, which may reach beyond the image.
     """
     if tile_px < 2 * halo_px + alignment_px or halo_px < 0:
         least = f", at least {2 * halo_px + alignment_px} px" if alignment_px > 1 else ""
@@ -85,7 +86,7 @@ def _up(size_px: int, alignment_px: int) -> int:
 
 
 def even_side_px(size_px: int, tile_px: int, halo_px: int, alignment_px: int = 1) -> int:
-    """The shortest side that needs no more tiles than `tile_px` does."""
+    """Return the shortest side that needs no more tiles than `tile_px` does."""
     # A last tile that is moved inward computes pixels twice; even tiles compute fewer.
     count = len(plan_side(size_px, tile_px, halo_px, alignment_px))
     even_px = -(-(_up(size_px, alignment_px) + 2 * halo_px * (count - 1)) // count)
@@ -93,7 +94,9 @@ def even_side_px(size_px: int, tile_px: int, halo_px: int, alignment_px: int = 1
 
 
 def _spans(image_px: int, size_px: int, tile_px: int, halo_px: int) -> Iterator[Span]:
-    """Spans over `size_px`, the image and its extension; what is kept ends with the image."""
+    """Yield spans over `size_px`, the image and its extension. The retained parts end with the
+    image.
+    """
     done = 0
     # All spans have the same length, so the last one is moved inward instead of cut.
     while done < image_px:
@@ -109,13 +112,13 @@ class Plan:
     """Rows and columns of tiles over an image of `bands` bands.
 
     Attributes:
-        bands: of the image, each cut alike and restored by itself, or all together as the network
-            takes them.
+        bands: of the image. Each is cut in the same way and restored separately, or jointly if the
+            network reads several.
         height_px: of the image.
         width_px: of the image.
-        tile_px: no tile is longer.
-        halo_px: context around what is kept of a tile.
-        tiling: how the network meets an image.
+        tile_px: the longest side of a tile.
+        halo_px: context around the retained part of a tile.
+        tiling: the network's tiling geometry.
         rows: of tiles, from top to bottom.
         columns: of tiles, from left to right.
     """
@@ -131,22 +134,22 @@ class Plan:
 
     @property
     def radius_px(self) -> int:
-        """The network's receptive radius; with a halo of so much the seams are exact."""
+        """The network's receptive radius. With a halo of at least this size the seams are exact."""
         return self.tiling.halo_px
 
     @property
     def scale(self) -> int:
-        """Pixels of the restored image for one of the image, along either side."""
+        """The number of pixels of the restored image per pixel of the image, along either side."""
         return int(self.tiling.scale)
 
     @property
     def groups(self) -> int:
-        """Of bands that the network takes together."""
+        """The number of groups of bands that the network restores jointly."""
         return self.bands // self.tiling.channels_in
 
     @property
     def out_shape(self) -> tuple[int, int, int]:
-        """Of the restored image: (bands, H, W)."""
+        """The shape of the restored image: (bands, H, W)."""
         return (
             self.groups * self.tiling.channels_out,
             self.height_px * self.scale,
@@ -155,22 +158,22 @@ class Plan:
 
     @property
     def tile_shape(self) -> tuple[int, int]:
-        """Rows and columns of pixels of every tile."""
+        """The number of rows and columns of pixels of every tile."""
         return self.rows[0].stop - self.rows[0].start, self.columns[0].stop - self.columns[0].start
 
     @property
     def row_tiles(self) -> int:
-        """Tiles of one row of tiles, those of all groups of bands."""
+        """The number of tiles in one row of tiles, over all groups of bands."""
         return len(self.columns) * self.groups
 
     @property
     def tiles(self) -> int:
-        """All tiles of the image: windows that the network sees."""
+        """The number of tiles of the image, each of which is one run of the network."""
         return len(self.rows) * self.row_tiles
 
     @property
     def work_factor(self) -> float:
-        """Pixels that the network sees over pixels of the image."""
+        """The number of pixels that the network reads, relative to the pixels of the image."""
         window_px = sum(r.stop - r.start for r in self.rows) * sum(
             c.stop - c.start for c in self.columns
         )
@@ -178,14 +181,14 @@ class Plan:
 
     @property
     def strip_rows_px(self) -> int:
-        """Most rows that are read at once: a tile's, and those that missing
-        pixels are filled from.
+        """The largest number of rows that are read at once: those of a tile, and those from which
+        missing pixels are filled.
         """
         return min(self.tile_shape[0] + 2 * self.radius_px, self.height_px)
 
     @property
     def halo_words(self) -> str:
-        """The halo, and whether seams are exact with it."""
+        """The halo, and whether the seams are exact with it, in words."""
         if self.halo_px >= self.radius_px:
             return f"{self.halo_px} px (exact)"
         return f"{self.halo_px} px (seams: exact is {self.radius_px})"
@@ -206,7 +209,7 @@ class Plan:
 
 
 def plan_for(network: Network, shape: tuple[int, int, int], tiles: Tiles) -> Plan:
-    """Return how an image of `shape` (bands, H, W) is cut for a network."""
+    """Return the plan of how an image of `shape` (bands, H, W) is cut for a network."""
     tiling = network.tiling
     _, height_px, width_px = shape
     if tiling.fixed_px is not None and (
@@ -221,10 +224,10 @@ def plan_for(network: Network, shape: tuple[int, int, int], tiles: Tiles) -> Pla
 
 
 def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, tiling: Tiling) -> Plan:
-    """The plan of an image of `shape` (bands, H, W).
+    """Return the plan for an image of `shape` (bands, H, W).
 
-    Tiles are as even as can be, of at most `tile_px` a side; of just that where the network is
-    fixed to it.
+    Tiles are as even as possible, with at most `tile_px` a side. If the network is fixed to a tile
+    size, they have exactly that size.
     """
     bands, height_px, width_px = shape
     _require_fit(bands, halo_px, tiling)
@@ -244,7 +247,9 @@ def make_plan(shape: tuple[int, ...], tile_px: int, halo_px: int, tiling: Tiling
 
 
 def _require_fit(bands: int, halo_px: int, tiling: Tiling) -> None:
-    """That a network can restore an image of so many bands, with such a halo."""
+    """Raise an error if a network cannot restore an image of this number of bands, or with this
+    halo.
+    """
     if tiling.scale.denominator != 1:
         raise ModelError(
             "The network's result must have the size of the image or a multiple of it, but it has "

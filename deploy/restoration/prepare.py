@@ -1,7 +1,8 @@
-"""What restores one image, made ready before its first row: a network, or the traditional pipeline.
+"""Prepare the restoration of one image, by a network or by the traditional pipeline, before its
+first row.
 
-Both return finished rows in order. Whoever writes them, to a file or into an array, need not know
-which of the two it is.
+Both return finished rows in order. Code that writes them, to a file or into an array, does not
+depend on which of the two it is.
 """
 
 import logging
@@ -49,31 +50,31 @@ from beers_deploy.restoration.tiles.rows import RestoredRow, restore_rows, rows_
 logger = logging.getLogger(__name__)
 
 Tick = Callable[[int], None]
-"""Is called with the number of ticks that were done."""
+"""A callback that receives the number of ticks that were completed."""
 
 RUNS_UNTIL_STEADY = 2
-"""Of each tile in work at a time: then a runtime takes no more memory."""
+"""The number of runs for each concurrent tile after which a runtime's memory no longer grows."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Restoration(ABC):
-    """What restores one image.
+    """The restoration of one image.
 
     Attributes:
         source: the image.
         name: of the image, for messages.
-        reading: how its pixels are understood.
+        reading: how its pixels are interpreted.
         method: 'network' or 'traditional'.
-        networks: that restore its bands; none of the traditional pipeline.
+        networks: the networks that restore its bands; empty for the traditional pipeline.
         scale: the pixel value that is full scale.
-        check: what was seen of the image's sensor.
-        check_s: the time that took.
+        check: the result of checking the image's sensor.
+        check_s: the seconds that the check took.
         out_shape: of the restored image, (bands, H, W).
         row_ends: the row of the restored image at which each row of tiles ends, where a later run
-            can go on; empty if none can.
-        identity: all that decides the pixels, besides the image and the full scale. Who computes,
-            on how many machines, is no part of it.
-        how: what computes, for the figures of time.
+            can continue; empty if it cannot.
+        identity: all parameters that determine the pixels, besides the image and the full scale.
+            The number and kind of machines is not part of it.
+        how: the runtime and machines, for the figures of time.
         text: the run in words.
         steady_ticks: the number of ticks after which memory is checked again; 0 if it is not.
     """
@@ -95,16 +96,16 @@ class Restoration(ABC):
 
     @abstractmethod
     def ticks(self, done_px: int) -> int:
-        """Return the sum of all ticks from row `done_px` of the restored image on."""
+        """Return the number of all ticks from row `done_px` of the restored image on."""
 
     @abstractmethod
     def rows(self, done_px: int, tick: Tick) -> Generator[RestoredRow, None, None]:
         """Restore the rows from `done_px` of the restored image on, in order."""
 
     def memory_bytes(self) -> int:
-        """Return the peak memory of the process, once it grows no more by itself.
+        """Return the peak memory of the process, once it no longer grows by itself.
 
-        Called only where `steady_ticks` is not 0: what sets one defines the other.
+        It is called only if `steady_ticks` is not 0. A class that sets one defines the other.
         """
         raise NotImplementedError
 
@@ -114,33 +115,33 @@ class Restoration(ABC):
 
 
 class Pipeline(Protocol):
-    """What can restore an image."""
+    """A method that can restore images."""
 
     @property
     def engine(self) -> Engine:
-        """What runs its networks."""
+        """The engine that runs its networks."""
 
     def prepare(
         self, source: Source, reading: Reading, name: str, cluster: Cluster | None = None
     ) -> Restoration:
-        """Make ready what restores an image.
+        """Prepare the restoration of an image.
 
         Args:
             source: the image.
-            reading: how its pixels are understood.
+            reading: how its pixels are interpreted.
             name: of the image, for messages.
-            cluster: whose workers run the network; None runs it here.
+            cluster: the cluster whose workers run the network; None runs it here.
         """
 
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkRestoration(Restoration):
-    """A network that restores one image.
+    """The restoration of one image by a network.
 
     Attributes:
         plan: how the image is cut into tiles.
-        restorer: what restores a tile.
-        at_once: tiles in work at a time.
+        restorer: restores a tile.
+        at_once: the number of tiles in work at a time.
         seams: figures of the error at seams.
     """
 
@@ -165,7 +166,7 @@ class NetworkRestoration(Restoration):
         )
 
     def memory_bytes(self) -> int:
-        """Return the peak memory: what the process holds, and the rows to come."""
+        """Return the peak memory: what the process uses now, plus the rows to come."""
         needed = rows_bytes(self.source, self.plan, begun=True)
         bulky = is_bulky(self.source, self.plan)
         return check_memory(needed, self.reading.memory_bytes, bulky)
@@ -185,10 +186,10 @@ class NetworkPipeline:
     """A network, or one for each band, and how it is run.
 
     Attributes:
-        networks: by band; under no name where one is for all.
+        networks: by band, or under "" if one is for all.
         tiles: how an image is cut.
-        engine: what runs the networks.
-        around: which steps around them are used.
+        engine: runs the networks.
+        around: the choice of the steps around them.
     """
 
     networks: Mapping[str, Network]
@@ -199,7 +200,7 @@ class NetworkPipeline:
     def prepare(
         self, source: Source, reading: Reading, name: str, cluster: Cluster | None = None
     ) -> NetworkRestoration:
-        """Make the network ready to restore an image; see `Pipeline.prepare`."""
+        """Prepare the network to restore an image; see `Pipeline.prepare`."""
         raster = source.raster
         networks = in_order(self.networks, raster)
         require_alike(networks)
@@ -259,10 +260,11 @@ class NetworkPipeline:
 def _opener(
     plan: Plan, engine: Engine, networks: Sequence[Network], cluster: Cluster | None
 ) -> tuple[Callable[[onnx.ModelProto], Infer], int, str]:
-    """Return what makes a network ready to run, how many tiles are in work, and the runtime.
+    """Return a function that opens a network, the number of tiles in work, and the name of the
+    runtime.
 
-    The first network is opened at once, because it tells whether the runtime takes it. Others are
-    opened at their first call: bright images ask for no other exposure.
+    The first network is opened at once, because that shows whether the runtime accepts it. Others
+    are opened at their first call, because bright images need no other exposure.
     """
     threads = 1 if cluster else engine.threads
     at_once = tiles_at_once(threads, plan.tiles)
@@ -293,10 +295,10 @@ def check_sensor(
     full_scale: float,
     name: str,
 ) -> tuple[SensorCheck, float]:
-    """Look for faults of detectors, and compare an image with the sensor that the user names.
+    """Detect faults of detectors, and compare an image with the sensor that the user names.
 
-    A warning is logged for each fault and each contradiction; without a named sensor, if the image
-    looks restored already.
+    A warning is logged for each fault and each contradiction. If no sensor is named, a warning is
+    logged if the image looks restored already.
 
     Returns:
         The check, and the seconds that it took.

@@ -65,7 +65,7 @@ class FullScale:
 
     @property
     def words(self) -> str:
-        """The value and its source."""
+        """The value and its source, in words."""
         return f"{self.value:g} ({self.source})"
 
     @property

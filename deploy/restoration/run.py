@@ -23,6 +23,7 @@ from beers_deploy.model.raster.facts import require_raw
 from beers_deploy.model.raster.reader import open_raster, require_image_file
 from beers_deploy.model.raster.source import Source, fingerprint, stamps
 from beers_deploy.model.raster.writer import cog_bytes, require_codec
+from beers_deploy.network import Network
 from beers_deploy.profiles.errors import BeersError, ImageError, MachineError
 from beers_deploy.profiles.figures import Figure, Row, measured
 from beers_deploy.profiles.sensor_numbers import numbers_of
@@ -68,10 +69,12 @@ class Run(Table):
     Attributes:
         path: of the restored image.
         time_s: from opening the image to the finished file.
+        networks: that restored its bands, in their order; none of the traditional pipeline.
     """
 
     path: Path
     time_s: float
+    networks: Sequence[Network] = ()
 
 
 def restore_file(
@@ -132,6 +135,7 @@ def restore_file(
         details=DETAILS,
         path=out,
         time_s=time_s,
+        networks=tuple(work.networks),
     )
 
 

@@ -1,5 +1,5 @@
-"""What runs a network: onnxruntime by default, OpenVINO as an option, with the
-same int8 numbers.
+"""The runtimes of a network: onnxruntime by default, OpenVINO as an option, with the same int8
+results.
 """
 
 import os
@@ -26,14 +26,14 @@ Runtime = Literal["onnxruntime", "openvino"]
 """The library that runs a network."""
 
 Infer = Callable[[np.ndarray], np.ndarray]
-"""A network ready to run: (1, C, h, w) float32 in [0, 1] to what it makes of it, of the shape that
-its file says.
+"""A network ready to run. It maps (1, C, h, w) float32 in [0, 1] to its result, of the shape that
+its file states.
 """
 
 
 @dataclass(frozen=True)
 class Engine:
-    """What runs the networks of a restoration.
+    """The engine that runs the networks of a restoration.
 
     Attributes:
         runtime: the library.
@@ -52,7 +52,7 @@ class Engine:
             require_cores("threads", self.threads)
 
     def packed(self, model: onnx.ModelProto) -> "Packed":
-        """Return a network for a worker, which takes one thread unless the user gives a number."""
+        """Return a network for a worker, which uses one thread unless the user gives a number."""
         return Packed(model.SerializeToString(), self.runtime, self.threads or 1)
 
 
@@ -112,12 +112,12 @@ def _adds_exactly(core: Any) -> bool:
 
 
 def saturating_adds(model: onnx.ModelProto) -> onnx.ModelProto:
-    """The model with every QLinearAdd written as dequantise, add, quantise.
+    """Return the model with every QLinearAdd written as dequantise, add, quantise.
 
-    OpenVINO's own QLinearAdd wraps around where it should saturate (256 becomes 0). Written out it
-    saturates, but a convolution before it is fused with it, and the rounding between the two is
-    lost; taking the larger of the value and 0, which changes no uint8, keeps them apart. Measured:
-    equal to onnxruntime bit for bit.
+    OpenVINO's own QLinearAdd wraps around where it should saturate (256 becomes 0). The three
+    operators saturate, but OpenVINO fuses them with a convolution before them, which loses the
+    rounding between the two. A Max with 0, which changes no uint8, prevents the fusion. The result
+    equals onnxruntime's bit for bit (measured).
     """
     expanded = onnx.ModelProto()
     expanded.CopyFrom(model)
@@ -134,7 +134,7 @@ def _written_out(add: onnx.NodeProto) -> list[onnx.NodeProto]:
     b, *b_scale = add.input[3:6]
     scale = add.input[6:8]
     name = add.output[0]
-    # Max with 0 changes no uint8, but keeps OpenVINO from fusing the convolution before the add,
+    # Max with 0 changes no uint8, but prevents OpenVINO from fusing the convolution into the add,
     # which would lose the rounding between the two.
     return [
         helper.make_node("Max", [a, LOWEST], [f"{name}.a"]),
@@ -147,15 +147,15 @@ def _written_out(add: onnx.NodeProto) -> list[onnx.NodeProto]:
 
 
 AT_ONCE = 4
-"""Most tiles in work at a time.
+"""The largest number of tiles in work at a time.
 
-Each needs the memory of a network's maps, and some 4 % are gained by it.
+Each tile needs the memory of a network's maps, and the gain is about 4 %.
 """
 
 
 def tiles_at_once(threads: int, tiles: int) -> int:
-    """How many tiles are restored at a time, such that each has as many threads; 0 threads takes
-    every core.
+    """Return the number of tiles restored at a time, such that each has the same number of threads.
+    0 threads uses every core.
     """
     cores = threads or os.cpu_count() or 1
     return max(
@@ -166,13 +166,13 @@ def tiles_at_once(threads: int, tiles: int) -> int:
 def open_runtime(
     runtime: Runtime, model: onnx.ModelProto, threads: int, at_once: int = 1
 ) -> tuple[Infer, str]:
-    """A network ready to run, and the runtime's name and version.
+    """Open a network, and return it ready to run with the runtime's name and version.
 
     Args:
-        runtime: which.
+        runtime: the library.
         model: the network.
-        threads: in all; 0 takes every core.
-        at_once: how many callers share the threads.
+        threads: the total number; 0 uses every core.
+        at_once: the number of callers that share the threads.
     """
     require_cores("threads", threads)
     if runtime == "openvino":
@@ -182,8 +182,8 @@ def open_runtime(
 
 
 def session_threads(threads: int, at_once: int) -> int:
-    """What to ask onnxruntime for: its n are n - 1 of its own, which all callers share, and each
-    caller.
+    """Return the number of threads to request from onnxruntime. Of its n threads, n - 1 are its own
+    and shared by all callers, and each caller adds itself.
     """
     return (threads or os.cpu_count() or 1) - at_once + 1 if at_once > 1 else threads
 
@@ -207,11 +207,11 @@ class AtFirstCall:
 
 @dataclass(frozen=True)
 class Packed:
-    """A network that is opened once, at its first call, be it in another process.
+    """A network that is opened once in each process, at its first call.
 
     Attributes:
         content: bytes of its ONNX file.
-        runtime: what runs it.
+        runtime: the library that runs it.
         threads: of the runtime.
     """
 
@@ -220,7 +220,7 @@ class Packed:
     threads: int
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """As an `Infer`."""
+        """Run the network, as an `Infer`."""
         # Without the lock each thread would open a network of its own.
         with _opening:
             infer = _opened(self)
@@ -238,7 +238,7 @@ def _opened(packed: Packed) -> Infer:
 
 
 def infer_on(cluster: Cluster, packed: Packed) -> Infer:
-    """A network that is run by the workers of a cluster: each call sends a tile and waits for its
+    """Return a network that the workers of a cluster run. Each call sends a tile and waits for its
     result.
     """
     shared = cluster.share(packed)

@@ -1,6 +1,6 @@
 """The self-check of a restored image: run over all of its rows, reported, refused and written.
 
-`model.self_check` judges blocks. Here each band is read once more from the image and from the
+`model.self_check` checks blocks. Here each band is read once more from the image and from the
 finished rows, the blocks are counted, and the map of them can be written as a GeoTIFF.
 """
 
@@ -20,7 +20,10 @@ from beers_deploy.model.self_check import (
     BLOCK_PX,
     LEAST_SHARPENING,
     MOST_CHI2,
+    OUTSIDE,
     REACH_PX,
+    SMOOTH,
+    WITHIN,
     Judged,
     SelfCheck,
 )
@@ -32,20 +35,20 @@ from beers_deploy.restoration.bands import in_order
 
 ROWS_PX = 4 * BLOCK_PX
 COLUMNS_PX = 32 * BLOCK_PX
-"""Rows and columns that are judged at a time, in addition to REACH_PX on every side."""
+"""Rows and columns that are checked at a time, in addition to REACH_PX on every side."""
 
 MANY_OUTSIDE = 0.01
-"""A larger share of decidable blocks outside the bound gives a warning, or is refused by `strict`:
-of right restorations none was outside (measured on photographs).
+"""If a larger share of decidable blocks is outside the bound, there is a warning, or an error with
+`strict`. For correct restorations none was outside (measured on photographs).
 """
 
 ReadRows = Callable[[int, int, int], np.ndarray]
-"""Return restored rows (rows, width) as stored, given the band, the first row and the end."""
+"""Returns restored rows (rows, width) as stored, given the band, the first row and the end."""
 
 
 @dataclass(frozen=True)
 class BlockMap:
-    """What the self-check says of every block of an image.
+    """The result of the self-check for every block of an image.
 
     Attributes:
         bands: the blocks of each band that has a known sensor, by its number.
@@ -73,7 +76,7 @@ class BlockMap:
 
     @property
     def figures(self) -> dict[str, Figure]:
-        """Return the shares of blocks, for the results of a run."""
+        """The shares of blocks, for the results of a run."""
         blocks = f"blocks of {BLOCK_PX} x {BLOCK_PX} pixels"
         outside = f"{blocks} that are decidable: residual above {MOST_CHI2:g} times the noise"
         smooth = f"{blocks}: too smooth to show a wrong restoration"
@@ -113,10 +116,10 @@ def checks_of(
     """Build the self-check of each band whose sensor is known.
 
     Args:
-        sensors: by band, or one under no name.
-        raster: the image's facts.
-        out_shape: (bands, H, W) of the restored image; without one pixel of the same band for each
-            pixel there is no check.
+        sensors: by band, or one under "".
+        raster: the description of the image.
+        out_shape: (bands, H, W) of the restored image. Unless it has one pixel of the same band for
+            each pixel, there is no check.
         full_scale: the pixel value that is full scale.
     """
     if tuple(out_shape) != raster.shape or not sensors:
@@ -133,7 +136,7 @@ def checks_of(
 
 
 def require_checkable(path: Path | None, checks: Mapping[int, SelfCheck]) -> None:
-    """Raise OptionError if a map is asked for where there is no self-check."""
+    """Raise OptionError if a map is requested and there is no self-check."""
     if path is not None and not checks:
         raise OptionError(
             "`self_check` needs a known sensor, and a network that gives one pixel of the same "
@@ -142,7 +145,7 @@ def require_checkable(path: Path | None, checks: Mapping[int, SelfCheck]) -> Non
 
 
 def check_result(source: Source, read: ReadRows, checks: Mapping[int, SelfCheck]) -> BlockMap:
-    """Judge all blocks of a restored image.
+    """Check all blocks of a restored image.
 
     Args:
         source: the raw image.
@@ -169,7 +172,7 @@ def check_result(source: Source, read: ReadRows, checks: Mapping[int, SelfCheck]
 
 
 def _judge_rows(check: SelfCheck, raw: np.ndarray, restored: np.ndarray, down: Placed) -> Judged:
-    """Judge rows (h, width) of an image window by window, which bounds the memory."""
+    """Check rows (h, width) of an image window by window, which bounds the memory."""
     width = raw.shape[1]
     parts = []
     for start, stop in strips(width, COLUMNS_PX):
@@ -185,16 +188,10 @@ def _joined(parts: Sequence[Judged], axis: int) -> Judged:
     return Judged(np.concatenate(chi2, axis), np.concatenate(sharpening, axis))
 
 
-WITHIN = 0
-OUTSIDE = 1
-SMOOTH = 2
-"""States of a block in a written map."""
-
-
 def write_map(path: Path, blocks: BlockMap, raster: Raster) -> None:
     """Write the map as a GeoTIFF of float32 with one pixel for each block.
 
-    It has two planes for each band that was judged: chi2, and the state of the block (0 within the
+    It has two planes for each band that was checked: chi2, and the state of the block (0 within the
     bound, 1 outside, 2 too smooth to decide). Both are NaN where too few pixels are known.
     """
     planes = []

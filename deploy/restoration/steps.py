@@ -1,8 +1,8 @@
-"""The steps around a network that a run takes: its exposures, and the consistency step.
+"""The steps around a network that a run uses: its exposures, and the consistency step.
 
-Both depend on what is known of the sensor. Exposures need a network that is conditioned on its
-sensor; the consistency step needs a known sensor, and a network that gives one pixel of the same
-band for each pixel.
+Both depend on the sensor. Exposures need a network that is conditioned on its sensor. The
+consistency step needs a known sensor, and a network that returns one pixel of the same band for
+each pixel.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -38,7 +38,7 @@ OTHER_PIXELS = f"{OFF}: the network makes other pixels or bands"
 
 @dataclass(frozen=True)
 class Around:
-    """The choice of the steps around a network that a run uses where it can.
+    """The choice of the steps around a network that a run uses where possible.
 
     Attributes:
         consistency: if True, the result is made to agree with the image at low spatial frequencies.
@@ -64,7 +64,7 @@ def exposures_of(network: Network, around: Around) -> Mapping[int, Network]:
 
 @dataclass(frozen=True)
 class InRange:
-    """A network that reads and returns images of other ranges than [0, 1], for one in [0, 1].
+    """Adapts a network that reads and returns images of other ranges to [0, 1].
 
     Attributes:
         infer: the network.
@@ -90,7 +90,7 @@ def _stated_ranges(network: Network) -> Ranges:
     """Return the ranges onto which full scale is mapped for a network; empty for [0, 1].
 
     Raises:
-        ModelError: ranges of samples, which need not reach as far as full scale.
+        ModelError: the ranges were found in samples, so they need not reach full scale.
     """
     ranges = network.input_ranges
     if ranges and FROM_SAMPLES in metadata(network.model).get(KEY, FROM_SAMPLES):
@@ -113,15 +113,15 @@ def exposed_networks(
     Args:
         networks: one for all bands or one for each.
         around: the steps that are used, among them higher exposures.
-        tiling: how the networks meet an image.
+        tiling: the networks' tiling geometry.
         full_scale: the pixel value that is 1.0 to a network.
-        opened: makes a network ready to run.
+        opened: opens a network.
 
     Returns:
         The networks in the given order. Without exposures a network has the factor 1 alone.
 
     Raises:
-        ModelError: a network whose ranges were found in samples, so that full scale is not known.
+        ModelError: the ranges of a network were found in samples, so that full scale is not known.
     """
     built = []
     for network in networks:
@@ -141,7 +141,7 @@ def offset_of(sensor: Sensor, full_scale: float) -> float:
     """Return the pixel value of the dark.
 
     Args:
-        sensor: whose middle of the ranges counts.
+        sensor: the sensor, of which the middle of each range is used.
         full_scale: the pixel value that is the sensor's largest digital number.
     """
     instrument = sensor.nominal()
@@ -161,7 +161,7 @@ def consistency_steps(
         around: the steps that are used.
         sensors: the sensor of each band. The sensor named "blind" is unknown.
         raster: the image, whose bands set the order.
-        tiling: how the network meets an image.
+        tiling: the network's tiling geometry.
         full_scale: the pixel value that is the largest digital number of a sensor.
 
     Returns:

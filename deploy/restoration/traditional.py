@@ -1,9 +1,9 @@
-"""The traditional pipeline on an image of any size: what `restore --method traditional` does.
+"""The traditional pipeline on an image of any size, as used by `restore --method traditional`.
 
-Rows come and go in strips, so that memory grows with the width alone. The pipeline depends on the
-sensor alone: its MTF, noise and gain. The reference it imitates is seen with the sensor's own gain
-and bits, so that the output has the scale of the input. Bands are restored one by one, each for its
-own sensor.
+Rows are read and written in strips, so that memory grows only with the width. The pipeline depends
+on the sensor alone: its MTF, noise and gain. The reference that it imitates is seen with the
+sensor's own gain and bits, so that the output has the scale of the input. Bands are restored
+separately, each for its own sensor.
 """
 
 from collections.abc import Callable, Generator, Iterator
@@ -29,20 +29,21 @@ from beers_deploy.restoration.tiles.engine import as_stored, checked_strip
 from beers_deploy.restoration.tiles.rows import RestoredRow
 
 STRIP_PX = 128
-"""Rows read at a time."""
+"""The number of rows read at a time."""
 
 FIXED_BYTES = 100_000_000
 BYTES_PER_COLUMN = 40_000
-"""Of memory that the pipeline takes for a band, and more for each pixel of a row: some 700 rows, in
-several float32 copies. Measured at 400 and 1200 columns: 75 MB and 30 kB.
+"""Memory of the pipeline for a band: a constant part (bytes), and BYTES_PER_COLUMN for each pixel
+of a row, which is about 700 rows in several float32 copies. Measured at 400 and 1200 columns: 75 MB
+and 30 kB.
 """
 
 
 @dataclass(frozen=True, kw_only=True)
 class TraditionalRestoration(Restoration):
-    """The traditional pipeline that restores one image.
+    """The restoration of one image by the traditional pipeline.
 
-    No run can go on from a strip, because the pipeline looks hundreds of rows back.
+    No run can continue from a strip, because the pipeline looks hundreds of rows back.
 
     Attributes:
         chains: the pipeline of each band.
@@ -59,7 +60,9 @@ class TraditionalRestoration(Restoration):
         done_px: int,  # noqa: ARG002
         tick: Callable[[int], None],
     ) -> Generator[RestoredRow, None, None]:
-        """Restore the image from its first row, strip by strip, all bands of one at a time."""
+        """Restore the image from its first row, strip by strip, all bands of one strip at a
+        time.
+        """
         height_px = self.source.raster.height_px
         by_band = [
             restore_strips(self.read(band), height_px, chain)
@@ -95,10 +98,11 @@ class TraditionalRestoration(Restoration):
             yield torch.from_numpy(dn)
 
     def fitted(self) -> "TraditionalRestoration":
-        """Return it with the regularisation of each band, from a first pass over the image.
+        """Return the restoration with the regularisation of each band, from a first pass over the
+        image.
 
-        That is the Wiener optimum of the whole image, so it needs all strips, but little of the
-        time.
+        The regularisation is the Wiener optimum of the whole image, so it needs all strips, but
+        little time.
         """
         with steps("measuring noise and contrast", len(self.chains) * self.ticks(0)) as bar:
             chains = [
@@ -130,7 +134,7 @@ class TraditionalRestoration(Restoration):
 
 
 def _counted(strips_read: Iterator[Tensor], bar: Steps) -> Iterator[Tensor]:
-    """Pass strips on as they come, and report the rows of each once the next one is asked for."""
+    """Yield strips as they come, and report the rows of each when the next one is requested."""
     for strip in strips_read:
         yield strip
         bar.advance(strip.shape[0])
@@ -138,7 +142,7 @@ def _counted(strips_read: Iterator[Tensor], bar: Steps) -> Iterator[Tensor]:
 
 @dataclass(frozen=True)
 class TraditionalPipeline:
-    """The traditional pipeline, as what can restore an image.
+    """The traditional pipeline, as a method that can restore images.
 
     Attributes:
         quality: fast, standard or best.
@@ -148,7 +152,7 @@ class TraditionalPipeline:
 
     @property
     def engine(self) -> Engine:
-        """This process."""
+        """The engine, which is this process."""
         return Engine()
 
     def prepare(
@@ -158,7 +162,7 @@ class TraditionalPipeline:
         name: str,
         cluster: Cluster | None = None,  # noqa: ARG002
     ) -> TraditionalRestoration:
-        """Make the pipeline ready to restore an image; see `prepare.Pipeline.prepare`."""
+        """Prepare the pipeline to restore an image; see `prepare.Pipeline.prepare`."""
         raster = source.raster
         sensors = in_order(reading.sensors, raster)
         sensors *= raster.bands // len(sensors)

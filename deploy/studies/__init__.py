@@ -1,3 +1,3 @@
-"""Long work on top of the verbs, studies and the making of networks: only its
-commands import it.
+"""Long-running work on top of the verbs: studies and the training of networks. Only its commands
+import it.
 """

@@ -37,7 +37,7 @@ LARGEST_PX = 1280
 SWATH_PX = (13600, 9016)
 """Width and height of the paper's swath."""
 WITHIN_S = 60.0
-"""What a swath may take, for the smallest board to be named."""
+"""The time limit for a swath, for which the smallest sufficient board is named."""
 INPUT = "degraded input"
 TRADITIONAL = "traditional"
 INT8 = f"{VARIANT}, INT8"
@@ -52,7 +52,7 @@ GATE_CAPTION = (
     "DPU's power-of-two rules."
 )
 DETAILS = bench_board.DETAILS | {"samples"}
-"""Figures and tables for a closer look."""
+"""Figures and tables that are shown only in detail."""
 
 NOTES = (
     (
@@ -78,7 +78,7 @@ def quality_rows(images: Mapping[str, np.ndarray], pair: Pair, degraded: np.ndar
 
 
 def load_sensors(sensor: SensorLike = SENSOR) -> tuple[Sensor, Sensor]:
-    """Return the sensor that the demo simulates, and the one that it imitates."""
+    """Return the sensor that the demo simulates, and the reference sensor that it aims at."""
     degraded = Sensor.load(sensor)
     if degraded.nominal().bits != BITS:
         raise OptionError(
@@ -91,15 +91,14 @@ def load_sensors(sensor: SensorLike = SENSOR) -> tuple[Sensor, Sensor]:
 def read_input(
     image: Path | None, seed: int, sensors: tuple[Sensor, Sensor], full_scale: float | None = None
 ) -> tuple[np.ndarray, Pair | None]:
-    """The degraded image (H, W) in digital numbers, and the pair that it belongs to where it is
-    simulated.
+    """Return the degraded image (H, W) in digital numbers, and its pair if it is simulated.
 
     Args:
         image: a photograph as a scene (8 bits) or a raw acquisition (mono, up to 12 bits); a
             synthetic scene if None.
         seed: of every random draw.
-        sensors: that acquire a scene.
-        full_scale: pixel value that is full scale: with it any image is a raw acquisition.
+        sensors: the sensors that acquire a scene.
+        full_scale: pixel value that is full scale. If it is given, any image is a raw acquisition.
     """
     degraded, reference = (profile.nominal() for profile in sensors)
     ratio = int(sensors[0].oversampling.low)
@@ -116,8 +115,8 @@ def read_input(
 
 
 def bench_tables(model: Network, dn: np.ndarray, sensors: tuple[Sensor, Sensor]) -> list[Section]:
-    """Speed for this image, for the swath of the paper beside its rows, and for that swath on every
-    board.
+    """Return the speed for this image, for the paper's swath next to its published rows, and for
+    that swath on every board.
     """
     dpu = load_dpu(DEFAULT_TARGET)
     halo_px = model.tiling.halo_px
@@ -149,8 +148,8 @@ def bench_tables(model: Network, dn: np.ndarray, sensors: tuple[Sensor, Sensor])
 
 
 def pictures_of(images: dict[str, np.ndarray], out: Path) -> list[Picture]:
-    """Crops of several (H, W) images side by side, also written as before-after.png, and the INT8
-    result whole.
+    """Return crops of several (H, W) images side by side, and the whole INT8 result. The crops are
+    also written as before-after.png.
     """
     side = min(CROP_PX, *images[INPUT].shape)
     stretch = stretch_of(images[INPUT])
@@ -170,7 +169,7 @@ def pictures_of(images: dict[str, np.ndarray], out: Path) -> list[Picture]:
 
 
 def headline(bench: Sequence[Row], quality: Sequence[Row], placement: Placement) -> str:
-    """One sentence: does it fit, how fast, at what quality."""
+    """Return one sentence: whether the network fits, how fast it is, and at what quality."""
     latency = next(row for row in bench if "whole tiles" in row.name).figures["latency"]
     cpu = bench[0].figures["latency"]
     board = DEFAULT_TARGET.upper()

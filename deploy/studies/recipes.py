@@ -1,4 +1,4 @@
-"""A shipped network made from its recipe: stage after stage, its INT8 file, and its model card.
+"""Make a shipped network from its recipe: stage after stage, its INT8 file, and its model card.
 
 OUT/1-float/      checkpoint, logs, pictures and weights of the first stage
 OUT/2-rounded/    of the second; start-int8.onnx is the INT8 file whose roundings it trains with
@@ -49,8 +49,8 @@ def make_network(
         recipe: of the network.
         toml: its text, for the model card.
         images: folders of photographs.
-        out: folder of what is made.
-        resume: whether to go on with what lies there; else it holds no run.
+        out: the output folder.
+        resume: True to continue the run in the folder; otherwise it must contain no run.
         device: cpu or cuda.
     """
     weights = shipped_weights(recipe.start) if recipe.start else None
@@ -81,8 +81,8 @@ def stage_run(
     start: Path | None,
     device: str,
 ) -> Run:
-    """Return the run of a stage; the INT8 file whose roundings it trains with is made where it is
-    not there.
+    """Return the run of a stage. Create the INT8 file whose roundings it trains with, if it does
+    not exist.
     """
     folder = out / f"{number}-{stage.name}"
     rounding = None
@@ -130,7 +130,7 @@ def stage_run(
 
 
 def model_card(recipe: NetworkRecipe, toml: str, images: Sequence[Path]) -> str:
-    """Return the text of a network's card: how it is made, from what, and on what it was made."""
+    """Return the text of a network's card: its recipe, its data, and the machine it was made on."""
     variant = VARIANTS[recipe.variant]
     files = list(chain.from_iterable(map(list_images, images)))
     # Sorted by name, so that the digest does not depend on the order of the folders.

@@ -1,4 +1,6 @@
-"""What all outputs of a table share: its columns, their units and modes, and missing figures."""
+"""The parts that all outputs of a table share: its columns, their units and modes, and missing
+figures.
+"""
 
 from collections.abc import Sequence, Set
 from dataclasses import dataclass
@@ -15,7 +17,7 @@ class Column:
 
     Attributes:
         name: of the figure.
-        unit: that its figures share; empty if they differ.
+        unit: the unit that its figures share; empty if they differ.
         mode: likewise, of those that have a value.
     """
 
@@ -29,7 +31,7 @@ class Column:
         return ", ".join(filter(None, (self.unit, self.mode)))
 
     def stated(self, figure: Figure) -> tuple[str, str]:
-        """Return a figure with its unit, and its mode; without what the heading states."""
+        """Return a figure with its unit, and its mode, without those that the heading states."""
         unit = "" if self.unit else figure.unit
         return " ".join(filter(None, (str(figure), unit))), "" if self.mode else figure.mode
 
@@ -53,7 +55,7 @@ def columns_of(rows: Sequence[Row]) -> list[Column]:
 
 
 def _common(words: Set[str]) -> str:
-    """Return the word that all have, if they have one."""
+    """Return the only word in a set, or "" if there are several."""
     return next(iter(words)) if len(words) == 1 else ""
 
 
@@ -63,7 +65,9 @@ def words_of(rows: Sequence[Row]) -> list[str]:
 
 
 def missing(rows: Sequence[Row]) -> list[str]:
-    """Return a line for each reason why figures are missing: which ones, of which rows."""
+    """Return a line for each reason why figures are missing, with the figures and rows
+    concerned.
+    """
     keys_of: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         for key, figure in row.figures.items():
@@ -74,7 +78,7 @@ def missing(rows: Sequence[Row]) -> list[str]:
         rows_of.setdefault((reason, ", ".join(keys)), []).append(name)
     lines = []
     for (reason, keys_text), names in rows_of.items():
-        # Where most rows lack a figure, their names say nothing.
+        # If most rows lack a figure, their names are no information.
         of_rows = f" of {', '.join(names)}" if len(names) < len(rows) / 2 else ""
         lines.append(f"{keys_text}{of_rows}: {reason}")
     return lines

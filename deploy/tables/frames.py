@@ -45,7 +45,7 @@ def wide_frame(rows: Sequence[Row]) -> "pd.DataFrame":
 
 def tidy_frame(rows: Sequence[Row]) -> "pd.DataFrame":
     """Return a line for each figure: its table, row and name, value, unit, mode, interval and
-    source (or why there is none).
+    source (or the reason why it is missing).
     """
     pandas = optional("pandas", "to_pandas")
     lines = []

@@ -13,7 +13,7 @@ STYLE = "border-bottom: 1px solid; padding: 2px 8px; text-align: left"
 def html_table(title: str, rows: Sequence[Row]) -> str:
     """Return one table with a line for each row.
 
-    The mode follows each figure. Its source, or why it is missing, is its tooltip.
+    The mode follows each figure. Its tooltip is its source, or the reason why it is missing.
     """
     columns = columns_of(rows)
     words = words_of(rows)
@@ -33,7 +33,7 @@ def html_table(title: str, rows: Sequence[Row]) -> str:
 
 
 def html_text(text: str) -> str:
-    """Return text as HTML that shows it and obeys nothing in it."""
+    """Return text escaped as HTML, so that none of it acts as markup."""
     return escape(visible(text))
 
 

@@ -8,18 +8,20 @@ from beers_deploy.profiles.figures import Row
 from beers_deploy.tables.columns import columns_of, missing, words_of
 
 MARKUP = re.compile(r"[\\`*_\[\]<>&|]")
-"""Characters that Markdown reads as markup within a line or a cell, or as the end of a cell."""
+"""Characters that Markdown treats as markup within a line or a cell, or as the end of a cell."""
 
 
 def markdown_text(text: str) -> str:
-    """Return text on one line that Markdown shows as it is: a layer's name comes from a file."""
+    """Return text escaped on one line, so that Markdown shows it literally. A layer's name comes
+    from a file.
+    """
     return MARKUP.sub(lambda match: f"\\{match[0]}", one_line(text))
 
 
 def markdown_table(rows: Sequence[Row]) -> list[str]:
-    """Return the lines of one table, and of a list why figures are missing.
+    """Return the lines of one table, and of a list of reasons why figures are missing.
 
-    A heading states the unit and the mode of its column where they are the same in all rows.
+    A heading states the unit and the mode of its column if they are the same in all rows.
     """
     columns = columns_of(rows)
     words = words_of(rows)

@@ -2,7 +2,7 @@
 
 Several layouts are tried, and the first that fits is printed:
 
-1. a line for each row, or for each figure where there are more figures than rows
+1. a line for each row, or for each figure if there are more figures than rows
 2. the same with each interval below its value
 3. and 4. the other way round
 5. a block for each row, which fits any width
@@ -25,13 +25,13 @@ from beers_deploy.tables.columns import Column, columns_of, missing, words_of
 
 COLOURS = {"measured": "green", "predicted": "yellow", "published": "blue"}
 PIPE_WIDTH = 160
-"""Columns when the output is no terminal."""
+"""The width in columns if the output is not a terminal."""
 
 NAME_WIDTH = 18
-"""Columns that a name or a word has at least, if it is as long."""
+"""The minimum number of columns for a name or a word, if it is that long."""
 
 HEADING_WIDTH = 16
-"""Columns at which the name of a row is wrapped where it heads a column."""
+"""The number of columns at which the name of a row is wrapped if it heads a column."""
 
 
 def default_console() -> Console:
@@ -41,12 +41,12 @@ def default_console() -> Console:
 
 
 def plain(text: str) -> Text:
-    """Return words on one line, as they are: without markup, and without characters of control."""
+    """Return words on one line, literally: without markup, and without control characters."""
     return Text(one_line(text))
 
 
 def print_rows(title: str, rows: Iterable[Row], console: Console) -> None:
-    """Print the rows of one table, and below it why figures are missing.
+    """Print the rows of one table, and below it the reasons why figures are missing.
 
     Args:
         title: of the table.
@@ -75,7 +75,7 @@ def _layouts(rows: Sequence[Row]) -> Iterator[Table]:
 
 
 def _fits(table: Table, console: Console) -> bool:
-    """Return True if a table fits with each figure whole; names then give way before figures."""
+    """Return True if a table fits with each figure whole. Names are shortened before figures."""
     # On its own console, the least width of a table never exceeds the console's.
     wide = console.options.update(width=10 * PIPE_WIDTH)
     needed = Measurement.get(console, wide, table)
@@ -111,7 +111,7 @@ def _by_row(rows: Sequence[Row], stacked: bool) -> Table:
 
 
 def _by_figure(rows: Sequence[Row], stacked: bool) -> Table:
-    """Return a table with a line for each figure; its unit and its mode stand in columns."""
+    """Return a table with a line for each figure. Its unit and its mode are in columns."""
     table = _empty()
     figures = columns_of(rows)
     words = words_of(rows)
@@ -133,7 +133,7 @@ def _by_figure(rows: Sequence[Row], stacked: bool) -> Table:
 
 
 def _add_figures(table: Table, heading: Sequence[str], cells: Sequence[Text]) -> None:
-    """Add a column in which no number is broken; words in it are wrapped."""
+    """Add a column in which no number is broken. Words in it are wrapped."""
     lines = [*heading, *chain.from_iterable(cell.plain.split("\n") for cell in cells)]
     least = max(map(cell_len, lines), default=0)
     text = Text("\n").join(map(plain, heading))
@@ -141,7 +141,7 @@ def _add_figures(table: Table, heading: Sequence[str], cells: Sequence[Text]) ->
 
 
 def _add_words(table: Table, heading: str, cells: Sequence[Text]) -> None:
-    """Add a column whose text is wrapped where it is longer than the terminal has room for."""
+    """Add a column whose text is wrapped if it is longer than the terminal has room for."""
     longest = max(map(cell_len, (heading, *(cell.plain for cell in cells))), default=0)
     table.add_column(plain(heading), overflow="fold", min_width=min(longest, NAME_WIDTH))
 
@@ -156,8 +156,8 @@ def _cell(row: Row, column: Column, stacked: bool) -> Text:
 
     Args:
         row: the row.
-        column: says whether unit and mode follow the figure.
-        stacked: whether interval and mode stand below the value.
+        column: determines whether unit and mode follow the figure.
+        stacked: True to put interval and mode below the value.
     """
     figure = row.figures.get(column.name)
     if figure is None or figure.value is None:

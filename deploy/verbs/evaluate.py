@@ -47,6 +47,7 @@ def evaluate(
     out: Annotated[OutputFolder, Holds(PAGE, folders=("",))] | None = None,
     sweep: bool = False,
     brightness: Factors = "1",
+    bits_per_pixel: Factors | None = None,
     consistency: bool = True,
     exposure: bool = True,
     strict: bool = False,
@@ -81,6 +82,8 @@ def evaluate(
         sweep: also compare under 16 sensors that are known exactly, and 7 that are known wrongly.
         brightness: also compare with the radiance of the scenes times these factors, separated by
             commas, such as 0.25,0.05.
+        bits_per_pixel: also compare restoration on board, before JPEG 2000 compresses to so many
+            bits per pixel, with restoration on the ground after it; several with commas: 1,2,3.
         consistency: networks that are given the sensor agree with the image at low frequencies.
         exposure: shipped networks restore dark parts at a higher exposure.
         strict: refuse pairs whose pixels contradict the sensor, instead of a warning.
@@ -114,7 +117,8 @@ def evaluate(
     given = partial(changed, evaluate, locals())
     if detector is not None:
         steps = ("consistency", "exposure", "strict")
-        refuse_with("`detector`", **given("pairs", "lpips", "sweep", "brightness", *steps))
+        also = ("sweep", "brightness", "bits_per_pixel")
+        refuse_with("`detector`", **given("pairs", "lpips", *also, *steps))
         return _detection(
             methods,
             images,
@@ -135,18 +139,28 @@ def evaluate(
         # An empty folder is refused before torch is loaded.
         list_images(Path(images))
     from beers_deploy.restoration.steps import Around
+    from beers_deploy.studies.evaluation.compression import check_rates
     from beers_deploy.studies.evaluation.pairs import check_brightness
     from beers_deploy.studies.evaluation.run import Plan, run_evaluation
 
     stored, in_memory = _stored_or_given(pairs)
+    named = named_methods(methods)
+    sensors = _sensors(sensor, reference, stored, in_memory)
+    rates = list[float]()
+    if bits_per_pixel is not None:
+        refuse_with("`methods` degraded", bits_per_pixel=len(named) == 1)
+        rates = check_rates(
+            numbers_of("bits_per_pixel", bits_per_pixel, "1,2,3"), sensors[0].nominal().bits
+        )
     plan = Plan(
-        methods=named_methods(methods),
-        sensors=_sensors(sensor, reference, stored, in_memory),
+        methods=named,
+        sensors=sensors,
         scenes=None if images is None else Path(images),
         folder=stored,
         given=in_memory,
         lpips=None if lpips is None else Path(lpips),
-        factors=check_brightness(factors_of(brightness)),
+        factors=check_brightness(numbers_of("brightness", brightness, "0.25,0.05")),
+        rates=rates,
         sweep=sweep,
         strict=strict,
         around=Around(consistency, exposure),
@@ -167,15 +181,20 @@ def named_methods(methods: Methods) -> dict[str, Any]:
     return {name.strip(): name.strip() for name in ("degraded", *names)}
 
 
-def factors_of(brightness: Factors) -> tuple[float, ...]:
-    """Return factors of radiance, of text with commas or of numbers."""
-    parts = brightness.split(",") if isinstance(brightness, str) else brightness
+def numbers_of(name: str, given: Factors, example: str) -> tuple[float, ...]:
+    """Return the numbers of an option, which are text with commas or numbers.
+
+    Args:
+        name: of the option.
+        given: its value.
+        example: of a value, for the error.
+    """
+    parts = given.split(",") if isinstance(given, str) else given
     try:
-        return tuple(float(factor) for factor in parts)
+        return tuple(float(part) for part in parts)
     except ValueError as error:
         raise OptionError(
-            f"`brightness` must be numbers separated by commas, such as 0.25,0.05, got "
-            f"{brightness!r}."
+            f"`{name}` must be numbers separated by commas, such as {example}, got {given!r}."
         ) from error
 
 

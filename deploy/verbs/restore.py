@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from beers_deploy.restoration.output import Output
     from beers_deploy.restoration.prepare import NetworkPipeline, Pipeline
     from beers_deploy.restoration.radiometry import Reading
+    from beers_deploy.restoration.run import Run
     from beers_deploy.results import Table
 
 
@@ -49,6 +50,7 @@ def restore(
     cog: bool = False,
     stac: OutputFile | None = None,
     self_check: OutputFile | None = None,
+    view: OutputFile | None = None,
     strict: bool = False,
     consistency: bool = True,
     exposure: bool = True,
@@ -94,6 +96,7 @@ def restore(
         stac: STAC item of the output to write; needs `cog`.
         self_check: TIFF to write with one pixel for each block of 64 x 64 pixels: whether the
             result, blurred as the sensor blurs, agrees with the image.
+        view: HTML file to write that shows raw and restored in a browser, to swipe and zoom.
         strict: refuse an image whose pixels contradict the sensor, and a result that fails the
             self-check, instead of a warning.
         consistency: make the result agree with the image at low spatial frequencies, if the sensor
@@ -138,7 +141,6 @@ def restore(
     from beers_deploy.restoration.radiometry import Reading
     from beers_deploy.restoration.run import restore_file
     from beers_deploy.restoration.runtime import Engine
-    from beers_deploy.restoration.stac import write_item
     from beers_deploy.restoration.steps import Around
 
     if method == "traditional":
@@ -153,8 +155,8 @@ def restore(
     if path is None:
         refuse_with(
             "an array",
-            **given("out", "compression", "cog", "stac", "self_check", "resume", "overwrite"),
-            **given("dry_run", "fix_detectors", "scheduler"),
+            **given("out", "compression", "cog", "stac", "self_check", "view", "resume"),
+            **given("overwrite", "dry_run", "fix_detectors", "scheduler"),
         )
     else:
         refuse_with("an image file, which states its own", **given("nodata"))
@@ -164,7 +166,7 @@ def restore(
     if path is not None and not dry_run:
         how: dict[str, Any] = {"compression": compression, "cog": cog, "resume": resume}
         how["self_check"] = None if self_check is None else Path(self_check)
-        output = _output(out, stac, overwrite or resume, fix_detectors or "", **how)
+        output = _output(out, (stac, view), overwrite or resume, fix_detectors or "", **how)
     sensors = sensors_of(sensor)
     unknown = is_unknown(sensors)
     reading = Reading(
@@ -193,8 +195,7 @@ def restore(
     if output is None:
         return _preview(path, network_pipeline(), reading)
     run = restore_file(path, output, reading, load)
-    if stac is not None:
-        write_item(output.path, Path(stac))
+    _write_documents(path, run, output, stac, view, force)
     return run
 
 
@@ -222,14 +223,23 @@ def _traditional(quality: str, unknown: bool) -> "Callable[[], Pipeline]":
 
 def _output(
     out: OutputFile | None,
-    stac: OutputFile | None,
+    documents: tuple[OutputFile | None, OutputFile | None],
     may_exist: bool,
     fix_detectors: str,
     **how: Any,
 ) -> "Output":
-    """Return what is written; raise OptionError if it is not named, or if it exists."""
+    """Return what is written; raise OptionError if it is not named, or if it exists.
+
+    Args:
+        out: the TIFF.
+        documents: the STAC item and the view.
+        may_exist: whether the TIFF may exist.
+        fix_detectors: what was asked about faulty detectors.
+        how: the other fields of `Output`.
+    """
     from beers_deploy.restoration.detectors.fault_list import list_beside
     from beers_deploy.restoration.output import Output
+    from beers_deploy.restoration.stac.network import network_paths
 
     if out is None:
         raise OptionError(
@@ -240,12 +250,35 @@ def _output(
         raise OptionError(
             f"{path} exists already. Add `overwrite` to replace it, or choose another name."
         )
-    if stac is not None:
+    named = [None if document is None else Path(document) for document in documents]
+    if named[0] is not None:
         optional("pystac", "stac")
+        (item,) = network_paths(named[0], 1)
+        named += [item, item.with_suffix(".onnx")]
     # The list of faults is an output of its own where they are searched for.
     listed = list_beside(path, fix_detectors)
-    others = (None if stac is None else Path(stac), listed, how["self_check"])
-    return Output(path, others=others, **how)
+    return Output(path, others=(*named, listed, how["self_check"]), **how)
+
+
+def _write_documents(
+    image: Path,
+    run: "Run",
+    output: "Output",
+    stac: OutputFile | None,
+    view: OutputFile | None,
+    force: bool,
+) -> None:
+    """Write the STAC item and the view of a run, where they are asked for."""
+    from beers_deploy.report.view import write_view
+    from beers_deploy.restoration.stac.item import write_item
+
+    # Rasters over the same place as the output, by the name of their layer and asset.
+    written = {"self-check": output.self_check}
+    maps = {name: raster for name, raster in written.items() if raster is not None}
+    if stac is not None:
+        write_item(run, Path(stac), maps)
+    if view is not None:
+        write_view(Path(view), image, run.path, maps, force)
 
 
 def _preview(image: Path, pipeline: "NetworkPipeline", reading: "Reading") -> "Table":

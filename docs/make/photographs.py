@@ -9,11 +9,13 @@ docs/results/gallery.md states where they are from.
 import argparse
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
 import beers_deploy as bd
 from beers_deploy.model.io.pictures import stretch_of, strip
+from beers_deploy.pairs import Pair
 
 ASSETS = Path(__file__).parents[1] / "assets"
 SENSOR = "pleiades-degraded"
@@ -58,7 +60,8 @@ def main() -> None:
 
 def draw(photograph: Path, view: View) -> str:
     """Write the picture, and return the PSNR of its columns for the caption."""
-    pair = bd.simulate(images=[photograph], oversampling=view.oversampling)
+    # Without `out` it is a pair.
+    pair = cast(Pair, bd.simulate(images=[photograph], oversampling=view.oversampling))
     images = {
         "raw": pair.degraded,
         "traditional, tuned": bd.restore(pair.degraded, method="traditional", sensor=SENSOR),

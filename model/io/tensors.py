@@ -117,7 +117,7 @@ def read_weights(path: Path) -> Weights:
     """Read the weights of a network, plain or conditioned on a sensor, or raise ModelError."""
     tensors, header = read_tensors(path)
     try:
-        conditioned = _told(header)
+        conditioned = _conditioned(header)
         shape: Any = header["variant"]
         variant = Variant(int(shape["blocks"]), int(shape["features"]), int(shape.get("scale", 1)))
         if variant.scale < 1:
@@ -172,7 +172,7 @@ def all_finite(tensors: Arrays) -> bool:
     return all(bool(np.isfinite(tensor).all()) for tensor in tensors.values())
 
 
-def _told(header: Mapping[str, object]) -> bool:
+def _conditioned(header: Mapping[str, object]) -> bool:
     """Return True if the network is conditioned on its sensor; raise ValueError for
     other versions.
     """

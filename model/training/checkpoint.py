@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beers_deploy.model.convbeers import Network, arrays, save_network, told
+from beers_deploy.model.convbeers import Network, arrays, for_sensor, save_network
 from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.tensors import all_finite, read_tensors
 from beers_deploy.model.training.losses import PAPER, LossWeights
@@ -141,7 +141,7 @@ def require_finite_output(
     image = torch.rand((1, 1, side_px, side_px), generator=torch.Generator().manual_seed(0))
     images = torch.cat([torch.zeros_like(image), image, torch.ones_like(image)])
     with torch.inference_mode():
-        restored = told(network, torch.zeros(len(RANGES)))(images)
+        restored = for_sensor(network, torch.zeros(len(RANGES)))(images)
     if not bool(torch.isfinite(restored).all()):
         raise ModelError(f"{name} returns NaN or infinity for a test image. {remedy}")
 

@@ -71,34 +71,34 @@ def prepare(scene: Scene, multiple: int, device: torch.device | str = "cpu") -> 
     return Visited(torch.fft.rfft2(torch.from_numpy(radiance).to(device)), radiance.shape[-1])
 
 
-def folded_signals(scene: Visited, sensors: tuple[Instrument, ...], made: Pass) -> list[Tensor]:
+def folded_signals(scene: Visited, sensors: tuple[Instrument, ...], passage: Pass) -> list[Tensor]:
     """Compute the blurred and sampled radiance (h, w) of each sensor on the target grid, without
     the margin.
 
     Args:
         scene: with its spectrum.
         sensors: the instruments.
-        made: the parameters of the pass.
+        passage: the parameters of the pass.
     """
     height, width = scene.sides
     device = scene.spectrum.device
-    down, across = frequencies(height, width, made.oversampling, device)
-    ground = looked(scene.spectrum, made.look, down, across)
+    down, across = frequencies(height, width, passage.oversampling, device)
+    ground = looked(scene.spectrum, passage.look, down, across)
     # Target pixel n is sampled at the centre of its scene pixels, as
     # `model.simulator.sampling.sample` does.
-    centre = (made.oversampling - 1) / 2
-    ground *= _ramp(down / made.oversampling, centre + made.phase_px[0])[:, None]
-    ramp = _ramp(across / made.oversampling, centre + made.phase_px[1]) / made.oversampling
+    centre = (passage.oversampling - 1) / 2
+    ground *= _ramp(down / passage.oversampling, centre + passage.phase_px[0])[:, None]
+    ramp = _ramp(across / passage.oversampling, centre + passage.phase_px[1]) / passage.oversampling
     signals = []
     for sensor in sensors:
         blurs = sensor.blur, sensor.antialias_px, sensor.smear_px
-        transfer = transfer_of(height, width, made.oversampling, *blurs, str(device))
+        transfer = transfer_of(height, width, passage.oversampling, *blurs, str(device))
         # Keeping every r-th row is adding up the r aliases of each frequency: what follows is r
         # times smaller.
-        aliases = (ground * transfer).view(made.oversampling, height // made.oversampling, -1)
+        aliases = (ground * transfer).view(passage.oversampling, height // passage.oversampling, -1)
         rows = aliases.sum(0) * ramp
         lines = torch.fft.irfft(torch.fft.ifft(rows, dim=0), n=width)
-        signals.append(within_margin(lines[:, :: made.oversampling], made.margin_px))
+        signals.append(within_margin(lines[:, :: passage.oversampling], passage.margin_px))
     return signals
 
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from beers_deploy.model.bank import Bank, network_bank
-from beers_deploy.model.convbeers import Told, vector_tensor
+from beers_deploy.model.convbeers import Condition, vector_tensor
 from beers_deploy.model.exposure import HEADROOM, factors_for
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import Scene
@@ -40,12 +40,13 @@ class Batch(NamedTuple):
     Attributes:
         degraded: the input of the network.
         reference: the target of the network.
-        told: description of the sensor of each, oriented as the patch; None for a plain network.
+        condition: description of the sensor of each, oriented as the patch; None for a plain
+            network.
     """
 
     degraded: Tensor
     reference: Tensor
-    told: Told | None = None
+    condition: Condition | None = None
 
 
 class Visit(NamedTuple):
@@ -53,11 +54,11 @@ class Visit(NamedTuple):
 
     Attributes:
         patches: (N, 2, P, P), degraded and reference in [0, 1].
-        told: description of the sensor of each; None without a family of sensors.
+        condition: description of the sensor of each; None without a family of sensors.
     """
 
     patches: Tensor
-    told: Told | None
+    condition: Condition | None
 
 
 class PatchSource:
@@ -109,8 +110,8 @@ class PatchSource:
                 waiting.append(ahead.submit(self._shard, number + threads - 1))
                 for k in range(within, self.SHARD_BATCHES):
                     part = slice(k * self.batch, (k + 1) * self.batch)
-                    told = None if shard.told is None else shard.told.some(part)
-                    yield Batch(shard.degraded[part], shard.reference[part], told)
+                    condition = None if shard.condition is None else shard.condition.some(part)
+                    yield Batch(shard.degraded[part], shard.reference[part], condition)
                 within = 0
 
     def _shard(self, number: int) -> Batch:
@@ -142,10 +143,12 @@ def _mixed(visits: Sequence[Visit], order: np.ndarray) -> Batch:
     places = torch.from_numpy(order)
     patches = torch.cat([item.patches for item in visits])[places.to(visits[0].patches.device)]
     pair = patches[:, :1].contiguous(), patches[:, 1:].contiguous()
-    told = [item.told.parts for item in visits if item.told is not None]
-    if not told:
+    condition = [item.condition.parts for item in visits if item.condition is not None]
+    if not condition:
         return Batch(*pair)
-    return Batch(*pair, Told(*(torch.cat(part)[places] for part in zip(*told, strict=True))))
+    return Batch(
+        *pair, Condition(*(torch.cat(part)[places] for part in zip(*condition, strict=True)))
+    )
 
 
 def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -> Visit | None:
@@ -161,7 +164,7 @@ def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -
     quarter, mirrored = draw_turn(generator, quarters or recipe.family is not None, mirrors)
     if recipe.family is None:
         return Visit(turned(patches, quarter, mirrored), None)
-    return _told(turned(patches, quarter, mirrored), sensor, quarter, mirrored)
+    return _conditioned(turned(patches, quarter, mirrored), sensor, quarter, mirrored)
 
 
 def _acquire_pair(
@@ -186,7 +189,7 @@ def _acquire_pair(
     return torch.stack([degraded, reference]), sensors[0]
 
 
-def _told(patches: Tensor, sensor: Instrument, quarter: int, mirrored: bool) -> Visit:
+def _conditioned(patches: Tensor, sensor: Instrument, quarter: int, mirrored: bool) -> Visit:
     """Brighten dark patches (N, 2, P, P) as a restoration does, and add the description of their
     sensors.
     """
@@ -195,15 +198,17 @@ def _told(patches: Tensor, sensor: Instrument, quarter: int, mirrored: bool) -> 
     for factor in factors_for(sensor):
         factors[brightest * factor <= HEADROOM] = factor
     distinct, places = np.unique(factors, return_inverse=True)
-    conditions = [_told_of(sensor, int(factor), quarter, mirrored) for factor in distinct]
-    told = Told.of(
+    conditions = [_condition_of(sensor, int(factor), quarter, mirrored) for factor in distinct]
+    condition = Condition.of(
         torch.stack([vector for vector, _ in conditions]), [bank for _, bank in conditions]
     )
     scale = torch.from_numpy(factors).to(patches)[:, None, None, None]
-    return Visit(patches * scale, told.some(torch.from_numpy(places)))
+    return Visit(patches * scale, condition.some(torch.from_numpy(places)))
 
 
-def _told_of(sensor: Instrument, factor: int, quarter: int, mirrored: bool) -> tuple[Tensor, Bank]:
+def _condition_of(
+    sensor: Instrument, factor: int, quarter: int, mirrored: bool
+) -> tuple[Tensor, Bank]:
     """Return the vector (4,) and the bank of a sensor of `factor` times the gain, for turned
     patches.
     """

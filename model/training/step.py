@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 
-from beers_deploy.model.convbeers import Network, Rounding, Told
+from beers_deploy.model.convbeers import Condition, Network, Rounding
 from beers_deploy.model.training.losses import RestorationLoss
 from beers_deploy.model.training.source import Batch
 
@@ -45,11 +45,11 @@ class Inputs:
 
     def tensors(self) -> list[Tensor]:
         """Return all tensors in a fixed order."""
-        told = () if self.batch.told is None else self.batch.told.parts
+        condition = () if self.batch.condition is None else self.batch.condition.parts
         return [
             self.batch.degraded,
             self.batch.reference,
-            *told,
+            *condition,
             *self.steps,
             self.rate,
             self.share,
@@ -126,14 +126,16 @@ class Step:
         return self._outputs.clone()
 
     def _on_device(self, batch: Batch, rate: float, share: float) -> Inputs:
-        told: Told | None = None
+        condition: Condition | None = None
         steps = list[Tensor]()
-        if batch.told is not None:
-            told = batch.told.to(self.device)
+        if batch.condition is not None:
+            condition = batch.condition.to(self.device)
             if self.rounding is not None:
-                steps = [step.to(self.device) for step in self.rounding.steps(batch.told.gains)]
+                steps = [
+                    step.to(self.device) for step in self.rounding.steps(batch.condition.gains)
+                ]
         degraded = batch.degraded.to(self.device, memory_format=torch.channels_last)
-        batch_on_device = Batch(degraded, batch.reference.to(self.device), told)
+        batch_on_device = Batch(degraded, batch.reference.to(self.device), condition)
         return Inputs(
             batch_on_device,
             steps,
@@ -159,8 +161,10 @@ class Step:
 
     def _backward(self, inputs: Inputs) -> tuple[Tensor, Mapping[str, Tensor]]:
         batch = inputs.batch
-        conditions = () if batch.told is None else (batch.told, self.bfloat16, inputs.steps)
-        keywords = {"bfloat16": self.bfloat16} if batch.told is None else {}
+        conditions = (
+            () if batch.condition is None else (batch.condition, self.bfloat16, inputs.steps)
+        )
+        keywords = {"bfloat16": self.bfloat16} if batch.condition is None else {}
         restored = self.forward(batch.degraded, *conditions, **keywords)
         total, terms = self.loss(restored, batch.reference)
         self.optimiser.zero_grad(set_to_none=True)

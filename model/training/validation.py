@@ -11,7 +11,7 @@ from torch.nn.functional import pad
 from beers_deploy.model.bank import network_bank
 from beers_deploy.model.convbeers import (
     Network,
-    told,
+    for_sensor,
     vector_tensor,
 )
 from beers_deploy.model.family import SensorFamily
@@ -36,32 +36,34 @@ SIDE_PX = 192
 OVERSAMPLINGS = (4, 3, 2, 1)
 
 
-def split_by_site(names: Sequence[str], wanted: Sequence[str] = ()) -> tuple[list[int], list[int]]:
+def split_by_site(
+    names: Sequence[str], excluded: Sequence[str] = ()
+) -> tuple[list[int], list[int]]:
     """Split images into those to train on and those held out, by whole sites and always equally.
 
     Args:
         names: of the images.
-        wanted: sites to hold out. Without any, those with the fewest images are held out; with
+        excluded: sites to hold out. Without any, those with the fewest images are held out; with
             fewer than three sites none is.
 
     Returns:
         The numbers of the images to train on, and of those held out.
 
     Raises:
-        OptionError: no image shows a wanted site.
+        OptionError: no image shows an excluded site.
     """
     sites: dict[str, list[int]] = {}
     for number, name in enumerate(names):
         sites.setdefault(site_of(name), []).append(number)
     held_out: list[int] = []
-    for site in wanted:
+    for site in excluded:
         if site not in sites:
             raise OptionError(
                 f"The site {site!r} is to be held out, but no image shows it. Give the folders of "
                 "all its images."
             )
         held_out += sites[site]
-    if len(sites) >= 3 and not wanted:
+    if len(sites) >= 3 and not excluded:
         # The name decides between sites of one size, so that the split is always the same.
         for site in sorted(sites, key=lambda s: (len(sites[s]), s)):
             if len(held_out) >= SHARE * len(names):
@@ -108,13 +110,13 @@ class Validation:
         """
         restored = []
         for (degraded, _), sensor in zip(self.pairs, self.sensors, strict=True):
-            for_sensor = told(network, vector_tensor(sensor), network_bank(sensor))
+            restorer = for_sensor(network, vector_tensor(sensor), network_bank(sensor))
             height, width = degraded.shape[-2:]
-            right = -width % for_sensor.variant.scale
-            below = -height % for_sensor.variant.scale
+            right = -width % restorer.variant.scale
+            below = -height % restorer.variant.scale
             extended = pad(degraded, [0, right, 0, below], mode="replicate")
             with torch.inference_mode():
-                restored.append(for_sensor(extended)[0, 0, :height, :width].clamp(0, 1).numpy())
+                restored.append(restorer(extended)[0, 0, :height, :width].clamp(0, 1).numpy())
         return restored
 
     def judge(self, network: Network) -> dict[str, float]:

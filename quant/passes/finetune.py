@@ -10,8 +10,9 @@ are powers of two.
 1. Hold out some of the pairs.
 2. Before each round of steps change scales by one bit if that reduces the error on training pairs
    (`quant.passes.scales`). The core stays within the windows of the DPU's shifts.
-3. Take steps of gradient descent.
-4. Every few steps round the numbers, and keep the core with the least error on the held-out pairs.
+3. Take steps of gradient descent, and average the numbers over the last steps, because single steps
+   cross rounding thresholds back and forth.
+4. Every few steps round the averages, and keep the core with the least error on the held-out pairs.
 5. Stop after a round of steps with little gain.
 """
 
@@ -22,6 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import onnx
 import torch
+from torch.optim.swa_utils import AveragedModel
 
 from beers_deploy.model.progress import step
 from beers_deploy.profiles.errors import ImageError
@@ -45,11 +47,18 @@ BORDER_PX = 8
 """This border is not compared with a reference if the sides of the result are at least four times
 as long. A patch ends there, but its image continues. The float network has the same border.
 """
-ROUNDS = (400, 800, 1600)
+ROUNDS = (500, 1000, 2000, 4000)
 """The number of steps of each round of "auto"."""
+DECAY = 0.98
+"""The decay per step of the running average of the numbers."""
+SLOWER = 4.0
+"""The rate is divided by it, SLOWDOWNS times at most. Which rate is best depends on the network: a
+depthwise one gains most at the first, one with a global add may gain only at the last.
+"""
+SLOWDOWNS = 2
 LEAST_GAIN = 0.02
 """A round that recovers less than this share of the initial INT8 loss is the last one."""
-JUDGED_EVERY = 20
+JUDGED_EVERY = 50
 JUDGING = 48
 """The number of training pairs on which scales are judged."""
 
@@ -70,7 +79,7 @@ class Tuning:
 
     pairs: Sequence[Pair]
     steps: int | None = None
-    rate: float = 0.02
+    rate: float = 0.3
     seed: int = 0
     original: onnx.ModelProto | None = None
 
@@ -85,14 +94,26 @@ class Sample:
         floats: the float network's correction.
         reference: the correction that would restore it completely, or None.
         weight: of its errors: one over the float network's own error, so that dark and busy patches
-            count equally.
+            count equally. A number, or (N, 1, 1, 1) of a batch.
     """
 
     image: np.ndarray
     planes: Tensor
     floats: Tensor
     reference: Tensor | None
-    weight: float
+    weight: float | Tensor
+
+    @classmethod
+    def batch(cls, samples: Sequence["Sample"]) -> "Sample":
+        """Join N samples of equal size to one, which runs faster than one by one."""
+        references = [sample.reference for sample in samples if sample.reference is not None]
+        return cls(
+            np.concatenate([sample.image for sample in samples]),
+            torch.cat([sample.planes for sample in samples]),
+            torch.cat([sample.floats for sample in samples]),
+            torch.cat(references) if references else None,
+            torch.tensor([float(sample.weight) for sample in samples])[:, None, None, None],
+        )
 
     def error(self, correction: Tensor) -> Tensor:
         """Return the weighted error of a correction, which autograd can differentiate.
@@ -104,10 +125,10 @@ class Sample:
             The mean squared difference from the float network's correction, plus that from the
             reference if there is one, times `weight`.
         """
-        error = (correction - self.floats).square().mean()
+        error = (self.weight * (correction - self.floats).square()).mean()
         if self.reference is not None:
-            error = error + _inner_error(correction, self.reference)
-        return self.weight * error
+            error = error + _inner_error(correction, self.reference, self.weight)
+        return error
 
 
 def finetune(
@@ -142,6 +163,7 @@ def finetune(
     judging = hardest_and_others(order, JUDGING)
     first = least = before = loss_of(core, held_out)
     done = 0
+    slowdowns = 0
     for steps in rounds:
         # 2.
         step("fine-tuning: trying other scales")
@@ -149,10 +171,13 @@ def finetune(
             trainable, full, shifts, lambda candidate: loss_of(candidate, judging)
         )
         # 3.
-        for left in descend(trainable, training, steps, tuning.rate, generator):
+        average = AveragedModel(trainable, avg_fn=_averaged)
+        rate = tuning.rate / SLOWER**slowdowns
+        for left in descend(trainable, training, steps, rate, generator):
+            average.update_parameters(trainable)
             # 4. Counted from the end, so that the last step is judged, where the rate is near 0.
             if left % JUDGED_EVERY == 0 or left == steps:
-                candidate = trainable.core()
+                candidate = average.module.core()
                 loss = loss_of(candidate, held_out)
                 if loss < least:
                     core = candidate
@@ -164,7 +189,10 @@ def finetune(
         done += steps
         # 5.
         if before - least < LEAST_GAIN * first:
-            break
+            if slowdowns == SLOWDOWNS:
+                break
+            slowdowns += 1
+            trainable = TrainableCore(core)
         before = least
     return core, done
 
@@ -195,18 +223,35 @@ def descend(
     optimizer = torch.optim.Adam(trainable.parameters(), eps=1e-15)
     # The number of samples follows from their size, so that a step costs about the same for any
     # size.
-    batch = max(BATCH_PIXELS // math.prod(samples[0].planes.shape[2:]), 1)
+    count = max(BATCH_PIXELS // math.prod(samples[0].planes.shape[2:]), 1)
     yield steps
     for taken in range(steps):
         rate = highest_rate * 0.5 * (1 + math.cos(math.pi * taken / steps))
         optimizer.param_groups[0]["lr"] = rate
         optimizer.zero_grad()
-        for number in torch.randint(len(samples), (batch,), generator=generator).tolist():
-            sample = samples[number]
-            # Gradients of the batch add up sample by sample, whose sizes may differ.
-            (sample.error(trainable(sample.planes)) / batch).backward()
+        drawn = torch.randint(len(samples), (count,), generator=generator).tolist()
+        for batch in _batches([samples[number] for number in drawn]):
+            share = len(batch.planes) / count
+            error = share * batch.error(trainable(batch.planes))
+            error.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
         yield steps - taken - 1
+
+
+def _batches(samples: Sequence[Sample]) -> list[Sample]:
+    """Group samples into batches, one for each size, with and without references."""
+    batches: dict[tuple[torch.Size, bool], list[Sample]] = {}
+    for sample in samples:
+        kind = sample.planes.shape, sample.reference is None
+        batches.setdefault(kind, []).append(sample)
+    return [Sample.batch(alike) for alike in batches.values()]
+
+
+def _averaged(average: Tensor, number: Tensor, count: Tensor | int) -> Tensor:
+    """Return the running average after one more step; `count` is the number of steps before it."""
+    # Early steps leave the start behind sooner, so that short rounds train at all.
+    decay = min(DECAY, (int(count) + 1) / (int(count) + 10))
+    return average.lerp(number, 1 - decay)
 
 
 def loss_of(core: IntCore, samples: Sequence[Sample]) -> float:
@@ -270,12 +315,13 @@ LEAST_ERROR = 1e-9
 """Mean squared error over full scale (90 dB) below which a float network counts as perfect."""
 
 
-def _inner_error(result: Tensor, target: Tensor) -> Tensor:
+def _inner_error(result: Tensor, target: Tensor, weight: float | Tensor = 1.0) -> Tensor:
     """Return the mean squared error without the border, which no network could restore.
 
     Args:
-        result: a correction (1, C, H', W').
-        target: the correction that it should be, of the same shape.
+        result: corrections (N, C, H', W').
+        target: the corrections that they should be, of the same shape.
+        weight: of each correction's error.
 
     Returns:
         A tensor of one number. A small result is compared as a whole.
@@ -284,4 +330,4 @@ def _inner_error(result: Tensor, target: Tensor) -> Tensor:
     border_px = BORDER_PX if min(result.shape[2:]) >= 4 * BORDER_PX else 0
     height, width = result.shape[2:]
     inner = (result - target)[..., border_px : height - border_px, border_px : width - border_px]
-    return inner.square().mean()
+    return (weight * inner.square()).mean()

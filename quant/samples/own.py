@@ -241,10 +241,10 @@ def _valid_reference(name: str, reference: np.ndarray) -> np.ndarray:
             f"The reference of {name} must be of real numbers, got {reference.dtype}. {REMEDY}"
         )
     values = np.asarray(reference, np.float32)
-    lost = np.count_nonzero(~np.isfinite(values))
-    if lost:
+    missing = np.count_nonzero(~np.isfinite(values))
+    if missing:
         raise ImageError(
-            f"The reference of {name} has {lost} values that are NaN or infinite. Leave out "
+            f"The reference of {name} has {missing} values that are NaN or infinite. Leave out "
             "samples whose references lack pixels."
         )
     return values
@@ -259,10 +259,10 @@ def _valid_image(name: str, image: np.ndarray, channels: int, ranges: Ranges | N
     if not image.size:
         raise ImageError(f"{name} has no pixels: its shape is {sizes_of(image)}. {REMEDY}")
     values = np.asarray(image, np.float32)
-    lost = np.count_nonzero(~np.isfinite(values))
-    if lost:
+    missing = np.count_nonzero(~np.isfinite(values))
+    if missing:
         raise ImageError(
-            f"{name} has {lost} values that are NaN or infinite. Leave out samples with missing "
+            f"{name} has {missing} values that are NaN or infinite. Leave out samples with missing "
             "pixels."
         )
     shares = to_shares(values, ranges or ())

@@ -11,7 +11,7 @@ from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.float_onnx import banked_to_onnx, float_for, to_onnx
 from beers_deploy.model.bank import network_bank
-from beers_deploy.model.convbeers import ConvBEERS, arrays, save_network, told, vector_tensor
+from beers_deploy.model.convbeers import ConvBEERS, arrays, for_sensor, save_network, vector_tensor
 from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.shipped import shipped_names, shipped_weights
 from beers_deploy.model.variants import Variant
@@ -67,7 +67,7 @@ def test_a_network_behind_a_bank_is_exported_for_one_sensor(
     model = banked_to_onnx(Weights(arrays(banked.state_dict()), banked.variant, {}), sensor, {})
     image = np.random.default_rng(1).random((2, 1, rows, columns), dtype=np.float32) * 0.02 + 0.4
     with torch.inference_mode():
-        expected = told(banked, vector_tensor(sensor), network_bank(sensor))(
+        expected = for_sensor(banked, vector_tensor(sensor), network_bank(sensor))(
             torch.from_numpy(image)
         ).numpy()
     np.testing.assert_allclose(run(open_session(model), image), expected, atol=2e-6)

@@ -99,7 +99,7 @@ REFUSED = {
     "evaluate": [
         Refused(("images", "sweep", "brightness"), "--pairs PAIRS"),
         Refused(("labels", "split", "side", "classes"), without="--detector"),
-        Refused(("pairs", "sweep", "strict", "exposure"), "--detector DETECTOR"),
+        Refused(("pairs", "sweep", "strict", "exposure", "bits_per_pixel"), "--detector DETECTOR"),
     ],
     "tradeoff": [Refused(("out",), "--dry-run")],
     "stress": [

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from beers_deploy.model.convbeers import load_network, save_network, told
+from beers_deploy.model.convbeers import for_sensor, load_network, save_network
 from beers_deploy.model.io.tensors import read_tensors
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.training import run as training
@@ -162,7 +162,7 @@ def banked_weights(folder: Path) -> Path:
 
 def restored(path: Path, image: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
     with torch.inference_mode():
-        result: torch.Tensor = told(load_network(path)[0], vector)(image)
+        result: torch.Tensor = for_sensor(load_network(path)[0], vector)(image)
     return result
 
 

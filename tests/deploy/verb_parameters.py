@@ -11,6 +11,7 @@ from beers_deploy.verbs.parameters import Holds, Interval, Written
 from beers_deploy.verbs.verb import marker
 
 GIVEN = {
+    "bits_per_pixel": "2",
     "brightness": "0.5",
     "cases": "night",
     "classes": "car=vehicle",

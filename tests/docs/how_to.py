@@ -33,7 +33,6 @@ LEFT_OUT = {
     "xdputil query": "is a program of the board",
     "xdputil benchmark core.xmodel 3": "is a program of the board",
     "beers-deploy golden results --compare kit/golden": "compares what a board wrote",
-    "beers-deploy gate FLOAT INT8": "is a form: the page's own commands fill it in",
     **{
         (
             f"beers-deploy train --recipe {name} --images aerial-train/ --images aerial-train2/ "

@@ -24,7 +24,7 @@ PATH = re.compile(r"(?<![\w/.-])docs/[\w./-]*\w\.(?:md|py|toml|svg|png|ipynb)\b"
 LINK = re.compile(r"\]\((?!https?:|data:|#)([^)#\s]+)")
 TERMS = (
     "halo",
-    "told sensor",
+    "known sensor",
     "DPU",
     "MTF",
     "residual group",

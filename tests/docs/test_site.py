@@ -10,39 +10,22 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from importlib.util import find_spec
 from pathlib import Path
-from queue import Queue
-from threading import Thread
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
 
-from tests.deploy.browser import browser
+from tests.deploy.browser import driven
 
 Run = Callable[..., Any]
 
 ROOT = Path(__file__).parents[2]
 WIDTHS_PX = (1280, 390)
-ASKED = {"halo": "tiling", "KV260": "boards", "told sensor": "glossary"}
+ASKED = {"halo": "tiling", "KV260": "boards", "known sensor": "glossary"}
 """What a reader may search for, and the page that must be among the first ten found."""
 FIRST = 10
-TIMEOUT_S = 240
-HARNESS = """<!doctype html><body><script>
-const sleep = (ms) => new Promise((done) => setTimeout(done, ms));
-const frame = (address, width) => new Promise((done) => {
-  const made = document.createElement("iframe");
-  Object.assign(made, { width, height: 900, onload: () => done(made) });
-  made.src = address;
-  document.body.append(made);
-});
-const tell = (report) => fetch("/told", { method: "POST", body: JSON.stringify(report) });
-const drive = async () => { %s };
-drive().then(tell, (error) => tell({ failed: String(error) + error.stack }));
-</script></body>"""
 LOOK = """
 const report = [];
 for (const address of %s) {
@@ -111,78 +94,16 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-class Server(SimpleHTTPRequestHandler):
-    """Serves the site, a page with a script in it, and takes what the script tells."""
-
-    def __init__(
-        self, script: str, messages: "Queue[Any]", *arguments: Any, directory: str
-    ) -> None:
-        self.script = script
-        self.told = messages
-        super().__init__(*arguments, directory=directory)
-
-    def log_message(self, *_: object) -> None:
-        """Say nothing."""
-
-    def do_GET(self) -> None:
-        if self.path.endswith("search_index.json") and self.script.startswith(LOOK[:20]):
-            # Every page would load the search index, a megabyte, without searching in it.
-            return self.answer(404, b"")
-        if self.path != "/harness":
-            return super().do_GET()
-        return self.answer(200, (HARNESS % self.script).encode())
-
-    def do_POST(self) -> None:
-        self.told.put(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
-        self.answer(200, b"")
-
-    def answer(self, status: int, body: bytes) -> None:
-        self.send_response(status)
-        self.send_header("Content-Type", "text/html")
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        self.wfile.write(body)
-
-
 @pytest.fixture
 def run(site: Path, tmp_path: Path) -> Run:
     """What a script answers in a page of the site."""
 
     def answer(script: str, *, dark: bool = False) -> Any:
-        messages: Queue[Any] = Queue()
-        handler = partial(Server, script, messages, directory=str(site))
-        browse = command(tmp_path, dark=dark)
-        with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-            thread = Thread(target=server.serve_forever)
-            thread.start()
-            address = f"http://127.0.0.1:{server.server_address[1]}/harness"
-            started = subprocess.Popen([*browse, address], stderr=subprocess.DEVNULL)
-            try:
-                report = messages.get(timeout=TIMEOUT_S)
-            finally:
-                started.terminate()
-                started.wait()
-                server.shutdown()
-                thread.join()
-        assert "failed" not in report, report["failed"]
-        return report
+        # Every page would load the search index, a megabyte, without searching in it.
+        missing = "search_index.json" if script.startswith(LOOK[:20]) else ""
+        return driven(site, script, tmp_path, dark=dark, missing=missing)
 
     return answer
-
-
-def command(profile: Path, *, dark: bool) -> list[str]:
-    options = [
-        "--headless",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--remote-debugging-port=0",
-        "--window-size=1400,1000",
-    ]
-    options += [
-        f"--user-data-dir={profile}",
-        f"--blink-settings=preferredColorScheme={0 if dark else 1}",
-    ]
-    return [browser(), *options]
 
 
 def pages(site: Path) -> list[str]:

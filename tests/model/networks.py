@@ -3,7 +3,7 @@
 import torch
 
 from beers_deploy.model.bank import bank_of_vector
-from beers_deploy.model.convbeers import BankedConvBEERS, ConvBEERS, Told, initialise
+from beers_deploy.model.convbeers import BankedConvBEERS, Condition, ConvBEERS, initialise
 from beers_deploy.model.variants import Variant
 
 
@@ -22,9 +22,9 @@ def behind_a_bank(variant: Variant, spread: float) -> BankedConvBEERS:
     return network.eval()
 
 
-def told_of(vectors: torch.Tensor) -> Told:
+def told_of(vectors: torch.Tensor) -> Condition:
     """What networks are told of the sensors of some vectors (N, 4)."""
-    return Told.of(vectors, [bank_of_vector(tuple(vector.tolist())) for vector in vectors])
+    return Condition.of(vectors, [bank_of_vector(tuple(vector.tolist())) for vector in vectors])
 
 
 def radius_px(variant: Variant) -> int:

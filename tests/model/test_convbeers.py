@@ -3,7 +3,7 @@ import torch
 from torch.nn.functional import conv2d, pad
 
 from beers_deploy.model.bank import bank_of_vector
-from beers_deploy.model.convbeers import ConvBEERS, told
+from beers_deploy.model.convbeers import ConvBEERS, for_sensor
 from beers_deploy.model.variants import VARIANTS, Variant
 from tests.model.networks import behind_a_bank, plain, radius_px, told_of
 
@@ -101,7 +101,7 @@ def test_each_image_of_a_batch_meets_its_own_sensor() -> None:
         together = network(images, told_of(VECTORS))
         for number in range(3):
             alone, other = (
-                told(network, VECTORS[k])(images[number : number + 1])[0]
+                for_sensor(network, VECTORS[k])(images[number : number + 1])[0]
                 for k in (number, number - 1)
             )
             assert float((together[number] - alone).abs().max()) <= 1e-6

@@ -1,4 +1,4 @@
-"""docs/explanation/traps.md is complete, and the controls that other tests lack: the trap itself,
+"""The list in traps.md is complete, and the controls that other tests lack: the trap itself,
 sprung.
 """
 
@@ -51,7 +51,7 @@ def missing_tests(rows: dict[int, list[tuple[str, str]]]) -> list[str]:
 
 
 def test_every_trap_has_a_test_and_every_test_is_there() -> None:
-    rows = trap_rows((ROOT / "docs" / "explanation" / "traps.md").read_text(encoding="utf-8"))
+    rows = trap_rows((Path(__file__).parent / "traps.md").read_text(encoding="utf-8"))
     assert list(rows) == list(range(1, TRAPS + 1))
     assert missing_tests(rows) == []
 

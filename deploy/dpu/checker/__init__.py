@@ -1,4 +1,4 @@
-"""What the DPU can run: its rules, one small function each, and where each node of a network goes.
+"""Check what the DPU can run: its rules, one small function each, and the device of each node.
 
 - `conv_rules`, `number_rules`, `other_rules`: the rules, whose docstrings are their text;
 - `operators`: which rules each operator must keep; `finding`: what breaks one, and the remedy;

@@ -1,4 +1,4 @@
-"""What the DPU demands of convolutions, plain, depthwise and transposed: one rule, one function."""
+"""The DPU's rules for plain, depthwise and transposed convolutions, one function for each rule."""
 
 import math
 
@@ -202,7 +202,7 @@ def transposed_channels(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def alu_padding(op: Operation, dpu: Dpu, table: str) -> Finding | None:
-    """The padding that the ALU engine can do, for depthwise convolutions and pools."""
+    """Check that the ALU engine can do the padding of a depthwise convolution or a pool."""
     # The ALU has a limit for top and left, which are the first two of ONNX, and one for the others.
     begin = dpu.limit(table, "pad_begin")
     end = dpu.limit(table, "pad_end")

@@ -1,4 +1,4 @@
-"""What a broken rule says: the reason, in the node's own numbers, and what to change."""
+"""The result of a broken rule: the reason, with the node's own values, and what to change."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,36 +10,36 @@ from beers_deploy.profiles.constant import Constant
 
 @dataclass(frozen=True)
 class Finding:
-    """Why a node cannot run on the DPU, and what would let it."""
+    """The reason why a node cannot run on the DPU, and a remedy."""
 
     reason: str
     remedy: str
 
 
 Rule = Callable[[Operation, Dpu], Finding | None]
-"""One rule of the DPU: None when the node keeps it.
+"""One rule of the DPU. It returns None if the node complies with it.
 
-Its docstring is the rule's text, {table[key]} its limits.
+Its docstring is the rule's text, in which {table[key]} stands for a limit.
 """
 
 
 def outside(values: tuple[int, ...], limit: Constant) -> bool:
-    """Whether any value lies beyond the limit."""
+    """Return True if any value lies outside the limit."""
     return any(not limit.low <= value <= limit.high for value in values)
 
 
 def shown(sides: tuple[int, int]) -> str:
-    """Height and width, in the order of ONNX, as sizes are shown everywhere: width x height."""
+    """Format height and width (the order of ONNX) as sizes are shown everywhere: width x height."""
     return f"{sides[1]} x {sides[0]}"
 
 
 def beyond_range(what: str, sides: tuple[int, int], limit: Constant, remedy: str) -> Finding | None:
-    """What to say of a kernel or a stride of which a side lies beyond the limit."""
+    """Return a finding if one side of a kernel or a stride lies outside the limit, else None."""
     if not outside(sides, limit):
         return None
     return Finding(f"{what} ({shown(sides)}) is not in the DPU's range {limit}", remedy)
 
 
 def groups_of(count: int, size: int) -> int:
-    """How many groups of `size` hold `count` things."""
+    """Return the number of groups of `size` that are needed for `count` items."""
     return -(-count // size)

@@ -1,6 +1,6 @@
-"""What the DPU demands of the numbers in a quantised file: one rule, one function.
+"""The DPU's rules for the numbers in a quantised file, one function for each rule.
 
-n fractional bits stand for the scale 2^-n; shifts are differences of them.
+n fractional bits mean the scale 2^-n. Shifts are differences of fractional bits.
 """
 
 import numpy as np
@@ -169,14 +169,16 @@ def same_scale(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def product_frac_bits(op: Operation) -> int | None:
-    """The scale of a convolution's sums of products, None without one."""
+    """Return the fractional bits of a convolution's sums of products, or None if a scale is
+    missing.
+    """
     weight = _frac_bits(op, "weight")
     source = _frac_bits(op, "input 0")
     return None if weight is None or source is None else weight + source
 
 
 def _reported(faults: list[str], remedy: str) -> Finding | None:
-    """Return what to say of faults; nothing where there is none."""
+    """Return a finding that lists the faults, or None if there are none."""
     return Finding("; ".join(faults), remedy) if faults else None
 
 
@@ -186,7 +188,9 @@ def _frac_bits(op: Operation, role: str) -> int | None:
 
 
 def _inputs(op: Operation) -> list[int]:
-    """Of the tensors and constants that an element-wise operator reads."""
+    """Return the fractional bits of the tensors and constants that an element-wise operator
+    reads.
+    """
     frac_bits = (
         _frac_bits(op, role) for role in op.scales if role.startswith(("input", "constant"))
     )
@@ -209,7 +213,7 @@ def _words(scale: Scale) -> str:
 
 
 BYTES = ("int8", "uint8")
-"""Whether uint8 lies around 128 is the rule "symmetric"."""
+"""The accepted types. The rule "symmetric" checks that uint8 is centred on 128."""
 
 
 def int8_constants(op: Operation, dpu: Dpu) -> Finding | None:
@@ -276,7 +280,7 @@ def _kind(values: np.ndarray | None) -> str:
 
 
 def _spare_bits(values: np.ndarray) -> int:
-    """How many low bits are 0 in every value; 0 where all values are."""
+    """Return the number of low bits that are 0 in every value, or 0 if all values are 0."""
     bits = int(np.bitwise_or.reduce(values, axis=None))
-    # `bits & -bits` keeps the lowest bit that is set.
+    # `bits & -bits` isolates the lowest bit that is set.
     return (bits & -bits).bit_length() - 1 if bits else 0

@@ -1,9 +1,10 @@
-"""The DPU's rules by kind of operation, their texts, and the judgement of one node: all broken
-rules, not the first.
+"""The DPU's rules by kind of operation, their texts, and the check of one node, which reports every
+broken rule.
 
-A rule is a small function (`conv_rules`, `other_rules`, `number_rules`) whose docstring is its
-text, filled in with the limits of the target profile: text, check and documentation cannot drift
-apart. A rule holds on the targets that state what its text names, so no rule knows a board's name.
+A rule is a small function (`conv_rules`, `other_rules`, `number_rules`). Its docstring is its text,
+filled in with the limits of the target profile, so text, check and documentation always agree. A
+rule applies to the targets that define the constants its text names, so no rule depends on a
+board's name.
 """
 
 import inspect
@@ -63,17 +64,17 @@ RULES: Mapping[Kind, tuple[Rule, ...]] = {
     "argmax": (other_rules.argmax_channels,),
     **dict.fromkeys(("quantize", "dequantize", "other"), (other_rules.known_operator,)),
 }
-"""What a node of each kind has to keep, float or quantised."""
+"""The rules for a node of each kind, float or quantised."""
 
 SIZES: tuple[Rule, ...] = (
     other_rules.map_exists,
     other_rules.maps_aligned,
     other_rules.map_in_memory,
 )
-"""What the tile's size has to allow every node."""
+"""The rules about the tile's size, which apply to every node."""
 
 EVERY: tuple[Rule, ...] = (other_rules.operator_domain, other_rules.int8_operator, *SIZES)
-"""What a node of any kind has to keep."""
+"""The rules for a node of any kind."""
 
 NUMBERS: tuple[Rule, ...] = (
     number_rules.on_integers,
@@ -96,12 +97,12 @@ SHIFTS: Mapping[Kind, tuple[Rule, ...]] = {
     "add": (number_rules.shift_read, number_rules.shift_write),
     **dict.fromkeys(("concat", "pool"), (number_rules.same_scale,)),
 }
-"""What a quantised node has to keep besides."""
+"""The additional rules for a quantised node."""
 
 
 @dataclass(frozen=True)
 class Broken:
-    """A rule that a node breaks."""
+    """A rule that a node breaks, with its text and the finding."""
 
     rule: str
     text: str
@@ -109,9 +110,9 @@ class Broken:
 
 
 def judge(op: Operation, dpu: Dpu, quantized: bool) -> tuple[Broken, ...]:
-    """Every rule that a node breaks, none where one of its `forms` breaks none.
+    """Return every rule that a node breaks, or none if one of its `forms` breaks none.
 
-    The rules of numbers are asked only where the file holds quantised ones.
+    The rules about numbers are checked only if the file is quantised.
     """
     breaches = [_broken(form, dpu, quantized) for form in forms(op, dpu)]
     # The first form is the operation as the file has it: the report is about that one.
@@ -132,15 +133,15 @@ def _broken(op: Operation, dpu: Dpu, quantized: bool) -> tuple[Broken, ...]:
 
 
 def forms(op: Operation, dpu: Dpu) -> Iterator[Operation]:
-    """The operation as it is written, then what else a compiler may take it as, each to be held
-    against the rules.
+    """Yield the operation as it is written, then the other forms that a compiler may convert it to.
+    Each is checked against the rules.
 
-    A fully connected layer is a convolution as large as its map, and as well one of 1 x 1 over the
-    flattened map: a matrix product becomes a convolution once that fits the hardware (UG1414 1.4.1,
-    Operators Supported by TensorFlow). Its outputs do not meet, so they may be computed in parts.
-    That they are is inferred from a rate: Ultrafast lanes' last layer has 14472 outputs, and at 392
-    images a second with one thread (Vitis-AI 2.5, model_zoo/README.md, VCK190) the DPU's batch of
-    six leaves the processor 15 ms for 356 MFLOP, more than its two cores can do.
+    A fully connected layer is a convolution as large as its map. It is also a 1 x 1 convolution
+    over the flattened map: a matrix product becomes a convolution if that fits the hardware (UG1414
+    1.4.1, Operators Supported by TensorFlow). Its outputs are independent, so they may be computed
+    in parts. That this happens is inferred from a rate. The last layer of Ultrafast lanes has 14472
+    outputs. At 392 images a second with one thread (Vitis-AI 2.5, model_zoo/README.md, VCK190), the
+    DPU's batch of six leaves the processor 15 ms for 356 MFLOP, more than its two cores can do.
     """
     yield op
     # An NPU's file does not state the array that it would fit.
@@ -159,7 +160,7 @@ def forms(op: Operation, dpu: Dpu) -> Iterator[Operation]:
 
 
 def fully_connected(op: Operation) -> bool:
-    """Whether a convolution is as large as its map, and so has a result of one pixel."""
+    """Return True if a convolution is as large as its map, so that its result has one pixel."""
     shape = op.in_shapes[0] if op.in_shapes else None
     window = op.window
     covers_map = (
@@ -172,13 +173,15 @@ def fully_connected(op: Operation) -> bool:
 
 
 def all_rules() -> Iterator[Rule]:
-    """Every rule once, in the order of the tables."""
+    """Yield every rule once, in the order of the tables."""
     tables = [*RULES.values(), EVERY, NUMBERS, *SHIFTS.values()]
     yield from dict.fromkeys(chain.from_iterable(tables))
 
 
 def require_known(dpu: Dpu) -> None:
-    """Refuse a constant that no rule names: misspelt, it would silence the rule that it is for."""
+    """Raise an error for a constant that no rule names. A misspelt constant would disable the rule
+    that it is meant for.
+    """
     keys: dict[str, set[str]] = {}
     for rule in all_rules():
         for table, key in _named(rule):
@@ -188,26 +191,26 @@ def require_known(dpu: Dpu) -> None:
 
 
 def rule_name(rule: Callable[..., object]) -> str:
-    """The rule's name in tables, such as "conv kernel"."""
+    """Return the rule's name in tables, such as "conv kernel"."""
     return getattr(rule, "__name__", "").replace("_", " ")
 
 
 def applies(rule: Callable[..., object], dpu: Dpu) -> bool:
-    """Whether the target states every constant that the rule's text names: a rule of other DPUs it
-    does not.
+    """Return True if the target defines every constant that the rule's text names. Otherwise the
+    rule is one of other DPUs.
     """
     facts = _facts(dpu)
     return all(key in facts.get(table, {}) for table, key in _named(rule))
 
 
 def rule_text(rule: Callable[..., object], dpu: Dpu) -> str:
-    """The text of a rule or a remark, with the target's limits and its own documents filled in."""
+    """Return the text of a rule or a remark, with the target's limits and documents filled in."""
     return _template(rule).format(**_facts(dpu))
 
 
 def _facts(dpu: Dpu) -> Mapping[str, Mapping[str, object]]:
-    """What texts name: constants, what is fused where, documents, and the limits that follow from
-    constants.
+    """Return the values that texts refer to: constants, fused activations, documents, and limits
+    derived from constants.
     """
     facts: dict[str, Mapping[str, object]] = {**dpu.tables}
     if "channel_groups" in facts.get("array", {}):
@@ -228,7 +231,7 @@ def _template(rule: Callable[..., object]) -> str:
 
 @cache
 def _named(rule: Callable[..., object]) -> tuple[tuple[str, str], ...]:
-    """Tables and keys of the constants in the rule's text: "{conv[kernel].source}" names ("conv",
-    "kernel").
+    """Return table and key of each constant in the rule's text: "{conv[kernel].source}" refers to
+    ("conv", "kernel").
     """
     return tuple(re.findall(r"{(\w+)\[(\w+)]", _template(rule)))

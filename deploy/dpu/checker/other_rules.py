@@ -1,5 +1,5 @@
-"""What the DPU demands of pools, activations, element-wise operators and moves of pixels: one rule,
-one function.
+"""The DPU's rules for pools, activations, element-wise operators and data movement operators, one
+function for each rule.
 """
 
 import math
@@ -24,7 +24,7 @@ MANUAL = {
     "HardSigmoid": "hard-sigmoid",
     "HardSwish": "hard-swish",
 }
-"""The activations of ONNX as manuals name them."""
+"""The names that manuals use for the activations of ONNX."""
 PLACE = {
     "conv": "conv",
     "transposed": "conv",
@@ -33,7 +33,9 @@ PLACE = {
     "add": "sum",
     "mul": "sum",
 }
-"""Behind which operations something may be fused, and under which name a profile lists it."""
+"""The operations after which an activation may be fused, and the key under which a profile lists
+it.
+"""
 INSTEAD = {
     "Sub": "fold the minus sign into the weights before it, and add",
     "Neg": "fold the minus sign into the weights before it",
@@ -182,7 +184,7 @@ def activation_place(op: Operation, dpu: Dpu) -> Finding | None:
     """
     place = PLACE.get(op.follows or "")
     fused = dpu.target.activations[place].value if place else ()
-    # What stands behind a sum is judged by `activation_of_sums`.
+    # An activation after a sum is checked by `activation_of_sums`.
     if place == "sum" or MANUAL[op.op_type] in (*fused, *dpu.target.activations["alone"].value):
         return None
     remedy = (

@@ -1,14 +1,16 @@
-"""Where each node goes: to the host by design, to the DPU, or to the CPU for want of a rule kept.
+"""Decide where each node goes: to the host by design, to the DPU, or to the CPU because it breaks a
+rule.
 
 A network on this board has three parts:
 
 1. host-front: scaling and splitting the image, before the first convolution.
-2. dpu-core: everything from the first convolution to the last, and int8 nodes right behind it.
-3. host-back: making numbers of integers, adding the correction to the 12-bit image, clipping.
+2. dpu-core: everything from the first convolution to the last, and the int8 nodes that directly
+   follow it.
+3. host-back: converting integers to numbers, adding the correction to the 12-bit image, clipping.
 
-What of the core the DPU cannot take goes to the CPU, as the vendor's compiler places it. At the
-ends of a float file that costs time and no more; between two parts of the DPU it would cut the
-core.
+Nodes of the core that the DPU cannot run go to the CPU, as the vendor's compiler places them. At
+the beginning or end of a float file this only costs time. Between two parts of the DPU it would cut
+the core.
 """
 
 from collections.abc import Iterable, Sequence
@@ -25,7 +27,9 @@ Part = Literal["host-front", "dpu-core", "host-back"]
 Device = Literal["host", "DPU", "CPU"]
 
 SCALING = {"Mul", "Div", "Add", "Sub", "Clip", "Cast", "Round", "Floor", "Identity", "Min", "Max"}
-"""What a float file may do to the image before the network and to the result behind it."""
+"""Operators that a float file may apply to the image before the network and to the result after
+it.
+"""
 
 SHAPING = {
     "ArgMax",
@@ -43,20 +47,22 @@ SHAPING = {
     "Transpose",
     "Unsqueeze",
 }
-"""What a float file may do to the result behind the network: it moves numbers, compares them or
-makes scores of them.
+"""Operators that a float file may apply to the result after the network. They move values, compare
+them, or convert them to scores.
 """
 
 DECODING = {"Exp", "Pow", "Sigmoid", "Slice", "Softplus", "Split", "Sqrt", "Tanh", "Transpose"}
-"""What it may do to make boxes of the result, which `quantize` leaves to the host too."""
+"""Operators that a float file may use to decode boxes from the result. `quantize` leaves them to
+the host too.
+"""
 
 FLOAT_NOTE = "a float file: judged as if its tensors had 8 bits, its final add left to the host"
 
 
 @dataclass(frozen=True)
 class PlacedNode:
-    """A node with its part, its device and, where it should run on the DPU and cannot, the rules it
-    breaks.
+    """A node with its part and its device. If it should run on the DPU and cannot, also the rules
+    that it breaks.
     """
 
     op: Operation
@@ -68,8 +74,8 @@ class PlacedNode:
 
 @dataclass(frozen=True)
 class Cut:
-    """A tensor that crosses between the DPU and a processor, as int8; its size None where its shape
-    is unknown.
+    """A tensor that is transferred between the DPU and a processor, as int8. Its size is None if
+    its shape is unknown.
     """
 
     tensor: str
@@ -79,7 +85,7 @@ class Cut:
 
 @dataclass(frozen=True)
 class Placement:
-    """The nodes in order; note says what was assumed."""
+    """The nodes in order. The note states what was assumed."""
 
     nodes: tuple[PlacedNode, ...]
     cuts: tuple[Cut, ...]
@@ -87,7 +93,7 @@ class Placement:
 
     @property
     def dpu_subgraphs(self) -> int:
-        """How many subgraphs the DPU runs, each with its own transfers."""
+        """The number of subgraphs that the DPU runs, each with its own transfers."""
         return len({node.subgraph for node in self.nodes if node.device == "DPU"})
 
     @property
@@ -97,8 +103,8 @@ class Placement:
 
     @property
     def cutting(self) -> tuple[PlacedNode, ...]:
-        """Those of them that part the core in two; of a quantised file all, whose numbers can be
-        made again.
+        """The failed nodes that cut the core in two. For a quantised file all failed nodes count,
+        because its integers can be regenerated.
         """
         if not self.note:
             return self.failed
@@ -116,7 +122,7 @@ class Placement:
 
 
 def place(network: SizedGraph, dpu: Dpu) -> Placement:
-    """Judge every node of a network against the rules of a DPU."""
+    """Check every node of a network against the rules of a DPU, and place it."""
     # A misspelt constant would silence the rule that it is for.
     require_known(dpu)
     parts = _parts(network)
@@ -135,8 +141,8 @@ def place(network: SizedGraph, dpu: Dpu) -> Placement:
 
 
 def _parts(network: SizedGraph) -> list[Part]:
-    """A node before the first or behind the last convolution is the host's if it is one of the
-    host's kinds.
+    """Return the part of each node. A node before the first or after the last convolution belongs
+    to the host if it is of a kind that the host computes.
     """
     operations = network.operations
     behind, before = (
@@ -147,7 +153,7 @@ def _parts(network: SizedGraph) -> list[Part]:
     for op in operations:
         leads = op.output not in behind
         trails = op.output not in before
-        # What no processor here computes is not the host's either.
+        # An operator that no processor here computes is not the host's either.
         if is_foreign(op.op_type):
             parts.append("dpu-core")
         elif leads and _is_host_front(op, network, trails=trails):
@@ -163,8 +169,8 @@ def _parts(network: SizedGraph) -> list[Part]:
 def _left_to_the_host(
     network: SizedGraph, parts: list[Part], broken: list[tuple[Broken, ...]]
 ) -> list[Part]:
-    """Behind the last convolution, what reads a result of the CPU stays with it: it is not handed
-    over again.
+    """Return the parts with more nodes left to the host. After the last convolution, a node that
+    reads a result of the CPU stays there, so that the tensor is not transferred again.
     """
     before = _reached(network.operations, _convolved(network), forwards=False)
     cpu_results: set[str] = set()
@@ -184,8 +190,8 @@ def _convolved(network: SizedGraph) -> set[str]:
 
 
 def _reached(operations: Sequence[Operation], starts: set[str], *, forwards: bool) -> set[str]:
-    """The results computed from one of `starts`, these included (forwards), or that one is computed
-    from.
+    """Return the results that are computed from one of `starts` (forwards), or from which one is
+    computed. `starts` is included.
     """
     results: set[str] = set()
     for op in operations if forwards else reversed(operations):
@@ -198,8 +204,10 @@ def _reached(operations: Sequence[Operation], starts: set[str], *, forwards: boo
 
 
 def _is_host_front(op: Operation, network: SizedGraph, *, trails: bool) -> bool:
-    """In a quantised file whatever leads to the core; in a float file scaling, mirroring, and
-    pixels to channels.
+    """Return True if a node before the core belongs to the host.
+
+    In a quantised file that is every such node; in a float file scaling, mirroring, and pixels to
+    channels.
     """
     # The DPU does not pad by reflection: the host mirrors the image.
     mirrors = (
@@ -212,7 +220,9 @@ def _is_host_front(op: Operation, network: SizedGraph, *, trails: bool) -> bool:
 
 
 def _is_host_back(op: Operation, network: SizedGraph, *, leads: bool) -> bool:
-    """In a quantised file what is float again; in a float file the add of the image, scaling,
+    """Return True if a node after the core belongs to the host.
+
+    In a quantised file that is a node in float; in a float file adding the image, scaling and
     shaping.
     """
     if op.kind in CONVOLUTIONS:
@@ -227,15 +237,15 @@ def _is_host_back(op: Operation, network: SizedGraph, *, leads: bool) -> bool:
 
 
 def _subgraphs(operations: tuple[Operation, ...], devices: list[Device]) -> list[int]:
-    """Pieces that run in one go: neighbours on one device that no other device's node stands
-    between.
+    """Return the number of the subgraph of each node: connected nodes on one device with no node of
+    another device between them.
     """
     depth: dict[str, tuple[bool, int]] = {}
     parents: dict[str, str] = {}
     for op, device in zip(operations, devices, strict=True):
         on_dpu = device == "DPU"
-        # A level counts the changes of device on the way here: what comes back to the DPU has
-        # another level than what left it, so that the two are never one piece.
+        # A level counts the changes of device up to this node. Nodes after a return to the DPU
+        # have another level than those before it, so the two are never one subgraph.
         levels = (depth[name] for name in op.inputs if name in depth)
         steps = [changes + (was_on_dpu != on_dpu) for was_on_dpu, changes in levels]
         level = (on_dpu, max(steps, default=0))
@@ -247,11 +257,13 @@ def _subgraphs(operations: tuple[Operation, ...], devices: list[Device]) -> list
 
 
 def _root(parents: dict[str, str], name: str) -> str:
-    """The tensor that stands for all of a piece."""
+    """Return the tensor that represents the subgraph of `name` (union-find with path
+    compression).
+    """
     root = name
     while parents.get(root, root) != root:
         root = parents[root]
-    # The way is walked once: in a long chain each node would walk all of it again.
+    # Path compression: without it, each node of a long chain would follow all of it again.
     while name != root:
         parent = parents[name]
         parents[name] = root
@@ -260,7 +272,9 @@ def _root(parents: dict[str, str], name: str) -> str:
 
 
 def _cuts(network: SizedGraph, nodes: Iterable[PlacedNode]) -> Iterable[Cut]:
-    """Tensors written on one side and read on the other, the network's own ends included."""
+    """Yield the tensors that are written on one side and read on the other, including the network's
+    inputs and outputs.
+    """
     on_dpu: dict[str, bool] = {}
     for node in nodes:
         on_dpu |= dict.fromkeys(node.op.outputs, node.device == "DPU")

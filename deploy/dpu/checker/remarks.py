@@ -1,5 +1,5 @@
-"""What to know of a placed network besides the rules: one remark, one function, whose docstring is
-its text.
+"""Remarks on a placed network in addition to the rules. Each remark is one function whose docstring
+is its text.
 """
 
 import math
@@ -13,7 +13,9 @@ from beers_deploy.dpu.checker.placement import PlacedNode, Placement
 # ruff: noqa: ARG001 - every remark takes the placement, the DPU and the tile's side
 
 Remark = Callable[[Placement, Dpu, int], str]
-"""Looks at a placed network, the DPU and the tile's side; empty where there is nothing to say."""
+"""Checks a placed network, given the DPU and the tile's side, and returns its remark, or "" if
+there is none.
+"""
 
 
 def fix2float(placement: Placement, dpu: Dpu, tile_px: int) -> str:
@@ -101,7 +103,7 @@ def float_islands(placement: Placement, dpu: Dpu, tile_px: int) -> str:
 
 
 def is_island(node: PlacedNode, placement: Placement) -> bool:
-    """Whether a quantised file leaves a node in float that stands between its integers."""
+    """Return True if a quantised file leaves a node in float between its integer nodes."""
     op = node.op
     weight = node.op.constants.get("weight")
     in_float = not op.integer or (weight is not None and weight.dtype == np.float32)
@@ -117,12 +119,12 @@ def unknown(placement: Placement, dpu: Dpu, tile_px: int) -> str:
 
 
 REMARKS: tuple[Remark, ...] = (fix2float, subgraphs, streaming, shuffles)
-"""Of a DPU."""
+"""The remarks for a DPU."""
 NPU_REMARKS: tuple[Remark, ...] = (unread, depthwise, float_islands, unknown)
 
 
 def remarks_on(placement: Placement, dpu: Dpu, tile_px: int) -> dict[str, str]:
-    """Every remark that a placed network calls for, by name."""
+    """Return every remark that applies to a placed network, by name."""
     remarks = NPU_REMARKS if dpu.target.npu else REMARKS
     texts = {remark.__name__: remark(placement, dpu, tile_px) for remark in remarks}
     return {name: text for name, text in texts.items() if text}

@@ -1,7 +1,7 @@
-"""`check`: where each node of a network runs, as a table.
+"""`check`: a table of where each node of a network runs.
 
-Of an NPU AMD publishes a table of operators, Y or N/A, and no limits. Where its nodes would run is
-the table's word: nothing here has seen the compiler.
+For an NPU, AMD publishes a table of operators, Y or N/A, and no limits. The device of each node
+then follows from that table: it was not verified with the compiler.
 """
 
 from collections import Counter
@@ -32,15 +32,15 @@ OTHERS_NOTE = "quantised by operators that are not ONNX's: judged without their 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Checked(Table):
-    """Every node of a network on the host, the DPU or the CPU.
+    """The device of every node of a network: the host, the DPU or the CPU.
 
-    It is true if the core runs whole on the DPU.
+    The table is true if the whole core runs on the DPU.
 
     Attributes:
         placement: the nodes, in order.
         dpu: the configuration of the board.
         tile_px: side of the tile.
-        network: that was checked.
+        network: the network that was checked.
     """
 
     placement: Placement
@@ -55,7 +55,7 @@ class Checked(Table):
 
     @property
     def verdict(self) -> str:
-        """A sentence that says whether the network fits."""
+        """A sentence that states whether the network fits."""
         if self.failed:
             return f"check FAILED: {'; '.join(map(str, self.failed))}"
         if self.dpu.target.npu:
@@ -84,12 +84,12 @@ def check_network(
         target: a board with a DPU or an NPU.
         dpu: configuration of the DPU; the board's default if None.
         tile: side of a tile in pixels; the network's own, else 640, if None.
-        output: the output that is kept; all if None.
+        output: the only output to check; all if None.
 
     Raises:
-        ModelError: no ONNX network of images.
-        ProfileError: no such configuration.
-        OptionError: a target without DPU or NPU.
+        ModelError: the file is not an ONNX network of images.
+        ProfileError: there is no such configuration.
+        OptionError: the target has neither a DPU nor an NPU.
     """
     source = Network.load(network, sensor=SENSOR, int8=True, to_run=False)
     if output is not None:
@@ -129,14 +129,14 @@ HEADINGS = {
     "profile": "what the file leaves open by the draft of ONNX's safety-related profile",
 }
 DETAILS = frozenset({"nodes", "subgraphs", "summary"})
-"""Tables for a closer look: a line for each node."""
+"""Tables with one line for each node, for detailed inspection."""
 
 
 ACCEPTED = "networks that 'quantize' refuses"
 
 
 def _makes_image(network: SizedGraph) -> bool:
-    """Return True if a network makes one image of one image, as 'quantize' wants."""
+    """Return True if a network maps one image to one image, as 'quantize' requires."""
     results = [op.out_shape for op in network.operations if op.output in network.outputs]
     sides_px = [min(shape[1:]) for shape in results if shape is not None]
     return len(network.inputs) == 1 and len(network.outputs) == 1 and max(sides_px, default=0) > 1
@@ -149,7 +149,7 @@ def _acceptance(model: onnx.ModelProto) -> Check:
 
 
 def _notes(placement: Placement, source: Network) -> list[str]:
-    """Return what a reader must know of a network that was not quantised here."""
+    """Return the notes for the reader of a network that was not quantised here."""
     if not placement.note:
         return []
     return [OTHERS_NOTE if is_quantized(source.model) else placement.note]
@@ -173,9 +173,9 @@ def _rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:
 
 
 def legality(placement: Placement, *, npu: bool = False) -> Check:
-    """The verdict on a network: no node of its core may break a rule.
+    """Return the check of the whole network, which fails if a node of its core breaks a rule.
 
-    What an NPU refuses is not known.
+    For an NPU, it is unknown which nodes the compiler refuses.
     """
     name = "nodes that break a rule" if npu else "nodes the DPU refuses"
     failed = placement.failed
@@ -184,7 +184,7 @@ def legality(placement: Placement, *, npu: bool = False) -> Check:
 
 
 def _is_for_a_board(model: onnx.ModelProto) -> bool:
-    """Return True if a compiler may be given the file: a float file or a host's is not for one."""
+    """Return True if the file is for a compiler. A float file or a host's file is not."""
     return is_quantized(model) and KEY not in metadata(model)
 
 
@@ -199,8 +199,8 @@ def _profile_rows(model: onnx.ModelProto) -> list[Row]:
 
 
 def _file_checks(model: onnx.ModelProto, dpu: Dpu) -> list[Check]:
-    """What a VINT8 file must keep as a whole; none of a float file or a host's, which no compiler
-    is given.
+    """Return the checks of a VINT8 file as a whole. There are none for a float file or a host's,
+    because these are not for a compiler.
     """
     if not _is_for_a_board(model):
         return []
@@ -219,7 +219,7 @@ def _file_checks(model: onnx.ModelProto, dpu: Dpu) -> list[Check]:
 
 
 def _device_rows(placement: Placement, dpu: Dpu) -> list[Row]:
-    """Return a row for each device: how many nodes it runs, and which operators."""
+    """Return a row for each device: the number of nodes that it runs, and their operators."""
     operators: dict[str, Counter[str]] = {}
     for node in placement.nodes:
         device = _npu_words(node, placement, dpu) if dpu.target.npu else node.device
@@ -233,7 +233,7 @@ def _device_rows(placement: Placement, dpu: Dpu) -> list[Row]:
 
 
 def _refusal_rows(placement: Placement) -> list[Row]:
-    """Return a row for each rule that is broken: by how many nodes, the first one, and a remedy."""
+    """Return a row for each broken rule: the number of nodes, the first one, and a remedy."""
     broken: dict[str, list[tuple[PlacedNode, Finding]]] = {}
     for node in placement.failed:
         for breach in node.broken:
@@ -263,7 +263,9 @@ def _node_rows(node: PlacedNode, placement: Placement, dpu: Dpu) -> list[Row]:
 
 
 def _npu_words(node: PlacedNode, placement: Placement, dpu: Dpu) -> str:
-    """On which device of an NPU's board a node would be computed, as far as AMD's table says."""
+    """Return the device of an NPU's board on which a node would be computed, according to AMD's
+    table.
+    """
     if node.device == "host":
         return "host"
     if node.broken:

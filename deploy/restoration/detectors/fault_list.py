@@ -1,8 +1,8 @@
 """A list of faulty detectors, as a file.
 
 The list is a CSV file, `column,row` or `column,row,band`, as `restore --fix-detectors` writes and
-reads it. Columns and rows count from 0, bands from 1; without a band a line holds for all. A row of
-`*` stands for the whole column, and a column of `*` for the whole row.
+reads it. Columns and rows count from 0, bands from 1. A line without a band applies to all bands. A
+row of `*` stands for the whole column, and a column of `*` for the whole row.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ FOUND = "found"
 HEADER = ("column", "row", "band")
 ALL = "*"
 DIGITS = 9
-"""Of a number: no image is larger."""
+"""The largest number of digits in a number, because no image is larger."""
 
 
 @dataclass(frozen=True, order=True)
@@ -40,20 +40,20 @@ class Fault:
 
     @property
     def line(self) -> str:
-        """The line of a file."""
+        """The line in a file that describes this fault."""
         numbers = [ALL if place < 0 else str(place) for place in (self.column, self.row)]
         return ",".join([*numbers, *([str(self.band)] if self.band else [])])
 
 
 @dataclass(frozen=True)
 class FaultList:
-    """The faults of an image's detectors, in order and each once."""
+    """The faults of an image's detectors, sorted and without duplicates."""
 
     faults: tuple[Fault, ...]
 
     @property
     def text(self) -> str:
-        """The content of a file."""
+        """The list as the content of a file."""
         header = HEADER if any(fault.band for fault in self.faults) else HEADER[:2]
         return "\n".join([",".join(header), *(fault.line for fault in self.faults), ""])
 
@@ -64,7 +64,7 @@ class FaultList:
 
     @property
     def words(self) -> str:
-        """How many pixels, columns and rows these are."""
+        """The number of pixels, columns and rows, in words."""
         columns = sum(fault.row < 0 for fault in self.faults)
         rows = sum(fault.column < 0 for fault in self.faults)
         counts = {"pixel": len(self.faults) - columns - rows, "column": columns, "row": rows}
@@ -74,8 +74,8 @@ class FaultList:
         return ", ".join(words) or "none"
 
     def mask(self, raster: Raster, start: int, stop: int) -> np.ndarray:
-        """Return where pixels of rows `start` to `stop` (excluded) are faulty, bool (bands, rows,
-        width).
+        """Return a mask of the faulty pixels in rows `start` to `stop` (excluded), bool (bands,
+        rows, width).
         """
         flags = np.zeros((raster.bands, stop - start, raster.width_px), bool)
         columns, rows, bands = self._numbers.T
@@ -89,29 +89,29 @@ class FaultList:
 
     @cached_property
     def _numbers(self) -> np.ndarray:
-        """Column, row and band of each, (n, 3)."""
+        """Column, row and band of each fault, (n, 3)."""
         places = [(fault.column, fault.row, fault.band) for fault in self.faults]
         return np.array(places, np.int64).reshape(-1, 3)
 
 
-def list_beside(out: Path, wanted: str) -> Path | None:
-    """Return where the list of found faults is written, beside the restored image; None if none are
-    searched for.
+def list_beside(out: Path, source: str) -> Path | None:
+    """Return the path of the list of found faults next to the restored image, or None if no faults
+    are searched for.
     """
-    return out.with_name(f"{out.stem}.detectors.csv") if wanted == FOUND else None
+    return out.with_name(f"{out.stem}.detectors.csv") if source == FOUND else None
 
 
 def write_list(faults: FaultList, path: Path | None) -> None:
-    """Write the faults that were found, if any; None asks for no file."""
+    """Write the faults that were found, if any, unless the path is None."""
     if path is not None and faults.faults:
         write_text(path, faults.text)
 
 
 def read_list(path: Path, raster: Raster) -> FaultList:
-    """Read a list of faults, and refuse what does not fit the image.
+    """Read a list of faults, and raise an error if one does not fit the image.
 
     Args:
-        path: of the file.
+        path: the path of the file.
         raster: of the image.
     """
     try:
@@ -168,7 +168,7 @@ def _fault(path: Path, number: int, line: str, raster: Raster) -> Fault:
 
 
 def _number(cell: str) -> int | None:
-    """Return the number in a cell, -1 for all; None for anything else."""
+    """Return the number in a cell, -1 for `*`, or None for anything else."""
     if cell == ALL:
         return -1
     # `isdecimal` alone accepts the digits of every script.

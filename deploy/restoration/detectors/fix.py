@@ -1,7 +1,8 @@
-"""Replace faulty detectors' pixels while an image's rows are read, before anything else sees them.
+"""Replace the pixels of faulty detectors while an image's rows are read, before any other step
+reads them.
 
-The faults are those of a list, or found in a pass over the whole image before the first row is
-restored: so the same command, resumed or not, replaces the same pixels.
+The faults are those of a list, or are detected in a pass over the whole image before the first row
+is restored. The same command, resumed or not, therefore replaces the same pixels.
 """
 
 import logging
@@ -22,32 +23,32 @@ from beers_deploy.restoration.detectors.look import as_floats, look_at_detectors
 logger = logging.getLogger(__name__)
 
 REACH_PX = 16
-"""How far away a sound neighbour may lie."""
+"""The largest distance of a valid neighbour."""
 STRIP_PX = 256
 """Rows that are searched at a time."""
 WRONG_GAIN = 0.05
-"""Gain from which a single column or row is replaced: a smaller one is for an equalization to
-correct.
+"""The gain error from which a single column or row is replaced. Smaller ones are left for an
+equalization to correct.
 """
 MANY = 0.01
-"""Share of the pixels from which they are no single faults."""
+"""The share of the pixels from which faults no longer count as single ones."""
 ONE_SIDED = 1e-3
-"""Weight of a direction with a sound neighbour on one side only, over one with two."""
+"""Weight of a direction with a valid neighbour on one side only, relative to one with two."""
 ASLANT = 1e-6
-"""Weight of the diagonals: they count where a faulty column crosses a faulty row."""
+"""Weight of the diagonals. They matter only where a faulty column crosses a faulty row."""
 WAYS = (
     ((0, -1), (0, 1), 1.0),
     ((-1, 0), (1, 0), 1.0),
     ((-1, -1), (1, 1), ASLANT),
     ((-1, 1), (1, -1), ASLANT),
 )
-"""Rows and columns of a step to either side, and the weight: along a row, along
-a column, aslant.
+"""For each direction, the offsets in rows and columns to either side, and the weight: along a row,
+along a column, diagonal.
 """
 
 
 def faults_of(source: Source, wanted: str, name: str) -> FaultList:
-    """Return the faults that `restore --fix-detectors` names.
+    """Return the faults that `restore --fix-detectors` specifies.
 
     Args:
         source: the image.
@@ -65,19 +66,19 @@ def faults_of(source: Source, wanted: str, name: str) -> FaultList:
 
 
 def fixed(source: Source, faults: FaultList) -> Source:
-    """Return an image without its faults; the image itself if there are none."""
+    """Return an image with its faults replaced, or the image itself if there are none."""
     return FixedSource(source, faults) if faults.faults else source
 
 
 def find_faults(source: Source, name: str) -> FaultList:
     """Find dead and wrong pixels, columns and rows in all rows of an image.
 
-    Columns, and rows that are off but not dead, are judged in the strips that `look_at_detectors`
+    Columns, and rows that are off but not dead, are detected in the strips that `look_at_detectors`
     reads.
 
     Args:
         source: the image.
-        name: of it, for messages.
+        name: of the image, for messages.
     """
     raster = source.raster
     lines = set[Fault]()
@@ -105,12 +106,12 @@ def find_faults(source: Source, name: str) -> FaultList:
 
 
 def band_number(band: int, raster: Raster) -> int:
-    """Return the number of a band in a list: 0 of an image's only one."""
+    """Return the number of a band in a list, or 0 if the image has only one band."""
     return band + 1 if raster.bands > 1 else 0
 
 
 def _replaced(stripes: Stripes) -> list[int]:
-    """Return the lines that an interpolation gives better than they are."""
+    """Return the dead lines, and those whose gain error exceeds WRONG_GAIN."""
     return [*stripes.dead, *(line.index for line in stripes.off if abs(line.gain) > WRONG_GAIN)]
 
 
@@ -133,11 +134,12 @@ def _found_in_strips(source: Source) -> Iterator[Fault]:
 
 
 class FixedSource:
-    """An image whose faulty pixels are replaced by interpolation between sound neighbours.
+    """An image whose faulty pixels are replaced by interpolation between valid neighbours.
 
-    A pixel is interpolated along its row and along its column, between the nearest sound pixels
-    within `REACH_PX`; the shorter way counts more. Where neither has any, the diagonals count.
-    Where no sound pixel is in reach it stays, and so does a missing one.
+    A pixel is interpolated along its row and along its column, between the nearest valid pixels
+    within `REACH_PX`. The shorter distance has the larger weight. If neither direction has a valid
+    pixel, the diagonals are used. Without a valid pixel in reach the pixel stays, and so does a
+    missing one.
     """
 
     def __init__(self, source: Source, faults: FaultList) -> None:
@@ -147,8 +149,8 @@ class FixedSource:
         self.files = source.files
 
     def read(self, start: int, stop: int) -> np.ndarray:
-        """Rows `start` to `stop` (excluded) of every band, (bands, rows, width), masked where the
-        image is.
+        """Read rows `start` to `stop` (excluded) of every band, (bands, rows, width), masked where
+        the image is.
         """
         raster = self.raster
         if not self.faults.mask(raster, start, stop).any():
@@ -174,7 +176,9 @@ class FixedSource:
         return self._source.read_mask(start, stop)
 
     def held_bytes(self, rows_px: int) -> int:
-        """As the image's own, and the rows around with their flags."""
+        """Return the memory that a read of `rows_px` rows needs: the image's own, and the rows
+        around with their flags.
+        """
         raster = self.raster
         row_bytes = raster.bands * raster.width_px * (raster.dtype.itemsize + 4)
         return (
@@ -189,8 +193,8 @@ def replace_pixels(
 
     Args:
         plane: (h, w).
-        bad: which to replace, bool.
-        sound: from which, bool.
+        bad: mask of the pixels to replace, bool.
+        sound: mask of the valid pixels to interpolate from, bool.
         nodata: a value that no replaced pixel may take; None for none.
     """
     places = np.argwhere(bad)
@@ -230,8 +234,8 @@ def replace_pixels(
 def _nearest(
     plane: np.ndarray, sound: np.ndarray, places: np.ndarray, side: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the value of the nearest sound pixel to one side of each place, and how far it is; inf
-    without one.
+    """Return the value of the nearest valid pixel to one side of each place, and its distance,
+    which is inf if there is none.
     """
     values = np.zeros(len(places))
     distances = np.full(len(places), np.inf)

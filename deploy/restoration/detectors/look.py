@@ -1,10 +1,10 @@
-"""A look for faults of detectors in strips of an image: gains of columns and rows, dead ones, wrong
+"""Detect faults of detectors in strips of an image: gains of columns and rows, dead lines, wrong
 single pixels.
 
-Restoration sharpens what stands alone: a column whose gain is off by 1 % comes out off by near 2 %.
-So `restore` warns of it, and `restore --dry-run` shows what was found. Strips over the whole width,
-spread evenly from top to bottom, are read: of a large image `LOOKED_PX` pixels of all bands
-together.
+Restoration sharpens isolated deviations: a column whose gain is off by 1 % comes out off by almost
+2 %. Therefore `restore` warns of it, and `restore --dry-run` shows the faults found. The strips
+span the whole width and are spread evenly from top to bottom. In a large image they cover
+`LOOKED_PX` pixels of all bands together.
 """
 
 from collections.abc import Iterator
@@ -21,30 +21,34 @@ from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.source import Source
 
 LOOKED_PX = 1 << 23
-"""Pixels of all bands that are looked at: one to two seconds on one core (measured)."""
+"""The number of pixels, over all bands, that are checked. This takes one to two seconds on one core
+(measured).
+"""
 STRIP_PX = 128
 LEAST_STRIP_PX = 16
 LEAST_ROWS_PX = 64
-"""Rows of a strip, the least of them, and the least of all strips together."""
+"""The number of rows of a strip, its minimum, and the minimum of all strips together."""
 MARGIN_PX = 4
-"""Rows around a strip that its rows and pixels are compared with."""
+"""The number of rows around a strip with which its rows and pixels are compared."""
 BLOCKS = 8
 SECTION_PX = 32
-"""Blocks along a line, and the least width of a section of a strip."""
+"""The number of blocks along a line, and the minimum width of a section of a strip."""
 LEAST = 0.003
-"""Gain of a column that matters, over the level; the patterns of two pixels likewise."""
+"""The smallest relevant relative gain error of a column, and the smallest relevant pattern of two
+pixels.
+"""
 
 
 @dataclass(frozen=True)
 class BandFaults:
-    """What one band shows of its detectors.
+    """The faults found in one band.
 
     Attributes:
         columns: of the image, whose lines have the image's numbers.
-        rows: likewise, of the rows that were looked at.
+        rows: likewise, of the rows that were checked.
         patterns: of period 2.
-        pixels: row and column (n, 2) of single wrong pixels in what was looked at.
-        looked_px: pixels that were looked at.
+        pixels: row and column (n, 2) of single wrong pixels among those that were checked.
+        looked_px: the number of pixels that were checked.
     """
 
     columns: Stripes
@@ -55,11 +59,11 @@ class BandFaults:
 
 
 def look_at_detectors(source: Source, full_scale: float = np.inf) -> tuple[BandFaults, ...]:
-    """Look for faults of detectors in strips of each band.
+    """Detect faults of detectors in strips of each band.
 
     Args:
         source: the image.
-        full_scale: the pixel value from which on a pixel is no measurement.
+        full_scale: the pixel value at and above which a pixel is not a measurement.
     """
     raster = source.raster
     measurements = [_Found(step) for step in value_steps(source)]
@@ -73,7 +77,7 @@ def look_at_detectors(source: Source, full_scale: float = np.inf) -> tuple[BandF
 
 
 def as_floats(raster: Raster, stored: np.ndarray) -> np.ndarray:
-    """Return stored pixels as float32, NaN where they are missing or no finite numbers."""
+    """Return stored pixels as float32, with NaN where they are missing or not finite."""
     with np.errstate(over="ignore"):
         pixels = np.ma.getdata(stored).astype(np.float32)
     if raster.dtype.kind == "f":
@@ -84,8 +88,8 @@ def as_floats(raster: Raster, stored: np.ndarray) -> np.ndarray:
 
 
 def value_steps(source: Source) -> list[float]:
-    """Return the step between the values of each band, 0 of floats: 64 of a 10-bit image stored in
-    16 bits.
+    """Return the step between the values of each band, 0 for floats. It is 64 for a 10-bit image
+    stored in 16 bits.
     """
     raster = source.raster
     if raster.dtype.kind == "f":
@@ -97,7 +101,7 @@ def value_steps(source: Source) -> list[float]:
 
 
 def _strips(height_px: int, width_px: int, bands: int) -> Iterator[tuple[int, int]]:
-    """First row and the one behind the last of each strip; first rows are even."""
+    """Yield the first row and the end (excluded) of each strip. First rows are even."""
     rows_px = min(height_px, max(LOOKED_PX // (width_px * bands), LEAST_ROWS_PX))
     side_px = min(STRIP_PX, max(LEAST_STRIP_PX, rows_px // BLOCKS))
     side_px = min(side_px, height_px)
@@ -108,7 +112,7 @@ def _strips(height_px: int, width_px: int, bands: int) -> Iterator[tuple[int, in
 
 
 class _Found:
-    """What was measured in the strips of one band."""
+    """The measurements in the strips of one band."""
 
     def __init__(self, step: float) -> None:
         self._step = step
@@ -124,11 +128,11 @@ class _Found:
 
         Args:
             top: its first row.
-            within: rows of it to be judged; those around are there for comparison.
+            within: rows of it to be checked; those around are for comparison.
             pixels: (h, w), NaN where they are missing.
-            full_scale: the value from which on a pixel is no measurement.
+            full_scale: the value at and above which a pixel is not a measurement.
         """
-        # The converter clips at both ends, where a pixel no longer follows its gain.
+        # The converter clips at 0 and at full scale, where a pixel no longer follows its gain.
         valid = (pixels > 0) & (pixels < full_scale)
         inner = valid[within]
         self._columns.append(measure_lines(pixels[within], inner))
@@ -146,7 +150,7 @@ class _Found:
         self._looked_px += int(np.isfinite(pixels[within]).sum())
 
     def judged(self) -> BandFaults:
-        """Judge all strips together."""
+        """Evaluate all strips together, and return the faults of the band."""
         rows = judge_lines(join_blocks(self._rows, axis=1), LEAST)
         return BandFaults(
             columns=judge_lines(join_blocks(self._columns), LEAST),
@@ -158,7 +162,7 @@ class _Found:
 
 
 def _sections(width_px: int) -> list[slice]:
-    """Sections of a strip, side by side, of even first columns."""
+    """Return the sections of a strip, side by side, with even first columns."""
     count = min(max(width_px // SECTION_PX, 1), BLOCKS)
     # First columns are even, so that all sections share the phase of a pattern of two pixels.
     ends = [width_px * number // count // 2 * 2 for number in range(count)] + [width_px]

@@ -1,4 +1,4 @@
-"""What `restore` says of the faults of detectors: sentences and figures."""
+"""The sentences and figures in which `restore` reports faults of detectors."""
 
 import logging
 import math
@@ -17,19 +17,19 @@ SHARPENS = "restoration about doubles it"
 EQUALIZE = "equalize the image first"
 FIX = f"`fix_detectors` {FOUND} replaces"
 EFFECTS = {"columns": "or train with the effects prnu and dsnu in the sensor's profile", "rows": ""}
-"""By the lines' name: the effects that describe them."""
+"""By kind of line, the effects that describe the faults."""
 ERRORS = 2.0
-"""Standard errors of an interval of 95 %."""
+"""The number of standard errors in an interval of 95 %."""
 NAMED = 3
-"""Places that a sentence names."""
+"""The largest number of places that a sentence names."""
 
 
 def warn_of_detectors(source: Source, full_scale: float) -> Mapping[str, Figure]:
-    """Look for faults of detectors, log a warning for each kind, and return the figures.
+    """Detect faults of detectors, log a warning for each kind, and return the figures.
 
     Args:
         source: the image.
-        full_scale: the pixel value from which on a pixel is no measurement.
+        full_scale: the pixel value at and above which a pixel is not a measurement.
     """
     bands = look_at_detectors(source, full_scale)
     for sentence in sentences(bands):
@@ -106,7 +106,7 @@ def _count(number: int, name: str) -> str:
 
 
 def _some(places: Sequence[str], count: int) -> str:
-    """Return the places, and that there are more of them."""
+    """Return the places as text, with a note if there are more of them."""
     more = f" and {count - len(places)} more" if count > len(places) else ""
     return f"{', '.join(places)}{more}"
 

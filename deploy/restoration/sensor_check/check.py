@@ -1,7 +1,7 @@
-"""The check of an image against the sensor that its user names, by its own pixels alone.
+"""Check an image against the sensor that its user names, by its own pixels alone.
 
-Windows spread over the image give its noise and its blur (`model.metrics.instrument`), which are
-compared with what the profile states (`comparison`).
+Noise and blur are measured in windows spread over the image (`model.metrics.instrument`), and
+compared with those in the profile (`comparison`).
 """
 
 import logging
@@ -30,7 +30,7 @@ from beers_deploy.restoration.sensor_check.windows import band_windows, integer_
 logger = logging.getLogger(__name__)
 
 ABOVE = 0.001
-"""Share of pixels above full scale that no image of the sensor has."""
+"""A larger share of pixels above full scale does not occur in an image of the sensor."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class SensorCheck:
 
     Attributes:
         figures: measured SNR and MTF, each with its interval.
-        warnings: a sentence for each that contradicts the profile.
+        warnings: one sentence for each contradiction of the profile.
     """
 
     figures: Mapping[str, Figure] = field(default_factory=dict)
@@ -47,7 +47,7 @@ class SensorCheck:
 
     @property
     def text(self) -> dict[str, str]:
-        """For a row of results: whether the image contradicts its sensor, and how."""
+        """The result of the check as the text of a row of results."""
         is_measured = any(figure.value is not None for figure in self.figures.values())
         words = "; ".join(self.warnings) or ("agrees" if is_measured else "not measurable")
         return {"sensor check": words} if self.figures else {}
@@ -58,10 +58,10 @@ class SensorCheck:
         Args:
             name: of the image, for messages.
             sensor: its profile's name.
-            strict: whether a contradiction is an error instead.
+            strict: if True, a contradiction is an error instead.
 
         Raises:
-            ImageError: a contradiction, if `strict`.
+            ImageError: there is a contradiction, and `strict` is True.
         """
         if self.warnings and strict:
             raise ImageError(
@@ -80,14 +80,14 @@ def checked_sensor(
     name: str,
     strict: bool,
 ) -> SensorCheck:
-    """Compare an image with the sensor that a user names, and warn where it contradicts it.
+    """Compare an image with the sensor that a user names, and warn if it contradicts it.
 
     Args:
         source: the image.
-        sensors: by band, under no name if one is for all; empty or blind if none is known.
+        sensors: by band, or under "" if one is for all; empty or blind if none is known.
         full_scale: the pixel value that is the sensors' largest digital number.
         name: of the image, for messages.
-        strict: whether a contradiction is an error instead of a warning.
+        strict: if True, a contradiction is an error instead of a warning.
     """
     if all(sensor.name == BLIND for sensor in sensors.values()):
         return SensorCheck()
@@ -125,7 +125,7 @@ def check_windows(windows: Sequence[np.ndarray], sensor: Sensor, full_scale: flo
 
     Args:
         windows: (h, w) each, raw values; 0 where pixels are missing.
-        sensor: the profile; if it states ranges, it agrees with all between their ends.
+        sensor: the profile. If it states ranges, every value within them agrees with it.
         full_scale: the value that is the sensor's largest digital number.
     """
     step = integer_step(windows)

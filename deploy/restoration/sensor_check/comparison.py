@@ -1,8 +1,8 @@
-"""Noise and blur that were measured in an image, compared with those that a sensor profile states.
+"""Compare the noise and blur measured in an image with those in a sensor profile.
 
-A measurement contradicts the profile if its 95 % interval lies off by more than a factor
-(`NOISE_FACTOR`, `BLUR_FACTOR`). Texture without edges shows no blur, and a scene without even
-ground shows no noise: then nothing is contradicted.
+A measurement contradicts the profile if its 95 % interval is off by more than a factor
+(`NOISE_FACTOR`, `BLUR_FACTOR`). Texture without edges has no measurable blur, and a scene without
+even ground has no measurable noise. In these cases nothing is contradicted.
 """
 
 import math
@@ -26,12 +26,13 @@ DRAWS = 20
 """Number of sensors drawn from a profile with ranges."""
 NOISE_FACTOR = 1.25
 BLUR_FACTOR = 1.15
-"""Of the noise's variance, and of the MTF."""
+"""The factors of the noise's variance (NOISE_FACTOR) and of the MTF (BLUR_FACTOR)."""
 SMOOTH = 0.45
 QUIET_PERCENT = 10.0
-"""Of the stated noise: less in a tenth of the blocks is the work of a filter.
+"""A filter was applied if this percentage of the blocks has less than the share SMOOTH of the
+stated variance of the noise.
 
-By chance they hold 0.6 of it.
+By chance the quietest blocks have 0.6 of it.
 """
 FILTERED = ": restored, resampled or compressed before, or of another gain"
 SNR = "measured SNR"
@@ -43,7 +44,7 @@ def mtf_name(axis: str) -> str:
 
 
 class StatedSensor(NamedTuple):
-    """What a profile states, in the image's numbers.
+    """The facts of a profile, in units of the image.
 
     Attributes:
         instruments: the nominal sensor, and others drawn from the profile's ranges.
@@ -55,7 +56,7 @@ class StatedSensor(NamedTuple):
 
     @classmethod
     def of(cls, sensor: Sensor, clipped_at: float) -> "StatedSensor":
-        """Return what a profile states of an image whose full scale is `clipped_at`."""
+        """Return the facts of a profile for an image whose full scale is `clipped_at`."""
         generator = np.random.default_rng(SEED)
         nominal = sensor.nominal()
         samples = (sensor.draw(generator) for _ in range(DRAWS))
@@ -76,11 +77,11 @@ class StatedSensor(NamedTuple):
         return np.asarray((sensor.alpha * radiance + sensor.beta) * (gain * self.unit) ** 2)
 
     def nominal_noise(self, values: np.ndarray) -> np.ndarray:
-        """Return the variance in the pixels of the nominal sensor, the rounding included."""
+        """Return the variance in the pixels of the nominal sensor, including rounding."""
         return self.variance(self.instruments[0], values) + ROUNDING
 
     def mtf(self, axis: str) -> tuple[float, float]:
-        """Return the least and the most contrast at Nyquist along an axis."""
+        """Return the lowest and the highest contrast at Nyquist along an axis."""
         f = np.array([[NYQUIST]]), np.array([[0.0]])
         fx, fy = f if axis == AXES[0] else f[::-1]
         contrasts = [
@@ -97,7 +98,7 @@ def compare_noise(
     """
     if isinstance(line, Refusal):
         return unavailable("ratio", line.reason), _smoothed(blocks, stated)
-    # The geometric mean of the two ends is the middle of the levels that were measured.
+    # The geometric mean of the two limits is the middle of the measured levels.
     value = math.sqrt(math.prod(line.measured_dn))
     variance = line.at(value)
     expected = stated.variances(value)
@@ -122,7 +123,7 @@ def compare_noise(
 
 
 def _smoothed(blocks: Blocks, stated: StatedSensor) -> list[str]:
-    """Return a sentence if pixels hold less noise than any image of the sensor."""
+    """Return a sentence if the pixels have less noise than any image of the sensor."""
     if not blocks.mean.size:
         return []
     expected = stated.variances(blocks.mean).min(0)

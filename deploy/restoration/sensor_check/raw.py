@@ -1,8 +1,8 @@
-"""The warning that an image of no named sensor looks restored already.
+"""The warning that an image without a named sensor looks restored already.
 
-Its noise is compared with that of the quietest sensor in range. Satellite products are mostly
-denoised and sharpened before they are delivered; a network that is not given their sensor takes
-them for images of an average one, and sharpens them a second time.
+Its noise is compared with that of the quietest sensor in range. Most satellite products are
+denoised and sharpened before they are delivered. A network that is not given their sensor treats
+them as images of an average one, and sharpens them a second time.
 """
 
 from collections.abc import Sequence
@@ -20,32 +20,35 @@ from beers_deploy.restoration.sensor_check.comparison import QUIET_PERCENT
 from beers_deploy.restoration.sensor_check.windows import band_windows, integer_step
 
 FAR_BELOW = 0.4
-"""Of the variance that the quietest sensor has, in a tenth of the blocks: less is no raw image.
+"""A share of the variance of the quietest sensor, in a tenth of the blocks. An image with less is
+not raw.
 
-Four Pleiades products hold 0.01 to 0.04 of it. Of images simulated by sensors of the range, at 1,
-1/4 and 1/20 of the light, the lowest holds 0.76, and chance alone may leave 0.6. An 11-bit image
-taken for one of 12 bits keeps half of it.
+Four Pleiades products have 0.01 to 0.04. Of images simulated by sensors of the range, at 1, 1/4 and
+1/20 of the light, the lowest has 0.76, and chance alone may leave 0.6. An 11-bit image that is
+mistaken for 12 bits retains half of it.
 """
 OFFSET = 0.01
-"""Of full scale, the largest value of the dark that an image may have."""
+"""The largest dark level that an image may have, as a share of full scale."""
 LEAST_EXPECTED = 3 * ROUNDING
-"""Least expected variance: below, rounding to integers hides the noise of a raw image as well."""
+"""The least expected variance. Below this, rounding to integers hides the noise of a raw image as
+well.
+"""
 FILLED = 1e-9
-"""Variance of blocks that are constant: filled, and not acquired."""
+"""Blocks with less variance are constant, so they are filled and not acquired."""
 
 
 def restored_already(source: Source, networks: Sequence[onnx.ModelProto], full_scale: float) -> str:
-    """Return a sentence if an image of no named sensor looks restored already; else nothing.
+    """Return a sentence if an image without a named sensor looks restored already, else "".
 
     Args:
         source: the image.
-        networks: that are to restore it; the range is known of networks that state their sensor,
-            "blind" included.
+        networks: the networks that are to restore it. The range is known if a network states its
+            sensor, "blind" included.
         full_scale: the pixel value that is 1.0 to them.
     """
     if not all(metadata(network).get("sensor") for network in networks):
         return ""
-    # Satellite products are mostly denoised before delivery: their noise gives them away.
+    # Most satellite products are denoised before delivery, which their noise reveals.
     shares = [_noise_share(windows, full_scale) for windows in band_windows(source)]
     quiet = [k for k, share in enumerate(shares, 1) if share is not None and share < FAR_BELOW]
     if not quiet:
@@ -61,8 +64,8 @@ def restored_already(source: Source, networks: Sequence[onnx.ModelProto], full_s
 
 
 def _noise_share(windows: Sequence[np.ndarray], full_scale: float) -> float | None:
-    """Return the noise's variance over the least of any sensor in range, in quiet blocks; None if
-    it cannot be measured.
+    """Return the noise's variance relative to the least of any sensor in range, in quiet blocks, or
+    None if it cannot be measured.
 
     Args:
         windows: (h, w) each, raw values; 0 where pixels are missing.
@@ -82,12 +85,12 @@ def _noise_share(windows: Sequence[np.ndarray], full_scale: float) -> float | No
 
 
 def _least_variance(values: np.ndarray, full_scale: float) -> np.ndarray:
-    """Return the least variance of the noise at pixel values, of any sensor that the networks were
-    trained for.
+    """Return the least variance of the noise at pixel values, over all sensors that the networks
+    were trained for.
 
-    It is stated at 1/16 and at 1/4 of full scale. A straight line through 0 and the first, and a
-    constant from the second on, lie below the noise line of every sensor of the range, also where
-    the dark is above 0.
+    The variance is defined at 1/16 and at 1/4 of full scale. A straight line through 0 and the
+    first, and a constant from the second on, lie below the noise line of every sensor of the range,
+    also where the dark is above 0.
     """
     # The variance of the noise is stated at 1/16 of full scale, hence 16 times the light.
     light = np.maximum(values / full_scale - OFFSET, 0)

@@ -1,4 +1,4 @@
-"""Windows spread over an image, by which its noise and its blur are checked."""
+"""Windows spread over an image, in which its noise and its blur are checked."""
 
 from collections.abc import Iterator, Sequence
 
@@ -8,7 +8,7 @@ from beers_deploy.model.raster.source import Source
 
 WINDOW_PX = 512
 ACROSS = 4
-"""Side of a window, and how many at most lie side by side, and below one another."""
+"""The side of a window, and the largest number of windows along each axis."""
 
 
 def band_windows(source: Source) -> list[list[np.ndarray]]:
@@ -17,7 +17,7 @@ def band_windows(source: Source) -> list[list[np.ndarray]]:
 
 
 def integer_step(windows: Sequence[np.ndarray]) -> int | None:
-    """Return the largest integer that divides all pixels; None if they are no integers."""
+    """Return the largest integer that divides all pixels, or None if they are not integers."""
     if any(window.dtype.kind == "f" for window in windows) and not all(
         (np.isfinite(window) & (window == np.rint(window))).all() for window in windows
     ):
@@ -40,7 +40,7 @@ def _windows(source: Source) -> Iterator[np.ndarray]:
 
 
 def _spread(size_px: int) -> list[slice]:
-    """Return windows along a side, evenly from end to end and none over another."""
+    """Return windows along a side, evenly spaced from end to end without overlap."""
     count = min(ACROSS, -(-size_px // WINDOW_PX))
     side_px = min(WINDOW_PX, size_px // count)
     starts = np.linspace(0, size_px - side_px, count)

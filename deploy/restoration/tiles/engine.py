@@ -1,9 +1,8 @@
-"""What restores a tile: a network, the facts of an image, and the two steps around the network.
+"""Restore a tile with a network, the description of an image, and the two steps around the network.
 
-`Restorer.read` takes a strip of rows from a `Source`, `Restorer.tile` runs the network on one tile
-of it, at each exposure that its pixels ask for, and `Restorer.finish` makes the restored pixels
-agree with the raw ones and stores them. `restoration.tiles.rows` calls these for all tiles
-of an image.
+`Restorer.read` reads a strip of rows from a `Source`. `Restorer.tile` runs the network on one tile
+of it, at each exposure that its pixels need. `Restorer.finish` makes the restored pixels agree with
+the raw ones and stores them. `restoration.tiles.rows` calls these for all tiles of an image.
 """
 
 from dataclasses import dataclass
@@ -25,17 +24,17 @@ from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 from beers_deploy.restoration.tiles.missing import fill_from_nearest
 
 NAME = "The image"
-"""What messages call an image that came without a file."""
+"""The name of an image that has no file, in messages."""
 
 Window = tuple[slice, slice, slice]
 """Bands, rows and columns of an array."""
 
 
 class Tile(NamedTuple):
-    """The kept pixels of a tile, (bands, h, w), and what was seen of them.
+    """The retained pixels of a tile, (bands, h, w), and their statistics.
 
-    Of `Restorer.tile` they are float32, NaN where a pixel is missing; of `Restorer.finish` as
-    stored.
+    From `Restorer.tile` the pixels are float32, NaN where a pixel is missing. From
+    `Restorer.finish` they are as stored.
     """
 
     pixels: np.ndarray
@@ -44,12 +43,12 @@ class Tile(NamedTuple):
 
 @dataclass(frozen=True)
 class Strip:
-    """Rows of an image from `top` on: `pixels` (bands, rows, width) as stored, and which are
-    missing.
+    """Rows of an image from `top` on: `pixels` (bands, rows, width) as stored, and which of them
+    are missing.
 
-    `missing` is bool of the same shape, or None where no pixel is missing; `above` says whether a
-    known pixel is above full scale. `left` is the first column, where the strip does not begin at
-    the image's border.
+    `missing` is bool of the same shape, or None if no pixel is missing. `above` is True if a known
+    pixel is above full scale. `left` is the first column, if the strip does not begin at the
+    image's border.
     """
 
     top: int
@@ -59,25 +58,25 @@ class Strip:
     left: int = 0
 
     def kept(self, bands: slice, rows: Span, columns: Span) -> Window:
-        """Where in these arrays lies what is kept of a tile."""
+        """Return the window of these arrays that contains the retained part of a tile."""
         down = slice(rows.keep_start - self.top, rows.keep_stop - self.top)
         return bands, down, slice(columns.keep_start - self.left, columns.keep_stop - self.left)
 
 
 @dataclass(frozen=True)
 class Restorer:
-    """A network and an image's facts: what turns stored pixels into restored ones.
+    """Restores stored pixels, given a network and the description of an image.
 
     Attributes:
-        raster: the image's facts.
+        raster: the description of the image.
         networks: the network at its exposures; one for all groups of bands, or one for each.
         full_scale: the pixel value that is 1.0 to the network.
-        tiling: how the network meets an image; missing pixels are filled from no farther away than
-            its halo, so what lies beyond, filled or not, is nothing that a known pixel sees.
+        tiling: the network's tiling geometry. Missing pixels are filled from no farther away than
+            its halo. Pixels beyond that, filled or not, do not influence a known pixel.
         name: of the image, for messages.
-        clips: whether values above full scale are clipped and counted; else they are an error.
-        consistency: the consistency step, one for all bands or one for each; empty where it is left
-            out, None for a band without it.
+        clips: if True, values above full scale are clipped and counted; else they are an error.
+        consistency: the consistency step, one for all bands or one for each; empty if it is
+            omitted, None for a band without it.
     """
 
     raster: Raster
@@ -93,17 +92,17 @@ class Restorer:
 
     @property
     def reach_px(self) -> int:
-        """Restored pixels that `finish` needs around what it keeps."""
+        """The number of restored pixels that `finish` needs around those that it retains."""
         return REACH_PX if self.consistency else 0
 
     @property
     def margin_px(self) -> int:
-        """Raw pixels that are read around the windows of tiles."""
+        """The number of raw pixels that are read around the windows of tiles."""
         fill_px = self.raster.fill_margin_px(self.tiling.halo_px)
         return max(fill_px, RAW_REACH_PX if self.consistency else 0)
 
     def read(self, source: Source, start: int, stop: int) -> Strip:
-        """The strip that tiles from row `start` to `stop` (excluded) need."""
+        """Read the strip that tiles from row `start` to `stop` (excluded) need."""
         start = max(start - self.margin_px, 0)
         stop = min(stop + self.margin_px, self.raster.height_px)
         return checked_strip(
@@ -139,14 +138,15 @@ class Restorer:
         rows: Span,
         columns: Span,
     ) -> Tile:
-        """Take the consistency step and store the kept pixels of a tile.
+        """Apply the consistency step and store the retained pixels of a tile.
 
         Args:
             strip: the raw rows around the tile.
-            restored: what `tile` gave, (bands, h, w), with `reach_px` pixels around what is kept.
+            restored: the result of `tile`, (bands, h, w), with `reach_px` pixels around the
+                retained ones.
             at: row and column in the image of its first pixel.
-            group: of bands.
-            rows: of which the kept ones count.
+            group: the group of bands.
+            rows: the rows of the tile, of which the retained ones are stored.
             columns: likewise.
         """
         scale = int(self.tiling.scale)
@@ -180,7 +180,7 @@ class Restorer:
         return Tile(result, tally)
 
     def _shares(self, pixels: np.ndarray) -> np.ndarray:
-        """Pixels in shares of full scale, missing ones 0."""
+        """Return pixels in shares of full scale, with missing ones 0."""
         return np.asarray(np.nan_to_num(pixels).astype(np.float64) / self.full_scale)
 
     def _change(
@@ -192,7 +192,7 @@ class Restorer:
         rows: Span,
         columns: Span,
     ) -> np.ndarray:
-        """What the consistency step adds to the kept pixels, (bands, h, w)."""
+        """Return the correction of the consistency step for the retained pixels, (bands, h, w)."""
         top = max(rows.keep_start - RAW_REACH_PX, 0)
         left = max(columns.keep_start - RAW_REACH_PX, 0)
         down = slice(top - strip.top, rows.keep_stop + RAW_REACH_PX - strip.top)
@@ -221,9 +221,11 @@ class Restorer:
         return slice(group * self.tiling.channels_in, (group + 1) * self.tiling.channels_in)
 
     def _missing(self, strip: Strip, bands: slice, rows: Span, columns: Span) -> np.ndarray | None:
-        """Which of the kept pixels are missing, of the restored shape; None where none is.
+        """Return a mask of the retained pixels that are missing, of the restored shape, or None if
+        there are none.
 
-        Where a network makes other bands of several, a pixel is missing that is missing in any.
+        If a network computes other bands from several, a pixel is missing if it is missing in any
+        of them.
         """
         if strip.missing is None:
             return None
@@ -236,8 +238,8 @@ class Restorer:
     def _unrestored(
         self, strip: Strip, missing: np.ndarray, bands: slice, rows: Span, columns: Span
     ) -> np.ndarray:
-        """What missing pixels are stored as: as they were, or the nodata value where bands do not
-        correspond.
+        """Return the values that missing pixels are stored as: unchanged, or the nodata value if
+        bands do not correspond.
         """
         tiling = self.tiling
         if tiling.channels_in != tiling.channels_out:
@@ -248,8 +250,8 @@ class Restorer:
         return _enlarged(stored, int(tiling.scale))
 
     def _window(self, strip: Strip, bands: slice, rows: Span, columns: Span) -> np.ndarray:
-        """What the network sees of a tile, (bands, h, w): missing pixels filled, extended to the
-        lattice.
+        """Return the network's input for a tile, (bands, h, w), with missing pixels filled,
+        extended to the lattice.
         """
         if strip.missing is None:
             down = slice(rows.start - strip.top, rows.stop - strip.top)
@@ -272,10 +274,10 @@ class Restorer:
     def _filled(
         self, strip: Strip, flags: np.ndarray, bands: slice, rows: Span, columns: Span
     ) -> np.ndarray:
-        """A window with its missing pixels filled, as far as the image goes."""
+        """Return a window with its missing pixels filled, as far as the image reaches."""
         radius_px = self.tiling.halo_px
-        # Beyond the last pixel a slice ends by itself; before the first one it would begin at the
-        # other end.
+        # A slice stops at the last pixel by itself, but a negative start would count from the
+        # end.
         left = max(columns.start - strip.left - radius_px, 0)
         right = columns.stop - strip.left + radius_px
         top = max(rows.start - radius_px, 0) - strip.top
@@ -310,7 +312,9 @@ def checked_strip(
     clips: bool = False,
     left: int = 0,
 ) -> Strip:
-    """Rows from `top` on, (bands, rows, width) as stored, and which of their pixels are missing."""
+    """Return rows from `top` on, (bands, rows, width) as stored, with the mask of missing pixels.
+    Raise ImageError for values outside full scale.
+    """
     missing = raster.missing(pixels) if raster.may_miss else None
     pixels = np.ma.getdata(pixels)
     missing = missing if missing is not None and missing.any() else None
@@ -330,10 +334,10 @@ def checked_strip(
 
 
 def as_stored(raster: Raster, restored: np.ndarray, full_scale: float) -> np.ndarray:
-    """Restored pixels of any shape in the output's type: rounded where that is an integer.
+    """Return restored pixels of any shape in the output's type, rounded if that is an integer.
 
-    A restored pixel that falls on the nodata value, which would read as missing, takes the number
-    beside it.
+    A restored pixel that equals the nodata value would read as missing, so it gets the adjacent
+    number.
     """
     result = np.rint(restored) if raster.out_dtype.kind != "f" else restored
     result = result.astype(raster.out_dtype)

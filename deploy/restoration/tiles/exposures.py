@@ -16,16 +16,16 @@ from beers_deploy.restoration.plan import Plan
 from beers_deploy.restoration.runtime import Infer
 
 Kept = tuple[slice, slice]
-"""Rows and columns of a window that are kept of it."""
+"""The rows and columns of a window that are retained."""
 
 
 class Exposed(NamedTuple):
-    """The kept pixels of a window, restored, and what was chosen for them.
+    """The retained pixels of a window, restored, and statistics of the exposures.
 
     Attributes:
         pixels: (bands, h, w) float32 in 0..full_scale, not rounded.
-        runs: how often the network was run, once for each factor.
-        brightened: kept pixels that were restored at a factor above 1.
+        runs: the number of runs of the network, one for each factor.
+        brightened: the number of retained pixels that were restored at a factor above 1.
     """
 
     pixels: np.ndarray
@@ -38,8 +38,8 @@ class ExposedNetwork:
     """A network for one exposure or several.
 
     Attributes:
-        infers: the network ready to run, by factor: the one for a sensor of so many times the gain.
-            1 is among them.
+        infers: the network ready to run, by factor. The factor multiplies the gain of the sensor,
+            and 1 is among them.
         radius_px: receptive radius, within which the brightest pixel decides.
         offset: the pixel value of the dark.
     """
@@ -52,13 +52,13 @@ class ExposedNetwork:
         """Restore a window of pixel values (bands, h, w) without missing pixels.
 
         Args:
-            window: what the network reads.
+            window: the network's input.
             full_scale: the pixel value that is 1.0 to the network.
-            kept: the part of the window that is kept.
-            tiling: how the network meets an image.
+            kept: the part of the window that is retained.
+            tiling: the network's tiling geometry.
 
         Raises:
-            ModelError: a result of another shape than the network's file states.
+            ModelError: the result has another shape than the network's file states.
         """
         scale = int(tiling.scale)
         inside = (slice(None), *(slice(part.start * scale, part.stop * scale) for part in kept))
@@ -81,7 +81,7 @@ class ExposedNetwork:
         return Exposed(pixels, len(factors), int((choice > 1).sum()))
 
     def _at(self, factor: int, image: np.ndarray, full_scale: float) -> np.ndarray:
-        """The image restored at one factor, in its own pixel values: (1, h, w)."""
+        """Restore the image at one factor, and return its own pixel values: (1, h, w)."""
         if factor == 1:
             return restore_window(image[None], self.infers[1], full_scale)
         offset = np.float32(self.offset)
@@ -97,12 +97,12 @@ class ExposedNetwork:
 def tiles_by_factor(
     image: np.ndarray, plan: Plan, factors: Sequence[int], full_scale: float, offset: float = 0.0
 ) -> dict[int, int]:
-    """Count the tiles of an image (H, W) that ask for each factor; a tile may ask for several.
+    """Count the tiles of an image (H, W) that need each factor. A tile may need several.
 
     Args:
         image: pixel values, none missing.
         plan: how it is cut.
-        factors: in rising order, 1 first.
+        factors: in ascending order, 1 first.
         full_scale: the pixel value that is 1.0 to the network.
         offset: the pixel value of the dark.
     """
@@ -117,7 +117,7 @@ def tiles_by_factor(
 
 
 def restore_window(dn: np.ndarray, infer: Infer, full_scale: float = MAX_DN) -> np.ndarray:
-    """Run a network on a window of pixel values: float32 in 0..full_scale, not rounded.
+    """Run a network on a window of pixel values, and return float32 in 0..full_scale, not rounded.
 
     Args:
         dn: (h, w) or (bands, h, w).
@@ -125,7 +125,8 @@ def restore_window(dn: np.ndarray, infer: Infer, full_scale: float = MAX_DN) -> 
         full_scale: the pixel value that is 1.0 to it.
 
     Returns:
-        Of as many axes; of other bands and sizes where the network makes others.
+        An array with the same number of axes. Its bands and sizes are those of the network's
+        result.
     """
     bands = dn[None] if dn.ndim == 2 else dn
     image = np.ascontiguousarray(bands, dtype=np.float32)[None] / np.float32(full_scale)

@@ -1,7 +1,7 @@
-"""A lazy array of Dask restored tile by tile, on this machine or on the workers of a cluster.
+"""Restore a lazy array of Dask tile by tile, on this machine or on the workers of a cluster.
 
-A tile is two tasks: the network on its window, and what stores its pixels, once the network has run
-on the tiles that the consistency step reaches.
+A tile is two tasks. One runs the network on its window. The other stores its pixels, once the
+network has run on the tiles that the consistency step reaches.
 """
 
 from functools import partial
@@ -23,8 +23,9 @@ from beers_deploy.restoration.tiles.engine import NAME, Restorer, Strip, checked
 def restore_lazily(bands: Any, raster: Raster, pipeline: NetworkPipeline, reading: Reading) -> Any:
     """Return a lazy (bands, H, W) array of Dask.
 
-    Errors in options and model come at once, those in pixels when it is computed. A tile is
-    finished from its own pixels and those that the network returned for the tiles around it.
+    Errors in options and model are raised at once, those in pixels when the array is computed. A
+    tile is finished from its own pixels and those that the network returned for the tiles around
+    it.
     """
     da: Any = import_module("dask.array")
     delayed: Any = import_module("dask").delayed
@@ -81,7 +82,7 @@ def restore_lazily(bands: Any, raster: Raster, pipeline: NetworkPipeline, readin
 
 
 def _near(other: Span, span: Span, reach_px: int) -> bool:
-    """Whether what is kept of one tile lies within reach of what is kept of another, along one
+    """Return True if the retained parts of two tiles lie within `reach_px` of each other, along one
     side.
     """
     return (
@@ -93,7 +94,9 @@ def _near(other: Span, span: Span, reach_px: int) -> bool:
 def _read(
     bands: Any, plan: Plan, margin_px: int, group: int, row: Span, column: Span
 ) -> tuple[Any, int, int]:
-    """What a tile reads: a lazy window (bands, h, w), and the row and column of its first pixel."""
+    """Return the input of a tile: a lazy window (bands, h, w), and the row and column of its first
+    pixel.
+    """
     rows, columns = (
         slice(max(span.start - margin_px, 0), span.stop + margin_px) for span in (row, column)
     )
@@ -112,8 +115,8 @@ def restore_tile(
     row: Span,
     column: Span,
 ) -> np.ndarray:
-    """Run the network on one tile: the kept pixels (bands, h, w) float32, of a window that begins
-    at (top, left).
+    """Run the network on one tile. Return its retained pixels (bands, h, w) float32, given a window
+    that begins at (top, left).
     """
     return restorer.tile(_strip(reading, restorer, window, top, left), 0, row, column).pixels
 
@@ -129,15 +132,15 @@ def finish_tile(
     row: Span,
     column: Span,
 ) -> np.ndarray:
-    """Store the kept pixels (bands, h, w) of one tile.
+    """Store the retained pixels (bands, h, w) of one tile.
 
     Args:
-        reading: how its pixels are understood.
+        reading: how its pixels are interpreted.
         restorer: of its band.
         window: raw pixels, as of `restore_tile`.
         top: row of its first pixel.
         left: its column.
-        around: what `restore_tile` gave of the tiles within reach, in rows.
+        around: the results of `restore_tile` for the tiles within reach, in rows.
         at: row and column of the first pixel of these.
         row: rows of the tile.
         column: its columns.
@@ -147,7 +150,7 @@ def finish_tile(
 
 
 def _strip(reading: Reading, restorer: Restorer, window: np.ndarray, top: int, left: int) -> Strip:
-    """Return a window as a strip; refuse pixels that leave the full scale open."""
+    """Return a window as a strip. Raise an error for pixels that contradict the full scale."""
     raster = restorer.raster
     # A dark tile may look like radiances; one tile alone does not prove that the image is.
     extent = raster.extent(window)._replace(whole=True)

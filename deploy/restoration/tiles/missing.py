@@ -1,15 +1,15 @@
-"""Missing pixels on the way into a network: filled from known ones that lie near."""
+"""Fill missing pixels from known ones nearby, before they enter a network."""
 
 import numpy as np
 
 
 def fill_from_nearest(pixels: np.ndarray, missing: np.ndarray, reach_px: int) -> np.ndarray:
-    """(h, w) pixels where each `missing` one is a copy of a known one at most `reach_px` rows and
-    columns away.
+    """Return (h, w) pixels where each `missing` one is a copy of a known one at most `reach_px`
+    rows and columns away.
 
-    The nearest known pixel of the row, then the nearest filled one of the column; 0 where there is
-    none in reach. So a filled pixel depends on nothing farther away, and a window gives just what
-    the whole image gives.
+    A missing pixel gets the nearest known pixel of the row, then the nearest filled one of the
+    column, or 0 if there is none in reach. A filled pixel therefore depends on nothing farther
+    away, and a window gives exactly the same result as the whole image.
     """
     filled, missing = _along_rows(pixels, missing, reach_px)
     filled, missing = _along_rows(filled.T, missing.T, reach_px)
@@ -19,8 +19,8 @@ def fill_from_nearest(pixels: np.ndarray, missing: np.ndarray, reach_px: int) ->
 def _along_rows(
     pixels: np.ndarray, missing: np.ndarray, reach_px: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Filled pixels, and where none was in reach; of two at the same distance the left one is
-    taken.
+    """Return the filled pixels, and a mask of those without a known pixel in reach. Of two at the
+    same distance the left one is used.
     """
     width = pixels.shape[1]
     # Without a known pixel on one side, its place is out of reach from every pixel.

@@ -1,10 +1,10 @@
-"""The one tile loop: whatever restores an image by a network, from a file or an array, runs what
-stands here.
+"""The one tile loop. All code that restores an image by a network, from a file or an array, uses
+it.
 
-A `Source` gives a strip of rows, `Restorer.tile` runs the network on one tile of it, and
-`Restorer.finish` takes the consistency step once the tiles around are there. `restore_rows` yields
-finished rows of tiles in order: the next strip is read ahead, and several tiles are in work at a
-time. `gathered`, `restore_floats` and `restore_dn` gather the rows of an image in memory;
+A `Source` provides a strip of rows, `Restorer.tile` runs the network on one tile of it, and
+`Restorer.finish` applies the consistency step once the tiles around are available. `restore_rows`
+yields finished rows of tiles in order: the next strip is read ahead, and several tiles are in work
+at a time. `gathered`, `restore_floats` and `restore_dn` gather the rows of an image in memory.
 `restoration.run` writes those of a file.
 """
 
@@ -30,14 +30,14 @@ from beers_deploy.restoration.tiles.engine import Restorer, Strip, Tile
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 
 Steps = tuple[Consistency | None, ...]
-"""The consistency step, one for all bands or one for each; empty where it is left out, None for a
-band without it.
+"""The consistency step, one for all bands or one for each; empty if it is omitted, None for a band
+without it.
 """
 
 
 class RestoredRow(NamedTuple):
-    """A row of tiles: its `span` in the image, restored `pixels` (bands, rows, width), and what was
-    seen of them.
+    """A row of tiles: its `span` in the image, the restored `pixels` (bands, rows, width), and
+    their statistics.
     """
 
     span: Span
@@ -46,8 +46,8 @@ class RestoredRow(NamedTuple):
 
 
 class NetworkRow(NamedTuple):
-    """A row of tiles as the network gave it: `pixels` (bands, rows, width) float32, NaN where they
-    are missing.
+    """A row of tiles as the network returned it: `pixels` (bands, rows, width) float32, NaN where
+    they are missing.
     """
 
     span: Span
@@ -58,7 +58,7 @@ class NetworkRow(NamedTuple):
 
 @dataclass
 class HeldRows:
-    """Rows that the network gave, as far up as the next row of tiles to finish needs them.
+    """Rows that the network returned, as far up as the next row of tiles to finish needs them.
 
     Rows and columns are those of the restored image.
     """
@@ -68,7 +68,7 @@ class HeldRows:
 
     @property
     def bottom(self) -> int:
-        """The row behind the last one."""
+        """The row after the last one."""
         return self.top + int(sum(part.shape[1] for part in self.parts))
 
     def window(self, bands: slice, rows: slice, columns: slice) -> np.ndarray:
@@ -82,7 +82,7 @@ class HeldRows:
         return np.concatenate(pieces, axis=1)
 
     def forget_above(self, row: int) -> None:
-        """Let go of the rows above one."""
+        """Release the rows above `row`."""
         while self.parts and self.top + self.parts[0].shape[1] <= row:
             self.top += self.parts.popleft().shape[1]
         if self.parts and self.top < row:
@@ -99,7 +99,8 @@ def restore_rows(
     tick: Callable[[], None],
     at_once: int = 1,
 ) -> Generator[RestoredRow, None, None]:
-    """Restore rows of tiles in order, `at_once` tiles at a time; `tick` is called once a tile.
+    """Restore rows of tiles in order, `at_once` tiles at a time. `tick` is called once for each
+    tile.
 
     The network also runs on rows of tiles before the first one, as far as the consistency step
     reaches.
@@ -123,7 +124,7 @@ def restore_rows(
                     waiting[0].span.keep_stop + reach_px, plan.height_px
                 ):
                     done_px = waiting[0].span.keep_stop
-                    # A name for the row would keep it in memory while the next is made.
+                    # A variable for the row would hold it in memory while the next is computed.
                     yield _finished(waiting.popleft(), buffer, plan, restorer, pool)
                     buffer.forget_above((done_px - reach_px) * scale)
         finally:
@@ -132,7 +133,7 @@ def restore_rows(
 
 
 def rows_to_run(plan: Plan, restorer: Restorer, rows: Sequence[Span]) -> list[Span]:
-    """The rows of tiles that the network runs on so that `rows` can be finished."""
+    """Return the rows of tiles that the network must run on to finish `rows`."""
     if not rows:
         return []
     start = rows[0].keep_start - restorer.reach_px
@@ -150,7 +151,7 @@ def _network_rows(
 ) -> Iterator[NetworkRow]:
     """Run the network on rows of tiles.
 
-    A row is begun before the one before it is finished, so no thread waits.
+    A row is started before the previous one is finished, so that no thread waits.
     """
     reader, pool = pools
     coming = [reader.submit(restorer.read, source, row.start, row.stop) for row in rows[:1]]
@@ -172,8 +173,8 @@ def _network_rows(
 def _tiles(
     strip: Strip, row: Span, plan: Plan, restorer: Restorer, pool: Executor
 ) -> Iterator[Tile]:
-    """The tiles of one row, in the order of `places`."""
-    # Written into the caller's loop, the lambda would take the strip and the row of the next one.
+    """Return an iterator over the tiles of one row, in the order of `places`."""
+    # Within the caller's loop, the lambda would use the strip and the row of the next iteration.
     return pool.map(lambda place: restorer.tile(strip, place[0], row, place[1]), places(plan))
 
 
@@ -190,7 +191,7 @@ def _network_row(
 def _finished(
     row: NetworkRow, buffer: HeldRows, plan: Plan, restorer: Restorer, pool: Executor
 ) -> RestoredRow:
-    """Finish a row of tiles, tile by tile, once all that they need is held."""
+    """Finish a row of tiles, tile by tile, once all that they need is available."""
     count = plan.tiling.channels_out
     reach_px = restorer.reach_px
     scale = plan.scale
@@ -213,7 +214,9 @@ def _finished(
 def _gathered(
     tiles: Iterable[Tile], pixels: np.ndarray, plan: Plan, tick: Callable[[], None]
 ) -> Tally:
-    """Put the tiles of a row into `pixels` (bands, rows, width); return what was seen of all."""
+    """Put the tiles of a row into `pixels` (bands, rows, width), and return their joint
+    statistics.
+    """
     tally = Tally()
     count = plan.tiling.channels_out
     for (group, columns), tile in zip(places(plan), tiles, strict=True):
@@ -225,8 +228,8 @@ def _gathered(
 
 
 def places(plan: Plan) -> list[tuple[int, Span]]:
-    """Group of bands and columns of every tile in a row of tiles, in the order in which they are
-    restored.
+    """Return the group of bands and the columns of every tile in a row of tiles, in the order in
+    which they are restored.
     """
     return list(product(range(plan.groups), plan.columns))
 
@@ -242,7 +245,7 @@ def gathered(
         dtype: of its pixels.
 
     Returns:
-        The pixels, and what was seen of all of them.
+        The pixels, and their statistics.
     """
     pixels = np.empty(shape, dtype)
     tally = Tally()
@@ -262,10 +265,10 @@ def restore_floats(
     max_dn: float = MAX_DN,
     consistency: Steps = (),
 ) -> np.ndarray:
-    """Restore (H, W) digital numbers of 0 to `max_dn` to float32, not rounded: what `restore`
-    writes of floats.
+    """Restore (H, W) digital numbers of 0 to `max_dn` to float32, not rounded, as `restore` writes
+    floats.
 
-    NaN is a missing pixel, and stays.
+    NaN is a missing pixel, and stays NaN.
     """
     if plan.out_shape != (1, *dn.shape):
         raise ModelError(
@@ -289,7 +292,7 @@ def restore_dn(
     max_dn: float = MAX_DN,
     consistency: Steps = (),
 ) -> np.ndarray:
-    """Restore (H, W) digital numbers of 0 to `max_dn` to whole ones, float32: what `restore` writes
-    of integers.
+    """Restore (H, W) digital numbers of 0 to `max_dn` to integers in float32, as `restore` writes
+    integers.
     """
     return np.asarray(np.rint(restore_floats(dn, network, plan, max_dn, consistency)))

@@ -1,13 +1,13 @@
-"""A sensor profile from raw frames of the sensor's own: what `characterize` does between options
-and TOML.
+"""Measure a sensor profile from the sensor's own raw frames: the part of `characterize` between
+options and TOML.
 
-- `frames`: which frames, what one digital number is, where the dark lies
+- `frames`: the frames, the value of one digital number, and the level of the dark
 - `measure`: noise and MTF, with intervals
 - `profile`: figures, sentences, and the TOML file
 
 Gain, ground sampling distance, black level, and bits unless pixels are clipped at full scale, are
-asked for or assumed. Where no edge gives an MTF, the user's word or an assumption stands in its
-place, marked so.
+requested from the user or assumed. If no edge gives an MTF, the profile has the user's value or an
+assumption instead, marked as such.
 """
 
 import os
@@ -49,9 +49,9 @@ def measure(
     """Measure a sensor on its own frames.
 
     Args:
-        images: raw ones of one sensor at one setting: files, and folders of them.
+        images: raw images of one sensor at one setting: files, and folders of them.
         edges: boxes with one straight edge as FILE:X,Y,WIDTH,HEIGHT; none searches for edges.
-        stated: what the user says.
+        stated: the values that the user states.
     """
     stated = stated or Stated()
     frames = open_frames(images, stated.bits, stated.black_level)
@@ -82,7 +82,7 @@ def measured_sensor(
     Args:
         images: one or several, each a path or an array (H, W) of integers.
         edges: boxes with one straight edge as FILE:X,Y,WIDTH,HEIGHT.
-        stated: what the user states.
+        stated: the values that the user states.
     """
     with TemporaryDirectory(prefix="beers-deploy-") as folder:
         paths = [

@@ -1,5 +1,5 @@
-"""The raw frames of one camera: which files they are, what one digital number is, and where the
-dark lies.
+"""The raw frames of one camera: their files, the stored step of one digital number, and the level
+of the dark.
 """
 
 import re
@@ -16,16 +16,16 @@ from beers_deploy.profiles.errors import ImageError, OptionError, printable
 
 TILE_PX = 1024
 BOX_PX = 2 * int(HALF_PX) + 1
-"""Shortest side of a box with an edge."""
+"""The shortest side of a box with an edge."""
 MAX_DN = 65535
 CLIPPED_PIXELS = 10
 PILE = 4
-"""Pixels at one value, 2^n - 1, and how many times as many as just below: what shows that it is
-full scale.
+"""A value 2^n - 1 is full scale if it has at least this number of pixels, and this multiple of the
+number just below it.
 """
 DARKEST_PERCENT = 0.01
 DARK_SHARE = 0.02
-"""Where the darkest pixels of all frames lie above this share of full scale, a black level is
+"""If the darkest pixels of all frames are above this share of full scale, a black level is
 probable.
 """
 
@@ -36,11 +36,11 @@ class Frames:
 
     Attributes:
         paths: of the images, sorted as given.
-        step: stored values are multiples of it; one digital number.
+        step: the stored step of one digital number, of which all stored values are multiples.
         bits: of a digital number.
-        bits_stated: whether the user states them.
+        bits_stated: True if the user states them.
         black_dn: the digital number of the dark, subtracted from all that is measured.
-        darkest_dn: what the darkest pixels have, the black level included.
+        darkest_dn: the digital number of the darkest pixels, the black level included.
     """
 
     paths: tuple[Path, ...]
@@ -57,26 +57,26 @@ class Frames:
 
     @property
     def stored_full_scale(self) -> int:
-        """The value that stands for it in the files."""
+        """The value of full scale in the files."""
         return self.full_scale_dn * self.step
 
     @property
     def name(self) -> str:
-        """The frames in a few words."""
+        """A short description of the frames."""
         more = f" and {len(self.paths) - 1} more" if len(self.paths) > 1 else ""
         return f"{self.paths[0].name}{more}"
 
     @property
     def hides_black(self) -> bool:
-        """Whether no black level is stated, though nothing in the frames is near 0."""
+        """True if no black level is stated, although no pixel in the frames is near 0."""
         return not self.black_dn and self.darkest_dn > DARK_SHARE * self.full_scale_dn
 
     def read(self, path: Path) -> np.ndarray:
-        """Digital numbers (H, W) of one frame, float64; 0 where they are missing."""
+        """Read the digital numbers (H, W) of one frame, float64, with 0 where they are missing."""
         return read_raw(path).astype(np.float64) / self.step
 
     def tiles(self, path: Path) -> Iterator[np.ndarray]:
-        """The frame in pieces (h, w) of 1024 pixels a side at most."""
+        """Yield the frame in parts (h, w) of at most 1024 pixels a side."""
         pixels = self.read(path)
         for top in range(0, pixels.shape[0], TILE_PX):
             for left in range(0, pixels.shape[1], TILE_PX):
@@ -84,12 +84,12 @@ class Frames:
 
 
 def open_frames(images: Sequence[Path], bits: int | None, black_level: float | None) -> Frames:
-    """Look at raw frames: steps, bits and the dark.
+    """Determine the step, the bits and the dark of raw frames.
 
     Args:
-        images: files, and folders whose images are taken in the order of their names.
-        bits: of a digital number, or of a stored value; None where clipped pixels must tell.
-        black_level: the stored value of the dark; None counts 0 as dark.
+        images: files, and folders whose images are sorted by name.
+        bits: of a digital number, or of a stored value; None to infer them from clipped pixels.
+        black_level: the stored value of the dark; None uses 0.
     """
     paths: tuple[Path, ...] = ()
     for image in images:
@@ -118,12 +118,12 @@ def open_frames(images: Sequence[Path], bits: int | None, black_level: float | N
 
 @dataclass(frozen=True)
 class _Look:
-    """What the stored values of one frame show.
+    """Statistics of the stored values of one frame.
 
     Attributes:
         step: largest number that divides all values.
-        largest: of the values.
-        piled: whether pixels pile up there as at a full scale alone.
+        largest: the largest value.
+        piled: True if pixels accumulate there, as they do only at full scale.
         darkest: value of the darkest pixels.
         middle: median.
     """
@@ -151,16 +151,16 @@ def _look(path: Path) -> _Look:
     step = step if apart else 1
     count = int((values == largest).sum())
     below = int((values == largest - step).sum())
-    # Values stored in 8 bits do not tell the bits of the digitiser, clipped or not.
+    # Values stored in 8 bits do not reveal the bits of the digitiser, clipped or not.
     piled = count >= max(CLIPPED_PIXELS, PILE * below) and pixels.dtype.itemsize > 1
-    # 0 stands for a missing pixel too, so that it tells nothing of the dark.
+    # 0 also stands for a missing pixel, so it says nothing about the dark.
     present = values[values > 0]
     darkest, middle = np.percentile(present, [DARKEST_PERCENT, 50]) if present.size else (0.0, 0.0)
     return _Look(step, largest, piled, float(darkest), float(middle))
 
 
 def _settled_bits(stated: int | None, largest: int, step: int, piled: bool) -> int:
-    """The bits that were given, or those that pixels clipped at full scale show."""
+    """Return the bits that the user states, or those inferred from pixels clipped at full scale."""
     largest_dn = largest // step
     if stated is None:
         if not piled or largest_dn != 2 ** largest_dn.bit_length() - 1:
@@ -182,7 +182,9 @@ def _settled_bits(stated: int | None, largest: int, step: int, piled: bool) -> i
 
 
 def read_raw(path: Path) -> np.ndarray:
-    """Stored values (H, W) of one band, integers of any width; 0 where they are missing."""
+    """Read the stored values (H, W) of one band, integers of any width, with 0 where they are
+    missing.
+    """
     with open_raster(path) as source:
         raster = source.raster
         rows = source.read(0, raster.height_px)
@@ -208,7 +210,9 @@ def read_raw(path: Path) -> np.ndarray:
 
 
 def cut_box(words: str, frames: Frames) -> np.ndarray:
-    """The digital numbers (h, w) that FILE:X,Y,WIDTH,HEIGHT names, FILE being one of the frames."""
+    """Return the digital numbers (h, w) in the box FILE:X,Y,WIDTH,HEIGHT, where FILE is one of the
+    frames.
+    """
     parts = re.fullmatch(r"(.*):(\d{1,8}),(\d{1,8}),(\d{1,8}),(\d{1,8})", words, re.ASCII)
     if parts is None:
         raise OptionError(

@@ -1,4 +1,4 @@
-"""Noise and MTF of a sensor, from its raw frames (`model.metrics.instrument`)."""
+"""Measure noise and MTF of a sensor from its raw frames (`model.metrics.instrument`)."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -26,13 +26,13 @@ from beers_deploy.restoration.sensor_check.comparison import NOISE_FACTOR
 from beers_deploy.studies.characterize.frames import Frames
 
 OWN_LEAK = 0.1
-"""Of the finest detail of one frame, what may be texture where its noise is compared with the
-others'.
+"""The share of the finest detail of one frame that may be texture when its noise is compared with
+that of others.
 """
 STILL_STRUCTURE = 2.0
 STILL_DRIFT = 0.02
-"""Of the difference of two frames of a still scene: structure over noise, and the largest change of
-level.
+"""Limits for the difference of two frames of a still scene: structure over noise, and the largest
+change of level.
 """
 
 Edges = dict[str, list[Edge]]
@@ -44,8 +44,9 @@ class Noise:
     """The noise of frames, above the dark.
 
     Attributes:
-        model: the line.
-        pairs: number of pairs of frames of one still scene that it rests on; 0 if on frames.
+        model: the fitted line.
+        pairs: the number of pairs of frames of one still scene that it rests on; 0 if it rests on
+            single frames.
     """
 
     model: NoiseModel
@@ -73,8 +74,8 @@ def measure_noise(frames: Frames) -> Noise:
 
 
 def _still_pairs(frames: Frames) -> list[Blocks]:
-    """Return blocks of the differences of frames that show the same scene, pixel by pixel: photon
-    transfer.
+    """Return blocks of the differences of frames that show the same scene, pixel by pixel (photon
+    transfer).
     """
     # Two frames of a still scene have one level: sorted by it, they are neighbours.
     by_level = sorted(frames.paths, key=lambda path: float(np.median(frames.read(path))))
@@ -99,8 +100,8 @@ def _still_pairs(frames: Frames) -> list[Blocks]:
 
 
 def _require_one_sensor(frames: Frames, frame_blocks: Sequence[Blocks], dn: float) -> None:
-    """Raise ImageError if the frames' own noise at a digital number differs: of another gain, or
-    processed.
+    """Raise ImageError if the frames' noise at a digital number differs, because they have another
+    gain or were processed.
     """
     variances = {}
     for path, blocks in zip(frames.paths, frame_blocks, strict=True):
@@ -110,7 +111,7 @@ def _require_one_sensor(frames: Frames, frame_blocks: Sequence[Blocks], dn: floa
             variances[path.name] = line.at(dn)
     if not variances:
         return
-    # The ends of the intervals are compared, so that frames which may be alike pass.
+    # The limits of the intervals are compared, so that frames which may be equal pass.
     least = min(variances, key=lambda name: variances[name].interval[1])
     most = max(variances, key=lambda name: variances[name].interval[0])
     if variances[most].interval[0] > NOISE_FACTOR * variances[least].interval[1]:
@@ -129,8 +130,8 @@ def measure_mtf(
 
     Args:
         frames: of the camera.
-        boxes: pixels (h, w) with one edge each, by the words that name them; none searches all
-            frames.
+        boxes: pixels (h, w) with one edge each, by their description; if empty, all frames are
+            searched.
         noise: of the pixels, above the dark.
     """
 
@@ -143,7 +144,9 @@ def measure_mtf(
 
 
 def _boxed(frames: Frames, boxes: Mapping[str, np.ndarray], variance: Variance) -> Edges:
-    """Return the edges in boxes, those near the horizontal turned upright."""
+    """Return the edges in boxes. Those near the horizontal are transposed to be near the
+    vertical.
+    """
     edges: Edges = {axis: [] for axis in AXES}
     for words, region in boxes.items():
         lies = _rise(region.T) > _rise(region)
@@ -161,7 +164,9 @@ def _boxed(frames: Frames, boxes: Mapping[str, np.ndarray], variance: Variance) 
 
 
 def _searched(frames: Frames, variance: Variance) -> Edges:
-    """Return the edges of all frames, those near the horizontal turned upright."""
+    """Return the edges of all frames. Those near the horizontal are transposed to be near the
+    vertical.
+    """
     edges: Edges = {axis: [] for axis in AXES}
     with steps("looking for edges", len(frames.paths)) as bar:
         for path in frames.paths:
@@ -173,14 +178,16 @@ def _searched(frames: Frames, variance: Variance) -> Edges:
 
 
 def _rise(region: np.ndarray) -> float:
-    """Return how much brighter one side is than the other, along the rows."""
+    """Return the difference in brightness between both sides, along the rows."""
     first, *_, last = np.array_split(region, 3, axis=1)
     return abs(float(last.mean() - first.mean()))
 
 
 @dataclass(frozen=True)
 class Snr:
-    """The SNR at one radiance, in W/m2/sr/um, with its 95 % interval (its end may be infinite)."""
+    """The SNR at one radiance, in W/m2/sr/um, with its 95 % interval, whose limits may be
+    infinite.
+    """
 
     radiance: float
     value: float

@@ -1,5 +1,5 @@
-"""What was measured of a camera as figures, as sentences for its user, and as a profile: a TOML
-file.
+"""Report the measurement of a camera as figures, as sentences for its user, and as a profile in a
+TOML file.
 """
 
 import math
@@ -22,19 +22,23 @@ from beers_deploy.studies.characterize.frames import Frames
 from beers_deploy.studies.characterize.measure import Noise, Snr
 
 PARTS = (16, 4)
-"""Of full scale: the radiances at which SNRs are stated, as in the profiles of networks."""
+"""The radiances at which SNRs are stated, as fractions 1 / n of full scale, as in the profiles of
+networks.
+"""
 GSD_M = 0.5
 OVERSAMPLING = 4
 SHOWN_CPX = {"at 0.1 cycles per pixel": 0.1, "at 0.25 cycles per pixel": 0.25, "at Nyquist": 0.5}
 MARGIN = 1e-5
-"""Of an SNR, by which it stays off the bounds of physics: decimals are rounded."""
+"""The relative margin by which an SNR stays off the bounds of physics, because decimals are
+rounded.
+"""
 FULL_SCALE_RADIANCE = 400.0
-"""W/m2/sr/um, where no gain is given."""
+"""The radiance of full scale in W/m2/sr/um if no gain is given."""
 
 
 @dataclass(frozen=True)
 class Stated:
-    """What the user states about a camera; None if it is measured or assumed.
+    """The values that the user states about a camera; None if a value is measured or assumed.
 
     Attributes:
         bits: of a digital number.
@@ -60,12 +64,12 @@ class Stated:
 
 @dataclass(frozen=True)
 class Measurement:
-    """What was found of a camera.
+    """The measurement of a camera.
 
     Attributes:
-        frames: that were measured.
+        frames: the frames that were measured.
         noise: the line that the SNRs lie on.
-        mtf: of each axis the curve that edges show, or why there is none; empty where the user
+        mtf: for each axis the measured curve, or the reason why there is none; empty if the user
             states the MTF.
         snrs: at two radiances.
         gain: DN per W/m2/sr/um, stated or assumed.
@@ -81,11 +85,11 @@ class Measurement:
 
     @property
     def curves(self) -> dict[str, MtfCurve]:
-        """The curve of each axis that edges show."""
+        """The measured curve of each axis that has one."""
         return {axis: curve for axis, curve in self.mtf.items() if isinstance(curve, MtfCurve)}
 
     def rows(self) -> list[Row]:
-        """The figures, as commands report them."""
+        """Return the figures, as commands report them."""
         figures: dict[str, Figure] = {}
         for axis in AXES:
             curve = self.mtf.get(axis, Refusal("the user states it"))
@@ -109,7 +113,7 @@ class Measurement:
         return [Row("sensor", "measured sensor", figures)]
 
     def notes(self) -> Iterator[str]:
-        """What a user should know before the profile is used, a sentence each."""
+        """Yield the sentences that a user should read before using the profile."""
         frames = self.frames
         model = self.noise.model
         if frames.step > 1:
@@ -151,7 +155,9 @@ class Measurement:
 
 
 def _colour_consequence(colour: float) -> str:
-    """What noise that is not white means for a restoration, which takes it for white."""
+    """Return the consequence of noise that is not white for a restoration, which assumes white
+    noise.
+    """
     if colour > 1:
         return (
             "The profile states the stronger part. Filtering or compression after the detector "
@@ -164,16 +170,16 @@ def _colour_consequence(colour: float) -> str:
 
 
 def _blocks(noise: Noise) -> str:
-    """How many blocks of what."""
+    """Return the number of blocks and their kind, in words."""
     still = f" of {noise.pairs} pairs of one scene each" if noise.pairs else ""
     return f"{noise.model.blocks} blocks of 16 x 16{still}"
 
 
-def profile_toml(found: Measurement) -> str:
-    """The profile as its TOML file; the source of what was measured has its interval, and any
+def profile_toml(measurement: Measurement) -> str:
+    """Return the profile as TOML. The source of each measured value includes its interval, and any
     doubt.
     """
-    frames = found.frames
+    frames = measurement.frames
     images = printable(frames.name)
     bits_source = (
         "given"
@@ -188,18 +194,18 @@ def profile_toml(found: Measurement) -> str:
     )
     tables: dict[str, dict[str, object]] = {
         "grid": {
-            "gsd_m": _given(found.stated.gsd_m, GSD_M, "no pixel depends on it; state it"),
+            "gsd_m": _given(measurement.stated.gsd_m, GSD_M, "no pixel depends on it; state it"),
             "oversampling": _constant(
                 OVERSAMPLING, "assumed", "for simulations alone: scene pixels a pixel"
             ),
         },
-        "mtf": _mtf_table(found, images),
-        "noise": _noise_table(found, images),
+        "mtf": _mtf_table(measurement, images),
+        "noise": _noise_table(measurement, images),
         "digitiser": {
             "bits": _constant(
                 frames.bits, "stated" if frames.bits_stated else "measured", bits_source
             ),
-            "gain_dn_per_radiance": _given(found.stated.gain, found.gain, gain_source),
+            "gain_dn_per_radiance": _given(measurement.stated.gain, measurement.gain, gain_source),
         },
     }
     if frames.black_dn:
@@ -210,8 +216,8 @@ def profile_toml(found: Measurement) -> str:
 
 
 def _mtf_table(sensor: Measurement, images: str) -> dict[str, object]:
-    """Measured curves, what the user states, or an assumption; an axis without a curve has the
-    other's.
+    """Return the measured curves, the user's values, or an assumption. An axis without a curve uses
+    the other's.
     """
     if sensor.stated.mtf is not None:
         across, along = (
@@ -223,7 +229,7 @@ def _mtf_table(sensor: Measurement, images: str) -> dict[str, object]:
         why = "no edge shows it; the middle of the range that networks are trained for"
         return {"mtf_nyquist": _constant(float(f"{middle:.4g}"), "assumed", why)}
     table: dict[str, object] = {"frequency": [float(f) for f in FREQUENCIES]}
-    # An axis without edges has the curve of the other one, and its source says so.
+    # An axis without edges has the curve of the other one, and its source states that.
     other = next(iter(sensor.curves))
     for axis in AXES:
         source_axis = axis if axis in sensor.curves else other
@@ -242,15 +248,15 @@ def _edges(curve: MtfCurve) -> str:
 
 
 def _intervals(curve: MtfCurve) -> str:
-    """The interval of each contrast, in the order of the table."""
+    """Return the interval of each contrast as text, in the order of the table."""
     return ", ".join(
         f"{low:.3g} to {high:.3g}" for low, high in zip(curve.low, curve.high, strict=True)
     )
 
 
 def _noise_table(sensor: Measurement, images: str) -> dict[str, object]:
-    """The SNRs are linear ratios without the rounding to whole DN; the darker one is kept within
-    physics.
+    """Return the SNRs as linear ratios without the rounding to integer DN. The darker one is
+    limited to the bounds of physics.
     """
     model = sensor.noise.model
     dark, bright = (dn / sensor.gain for dn in model.measured_dn)
@@ -266,7 +272,7 @@ def _noise_table(sensor: Measurement, images: str) -> dict[str, object]:
             f"{_blocks(sensor.noise)} in {images}, 95 % interval {snr.interval[0]:.3g} to "
             f"{snr.interval[1]:.3g}"
         )
-        # No block has this radiance: the interval is wider, and the source says so.
+        # No block has this radiance, so the interval is wider, and the source states that.
         if snr.extrapolated:
             source += f"; extrapolated from {dark:.3g} to {bright:.3g} W/m2/sr/um"
         if not model.white:

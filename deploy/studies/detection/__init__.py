@@ -1,5 +1,5 @@
-"""What restoration gains an object detector: labelled scenes, a detector, and average precision
-with intervals.
+"""Measure the gain of restoration for an object detector: labelled scenes, a detector, and average
+precision with intervals.
 
 - `labels`: labelled images of VOC, DIOR and COCO;
 - `boxes`: boxes and the square input of a detector; `detector`: detectors as Ultralytics exports

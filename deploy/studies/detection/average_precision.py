@@ -1,10 +1,10 @@
 """Average precision, precision and recall, by class and by size, with a bootstrap over sites.
 
-Boxes are matched once, in pixels of the scene. Every figure is then a sum over images, each times
-its weight: with weights of 1 the average precision is that of pycocotools, the reference code of
-the COCO evaluation; with the counts of a bootstrap draw it is that of the images drawn (Everingham
-et al., IJCV 111, 2015, section 3.5). A mean average precision is no mean over images, so each draw
-is scored again.
+Boxes are matched once, in pixels of the scene. Every figure is then a weighted sum over images.
+With weights of 1 the average precision is that of pycocotools, the reference code of the COCO
+evaluation. With the counts of a bootstrap draw it is that of the images drawn (Everingham et al.,
+IJCV 111, 2015, section 3.5). A mean average precision is not a mean over images, so each draw is
+scored again.
 """
 
 import math
@@ -18,12 +18,12 @@ from beers_deploy.model.metrics.bootstrap import LEAST_SITES, percentiles, too_f
 from beers_deploy.studies.detection.boxes import Boxes, areas, iou
 
 OVERLAPS = np.linspace(0.5, 0.95, 10)
-"""Intersection over union from which a box counts as found: ten levels, as COCO has them."""
+"""Intersection over union from which a box counts as found: ten levels, as in COCO."""
 RECALLS = np.linspace(0.0, 1.0, 101)
-"""Where COCO reads precision off, to average it."""
+"""The recalls at which COCO samples precision, to average it."""
 CONFIDENCES = np.linspace(0.0, 1.0, 1001)
-"""Where precision and recall are read off: a detection counts up to the confidence that is its
-score.
+"""The confidences at which precision and recall are sampled. A detection counts at confidences up
+to its score.
 """
 SIZES_PX = {
     "all": (0.0, math.inf),
@@ -31,29 +31,32 @@ SIZES_PX = {
     "16 to 32 px": (16.0, 32.0),
     "32 px up": (32.0, math.inf),
 }
-"""Root of a box's area, in px of the scene: from the first up to below the second."""
+"""Square root of a box's area, in px of the scene: from the first value to below the second."""
 ALL = 0
 DRAWS = 1000
 FEW_SITES = 10
-"""Below it the percentiles of a bootstrap are too narrow to be trusted, and a note says so."""
+"""With fewer sites the percentiles of a bootstrap are too narrow to be trusted, and a note reports
+it.
+"""
 
 Figures = Mapping[str, np.ndarray]
-"""The figures of a row by name, (1 + draws,) each: on all images, then on each draw; NaN where
-there is no object.
+"""The figures of a row by name, (1 + draws,) each: on all images, then on each draw. They are NaN
+if there is no object.
 """
 
 
 @dataclass(frozen=True)
 class Hits:
-    """Every detection on a set of images, the best scored first, and which of them found an object.
+    """Every detection on a set of images, sorted by descending score, and which of them found an
+    object.
 
     Attributes:
         images: (D,) int64, the image of each detection.
         classes: (D,) int64.
-        scores: (D,) float64, falling.
-        hits: (S, 10, D) bool, whether it found an object, by `SIZES_PX` and `OVERLAPS`.
-        ignored: (S, 10, D) bool, whether it counts neither way.
-        objects: (S, C, I) int64, the objects to be found, by size, class and image.
+        scores: (D,) float64, descending.
+        hits: (S, 10, D) bool, True if it found an object, by `SIZES_PX` and `OVERLAPS`.
+        ignored: (S, 10, D) bool, True if it counts neither as hit nor as false.
+        objects: (S, C, I) int64, the number of objects to find, by size, class and image.
     """
 
     images: np.ndarray
@@ -64,27 +67,27 @@ class Hits:
     objects: np.ndarray
 
 
-def find_hits(truths: Sequence[Boxes], found: Sequence[Boxes], classes: int) -> Hits:
-    """Match what was found with what is labelled, once for all figures, by the rules of the COCO
-    evaluation.
+def find_hits(truths: Sequence[Boxes], detected: Sequence[Boxes], classes: int) -> Hits:
+    """Match detections with labels, once for all figures, by the rules of the COCO evaluation.
 
-    The best scored detection is matched first, with the free object of its class that it overlaps
-    most. What lies in an ignored box counts neither way; nor do objects of another size, and
-    detections of one that found none. Every detection counts, where COCO takes the best 100 of a
-    class: aerial images hold more objects than photographs do.
+    The detection with the best score is matched first, with the free object of its class that it
+    overlaps most. Detections in an ignored box count neither as hits nor as false. The same holds
+    for objects of another size, and for detections of another size that found none. Every
+    detection counts, while COCO uses the best 100 of a class, because aerial images contain more
+    objects than photographs do.
 
     Args:
-        truths: labelled boxes of each image; images without any belong to them: what is found there
-            is false.
-        found: what was found on each image, in the same px, of the same classes.
-        classes: how many there are.
+        truths: labelled boxes of each image. Images without any are included: detections there
+            are false.
+        detected: the detections on each image, in the same px, of the same classes.
+        classes: the number of classes.
     """
-    scores = np.concatenate([boxes.scores for boxes in found])
-    kinds = np.concatenate([boxes.classes for boxes in found])
+    scores = np.concatenate([boxes.scores for boxes in detected])
+    kinds = np.concatenate([boxes.classes for boxes in detected])
     # Stable, so that equal scores keep the order of the images.
     order = np.argsort(-scores, kind="stable")
-    image = np.repeat(np.arange(len(found)), [len(boxes) for boxes in found])
-    matches = [match(truth, boxes)[:2] for truth, boxes in zip(truths, found, strict=True)]
+    image = np.repeat(np.arange(len(detected)), [len(boxes) for boxes in detected])
+    matches = [match(truth, boxes)[:2] for truth, boxes in zip(truths, detected, strict=True)]
     hits, ignored = (
         np.concatenate(parts, axis=-1)[..., order] for parts in zip(*matches, strict=True)
     )
@@ -103,21 +106,21 @@ def _of_other_size(boxes: Boxes) -> np.ndarray:
     return np.array([(sides < low) | (sides >= high) for low, high in SIZES_PX.values()])
 
 
-def match(truth: Boxes, found: Boxes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def match(truth: Boxes, detected: Boxes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Match the N boxes found on an image with its M labelled ones, by `SIZES_PX` and `OVERLAPS`.
 
     Returns:
-        Which of those found are hits, and which count neither way, (S, 10, N); which objects are
-            taken, (S, 10, M).
+        Masks of the boxes found that are hits, and of those that are ignored, (S, 10, N), and of
+        the objects that are matched, (S, 10, M).
     """
     uncounted = np.repeat((truth.ignored | _of_other_size(truth))[:, None], len(OVERLAPS), axis=1)
-    ignored = np.repeat(_of_other_size(found)[:, None], len(OVERLAPS), axis=1)
+    ignored = np.repeat(_of_other_size(detected)[:, None], len(OVERLAPS), axis=1)
     hits = np.zeros_like(ignored)
     matched = np.zeros_like(uncounted)
-    overlaps = iou(found.corners, truth.corners, truth.ignored) * (
-        found.classes[:, None] == truth.classes
+    overlaps = iou(detected.corners, truth.corners, truth.ignored) * (
+        detected.classes[:, None] == truth.classes
     )
-    for one in np.argsort(-found.scores, kind="stable"):
+    for one in np.argsort(-detected.scores, kind="stable"):
         if overlaps[one].max(initial=0) < OVERLAPS[0]:
             continue
         # An object is found once; an ignored box may hold any number of detections.
@@ -133,8 +136,8 @@ def match(truth: Boxes, found: Boxes) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def site_weights(sites: Sequence[str], seed: int, draws: int = DRAWS) -> np.ndarray:
-    """How often each image counts, (1 + draws, I): once, then as often as each draw with
-    replacement has its site.
+    """Return the weights of the images, (1 + draws, I): 1 for all, then the number of times that
+    each draw with replacement contains their site.
     """
     names, site = np.unique(np.array(sites), return_inverse=True)
     generator = np.random.default_rng(seed)
@@ -144,10 +147,10 @@ def site_weights(sites: Sequence[str], seed: int, draws: int = DRAWS) -> np.ndar
 
 
 def interval(values: np.ndarray, sites: int) -> tuple[float, float] | None:
-    """The interval at 95 % of a figure, or of a difference of two, (1 + draws,): percentiles of its
-    draws.
+    """Return the 95 % interval of a figure, or of a difference of two, (1 + draws,), from the
+    percentiles of its draws.
 
-    Of fewer than `LEAST_SITES` different sites there is none: it could not be trusted.
+    With fewer than `LEAST_SITES` different sites it is None, because it could not be trusted.
     """
     defined = values[1:][~np.isnan(values[1:])]
     if np.isnan(values[0]) or sites < LEAST_SITES or not len(defined):
@@ -156,8 +159,8 @@ def interval(values: np.ndarray, sites: int) -> tuple[float, float] | None:
 
 
 def sites_note(sites: int) -> str:
-    """What a reader must know of intervals over so many sites, in a sentence; empty where there is
-    nothing to say.
+    """Return a sentence on the reliability of intervals over this number of sites, or "" if they
+    are reliable.
     """
     few = (
         f"Only {sites} sites: the intervals are too narrow to be trusted."
@@ -170,14 +173,14 @@ def sites_note(sites: int) -> str:
 def score_rows(
     rows: Mapping[str, Hits], names: Sequence[str], weights: np.ndarray
 ) -> tuple[dict[str, Figures], float]:
-    """Every figure of every row, and the confidence at which `precision` and `recall` are read in
-    all of them.
+    """Return every figure of every row, and the confidence at which `precision` and `recall` are
+    sampled in all of them.
 
     Args:
-        rows: of the same images; the confidence is that of the best F1 of the first one on all
+        rows: rows of the same images. The confidence is that of the best F1 of the first row on all
             images.
         names: of the classes.
-        weights: (W, I), how often each image counts, as `site_weights` gives it.
+        weights: (W, I), the weight of each image, as `site_weights` returns it.
     """
     confidence = float(score(next(iter(rows.values())), names, weights[:1])["own confidence"][0])
     return {row: score(hits, names, weights, confidence) for row, hits in rows.items()}, confidence
@@ -186,21 +189,21 @@ def score_rows(
 def score(
     hits: Hits, names: Sequence[str], weights: np.ndarray, confidence: float = 0.0
 ) -> Figures:
-    """Every figure of a row, (W,) each.
+    """Return every figure of a row, (W,) each.
 
     Args:
         hits: of the row.
         names: of the classes.
-        weights: (W, I) whole numbers, how often each image counts.
-        confidence: where `precision` and `recall` are read; `own precision` and `own recall` are
-            read at `own confidence`, that of the row's best F1.
+        weights: (W, I) integers, the weight of each image.
+        confidence: where `precision` and `recall` are sampled. `own precision` and `own recall` are
+            sampled at `own confidence`, that of the row's best F1.
     """
     every = len(OVERLAPS)
     by_class = np.array(
         [precisions(hits, kind, weights, ALL, every).mean(axis=-1) for kind in range(len(names))]
     )
     curves = _confidence_curves(hits, weights)
-    # The confidence is a level of its own grid: the margin keeps rounding from taking the next one.
+    # The confidence lies on the grid. The margin prevents that rounding selects the next level.
     fixed = np.searchsorted(CONFIDENCES, np.nan_to_num(confidence) - 1e-9)
     # It is 0 where nothing is labelled, and there the curves are NaN.
     own = np.argmax(curves[2], axis=-1)
@@ -225,8 +228,8 @@ def score(
 
 
 def map50(hits: Hits, weights: np.ndarray, size: int = ALL) -> np.ndarray:
-    """Average precision at an overlap of one half alone, mean over classes, (W,); arguments as of
-    `score`.
+    """Return the average precision at an overlap of one half, mean over classes, (W,). The
+    arguments are those of `score`.
     """
     kinds = range(hits.objects.shape[1])
     return mean_known(
@@ -235,22 +238,24 @@ def map50(hits: Hits, weights: np.ndarray, size: int = ALL) -> np.ndarray:
 
 
 def mean_known(values: np.ndarray) -> np.ndarray:
-    """Mean over the first axis of those that are there; NaN of none."""
+    """Return the mean over the first axis of the values that are not NaN, or NaN if there are
+    none.
+    """
     return np.asarray(np.ma.filled(np.ma.masked_invalid(values).mean(axis=0), np.nan))
 
 
 def precisions(
     hits: Hits, kind: int, weights: np.ndarray, size: int = ALL, levels: int = 1
 ) -> np.ndarray:
-    """Precision of a class at each of `RECALLS`, (W, levels, 101): the best at that recall or more
-    (COCO).
+    """Return the precision of a class at each of `RECALLS`, (W, levels, 101): the best at that
+    recall or more (COCO).
 
     Args:
         hits: of a row.
         kind: number of the class.
-        weights: (W, I) how often each image counts.
+        weights: (W, I) the weight of each image.
         size: number of a range of `SIZES_PX`.
-        levels: how many of `OVERLAPS`, from the first.
+        levels: the number of `OVERLAPS` to use, from the first.
 
     Returns:
         NaN where the class has no object.
@@ -274,10 +279,10 @@ def precisions(
 
 
 def _confidence_curves(hits: Hits, weights: np.ndarray) -> np.ndarray:
-    """Precision, recall and F1 at an overlap of half, (3, W, 1001): means over the classes that
-    have an object.
+    """Return precision, recall and F1 at an overlap of half, (3, W, 1001): means over the classes
+    that have an object.
 
-    Precision is 1 of a class of which nothing is found, as Ultralytics has it.
+    The precision of a class without detections is 1, as in Ultralytics.
     """
     total = np.zeros((3, len(weights), len(CONFIDENCES)))
     class_counts = np.zeros((len(weights), 1))

@@ -1,8 +1,8 @@
-"""Boxes on an image: how much two overlap, which of several on one object stays, and how they
-follow an image's size.
+"""Boxes on an image: their overlap, the suppression of several on one object, and their scaling
+with an image.
 
 Coordinates are continuous pixels: pixel i covers [i, i + 1), so a box around the first pixel is 0,
-0, 1, 1. Readers bring every other convention to this one (`labels`).
+0, 1, 1. Readers convert every other convention to this one (`labels`).
 """
 
 from dataclasses import dataclass, replace
@@ -14,15 +14,16 @@ from skimage.transform import resize
 from beers_deploy.profiles.errors import OptionError
 
 LEAST_VISIBLE = 0.3
-"""Share of a box inside the image below which finding it counts neither for nor
-against a detector.
+"""If a smaller share of a box is inside the image, finding it counts neither for nor against a
+detector.
 """
 PADDING = 114 / 255
 OVERLAP = 0.7
 MOST = 300
 CANDIDATES = 30_000
-"""As Ultralytics validates: the grey around an image, the overlap above which the lower scored of
-two boxes goes, the boxes kept of an image, and those compared, best scores first.
+"""The values with which Ultralytics validates: the grey around an image, the overlap above which
+the box with the lower score is removed, the number of boxes retained in an image, and the number
+compared, best scores first.
 """
 
 
@@ -32,10 +33,9 @@ class Boxes:
 
     Attributes:
         corners: (N, 4) float64: left, top, right and bottom in px.
-        classes: (N,) int64 into a tuple of names that is kept elsewhere.
-        scores: (N,) float64 confidence in 0 to 1; 1 of what is labelled.
-        ignored: (N,) bool: what is found inside such a box counts neither for nor against a
-            detector.
+        classes: (N,) int64, indices of a tuple of names that is stored elsewhere.
+        scores: (N,) float64 confidence in 0 to 1; 1 for labelled boxes.
+        ignored: (N,) bool: detections inside such a box count neither for nor against a detector.
     """
 
     corners: np.ndarray
@@ -51,8 +51,8 @@ class Boxes:
         scores: ArrayLike | None = None,
         ignored: ArrayLike | None = None,
     ) -> "Boxes":
-        """Boxes of any array-like; without scores they are labelled ones, and none is ignored
-        by default.
+        """Create boxes from any array-like. Without scores they are labelled ones, and none is
+        ignored by default.
         """
         array = np.asarray(corners, np.float64).reshape(-1, 4)
         count = len(array)
@@ -67,21 +67,21 @@ class Boxes:
         return len(self.corners)
 
     def __getitem__(self, which: np.ndarray | slice) -> "Boxes":
-        """The boxes that a mask, indices or a slice choose."""
+        """Return the boxes selected by a mask, indices or a slice."""
         return Boxes(
             self.corners[which], self.classes[which], self.scores[which], self.ignored[which]
         )
 
     def renamed(self, classes: np.ndarray) -> "Boxes":
-        """Boxes whose class c becomes `classes[c]`; those of a class that
-        becomes -1 are left out.
+        """Return boxes whose class c becomes `classes[c]`. Those of a class that becomes -1 are
+        left out.
         """
         new = np.asarray(classes, np.int64)[self.classes]
         return Boxes(self.corners, new, self.scores, self.ignored)[new >= 0]
 
     def clipped(self, height_px: float, width_px: float) -> "Boxes":
-        """The parts inside an image: what lies outside whole is left out, what is mostly outside is
-        ignored.
+        """Return the parts inside an image. Boxes completely outside are left out, and those mostly
+        outside are ignored.
         """
         limits = np.array([width_px, height_px, width_px, height_px])
         inside = np.clip(self.corners, 0, limits)
@@ -92,20 +92,20 @@ class Boxes:
 
 
 def areas(corners: np.ndarray) -> np.ndarray:
-    """(N,) areas in px2 of (N, 4) corners; 0 where a right or lower edge lies
-    before its opposite.
+    """Return the areas in px2 (N,) of corners (N, 4), or 0 if a right or lower edge lies before its
+    opposite.
     """
     return np.asarray(np.prod(np.maximum(corners[:, 2:] - corners[:, :2], 0), axis=1))
 
 
 def iou(one: np.ndarray, other: np.ndarray, ignored: np.ndarray | bool = False) -> np.ndarray:
-    """(N, M) overlaps, 0 to 1, of (N, 4) and (M, 4) corners: intersection over union; 0 of two
-    boxes without area.
+    """Return the intersection over union (N, M), 0 to 1, of corners (N, 4) and (M, 4). It is 0 for
+    two boxes without area.
 
     Args:
         one: corners.
         other: corners.
-        ignored: (M,) of which of `other` the overlap is the share of `one` inside it.
+        ignored: (M,) True where the overlap is the share of `one` inside `other`.
     """
     low = np.maximum(one[:, None, :2], other[None, :, :2])
     high = np.minimum(one[:, None, 2:], other[None, :, 2:])
@@ -117,31 +117,30 @@ def iou(one: np.ndarray, other: np.ndarray, ignored: np.ndarray | bool = False) 
     return np.asarray(np.divide(shared, union, out=np.zeros_like(shared), where=union > 0))
 
 
-def suppress(found: Boxes) -> Boxes:
-    """Non-maximum suppression within each class: what stays of boxes as a detector gives them, best
-    score first.
+def suppress(boxes: Boxes) -> Boxes:
+    """Return the boxes of a detector after non-maximum suppression within each class, best score
+    first.
     """
-    candidates = np.argsort(-found.scores, kind="stable")[:CANDIDATES]
+    candidates = np.argsort(-boxes.scores, kind="stable")[:CANDIDATES]
     selection = list[int]()
     while len(candidates) and len(selection) < MOST:
         best = int(candidates[0])
         candidates = candidates[1:]
         selection.append(best)
         # Boxes of other classes stay: overlaps are computed within the class alone.
-        crowded = found.classes[candidates] == found.classes[best]
+        crowded = boxes.classes[candidates] == boxes.classes[best]
         crowded[crowded] = (
-            iou(found.corners[best][None], found.corners[candidates[crowded]])[0] > OVERLAP
+            iou(boxes.corners[best][None], boxes.corners[candidates[crowded]])[0] > OVERLAP
         )
         candidates = candidates[~crowded]
-    return found[np.array(selection, np.int64)]
+    return boxes[np.array(selection, np.int64)]
 
 
 class Letterbox:
-    """How an image of any size goes into a detector's square input: enlarged or shrunk alike,
-    centred, padded grey.
+    """Fits an image of any size into a detector's square input: scaled uniformly, centred, padded
+    grey.
 
-    Shrinking samples bilinearly without a filter in front, as Ultralytics does when it trains and
-    runs.
+    Downscaling samples bilinearly without a prefilter, as Ultralytics does when it trains and runs.
 
     Args:
         height_px: of the image.
@@ -168,8 +167,8 @@ class Letterbox:
         self._shift = np.tile([left, top], 2)
 
     def image(self, rgb: np.ndarray) -> np.ndarray:
-        """The input, (3, size_px, size_px) float32, of an image (height_px,
-        width_px, 3) in 0 to 1.
+        """Return the input, (3, size_px, size_px) float32, for an image (height_px, width_px, 3) in
+        0 to 1.
         """
         # Shrunk without a filter in front, as Ultralytics does when it trains and runs.
         same = self._inner == rgb.shape[:2]
@@ -180,9 +179,9 @@ class Letterbox:
         return np.ascontiguousarray(padded.transpose(2, 0, 1))
 
     def to_input(self, corners: np.ndarray) -> np.ndarray:
-        """(N, 4) corners on the image as px of the input."""
+        """Convert (N, 4) corners from px of the image to px of the input."""
         return np.asarray(corners * self._gain + self._shift)
 
     def to_image(self, corners: np.ndarray) -> np.ndarray:
-        """(N, 4) corners in px of the input as px of the image."""
+        """Convert (N, 4) corners from px of the input to px of the image."""
         return np.asarray((corners - self._shift) / self._gain)

@@ -1,10 +1,10 @@
-"""Detectors as Ultralytics exports them to ONNX: what a file says of itself, and boxes by
-onnxruntime on the CPU.
+"""Detectors as Ultralytics exports them to ONNX: the metadata of a file, and boxes by onnxruntime
+on the CPU.
 
-Two layouts are read (docs.ultralytics.com/integrations/onnx, and files of its 8.4.190): raw, 1 x (4
-+ classes) x anchors, centre, size and a score of each class; and final, 1 x N x 6, corners, score
-and class, of `nms=True` or of a network that needs no suppression. Both take RGB in 0 to 1 on a
-grey letterbox, and answer in px of the input.
+Two layouts are supported (docs.ultralytics.com/integrations/onnx, and files of its 8.4.190). Raw is
+1 x (4 + classes) x anchors: centre, size and a score of each class. Final is 1 x N x 6: corners,
+score and class, of `nms=True` or of a network that needs no suppression. Both accept RGB in 0 to 1
+on a grey letterbox, and return px of the input.
 """
 
 import ast
@@ -33,17 +33,19 @@ from beers_deploy.quant.session import open_session
 from beers_deploy.studies.detection.boxes import MOST, Boxes, Letterbox, suppress
 
 LEAST_SCORE = 1e-3
-"""Below it a detection is none, as Ultralytics validates: average precision needs the doubtful
-ones.
+"""Detections below this score are dropped, as Ultralytics validates: average precision needs the
+doubtful ones.
 """
 CUT = 0.01
-"""A file that drops detections only below this confidence loses next to nothing of its average
+"""A file that drops detections only below this confidence loses almost nothing of its average
 precision.
 """
 LITERAL = 1 << 16
-"""Characters of a Python literal in the metadata; the names of 1 200 classes take half of it."""
+"""The maximum number of characters of a Python literal in the metadata. The names of 1 200 classes
+need half of it.
+"""
 ROUNDING = 1e-3
-"""By how much a score may pass 0 or 1."""
+"""The margin by which a score may lie outside 0 to 1."""
 REMEDY = "Export it with Ultralytics for detection, with format='onnx'."
 
 
@@ -54,8 +56,7 @@ class Detector:
     Attributes:
         names: of its classes, in its order.
         size_px: side of its square input.
-        flag: why its average precision comes out too low, in a sentence; empty where nothing is
-            cut.
+        flag: a sentence on why its average precision is too low; empty if nothing is dropped.
     """
 
     names: tuple[str, ...]
@@ -64,8 +65,8 @@ class Detector:
     _run: Callable[[np.ndarray], np.ndarray]
 
     def detect(self, rgb: np.ndarray) -> Boxes:
-        """What it finds on an image (H, W, 3) float32 in 0 to 1, the best scored first, 300 boxes
-        at most.
+        """Detect objects on an image (H, W, 3) float32 in 0 to 1. Return at most 300 boxes, best
+        score first.
 
         Returns:
             Boxes in px of the image, cut at its borders.
@@ -78,8 +79,8 @@ class Detector:
         return Boxes.of(inside.corners, inside.classes, inside.scores)
 
     def decoded(self, output: np.ndarray) -> Boxes:
-        """Boxes in px of the input, suppressed, of an answer (1, 4 + classes, anchors) raw, or (1,
-        N, 6) final.
+        """Decode an output (1, 4 + classes, anchors) raw, or (1, N, 6) final, to boxes in px of the
+        input, suppressed.
         """
         if not _is_read(output.shape, len(self.names)):
             sizes = " x ".join(map(str, output.shape))
@@ -105,8 +106,8 @@ def open_detector(path: Path, threads: int = 0, size_px: int | None = None) -> D
 
     Args:
         path: an ONNX file.
-        threads: of onnxruntime; 0 takes a thread a core.
-        size_px: side of the input; None takes the one that the file is fixed to or was trained for.
+        threads: of onnxruntime; 0 uses one thread for each core.
+        size_px: side of the input; None uses the size that the file is fixed to or was trained for.
     """
     model = load_onnx(path)
     # Ultralytics writes its metadata as Python literals.
@@ -137,7 +138,7 @@ def _answer(session: InferenceSession, path: Path, image: np.ndarray) -> np.ndar
 
 
 def _literal(text: str) -> Any:
-    """What a value of the metadata stands for, where it is a Python literal; else the text."""
+    """Return the value of a metadata entry if it is a Python literal, else the text."""
     try:
         # The names of 1 200 classes take half of this limit: a longer text is not parsed.
         return ast.literal_eval(text) if len(text) <= LITERAL else text
@@ -151,23 +152,23 @@ def _require_layout(model: onnx.ModelProto, task: Any, classes: int, path: Path)
     if task == "detect" and channels == [3] and len(outputs) == 1 and _is_read(outputs[0], classes):
         return
     shapes = ", ".join(" x ".join(map(str, sizes)) for sizes in outputs)
-    found = f"task {task}, {' '.join(map(str, channels))} channels, output {shapes}"
+    facts = f"task {task}, {' '.join(map(str, channels))} channels, output {shapes}"
     raise ModelError(
         f"{path} must have a detector's output as Ultralytics exports it for RGB, "
         f"1 x {4 + classes} x anchors for {classes} classes (raw) or 1 x N x 6 (nms=True or "
-        f"end2end), but it has {printable(found)}. {REMEDY}"
+        f"end2end), but it has {printable(facts)}. {REMEDY}"
     )
 
 
 def _is_read(shape: Sequence[int], classes: int) -> bool:
-    """Whether an output is raw or final, of one image; 0 stands for a size that
-    a file leaves open.
+    """Return True if an output is raw or final, of one image. 0 stands for a size that a file
+    leaves open.
     """
     return len(shape) == 3 and shape[0] in (0, 1) and (shape[1] == 4 + classes or shape[2] == 6)
 
 
 def _sizes(value: onnx.ValueInfoProto) -> list[int]:
-    """Sizes that a file states of an input or output; 0 where it leaves one open."""
+    """Return the sizes that a file states for an input or output, with 0 for those left open."""
     return [dimension.dim_value for dimension in value.type.tensor_type.shape.dim]
 
 
@@ -189,8 +190,8 @@ def _size_px(fixed: int | None, stated: Any, requested: int | None, path: Path) 
 
 
 def _flag(model: onnx.ModelProto) -> str:
-    """What suppression inside the file costs; the confidence it cuts at stands nowhere but in its
-    graph.
+    """Return a sentence on the loss by suppression inside the file. Its confidence threshold is
+    found only in the graph.
     """
     if not any(node.op_type == "NonMaxSuppression" for node in model.graph.node):
         return ""
@@ -209,7 +210,7 @@ def _flag(model: onnx.ModelProto) -> str:
 
 
 def _raw(output: np.ndarray) -> Boxes:
-    """Every pair of an anchor and a class whose score counts; px of the input."""
+    """Return every pair of an anchor and a class with a sufficient score, in px of the input."""
     classes, anchors = np.nonzero(output[4:] > LEAST_SCORE)
     middle = output[:2, anchors].T.astype(np.float64)
     half = output[2:4, anchors].T.astype(np.float64) / 2
@@ -218,7 +219,9 @@ def _raw(output: np.ndarray) -> Boxes:
 
 
 def _final(output: np.ndarray, classes: int) -> Boxes:
-    """Rows with a score that counts, the best first: the rest pads the list with zeros."""
+    """Return the rows with a sufficient score, best first. The other rows pad the list with
+    zeros.
+    """
     rows = output[output[:, 4] > LEAST_SCORE]
     if not np.isin(rows[:, 5], np.arange(classes)).all():
         raise ModelError(
@@ -230,18 +233,18 @@ def _final(output: np.ndarray, classes: int) -> Boxes:
 
 
 def letters(name: str) -> str:
-    """The letters and digits of a class's name, without case: tools spell the same ones
-    differently.
+    """Return the letters and digits of a class name, without case, because tools spell the same
+    names differently.
     """
     return "".join(c for c in name.casefold() if c.isalnum())
 
 
-def class_names(found: Any) -> tuple[str, ...]:
-    """Names of classes from a list, or a table by number from 0; none where what was found is
-    something else.
+def class_names(names: Any) -> tuple[str, ...]:
+    """Return class names from a list, or from a table by number from 0, or none for any other
+    value.
     """
     names = (
-        [found.get(number) for number in range(len(found))] if isinstance(found, dict) else found
+        [names.get(number) for number in range(len(names))] if isinstance(names, dict) else names
     )
     if not isinstance(names, list) or not all(
         isinstance(name, str) and letters(name) for name in names
@@ -251,7 +254,7 @@ def class_names(found: Any) -> tuple[str, ...]:
 
 
 def parse_classes(text: str) -> dict[str, str]:
-    """Read LABELLED=DETECTOR,...: which class of the detector a labelled class is."""
+    """Parse LABELLED=DETECTOR,... and return the detector's class for each labelled class."""
     pairs = [
         [part.strip() for part in entry.split("=")] for entry in text.split(",") if entry.strip()
     ]
@@ -267,16 +270,16 @@ def parse_classes(text: str) -> dict[str, str]:
 def class_numbers(
     labelled: Sequence[str], detector: Sequence[str], given: Mapping[str, str]
 ) -> np.ndarray:
-    """For each labelled class its number among the detector's: of the one given, else of the one of
-    the same letters.
+    """Return for each labelled class its number among the detector's classes: the one given, else
+    the one with the same letters.
 
     Args:
         labelled: names in the order of the labels' numbers.
         detector: names in the order of the detector's.
-        given: detector's names by labelled ones, as `parse_classes` reads them.
+        given: detector's names by labelled ones, as `parse_classes` returns them.
 
     Returns:
-        (L,) int64, -1 for a class that the detector does not know; as `Boxes.renamed` takes it.
+        (L,) int64, -1 for a class that the detector does not know, as `Boxes.renamed` accepts it.
     """
     number = {letters(name): i for i, name in enumerate(detector)}
     if len(number) < len(detector):

@@ -26,12 +26,12 @@ from beers_deploy.studies.detection.detector import letters
 LAYOUTS = "VOC (.xml) or COCO (.json) labels"
 CORRECT = "Correct the labels."
 LABEL_BYTES = 1 << 23
-"""Limit of a file of labels: 25 000 boxes of XML."""
+"""The largest size of a file of labels, which is 25 000 boxes of XML."""
 HORIZONTAL = "Horizontal Bounding Boxes"
 CORNERS = ("xmin", "ymin", "xmax", "ymax")
 
 Box = tuple[str, Sequence[float], bool]
-"""A name, the corners, and whether the box counts neither way."""
+"""A name, the corners, and True if the box is ignored."""
 
 
 class LabelledSet(NamedTuple):
@@ -45,8 +45,8 @@ class LabelledSet(NamedTuple):
 
 
 class _File(NamedTuple):
-    """The labels of one image; `size_px` is the height and width that they were made for, 0 where
-    they say none.
+    """The labels of one image. `size_px` is the height and width that they were made for, or 0 if
+    they state none.
     """
 
     image: Path
@@ -61,10 +61,10 @@ def read_labelled(
     """Read the labelled images of a folder.
 
     Args:
-        images: the folder of the images, or the top of a tree as VOC and DIOR have it.
-        labels: a folder of label files, one for each image, or COCO's JSON; None looks next to the
-            images.
-        split: which part of a tree; None takes `test` if there is one.
+        images: the folder of the images, or the top of a tree in the layout of VOC and DIOR.
+        labels: a folder of label files, one for each image, or COCO's JSON; None searches next to
+            the images.
+        split: the part of a tree; None uses `test` if there is one.
     """
     is_tree = (images / "Annotations").is_dir() and any(images.glob("JPEGImages*"))
     if labels is None and is_tree:
@@ -80,7 +80,7 @@ def read_labelled(
 
 
 def _labels_near(folder: Path) -> Path:
-    """Return where the labels of a folder's images lie: next to them, or in a file of JSON."""
+    """Return the path of the labels of a folder's images: next to them, or a JSON file."""
     # This call refuses a folder without images.
     list_images(folder)
     if any(path.suffix.lower() == ".xml" for path in folder.iterdir()):
@@ -119,7 +119,7 @@ def _labelled_set(files: Sequence[_File], notes: Sequence[str] = ()) -> Labelled
     names = sorted(sorted({name for name, *_ in boxes}), key=letters)
     number = {name: i for i, name in enumerate(names)}
     images = []
-    lost = list[str]()
+    outside = list[str]()
     for one in sorted(files, key=lambda one: one.image.name):
         labelled = Boxes.of(
             [corners for _, corners, _ in one.boxes],
@@ -127,19 +127,21 @@ def _labelled_set(files: Sequence[_File], notes: Sequence[str] = ()) -> Labelled
             ignored=[ignored for *_, ignored in one.boxes],
         )
         inside = labelled[areas(labelled.corners) > 0].clipped(*_size_px(one))
-        lost += [one.source.name] * (len(labelled) - len(inside))
+        outside += [one.source.name] * (len(labelled) - len(inside))
         images.append((one.image, inside))
     if not any(len(truth) for _, truth in images):
         raise OptionError(
             f"The labels must have at least one object, but they have none on {len(images)} "
             "images. Check the labels."
         )
-    remarks = [*notes, *_remarks([truth for _, truth in images], lost)]
+    remarks = [*notes, *_remarks([truth for _, truth in images], outside)]
     return LabelledSet(images, names, remarks)
 
 
 def _size_px(one: _File) -> tuple[int, int]:
-    """Height and width of an image in px; its labels must have been made for them."""
+    """Return height and width of an image in px. Raise OptionError if its labels were made for
+    another size.
+    """
     height, width = image_size_px(one.image)
     # Boxes in pixels fit only the image that they were drawn on.
     if min(one.size_px) > 0 and one.size_px != (height, width):
@@ -150,15 +152,15 @@ def _size_px(one: _File) -> tuple[int, int]:
     return height, width
 
 
-def _remarks(truths: Sequence[Boxes], lost: Sequence[str]) -> list[str]:
+def _remarks(truths: Sequence[Boxes], outside: Sequence[str]) -> list[str]:
     empty = sum(not len(truth) for truth in truths)
     ignored = sum(int(truth.ignored.sum()) for truth in truths)
     remarks = []
     if empty:
         count = f"{empty} of {len(truths)}"
         remarks.append(f"Images without a labelled object, all found there is false: {count}.")
-    if lost:
-        count = f"{len(lost)}, the first in {lost[0]}"
+    if outside:
+        count = f"{len(outside)}, the first in {outside[0]}"
         remarks.append(f"Boxes left out, without area inside their image: {count}.")
     if ignored:
         kinds = "difficult, a crowd or visible by less than 30 %"
@@ -167,8 +169,8 @@ def _remarks(truths: Sequence[Boxes], lost: Sequence[str]) -> list[str]:
 
 
 def _read_voc_tree(folder: Path, split: str | None) -> list[_File]:
-    """The labels of a split of VOC's or DIOR's folders; None takes `test`, or all where there is
-    none.
+    """Read the labels of a split of VOC's or DIOR's folders. None uses `test`, or all images if
+    there is no such split.
     """
     images = {
         p.stem: p
@@ -182,7 +184,7 @@ def _read_voc_tree(folder: Path, split: str | None) -> list[_File]:
     stems = list(images)
     list_name = split or "test"
     if list_name in lists:
-        # A list of one class has a number behind each name.
+        # A list of one class has a number after each name.
         stems = sorted({line.split()[0] for line in _lines(lists[list_name])})
     elif split:
         raise OptionError(
@@ -234,8 +236,8 @@ def _voc_box(entry: ET.Element, path: Path) -> Box:
 
 
 def _read_coco(labels: Path, folder: Path) -> tuple[list[_File], list[str]]:
-    """The labels of every image that is both listed and in the folder, and a sentence about those
-    that are not.
+    """Read the labels of every image that is both listed and in the folder. Also return a sentence
+    about those that are not.
     """
     try:
         content: Any = read_json(labels)
@@ -279,7 +281,9 @@ def _read_coco(labels: Path, folder: Path) -> tuple[list[_File], list[str]]:
 
 
 def _inside(folder: Path, name: str) -> Path | None:
-    """The file of that name in the folder, or of its last part; nothing outside the folder."""
+    """Return the file of that name, or of its last part, in the folder. A path outside the folder
+    gives None.
+    """
     # A name in the file must not lead out of the folder.
     if ".." in Path(name).parts or Path(name).is_absolute():
         return None

@@ -29,7 +29,7 @@ PICTURES = 4
 FOUND = "#2fd39b"
 MISSED = "#ff5a36"
 FALSE = "#ffd21f"
-"""Colours of boxes."""
+"""The colours of boxes: found, missed and false."""
 
 CAPTIONS = {
     MAIN: "Precision and recall at the confidence of the reference's best F1, the one a "
@@ -53,7 +53,7 @@ NOTES = (
 
 
 def write_page(compared: Sequence[Comparison], table: Table, path: Path) -> None:
-    """Write the page of a study, whole or not at all.
+    """Write the page of a study, atomically.
 
     Args:
         compared: comparisons of one set of scenes.
@@ -74,7 +74,9 @@ def write_page(compared: Sequence[Comparison], table: Table, path: Path) -> None
 
 
 def curves(compared: Sequence[Comparison]) -> Picture:
-    """Precision by recall at an overlap of one half, means over classes: a panel a sensor."""
+    """Plot precision by recall at an overlap of one half, means over classes, with a panel for each
+    sensor.
+    """
     panels = [
         (comparison.name, [_curve(comparison, row) for row in comparison.hits])
         for comparison in compared
@@ -94,7 +96,9 @@ def _curve(comparison: Comparison, row: str) -> Curve:
 
 
 def crops(compared: Sequence[Comparison]) -> list[Picture]:
-    """The same crops of the scenes that lose most objects: a row a sensor and a column a method."""
+    """Return the same crops of the scenes that lose most objects, with a row for each sensor and a
+    column for each method.
+    """
     losses = [
         sum(int(_lost(comparison, number).sum()) for comparison in compared)
         for number in range(len(compared[0].scenes))
@@ -104,7 +108,9 @@ def crops(compared: Sequence[Comparison]) -> list[Picture]:
 
 
 def _lost(comparison: Comparison, number: int) -> np.ndarray:
-    """(M,) objects of a scene that are found on the reference and not on degraded images."""
+    """Return a mask (M,) of the objects of a scene that are found on the reference and not on
+    degraded images.
+    """
     return np.asarray(
         _matched(comparison, REFERENCE, number)[-1] & ~_matched(comparison, DEGRADED, number)[-1]
     )
@@ -113,8 +119,8 @@ def _lost(comparison: Comparison, number: int) -> np.ndarray:
 def _matched(
     comparison: Comparison, row: str, number: int
 ) -> tuple[Boxes, np.ndarray, np.ndarray, np.ndarray]:
-    """The boxes on a scene that reach the table's confidence; hits, ignored ones, and objects
-    taken, by half.
+    """Return the boxes on a scene that reach the table's confidence, with masks of hits, ignored
+    boxes, and matched objects at an overlap of half.
     """
     boxes = comparison.boxes[row][number]
     # The pictures show what the table counts.
@@ -144,8 +150,8 @@ def _picture(compared: Sequence[Comparison], number: int) -> Picture:
 
 
 def _middle(comparison: Comparison, number: int) -> np.ndarray:
-    """(2,) x and y in scene pixels of the object, a lost one if there is any, with most such near
-    it.
+    """Return x and y (2,) in scene pixels of the object with most others near it. Only lost objects
+    are considered, if there are any.
     """
     truth = comparison.scenes[number].scene.truth
     lost_objects = _lost(comparison, number)
@@ -161,7 +167,7 @@ def _middle(comparison: Comparison, number: int) -> np.ndarray:
 
 
 def _cell(comparison: Comparison, row: str, number: int, middle: np.ndarray) -> np.ndarray:
-    """An enlarged crop around a place of the scene, what is missed, falsely found and found drawn
+    """Draw an enlarged crop around a place of the scene, with the missed, false and found boxes
     over it.
     """
     scene = comparison.scenes[number]

@@ -1,8 +1,8 @@
-"""What a fixed detector finds on the same scenes: as the reference sensor sees them, degraded, and
-restored.
+"""Compare the detections of a fixed detector on the same scenes: as the reference sensor sees them,
+degraded, and restored.
 
-scene -> acquisition, whole -> restoration -> one display for all rows, stretched as the reference
-asks -> detector -> boxes back on the scene -> average precision.
+scene -> acquisition of the whole scene -> restoration -> one display for all rows, with the
+reference's stretch -> detector -> boxes back on the scene -> average precision.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -43,11 +43,11 @@ class LabelledScene:
 
     Attributes:
         name: of the file.
-        site: where it lies; scenes of one site are alike.
+        site: its place; scenes of one site resemble one another.
         truth: labelled boxes in scene pixels, of the detector's classes.
-        path: of the file; None of a scene in memory.
-        radiance: the scene (H, W) in W/m2/sr/um; a picture's white stands for the full scale of the
-            sensor given.
+        path: of the file; None for a scene in memory.
+        radiance: returns the scene (H, W) in W/m2/sr/um. A picture's white is the full scale of the
+            given sensor.
     """
 
     name: str
@@ -59,7 +59,7 @@ class LabelledScene:
 
 @dataclass(frozen=True)
 class SensorPair:
-    """The sensor that degrades, and the one that is aimed at, in its units."""
+    """The degrading sensor, and the reference sensor converted to its units."""
 
     degraded: Sensor
     reference: Sensor
@@ -72,8 +72,8 @@ class SensorPair:
 
 @dataclass(frozen=True)
 class AcquiredScene:
-    """A scene in front of two sensors, under one draw of them and of the noise; acquired once it is
-    asked for.
+    """A scene in front of two sensors, under one draw of them and of the noise. It is acquired on
+    demand.
     """
 
     scene: LabelledScene
@@ -82,26 +82,28 @@ class AcquiredScene:
 
     @cached_property
     def reference(self) -> np.ndarray:
-        """Digital numbers (h, w) of the reference sensor."""
+        """The digital numbers (h, w) of the reference sensor."""
         return self._acquired(self.sensors.reference, REFERENCE)
 
     @cached_property
     def degraded(self) -> np.ndarray:
-        """Digital numbers (h, w) of the degraded one."""
+        """The digital numbers (h, w) of the degrading sensor."""
         return self._acquired(self.sensors.degraded, DEGRADED)
 
     def shown(self, method: Method | None) -> np.ndarray:
-        """What a detector is given, (h, w, 3) float32 in 0 to 1: restored by a method; the
-        reference for None.
+        """Return the image for a detector, (h, w, 3) float32 in 0 to 1: restored by a method, or
+        the reference for None.
 
-        Every row's image of a scene is shown alike, stretched as the reference asks.
+        All rows of a scene are displayed in the same way, with the stretch of the reference.
         """
         # All rows of a scene share the stretch of the reference, so that contrast compares.
         dn = self.reference if method is None else method.restore(self.degraded)
         return stretch_of(self.reference).to_srgb(dn)
 
     def boxes(self, detector: Detector, method: Method | None) -> Boxes:
-        """What a detector finds on it, in scene pixels; arguments as of `shown`."""
+        """Return the detections on the image, in scene pixels. The arguments are those of
+        `shown`.
+        """
         detections = detector.detect(self.shown(method))
         return replace(detections, corners=detections.corners * self.sensors.oversampling)
 
@@ -113,16 +115,16 @@ class AcquiredScene:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What was found under one pair of sensors.
+    """The detections under one pair of sensors.
 
     Attributes:
         sensors: as they are stated.
         methods: by the names of the rows; None is the reference, which is first.
         scenes: in front of the sensors.
-        boxes: that were found on each scene, by row.
+        boxes: the detections on each scene, by row.
         hits: which of them found an object, by row.
         figures: by row.
-        confidence: where precision and recall are read in every row.
+        confidence: the confidence at which precision and recall are sampled in every row.
         names: of the classes.
     """
 
@@ -137,12 +139,12 @@ class Comparison:
 
     @property
     def name(self) -> str:
-        """Of the sensor that degrades."""
+        """The name of the degrading sensor."""
         return self.sensors.degraded.name
 
     @property
     def sites(self) -> int:
-        """How many different ones there are."""
+        """The number of different sites."""
         return len({acquired.scene.site for acquired in self.scenes})
 
 
@@ -155,11 +157,11 @@ def run_study(
     reference: SensorLike | None = None,
     seed: int = 0,
 ) -> list[Comparison]:
-    """Show a detector the same scenes as the reference sees them, degraded and restored, under each
-    sensor.
+    """Run a detector on the same scenes as the reference sees them, degraded and restored, under
+    each sensor.
 
     Args:
-        detector: that is shown the pictures.
+        detector: the detector that runs on the images.
         scenes: labelled.
         sensors: of the degraded images.
         methods: names of the rows besides the reference, the degraded images among them.
@@ -185,7 +187,7 @@ def _compared(
     rows = {REFERENCE: None, **methods}
     boxes: dict[str, list[Boxes]] = {row: [] for row in rows}
     with steps(f"detecting, {sensors.degraded.name}", len(scenes) * len(rows)) as bar:
-        # Each scene is let go of after its rows: thousands would fill the memory.
+        # Each scene is released after its rows, because thousands would fill the memory.
         for scene in acquired(scenes, sensors, seed):
             for row, method in rows.items():
                 boxes[row].append(scene.boxes(detector, method))
@@ -203,7 +205,9 @@ def _compared(
 def acquired(
     scenes: Sequence[LabelledScene], sensors: SensorPair, seed: int
 ) -> Iterator[AcquiredScene]:
-    """Yield every scene in front of the sensors, the noise drawn by the seed and its number."""
+    """Yield every scene in front of the sensors. The noise depends on the seed and the scene's
+    number.
+    """
     for number, scene in enumerate(scenes):
         yield AcquiredScene(scene, sensors, Draw(seed, number))
 
@@ -215,15 +219,15 @@ def labelled_scenes(
     labels: Path | None = None,
     split: str | None = None,
 ) -> tuple[list[LabelledScene], list[str]]:
-    """Return the labelled pictures of a folder as scenes, read when they are used, and sentences on
-    what is left out.
+    """Return the labelled pictures of a folder as scenes, which are read on demand, and sentences
+    on what is left out.
 
     Args:
         names: of the classes that the detector knows.
-        given: of them by labelled ones, where letters do not match.
-        images: as `read_labelled` takes it.
-        labels: where they lie, if not beside the pictures.
-        split: which part of a tree.
+        given: the detector's names by labelled ones, where letters do not match.
+        images: as `read_labelled` accepts it.
+        labels: their path, if not next to the pictures.
+        split: the part of a tree.
     """
     labelled = read_labelled(images, labels, split)
     numbers = class_numbers(labelled.names, names, given)
@@ -239,7 +243,9 @@ def _of_file(path: Path, truth: Boxes) -> LabelledScene:
 
 
 def left_out(labelled: Sequence[str], numbers: np.ndarray) -> list[str]:
-    """A sentence on the labelled classes that the detector does not know, where there are such."""
+    """Return a sentence on the labelled classes that the detector does not know, if there are
+    any.
+    """
     names = [name for name, number in zip(labelled, numbers, strict=True) if number < 0]
     sentence = f"Not known to the detector and left out: {', '.join(names)}. What it finds there "
     return [f"{sentence}counts as false."] if names else []

@@ -17,13 +17,13 @@ from beers_deploy.studies.evaluation.methods import DEGRADED
 
 PERCENT = "%"
 POINTS = "points"
-"""Units: a share, and a difference of two shares."""
+"""The units of a share, and of a difference of two shares."""
 
 MAIN = "detection"
 OWN = "each at its own best confidence"
 BY_CLASS = "mAP50 by class"
 BY_SIZE = "mAP50 by size"
-"""What the names of the tables begin with; the sensor's follows."""
+"""The beginning of each table's name, which the sensor's name follows."""
 
 NO_OBJECT = "no object to be found"
 NO_LOSS = "no significant loss: the interval of reference minus degraded contains 0"
@@ -45,9 +45,9 @@ def detection_table(
     Args:
         compared: comparisons under each sensor.
         file: of the detector.
-        detector: that was shown the scenes.
+        detector: the detector that ran on the scenes.
         scenes: labelled.
-        notes: what a reader must know of the labels.
+        notes: sentences that a reader must know about the labels.
     """
     rows = (*chain.from_iterable(map(detection_rows, compared)), *paper_rows())
     remarks = (detector.flag, sites_note(compared[0].sites), *notes, headline(compared))
@@ -60,27 +60,29 @@ def detection_table(
     )
 
 
-def detection_rows(found: Comparison) -> list[Row]:
-    """Return the tables of one sensor: the answer, each row at its own confidence, by class and by
-    size.
+def detection_rows(comparison: Comparison) -> list[Row]:
+    """Return the tables of one sensor: the main result, each row at its own confidence, by class
+    and by size.
     """
     # A class without a labelled object has no average precision.
     labelled = [
-        name for name in found.names if not isnan(found.figures[REFERENCE][f"mAP50 of {name}"][0])
+        name
+        for name in comparison.names
+        if not isnan(comparison.figures[REFERENCE][f"mAP50 of {name}"][0])
     ]
     by_class = {name: f"mAP50 of {name}" for name in labelled}
     by_size = {name: f"mAP50 {name}" for name in list(SIZES_PX)[1:]}
-    rows = [_main_row(found, row) for row in found.methods]
-    rows += [_own_row(found, row) for row in found.methods]
+    rows = [_main_row(comparison, row) for row in comparison.methods]
+    rows += [_own_row(comparison, row) for row in comparison.methods]
     for table, keys in ((BY_CLASS, by_class), (BY_SIZE, by_size)):
-        name = f"{table}, {found.name}"
-        rows += [Row(name, row, _values(found, row, keys)) for row in found.methods]
+        name = f"{table}, {comparison.name}"
+        rows += [Row(name, row, _values(comparison, row, keys)) for row in comparison.methods]
     return rows
 
 
 def _main_row(comparison: Comparison, row: str) -> Row:
-    """Precision and recall at one confidence for all rows; gains and losses in mAP50, paired by
-    draw.
+    """Return precision and recall at one confidence for all rows, and gains and losses in mAP50,
+    paired by draw.
     """
     keys = ("mAP50", "mAP50-95", "precision", "recall")
     figures = _values(comparison, row, dict(zip(keys, keys, strict=True)))
@@ -99,8 +101,8 @@ def _main_row(comparison: Comparison, row: str) -> Row:
 
 
 def verdict(difference: np.ndarray, sites: int) -> str:
-    """What a paired difference (1 + draws,) over so many sites says: one whose interval holds 0 is
-    none.
+    """Return the conclusion from a paired difference (1 + draws,) over `sites` sites. If its
+    interval contains 0, there is no difference.
     """
     ends = interval(difference, sites)
     if ends is None:
@@ -111,7 +113,7 @@ def verdict(difference: np.ndarray, sites: int) -> str:
 
 
 def _regained(comparison: Comparison, gain: np.ndarray, loss: np.ndarray) -> Figure:
-    """Return the share of a loss that a gain makes good; unavailable if the loss is not
+    """Return the share of a loss that a gain recovers; unavailable if the loss is not
     significant.
     """
     if too_few(comparison.sites):
@@ -140,8 +142,8 @@ def _values(comparison: Comparison, row: str, keys: Mapping[str, str]) -> dict[s
 
 
 def _figure(comparison: Comparison, values: np.ndarray, unit: str = PERCENT) -> Figure:
-    """A share of 0 to 1, or a difference of two, (1 + draws,), times 100; its interval where sites
-    are enough.
+    """Return a share of 0 to 1, or a difference of two, (1 + draws,), times 100, with its interval
+    if there are enough sites.
     """
     if isnan(values[0]):
         return unavailable(unit, NO_OBJECT)
@@ -164,11 +166,11 @@ PAPER = {
     "paper: restored, high": (72.37, 50.57, 85.03, 66.36),
 }
 PAPER_COLUMNS = ("mAP50", "mAP90 (sic)", "precision", "recall")
-"""In %; it calls the second one mAP90."""
+"""In %. The paper calls the second one mAP90."""
 
 
 def paper_rows() -> list[Row]:
-    """Return the paper's table as printed, with what differs."""
+    """Return the paper's table as printed, with the differences to ours."""
     rows = []
     for name, values in PAPER.items():
         figures = [published(value, PERCENT, SOURCE) for value in values]
@@ -195,7 +197,9 @@ PAPER_NOTES = (
 
 
 def headline(compared: Sequence[Comparison]) -> str:
-    """A sentence a sensor: what was lost, and what the last of the methods brought back."""
+    """Return a sentence for each sensor: the loss, and the part that the last of the methods
+    recovers.
+    """
     return " ".join(_sentence(comparison) for comparison in compared)
 
 

@@ -1,7 +1,7 @@
-"""The methods that can be compared, by name, and what each of them knows of the sensor.
+"""The methods that can be compared, by name, and the knowledge of the sensor that each of them has.
 
-They are the input itself, the traditional pipeline in both orders and three qualities, other
-libraries' ways, and networks.
+They are the input itself, the traditional pipeline in both orders and three qualities, methods of
+other libraries, and networks.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ from beers_deploy.restoration.method import Restore, network_method
 from beers_deploy.restoration.steps import BOTH, Around, exposures_of
 
 Specialise = Callable[[Instrument], Restore]
-"""A sensor to the restoration of images that it acquired."""
+"""Maps a sensor to the restoration of images that it acquired."""
 
 DEGRADED: Final = "degraded"
 TRADITIONAL: Final = "traditional"
@@ -47,25 +47,25 @@ CHAINS: dict[str, tuple[str, Order]] = {
         for name, order in (ORDERS | dict.fromkeys(PEERS, ORDERS[TRADITIONAL])).items()
     },
 }
-"""Quality and order of each traditional pipeline, by name, and of its peers."""
+"""Quality and order of each traditional pipeline and of its peers, by name."""
 WITHOUT_NETWORK = (DEGRADED, *CHAINS)
 """The input itself, and the traditional pipelines and their peers."""
 
 KNOWN = "known"
 BLIND = "blind"
-"""What a method knows of the sensor."""
+"""The knowledge of the sensor that a method may have."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """A restoration with the name it is listed under, and what it knows of the sensor.
+    """A restoration with the name it is listed under, and its knowledge of the sensor.
 
     Attributes:
         name: in tables.
-        restore: what it does.
-        sensor_known: what it knows of the sensor when it does so, in words.
-        specialise: how it restores when it knows another sensor; None where what it does depends on
-            none.
+        restore: the restoration.
+        sensor_known: the knowledge of the sensor that the restoration uses, in words.
+        specialise: returns the restoration for another known sensor; None if it does not depend on
+            a sensor.
     """
 
     name: str
@@ -74,7 +74,7 @@ class Method:
     specialise: Specialise | None = None
 
     def with_sensor(self, sensor: Instrument) -> "Method":
-        """This method with that sensor known; itself where what it does depends on none."""
+        """Return this method for the given sensor, or itself if it does not depend on a sensor."""
         if self.specialise is None:
             return self
         return replace(self, restore=self.specialise(sensor), sensor_known=KNOWN)
@@ -104,14 +104,14 @@ METHOD_NAMES = (
 
 
 def method_named(name: str, degraded: Sensor, reference: Sensor, around: Around = BOTH) -> Method:
-    """The method of that name; the traditional ones know both sensors, a shipped network the
+    """Return the method of that name. The traditional ones know both sensors, a shipped network the
     degraded one.
 
     Args:
         name: one of METHOD_NAMES.
         degraded: the sensor of the images.
-        reference: the one that is aimed at.
-        around: which steps around a network are taken.
+        reference: the sensor that is aimed at.
+        around: the steps around a network that are used.
     """
     if name in WITHOUT_NETWORK:
         return method_without_network(name, degraded.nominal(), reference.nominal())
@@ -154,9 +154,9 @@ def method_of(
     Args:
         name: in tables.
         network: float or INT8.
-        sensor: that the steps around the network are taken for.
+        sensor: the sensor that the steps around the network use.
         reference: the sensor that is aimed at.
-        around: which steps are taken.
+        around: the steps that are used.
         acquired_by: the name of the images' sensor; that of `sensor` if empty.
     """
     restore = network_restore(network, sensor, reference.nominal(), around)
@@ -166,7 +166,9 @@ def method_of(
 def network_restore(
     network: Network, sensor: Sensor, reference: Instrument, around: Around
 ) -> Restore:
-    """Return a network with the steps around it; dark parts are restored at a higher exposure."""
+    """Return the restoration by a network with the steps around it, in which dark parts are
+    restored at a higher exposure.
+    """
     exposures = exposures_of(network, around)
     brighter = {factor: other.model for factor, other in exposures.items()}
     instrument = sensor.nominal()
@@ -178,7 +180,7 @@ def network_restore(
 
 
 def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:
-    """What a network knows of the sensor of that name: it, nothing, or another one."""
+    """Return which sensor a network knows: the one with that name, none, or another one."""
     own = metadata(model).get("sensor", "")
     # A file without a sensor in its metadata was conditioned on none.
     if own in ("", NOT_KNOWN, BLIND_PROFILE):
@@ -187,7 +189,7 @@ def knowledge_of(model: onnx.ModelProto, sensor_name: str) -> str:
 
 
 def profile_of(sensor: Instrument, like: Sensor) -> Sensor:
-    """A profile of which every draw is that sensor, in the grid of another profile."""
+    """Return a profile from which every draw is that sensor, in the grid of another profile."""
     across, along = sensor.mtf_axes
     numbers = {
         "mtf_nyquist": across,

@@ -29,9 +29,9 @@ class NamedPair:
     scene's name.
 
     Attributes:
-        place: its site, where one is known by more than the name.
-        oversampling: scene pixels per pixel, where the pair was simulated here.
-        noise_free: the reference without noise and rounding, (H, W) float32, where the pair was
+        place: its site, if it is known by more than the name.
+        oversampling: scene pixels per pixel, if the pair was simulated here.
+        noise_free: the reference without noise and rounding, (H, W) float32, if the pair was
             simulated here.
     """
 
@@ -44,15 +44,17 @@ class NamedPair:
 
     @property
     def site(self) -> str:
-        """The place that is known; else the name without what tells frames of one site apart."""
+        """The place if it is known, else the name without the parts that distinguish frames of one
+        site.
+        """
         return self.place or site_of(self.name)
 
 
 def pairs_of_scenes(
     images: Path | None, degraded: Sensor, reference: Sensor, seed: int, brightness: float = 1.0
 ) -> tuple[list[NamedPair], list[str]]:
-    """Simulate pairs of the scenes of a folder, or of drawn ones, and return them with notes for
-    the reader.
+    """Simulate pairs from the scenes of a folder, or from drawn ones, and return them with notes
+    for the reader.
 
     Args:
         images: the folder; drawn scenes if None.
@@ -79,7 +81,7 @@ def table_at(brightness: float, name: str) -> str:
 
 
 def check_brightness(brightness: Iterable[float]) -> list[float]:
-    """Return 1 and the other factors of radiance, each once.
+    """Return 1 and the other factors of radiance, without duplicates.
 
     Raises:
         OptionError: a factor is not above 0 and at most 1.
@@ -101,11 +103,12 @@ def simulate_pairs(
     seed: int,
     oversamplings: Sequence[int] = OVERSAMPLINGS,
 ) -> tuple[list[NamedPair], list[str]]:
-    """Simulate a pair of each scene, at the first of the oversamplings that leaves enough of it.
+    """Simulate a pair from each scene, at the first of the oversamplings at which the pair is large
+    enough.
 
     Args:
-        scenes: what is seen.
-        degraded: the same sensor for all scenes, or a profile that one is drawn from for each.
+        scenes: the scenes.
+        degraded: the same sensor for all scenes, or a profile from which one is drawn for each.
         reference: likewise.
         seed: of every random draw.
         oversamplings: scene pixels per pixel.
@@ -120,7 +123,7 @@ def simulate_pairs(
         if ratio is None:
             small.append(scene.name)
             continue
-        # A scene that is left out takes a number too: the draws of the others do not depend on it.
+        # A scene that is left out has a number too, so the draws of the others do not change.
         draw = Draw(seed, number)
         camera, aim = (
             source if isinstance(source, Instrument) else source.draw(draw.generator("sensor"))
@@ -142,17 +145,17 @@ def simulate_pairs(
 
 
 def oversamplings_of(profile: Sensor) -> tuple[int, ...]:
-    """The profile's oversampling, though no more than 4, and 2 for scenes too small for it.
+    """Return the profile's oversampling, limited to 4, and 2 for scenes that are too small for it.
 
-    At more than 4 little would be left of a photograph, and the blur is sampled finely enough at 4.
+    At more than 4 little would be left of a photograph, and at 4 the blur is sampled finely enough.
     """
     own = int(profile.oversampling.low)
     return tuple(dict.fromkeys(min(own, ratio) for ratio in OVERSAMPLINGS))
 
 
 def oversampling_note(pairs: Sequence[NamedPair], profile: Sensor) -> str:
-    """A sentence where pairs were simulated at another oversampling than the profile's; else
-    nothing.
+    """Return a sentence if pairs were simulated at another oversampling than the profile's, else
+    "".
     """
     own = int(profile.oversampling.low)
     counts = Counter(pair.oversampling for pair in pairs if pair.oversampling is not None)
@@ -171,9 +174,9 @@ def oversampling_note(pairs: Sequence[NamedPair], profile: Sensor) -> str:
 def read_pairs(
     folder: Path, max_dn: int = MAX_DN, recipe: PairsRecipe | None = None
 ) -> list[NamedPair]:
-    """Read FOLDER/degraded/NAME.tif beside FOLDER/reference/NAME.tif, mono images of 0 to max_dn.
+    """Read FOLDER/degraded/NAME.tif and FOLDER/reference/NAME.tif, mono images of 0 to max_dn.
 
-    With the recipe beside them, the sites are those of the scenes that it names.
+    With the recipe of the folder, the sites are those of the scenes that it names.
     """
     pairs = []
     for degraded, reference in pair_files(folder):

@@ -1,7 +1,7 @@
-"""`evaluate`: restorations compared on the same pairs, from names, networks and functions to rows
+"""`evaluate`: compare restorations on the same pairs, from names, networks and functions to rows
 and a page.
 
-The page has the tables, and the same crops of every method with their errors beside the reference.
+The page has the tables, and the same crops of every method with their errors next to the reference.
 """
 
 import os
@@ -36,7 +36,7 @@ from beers_deploy.restoration.sensor_check.check import check_windows
 from beers_deploy.restoration.sensor_check.windows import WINDOW_PX
 from beers_deploy.restoration.steps import Around
 from beers_deploy.results import Input, Table
-from beers_deploy.studies.evaluation import scores, target_scenes, targets
+from beers_deploy.studies.evaluation import compression, scores, target_scenes, targets
 from beers_deploy.studies.evaluation.methods import (
     Method,
     method_named,
@@ -53,13 +53,12 @@ from beers_deploy.studies.evaluation.sweep import run_sweep
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Evaluation(Table):
-    """Methods compared on the same pairs: means, sites, images, and other sensors where they were
-    asked for.
+    """Methods compared on the same pairs: means, sites, images, and other sensors if requested.
 
     Attributes:
         sensors: of the degraded and of the reference images.
         methods: as they were run.
-        pairs: that they were run on.
+        pairs: the pairs that they were run on.
     """
 
     sensors: tuple[Sensor, Sensor]
@@ -67,7 +66,7 @@ class Evaluation(Table):
     pairs: Sequence[NamedPair]
 
     def report(self, folder: str | os.PathLike[str]) -> Path:
-        """Write report.html and pictures into a folder; returns the page's path."""
+        """Write report.html and pictures into a folder, and return the page's path."""
         page = Path(folder) / "report.html"
         write_report(evaluation_report(self, pictures(self.pairs, self.methods, page.parent)), page)
         return page
@@ -75,7 +74,7 @@ class Evaluation(Table):
 
 @dataclass(frozen=True)
 class Plan:
-    """What is compared, and how.
+    """The settings of a comparison.
 
     Attributes:
         methods: names, networks or functions, by the name of their row.
@@ -85,9 +84,10 @@ class Plan:
         given: pairs in memory; None if there are none.
         lpips: weights for LPIPS, or None.
         factors: of the scenes' radiance; the first is 1.
-        sweep: whether other blurs, noises and gains are compared too.
-        strict: whether stored pairs that contradict the sensor are refused.
-        around: which steps around networks are used.
+        rates: bits per pixel to which images are compressed before or after restoration.
+        sweep: True to compare other blurs, noises and gains too.
+        strict: True to refuse stored pairs that contradict the sensor.
+        around: the steps around networks that are used.
         seed: of every random draw.
     """
 
@@ -98,6 +98,7 @@ class Plan:
     given: Sequence[Pair] | None
     lpips: Path | None
     factors: Sequence[float]
+    rates: Sequence[float]
     sweep: bool
     strict: bool
     around: Around
@@ -105,7 +106,7 @@ class Plan:
 
 
 def run_evaluation(plan: Plan) -> Evaluation:
-    """Compare restorations on the same pairs and targets; the degraded input is always a row."""
+    """Compare restorations on the same pairs and targets. The degraded input is always a row."""
     sensors = plan.sensors
     seed = plan.seed
     methods = [_method(name, source, sensors, plan.around) for name, source in plan.methods.items()]
@@ -127,6 +128,7 @@ def run_evaluation(plan: Plan) -> Evaluation:
         for method in methods:
             scored = scores.score(method, dimmed, instruments, seed)
             rows += [replace(row, table=table_at(factor, row.table)) for row in scored]
+    rates = compression.run_compression(methods, loaded, nominal, plan.rates, seed)
     swept = list[Row]()
     for factor in plan.factors if plan.sweep else ():
         swept += run_sweep(methods, plan.scenes, *sensors, seed, factor).rows
@@ -134,7 +136,7 @@ def run_evaluation(plan: Plan) -> Evaluation:
     few = too_few(len({pair.site for pair in loaded}))
     notes = [note for note in (few, scores.inner_note(loaded), *remarks) if note]
     names = f"{sensors[0].name} -> {sensors[1].name}"
-    every = (*_in_order([*rows, *scores.paper_rows()]), *sensor_rows, *swept)
+    every = (*_in_order([*rows, *scores.paper_rows()]), *sensor_rows, *rates, *swept)
     return Evaluation(
         title=f"{names}, {len(loaded)} image{'' if len(loaded) == 1 else 's'}",
         arguments={
@@ -201,7 +203,7 @@ def _sensor_row(pairs: Sequence[NamedPair], sensor: Sensor, name: str, strict: b
 
 
 def _inputs(plan: Plan) -> Iterator[Path | Input]:
-    """Yield what the figures rest on: networks, weights of LPIPS, scenes or pairs."""
+    """Yield the inputs of the figures: networks, weights of LPIPS, scenes or pairs."""
     for source in plan.methods.values():
         if isinstance(source, Network):
             yield source.input
@@ -242,11 +244,11 @@ SITES = 4
 CROP_PX = 96
 ZOOM = 2
 CHECKED_IMAGES = 16
-"""Images at most that are compared with the sensor."""
+"""The largest number of images that are compared with the sensor."""
 
 
 def chosen_pairs(pairs: Sequence[NamedPair]) -> list[NamedPair]:
-    """The first pair of each of the first few sites."""
+    """Return the first pair of each of the first few sites."""
     first = dict[str, NamedPair]()
     for pair in pairs:
         first.setdefault(pair.site, pair)
@@ -254,7 +256,7 @@ def chosen_pairs(pairs: Sequence[NamedPair]) -> list[NamedPair]:
 
 
 def strip_of(pair: NamedPair, methods: Sequence[Method]) -> tuple[np.ndarray, float]:
-    """Crops of every method and the reference, and below them the size of the errors.
+    """Draw crops of every method and the reference, with the absolute errors below them.
 
     Returns:
         The picture (h, w) uint8, and the error in DN that is shown white.
@@ -278,7 +280,7 @@ def strip_of(pair: NamedPair, methods: Sequence[Method]) -> tuple[np.ndarray, fl
 
 
 def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -> list[Picture]:
-    """A strip for each of a few sites, also written to OUT/SITE.png."""
+    """Draw a strip for each of a few sites, and also write it to OUT/SITE.png."""
     strips = []
     for pair in chosen_pairs(pairs):
         strip, white = strip_of(pair, methods)
@@ -292,18 +294,20 @@ def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -
     return strips
 
 
-def evaluation_report(found: Evaluation, strips: Sequence[Picture]) -> Report:
-    """Return the page: pictures, means, sites, and the sweep where there was one.
+def evaluation_report(evaluation: Evaluation, strips: Sequence[Picture]) -> Report:
+    """Return the page: pictures, means, sites, and the sweep if there was one.
 
-    Tables of single images are for the document alone.
+    Tables of single images are only in the document.
     """
     tables = []
-    for name, rows in by_table(found.rows).items():
+    for name, rows in by_table(evaluation.rows).items():
         if not name.startswith("images"):
             heading = HEADINGS.get(name, name)
             title = f"{heading[0].upper()}{heading[1:]}"
             tables.append(Section(title, rows, caption_of(name)))
-    return Report(found.title, headline(found.rows), tables, strips, (*NOTES, *found.notes))
+    return Report(
+        evaluation.title, headline(evaluation.rows), tables, strips, (*NOTES, *evaluation.notes)
+    )
 
 
 def caption_of(table: str) -> str:
@@ -312,7 +316,8 @@ def caption_of(table: str) -> str:
         return MEAN_CAPTION if table == "mean" else DIMMED_CAPTION
     if table == targets.TARGETS:
         return TARGETS_CAPTION
-    return SWEEP_CAPTION if table.startswith("sweep") else SITES_CAPTION
+    captions = {compression.GAIN: GAIN_CAPTION, compression.LOSSLESS: LOSSLESS_CAPTION}
+    return captions.get(table, SWEEP_CAPTION if table.startswith("sweep") else SITES_CAPTION)
 
 
 MEAN_CAPTION = (
@@ -337,6 +342,13 @@ TARGETS_CAPTION = (
     "contrast of the scene (amplitude over background). Zone plates are measured from "
     f"{target_scenes.ZONE_BAND[0]} to {target_scenes.ZONE_BAND[1]} cycles per pixel."
 )
+GAIN_CAPTION = (
+    "Inner PSNR against the reference, without its noise where that is known. On board: restored, "
+    "then compressed by JPEG 2000. On the ground: compressed to the same rate, then restored with "
+    "a sensor profile that has more noise: a share of the mean squared error of compression is "
+    "added to the variance. The share is the one that is best on the other sites."
+)
+LOSSLESS_CAPTION = "Bits per pixel of lossless JPEG 2000, of the raw and of the restored images."
 SITES_CAPTION = (
     "PSNR is over full scale and leaves out pixels that clipped in the input or the reference. The "
     "bias of the mean is that of inner pixels against the reference."

@@ -1,7 +1,7 @@
 """Figures of one method on pairs of images: scores of each image, their means, and means by site.
 
-Scores of inner pixels leave out a border on every side. At the border of an image a method sees
-less than its receptive field, and the borders of small images make up much of them; a swath has
+Scores of inner pixels leave out a border on every side. At the border of an image a method reads
+less than its receptive field, and the borders of small images are a large part of them. A swath has
 hardly any border.
 """
 
@@ -25,15 +25,16 @@ from beers_deploy.studies.evaluation.pairs import NamedPair
 from beers_deploy.studies.evaluation.targets import snr_name
 
 Perceptual = Callable[[np.ndarray, np.ndarray], float]
-"""Distance of two images (H, W) in [0, 1] of full scale."""
+"""Computes the distance of two images (H, W) in [0, 1] of full scale."""
 
 
 def perceptual_distances(place: Path | None) -> dict[str, Perceptual | str]:
-    """LPIPS-squeeze or the reason why not, and LPIPS-vgg and DISTS where VGG16 is found.
+    """Return LPIPS-squeeze or the reason why it is unavailable, and LPIPS-vgg and DISTS if VGG16 is
+    found.
 
     Args:
-        place: a file with SqueezeNet 1.1, or a folder with any of the backbones; None asks the
-            environment.
+        place: a file with SqueezeNet 1.1, or a folder with any of the backbones; None reads the
+            path from the environment.
     """
     distances: dict[str, Perceptual | str] = {"LPIPS-squeeze": not_found("squeeze")}
     # A single file is that of SqueezeNet.
@@ -59,7 +60,7 @@ INNER_NOISE_FREE = f"inner {NOISE_FREE}"
 BIAS = "bias of the mean"
 LARGEST_BIAS = "largest bias of the mean"
 DETAILS: tuple[str, ...] = (NOISE_FREE, INNER, INNER_NOISE_FREE, "PSNR gain", BIAS)
-"""Scores that say more about PSNR, or about the level of an image."""
+"""Scores that add detail to PSNR, or report the level of an image."""
 UNITS = {
     "PSNR": "dB",
     "SSIM": "ratio",
@@ -72,9 +73,9 @@ IDENTICAL = "infinite: identical to the reference"
 BLACK = "the reference is black"
 
 INNER_BORDER_PX = 57
-"""Border that inner pixels leave out: the receptive radius of the largest shipped network (38 px),
-and the reach of the consistency step (19 px). It is the same for all methods, so that their rows
-compare.
+"""The border that inner pixels leave out: the receptive radius of the largest shipped network (38
+px), and the reach of the consistency step (19 px). It is the same for all methods, so that their
+rows compare.
 """
 
 
@@ -84,7 +85,7 @@ def inner_border_px(height: int, width: int) -> int:
 
 
 def inner_note(pairs: Sequence[NamedPair]) -> str:
-    """Return a sentence if some images are too small for the whole border; else nothing."""
+    """Return a sentence if some images are too small for the whole border, else ""."""
     small = sum(inner_border_px(*pair.degraded.shape) < INNER_BORDER_PX for pair in pairs)
     if not small:
         return ""
@@ -102,18 +103,21 @@ def inner(image: np.ndarray) -> np.ndarray:
 
 
 def bias_percent(
-    dn: np.ndarray, wanted: np.ndarray, unclipped: np.ndarray | None = None, offset_dn: float = 0.0
+    dn: np.ndarray,
+    reference_dn: np.ndarray,
+    unclipped: np.ndarray | None = None,
+    offset_dn: float = 0.0,
 ) -> float:
-    """Return by how much the mean of the inner pixels differs from the wanted one, in %; NaN for a
+    """Return the difference of the mean of the inner pixels from the wanted one, in %, or NaN for a
     black image.
 
     Args:
         dn: the restored image (H, W), digital numbers.
-        wanted: the reference, likewise.
+        reference_dn: the reference, likewise.
         unclipped: True where pixels count, (H, W); None if all of them do.
         offset_dn: the digital number of the dark.
     """
-    images = [inner(image) for image in (dn, wanted)]
+    images = [inner(image) for image in (dn, reference_dn)]
     if unclipped is not None and inner(unclipped).any():
         images = [image[inner(unclipped)] for image in images]
     mean_dn, level = (float(image.mean(dtype=np.float64)) - offset_dn for image in images)
@@ -122,10 +126,11 @@ def bias_percent(
 
 @dataclass(frozen=True)
 class Instruments:
-    """What images are measured with.
+    """The metrics and units with which images are measured.
 
     Attributes:
-        perceptual: distances by name besides PSNR and SSIM, each or the reason why not.
+        perceptual: distances by name besides PSNR and SSIM, each a function or the reason why it is
+            unavailable.
         max_dn: the digital number that is full scale.
         offset_dn: the digital number of the dark.
     """
@@ -168,7 +173,7 @@ class Instruments:
         source: str,
         interval: tuple[float, float] | None = None,
     ) -> Figure:
-        """A score as a figure; unavailable with the reason where there is none."""
+        """Return a score as a figure, which is unavailable with a reason if there is no value."""
         unit = UNITS.get(key, DISTANCE)
         if value is None:
             without_clean = key in (NOISE_FREE, INNER_NOISE_FREE)
@@ -180,8 +185,8 @@ class Instruments:
     def means(
         self, scores: Sequence[Mapping[str, float | None]], sites: Sequence[str], seed: int
     ) -> dict[str, Figure]:
-        """The mean of each score over the images that have it, with the bootstrap interval over
-        their sites.
+        """Return the mean of each score over the images that have it, with the bootstrap interval
+        over their sites.
         """
         figures = {}
         for key, first in scores[0].items():
@@ -208,7 +213,7 @@ class Instruments:
 def score(
     method: Method, pairs: Sequence[NamedPair], instruments: Instruments, seed: int
 ) -> list[Row]:
-    """The mean row of a method, then one row an image."""
+    """Return the mean row of a method, then one row for each image."""
     rows = []
     scores = []
     with steps(method.name, len(pairs)) as bar:
@@ -225,7 +230,9 @@ def score(
 
 
 def site_rows(rows: Sequence[Row]) -> list[Row]:
-    """Return tables by site of every score but the gain: a row a site, a column a method."""
+    """Return tables by site of every score except the gain, with a row for each site and a column
+    for each method.
+    """
     images = [row for row in rows if row.table == "images"]
     there = [
         key
@@ -269,7 +276,7 @@ PAPER = {
 
 
 def paper_rows() -> list[Row]:
-    """The paper's two rows as printed."""
+    """Return the paper's two rows as printed."""
     rows = []
     for name, values in PAPER.items():
         figures: dict[str, Figure] = {}

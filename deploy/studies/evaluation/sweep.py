@@ -1,8 +1,8 @@
-"""The sweep: the same methods under sensors of other blur, noise and gain, each known as it is, or
-known wrongly.
+"""The sweep: the same methods under sensors of other blur, noise and gain, whose parameters are
+known correctly or wrongly.
 
-Its tables: PSNR, MTF, the gain over the traditional pipeline, and what a wrongly known sensor
-costs.
+Its tables are PSNR, MTF, the gain over the traditional pipeline, and the loss due to a wrongly
+known sensor.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,15 +39,15 @@ from beers_deploy.studies.evaluation.target_scenes import acquire_edges
 from beers_deploy.studies.evaluation.targets import restored_mtf
 
 NOMINAL = "nominal"
-"""The condition that the others depart from."""
+"""The condition from which the others depart."""
 SHARPNESS = (0.10, 0.07, 0.05, 0.03, 0.02)
 NOISE = ((15.0, 50.0), (25.0, 55.0), (30.0, 80.0), (70.0, 150.0), (90.0, 190.0))
-"""SNR at 25 and 100 W/m2/sr/um; the nominal 50 / 110 is in every sweep."""
+"""SNR at 25 and 100 W/m2/sr/um. The nominal 50 / 110 is in every sweep."""
 
 
 def conditions(nominal: Instrument, profile: Sensor) -> dict[str, Instrument]:
-    """The nominal sensor; other MTFs, both axes alike or not; other SNRs; both at once; and one
-    with another gain.
+    """Return the nominal sensor, and sensors with other MTFs (equal or different along both axes),
+    other SNRs, both, and another gain.
     """
     low = _noisy(nominal, profile, 25, 55)
     worst = _noisy(nominal, profile, 15, 50)
@@ -64,8 +64,8 @@ def conditions(nominal: Instrument, profile: Sensor) -> dict[str, Instrument]:
 
 
 def suppositions(nominal: Instrument, profile: Sensor) -> dict[str, dict[str, Instrument]]:
-    """Sensors known wrongly: by the name of the condition that holds, what is supposed in its
-    place.
+    """Return wrongly known sensors: for the name of each true condition, the sensors that are
+    assumed instead.
     """
     mtf = {value: {f"MTF {value:.0%}": _sharp(nominal, value)} for value in (0.05, 0.07, 0.10)}
     # SNR is radiance over sigma: with k times as much of it, the variance is k^2 times smaller.
@@ -83,7 +83,7 @@ def suppositions(nominal: Instrument, profile: Sensor) -> dict[str, dict[str, In
 
 
 def _sharp(sensor: Instrument, mtf: float) -> Instrument:
-    """The sensor with the formula's MTF, that at Nyquist on both axes."""
+    """Return the sensor with the formula's MTF, and the given contrast at Nyquist on both axes."""
     return replace(sensor, mtf_nyquist=mtf, mtf_nyquist_along=None, response=None)
 
 
@@ -100,17 +100,18 @@ def run_sweep(
     seed: int,
     brightness: float = 1.0,
 ) -> "Found":
-    """Try the input, the chain and every network under every condition, on one scene of each site.
+    """Run the input, the pipeline and every network under every condition, on one scene of each
+    site.
 
     Args:
-        methods: of which the networks are run, each condition's sensor known where they can know
-            it.
+        methods: the methods, of which the networks are run. Each condition's sensor is given to
+            those that can use it.
         images: folder of the scenes; drawn ones if None.
-        profile: of the sensor that the conditions depart from.
+        profile: of the sensor from which the conditions depart.
         reference: profile of the sensor that is aimed at.
         seed: of every random draw.
-        brightness: factor of the scenes' radiance. The MTF is measured at 1 alone: edges do not
-            depend on it.
+        brightness: factor of the scenes' radiance. The MTF is measured only at 1, because edges do
+            not depend on it.
     """
     psnr = dict[Key, np.ndarray]()
     mtf = dict[Key, Figure]()
@@ -145,7 +146,7 @@ def run_sweep(
 def _trials(
     name: str, sensor: Instrument, methods: Sequence[Method], profile: Sensor
 ) -> list[tuple[str, Instrument, Method]]:
-    """Return name, sensor and method for each supposed sensor; the second of `methods` is the
+    """Return name, sensor and method for each assumed sensor. The second of `methods` is the
     pipeline.
     """
     nominal = profile.nominal()
@@ -162,7 +163,9 @@ def _trials(
 
 
 def _psnr_db(method: Method, pairs: Sequence[NamedPair], max_dn: int) -> np.ndarray:
-    """(2, N): each image against the reference, and against the reference without noise."""
+    """Return the PSNR (2, N) of each image against the reference, and against the reference without
+    noise.
+    """
     rows = []
     for pair in pairs:
         dn = method.restore(pair.degraded)
@@ -181,18 +184,18 @@ NOMINAL_KNOWN = "traditional, nominal sensor known"
 TRUTH_KNOWN = "traditional, true sensor known"
 
 Key = tuple[str, str, str]
-"""Names: of the condition that holds, of the sensor that the method supposes, and of the method."""
+"""The names of the true condition, of the sensor that the method assumes, and of the method."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a sweep measured, trial by trial.
+    """The measurements of a sweep, trial by trial.
 
     Attributes:
         psnr: in dB, (2, N): each image against the reference, and against the reference without
             noise.
-        mtf: after restoration, where the sensor is known as it is, and of the pipeline that
-            supposes the nominal one.
+        mtf: after restoration, with the true sensor known, and for the pipeline that assumes the
+            nominal one.
         sites: of the images, (N,).
         seed: of the bootstrap.
         brightness: factor of the scenes' radiance.
@@ -206,12 +209,12 @@ class Found:
 
     @property
     def conditions(self) -> list[str]:
-        """Names of the sensors that acquired the scenes."""
+        """The names of the sensors that acquired the scenes."""
         return list(dict.fromkeys(truth for truth, _, _ in self.psnr))
 
     @property
     def networks(self) -> list[str]:
-        """Names of the methods that are neither the input nor the pipeline."""
+        """The names of the methods that are neither the input nor the pipeline."""
         return [
             name
             for name in dict.fromkeys(name for *_, name in self.psnr)
@@ -220,10 +223,10 @@ class Found:
 
     @property
     def rows(self) -> list[Row]:
-        """Every table, a row a condition; and of the gains a row a network over all conditions.
+        """Every table, with a row for each condition, and for the gains also a row for each network
+        over all conditions.
 
-        The MTF does not depend on the scenes, so it is left out where their brightness is not their
-        own.
+        The MTF does not depend on the scenes, so it is left out if their brightness is changed.
         """
         psnr, clean = (
             {key: self._mean(both[k]) for key, both in self.psnr.items()} for k in (0, 1)
@@ -240,8 +243,8 @@ class Found:
         return [replace(row, table=table_at(self.brightness, row.table)) for row in rows]
 
     def _columns(self, truth: str) -> dict[str, Key]:
-        """The input, the pipeline that knows the truth, the one that knows the nominal sensor, and
-        each network.
+        """Return the keys of the input, the pipeline that knows the truth, the one that knows the
+        nominal sensor, and each network.
         """
         chains = {
             TRUTH_KNOWN: (truth, truth, TRADITIONAL),
@@ -251,8 +254,8 @@ class Found:
         return {DEGRADED: (truth, truth, DEGRADED), **chains, **networks}
 
     def _gains(self) -> list[Row]:
-        """How far each network is ahead of the pipeline that knows the truth: by condition, then
-        over all of them.
+        """Return the gain of each network over the pipeline that knows the truth: by condition,
+        then over all of them.
         """
         psnr = {
             (truth, name): both[0]
@@ -282,9 +285,7 @@ class Found:
         )
 
     def _wrong(self) -> list[Row]:
-        """PSNR where each method supposes another sensor than the true one, and what it loses by
-        that.
-        """
+        """Return the PSNR of each method that assumes a wrong sensor, and the loss due to that."""
         pairs = dict.fromkeys(key[:2] for key in self.psnr if key[1] not in (key[0], NOMINAL))
         psnr = []
         losses = []
@@ -306,8 +307,8 @@ class Found:
         return {name: self._mean(in_db) for name, in_db in values.items()}
 
     def _mean(self, values: np.ndarray) -> Figure:
-        """The mean of (N,) dB, an image each: of differences on the same images the interval is a
-        paired one.
+        """Return the mean of (N,) dB, one value for each image. For differences on the same images
+        the interval is a paired one.
         """
         interval, words = site_interval(
             values.tolist(), self.sites, np.random.default_rng(self.seed)

@@ -18,7 +18,7 @@ from beers_deploy.model.simulator.sampling import scene_spectrum
 from beers_deploy.profiles.instrument import Instrument
 
 OVERSAMPLING = 5
-"""Scene pixels per pixel of all targets but flat fields."""
+"""Scene pixels per pixel of all targets except flat fields."""
 
 ANGLES_DEG = (3.0, 5.0, 8.0, 11.0)
 REPEATS = 3
@@ -29,27 +29,29 @@ RADIANCES = (10.0, 25.0, 100.0)
 """Radiances of the flat fields, W/m2/sr/um."""
 
 POINT_BACKGROUNDS = (20.0, 100.0)
-"""W/m2/sr/um."""
+"""The radiance of the backgrounds of points, in W/m2/sr/um."""
 POINT_RADIANCES = (12.0, 40.0, 120.0)
-"""Light of a point, as what it adds to the mean radiance of one pixel, W/m2/sr/um."""
+"""The light of a point: its contribution to the mean radiance of one pixel, in W/m2/sr/um."""
 POINTS_A_SIDE = 6
 POINT_STEP_PX = 48
 
 PATTERN_BACKGROUND = 100.0
-"""W/m2/sr/um."""
+"""The mean radiance of patterns, in W/m2/sr/um."""
 BAR_CONTRASTS = (0.05, 0.10)
 BAR_PERIODS_PX = (2.0, 8 / 3, 3.0)
-"""Contrast is the amplitude of the wave over the background."""
+"""The periods of the bars. Contrast is the amplitude of the wave relative to the background."""
 BARS_PX = 144
 BARS_MEASURED_PX = 64
-"""The side is a multiple of all periods, since scenes wrap around at their borders."""
+"""The side of the bars is a multiple of all periods, because scenes wrap around at their
+borders.
+"""
 
 ZONE_CONTRASTS = (0.08, 0.30)
 ZONE_BAND: tuple[float, float] = (0.35, 0.45)
-"""Spatial frequencies that are measured, cycles per pixel."""
+"""The spatial frequencies that are measured, in cycles per pixel."""
 ZONE_PX = 288
 ZONE_NYQUIST_PX = 96
-"""Side, and the radius at which the pattern reaches half a cycle per pixel and ends."""
+"""The side, and the radius at which the pattern reaches half a cycle per pixel and ends."""
 
 Edges = Sequence[tuple[float, np.ndarray]]
 """Angle in degrees and image of each slanted edge."""
@@ -205,7 +207,7 @@ def _zone_plates() -> list[tuple[str, np.ndarray, np.ndarray]]:
     frequency = _radius_px(ZONE_PX, 1) / (2 * ZONE_NYQUIST_PX)
     ring = (frequency >= ZONE_BAND[0]) & (frequency <= ZONE_BAND[1])
     radius_px = _radius_px(ZONE_PX, OVERSAMPLING)
-    # It ends at the radius where it reaches Nyquist: beyond it the sampling would alias.
+    # The pattern ends at the radius where it reaches Nyquist, because it would alias beyond.
     chirp = np.cos(math.pi / 2 * radius_px**2 / ZONE_NYQUIST_PX) * (radius_px < ZONE_NYQUIST_PX)
     return [
         (f"zone plate of {contrast:.0%}", contrast * chirp, ring) for contrast in ZONE_CONTRASTS
@@ -213,8 +215,8 @@ def _zone_plates() -> list[tuple[str, np.ndarray, np.ndarray]]:
 
 
 def _places_px(side_px: int, ratio: int = OVERSAMPLING) -> np.ndarray:
-    """Return where the scene pixels of a side lie, in pixels: 0 is the centre
-    of the first pixel.
+    """Return the positions of the scene pixels of a side, in pixels. 0 is the centre of the first
+    pixel.
     """
     return (np.arange(side_px * ratio) - (ratio - 1) / 2) / ratio
 

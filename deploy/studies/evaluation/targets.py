@@ -41,7 +41,7 @@ TARGETS = "targets"
 EDGE_PX = 80
 """Side of the middle of edges and flat fields that is measured."""
 APERTURE_PX = 33
-"""Side of the square over which the light of a point is added up.
+"""Side of the square over which the light of a point is summed.
 
 A restoration may move light by its receptive field, and the consistency step by two of its blocks,
 16 px.
@@ -96,17 +96,17 @@ def _middle(image: np.ndarray) -> np.ndarray:
     return image[top : top + EDGE_PX, left : left + EDGE_PX]
 
 
-def mtf_figure(found: Sequence[float | Refusal]) -> Figure:
+def mtf_figure(edges: Sequence[float | Refusal]) -> Figure:
     """Return the mean over the edges with its 90 % interval; unavailable if most edges were
     refused.
     """
-    values = [100 * edge for edge in found if not isinstance(edge, Refusal)]
-    refusals = [edge for edge in found if isinstance(edge, Refusal)]
+    values = [100 * edge for edge in edges if not isinstance(edge, Refusal)]
+    refusals = [edge for edge in edges if isinstance(edge, Refusal)]
     if len(values) < max(len(refusals), 2):
         return unavailable(
-            "%", f"{len(refusals)} of {len(found)} edges refused: {refusals[0].reason}"
+            "%", f"{len(refusals)} of {len(edges)} edges refused: {refusals[0].reason}"
         )
-    source = f"{len(values)} of {len(found)} simulated slanted edges, 90 % interval of the mean"
+    source = f"{len(values)} of {len(edges)} simulated slanted edges, 90 % interval of the mean"
     return measured(float(np.mean(values)), "%", source, interval_of_mean(values))
 
 
@@ -135,9 +135,9 @@ def flux_name(radiance: float, background: float) -> str:
 def flux_figures(method: Method, points: Points) -> dict[str, Figure]:
     """Return the flux in % of the points of each radiance.
 
-    The background is what the method makes of the same flat field with the same random draws. Its
-    noise is nearly the same at each pixel, so the difference measures far better than a ring around
-    the point would.
+    The background is the result of the method for the same flat field with the same random draws.
+    Its noise is nearly the same at each pixel, so the difference is much more accurate than one
+    with a ring around the point would be.
     """
     light = method.restore(points.seen).astype(np.float64) - method.restore(points.flat)
     values: dict[float, list[float]] = {radiance: [] for radiance in POINT_RADIANCES}
@@ -184,7 +184,7 @@ def _transfers(restored: np.ndarray, pattern: Pattern) -> list[float]:
         columns = slice(right * width // 2, (right + 1) * width // 2)
         mask = pattern.measured[rows, columns]
         truth = pattern.wanted[rows, columns][mask].astype(np.float64)
-        # Without the mean the slope tells contrast alone, whatever the level of the image.
+        # Without the mean, the slope depends only on contrast, not on the level of the image.
         truth -= truth.mean()
         slopes.append(float(truth @ restored[rows, columns][mask] / (truth @ truth)))
     return slopes

@@ -1,4 +1,4 @@
-"""Run every case through every stage, judge what was measured, and make the tables of both."""
+"""Run every case through every stage, evaluate the measurements, and make the tables of both."""
 
 import math
 import zlib
@@ -21,7 +21,9 @@ from beers_deploy.studies.stress.networks import STAGES, Subject
 
 @dataclass(frozen=True)
 class StageResult:
-    """One case at one stage: the worst of each check over its images, or why it was not checked."""
+    """One case at one stage: the worst value of each check over its images, or the reason why it
+    was not checked.
+    """
 
     case: Case
     stage: str
@@ -30,24 +32,26 @@ class StageResult:
 
     @property
     def broken(self) -> list[tuple[Measure, Limitation | None]]:
-        """Measures that do not hold, each with the known limitation that explains it."""
+        """The measures that exceed their bounds, each with the known limitation that explains it,
+        or None.
+        """
         return [
             (m, limitation_of(self.stage, self.case.name, m)) for m in self.measures if not m.holds
         ]
 
     @property
     def limitations(self) -> list[Limitation]:
-        """The known limitations that were met."""
+        """The known limitations that were reached."""
         return list(dict.fromkeys(limit for _, limit in self.broken if limit is not None))
 
     @property
     def failed(self) -> list[Measure]:
-        """Measures that do not hold, and that no limitation explains."""
+        """The measures that exceed their bounds and that no limitation explains."""
         return [measure for measure, limit in self.broken if limit is None]
 
     @property
     def verdict(self) -> str:
-        """In a word or two."""
+        """The verdict in a few words."""
         if self.failed:
             return "FAILED: " + ", ".join(measure.check for measure in self.failed)
         if self.limitations:
@@ -66,7 +70,7 @@ def run_battery(
 
     Args:
         subject: the networks.
-        cases: what they restore.
+        cases: the hard cases that they restore.
         stages: names of STAGES.
         seed: of the images.
         side_px: of images whose case has no size of its own.
@@ -87,7 +91,7 @@ def run_battery(
 
 
 def _obstacle(subject: Subject, stage: str) -> str:
-    """Return why a stage cannot be checked; empty if it can."""
+    """Return the reason why a stage cannot be checked, or "" if it can."""
     try:
         if stage == "INT8":
             _ = subject.quantized
@@ -112,7 +116,7 @@ def _measures(
 
 
 def worst(measures: Iterable[Measure]) -> list[Measure]:
-    """Return the measure of each check that exceeds its bound most; NaN is the worst."""
+    """Return the measure of each check that exceeds its bound most. NaN counts as the worst."""
     by_check: dict[str, list[Measure]] = {}
     for measure in measures:
         by_check.setdefault(measure.check, []).append(measure)
@@ -124,10 +128,10 @@ def _excess(measure: Measure) -> float:
 
 
 def chosen(names: str | Sequence[str] | None, known: Iterable[str], option: str) -> list[str]:
-    """Return names of a list, or of text with commas; all if None.
+    """Return names from a list, or from text with commas; all if None.
 
     Raises:
-        OptionError: a name that is not known.
+        OptionError: a name is unknown.
     """
     every = list(known)
     if names is None:
@@ -163,8 +167,8 @@ def battery_table(
 ) -> Table:
     """Run the battery, and return its tables and its verdict.
 
-    The tables: a row for each case, the worst of each check, the known limitations that were met,
-    the integer layers, and in detail every figure of every case at every stage.
+    The tables are a row for each case, the worst value of each check, the known limitations that
+    were reached, the integer layers, and in detail every figure of every case at every stage.
     """
     results = run_battery(subject, cases, stages, seed, side_px)
     layers = layer_rows(subject)
@@ -232,7 +236,7 @@ def worst_rows(results: Iterable[StageResult]) -> list[Row]:
 
 
 def limitation_rows(results: Iterable[StageResult]) -> list[Row]:
-    """Return a row for each known limitation that was met, with its largest value."""
+    """Return a row for each known limitation that was reached, with its largest value."""
     largest: dict[str, tuple[Measure, Limitation, str]] = {}
     for result in results:
         for measure, limit in result.broken:
@@ -263,8 +267,8 @@ def _figure(measure: Measure) -> Figure:
 
 
 def layer_rows(subject: Subject) -> list[Row]:
-    """Return for each integer layer the bits that its accumulator needs at most, and whether it
-    might saturate.
+    """Return for each integer layer the maximum number of bits that its accumulator needs, and
+    whether it might saturate.
     """
     if _obstacle(subject, "INT8 reference"):
         return []

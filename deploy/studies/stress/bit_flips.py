@@ -1,7 +1,7 @@
-"""`stress --bit-flips`: what bit flips cost, and what guards buy back and cost.
+"""`stress --bit-flips`: measure the cost of bit flips, and the benefit and cost of guards.
 
-Flips are injected into weights, shifts, feature maps or the image, one kind of memory at a time;
-the DPU's arithmetic then runs in whole numbers.
+Flips are injected into weights, shifts, feature maps or the image, one kind of memory at a time.
+Then the DPU's arithmetic runs in integers.
 """
 
 import statistics
@@ -50,19 +50,19 @@ GUARD_NOTE = (
 
 
 def flip_table(subject: Subject, source: Calibration, board: TargetProfile) -> Table:
-    """Return quality against flips, and what guards cost.
+    """Return quality against flips, and the cost of guards.
 
     Args:
         subject: with an INT8 network.
-        source: of the patches that flips are tried on, one an injection into each kind of memory at
-            each rate.
-        board: whose cost model predicts the cost of the guards.
+        source: of the patches that flips are tried on, one for each injection into each kind of
+            memory at each rate.
+        board: the board whose cost model predicts the cost of the guards.
     """
     # A file without an integer core is refused before anything is drawn.
     _ = subject.core
     dpu = dpu_of(board)
     prediction = predict_network(subject.quantized.source, dpu, TILE_PX)
-    # So is a board that cannot price the guards.
+    # A board that cannot predict the cost of the guards is refused as well.
     dpu.limit("cpu", "clock_ghz")
     target = make_target(subject, source)
     curves = curve_rows(target, source.patches, source.seed)
@@ -77,7 +77,7 @@ def flip_table(subject: Subject, source: Calibration, board: TargetProfile) -> T
 
 @dataclass(frozen=True)
 class FaultTarget:
-    """What faults are injected into.
+    """The target of fault injection.
 
     Attributes:
         core: the network as the board stores it.
@@ -93,12 +93,12 @@ class FaultTarget:
 
 
 def make_target(subject: Subject, source: Calibration) -> FaultTarget:
-    """Build what faults are injected into.
+    """Build the target of fault injection.
 
     Args:
         subject: with an INT8 network.
         source: of the patches. The guards are learnt from some of them. Flips are tried on patches
-            of another seed, so that the guards are not judged on what they were learnt from.
+            of another seed, so that the guards are not evaluated on their training data.
     """
     core = faults.as_stored(subject.core)
     calibration = replace(source, patches=CALIBRATION_PATCHES)
@@ -123,7 +123,7 @@ def name_of(memory: str, rate: float) -> str:
 Quality = tuple[float, float, float]
 """PSNR in dB with each set of guards."""
 COSTLY_DB = 0.5
-"""A flip that costs an unguarded patch more is one that the self-check ought to find."""
+"""A flip that costs an unguarded patch more than this should be found by the self-check."""
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ def _quality_db(
 
 
 def _judged(check: SelfCheck, image: np.ndarray, restored: np.ndarray) -> Judged:
-    """Judge the blocks of a patch.
+    """Check the blocks of a patch.
 
     Args:
         check: the self-check of the patch's sensor.
@@ -203,7 +203,7 @@ def _judged(check: SelfCheck, image: np.ndarray, restored: np.ndarray) -> Judged
 def _drawn(
     target: FaultTarget, name: str, rate: float, draw: int, seed: int, clean: Quality
 ) -> Injection:
-    """Flip bits of a memory once, and return what that did.
+    """Flip bits of a memory once, and return the effect.
 
     Args:
         target: the network, its guards and the patches.
@@ -239,8 +239,8 @@ def _drawn(
 
 
 def _curve_row(name: str, draws: Sequence[Injection], kind: str) -> Row:
-    """Return the row of some injections: means of the flips and of the PSNR, and how many were
-    found.
+    """Return the row of some injections: means of the flips and of the PSNR, and the number of
+    those detected.
 
     Args:
         name: of the row.
@@ -252,8 +252,8 @@ def _curve_row(name: str, draws: Sequence[Injection], kind: str) -> Row:
     figures = {"flips": flips}
     by_guards = zip(*(draw.quality for draw in draws), strict=True)
     for guards, values in zip(SETS, by_guards, strict=True):
-        # Exact before it is rounded once: the mean of the same values is the same, however often
-        # each stands there.
+        # The sum is exact and rounded once, so the mean of equal values does not depend on their
+        # number.
         figures[guards] = measured(
             statistics.mean(values), "dB", source, (min(values), max(values))
         )
@@ -320,12 +320,12 @@ def _price_row(name: str, time_s: float, source: str, prediction: Prediction, sp
     """
     tile_s = prediction.batch_time_s / prediction.batch
     slow, fast = prediction.fps_interval
-    # The host prepares the next tile while the DPU runs: only what does not fit beside it costs
-    # frames.
+    # The host prepares the next tile while the DPU runs. Only the time beyond that reduces the
+    # frame rate.
     before_s = max(tile_s, prediction.host_s)
     beside_s = max(tile_s, prediction.host_s + time_s)
     times_s = (time_s / spread, time_s * spread)
-    # The share is largest at the highest frame rate, where a tile takes the least time.
+    # The share is largest at the highest frame rate, where a tile needs the least time.
     most = 100 * time_s * spread * fast
     figures = {
         "time": predicted(1e3 * time_s, "ms/tile", (1e3 * times_s[0], 1e3 * times_s[1]), source),

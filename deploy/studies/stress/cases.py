@@ -1,5 +1,5 @@
-"""The hard cases: images (H, W) float32 in digital numbers of 12 bits that an instrument meets, or
-a fault makes.
+"""The hard cases: images (H, W) float32 in digital numbers of 12 bits that an instrument
+encounters, or that a fault produces.
 
 The same generator draws the same images.
 """
@@ -15,19 +15,21 @@ from beers_deploy.model.simulator.mtf import transfer_function
 FULL_DN = 4095
 SIDE_PX = 96
 DRAWN_MTF = 0.25
-"""At Nyquist, of the drawn ground: what a sharp sensor shows of it."""
+"""The MTF at Nyquist of the drawn ground, as a sharp sensor sees it."""
 
 Draw = Callable[[int, np.random.Generator], list[np.ndarray]]
-"""Images for a side in pixels; their order tells nothing."""
+"""Draws images for a side in pixels. Their order has no meaning."""
 
 
 def flat(*levels: float) -> Draw:
-    """Constant images (side, side) of these shares of full scale."""
+    """Return a function that draws constant images (side, side) at these shares of full scale."""
     return lambda side, _: [_filled(side, level * FULL_DN) for level in levels]
 
 
 def steps(side: int, _: np.random.Generator) -> list[np.ndarray]:
-    """Steps from black to full scale, upright, lying and slanted: three images (side, side)."""
+    """Draw steps from black to full scale, vertical, horizontal and slanted: three images (side,
+    side).
+    """
     row, column = np.mgrid[:side, :side]
     return [
         _two(column >= side // 2),
@@ -37,20 +39,22 @@ def steps(side: int, _: np.random.Generator) -> list[np.ndarray]:
 
 
 def checkerboard(side: int, _: np.random.Generator) -> list[np.ndarray]:
-    """Black and full scale in turn, which is Nyquist along both axes: one image (side, side)."""
+    """Draw black and full scale alternately, which is Nyquist along both axes: one image (side,
+    side).
+    """
     row, column = np.mgrid[:side, :side]
     return [_two((row + column) % 2 == 1)]
 
 
 def hot_pixel(side: int, _: np.random.Generator) -> list[np.ndarray]:
-    """One pixel at full scale on a dark ground: one image (side, side)."""
+    """Draw one pixel at full scale on dark ground: one image (side, side)."""
     image = _filled(side, 200)
     image[side // 2, side // 2] = FULL_DN
     return [image]
 
 
 def dead_lines(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """A column and a row at 0 in a drawn ground: one image (side, side)."""
+    """Draw a ground with a column and a row at 0: one image (side, side)."""
     image = ground(side, generator)
     image[:, side // 3] = 0
     image[side // 2] = 0
@@ -58,7 +62,7 @@ def dead_lines(side: int, generator: np.random.Generator) -> list[np.ndarray]:
 
 
 def glint(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """Dark water with sparks beyond full scale, clipped: one image (side, side)."""
+    """Draw dark water with glints beyond full scale, clipped: one image (side, side)."""
     image = 150 + 10 * generator.standard_normal((side, side))
     sparks = generator.random((side, side)) > 0.97
     image[sparks] += generator.exponential(6000, int(sparks.sum()))
@@ -66,7 +70,7 @@ def glint(side: int, generator: np.random.Generator) -> list[np.ndarray]:
 
 
 def snow(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """99 % of the pixels at full scale, the rest in shadow: one image (side, side)."""
+    """Draw 99 % of the pixels at full scale and the rest in shadow: one image (side, side)."""
     image = _filled(side, FULL_DN)
     shadow = generator.random((side, side)) < 0.01
     image[shadow] = generator.uniform(500, 3500, int(shadow.sum()))
@@ -74,35 +78,39 @@ def snow(side: int, generator: np.random.Generator) -> list[np.ndarray]:
 
 
 def night(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """Whole numbers of 1 to 20 DN: one image (side, side)."""
+    """Draw integers of 1 to 20 DN: one image (side, side)."""
     return [generator.integers(1, 21, (side, side)).astype(np.float32)]
 
 
 def ramps(side: int, _: np.random.Generator) -> list[np.ndarray]:
-    """12 bits from left to right, (side, side), and every number once, (64, 64)."""
+    """Draw a ramp over 12 bits from left to right, (side, side), and an image of every number once,
+    (64, 64).
+    """
     across = np.tile(np.linspace(0, FULL_DN, side), (side, 1))
     return [_digital(across), np.arange(4096, dtype=np.float32).reshape(64, 64)]
 
 
 def star(side: int, _: np.random.Generator) -> list[np.ndarray]:
-    """A Siemens star of 36 spokes, its middle finer than the pixels: one image (side, side)."""
+    """Draw a Siemens star of 36 spokes, whose middle is finer than the pixels: one image (side,
+    side).
+    """
     row, column = np.mgrid[:side, :side] - (side - 1) / 2
     return [_two(np.sin(18 * np.arctan2(row, column)) > 0)]
 
 
 def noisy(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """A drawn ground at a signal-to-noise ratio of 3: one image (side, side)."""
+    """Draw a ground at a signal-to-noise ratio of 3: one image (side, side)."""
     clean = ground(side, generator)
     return [_digital(clean * (1 + generator.standard_normal(clean.shape) / 3))]
 
 
 def through(mtf_nyquist: float) -> Draw:
-    """A drawn ground seen through such an MTF, without noise."""
+    """Return a function that draws a ground with the given MTF at Nyquist, without noise."""
     return lambda side, generator: [ground(side, generator, mtf_nyquist)]
 
 
 def stripes(side: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """A drawn ground that lacks every seventh column and a row (NaN): one image (side, side)."""
+    """Draw a ground that lacks every seventh column and one row (NaN): one image (side, side)."""
     image = ground(side, generator)
     image[:, 3::7] = np.nan
     image[side // 4] = np.nan
@@ -110,7 +118,7 @@ def stripes(side: int, generator: np.random.Generator) -> list[np.ndarray]:
 
 
 def scattered(value: float) -> Draw:
-    """One pixel in fifty of a drawn ground is this value."""
+    """Return a function that draws a ground in which 2 % of the pixels have this value."""
 
     def draw(side: int, generator: np.random.Generator) -> list[np.ndarray]:
         image = ground(side, generator)
@@ -121,7 +129,9 @@ def scattered(value: float) -> Draw:
 
 
 def sized(*shapes: tuple[int, int]) -> Draw:
-    """Parts of one drawn ground of these shapes, whatever the side."""
+    """Return a function that cuts parts of these shapes from one drawn ground, independent of the
+    side.
+    """
 
     def draw(_: int, generator: np.random.Generator) -> list[np.ndarray]:
         largest = ground(max(max(shape) for shape in shapes), generator)
@@ -131,13 +141,13 @@ def sized(*shapes: tuple[int, int]) -> Draw:
 
 
 def narrow(_: int, __: np.random.Generator) -> list[np.ndarray]:
-    """A row (1, 97) and a column (97, 1) of half of full scale."""
+    """Return a row (1, 97) and a column (97, 1) at half of full scale."""
     row = np.full((1, 97), FULL_DN // 2, np.float32)
     return [row, row.T.copy()]
 
 
 def ground(side: int, generator: np.random.Generator, mtf_nyquist: float = DRAWN_MTF) -> np.ndarray:
-    """Rectangles of all sizes and brightnesses, seen through an MTF: (side, side), whole numbers of
+    """Draw rectangles of all sizes and brightnesses, seen through an MTF: (side, side), integers of
     0 to 4095.
     """
     image = _filled(side, generator.uniform(800, 1600))
@@ -167,11 +177,10 @@ class Case:
 
     Attributes:
         name: short, as in the tables.
-        draw: makes its images.
-        pixels: "sound", or what is wrong with them: "missing" (NaN), "infinite", "beyond" 12 bits.
-        flat: every pixel of an image is the same: the mean must be kept, there is nothing to
-            restore.
-        large: only the checks of one run are made.
+        draw: draws its images.
+        pixels: "sound", or the fault of the pixels: "missing" (NaN), "infinite", "beyond" 12 bits.
+        flat: True if every pixel of an image is the same, so that the mean must be preserved.
+        large: True if only the checks of one run are made.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""What is measured on a hard case, and when it holds."""
+"""The measures on a hard case, and their bounds."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,18 +10,20 @@ from beers_deploy.profiles.errors import BeersError
 from beers_deploy.studies.stress.cases import FULL_DN
 
 FLAT_DN = 0.01 * FULL_DN
-"""One per cent of full scale: what the mean may move by, and what does not count as ringing."""
+"""One per cent of full scale: the largest change of the mean, and the largest excess that does not
+count as ringing.
+"""
 
 RINGING_PERCENT = 100.0
-"""No more than the contrast around it."""
+"""The largest ringing, in percent of the contrast around it."""
 
 Work = Callable[[np.ndarray], np.ndarray]
-"""An image (H, W) in DN to another."""
+"""Maps an image (H, W) in DN to another."""
 
 
 @dataclass(frozen=True)
 class Measure:
-    """One figure of one image; it holds where it is at most what is allowed. NaN never holds."""
+    """One figure of one image. It holds if it is at most the allowed value. NaN never holds."""
 
     check: str
     value: float
@@ -30,35 +32,33 @@ class Measure:
 
     @property
     def holds(self) -> bool:
-        """Whether the value is within what is allowed."""
+        """True if the value is at most the allowed one."""
         return self.value <= self.allowed
 
 
 def not_finite(pixels: np.ndarray) -> Measure:
-    """How many pixels, of any shape, are NaN or infinite."""
+    """Count the pixels, of any shape, that are NaN or infinite."""
     return Measure("not finite", float((~np.isfinite(pixels)).sum()), 0, "px")
 
 
 def out_of_range(image: np.ndarray) -> Measure:
-    """How many known pixels of an image (H, W) lie outside 0 to 4095 DN."""
+    """Count the known pixels of an image (H, W) that lie outside 0 to 4095 DN."""
     return Measure("out of range", float(((image < 0) | (image > FULL_DN)).sum()), 0, "px")
 
 
 def differing(check: str, image: np.ndarray, other: np.ndarray) -> Measure:
-    """How many pixels of two images (H, W) are not the same, bit for bit; NaN
-    is the same as NaN.
-    """
+    """Count the pixels of two images (H, W) that differ in any bit. NaN equals NaN."""
     # NaN differs from itself, and a missing pixel is the same in both.
     same = (image == other) | (np.isnan(image) & np.isnan(other))
     return Measure(check, float((~same).sum()), 0, "px")
 
 
 def ringing(image: np.ndarray, source: np.ndarray, radius_px: int, allowed: float) -> Measure:
-    """How far pixels (H, W) leave the range of the source's pixels within the radius, over the
-    contrast there.
+    """Measure how far pixels (H, W) leave the range of the source's pixels within the radius,
+    relative to the contrast there.
 
-    One per cent of full scale does not count, and contrast is ten per cent at least: flat ground
-    has none.
+    One per cent of full scale does not count. The contrast is taken as at least ten per cent,
+    because flat ground has none.
     """
     low, high = local_range(source, radius_px)
     # Rounding and noise leave the range by a little on any ground.
@@ -68,8 +68,8 @@ def ringing(image: np.ndarray, source: np.ndarray, radius_px: int, allowed: floa
 
 
 def local_range(image: np.ndarray, radius_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """The smallest and the largest pixel (H, W) within the radius along both axes, the image (H, W)
-    ending there.
+    """Return the smallest and the largest pixel (H, W) within the radius along both axes. The
+    window is cut at the image's border.
     """
     square = np.ones((2 * radius_px + 1, 2 * radius_px + 1))
     return erosion(image, square), dilation(image, square)
@@ -78,8 +78,8 @@ def local_range(image: np.ndarray, radius_px: int) -> tuple[np.ndarray, np.ndarr
 def gain(
     work: Work, source: np.ndarray, result: np.ndarray, generator: np.random.Generator
 ) -> float:
-    """Largest change of a pixel (H, W), in DN, for a change of 1 DN: of one pixel, and of all by
-    random signs.
+    """Return the largest change of a pixel (H, W), in DN, for a change of 1 DN: of one pixel, and
+    of all pixels with random signs.
     """
     one = np.zeros(source.shape, np.float32)
     one[source.shape[0] // 2, source.shape[1] // 2] = 1
@@ -88,15 +88,15 @@ def gain(
 
 
 def change(work: Work, source: np.ndarray, result: np.ndarray, nudge: np.ndarray) -> float:
-    """Largest change of any pixel (H, W), in DN, for a nudge (H, W) of -1, 0 or 1 DN."""
+    """Return the largest change of any pixel (H, W), in DN, for a nudge (H, W) of -1, 0 or 1 DN."""
     target = source + nudge
-    # Turned round where it would leave the converter's range.
+    # Reverse the nudge where it would leave the converter's range.
     nudged = np.where((target < 0) | (target > FULL_DN), source - nudge, target)
     return float(np.abs(work(np.asarray(nudged, np.float32)) - result).max())
 
 
 def refused(work: Callable[[], object]) -> Measure:
-    """Count 1 where work went through for which one sentence was due, else 0."""
+    """Count 1 if the work succeeded although an error of one sentence was expected, else 0."""
     try:
         work()
     except BeersError:
@@ -105,8 +105,8 @@ def refused(work: Callable[[], object]) -> Measure:
 
 
 def inside(image: np.ndarray, margin_px: int) -> np.ndarray:
-    """An image (H, W) without so many pixels on each side; the whole where
-    nothing would be left.
+    """Return an image (H, W) without a margin on each side, or the whole image if nothing would be
+    left.
     """
     if min(image.shape) <= 2 * margin_px + 1:
         return image
@@ -114,11 +114,11 @@ def inside(image: np.ndarray, margin_px: int) -> np.ndarray:
 
 
 def fidelity(image: np.ndarray, result: np.ndarray, radius_px: int, flat: bool) -> list[Measure]:
-    """What a restoration (H, W) may not do to contrast and, on flat ground, to brightness."""
+    """Measure the effect of a restoration (H, W) on contrast and, on flat ground, on brightness."""
     inner = inside(result, radius_px)
     measures = [ringing(inner, inside(image, radius_px), radius_px, RINGING_PERCENT)]
     if flat:
-        # All that is lost at the border of flat ground is the padding's doing.
+        # On flat ground, any error at the border is caused by the padding.
         border = Measure("border", float(np.abs(result - image).max()), 2 * FLAT_DN)
         shift_dn = abs(float(np.mean(inner, dtype=np.float64) - np.mean(image, dtype=np.float64)))
         measures += [Measure("mean moved", shift_dn, FLAT_DN), border]
@@ -130,15 +130,15 @@ NETWORKS = ("float32", "INT8")
 
 @dataclass(frozen=True)
 class Limitation:
-    """One thing that does not hold; beyond its ceiling it is a failure like any other.
+    """A known limitation. Beyond its ceiling it is a failure like any other.
 
     Attributes:
         name: as in the tables.
-        checks: what does not hold.
+        checks: the checks that it explains.
         ceiling: the largest value of such a check that it explains.
-        meaning: to a user, in a sentence.
-        cases: of which hard cases; none for all.
-        stages: where it is known.
+        meaning: its meaning for a user, in a sentence.
+        cases: the hard cases that it applies to; none for all.
+        stages: the stages at which it is known.
     """
 
     name: str
@@ -186,7 +186,7 @@ LIMITATIONS: tuple[Limitation, ...] = (
 
 
 def limitation_of(stage: str, case: str, measure: Measure) -> Limitation | None:
-    """The limitation that explains a measure which does not hold, or None."""
+    """Return the limitation that explains a measure outside its bound, or None."""
     for limit in LIMITATIONS:
         applies = (
             stage in limit.stages

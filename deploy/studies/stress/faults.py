@@ -1,8 +1,8 @@
 """Bit flips (single-event upsets) in weights, shifts, feature maps and the image, and cheap guards
 against them.
 
-The guards: ReLU6 in place of ReLU, a limit of the correction, scrubbing of the weights by their
-checksums, triple modular redundancy of the shifts.
+The guards are ReLU6 in place of ReLU, a limit of the correction, scrubbing of the weights by their
+checksums, and triple modular redundancy of the shifts.
 """
 
 import math
@@ -23,25 +23,26 @@ INT8_BITS = 8
 PIXEL_BITS = 12
 SHIFT_BITS = 6
 Shifts = dict[tuple[str, str], int]
-"""By operation and field, as `Faults` takes them."""
+"""Shifts by operation and field, as `Faults` accepts them."""
 
 
 def flip_count(bits: int, per_megabit: float, generator: np.random.Generator) -> int:
-    """How many of `bits` bits flip, each on its own with probability `per_megabit` / 10^6."""
+    """Draw the number of `bits` bits that flip, each independently with probability `per_megabit` /
+    10^6.
+    """
     return int(generator.binomial(bits, min(per_megabit / MEGABIT, 1.0)))
 
 
 def flip_bits(
     values: np.ndarray, count: int, generator: np.random.Generator, bits: int = INT8_BITS
 ) -> np.ndarray:
-    """A copy of whole numbers, two's complement where their type is signed, with `count` bits
-    flipped.
+    """Return a copy of integers with `count` bits flipped. Signed types are in two's complement.
 
     Args:
         values: of any shape and integer type that holds them.
-        count: how many different bits.
-        generator: draws which.
-        bits: how many one number has in memory.
+        count: the number of different bits to flip.
+        generator: draws which bits flip.
+        bits: the number of bits of one integer in memory.
     """
     choices = values.size * bits
     # Without replacement: a bit that flips twice would not have flipped.
@@ -58,8 +59,8 @@ def flip_bits(
 
 
 def as_stored(core: IntCore) -> IntCore:
-    """The core with its bias in int8, at the finest scale that holds it: what the board keeps in
-    memory.
+    """Return the core with its bias in int8, at the finest scale that holds it, as the board stores
+    it in memory.
     """
     # A shift has six bits in memory, in two's complement.
     for (op, field), shift in shifts_of(core).items():
@@ -93,12 +94,12 @@ def _refused(found: str) -> ModelError:
 
 
 def weight_bits(core: IntCore) -> int:
-    """How many bits all weights and bias take in memory."""
+    """Return the number of bits of all weights and bias in memory."""
     return INT8_BITS * sum(op.weight.size + op.bias.size for op in core.convolutions)
 
 
 def flip_weights(core: IntCore, count: int, generator: np.random.Generator) -> IntCore:
-    """The core with `count` bits of its weights and bias flipped, wherever they fall."""
+    """Return the core with `count` random bits of its weights and bias flipped."""
     sizes = np.array([op.weight.size + op.bias.size for op in core.convolutions])
     # How many of the bits fall into each layer, as if all were drawn from one memory without
     # replacement.
@@ -112,7 +113,7 @@ def flip_weights(core: IntCore, count: int, generator: np.random.Generator) -> I
 
 
 def flip_conv(op: IntConv, count: int, generator: np.random.Generator) -> IntConv:
-    """The convolution with `count` bits of weights and bias flipped."""
+    """Return the convolution with `count` bits of weights and bias flipped."""
     values = flip_bits(np.concatenate([op.weight.ravel(), op.bias]), count, generator)
     return replace(
         op, weight=values[: op.weight.size].reshape(op.weight.shape), bias=values[op.weight.size :]
@@ -120,18 +121,18 @@ def flip_conv(op: IntConv, count: int, generator: np.random.Generator) -> IntCon
 
 
 def with_ops(core: IntCore, others: Mapping[str, IntConv]) -> IntCore:
-    """The core with other convolutions of these names."""
+    """Return the core with the convolutions of these names replaced."""
     return replace(core, ops=tuple(others.get(op.name, op) for op in core.ops))
 
 
 def map_channels(core: IntCore) -> dict[str, int]:
-    """Channels of every tensor that the core reads or writes."""
+    """Return the number of channels of every tensor that the core reads or writes."""
     return channels_of(core.ops, {PLANES: core.host_part.planes})
 
 
 def shifts_of(core: IntCore) -> Shifts:
-    """The shifts of every operation, but for an add's shift_read: 0 where a stream shares one
-    scale.
+    """Return the shifts of every operation, except shift_read of an add, which is 0 because a
+    stream shares one scale.
     """
     shifts: Shifts = {}
     for op in core.ops:
@@ -142,29 +143,29 @@ def shifts_of(core: IntCore) -> Shifts:
 
 
 def bits_apart(shifts: Shifts, others: Shifts) -> int:
-    """In how many bits two sets of shifts differ, six bits a shift."""
+    """Return the number of bits in which two sets of shifts differ, with six bits in each shift."""
     return sum(
         ((shifts[key] ^ others[key]) & ((1 << SHIFT_BITS) - 1)).bit_count() for key in shifts
     )
 
 
 def flip_shifts(shifts: Shifts, count: int, generator: np.random.Generator) -> Shifts:
-    """The shifts with `count` of their bits flipped."""
+    """Return the shifts with `count` of their bits flipped."""
     raw = flip_bits(np.array(list(shifts.values()), np.int16), count, generator, SHIFT_BITS)
     return dict(zip(shifts, raw.tolist(), strict=True))
 
 
 RELU6_UNITS = (96, 48, 24, 12, 6, 3)
-"""6 with 4 to -1 fractional bits; with 5 it would be 192, above int8."""
+"""The value 6 with 4 to -1 fractional bits. With 5 it would be 192, which exceeds int8."""
 
 
 @dataclass(frozen=True)
 class Guards:
-    """What a fault-free network never exceeds, and what its weights sum to.
+    """Bounds that a fault-free network never exceeds, and checksums of its weights.
 
     Attributes:
         relu6: bound in units of each ReLU that has one, by its tensor.
-        limit_dn: bound of the correction's size.
+        limit_dn: bound of the correction's magnitude.
         checksums: of each convolution, by name.
     """
 
@@ -173,13 +174,13 @@ class Guards:
     checksums: Mapping[str, int]
 
     def limit(self, correction: np.ndarray) -> np.ndarray:
-        """A correction, any shape, in shares of full scale, clipped to the bound on both sides."""
+        """Clip a correction of any shape, in shares of full scale, to the bound on both sides."""
         bound = np.float32(self.limit_dn / MAX_DN)
         return np.asarray(np.clip(correction, -bound, bound), np.float32)
 
 
 def learn_guards(core: IntCore, planes: Iterable[np.ndarray]) -> Guards:
-    """Guards from what a fault-free core reaches on calibration patches, planes
+    """Learn guards from the values that a fault-free core reaches on calibration patches, planes
     (N, 3, H, W) each.
     """
     relus = {op.output: 0 for op in core.convolutions if op.activation is Activation.relu}
@@ -199,7 +200,7 @@ def learn_guards(core: IntCore, planes: Iterable[np.ndarray]) -> Guards:
 
 
 def checksums(core: IntCore) -> dict[str, int]:
-    """CRC-32 of each convolution's weights and bias."""
+    """Return the CRC-32 of each convolution's weights and bias."""
     return {
         op.name: zlib.crc32(op.bias.tobytes(), zlib.crc32(op.weight.tobytes()))
         for op in core.convolutions
@@ -207,21 +208,25 @@ def checksums(core: IntCore) -> dict[str, int]:
 
 
 def scrubbed(core: IntCore, sound: IntCore, known: Mapping[str, int]) -> IntCore:
-    """The core after scrubbing: every convolution whose checksum is not the known one comes from a
-    sound copy.
+    """Return the core after scrubbing: every convolution whose checksum differs from the known one
+    is replaced by a valid copy.
     """
     wrong = {name for name, _ in checksums(core).items() - known.items()}
     return with_ops(core, {op.name: op for op in sound.convolutions if op.name in wrong})
 
 
 def voted(copies: tuple[Shifts, Shifts, Shifts]) -> Shifts:
-    """The shifts by majority of three copies, bit by bit: triple modular redundancy."""
+    """Return the shifts by majority vote of three copies, bit by bit (triple modular
+    redundancy).
+    """
     a, b, c = copies
     return {key: (a[key] & b[key]) | (a[key] & c[key]) | (b[key] & c[key]) for key in a}
 
 
 def guarded(faults: Faults, guards: Guards) -> Faults:
-    """The same faults in a clamped network: a result is bounded before memory can spoil it."""
+    """Return the same faults in a clamped network, where a result is bounded before memory can
+    corrupt it.
+    """
 
     def touch(name: str, tensor: np.ndarray) -> np.ndarray:
         clamped = np.minimum(tensor, guards.relu6[name]) if name in guards.relu6 else tensor
@@ -235,10 +240,10 @@ class Injected:
     """A network and an image after an injection.
 
     Attributes:
-        core: with the weights as they are now.
-        faults: what else is wrong.
-        image: (1, 1, H, W), as it is now.
-        flips: how many bits were flipped.
+        core: with the weights after the injection.
+        faults: the faults elsewhere.
+        image: (1, 1, H, W), after the injection.
+        flips: the number of flipped bits.
     """
 
     core: IntCore
@@ -248,8 +253,8 @@ class Injected:
 
 
 def restored(injected: Injected, guards: Guards | None = None) -> np.ndarray:
-    """The restored image (1, 1, H, W) in [0, 1]; guards turn the ReLU6 and the limit of the
-    correction on.
+    """Return the restored image (1, 1, H, W) in [0, 1]. Guards enable the ReLU6 and the limit of
+    the correction.
     """
     faults = guarded(injected.faults, guards) if guards else injected.faults
     core = injected.core
@@ -282,8 +287,8 @@ def _flip_copy(core: IntCore, per_megabit: float, generator: np.random.Generator
 def _maps(
     core: IntCore, image: np.ndarray, per_megabit: float, generator: np.random.Generator
 ) -> Injected:
-    """Faults enter every tensor once, between the operation that writes it and
-    those that read it.
+    """Inject faults into every tensor once, between the operation that writes it and those that
+    read it.
     """
     places = image[0, 0].size // core.host_part.place_px**2
     channels = map_channels(core)
@@ -317,12 +322,12 @@ class Memory:
     """One kind of memory, and how faults are injected into it.
 
     Attributes:
-        inject: into a core as the board stores it and an image (1, 1, H, W), at a rate of flips in
-            a megabit.
+        inject: injects faults into a core as the board stores it and an image (1, 1, H, W), at a
+            rate of flips in a megabit.
         rates: bit flips in a megabit, of 10^6, that are tried.
-        times: so many times the draws asked for, where few of them flip a bit; those that do not
-            cost nothing.
-        kept: whether it lives longer than a tile, so that scrubbing has something to compare it
+        times: factor of the number of draws, for memory in which few draws flip a bit. Draws
+            without a flip cost nothing.
+        kept: True if it lives longer than a tile, so that scrubbing has something to compare it
             with.
     """
 
@@ -348,16 +353,16 @@ def corrected(
     per_megabit: float,
     generator: np.random.Generator,
 ) -> Injected:
-    """The network as scrubbing and triple modular redundancy leave it before the next image.
+    """Return the network after scrubbing and triple modular redundancy, before the next image.
 
-    The other two copies of the shifts suffer flips at the same rate, each on its own.
+    The other two copies of the shifts suffer flips at the same rate, independently.
 
     Args:
-        injected: whose shifts are the first of the three copies.
+        injected: its shifts are the first of the three copies.
         sound: the core without faults.
         guards: with the checksums of its weights.
         per_megabit: rate of flips in the other copies.
-        generator: draws which.
+        generator: draws which bits flip.
     """
     core = scrubbed(injected.core, sound, guards.checksums)
     own = {**shifts_of(sound), **injected.faults.shifts}

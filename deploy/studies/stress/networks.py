@@ -44,7 +44,7 @@ from beers_deploy.studies.stress import checks
 from beers_deploy.studies.stress.cases import FULL_DN, Case
 
 WHOLE_PX = 4096
-"""A tile that no case fills."""
+"""The side of a tile that is larger than any case."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Runner:
 
     @cached_property
     def tiling(self) -> Tiling:
-        """How an image of any size may be cut into tiles."""
+        """The tiling geometry for an image of any size."""
         return tiling_of(any_size(self.source.model))
 
     def extended(self, image: np.ndarray) -> np.ndarray:
@@ -73,8 +73,8 @@ class Runner:
         return partial(run, self._sessions[threads])
 
     def restore(self, image: np.ndarray, threads: int = 1, tile_px: int = WHOLE_PX) -> np.ndarray:
-        """Restore digital numbers (H, W) float as `restore` does: tiled, missing pixels stay,
-        clipped, not rounded.
+        """Restore digital numbers (H, W) float as `restore` does: tiled, clipped, not rounded.
+        Missing pixels stay.
         """
         plan = make_plan((1, *image.shape), tile_px, self.tiling.halo_px, self.tiling)
         return restore_floats(image, self.infer(threads), plan, FULL_DN)
@@ -94,7 +94,7 @@ class Subject:
 
     @property
     def by_name(self) -> dict[str, Runner]:
-        """The networks that are there, by the name of their precision."""
+        """The available networks, by the name of their precision."""
         networks = {"float32": self.float32, "INT8": self.int8}
         return {name: network for name, network in networks.items() if network is not None}
 
@@ -105,7 +105,9 @@ class Subject:
 
     @cached_property
     def graph(self) -> Graph | None:
-        """The float network as convolutions and additions alone; None of any other."""
+        """The float network as convolutions and additions alone, or None if it has other
+        operators.
+        """
         try:
             return correction_graph(self.float32.source.model)
         except BeersError:
@@ -113,7 +115,7 @@ class Subject:
 
     @cached_property
     def core(self) -> IntCore:
-        """The integers of the INT8 file."""
+        """The integer core stored in the INT8 file."""
         return read_core(self.quantized.source.model)
 
     @property
@@ -134,15 +136,15 @@ def open_subject(
     Args:
         float_network: a shipped name, or an INT8 network that was quantised in this process, stands
             for both; the default pair if None.
-        int8_network: None tests the float network alone, unless `float_network` stands for both.
-        sensor: that shipped networks are conditioned on.
+        int8_network: None tests only the float network, unless `float_network` stands for both.
+        sensor: the sensor that shipped networks are conditioned on.
     """
     profile = Sensor.load(sensor)
     if int8_network is not None or _is_pair(float_network):
         subject = Subject(*map(Runner, pair_of(float_network, int8_network, profile)))
     else:
         floating = Network.load(float_network, sensor=profile, int8=False)
-        require_quantized(floating.model, floating.label, wanted=False)
+        require_quantized(floating.model, floating.label, expected=False)
         subject = Subject(Runner(floating))
     for network in subject.by_name.values():
         # A network that cannot be tiled is refused before anything runs.
@@ -165,7 +167,9 @@ def _is_pair(network: NetworkLike | None) -> bool:
 
 
 def in_torch(graph: Graph, image: Tensor) -> Tensor:
-    """An image (N, 1, H, W) plus the graph's correction, computed in the image's precision."""
+    """Return an image (N, 1, H, W) plus the graph's correction, computed in the image's
+    precision.
+    """
     place_px = math.isqrt(image_channels(graph))
     tensors = {IMAGE: pixel_unshuffle(image, place_px)}
     for op in graph:
@@ -180,8 +184,8 @@ def in_torch(graph: Graph, image: Tensor) -> Tensor:
 
 
 def steepest_signs(graph: Graph, image: np.ndarray) -> np.ndarray:
-    """The change (H, W) of -1, 0 or 1 that moves the middle pixel most, to first order: its
-    gradient's signs.
+    """Return the change (H, W) of -1, 0 or 1 that moves the middle pixel most to first order: the
+    signs of its gradient.
     """
     pixels = torch.from_numpy(image)[None, None].requires_grad_()
     middle = in_torch(graph, pixels)[0, 0, image.shape[0] // 2, image.shape[1] // 2]
@@ -193,21 +197,24 @@ GAIN_DN = 16.0
 STEEPEST_DN = 64.0
 FLOAT32_DN = 0.05
 INT8_GAIN_DN = 128.0
-"""A change of 1 DN can move a rounding in every layer, and a pixel from the fine gain to the coarse
-one.
+"""The bound of the INT8 gain. A change of 1 DN can change a rounding in every layer, and move a
+pixel from the fine gain to the coarse one.
 """
 ROUNDING_DN = 128.0
-"""What the DPU's tie rounding (half up) may change: one unit in any layer, carried on."""
+"""The bound of the effect of the DPU's tie rounding (half up): one unit in any layer,
+propagated.
+"""
 MORE_THREADS = 2
 CROP_PX = 48
 CORES_PX = (16, 29)
 LARGE_CORE_PX = 250
-"""What a tile keeps beside its two halos."""
+"""The side of a tile without its two halos, for large images."""
 
 
 def float32(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
-    """The float network in float32, and against float64 where it is plain convolutions, on an image
-    (H, W) in DN.
+    """Check the float network in float32, and against float64 if it has only convolutions.
+
+    The image is (H, W) in DN.
     """
     network = subject.float32
     graph = subject.graph
@@ -224,7 +231,7 @@ def float32(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Meas
 
 
 def int8(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
-    """The INT8 network by onnxruntime's integer kernels, on an image (H, W) in DN."""
+    """Check the INT8 network with onnxruntime's integer kernels on an image (H, W) in DN."""
     network = subject.quantized
     measures = restoration(network, case, image, INT8_GAIN_DN)
     if case.pixels == "sound" and not case.large:
@@ -237,7 +244,7 @@ def int8(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure
 def restoration(
     network: Runner, case: Case, image: np.ndarray, gain_dn: float
 ) -> list[checks.Measure]:
-    """What must hold of any network on an image (H, W) in DN, by whatever it is run."""
+    """Return the measures that apply to any network on an image (H, W) in DN, whatever runs it."""
     if case.pixels in ("infinite", "beyond"):
         return [checks.refused(lambda: network.restore(image))]
     result = network.restore(image)
@@ -257,7 +264,7 @@ def restoration(
 
 
 def reference(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
-    """The INT8 network in whole numbers alone, on 48 x 48 pixels of larger images (H, W)."""
+    """Check the INT8 network in integer arithmetic, on 48 x 48 pixels of larger images (H, W)."""
     core = subject.core
     network = subject.quantized
     if case.pixels != "sound":
@@ -293,8 +300,9 @@ def _fractions(image: np.ndarray) -> np.ndarray:
 
 
 def tiling(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
-    """Both networks, tiled by several plans, against the whole image (H, W); plans refuse unsound
-    pixels.
+    """Compare both networks, tiled by several plans, with the whole image (H, W).
+
+    Each plan must refuse pixels that are infinite or beyond 12 bits.
     """
     measures = []
     cores_px = (LARGE_CORE_PX,) if case.large else CORES_PX

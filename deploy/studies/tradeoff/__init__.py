@@ -1,3 +1,3 @@
-"""What accuracy costs in time: operating points measured on the same images, and which of them to
-take.
+"""Compare accuracy with time: operating points measured on the same images, and a
+recommendation.
 """

@@ -1,4 +1,4 @@
-"""Choose a point: limits such as `latency<=20s`, and one recommended line."""
+"""Choose a point by limits such as `latency<=20s`, and recommend it in one line."""
 
 import math
 import re
@@ -27,12 +27,12 @@ NAMES: dict[str, tuple[str, str]] = {
     "host-p90": ("host p90", "s/Mpx"),
     **{key.removeprefix("board "): (key, unit) for key, unit in UNITS.items()},
 }
-"""What a user writes: the figure that it stands for, and its unit."""
+"""The names that a user may write: the figure that each one stands for, and its unit."""
 BARE_UNITS = ("ratio", "distance")
-"""Units that are not written behind a number."""
+"""Units that are not written after a number."""
 
 WORTH_A_WORD_DB = 0.002
-"""Gains below it that are not significant are not mentioned."""
+"""Smaller gains are not mentioned unless they are significant."""
 
 CONSTRAINT = re.compile(
     r"(?P<name>[a-z0-9-]+)\s*(?P<side><=|>=)\s*(?P<limit>[+-]?\d+(\.\d+)?([eE][+-]?\d+)?)\s*(?P<unit>\S*)"
@@ -41,7 +41,7 @@ CONSTRAINT = re.compile(
 
 @dataclass(frozen=True)
 class Constraint:
-    """A figure at most, or at least, so much."""
+    """An upper or lower limit of a figure."""
 
     key: str
     at_most: bool
@@ -52,7 +52,7 @@ class Constraint:
         return f"{self.key} {'<=' if self.at_most else '>='} {self.limit:g}{self._unit}"
 
     def in_words(self, value: float) -> str:
-        """Return a value of the figure with its unit, with as many digits as tell it apart from the
+        """Return a value of the figure with its unit, with enough digits to distinguish it from the
         limit.
         """
         digits = next(
@@ -65,8 +65,8 @@ class Constraint:
         return "" if self.unit in BARE_UNITS else f" {self.unit}"
 
     def violation(self, point: Measured) -> float:
-        """By what share of the limit a point misses it: 0 where it keeps it, endless without such a
-        figure.
+        """Return the violation by a point as a share of the limit: 0 if it complies, infinity if it
+        lacks the figure.
         """
         over = point.value(self.key) - self.limit
         miss = over if self.at_most else -over
@@ -74,13 +74,13 @@ class Constraint:
         return math.inf if math.isnan(miss) else max(miss, 0.0) / (abs(self.limit) or 1.0)
 
     def holds_throughout(self, figure: Figure) -> bool:
-        """Whether the figure's whole interval keeps it."""
+        """Return True if the figure's whole interval complies."""
         low, high = ends(figure)
         return high <= self.limit if self.at_most else low >= self.limit
 
 
 def parse_constraints(option: str, text: str | None) -> list[Constraint]:
-    """Read constraints with commas between: `latency<=20s, psnr>=44`."""
+    """Parse constraints separated by commas: `latency<=20s, psnr>=44`."""
     return [_parse(option, part.strip()) for part in text.split(",")] if text is not None else []
 
 
@@ -108,12 +108,12 @@ def _parse(option: str, text: str) -> Constraint:
 
 @dataclass(frozen=True)
 class Question:
-    """The limits that points of all boards are compared under.
+    """The limits under which points of all boards are compared.
 
     Attributes:
-        budget: what can be afforded.
-        need: what must be reached.
-        compare: shows which of two points is better.
+        budget: upper limits of costs.
+        need: limits of quality that must be reached.
+        compare: determines which of two points is better.
     """
 
     budget: Sequence[Constraint]
@@ -122,12 +122,12 @@ class Question:
 
     @property
     def constraints(self) -> list[Constraint]:
-        """Budget and need together."""
+        """The budget and the need together."""
         return [*self.budget, *self.need]
 
     def cost(self, points: Sequence[Measured]) -> str:
-        """Return the cost that the budget names; else the first that any point has, the board's
-        latency before all.
+        """Return the cost that the budget names, else the first that any point has, starting with
+        the board's latency.
         """
         in_budget = (constraint.key for constraint in self.budget if constraint.key in COSTS)
         available = (
@@ -147,7 +147,8 @@ def recommend(points: Sequence[Measured], asked: Question) -> tuple[Measured | N
         asked: budget and need.
 
     Returns:
-        The recommended point, None where none keeps the constraints; and a line that says so.
+        The recommended point, or None if none complies with the constraints, and a line that states
+        the result.
     """
     constraints = asked.constraints
     cost = asked.cost(points)
@@ -179,33 +180,34 @@ def recommend(points: Sequence[Measured], asked: Question) -> tuple[Measured | N
 def within(
     points: Iterable[Measured], constraints: Sequence[Constraint], cost: str
 ) -> list[Measured]:
-    """Return the points that keep every constraint by value, sorted by increasing cost."""
+    """Return the points that comply with every constraint by value, sorted by increasing cost."""
     return [point for point in placed(points, cost) if not _violation(point, constraints)]
 
 
-def choose(kept: Sequence[Measured], asked: Question) -> tuple[Measured, Measured]:
-    """Choose among points that keep the constraints, sorted by increasing cost, at least one.
+def choose(candidates: Sequence[Measured], asked: Question) -> tuple[Measured, Measured]:
+    """Choose among points that comply with the constraints, sorted by increasing cost, at least
+    one.
 
     Returns:
         The chosen point, and the one with the best PSNR.
     """
-    best = max(kept, key=lambda point: point.value(PSNR))
+    best = max(candidates, key=lambda point: point.value(PSNR))
     # A need without a budget asks for the cheapest point, however good it is.
     if asked.need and not asked.budget:
-        return kept[0], best
+        return candidates[0], best
     # They are sorted by cost: the first that is not significantly worse is the cheapest such.
     return next(
-        point for point in kept if not significant(asked.compare.difference(best, point))
+        point for point in candidates if not significant(asked.compare.difference(best, point))
     ), best
 
 
 def affordable(
     points: Sequence[Measured], constraints: Sequence[Constraint], cost: str
 ) -> Sequence[Measured]:
-    """Return the points that keep the limits on figures other than PSNR and cost; all points if
-    none does.
+    """Return the points that comply with the limits on figures other than PSNR and cost, or all
+    points if none does.
 
-    The front shows PSNR against one cost. Without this, a point that the budget excludes for
+    The front shows PSNR against one cost. Without this filter, a point that the budget excludes for
     another reason, such as its power, would hide those that can be recommended.
     """
     others = [constraint for constraint in constraints if constraint.key not in (PSNR, cost)]
@@ -213,12 +215,12 @@ def affordable(
 
 
 def _violation(point: Measured, constraints: Sequence[Constraint]) -> float:
-    """Return the violation of the constraint that a point misses most."""
+    """Return the largest violation of a constraint by a point."""
     return max((constraint.violation(point) for constraint in constraints), default=0.0)
 
 
 def nearest(points: Sequence[Measured], constraints: Sequence[Constraint]) -> str:
-    """Name the point that misses the constraints least, as the end of a sentence."""
+    """Return the name of the point with the smallest violation, as the end of a sentence."""
     comparable = [point for point in points if math.isfinite(_violation(point, constraints))]
     if not comparable:
         return ": no point has every figure asked for"

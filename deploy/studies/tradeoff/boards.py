@@ -1,4 +1,4 @@
-"""What each board offers within the budget: its best point compared with the recommended one, or
+"""The best point of each board within the budget compared with the recommended one, or the reason
 why it has none.
 """
 
@@ -51,7 +51,7 @@ def board_rows(
 
 
 def refusals(points: Sequence[Measured], board: str) -> list[str]:
-    """Say which networks a board's DPU refuses, and why."""
+    """Return sentences on the networks that a board's DPU refuses, and the reasons."""
     return [
         f"{point.name} does not fit its DPU: {point.point.reason}"
         for point in points
@@ -60,8 +60,8 @@ def refusals(points: Sequence[Measured], board: str) -> list[str]:
 
 
 def lines(rows: Sequence[Row]) -> list[str]:
-    """Return the rows as sentences: those of several boards, and that of a single one only if it
-    has no point.
+    """Return the rows as sentences: those of several boards, or that of a single one if it has no
+    point.
     """
     return [f"{row.name}: {_sentence(row)}" for row in rows if len(rows) > 1 or not row.figures]
 
@@ -71,7 +71,9 @@ def _sentence(row: Row) -> str:
 
 
 def why_not(points: Sequence[Measured], constraints: Sequence[Constraint], cost: str) -> str:
-    """Say which constraint no point of a board keeps, and what comes closest to it."""
+    """Return a sentence on the constraint that no point of a board complies with, and the closest
+    point.
+    """
     here = placed(points, cost)
     if not here:
         return f"no point has both a PSNR and a {cost}"

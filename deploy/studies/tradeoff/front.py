@@ -1,10 +1,11 @@
 """Compare operating points: the front of quality against cost, and paired differences.
 
 Points of all boards are compared in one list, and ties are broken by the points' own figures and
-names. So the order in which boards were named changes nothing.
+names. The order in which boards are named therefore has no effect.
 
-Two points are compared on the same images: by the bootstrap interval, over whole sites, of the mean
-difference of their scores. Their own intervals show how images differ, which the points share.
+Two points are compared on the same images, by the bootstrap interval over whole sites of the mean
+difference of their scores. Their own intervals reflect the differences between images, which are
+common to both points.
 """
 
 import math
@@ -25,9 +26,9 @@ COSTS = (LATENCY, "board energy", "host p50")
 PSNR = "PSNR"
 FRONT = "front of PSNR against"
 BOARDS = "boards"
-"""What the names of the tables begin with."""
+"""The beginning of the names of the tables."""
 ALIKE_DB = 0.05
-"""Where the sites are too few for an interval, PSNR within this counts as equal."""
+"""If there are too few sites for an interval, a difference of PSNR within this counts as none."""
 SIGNIFICANT = "significant"
 NOT_SIGNIFICANT = "not significant"
 TOO_FEW = "too few sites to tell"
@@ -38,11 +39,11 @@ class Measured:
     """A point with all its figures.
 
     Attributes:
-        name: of the point; of a published run, as it is printed.
-        figures: by name; unavailable ones with the reason.
-        text: words beside them.
-        point: None of a published run.
-        images: scores of each image, in the order of the pairs; empty where there are none.
+        name: of the point, or of a published run as it is printed.
+        figures: by name; unavailable ones have a reason.
+        text: the words next to the figures.
+        point: None for a published run.
+        images: scores of each image, in the order of the pairs; empty if there are none.
     """
 
     name: str
@@ -52,8 +53,8 @@ class Measured:
     images: Sequence[Scores] = field(default=(), repr=False)
 
     def value(self, key: str) -> float:
-        """A figure's value; NaN where there is none to compare: a published one was found on other
-        images.
+        """Return a figure's value, or NaN if it cannot be compared. A published figure was measured
+        on other images.
         """
         figure = self.figures.get(key)
         if figure is None or figure.value is None or figure.mode == "published":
@@ -62,7 +63,7 @@ class Measured:
 
     @property
     def network(self) -> Network:
-        """The network that restores here."""
+        """The network that restores at this point."""
         if self.point is None or self.point.variant.network is None:
             raise OptionError(f"The point {self.name} has no network. Choose a point of a network.")
         return self.point.variant.network
@@ -77,8 +78,8 @@ def placed(points: Iterable[Measured], cost: str) -> list[Measured]:
 
 
 def _rank(point: Measured, cost: str) -> tuple[float, float, float, str]:
-    """Return the sort key of a point: its cost, then what breaks ties without regard to the order
-    of the points.
+    """Return the sort key of a point: its cost, then values that break ties independently of the
+    order of the points.
     """
     latency_s = point.value(LATENCY)
     return (
@@ -111,13 +112,13 @@ class Comparison:
     seed: int
 
     def difference(self, a: Measured, b: Measured) -> Figure:
-        """The PSNR of `a` less that of `b`, with the interval of the paired difference; none below
-        five sites.
+        """Return the PSNR of `a` minus that of `b`, with the interval of the paired difference;
+        without one below five sites.
         """
         # Differences on the same images: how the images differ from one another drops out.
         pairs = zip(a.images, b.images, strict=True)
         differences = [(x[PSNR] or 0.0) - (y[PSNR] or 0.0) for x, y in pairs]
-        # The same pictures are equal on however few sites: no bootstrap is needed to tell.
+        # Identical images need no bootstrap, however few the sites are.
         if not any(differences):
             return measured(0.0, "dB", "the same pictures", (0.0, 0.0))
         interval, words = site_interval(differences, self.sites, np.random.default_rng(self.seed))
@@ -126,14 +127,18 @@ class Comparison:
 
 
 def significant(difference: Figure) -> bool:
-    """Whether the whole interval is above 0; by value, beyond ALIKE_DB, where there is none."""
+    """Return True if the whole interval is above 0. Without an interval, return True if the value
+    exceeds ALIKE_DB.
+    """
     if difference.interval is None:
         return (difference.value or 0.0) > ALIKE_DB
     return difference.interval[0] > 0
 
 
 def verdict(difference: Figure) -> str:
-    """In words: not significant where the interval holds 0."""
+    """Return the significance in words. A difference is not significant if its interval contains
+    0.
+    """
     if difference.interval is None:
         return TOO_FEW
     low, high = difference.interval
@@ -143,9 +148,9 @@ def verdict(difference: Figure) -> str:
 def cost_ratio(a: Measured, b: Measured, cost: str) -> Figure:
     """Return the cost of `a` divided by that of `b`, with an interval.
 
-    Two predictions of one board share most of their error: the interval of a ratio of latencies is
-    the board's `pair_width`, and nothing where only the count of tiles differs. Predictions of two
-    boards share none of it.
+    Two predictions for one board share most of their error. The interval of a ratio of latencies is
+    therefore the board's `pair_width`, and empty if only the number of tiles differs. Predictions
+    for two boards share no error.
     """
     value = a.value(cost) / b.value(cost)
     source = f"{cost} over that of {b.name}"
@@ -168,7 +173,7 @@ def cost_ratio(a: Measured, b: Measured, cost: str) -> Figure:
 
 
 def ends(figure: Figure) -> tuple[float, float]:
-    """The interval, or the value twice where it has none."""
+    """Return the interval, or the value twice if there is none."""
     return figure.interval or (figure.value or 0.0, figure.value or 0.0)
 
 

@@ -1,4 +1,4 @@
-"""Measure each variant once, on the same images, and in tiles the effect of their size and halo."""
+"""Measure each variant once on the same images, and the effect of tile size and halo."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,23 +30,24 @@ from beers_deploy.studies.tradeoff.points import (
 )
 
 Scores = dict[str, float | None]
-"""Figures of one image by name; None where an instrument is not there."""
+"""Figures of one image by name; None if the metric is unavailable."""
 
 LPIPS = "LPIPS-squeeze"
 SEAM_ERROR = "seam error"
 NOT_SHOWN = (*DETAILS, SEAM_ERROR)
-"""Of the scores of an image, in the means of a point."""
+"""Scores of an image that are left out of the means of a point."""
 
 
 @dataclass(frozen=True)
 class Benchmark:
-    """What all variants are measured on.
+    """The data that all variants are measured on.
 
     Attributes:
         pairs: held-out images, degraded and reference.
         degraded: sensor of the degraded images.
         reference: sensor of the reference images.
-        lpips: weights of SqueezeNet 1.1, or a folder of backbones; None asks the environment.
+        lpips: weights of SqueezeNet 1.1, or a folder of backbones; None reads the path from the
+            environment.
         seed: of the bootstrap.
     """
 
@@ -69,8 +70,8 @@ class Benchmark:
         return [pair.site for pair in self.pairs]
 
     def cuts(self, point: Point) -> tuple[int, ...]:
-        """Return the sides of the tiles that a point with seams cuts the images into; none of exact
-        ones. Points that differ in nothing else have the same scores.
+        """Return the sides of the tiles into which a point with seams cuts the images; empty if its
+        seams are exact. Points that differ in nothing else have the same scores.
         """
         if point.halo_px is None:
             return ()
@@ -78,7 +79,7 @@ class Benchmark:
         return tuple(sorted({tiles_of_point(point, shape).tile_px for shape in shapes}))
 
     def scores(self, point: Point, exact: Restore) -> list[Scores]:
-        """Return the scores of each image: those of the exact restoration, or with seams where the
+        """Return the scores of each image: those of the exact restoration, or with seams if the
         halo is too small for that.
         """
         if point.halo_px is None:
@@ -86,8 +87,8 @@ class Benchmark:
         return self.score(restore_in_tiles(point, self.degraded, self.reference), exact)
 
     def runs(self, point: Point) -> float:
-        """How often the network of a point runs on a tile of the images, once for each exposure; a
-        mean.
+        """Return the mean number of runs of a point's network on a tile of the images, one for each
+        exposure.
         """
         network = point.variant.network
         if network is None or not network.exposures:
@@ -105,8 +106,8 @@ class Benchmark:
         return runs / tiles
 
     def score(self, restore: Restore, exact: Restore | None = None) -> list[Scores]:
-        """Scores of every pair; and how far, in DN, a restoration with seams is from the exact one
-        given.
+        """Return the scores of every pair. If an exact restoration is given, also return the
+        difference from it in DN.
         """
         scores = []
         for pair in self.pairs:
@@ -118,7 +119,7 @@ class Benchmark:
         return scores
 
     def means(self, images: Sequence[Scores]) -> dict[str, Figure]:
-        """Means over the images, with bootstrap intervals over whole sites."""
+        """Return the means over the images, with bootstrap intervals over whole sites."""
         plain = [
             {key: value for key, value in image.items() if key not in NOT_SHOWN} for image in images
         ]
@@ -131,7 +132,9 @@ class Benchmark:
 
 
 def restore_in_tiles(point: Point, degraded: Sensor, reference: Sensor) -> Restore:
-    """A network in a point's tiles, with the steps around it that `restore` takes."""
+    """Return the restoration by a network in a point's tiles, with the steps around it that
+    `restore` uses.
+    """
     source = network_of_variant(point.variant)
     sensor = degraded.nominal()
     brighter = {factor: other.model for factor, other in source.exposures.items()}
@@ -141,7 +144,7 @@ def restore_in_tiles(point: Point, degraded: Sensor, reference: Sensor) -> Resto
 
 
 def tiles_of_point(point: Point, shape: tuple[int, ...]) -> Plan:
-    """The tiles of a point on an image (H, W); one that is no larger than a tile is cut in two
+    """Return the tiles of a point on an image (H, W). An image no larger than a tile is cut in two
     along each side.
     """
     tiling = network_of_variant(point.variant).tiling
@@ -158,8 +161,8 @@ ROUNDS = 9
 def measure_host(
     methods: Mapping[Variant, Method], benchmark: Benchmark
 ) -> dict[Variant, dict[str, Figure]]:
-    """Measure what each variant takes on this machine, all timed together on a drawn scene as the
-    sensor sees it.
+    """Measure the time of each variant on this machine. All are timed together on a drawn scene as
+    the sensor sees it.
     """
     tile = drawn_acquisition(
         Swath(TILE_PX, TILE_PX), benchmark.degraded, benchmark.reference, benchmark.seed
@@ -172,8 +175,8 @@ def measure_host(
 
 
 def host_times(restores: Iterable[Restore], tile: np.ndarray) -> list[list[float]]:
-    """Seconds that each method takes for a tile on this machine, interleaved, after one run for
-    warm-up.
+    """Return the seconds that each method needs for a tile on this machine, interleaved, after one
+    warm-up run.
     """
     calls = [partial(restore, tile) for restore in restores]
     for call in calls:
@@ -182,7 +185,7 @@ def host_times(restores: Iterable[Restore], tile: np.ndarray) -> list[list[float
 
 
 def host_figures(times_s: Sequence[float], pixels: int) -> dict[str, Figure]:
-    """Median and 90th percentile for a million pixels, in s."""
+    """Return the median and the 90th percentile of the time for a million pixels, in s."""
     source = (
         f"{len(times_s)} runs of a tile of {TILE_PX} x {TILE_PX}, interleaved with the "
         "other methods"
@@ -195,9 +198,7 @@ def host_figures(times_s: Sequence[float], pixels: int) -> dict[str, Figure]:
 
 PATCHES = 32
 PATCH_PX = 96
-"""Calibration of a network that comes without INT8: fewer and smaller patches than `quantize`
-takes.
-"""
+"""Calibration of a network without INT8 file: fewer and smaller patches than `quantize` uses."""
 
 
 def make_int8(network: Network, scenes: Path | None, sensor: Sensor, seed: int) -> Network:
@@ -206,7 +207,7 @@ def make_int8(network: Network, scenes: Path | None, sensor: Sensor, seed: int) 
     Args:
         network: in float32.
         scenes: folder of images to calibrate on; drawn ones if None.
-        sensor: of the patches, where the network names none that is known.
+        sensor: of the patches, if the network names no known one.
         seed: of every random draw.
     """
     named = network.sensor

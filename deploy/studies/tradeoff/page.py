@@ -1,5 +1,5 @@
-"""What a study found, and its page: the recommended line, the plot with its front, boards, and all
-points.
+"""The result of a study, and its page: the recommended line, the plot with its front, boards, and
+all points.
 """
 
 import os
@@ -42,8 +42,8 @@ POINTS_CAPTION = (
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Tradeoff(Table):
-    """What accuracy costs in time: the recommended point, the Pareto front, and every point with
-    its figures. It is true if a point keeps the budget and the need.
+    """Accuracy compared with time: the recommended point, the Pareto front, and every point with
+    its figures. It is true if a point complies with the budget and the need.
 
     Attributes:
         boards: the names of all boards that were compared.
@@ -51,9 +51,9 @@ class Tradeoff(Table):
         front: those on the Pareto front over all boards, sorted by increasing cost.
         constraints: budget and need.
         cost: the figure that the front is against.
-        best: the recommended point; None where none keeps the budget and the need.
-        line: that recommends it.
-        remarks: how the figures were found.
+        best: the recommended point; None if none complies with the budget and the need.
+        line: the sentence that recommends it.
+        remarks: how the figures were measured.
     """
 
     boards: Sequence[str]
@@ -72,7 +72,7 @@ class Tradeoff(Table):
 
     @property
     def board_rows(self) -> list[Row]:
-        """For each board its best point within the limits, or why it has none."""
+        """For each board its best point within the limits, or the reason why it has none."""
         return [row for row in self.rows if row.table == BOARDS]
 
     @property
@@ -87,7 +87,7 @@ class Tradeoff(Table):
         budget.
 
         Args:
-            figure: given, bars of that figure instead, as of any table.
+            figure: if given, draw bars of that figure instead, as for any table.
             ax: axes of matplotlib to draw on; new ones if None.
         """
         if figure is not None:
@@ -97,7 +97,7 @@ class Tradeoff(Table):
         return cast("Axes", axes)
 
     def report(self, folder: str | os.PathLike[str]) -> Path:
-        """Write the page and its plot into a folder; returns the page's path."""
+        """Write the page and its plot into a folder, and return the page's path."""
         svg = plot_svg(self)
         page, plot = (Path(folder) / name for name in FILES)
         write_text(plot, svg)
@@ -106,7 +106,7 @@ class Tradeoff(Table):
 
 
 def report_of(study: Tradeoff, svg: str) -> Report:
-    """The page in reading order."""
+    """Compose the page in reading order."""
     picture = Picture(f"{PSNR} against {study.cost}", data_url(svg), CAPTION)
     points = []
     for point in study.points:

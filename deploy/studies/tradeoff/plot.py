@@ -19,15 +19,17 @@ if TYPE_CHECKING:
 
 SIZE_PX = (560, 520)
 TEXT_PX = 15
-"""Of the plot: wide enough for a desk, and its words large enough on a telephone, where it is
-scaled down.
+"""Size of the plot and of its text. The plot fits a desktop screen, and its text stays legible on a
+telephone, where it is scaled down.
 """
 FRONT_PX2 = 90
 OTHERS_PX2 = 34
 RING_PX2 = 330
-"""Areas of marks: of the front, of other points, and of the ring around the recommended point."""
+"""Areas of marks: those of the front, those of other points, and the ring around the recommended
+point.
+"""
 NEAR_PX = 16
-"""Marks no farther apart share a label."""
+"""Marks at most this far apart share a label."""
 PALE = 0.45
 MARKERS = ("o", "s", "D", "^", "v", "P", "X")
 CHAINS = "traditional pipelines"
@@ -48,7 +50,7 @@ CAPTION = (
 
 @dataclass(frozen=True)
 class Series:
-    """Points that look alike: those of one network, of the pipelines, or of other libraries, on one
+    """Points of one style: those of one network, of the pipelines, or of other libraries, on one
     board.
     """
 
@@ -60,7 +62,7 @@ class Series:
 
 
 class Plotted(Protocol):
-    """What a plot shows of a trade-off, with the meanings of `page.Tradeoff`."""
+    """The parts of a trade-off that a plot shows, with the meanings of `page.Tradeoff`."""
 
     @property
     def boards(self) -> Sequence[str]: ...  # noqa: D102 - see there
@@ -87,7 +89,7 @@ def plot_svg(study: Plotted) -> Markup:
 
 
 def figure_of(study: Plotted) -> "Figure":
-    """Draw the plot; for use within `look`."""
+    """Draw the plot. Call this within `look`."""
     from matplotlib import rc_context
 
     with rc_context({"font.size": TEXT_PX}):
@@ -105,8 +107,8 @@ def figure_of(study: Plotted) -> "Figure":
 
 
 def draw(axes: "Axes", study: Plotted) -> None:
-    """Draw points, front, limits and recommended point; the numbers are left to whoever sizes the
-    axes.
+    """Draw points, front, limits and recommended point. The caller adds the numbers once it has
+    sized the axes.
     """
     axes.set(xscale="log", xlabel=_label(study, study.cost), ylabel=_label(study, PSNR))
     groups = list(series(study))
@@ -125,8 +127,8 @@ def draw(axes: "Axes", study: Plotted) -> None:
 
 
 def series(study: Plotted) -> Iterator[Series]:
-    """Yield the points by what they look like: a colour for each network, and of several boards a
-    marker for each.
+    """Yield the points by style: a colour for each network, and for several boards a marker for
+    each.
     """
     names: dict[str, int] = {}
     groups: dict[tuple[str, str], list[Measured]] = {}
@@ -187,8 +189,8 @@ def _draw_front(axes: "Axes", study: Plotted) -> None:
 
 
 def _draw_limits(axes: "Axes", study: Plotted) -> None:
-    """Draw the limits on cost and PSNR as dashed lines with their words; the axes keep their range
-    if one is outside.
+    """Draw the limits on cost and PSNR as dashed lines with their text. The axes retain their range
+    if a limit is outside.
 
     A limit on another figure, such as power, has no place in the plot.
     """
@@ -198,7 +200,7 @@ def _draw_limits(axes: "Axes", study: Plotted) -> None:
         if limit.key == study.cost and low <= limit.limit <= high:
             axes.axvline(limit.limit, **style)
             words = f"{AT_MOST if limit.at_most else AT_LEAST} {limit.in_words(limit.limit)}"
-            # The axis is logarithmic: its middle is the geometric mean of its ends.
+            # The axis is logarithmic, so its middle is the geometric mean of its limits.
             right = limit.limit > np.sqrt(low * high)
             place: dict[str, Any] = {"ha": "right" if right else "left", "va": "bottom"}
             axes.annotate(
@@ -227,7 +229,7 @@ def _draw_best(axes: "Axes", study: Plotted) -> None:
 
 
 def _draw_legend(axes: "Axes", groups: Sequence[Series], study: Plotted) -> None:
-    """Add what the legend names, as marks without a point: networks by colour, and of several
+    """Add the entries of the legend, as marks without a point: networks by colour, and for several
     boards the markers.
     """
     several = len(study.boards) > 1
@@ -240,8 +242,8 @@ def _draw_legend(axes: "Axes", groups: Sequence[Series], study: Plotted) -> None
 
 
 def _draw_numbers(axes: "Axes", study: Plotted) -> None:
-    """Write the members' numbers next to their marks; one label for neighbours whose marks lie on
-    one another.
+    """Write the members' numbers next to their marks, with one label for neighbours whose marks
+    overlap.
     """
     groups: list[tuple[int, int, Measured]] = []
     for number, point in enumerate(study.front, 1):

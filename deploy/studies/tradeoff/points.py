@@ -1,9 +1,9 @@
-"""Operating points: which networks are compared, in which tiles, halos and configurations, and what
-a board takes.
+"""Operating points: the networks that are compared, their tiles, halos and configurations, and the
+time on a board.
 
-A variant is a method in one precision, measured once. A point is a variant where it runs: an INT8
+A variant is a method in one precision, measured once. A point is a variant on one device: an INT8
 network on one configuration of a board's DPU, in tiles with a halo; a traditional pipeline on a
-board's processor; or anything on this machine alone.
+board's processor; or any variant on this machine alone.
 """
 
 import logging
@@ -40,9 +40,9 @@ FLOAT_ON_DPU = "the DPU takes INT8 alone"
 
 TILE_STEP_PX = 16
 HALO_STEP_PX = 8
-"""Tiles and halos that are tried are multiples of these."""
+"""The tiles and halos that are tried are multiples of these."""
 HALOS_PX = (0, HALO_STEP_PX, 2 * HALO_STEP_PX)
-"""Halos below the exact one that are tried."""
+"""The halos below the exact one that are tried."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Variant:
     Attributes:
         method: its name without the precision.
         precision: float32 or INT8.
-        network: in that precision; None of a method without a network.
+        network: in that precision; None for a method without a network.
     """
 
     method: str
@@ -67,15 +67,15 @@ class Variant:
 
 @dataclass(frozen=True)
 class Point:
-    """A variant where it runs.
+    """A variant on one device.
 
     Attributes:
-        variant: what restores.
+        variant: the method and its precision.
         board: the target, None for this machine alone.
         dpu: the configuration of the board's DPU; None for its processor.
         tile_px: side of a tile.
         halo_px: context around a tile; None for the receptive radius, whose seams are exact.
-        reason: why there are no figures of a board.
+        reason: the reason why there are no figures of a board.
         refused_by: the board whose DPU refuses the network, for that reason; empty if none does.
     """
 
@@ -89,7 +89,7 @@ class Point:
 
     @property
     def name(self) -> str:
-        """The name in tables: the variant, and where it runs."""
+        """The name in tables: the variant and its device."""
         if self.board is None:
             return self.variant.name
         if self.dpu is None:
@@ -106,11 +106,12 @@ def network_variants(
     sensor: Sensor,
     make_int8: Callable[[Network], Network],
 ) -> list[Variant]:
-    """Networks in float32 and INT8; shipped ones with the sensor's profile, INT8 files as they are.
+    """Return the networks in float32 and INT8. Shipped ones are conditioned on the sensor's
+    profile, and INT8 files are used as they are.
 
     Args:
         given: shipped names, ONNX and safetensors files, or networks in memory.
-        sensor: that acquires the images.
+        sensor: the sensor that acquires the images.
         make_int8: quantises a float network.
     """
     variants: list[Variant] = []
@@ -175,7 +176,8 @@ def _require_tiles(name: str, tiling: Tiling) -> None:
 def points_of(
     networks: Iterable[Variant], boards: Sequence[TargetProfile], whole: Swath
 ) -> list[Point]:
-    """Return where networks, traditional pipelines and other libraries' ways are compared.
+    """Return the points at which networks, traditional pipelines and methods of other libraries are
+    compared.
 
     Args:
         networks: in float32 and in INT8.
@@ -191,10 +193,10 @@ def points_of(
 
 
 def network_points(variant: Variant, boards: Sequence[TargetProfile], whole: Swath) -> list[Point]:
-    """Return where a network is compared: in INT8 in each configuration of every board, in the
-    default in more tiles.
+    """Return the points at which a network is compared: in INT8 in each configuration of every
+    board, with more tiles in the default one.
 
-    Every board is treated alike, so that the order of the boards changes nothing.
+    Every board is treated in the same way, so that the order of the boards has no effect.
     """
     if variant.precision == FLOAT:
         return [Point(variant, reason=FLOAT_ON_DPU)]
@@ -210,8 +212,9 @@ def network_points(variant: Variant, boards: Sequence[TargetProfile], whole: Swa
 
 
 def _on_board(variant: Variant, board: TargetProfile, swath: Swath) -> list[Point]:
-    """Return the fastest tile in each configuration; in the default one the paper's tile and
-    smaller halos too.
+    """Return a point in each configuration, with the fastest tile of the default one.
+
+    In the default configuration there are also points with the paper's tile and smaller halos.
     """
     default = dpu_of(board)
     others = [dpu_of(board, name) for name in board.configurations if name != default.name]
@@ -225,8 +228,8 @@ def _on_board(variant: Variant, board: TargetProfile, swath: Swath) -> list[Poin
 
 
 def fastest_tile_px(variant: Variant, dpu: Dpu, whole: Swath) -> int:
-    """The tile with exact seams, no larger than the paper's, in which the swath is predicted to
-    take least time.
+    """Return the tile with exact seams, no larger than the paper's, that has the shortest predicted
+    time for the swath.
     """
     radius = radius_px(variant)
     # A tile has to be wider than its two halos.
@@ -239,11 +242,12 @@ def fastest_tile_px(variant: Variant, dpu: Dpu, whole: Swath) -> int:
 
 
 def dpu_latency(variant: Variant, dpu: Dpu, swath: Swath) -> Figure:
-    """What the cost model says of an INT8 network and a swath in whole tiles.
+    """Return the latency that the cost model predicts for an INT8 network and a swath in whole
+    tiles.
 
     Args:
         variant: the network.
-        dpu: that it runs on.
+        dpu: the DPU that it runs on.
         swath: with its tiles and their halo.
     """
     placement = place(_graph(network_of_variant(variant), swath.tile_px), dpu)
@@ -252,7 +256,7 @@ def dpu_latency(variant: Variant, dpu: Dpu, swath: Swath) -> Figure:
 
 
 def radius_px(variant: Variant) -> int:
-    """The halo that makes the seams of a network exact."""
+    """Return the halo that makes the seams of a network exact."""
     return network_of_variant(variant).tiling.halo_px
 
 
@@ -273,21 +277,21 @@ UNITS: dict[str, str] = {
     "board energy": "J",
     "board efficiency": "px/s/W",
 }
-"""Of the figures of a point on its board."""
+"""The figures of a point on its board, with their units."""
 CHAIN = "traditional-standard"
-"""The chain whose time on a board's processor a target states."""
+"""The pipeline whose time on a board's processor a target states."""
 
 
 def board_figures(
     point: Point, whole: Swath, slower: float | None = None, runs: float = 1.0
 ) -> dict[str, Figure]:
-    """The figures of a point's board; unavailable, with the reason, where it has none.
+    """Return the figures of a point's board, which are unavailable with a reason if it has none.
 
     Args:
         point: a network on a DPU, or a traditional pipeline on the board's processor.
         whole: the swath.
-        slower: how many times as long a chain takes as CHAIN, measured on this machine.
-        runs: how often the network runs on a tile of the measured images, a mean.
+        slower: the time of a pipeline relative to CHAIN, measured on this machine.
+        runs: the mean number of runs of the network on a tile of the measured images.
     """
     if point.dpu is not None:
         halo_px = radius_px(point.variant) if point.halo_px is None else point.halo_px

@@ -1,4 +1,4 @@
-"""One study: variants, what is measured of each, points with their figures, a front and a
+"""Run one study: variants, their measurements, points with their figures, a front and a
 recommendation.
 """
 
@@ -54,18 +54,18 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Study:
-    """What is compared, and on what.
+    """The settings of a study.
 
     Attributes:
         networks: shipped names, files, or networks in memory; float ones are quantised.
-        boards: whose points are compared.
+        boards: the boards whose points are compared.
         sensors: of the degraded and of the reference images.
         scenes: folder of held-out scenes; None for drawn ones.
         lpips: weights for LPIPS, or None.
         calibration: folder of scenes to quantise networks on; None for drawn ones.
         size: (width, height) of the swath in pixels.
-        budget: limits of what can be afforded.
-        need: limits of what must be reached.
+        budget: upper limits of costs.
+        need: limits of quality that must be reached.
         seed: of every random draw.
     """
 
@@ -88,7 +88,7 @@ class Study:
 
     @property
     def names(self) -> list[str]:
-        """The networks as they are given: names and paths."""
+        """The names and paths of the networks, as they are given."""
         return [
             each.label if isinstance(each, Network) else os.fspath(cast(str, each))
             for each in self.networks
@@ -101,7 +101,8 @@ class Study:
 
     @property
     def arguments(self) -> dict[str, str]:
-        """The arguments that are recorded as they were read; the others stand as they were given.
+        """The arguments that are recorded in normalised form. The others are recorded as they were
+        given.
 
         A limit names its figure and unit: `board latency <= 20 s`, however it was typed.
         """
@@ -171,9 +172,9 @@ PREVIEW_RUNS = 3
 
 
 def preview(study: Study) -> Table:
-    """Return what a study would measure and about how long that takes, from a crop timed here."""
+    """Return the planned measurements and an estimate of their duration, from a crop timed here."""
     benchmark, _ = benchmark_of(study)
-    # A float network stands for its INT8 one: to quantise it would take longer than the answer.
+    # A float network stands for its INT8 one, because quantising would take too long here.
     points = points_for(study, require_quantizable)
     methods = _methods([point.variant for point in points], benchmark)
     first = benchmark.pairs[0]
@@ -209,7 +210,9 @@ def preview(study: Study) -> Table:
 
 
 def _require_different(boards: Sequence[TargetProfile]) -> None:
-    """Raise OptionError if two boards have one name: their points could not be told apart."""
+    """Raise OptionError if two boards have the same name, because their points could not be
+    distinguished.
+    """
     names = [profile.name for profile in boards]
     if len(set(names)) < len(names):
         twice = max(names, key=names.count)
@@ -224,7 +227,7 @@ def weigh(
     asked: advice.Question,
     remarks: Sequence[str] = (),
 ) -> Tradeoff:
-    """Find the front, the recommendation, and what each board offers.
+    """Find the front, the recommendation, and the best point of each board.
 
     Args:
         points: of all boards, and published runs.
@@ -286,7 +289,7 @@ def _measured(
     medians_s = {variant: times["host p50"].value or 1.0 for variant, times in host.items()}
     for point, result in zip(points, results, strict=True):
         here_s = medians_s[point.variant]
-        # Where the chain itself was not timed, the board's stated time stands as it is.
+        # If the chain itself was not timed, the board's stated time is used as it is.
         slower = here_s / medians_s.get(Variant(CHAIN), here_s)
         runs = benchmark.runs(point) if point.dpu is not None else 1.0
         figures = host[point.variant] | board_figures(point, swath, slower, runs)

@@ -12,7 +12,6 @@ import pytest
 import rasterio
 
 from beers_deploy.profiles.shipped import BLIND
-from beers_deploy.restoration.stac import write_item
 from beers_deploy.verbs.restore import restore
 from tests.model.raster import formats as images
 from tests.shipped import shipped_pair
@@ -172,8 +171,7 @@ def test_qgis_s_toolbox_restores(qgis: Path, tmp_path: Path) -> None:
 def test_qgis_draws_the_footprint_of_a_stac_item(qgis: Path, model: Path, tmp_path: Path) -> None:
     pytest.importorskip("pystac")
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    restore(image, tmp_path / "out.tif", network=model, cog=True)
-    write_item(tmp_path / "out.tif", tmp_path / "out.json")
+    restore(image, tmp_path / "out.tif", network=model, cog=True, stac=tmp_path / "out.json")
     layer = answer(qgis, "-c", IN_QGIS.replace("{}", FOOTPRINT), tmp_path / "out.json")
     assert (layer["features"], layer["crs"]) == (1, "EPSG:4326")
     assert layer["box"] == pytest.approx(

@@ -1,10 +1,16 @@
-"""STAC items are valid by the core schema, and have the place of the image and what was done."""
+"""STAC items are valid by the core schema and by the fields of their extensions. They have the
+place of the image, what was done, and the network by its digest.
+"""
 
 import json
+import re
 import sys
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import jsonschema
+import numpy as np
 import pytest
 import rasterio
 
@@ -12,6 +18,35 @@ from tests.deploy.command_line import done, refused
 from tests.model.raster import formats as images
 
 pystac: Any = pytest.importorskip("pystac")
+validation: Any = pytest.importorskip("pystac.validation")
+mlm: Any = pytest.importorskip("pystac.extensions.mlm")
+
+PROCESSING = {
+    "type": "object",
+    "properties": {
+        "processing:datetime": {"type": "string", "pattern": r"^\d{4}-\d\d-\d\dT.*Z$"},
+        "processing:expression": {"type": "object", "required": ["format", "expression"]},
+        "processing:level": {"enum": ["RAW", "L0", "L1", "L2", "L3", "L4"]},
+        "processing:lineage": {"type": "string"},
+        "processing:software": {
+            "type": "object",
+            "additionalProperties": {"type": "string"},
+        },
+    },
+    "patternProperties": {"^(?!processing:)": {}},
+    "additionalProperties": False,
+}
+"""The fields that are used of version 1.2.0 of the processing extension, by its README."""
+
+
+def require_valid(content: dict[str, Any]) -> None:
+    """Check an item by the schemas that pystac brings, and by the fields of processing.
+
+    The schemas of extensions are on the network.
+    """
+    validation.validate_dict(content, extensions=[])
+    for fields in (content["properties"], *content["assets"].values(), *content["links"]):
+        jsonschema.validate(fields, PROCESSING)
 
 
 def restored_item(image: Path, item: Path, model: Path) -> dict[str, Any]:
@@ -24,7 +59,7 @@ def restored_item(image: Path, item: Path, model: Path) -> dict[str, Any]:
 def test_an_item_is_valid_and_has_the_place_of_the_image(model: Path, tmp_path: Path) -> None:
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
     content = restored_item(image, tmp_path / "catalogue" / "item.json", model)
-    pystac.Item.from_dict(content).validate()
+    require_valid(content)
     assert content["assets"]["restored"]["href"] == "../out.tif"
     assert "cloud-optimized" in content["assets"]["restored"]["type"]
     assert [band["name"] for band in content["assets"]["restored"]["bands"]] == ["B0", "B1"]
@@ -41,7 +76,7 @@ def test_an_image_without_a_place_has_no_geometry(model: Path, tmp_path: Path) -
         tmp_path / "in.tif", images.digital_numbers(), crs=None, transform=None
     )
     content = restored_item(image, tmp_path / "item.json", model)
-    pystac.Item.from_dict(content).validate()
+    require_valid(content)
     assert content["geometry"] is None
     assert "bbox" not in content
 
@@ -55,3 +90,90 @@ def test_an_item_needs_a_cog_and_its_package(
     assert "--stac has no effect without --cog" in refused(command)
     assert "beers-deploy[stac]" in refused(f"{command} --cog")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]
+
+
+def test_an_item_tells_how_the_image_was_made(tmp_path: Path) -> None:
+    """A shipped network is made for the sensor, so it is written: its digest is that of the run."""
+    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
+    words = "--network convbeers-xs-int8 --sensor pleiades-degraded --cog"
+    done(
+        f"restore {image} {tmp_path}/out.tif {words} --stac {tmp_path}/out.json "
+        f"--self-check {tmp_path}/blocks.tif"
+    )
+    content = json.loads((tmp_path / "out.json").read_text())
+    require_valid(content)
+    about = content["properties"]
+    assert about["processing:datetime"] == about["datetime"]
+    assert set(about["processing:software"]) == {"beers-deploy", "onnxruntime"}
+    assert "Restored from in.tif; consistency: on" in about["processing:lineage"]
+    # The image is noise, which no sensor sees.
+    assert "self-check outside: 100 %" in about["processing:lineage"]
+    assert content["assets"]["self-check"]["href"] == "blocks.tif"
+    made = content["assets"]["restored"]
+    assert made["processing:expression"] == {"format": "stac-mlm", "expression": "out-network.json"}
+    assert [link["href"] for link in content["links"]] == ["out-network.json"]
+    network = network_item(tmp_path / "out-network.json")
+    asset = network.assets["model"]
+    digest = sha256((tmp_path / asset.href).read_bytes()).hexdigest()
+    assert asset.extra_fields["file:checksum"] == f"1220{digest}"
+    assert about["restored_network_sha256"] == digest
+    model = mlm.MLMExtension.ext(network)
+    assert model.architecture == "ConvBEERS"
+    assert model.hyperparameters.to_dict() == {"precision": "int8", "sensor": "pleiades-degraded"}
+
+
+def network_item(path: Path) -> Any:
+    """Return the item of a network, valid by the core schema and with all that its extension asks
+    for.
+    """
+    content = json.loads(path.read_text())
+    validation.validate_dict(content, extensions=[])
+    # The extension's schema has these rules besides the fields that it requires, which pystac
+    # refuses to read where they are missing.
+    assert any("mlm:model" in asset["roles"] for asset in content["assets"].values())
+    assert "mlm:pretrained_source" not in content["properties"]
+    item = pystac.Item.from_dict(content)
+    model = mlm.MLMExtension.ext(item)
+    assert re.fullmatch(r"[a-zA-Z][a-zA-Z0-9_.\-\s]+[a-zA-Z0-9]", model.mlm_name)
+    assert model.tasks
+    (image,) = model.input
+    (restored,) = model.output
+    assert len(image.input.shape) == len(image.input.dim_order) == len(restored.result.shape)
+    return item
+
+
+def test_a_network_with_a_file_is_referred_to_where_it_lies(model: Path, tmp_path: Path) -> None:
+    """A name that the extension does not accept is not claimed, nor an architecture."""
+    own = tmp_path / "networks" / "1.onnx"
+    own.parent.mkdir()
+    own.write_bytes(model.read_bytes())
+    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
+    content = restored_item(image, tmp_path / "items" / "a.json", own)
+    require_valid(content)
+    network = network_item(tmp_path / "items" / "a-network.json")
+    assert network.assets["model"].href == "../networks/1.onnx"
+    assert mlm.MLMExtension.ext(network).mlm_name == "network"
+    names = sorted(path.name for path in (tmp_path / "items").iterdir())
+    assert names == ["a-network.json", "a.json"]
+
+
+def test_each_sensor_has_a_network_and_the_traditional_pipeline_has_none(tmp_path: Path) -> None:
+    pixels = images.digital_numbers()
+    image = images.write_tiff(tmp_path / "in.tif", pixels)
+    sensors = "--network convbeers-xs --sensor B0=pleiades-degraded,B1=blind"
+    done(f"restore {image} {tmp_path}/a.tif {sensors} --cog --stac {tmp_path}/a.json")
+    content = json.loads((tmp_path / "a.json").read_text())
+    require_valid(content)
+    names = ["a-network-1.json", "a-network-2.json"]
+    assert content["assets"]["restored"]["processing:expression"]["expression"] == names
+    items = [network_item(tmp_path / name) for name in names]
+    told = [mlm.MLMExtension.ext(item).hyperparameters.to_dict()["sensor"] for item in items]
+    assert told == ["pleiades-degraded", "blind"]
+
+    small = images.write_tiff(tmp_path / "small.tif", np.ascontiguousarray(pixels[:, :24, :24]))
+    how = "--method traditional --quality fast --sensor pleiades-degraded"
+    done(f"restore {small} {tmp_path}/b.tif {how} --cog --stac {tmp_path}/b.json")
+    content = json.loads((tmp_path / "b.json").read_text())
+    require_valid(content)
+    assert content["links"] == []
+    assert "processing:level" not in content["assets"]["restored"]

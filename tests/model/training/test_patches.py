@@ -39,7 +39,7 @@ def test_the_same_seed_gives_the_same_batches_from_anywhere() -> None:
 
 
 def parts(batch: Batch) -> list[torch.Tensor]:
-    return [batch.degraded, batch.reference, *(batch.told.parts if batch.told else ())]
+    return [batch.degraded, batch.reference, *(batch.condition.parts if batch.condition else ())]
 
 
 def equal(one: Batch, other: Batch) -> bool:
@@ -98,9 +98,13 @@ def test_a_turned_patch_comes_with_the_sensor_as_it_lies() -> None:
     )
     ways = set()
     for batch in islice(PatchSource([scene], recipe, 3, 0).batches(), 30):
-        assert batch.told is not None
+        assert batch.condition is not None
         samples = zip(
-            batch.degraded, batch.reference, batch.told.vectors, batch.told.filters, strict=True
+            batch.degraded,
+            batch.reference,
+            batch.condition.vectors,
+            batch.condition.filters,
+            strict=True,
         )
         for one, other, vector, filters in samples:
             across, along = (a / b for a, b in zip(steps(one), steps(other), strict=True))
@@ -114,7 +118,7 @@ def test_a_turned_patch_comes_with_the_sensor_as_it_lies() -> None:
 
 def test_conditioned_patches_come_with_vectors_of_many_sensors_and_the_same_again() -> None:
     first, repeated = ([*islice(source(conditioned=True).batches(k), 20 - k)] for k in (0, 17))
-    vectors = torch.cat([batch.told.vectors for batch in first if batch.told is not None])
+    vectors = torch.cat([batch.condition.vectors for batch in first if batch.condition is not None])
     assert vectors.shape == (60, 4)
     assert float(vectors.std(0).min()) > 0.3
     assert all(equal(one, two) for one, two in zip(first[17:], repeated, strict=True))
@@ -129,8 +133,8 @@ def test_dark_patches_are_those_of_a_brighter_sensor_as_a_restoration_shows_them
     recipe = replace(source().recipe, family=family, looks=looks)
     applied = set()
     for batch in islice(PatchSource([small_scene()], recipe, 3, 0).batches(), 40):
-        assert batch.told is not None
-        for patch, vector in zip(batch.degraded, batch.told.vectors, strict=True):
+        assert batch.condition is not None
+        for patch, vector in zip(batch.degraded, batch.condition.vectors, strict=True):
             low, high = RANGES["sigma_bright"]
             sigma = low * (high / low) ** ((float(vector[3]) + 1) / 2)
             factor = round(sigma / noise_over_full_scale(family.like))

@@ -62,13 +62,13 @@ def test_a_chain_that_gets_to_know_a_sensor_is_the_one_made_for_it(name: str) ->
     dn = np.random.default_rng(0).integers(200, 1800, (40, 47)).astype(np.float32)
     method = method_without_network(name, *SENSORS)
     other = method_without_network(name, OTHER, SENSORS[1].in_units_of(OTHER))
-    restored = method.knowing(OTHER).restore(dn)
+    restored = method.with_sensor(OTHER).restore(dn)
     assert np.array_equal(restored, other.restore(dn))
     assert not np.array_equal(restored, method.restore(dn))
 
 
 def test_who_can_know_a_sensor_says_so_and_what_depends_on_none_stays_as_it_is() -> None:
     for fixed in (method_without_network("degraded", *SENSORS), Method("blind", np.sqrt, BLIND)):
-        assert fixed.knowing(OTHER) is fixed
+        assert fixed.with_sensor(OTHER) is fixed
     method = Method("net", np.sqrt, BLIND, lambda _: np.abs)
-    assert (method.knowing(OTHER).sensor_known, method.sensor_known) == (KNOWN, BLIND)
+    assert (method.with_sensor(OTHER).sensor_known, method.sensor_known) == (KNOWN, BLIND)

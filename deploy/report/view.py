@@ -1,0 +1,97 @@
+"""A view of a run: raw and restored image in one HTML file, to swipe, zoom and compare.
+
+The page needs no server and no network access. It contains OpenSeadragon with its licence, which
+draws tiles that are data: addresses. A browser therefore decodes only the visible tiles.
+"""
+
+import base64
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+from PIL import Image
+
+from beers_deploy import __version__
+from beers_deploy.model.io.files import write_text
+from beers_deploy.report.page import template
+from beers_deploy.report.view_layers import SELF_CHECK, Layer, layers_of
+
+TILE_PX = 512
+QUALITY = 90
+"""Quality of the JPEG tiles, with which 8-bit levels are off by about one."""
+
+VIEWER = Path(__file__).parent / "openseadragon"
+
+
+def write_view(
+    path: Path, image: Path, restored: Path, maps: Mapping[str, Path], trusted: bool
+) -> None:
+    """Write the view of a run, atomically.
+
+    Args:
+        path: of the HTML file.
+        image: the raw image.
+        restored: the image that was made from it.
+        maps: further layers; see `layers_of`.
+        trusted: True if an index may name files outside its folder.
+    """
+    layers, notes = layers_of(image, restored, maps, trusted)
+    page = template("view.html").render(
+        title=f"{image.name}, raw and restored",
+        notes=notes,
+        layers=[_described(layer, layers[0]) for layer in layers],
+        overlay=SELF_CHECK,
+        quality=QUALITY,
+        version=__version__,
+        licence=(VIEWER / "LICENSE.txt").read_text(encoding="utf-8"),
+        viewer=Markup((VIEWER / "openseadragon.min.js").read_text(encoding="utf-8")),  # noqa: S704
+    )
+    write_text(path, page)
+
+
+def _described(layer: Layer, raw: Layer) -> dict[str, Any]:
+    """Return the description of a layer for the page's script."""
+    height, width = layer.pixels.shape[:2]
+    return {
+        "name": layer.name,
+        "width": width,
+        "height": height,
+        # In widths of the raw image as it is shown.
+        "across": width * layer.pixel_px / (raw.pixels.shape[1] * raw.pixel_px),
+        "legend": layer.legend,
+        "tiles": pyramid(Image.fromarray(layer.pixels)),
+    }
+
+
+def pyramid(picture: Image.Image) -> list[list[list[str]]]:
+    """Return the tiles of a picture as data: addresses, by level, row and column.
+
+    Each level has half the size of the next. The first is a single tile, the last the picture.
+    """
+    levels = [picture]
+    while max(levels[0].size) > TILE_PX:
+        levels.insert(0, levels[0].reduce(2))
+    return [_tiles(level) for level in levels]
+
+
+def _tiles(level: Image.Image) -> list[list[str]]:
+    width, height = level.size
+    rows = []
+    for top in range(0, height, TILE_PX):
+        bottom = min(top + TILE_PX, height)
+        row = []
+        for left in range(0, width, TILE_PX):
+            right = min(left + TILE_PX, width)
+            row.append(_address(level.crop((left, top, right, bottom))))
+        rows.append(row)
+    return rows
+
+
+def _address(tile: Image.Image) -> str:
+    """Return a tile as a data: address: PNG with opacity, else JPEG."""
+    buffer = io.BytesIO()
+    kind = "png" if tile.mode == "RGBA" else "jpeg"
+    tile.save(buffer, kind, quality=QUALITY, subsampling=0)
+    return f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode()}"

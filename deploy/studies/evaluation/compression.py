@@ -1,0 +1,304 @@
+"""Restoration on board, before compression, compared with restoration on the ground, after it.
+
+On board the raw image is restored, rounded to the sensor's bits and compressed. On the ground the
+raw image is compressed to the same rate, decompressed and restored. Both are compared with the
+same reference.
+
+The codec is JPEG 2000 with the 9/7 wavelet (OpenJPEG in Pillow). CCSDS 122, the standard for
+satellites, has the same wavelet and a simpler coder.
+
+Restoration on the ground uses a sensor profile with the noise that compression adds. The encoder
+knows the mean squared error of each image, and may send this one number with the image. The
+profile then has the variance beta + share * error / gain^2. With the whole error a restoration
+smooths too much, because much of the error is detail and noise that the codec removed. So four
+shares are tried, and each image is restored with the share that is best on the other sites.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from io import BytesIO
+
+import numpy as np
+from PIL import Image
+
+from beers_deploy.model.metrics.bootstrap import site_interval
+from beers_deploy.model.metrics.fidelity import fidelity_db
+from beers_deploy.model.progress import steps
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.figures import Row, measured
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.studies.evaluation.methods import DEGRADED, Method
+from beers_deploy.studies.evaluation.pairs import NamedPair
+from beers_deploy.studies.evaluation.scores import inner
+
+GAIN = "gain of restoring before compression"
+LOSSLESS = "lossless rate"
+"""The names of the two tables."""
+RATE = "bit/px"
+"""Unit of a rate."""
+
+SHARES = (0.0, 0.25, 0.5, 1.0)
+"""Shares of the compression's error that may count as noise: none first, all last."""
+
+CONTAINER_BITS = 16
+"""Bits of the integers that Pillow writes."""
+CODE_BLOCK_PX = 32
+"""Side of a block that is coded by itself.
+
+With blocks of 64, small images have few rates to choose from. 32 raise the error by 2 %.
+"""
+REQUESTS = tuple(np.linspace(0.975, 1.025, 11).tolist())
+"""Multiples of a rate that are requested. A code consists of whole coding passes, so it rarely has
+the requested rate, and the nearest code counts.
+"""
+
+
+@dataclass(frozen=True)
+class Decompressed:
+    """An image after compression.
+
+    Attributes:
+        dn: digital numbers (H, W) float32.
+        rate: of its code, in bits per pixel.
+    """
+
+    dn: np.ndarray
+    rate: float
+
+
+def check_rates(rates: Iterable[float], bits: int) -> list[float]:
+    """Return the rates without duplicates.
+
+    Args:
+        rates: in bits per pixel.
+        bits: of the sensor.
+
+    Raises:
+        OptionError: a rate is not above 0 and at most the bits of the sensor.
+    """
+    checked = list(dict.fromkeys(rates))
+    for rate in checked:
+        if not 0 < rate <= bits:
+            raise OptionError(
+                f"`bits_per_pixel` must be rates above 0 and at most the {bits} bits of the "
+                f"sensor, but one is {rate:g}. Give rates such as 1,2,3."
+            )
+    return checked
+
+
+def lossless_rate(dn: np.ndarray, bits: int) -> float:
+    """Return the bits per pixel of lossless JPEG 2000, with the reversible 5/3 wavelet.
+
+    Args:
+        dn: digital numbers (H, W), which are rounded.
+        bits: of a digital number.
+    """
+    return 8 * len(_code(_rounded(dn, bits))) / dn.size
+
+
+def decompressed(dn: np.ndarray, rate: float, bits: int) -> Decompressed:
+    """Compress an image, and decompress it.
+
+    Args:
+        dn: digital numbers (H, W), which are rounded.
+        rate: in bits per pixel.
+        bits: of a digital number.
+    """
+    # OpenJPEG controls the rate more finely if the upper bits of the container are used. The error
+    # at a rate is the same within 0.5 %.
+    unit = 2 ** (CONTAINER_BITS - bits)
+    image = _rounded(dn, bits) * np.uint16(unit)
+    codes = [
+        # Pillow expects the compression ratio of the container.
+        _code(
+            image,
+            irreversible=True,
+            quality_mode="rates",
+            quality_layers=[CONTAINER_BITS / (rate * request)],
+        )
+        for request in REQUESTS
+    ]
+    nearest = min(codes, key=lambda code: abs(8 * len(code) / dn.size - rate))
+    with Image.open(BytesIO(nearest)) as opened:
+        levels = np.rint(np.asarray(opened, np.float32) / np.float32(unit))
+    return Decompressed(np.minimum(levels, 2**bits - 1), 8 * len(nearest) / dn.size)
+
+
+def _rounded(dn: np.ndarray, bits: int) -> np.ndarray:
+    """Return digital numbers as the integers of a sensor, uint16."""
+    return np.asarray(np.clip(np.rint(dn), 0, 2**bits - 1), np.uint16)
+
+
+def _code(image: np.ndarray, **options: object) -> bytes:
+    buffer = BytesIO()
+    block = (CODE_BLOCK_PX, CODE_BLOCK_PX)
+    # The code stream alone: the boxes of a JP2 file would count as rate.
+    Image.fromarray(image).save(buffer, "JPEG2000", no_jp2=True, codeblock_size=block, **options)
+    return buffer.getvalue()
+
+
+def with_noise(sensor: Instrument, variance_dn2: float) -> Instrument:
+    """Return a sensor with more noise, the same at every radiance.
+
+    Args:
+        sensor: as it is.
+        variance_dn2: of the noise that is added.
+    """
+    return replace(sensor, beta=sensor.beta + variance_dn2 / sensor.gain_dn_per_radiance**2)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """PSNRs and rates of a method at one rate, image by image.
+
+    Attributes:
+        board_db: PSNR of the images restored on board, (N,).
+        ground_db: PSNR of those restored on the ground, by the share of the error that counts as
+            noise, (S, N); of a method that uses no sensor profile, S is 1.
+        rates: of the codes on board and on the ground, in bits per pixel, (2, N).
+        error_dn2: mean squared error of the images that reach the ground, (N,).
+        sites: of the images, (N,).
+    """
+
+    board_db: np.ndarray
+    ground_db: np.ndarray
+    rates: np.ndarray
+    error_dn2: np.ndarray
+    sites: Sequence[str]
+
+    @property
+    def chosen(self) -> np.ndarray:
+        """The number of the share that each image is restored with, (N,)."""
+        sites = np.asarray(self.sites)
+        numbers = np.empty(len(sites), int)
+        for site in np.unique(sites):
+            here = sites == site
+            # A single site has no others, so its own images choose, which favours the ground.
+            judges = here if here.all() else ~here
+            numbers[here] = self.ground_db[:, judges].mean(1).argmax()
+        return numbers
+
+    def row(self, name: str, seed: int) -> Row:
+        """Return the row of the table; the seed is that of the bootstrap."""
+        shares = self.chosen
+        ground = self.ground_db[shares, np.arange(len(shares))]
+        gain = self.board_db - ground
+        source = f"mean of {len(gain)} pairs"
+        interval, words = site_interval(gain.tolist(), self.sites, np.random.default_rng(seed))
+        figures = {
+            "on board minus on the ground": measured(
+                float(gain.mean()), "dB", f"{source}, {words}", interval
+            )
+        }
+        means = {
+            "restored on board": (self.board_db, "dB"),
+            "restored on the ground": (ground, "dB"),
+            "on the ground, sensor as it is": (self.ground_db[0], "dB"),
+            "on the ground, whole error as noise": (self.ground_db[-1], "dB"),
+            "rate on board": (self.rates[0], RATE),
+            "rate on the ground": (self.rates[1], RATE),
+        }
+        for key, (values, unit) in means.items():
+            figures[key] = measured(float(values.mean()), unit, source)
+        apart = np.abs(self.rates[0] / self.rates[1] - 1).max()
+        figures["rates of an image differ by up to"] = measured(
+            100 * float(apart), "%", f"largest of {len(gain)} pairs"
+        )
+        error_dn = float(np.sqrt(self.error_dn2.mean()))
+        figures["error of compression"] = measured(error_dn, "DN", f"root of the {source}")
+        used = sorted({f"{SHARES[number]:.0%}" for number in shares})
+        return Row(GAIN, name, figures, {"share of the error as noise": ", ".join(used)})
+
+
+def run_compression(
+    methods: Sequence[Method],
+    pairs: Sequence[NamedPair],
+    sensor: Instrument,
+    rates: Sequence[float],
+    seed: int,
+) -> list[Row]:
+    """Restore images on board and on the ground, at each rate.
+
+    Args:
+        methods: the methods; the degraded input is left out.
+        pairs: of images.
+        sensor: the sensor that acquired the images.
+        rates: in bits per pixel; without any, no row is returned.
+        seed: of the bootstrap.
+
+    Returns:
+        A row for each method and rate, then one for each method with its lossless rates.
+    """
+    received = {
+        rate: _all_decompressed([p.degraded for p in pairs], rate, sensor) for rate in rates
+    }
+    restoring = [method for method in methods if method.name != DEGRADED] if rates else []
+    rows = list[Row]()
+    lossless = list[Row]()
+    with steps("compression", len(restoring) * len(rates)) as bar:
+        for method in restoring:
+            restored = [method.restore(pair.degraded) for pair in pairs]
+            lossless.append(_lossless_row(method.name, pairs, restored, sensor.bits))
+            for rate, raw in received.items():
+                trial = try_method(method, pairs, restored, raw, rate, sensor)
+                rows.append(trial.row(f"{method.name}, {rate:g} {RATE}", seed))
+                bar.advance()
+    return [*rows, *lossless]
+
+
+def try_method(
+    method: Method,
+    pairs: Sequence[NamedPair],
+    restored: Sequence[np.ndarray],
+    raw: Sequence[Decompressed],
+    rate: float,
+    sensor: Instrument,
+) -> Trial:
+    """Compare both orders of a method at one rate.
+
+    Args:
+        method: the method that restores.
+        pairs: of images.
+        restored: the degraded images of the pairs, restored.
+        raw: the same images, decompressed.
+        rate: in bits per pixel.
+        sensor: the sensor that acquired the images.
+    """
+    sent = _all_decompressed(restored, rate, sensor)
+    shares = SHARES if method.specialise else SHARES[:1]
+    board = np.empty(len(pairs))
+    ground = np.empty((len(shares), len(pairs)))
+    errors = np.empty(len(pairs))
+    for number, (pair, image) in enumerate(zip(pairs, raw, strict=True)):
+        board[number] = _psnr_db(sent[number].dn, pair, sensor)
+        errors[number] = np.mean((image.dn - pair.degraded) ** 2, dtype=np.float64)
+        for k, share in enumerate(shares):
+            with_sensor = (
+                method.with_sensor(with_noise(sensor, share * errors[number])) if share else method
+            )
+            ground[k, number] = _psnr_db(with_sensor.restore(image.dn), pair, sensor)
+    rates = [[image.rate for image in images] for images in (sent, raw)]
+    return Trial(board, ground, np.array(rates), errors, [pair.site for pair in pairs])
+
+
+def _all_decompressed(
+    images: Sequence[np.ndarray], rate: float, sensor: Instrument
+) -> list[Decompressed]:
+    return [decompressed(image, rate, sensor.bits) for image in images]
+
+
+def _psnr_db(dn: np.ndarray, pair: NamedPair, sensor: Instrument) -> float:
+    """Return the PSNR of inner pixels against the reference, without its noise if that is known."""
+    truth = pair.reference if pair.noise_free is None else pair.noise_free
+    return fidelity_db(inner(dn), inner(truth), inner(pair.degraded), sensor.max_dn)
+
+
+def _lossless_row(
+    name: str, pairs: Sequence[NamedPair], restored: Sequence[np.ndarray], bits: int
+) -> Row:
+    images = {"raw": [pair.degraded for pair in pairs], "restored": restored}
+    figures = {}
+    for key, several in images.items():
+        rates = [lossless_rate(image, bits) for image in several]
+        figures[key] = measured(float(np.mean(rates)), RATE, f"mean of {len(rates)} images")
+    return Row(LOSSLESS, name, figures)

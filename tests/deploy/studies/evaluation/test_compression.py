@@ -1,0 +1,272 @@
+"""Restoration before and after compression: the codec, the noise of the profile, and the tables."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rasterio.io import MemoryFile
+from rasterio.transform import Affine
+
+from beers_deploy.model.metrics.fidelity import psnr_db
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.restoration.method import Restore
+from beers_deploy.studies.evaluation.compression import (
+    GAIN,
+    LOSSLESS,
+    SHARES,
+    Trial,
+    check_rates,
+    decompressed,
+    lossless_rate,
+    run_compression,
+    try_method,
+    with_noise,
+)
+from beers_deploy.studies.evaluation.methods import Method
+from beers_deploy.studies.evaluation.pairs import NamedPair
+from beers_deploy.studies.evaluation.scores import inner
+from beers_deploy.verbs.evaluate import evaluate
+from tests.deploy.command_line import done, refused
+from tests.deploy.documents import valid
+from tests.deploy.studies.evaluation.small_pairs import (
+    IDENTITY,
+    SENSORS,
+    few_targets,
+    pair,
+    write_pairs,
+)
+
+SENSOR = SENSORS[0]
+RATE = 2.0
+
+
+def scene(seed: int = 0, height: int = 128, width: int = 101, top: int = 4095) -> np.ndarray:
+    """Return waves under noise, from near 0 to near `top`."""
+    generator = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:height, :width]
+    waves = np.sin(rows / 5) * np.sin(columns / 7 + seed)
+    noisy = waves * 0.4 + 0.5 + generator.normal(0, 0.01, waves.shape)
+    return np.asarray(np.rint(top * np.clip(noisy, 0, 1)), np.float32)
+
+
+def seen(name: str, seed: int) -> NamedPair:
+    """Return a pair whose reference without noise is the degraded image less 10 DN."""
+    dn = scene(seed)
+    return NamedPair(name, dn, dn, noise_free=np.maximum(dn - 10, 0))
+
+
+def rms_dn(image: np.ndarray, other: np.ndarray) -> float:
+    return float(np.sqrt(np.mean((image.astype(np.float64) - other) ** 2)))
+
+
+def half(dn: np.ndarray) -> np.ndarray:
+    return dn / 2
+
+
+@pytest.mark.parametrize("bits", [8, 12, 16])
+def test_a_rate_is_kept_and_more_of_it_is_better(bits: int) -> None:
+    dn = scene(top=2**bits - 1)
+    images = [decompressed(dn, rate, bits) for rate in (1, 2, 4)]
+    assert [image.rate for image in images] == pytest.approx([1, 2, 4], rel=0.03)
+    errors = [rms_dn(image.dn, dn) for image in images]
+    assert errors[0] > errors[1] > errors[2]
+    for image in images:
+        assert np.array_equal(image.dn, np.rint(image.dn))
+        assert 0 <= image.dn.min() <= image.dn.max() <= 2**bits - 1
+
+
+def test_clipped_and_fractional_pixels_are_those_of_the_sensor() -> None:
+    outside = scene() * 1.5 - 1000.3
+    integers = np.clip(np.rint(outside), 0, 4095)
+    assert np.array_equal(decompressed(outside, RATE, 12).dn, decompressed(integers, RATE, 12).dn)
+
+
+@pytest.mark.parametrize("rate", [1, 3])
+def test_the_codec_is_as_good_as_one_of_twelve_bits(rate: float) -> None:
+    """GDAL writes the bits of the sensor, Pillow a container of sixteen; both are OpenJPEG."""
+    dn = scene(height=256, width=256)
+    options = {"NBITS": 12, "QUALITY": 100 * rate / 12, "REVERSIBLE": "NO", "RESOLUTIONS": 6}
+    grid = Affine.translation(1, 1)
+    shape = {"height": 256, "width": 256, "count": 1, "dtype": "uint16", "transform": grid}
+    with MemoryFile(ext=".j2k") as file:
+        with file.open(driver="JP2OpenJPEG", CODEC="J2K", **shape, **options) as written:
+            written.write(dn.astype(np.uint16), 1)
+        own_rate = 8 * len(file.getbuffer()) / dn.size
+        with file.open() as read:
+            other = read.read(1)
+    ours = decompressed(dn, rate, 12)
+    assert ours.rate == pytest.approx(own_rate, rel=0.02)
+    assert rms_dn(ours.dn, dn) < 1.05 * rms_dn(other, dn)
+
+
+def test_the_lossless_rate_grows_with_noise() -> None:
+    smooth = scene()
+    noisy = np.random.default_rng(0).integers(0, 4096, smooth.shape)
+    assert lossless_rate(np.zeros_like(smooth), 12) < 0.1
+    assert 5 < lossless_rate(smooth, 12) < 10
+    assert lossless_rate(noisy, 12) > 12
+
+
+def trial_of(method: Method, pairs: list[NamedPair]) -> Trial:
+    restored = [method.restore(item.degraded) for item in pairs]
+    raw = [decompressed(item.degraded, RATE, 12) for item in pairs]
+    return try_method(method, pairs, restored, raw, RATE, SENSOR)
+
+
+def test_on_board_is_compressed_after_and_on_the_ground_before_restoration() -> None:
+    one = seen("a", 0)
+    trial = trial_of(Method("half", half, "blind"), [one])
+
+    def inner_db(dn: np.ndarray) -> float:
+        assert one.noise_free is not None
+        return psnr_db(inner(dn), inner(one.noise_free), 4095)
+
+    raw = decompressed(one.degraded, RATE, 12)
+    board = decompressed(half(one.degraded), RATE, 12)
+    assert trial.board_db[0] == pytest.approx(inner_db(board.dn))
+    assert trial.ground_db.tolist() == [[pytest.approx(inner_db(half(raw.dn)))]]
+    assert trial.rates[:, 0].tolist() == [board.rate, raw.rate]
+    assert trial.board_db[0] != trial.ground_db[0, 0]
+
+
+def telling(given: list[Instrument]) -> Method:
+    """Return a method that records the sensors it is given, and restores as well with each."""
+
+    def specialise(sensor: Instrument) -> Restore:
+        given.append(sensor)
+        return lambda dn: dn
+
+    return Method("telling", lambda dn: dn, "known", specialise)
+
+
+def test_the_noise_of_the_profile_grows_by_shares_of_the_measured_error() -> None:
+    given: list[Instrument] = []
+    pairs = [seen("a", 0), seen("b", 1)]
+    trial = trial_of(telling(given), pairs)
+    expected = []
+    for item in pairs:
+        error = rms_dn(decompressed(item.degraded, RATE, 12).dn, item.degraded) ** 2
+        expected += [share * error for share in SHARES[1:]]
+    gain = SENSOR.gain_dn_per_radiance
+    assert [gain**2 * (sensor.beta - SENSOR.beta) for sensor in given] == pytest.approx(expected)
+    assert {(sensor.alpha, sensor.mtf_axes) for sensor in given} == {
+        (SENSOR.alpha, SENSOR.mtf_axes)
+    }
+    assert trial.error_dn2 * SHARES[-1] == pytest.approx(expected[2::3])
+
+
+def test_noise_is_added_at_every_radiance() -> None:
+    noisier = with_noise(SENSOR, 100.0)
+    for radiance in (0, 25, 100):
+        variances = (gain_dn2(sensor.noise_sigma(radiance)) for sensor in (noisier, SENSOR))
+        assert next(variances) - next(variances) == pytest.approx(100)
+
+
+def gain_dn2(sigma: float) -> float:
+    return (SENSOR.gain_dn_per_radiance * sigma) ** 2
+
+
+def trial(ground: list[list[float]], sites: str, board: float = 40.0) -> Trial:
+    count = len(sites)
+    level = np.linspace(0, 20, count)
+    ones = np.ones(count)
+    return Trial(
+        ones * board + level, np.array(ground) + level, np.stack([ones, ones]), ones, list(sites)
+    )
+
+
+@pytest.mark.parametrize(
+    ("sites", "whole_at_a", "chosen"),
+    [
+        ("aabcd", 38.0, [1, 1, 1, 1, 1]),
+        ("aabcd", 0.0, [1, 1, 0, 0, 0]),
+        ("aaaaa", 0.0, [0, 0, 0, 0, 0]),
+    ],
+)
+def test_other_sites_choose_the_share(sites: str, whole_at_a: float, chosen: list[int]) -> None:
+    """Site a is best without more noise, whatever the others need; one site alone decides."""
+    ground = [[39.0] * 2 + [30.0] * 3, [whole_at_a] * 2 + [33.0] * 3]
+    assert trial(ground, sites).chosen.tolist() == chosen
+
+
+def test_the_interval_of_the_gain_is_that_of_differences_on_the_same_images() -> None:
+    row = trial([[39.0] * 5, [38] * 5], "abcde").row("net", 0)
+    gain = row.figures["on board minus on the ground"]
+    assert gain.value == pytest.approx(1)
+    assert gain.interval == pytest.approx((1, 1))
+    assert row.figures["restored on board"].interval is None
+    whole = row.figures["on the ground, whole error as noise"]
+    assert whole.value == pytest.approx(48)
+    assert row.text == {"share of the error as noise": "0%"}
+
+
+def test_rates_that_differ_are_reported() -> None:
+    one = trial([[39.0] * 2, [38] * 2], "ab")
+    apart = replace(one, rates=np.array([[1.0, 0.98], [1, 1]])).row("net", 0).figures
+    assert apart["rates of an image differ by up to"].value == pytest.approx(2)
+    assert apart["rate on board"].value == pytest.approx(0.99)
+
+
+@pytest.mark.parametrize("specialised", [True, False])
+def test_a_method_without_a_sensor_is_run_once(specialised: bool) -> None:
+    method = telling([]) if specialised else Method("telling", lambda dn: dn, "blind")
+    assert len(trial_of(method, [seen("a", 0)]).ground_db) == (len(SHARES) if specialised else 1)
+
+
+def test_there_is_a_row_for_each_method_and_rate_but_the_input() -> None:
+    methods = [IDENTITY, Method("half", half, "blind")]
+    rows = run_compression(methods, [seen("a", 0)], SENSOR, [1.0, 2.5], 0)
+    assert [(row.table, row.name) for row in rows] == [
+        (GAIN, "half, 1 bit/px"),
+        (GAIN, "half, 2.5 bit/px"),
+        (LOSSLESS, "half"),
+    ]
+    rates = [rows[2].figures[key].value or 0 for key in ("restored", "raw")]
+    assert 0 < rates[0] < rates[1]
+    assert run_compression(methods, [seen("a", 0)], SENSOR, [], 0) == []
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, 12.5, float("nan"), float("inf")])
+def test_a_rate_that_no_code_has_is_refused(rate: float) -> None:
+    assert check_rates([2, 12, 2], 12) == [2, 12]
+    with pytest.raises(OptionError, match="above 0 and at most the 12 bits of the sensor"):
+        check_rates([1, rate], 12)
+
+
+@pytest.mark.parametrize(
+    ("rates", "message"),
+    [
+        ("0", "--bits-per-pixel must be rates above 0 and at most the 12 bits of the sensor"),
+        ("1,two", "--bits-per-pixel must be numbers separated by commas, such as 1,2,3"),
+    ],
+)
+def test_a_wrong_rate_is_one_sentence(rates: str, message: str, tmp_path: Path) -> None:
+    folder = write_pairs(tmp_path, [pair("a_1.tif")])
+    output = refused(
+        "evaluate", "--pairs", folder, "--methods", "wiener", "--bits-per-pixel", rates
+    )
+    assert output.startswith(f"beers-deploy: {message}")
+
+
+def test_rates_without_a_restoration_have_no_effect() -> None:
+    with pytest.raises(OptionError, match="`bits_per_pixel` has no effect"):
+        evaluate(methods="degraded", bits_per_pixel="2")
+
+
+def test_the_command_compares_stored_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few_targets(monkeypatch)
+    folder = write_pairs(tmp_path / "pairs", [pair("a_1.tif", 1), pair("b_1.tif", 2)])
+    files = "--json", tmp_path / "e.json", "--out", tmp_path / "out"
+    done("evaluate --methods traditional-fast --bits-per-pixel 6 --pairs", folder, *files)
+    rows: list[dict[str, Any]] = [
+        row for row in valid(tmp_path / "e.json")["rows"] if row["table"] in (GAIN, LOSSLESS)
+    ]
+    assert [row["name"] for row in rows] == ["traditional-fast, 6 bit/px", "traditional-fast"]
+    figures = rows[0]["figures"]
+    values = {key: figure["value"] for key, figure in figures.items()}
+    difference = values["restored on board"] - values["restored on the ground"]
+    assert values["on board minus on the ground"] == pytest.approx(difference)
+    assert "Gain of restoring before compression" in (tmp_path / "out/report.html").read_text()
