@@ -50,8 +50,8 @@ def factors_for(sensor: Instrument) -> tuple[int, ...]:
     """Return the factors that a network conditioned on `sensor` can use, 1 among them, in rising
     order.
 
-    A factor raises the noise over full scale. A factor is left out if the noise leaves the range of
-    training by more than NOISE_BEYOND.
+    A factor raises the noise over full scale. It is excluded if the noise exceeds the training
+    range by more than NOISE_BEYOND.
     """
     usable = [factor for factor in FACTORS if _within_training(sensor, factor)]
     return (1, *usable[-MOST_FACTORS:])

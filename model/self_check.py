@@ -47,9 +47,7 @@ the radius (measured on a drawn scene of 480 DN rms).
 """
 
 LEAST_TERM = 1e-5
-"""Share of the largest term below which the kernel's terms are left out. They sum to 0.001
-(measured).
-"""
+"""Terms of the kernel below this share of the largest are omitted. They sum to 0.001 (measured)."""
 
 NEAR_PX = 16
 """Pixels this close to a missing or saturated one, or to the image's border, do not count: 2 % of

@@ -1,10 +1,10 @@
 """Open images by windows with GDAL: TIFF, PNG, JPEG, JPEG 2000, NITF, HFA, ENVI, and the indexes
-VRT and DIMAP that make one image of many tiles.
+VRT and DIMAP that combine many tiles to one image.
 
-GDAL chooses among all of its drivers by content, follows what a file names, and knows the network.
-Here the suffix chooses the driver, an index and its tiles are checked before GDAL opens them
-(`model.raster.index`), and all files that GDAL reports afterwards must lie in the image's folder,
-unless the user trusts the index.
+GDAL chooses among all of its drivers by content, opens files that a file names, and can use the
+network. Here the suffix selects the driver, and an index and its tiles are checked before GDAL
+opens them (`model.raster.index`). All files that GDAL reports afterwards must lie in the image's
+folder, unless the user trusts the index.
 """
 
 import logging

@@ -1,8 +1,8 @@
 """Write images: TIFFs by rows, from rows that are read twice; and Cloud-Optimised GeoTIFFs.
 
-GDAL compresses in threads, which lose the errors of a full disk, and it writes the last blocks when
-the file is closed, where rasterio reports none. So a file that was written is read again and
-compared with what it was written from.
+GDAL compresses in threads, which lose the errors of a full disk. It writes the last blocks when the
+file is closed, for which rasterio reports no errors. A written file is therefore read again and
+compared with the given pixels.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -118,10 +118,10 @@ class Scene:
 def read_scene(path: Path, sensor: Instrument) -> Scene:
     """Read a scene from an image file.
 
-    1. 8-bit RGB or mono: sRGB, linearised, the bands averaged (a panchromatic band weighs the
-      visible evenly: an assumption); white stands for the sensor's full scale.
-    2. 16-bit mono TIFF or PNG: digital numbers, made radiance by the sensor's gain.
-    3. float mono TIFF: radiance in W/m2/sr/um as it stands.
+    1. 8-bit RGB or mono: sRGB, linearised, the bands averaged (it is assumed that a panchromatic
+       band weights the visible evenly); white corresponds to the sensor's full scale.
+    2. 16-bit mono TIFF or PNG: digital numbers, converted to radiance by the sensor's gain.
+    3. float mono TIFF: radiance in W/m2/sr/um.
     """
     return scene_of(path.name, read_pixels(path), sensor)
 

@@ -86,7 +86,7 @@ def _deconvolved(
     """Undo the degraded MTF on mirrored borders, at a scale of 1 for full scale, and blur to the
     reference's.
 
-    `deconvolve` takes an image (H, W) and the half spectrum of its blur, (H, W // 2 + 1).
+    `deconvolve` accepts an image (H, W) and the half spectrum of its blur, (H, W // 2 + 1).
     """
     full_scale = chain.degraded.max_dn / chain.degraded.gain_dn_per_radiance
     rows, columns = (mirrored(-PAD_PX, size + PAD_PX, size) for size in dn.shape)

@@ -26,11 +26,11 @@ class Node:
     """An operator, in ONNX's words.
 
     Attributes:
-        op_type: its operator, as `quant.domains.operator_name` spells it.
+        op_type: its operator, as `quant.domains.operator_name` returns it.
         name: its own name, or that of its first result.
-        inputs: the tensors it reads; one that is left out has an empty name.
+        inputs: the tensors it reads; an omitted one has an empty name.
         outputs: the tensors it writes.
-        attributes: those that it states, text as such.
+        attributes: those that it states, strings decoded.
         proto: the message it was read from; inputs and outputs may have changed since.
     """
 

@@ -1,8 +1,9 @@
-"""Views: which ground a simulated patch shows, in which light, and the sensors that see it.
+"""Define views: the ground that a simulated patch shows, its light, and the sensors that acquire
+it.
 
-Scenes as they are drawn leave most of the sensor's range empty: 2 pixels in 100 000 lie above 0.7
-of full scale. A network that clips bright ground then passes the gate, and a network calibrated on
-them does clip it. So a stated share of the patches is lit as on a dark day, up to full scale, and
+Drawn scenes leave most of the sensor's range empty: 2 pixels in 100 000 lie above 0.7 of full
+scale. A network that clips bright ground then passes the gate, and a network calibrated on them
+does clip it. A stated share of the patches is therefore lit as on a dark day, up to full scale, and
 beyond it.
 """
 
@@ -37,10 +38,10 @@ Lightings = Mapping[str, float]
 """Ways to light the ground, and the share of the patches that are lit so."""
 
 CALIBRATION: Lightings = {"as drawn": 13 / 16, "bright": 2 / 16, "dark": 1 / 16}
-"""Up to full scale, but not beyond: at the edge of a saturated area a network corrects much and in
-vain, because the result is clipped, and steps that hold such corrections are coarser everywhere.
-With a sixteenth of saturated patches a DnCNN lost 0.2 dB more on photographs; with a quarter of
-bright and an eighth of saturated ones a U-Net lost 0.41 dB instead of 0.17 (measured).
+"""Up to full scale, but not beyond. At the edge of a saturated area the corrections of a network
+are large and useless, because the result is clipped, and they make steps coarser everywhere. With a
+sixteenth of saturated patches a DnCNN lost 0.2 dB more on photographs. With a quarter of bright and
+an eighth of saturated ones a U-Net lost 0.41 dB instead of 0.17 (measured).
 """
 JUDGING: Lightings = {
     "as drawn": 12 / 16,
