@@ -58,7 +58,7 @@ NATURAL_PX = 0.3
 objects next to them make them appear; it widens the interval.
 """
 MOST_FITTED = 600
-"""The maximum number of edges that are fitted; of more, a regular subset is used."""
+"""If there are more edges, every n-th one is fitted, such that at least this number is."""
 FEW_EDGES = 7
 """Up to this number of edges, strips along the edges are drawn; with more, whole edges."""
 EVEN = 0.012

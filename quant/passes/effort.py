@@ -38,9 +38,9 @@ group are divided.
 """
 FEWEST_GROUPS = 8
 FEWEST_CROPS = 24
-"""With fewer crops much of the gain was lost (measured). This number may therefore exceed the
-likely work: a quarter with 4 groups in a U-Net, all with 12 crops of 64 pixels in a residual
-network.
+"""With fewer groups or crops much of the gain was lost (measured). The likely work may therefore be
+exceeded: a quarter of the gain with 4 groups in a U-Net, all of it with 12 crops of 64 pixels in a
+residual network.
 """
 LIKELY_WORK = 7e11
 MOST_WORK = 2e12

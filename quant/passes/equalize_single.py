@@ -57,8 +57,8 @@ FEW_TENSORS = 4
 
 EVERY = 8
 CLEARLY = 1.1
-"""A guess is tried on a subset of the crops first, and rejected if its error there is larger by
-this factor.
+"""A guess is tried on every EVERY-th crop first, and rejected if its error there is larger by the
+factor CLEARLY.
 """
 
 
