@@ -1,17 +1,17 @@
-"""The science: what is computed on images, and the networks.
+"""The science: computations on images, and the networks.
 
-It imports `profiles` and nothing else of ours.
+It imports `profiles` and nothing else of this project.
 
 - `convbeers`: the network, plain and behind the bank of a sensor's filters (`bank`); `family`: the
-  sensors that the latter is trained on, and what it is told of each;
-- `simulator`: from a scene's radiance to digital numbers; `traditional`: the pipeline that a
-  network has to beat;
-- `dataset`: pairs on disk, and the sensors and scenes that made them; `training`: runs that make
+  sensors that the latter is trained on, and the sensor vector that it is conditioned on;
+- `simulator`: from a scene's radiance to digital numbers; `traditional`: the baseline pipeline
+  without training;
+- `dataset`: pairs on disk, and the sensors and scenes that made them; `training`: runs that produce
   weights;
-- `metrics`: what a restored image is worth;
-- `io`: images and tensors on disk; `shipped`: where our weights lie; `processor`: what this
-  machine's kernels do;
-- `progress`: what long work shows, and how Ctrl-C stops it.
+- `metrics`: the quality of a restored image;
+- `io`: images and tensors on disk; `shipped`: the location of the shipped weights; `processor`: the
+  behaviour of this machine's kernels;
+- `progress`: progress reports of long work, and how Ctrl-C stops it.
 
-It offers no names of its own, so that finding a file or reading an image loads no torch.
+It exports no names itself, so that finding a file or reading an image does not load torch.
 """

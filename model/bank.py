@@ -1,8 +1,10 @@
-"""What a sensor's blur and noise ask for, in closed form: the filters of a network's first layer.
+"""Compute the filters of a network's first layer in closed form, from the blur and noise of a
+sensor.
 
-Of a sensor: H(f) its transfer, sigma its noise over full scale at a quarter of full scale, rounding
-counted. Of the reference: T(f). r = |f| / f_Nyquist. Four restorations, each more cautious than the
-one before, and what lies between them and the image itself, cut to 7 x 7:
+The sensor has the transfer function H(f) and the noise sigma. Sigma is the standard deviation over
+full scale at a quarter of full scale, rounding included. The reference has T(f), and r = |f| /
+f_Nyquist. Four restorations W_k, each more cautious than the one before, and the image itself (W_4)
+are subtracted from each other and fitted to 7 x 7:
 
     W_k = T conj(H) / (|H|^2 + eps_k r^2),   eps_k = 1.32 sigma 4^(k-1),   k = 0..3,   W_4 = 1
     D_k = W_k - W_(k+1), of sum 0
@@ -11,12 +13,12 @@ one before, and what lies between them and the image itself, cut to 7 x 7:
     y_0 = x + (D_1 + D_2 + D_3) x            the analytic restoration W_1 x
     g   = 20 sigma ||D_1 + D_2 + D_3||       the unit of what a network adds to it
 
-A network that reads x and u and gives `y_0 + g * body` is the same for every sensor. (Wiener
-filters in front of a network: Dong, Roth and Schiele, NeurIPS 2020.) This is NumPy alone, so that a
-restoration begins without torch.
+A network that reads x and u and returns `y_0 + g * body` is the same for every sensor. (Wiener
+filters in front of a network: Dong, Roth and Schiele, NeurIPS 2020.) This module uses NumPy only,
+so that a restoration starts without loading torch.
 
-Networks of before 7 x 7 kernels were fitted read filters that are cut to that size. They keep them
-until they are trained anew.
+Networks trained before the 7 x 7 kernels were fitted use filters that are cut to that size. They
+keep them until they are retrained.
 """
 
 from dataclasses import dataclass, replace
@@ -36,40 +38,44 @@ from beers_deploy.profiles.shipped import REFERENCE
 
 FILTERS = 4
 SIDE_PX = 7
-"""7 x 7 holds 98.6 to 99.95 % of a filter's energy, and is the largest square that the window of a
-DPU takes.
+"""Side of a kernel. 7 x 7 contains 98.6 to 99.95 % of a filter's energy, and is the largest square
+that the window of a DPU accepts.
 """
 
 GRID = 64
-"""Frequencies along an axis. Finer ones move no tap by more than 3e-4 of a filter's largest."""
+"""The number of frequencies along an axis. A finer grid changes no tap by more than 3e-4 of the
+largest tap.
+"""
 
 EPSILON_PER_SIGMA = 1.32
 STEP = 4.0
 """Regularisation at Nyquist of W_1, over sigma, and from each filter to the next."""
 
 UNIT = 20.0
-"""Standard deviations of noise that make a plane's 1."""
+"""The number of standard deviations of noise that correspond to 1 in a plane."""
 
 UNIT_STEPS = 24
-"""In which int8 holds a unit: sixteen would hold all that training saw, but their coarser steps
-cost more than what 24 clip.
+"""The number of int8 steps per unit. 16 would represent every value of the training data, but its
+coarser steps cost more accuracy than the clipping with 24.
 """
 
 LARGEST = 127 / UNIT_STEPS
-"""Planes are held to so many units: few edges leave more, and what no sensor makes, as
-checkerboards, must not.
+"""Planes are clipped to this number of units. Few edges exceed it. Patterns that no sensor
+produces, such as checkerboards, must not.
 """
 
 SIGMA = 0.0016
-"""Noise over full scale of sensors with a gain of 1: unseen photographs lost least with it."""
+"""Noise over full scale of sensors with a gain of 1. This value had the smallest loss on unseen
+photographs.
+"""
 
 GAINS = 0.5, 2.0
-"""The smallest and the largest: with more, the image itself would not fit int8."""
+"""The smallest and the largest gain. With a larger one the image itself would not fit int8."""
 
 WIDE = 4
-"""How many times as far the analytic restoration reaches behind fitted kernels: what a network adds
-to an image must not end at a fifth of full scale, as a point of light or the edge of a saturated
-area asks for more.
+"""The clipping range of the analytic restoration behind fitted kernels, relative to that of the
+planes. The correction of an image may exceed a fifth of full scale, for example at a point of light
+or at the edge of a saturated area.
 """
 
 
@@ -84,25 +90,26 @@ class Bank:
 
     @cached_property
     def units(self) -> NDArray[np.float64]:
-        """20 sigma n_k, (4,): the share of full scale that is 1 in plane k."""
+        """20 sigma n_k, shape (4,): the share of full scale that corresponds to 1 in plane k."""
         return np.asarray(UNIT * self.sigma * np.sqrt(np.square(self.details).sum((1, 2))))
 
     @property
     def gain(self) -> float:
-        """How many times finer than 1/24 of a unit a sensor's steps are, and than 32 the image's:
-        whole eighths.
+        """The factor by which quantization steps are finer than 1/24 of a unit, and those of the
+        image finer than 1/32.
 
-        The image's one weight, which no copy corrects, is a whole number so.
+        It is rounded to eighths, so that the single weight of the image is an integer: no
+        duplicated channel corrects its rounding.
         """
         # In eighths the image's one weight is an integer in INT8. No copy would correct its
         # rounding.
         return float(np.clip(np.rint(8 * self.sigma / SIGMA) / 8, *GAINS))
 
     def reach(self, kernels: Kernels) -> tuple[float, float]:
-        """The units to which the planes and the analytic restoration are held: as far as int8 holds
-        them.
+        """Return the limits in units to which the planes and the analytic restoration are clipped.
 
-        Networks behind cut kernels were trained as if every sensor had a gain of 1.
+        They are the range of int8. Networks with cut kernels were trained as if every sensor had a
+        gain of 1.
         """
         if kernels == "cut":
             return LARGEST, LARGEST
@@ -115,30 +122,39 @@ class Bank:
 
     @property
     def analytic(self) -> NDArray[np.float64]:
-        """D_1 + D_2 + D_3, (7, 7): what the analytic restoration adds to the image."""
+        """D_1 + D_2 + D_3, shape (7, 7): the kernel that the analytic restoration adds to the
+        image.
+        """
         return np.asarray(self.details[1:].sum(0))
 
     @cached_property
     def filters(self) -> NDArray[np.float64]:
-        """The kernels of the four planes, and of (W_1 - 1) x / g: (5, 7, 7)."""
+        """The kernels of the four planes and of (W_1 - 1) x / g, shape (5, 7, 7)."""
         return np.concatenate([self.planes, self.analytic[None] / self.unit])
 
     @property
     def kernels(self) -> NDArray[np.float64]:
-        """What a network reads of the image: itself, and what `filters` make of it: (6, 7, 7)."""
+        """All kernels that a network applies to the image: the identity and `filters`, shape (6, 7,
+        7).
+        """
         itself = np.zeros((1, SIDE_PX, SIDE_PX))
         itself[0, SIDE_PX // 2, SIDE_PX // 2] = 1
         return np.concatenate([itself, self.filters])
 
     @property
     def unit(self) -> float:
-        """The share g of full scale that is 1 in what a network adds."""
+        """The share g of full scale that corresponds to 1 in the network's correction."""
         return UNIT * self.sigma * float(np.linalg.norm(self.analytic))
 
 
 def network_bank(sensor: Instrument, kernels: Kernels = "fitted") -> Bank:
-    """The filters in front of a network: noise outside the range that was trained counts as the
-    nearest end of it.
+    """Build the filter bank of a sensor.
+
+    Noise outside the training range is clamped to the nearest end of the range.
+
+    Args:
+        sensor: the instrument that acquired the images.
+        kernels: "fitted", or "cut" for networks trained before kernels were fitted.
     """
     sigma = float(np.clip(noise_over_full_scale(sensor), *RANGES["sigma_bright"]))
     return _bank(sensor, sigma, kernels)
@@ -146,7 +162,7 @@ def network_bank(sensor: Instrument, kernels: Kernels = "fitted") -> Bank:
 
 @lru_cache(maxsize=4096)
 def bank_of_vector(vector: tuple[float, ...], kernels: Kernels = "fitted") -> Bank:
-    """As `network_bank`, of the sensor that a sensor vector (4,) tells of."""
+    """Build the filter bank of the sensor described by the sensor vector, shape (4,)."""
     ends = zip(vector, RANGES.values(), strict=True)
     across, along, _, sigma = (
         low * (high / low) ** ((entry + 1) / 2) for entry, (low, high) in ends
@@ -186,13 +202,13 @@ def _bank(sensor: Instrument, sigma: float, kernels: Kernels) -> Bank:
 def fitted_kernel(
     gain: NDArray[np.inexact], power: NDArray[np.float64], r_squared: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The kernel (7, 7) of sum 1 that restores best where a filter of any size restores best with
-    `gain`.
+    """Compute the kernel (7, 7) of sum 1 with the least restoration error.
 
-    Of scenes whose power falls as 1 / r^2, W_k leaves the least error under noise. A kernel K errs
-    by the sum of (|H|^2 + eps_k r^2) / r^2 |K - W_k|^2 more, which is least for the solution of 49
-    linear equations. Cut to 7 x 7 instead, W_k loses up to a tenth of the contrast at low
-    frequencies, by more or less for each curve of the MTF.
+    It approximates a filter of any size that has the frequency response `gain`. For scenes whose
+    power falls as 1 / r^2, W_k minimises the error under noise. A kernel K has an additional error,
+    the sum of (|H|^2 + eps_k r^2) / r^2 |K - W_k|^2. The solution of 49 linear equations minimises
+    it. W_k cut to 7 x 7 instead loses up to a tenth of the contrast at low frequencies, by a
+    different amount for each MTF curve.
 
     Args:
         gain: W_k at the frequencies of a grid, (GRID, GRID).
@@ -215,16 +231,15 @@ def fitted_kernel(
 
 
 def in_places(kernels: NDArray[np.float64], scale: int) -> NDArray[np.float64]:
-    """Kernels (K, 7, 7) as the convolution that makes their planes where S x S pixels are the
-    channels of one place.
+    """Rewrite kernels (K, 7, 7) as a convolution on an image after pixel unshuffle by `scale`.
 
-    So for kernels of any odd side. Row i of a place reads row i + d of the same plane, d from -3 to
-    3: it lies in row (i + d) mod S of the place that is floor((i + d) / S) below. So for columns.
+    S = `scale`, and any odd side is possible. Row i of a place reads row i + d of the same plane,
+    with d from -3 to 3. That row is row (i + d) mod S of the place that is floor((i + d) / S)
+    below. The same holds for columns.
 
     Returns:
-        (K S^2, S^2, k, k), k places wide: 7 at scale 1, 5 at scale 2. The channels are ordered as a
-            pixel unshuffle
-        of the planes, and of the image, orders them.
+        Weights (K S^2, S^2, k, k), where k is 7 at scale 1 and 5 at scale 2. The channels have the
+        order of a pixel unshuffle of the planes and of the image.
     """
     side_px = kernels.shape[-1]
     reach = -(-(side_px // 2) // scale)
@@ -242,10 +257,11 @@ def in_places(kernels: NDArray[np.float64], scale: int) -> NDArray[np.float64]:
 def restoring_gain(
     blur: NDArray[np.inexact], target: ArrayLike, r_squared: ArrayLike, epsilon: float
 ) -> NDArray[np.inexact]:
-    """T conj(H) / (|H|^2 + epsilon r^2), of arrays of one shape: from a blur H to a target T.
+    """Compute T conj(H) / (|H|^2 + epsilon r^2) for the blur H and the target T, arrays of one
+    shape.
 
-    Weighted by r^2, epsilon leaves the gain at frequency 0 at exactly 1; a constant one would
-    darken the image.
+    The weight r^2 keeps the gain at frequency 0 at exactly 1. A constant epsilon would darken the
+    image.
     """
     return np.asarray(
         target * np.conj(blur) / (np.abs(blur) ** 2 + epsilon * np.asarray(r_squared))
@@ -253,11 +269,15 @@ def restoring_gain(
 
 
 def cut_filter(whole: NDArray[np.float64], radius_px: int, total: float) -> NDArray[np.float64]:
-    """The middle (2 R + 1, 2 R + 1) of a filter (H, W) around its first pixel, brought to a sum by
-    a smooth hill.
+    """Cut a filter (H, W) around its first pixel to (2 R + 1, 2 R + 1), and correct its sum.
 
-    So what is cut off comes back at frequencies near 0 alone; dividing by the sum would raise every
-    other one.
+    The sum is set to `total` by adding a smooth window, which changes frequencies near 0 only.
+    Dividing by the sum would raise all other frequencies.
+
+    Args:
+        whole: the filter, centred on its first pixel.
+        radius_px: R.
+        total: the sum of the result.
     """
     side_px = 2 * radius_px + 1
     kernel = np.roll(whole, (radius_px, radius_px), (0, 1))[:side_px, :side_px]

@@ -1,8 +1,9 @@
-"""Means over the blocks of an image, and bilinear interpolation between the centres of blocks.
+"""Compute means over the blocks of an image, and interpolate bilinearly between the centres of
+blocks.
 
-The blocks are aligned to the image, and every block and pixel is computed by the same float32
-operations in the same order wherever a tile begins. So tiles give the whole image's values bit for
-bit.
+The blocks are aligned to the image. Every block and pixel is computed by the same float32
+operations in the same order wherever a tile begins. Tiles therefore reproduce the values of the
+whole image bit for bit.
 """
 
 from dataclasses import dataclass
@@ -22,21 +23,21 @@ The mean of 64 pixels has an eighth of a pixel's noise. Blocks of 16 and 32 gain
 
 
 BORDER_BLOCKS = 2
-"""Blocks at the image's border that are left out, because H brings light into them that x does not
-show. With all blocks the outer 8 pixels lost 0.2 dB, with one left out 0.05 dB; with two they gain
+"""Blocks at the image's border are excluded, because H spreads light into them from outside the
+image. With all blocks the outer 8 pixels lost 0.2 dB, with one excluded 0.05 dB; with two they gain
 (measured on training places).
 """
 
 
 @dataclass(frozen=True)
 class Placed:
-    """Where in an image the pixels of an array lie along one side.
+    """The position of an array in the image, along one side.
 
     Attributes:
-        size_px: of the image.
-        start: place in the image of the array's first pixel.
-        keep_start: first kept pixel, in the image.
-        keep_stop: end of the kept pixels (excluded).
+        size_px: side of the image.
+        start: position in the image of the array's first pixel.
+        keep_start: first pixel of the result, in the image.
+        keep_stop: end of the pixels of the result (excluded).
     """
 
     size_px: int
@@ -46,9 +47,9 @@ class Placed:
 
     @property
     def blocks(self) -> tuple[int, int]:
-        """First and last block that the kept pixels are interpolated from.
+        """The first and the last block from which the pixels of the result are interpolated.
 
-        BORDER_BLOCKS at either end of the image are left out, unless it has no others.
+        The outer BORDER_BLOCKS at either end of the image are excluded, unless it has no others.
         """
         # Pixel p lies between the centres of blocks (p - 4) // 8 and the next: a centre lies at 8 k
         # + 3.5.
@@ -77,7 +78,7 @@ def extend(
 
     Args:
         image: pixels (h, w) of a part of the image.
-        sides: where its rows and its columns lie, and which are kept.
+        sides: the positions of its rows and its columns in the image.
         origin: row and column in the image of its first pixel.
         around_px: pixels beyond the blocks on every side.
     """
@@ -143,7 +144,7 @@ def reached_blocks(flags: Image, reach_px: int) -> Image:
 
 
 def interpolate(blocks: Image, down: Placed, across: Placed) -> Image:
-    """Interpolate bilinearly between the centres of blocks, at the kept pixels."""
+    """Interpolate bilinearly between the centres of blocks, at the pixels of the result."""
     return _along(_along(blocks, down).T, across).T
 
 

@@ -1,32 +1,31 @@
-"""The consistency step: a restored image that agrees with the raw one at low spatial frequencies.
+"""Make a restored image consistent with the raw one at low spatial frequencies.
 
     x' = x + G (y - H x)
 
 y is the raw image and x the restored one. H is the blur that leads from the reference's MTF to the
 sensor's, H(f) = MTF_sensor(f) / MTF_reference(f), with H(0) = 1. If x is right, y - H x is the
-noise of y. Networks move the mean by some tenths of a per cent and dim faint points. This error
-lies at low frequencies, and the low-pass filter G finds it there and removes it. G averages the
-noise of y, so that little of it comes back.
+noise of y. Networks shift the mean by some tenths of a per cent and dim faint points. This error
+lies at low frequencies, so the low-pass filter G isolates it and the step removes it. G averages
+the noise of y, so that little of it is added.
 
-G takes the mean of y - H x over blocks of BLOCK_PX x BLOCK_PX pixels and interpolates bilinearly
-between the centres of the blocks. So only block means of H x are needed, and they cost a few
-operations a pixel:
+G averages y - H x over blocks of BLOCK_PX x BLOCK_PX pixels and interpolates bilinearly between the
+centres of the blocks. So only block means of H x are needed, and they cost a few operations a
+pixel:
 
 1. Near: the part of H within NEAR_PX is a sum of RANK separable filters, each evaluated for the
-  block means alone.
-2. Far: what the rest of H brings is computed from block means of x, up to FAR_BLOCKS blocks away.
-  The formula's MTF has a kink at frequency 0, so H falls off as 1 / r^3 and may not be cut near its
-  centre: H cut at 8 pixels lost 0.4 dB where the whole H gains 0.05 dB (measured on photographs of
-  training places).
+   block means alone.
+2. Far: the contribution of the rest of H is computed from block means of x, up to FAR_BLOCKS blocks
+   away. The formula's MTF has a kink at frequency 0, so H falls off as 1 / r^3 and may not be cut
+   near its centre. H cut at 8 pixels lost 0.4 dB where the whole H gains 0.05 dB (measured on
+   photographs of training places).
 
 The blocks are aligned to the image, and every pixel is computed by the same float32 operations in
-the same order wherever a tile begins. So tiles give the whole image's result bit for bit, if
-REACH_PX pixels of x and RAW_REACH_PX of y around what is kept are at hand. Blocks that a missing or
-saturated pixel reaches through the near part of H are left out, because the residual of a clipped
-pixel is not noise; the blocks around them are interpolated instead.
+the same order wherever a tile begins. Tiles therefore reproduce the result of the whole image bit
+for bit, if they include REACH_PX pixels of x and RAW_REACH_PX of y around the kept pixels. Blocks
+that a missing or saturated pixel affects through the near part of H are excluded, because the
+residual of a clipped pixel is not noise. They are interpolated from the blocks around them.
 
-Nothing but NumPy runs on pixels here, so that `deploy/kit/host.py` can do the same on a board's
-host.
+Only NumPy runs on pixels here, so that `deploy/kit/host.py` can do the same on a board's host.
 """
 
 from dataclasses import dataclass
@@ -69,19 +68,19 @@ Twice as many changed the PSNR by less than 0.01 dB (measured).
 
 
 REACH_PX = BLOCK_PX * (FAR_BLOCKS + BORDER_BLOCKS + 1) - 1
-"""How far from a pixel lie the restored pixels that its correction depends on."""
+"""The correction of a pixel depends on restored pixels up to this distance."""
 
 RAW_REACH_PX = BLOCK_PX * (BORDER_BLOCKS + 1) - 1 + NEAR_PX
-"""How far from a pixel lie the raw pixels that its correction depends on."""
+"""The correction of a pixel depends on raw pixels up to this distance."""
 
 LEAST_SHARE = 0.25
-"""Where fewer of the weights around a pixel lie on usable blocks, the correction fades out instead
-of ending in a step.
+"""If a smaller share of the weights around a pixel lies on usable blocks, the correction fades out
+instead of ending in a step.
 """
 
 GRID = 512
-"""Frequencies along an axis from which H is transformed: wide enough for the far part not to wrap
-around.
+"""The number of frequencies along an axis from which H is computed. It is large enough for the far
+part not to wrap around.
 """
 
 PRODUCTS_PER_PX = (
@@ -92,10 +91,10 @@ PRODUCTS_PER_PX = (
     + (2 * FAR_BLOCKS + 1) ** 2 / BLOCK_PX**2  # The far part.
     + 2 * (1 + 1 / BLOCK_PX)  # Interpolation.
 )
-"""Products, each with its sum, that the step takes for a pixel."""
+"""The number of multiply-accumulate operations of the step per pixel."""
 
 EXCESS_SIGMAS = 6.0
-"""Above so many standard deviations of noise no pixel is clipped at zero."""
+"""Signals of more than this number of standard deviations of noise are never clipped at zero."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +107,8 @@ class Consistency:
         columns: weights of the columns, likewise; a term's weight of a pixel is the product of the
             two.
         far: weights (2 FAR_BLOCKS + 1, 2 FAR_BLOCKS + 1) of the block means around a block.
-        means: mean values of a raw block at which `excess` is stated, rising.
-        excess: what clipping the noise at zero has added to them.
+        means: mean values of a raw block at which `excess` is given, ascending.
+        excess: the amount that clipping the noise at zero has added to them.
         full_scale: the pixel value at and above which a raw pixel is saturated.
     """
 
@@ -190,7 +189,9 @@ class Consistency:
         return change
 
     def _near(self, padded: Image) -> Image:
-        """Block means of the near part of H x, from pixels with NEAR_PX more on every side."""
+        """Compute block means of the near part of H x from pixels padded by NEAR_PX on
+        every side.
+        """
         total: Image | None = None
         for row, column in zip(self.rows, self.columns, strict=True):
             term = weighted_sums(weighted_sums(padded, row, 0), column, 1)
@@ -201,9 +202,9 @@ class Consistency:
     def _far(
         self, finite: Image, missing: NDArray[np.bool_] | None, down: Placed, across: Placed
     ) -> Image:
-        """Block means of the far part of H x.
+        """Compute block means of the far part of H x.
 
-        A block with missing pixels counts as the block in the middle does.
+        A block with missing pixels is replaced by the block in the middle.
         """
         around_px = BLOCK_PX * FAR_BLOCKS
         origin = down.start, across.start
@@ -222,7 +223,7 @@ class Consistency:
         )
 
     def _around(self, means: Image) -> Image:
-        """The sum of block means around each block, weighted by `far`."""
+        """Sum the block means around each block, weighted by `far`."""
         side = len(self.far)
         height = means.shape[0] - side + 1
         width = means.shape[1] - side + 1
@@ -234,7 +235,7 @@ class Consistency:
 
 
 def blur_between(sensor: Instrument, reference: Instrument) -> NDArray[np.float64]:
-    """The filter H around its first pixel, (GRID, GRID) float64 of sum 1."""
+    """Compute the filter H, centred on its first pixel, (GRID, GRID) float64 of sum 1."""
     fy = np.fft.fftfreq(GRID)[:, None]
     fx = np.fft.fftfreq(GRID)[None, :]
     ratio = sensor_mtf(fx, fy, sensor) / sensor_mtf(fx, fy, reference)
@@ -242,16 +243,16 @@ def blur_between(sensor: Instrument, reference: Instrument) -> NDArray[np.float6
 
 
 def centre(kernel: NDArray[np.float64], radius: int) -> NDArray[np.float64]:
-    """The middle (2 R + 1, 2 R + 1) of a filter that lies around its first element."""
+    """Cut a filter that is centred on its first element to (2 R + 1, 2 R + 1)."""
     return np.roll(kernel, (radius, radius), (0, 1))[: 2 * radius + 1, : 2 * radius + 1]
 
 
 def _far_weights(kernel: NDArray[np.float64], near: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What each block mean around a block adds to the mean of H x there, the near part left out.
+    """Compute the weights of the surrounding block means in the mean of H x, without the near part.
 
-    The mean over one block of what a filter f makes of another, d blocks away and of constant
-    value, is the sum of f(8 d + e) (8 - |e_y|) (8 - |e_x|) / 64 over the offsets e. What lies
-    beyond the farthest blocks is spread over all of them, so that a constant image stays as it is.
+    A filter f is applied to a block of constant value, d blocks away. The mean of the result over
+    one block is the sum of f(8 d + e) (8 - |e_y|) (8 - |e_x|) / 64 over the offsets e. The weight
+    beyond the farthest blocks is spread over all of them, so that a constant image does not change.
     """
     remainder = kernel.copy()
     offsets = np.arange(-NEAR_PX, NEAR_PX + 1)
@@ -264,11 +265,13 @@ def _far_weights(kernel: NDArray[np.float64], near: NDArray[np.float64]) -> NDAr
 
 
 def _clipped_noise(sensor: Instrument, full_scale: float) -> tuple[Image, Image]:
-    """What the converter's clipping at zero adds to the mean of a dark block: its mean value, and
-    the excess.
+    """Compute how much clipping at zero raises the mean of a dark block.
 
     A signal s with Gaussian noise sigma, clipped at 0, has the mean s + e with e = sigma phi(s /
-    sigma) - s Phi(-s / sigma), phi and Phi being the normal density and distribution.
+    sigma) - s Phi(-s / sigma), where phi and Phi are the normal density and distribution.
+
+    Returns:
+        Mean values of a block after clipping, and the excess e at each.
     """
     gain = sensor.gain_dn_per_radiance
     unit = full_scale / sensor.max_dn

@@ -1,12 +1,12 @@
-"""ConvBEERS: a residual network without batch normalisation that undoes blur and noise (paper,
-section 3.1).
+"""Define ConvBEERS: a residual network without batch normalisation that undoes blur and noise
+(paper, section 3.1).
 
     image -> head -> [conv, ReLU, conv, +] x blocks -> body end, + head
     -> tail -> correction, + image
 
-A variant of scale S rearranges the image in front of its head, S x S pixels into channels, and the
-correction back behind its tail (pixel unshuffle and shuffle; Shi et al., CVPR 2016). The host does
-both; what lies between runs at 1 / S of the resolution.
+A variant of scale S rearranges S x S pixels of the image into channels before its head, and the
+correction back after its tail (pixel unshuffle and shuffle; Shi et al., CVPR 2016). The host does
+both, and the layers in between run at 1 / S of the resolution.
 
 Every convolution is 3 x 3 with stride 1 and zero padding 1. 16 blocks of 64 features make 1.2 M
 parameters.
@@ -15,11 +15,11 @@ Behind the bank of its sensor (`model.bank`) the same body is one network for ev
 
     restored = x + g (w + body([x - 1/2, u])),   w = (W_1 - 1) x / g
 
-What a sensor changes are the filters that make u and w and the unit g, known in closed form, and
-the bias of the head, which is linear in the sensor vector.
+A sensor changes the filters for u and w and the unit g, which are known in closed form, and the
+bias of the head, which is linear in the sensor vector.
 
-A larger network can begin where a smaller one stands (`grow`): wider, deeper or coarser, with the
-same outputs. Trained in the end with its maps rounded as its INT8 file rounds them (`Rounding`), a
+A larger network can start from a smaller one (`grow`): wider, deeper or coarser, with the same
+outputs. If the last part of the training rounds the maps as the INT8 file does (`Rounding`), a
 network loses less in INT8.
 """
 
@@ -50,9 +50,9 @@ class ResidualBlock(nn.Module):
     def forward(
         self, x: Tensor, step: Tensor | None = None, inner_step: Tensor | None = None
     ) -> Tensor:
-        """Add the block's correction to x (N, F, H, W); the shape is kept.
+        """Add the block's correction to x (N, F, H, W); the shape does not change.
 
-        Given steps, the maps are rounded.
+        Given step sizes, the maps are rounded.
         """
         inner = torch.relu(self.first(x))
         if step is not None and inner_step is not None:
@@ -63,7 +63,9 @@ class ResidualBlock(nn.Module):
 
 
 class Layers(nn.Module):
-    """What both networks are made of; their heads read so many planes of each pixel."""
+    """The layers that both networks share. `planes` is the number of input planes per pixel of the
+    head.
+    """
 
     def __init__(self, variant: Variant, planes: int) -> None:
         super().__init__()
@@ -74,8 +76,9 @@ class Layers(nn.Module):
         self.tail = nn.Conv2d(variant.features, variant.pixels, kernel_size=3, padding=1)
 
     def corrected(self, shallow: Tensor, bfloat16: bool, steps: Sequence[Tensor] = ()) -> Tensor:
-        """What the head gave, (N, F, H / S, W / S), to the correction (N, 1, H, W); see
-        `Rounding.steps`.
+        """Compute the correction (N, 1, H, W) from the output of the head, (N, F, H / S, W / S).
+
+        Given `steps` (see `Rounding.steps`), all maps are rounded.
         """
         with torch.autocast(shallow.device.type, dtype=torch.bfloat16, enabled=bfloat16):
             deep = (
@@ -86,7 +89,7 @@ class Layers(nn.Module):
         return pixel_shuffle(self.tail(deep), self.variant.scale)
 
     def _rounded(self, shallow: Tensor, step: Tensor, *inner: Tensor) -> Tensor:
-        """What the tail reads, with every map between head and tail rounded."""
+        """Compute the input of the tail, with every map between head and tail rounded."""
         skip = stream = in_steps(shallow, step)
         for block, inner_step in zip(self.body, inner, strict=True):
             stream = block(stream, step, inner_step)
@@ -94,8 +97,9 @@ class Layers(nn.Module):
 
 
 def in_steps(maps: Tensor, step: Tensor) -> Tensor:
-    """Maps (N, F, H, W) in float32, held to int8 and rounded to whole steps; gradients pass the
-    rounding.
+    """Clip maps (N, F, H, W) to int8 and round them to multiples of `step`, in float32.
+
+    Gradients pass the rounding unchanged (straight-through estimator).
     """
     clipped = maps.float().clamp(-128 * step, 127 * step)
     # The value is rounded, but the gradient is that of `clipped`: detach hides the difference.
@@ -107,30 +111,34 @@ class Rounding:
     """How an INT8 file rounds the maps of a network behind a bank.
 
     Attributes:
-        stream: what a 1 stands for in the maps between head and tail, (F, 1, 1), at a gain of 1.
-        inner: the same of the map within each block.
+        stream: step size of the maps between head and tail, (F, 1, 1), at a gain of 1.
+        inner: step size of the map within each block.
     """
 
     stream: Tensor
     inner: tuple[Tensor, ...]
 
     def steps(self, gains: Tensor) -> list[Tensor]:
-        """Those of images, each with the gain of its bank (N,): (N, F, 1, 1) of the stream, then of
-        each block.
+        """Compute the step sizes for images whose banks have the gains (N,).
+
+        Returns:
+            Steps (N, F, 1, 1) of the stream, then of each block.
         """
         return [step.to(gains) / gains[:, None, None, None] for step in (self.stream, *self.inner)]
 
 
 class ConvBEERS(Layers):
-    """The network: (N, 1, H, W) in [0, 1] of full scale to the same, not clipped; H and W multiples
-    of its scale.
+    """The network. It maps (N, 1, H, W) in [0, 1] of full scale to the same shape, without
+    clipping; H and W are multiples of its scale.
     """
 
     def __init__(self, variant: Variant) -> None:
         super().__init__(variant, planes=1)
 
     def forward(self, image: Tensor, bfloat16: bool = False) -> Tensor:
-        """Image plus correction, (N, 1, H, W); `bfloat16` is for the blocks alone."""
+        """Return the image plus its correction, (N, 1, H, W); `bfloat16` applies to the blocks
+        only.
+        """
         return image + self.corrected(
             self.head(pixel_unshuffle(image, self.variant.scale)), bfloat16
         )
@@ -138,12 +146,13 @@ class ConvBEERS(Layers):
 
 @dataclass(frozen=True)
 class Condition:
-    """What a network behind a bank is told of the sensors of N images, float32.
+    """The description of the sensors of N images on which a network behind a bank is conditioned,
+    float32.
 
     Attributes:
         vectors: the sensor vectors (N, 4).
         filters: (N, 5, 7, 7), see `Bank.filters`.
-        units: (N,) what the network adds is in these shares of full scale.
+        units: (N,) shares of full scale that correspond to 1 in the network's correction.
         gains: (N,) see `Bank.gain`.
     """
 
@@ -154,7 +163,7 @@ class Condition:
 
     @classmethod
     def of(cls, vectors: Tensor, banks: Sequence[Bank]) -> "Condition":
-        """Of the sensor vectors (N, 4) and as many banks."""
+        """Build the description from sensor vectors (N, 4) and N banks."""
         filters = torch.from_numpy(np.stack([bank.filters for bank in banks])).to(vectors)
         units = vectors.new_tensor([bank.unit for bank in banks])
         gains = vectors.new_tensor([bank.gain for bank in banks])
@@ -162,27 +171,27 @@ class Condition:
 
     @property
     def parts(self) -> tuple[Tensor, ...]:
-        """All of it, in its order."""
+        """All tensors, in the order of the attributes."""
         return self.vectors, self.filters, self.units, self.gains
 
     def to(self, device: torch.device) -> "Condition":
-        """The same on a device."""
+        """Return the same description on a device."""
         return Condition(*(part.to(device, non_blocking=True) for part in self.parts))
 
     def repeated(self, count: int) -> "Condition":
-        """What is told of one image, for as many."""
+        """Repeat the description of one image `count` times."""
         return Condition(*(part.expand(count, *part.shape[1:]) for part in self.parts))
 
     def some(self, which: slice | Tensor) -> "Condition":
-        """What is told of some of the images."""
+        """Return the descriptions of the images that `which` selects."""
         return Condition(*(part[which] for part in self.parts))
 
 
 class BankedConvBEERS(Layers):
-    """Images (N, 1, H, W) in [0, 1] of full scale and what is told of their sensors to (N, 1, H,
-    W), not clipped.
+    """A network behind the bank of its sensor.
 
-    `kernels` says what banks it was trained behind.
+    It maps images (N, 1, H, W) in [0, 1] of full scale and the description of their sensors to (N,
+    1, H, W), without clipping. `kernels` names the kind of banks that it was trained behind.
     """
 
     def __init__(self, variant: Variant, kernels: Kernels = "fitted") -> None:
@@ -198,14 +207,14 @@ class BankedConvBEERS(Layers):
         bfloat16: bool = False,
         steps: Sequence[Tensor] = (),
     ) -> Tensor:
-        """Restore each image as its own sensor asks for.
+        """Restore each image with the filters of its own sensor.
 
         Args:
             image: (N, 1, H, W).
-            condition: of the sensor of each.
-            bfloat16: for the blocks alone.
-            steps: that the maps are rounded to, see `Rounding.steps`; without any they stay as they
-                are.
+            condition: description of the sensor of each image.
+            bfloat16: whether the blocks compute in bfloat16.
+            steps: step sizes to which the maps are rounded, see `Rounding.steps`; without steps
+                they are not rounded.
         """
         filtered = each_by_its_own(image, condition.filters)
         planes, analytic = self._held(filtered, condition.gains)
@@ -218,7 +227,9 @@ class BankedConvBEERS(Layers):
         return restored
 
     def _held(self, filtered: Tensor, gains: Tensor) -> tuple[Tensor, Tensor]:
-        """Planes and analytic restoration, (N, 5, H, W) in units, held as `Bank.reach` says."""
+        """Clip planes and analytic restoration, (N, 5, H, W) in units, to the limits of
+        `Bank.reach`.
+        """
         planes = filtered[:, :FILTERS]
         analytic = filtered[:, FILTERS:]
         if self.kernels == "cut":
@@ -229,10 +240,10 @@ class BankedConvBEERS(Layers):
 
 
 class OfOneSensor(nn.Module):
-    """A network behind a bank, told one sensor's vector (4,): (N, 1, H, W) in [0, 1] of full scale
-    to the same.
+    """A network behind a bank, conditioned on one sensor vector (4,). It maps (N, 1, H, W) in [0,
+    1] of full scale to the same shape.
 
-    It shares the network's weights. Without a bank the sensor's is made of the vector.
+    It shares the network's weights. If no bank is given, it is built from the vector.
     """
 
     def __init__(self, network: BankedConvBEERS, vector: Tensor, bank: Bank | None = None) -> None:
@@ -251,21 +262,28 @@ class OfOneSensor(nn.Module):
 
 
 Network = ConvBEERS | BankedConvBEERS
-"""What can be trained and kept: a plain network, or one for every sensor in range."""
+"""A network that can be trained and saved: a plain one, or one for every sensor in range."""
 
 
 def for_sensor(
     network: Network, vector: Tensor, bank: Bank | None = None
 ) -> ConvBEERS | OfOneSensor:
-    """A network that takes images alone: one behind a bank told the sensor of a vector (4,), a
-    plain one as it is.
+    """Return a network that accepts images only.
+
+    Args:
+        network: a network behind a bank is conditioned on the sensor; a plain one is returned
+            unchanged.
+        vector: the sensor vector (4,).
+        bank: of the sensor; None builds it from the vector.
     """
     return OfOneSensor(network, vector, bank) if isinstance(network, BankedConvBEERS) else network
 
 
 def each_by_its_own(image: Tensor, kernels: Tensor) -> Tensor:
-    """Image n of (N, 1, H, W), mirrored at its borders, by kernels n of (N, K,
-    7, 7): (N, K, H, W).
+    """Filter image n of (N, 1, H, W), mirrored at its borders, with kernels n of (N, K, 7, 7).
+
+    Returns:
+        The filtered images (N, K, H, W).
     """
     count = len(image)
     radius = SIDE_PX // 2
@@ -283,7 +301,7 @@ def initialise(network: Network, generator: torch.Generator) -> None:
             fan_in = module.in_channels * 9
             # Without batch normalisation the stream's variance would double at each block.
             scale = 0.1 if name.endswith(("second", "body_end", "tail")) else 1.0
-            # What is an offset of one channel is a pattern of the pixels of one place.
+            # An offset of one channel would be a pattern of the pixels of one place.
             scale /= network.variant.scale if name == "tail" else 1
             with torch.no_grad():
                 module.weight.normal_(0.0, scale * (2 / fan_in) ** 0.5, generator=generator)
@@ -292,17 +310,17 @@ def initialise(network: Network, generator: torch.Generator) -> None:
 
 
 def vector_tensor(sensor: Instrument) -> Tensor:
-    """The sensor vector (4,) float32, clamped to the ranges."""
+    """Return the sensor vector (4,) float32, clamped to the ranges."""
     return torch.tensor(sensor_vector(sensor).values)
 
 
 def arrays(tensors: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
-    """Tensors of any shape as arrays."""
+    """Convert tensors of any shape to NumPy arrays."""
     return {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()}
 
 
 def network_of(weights: Weights) -> Network:
-    """A network of those weights, plain or behind a bank, in evaluation mode, on the CPU."""
+    """Build the network of some weights, plain or behind a bank, in evaluation mode on the CPU."""
     network: Network = ConvBEERS(weights.variant)
     if weights.conditioned:
         network = BankedConvBEERS(weights.variant, weights.kernels)

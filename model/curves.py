@@ -1,15 +1,15 @@
-"""Curves of the MTF that a training draws, besides the formula's: all instruments of one contrast
+"""Draw MTF curves for training, in addition to the formula's, because instruments of equal contrast
 at Nyquist differ.
 
-A curve is what the optics leave, times sinc(f) of the square detector. Of the optics:
+A curve is the MTF of the optics, times sinc(f) of the square detector. The optics are one of:
 
     formula     exp(-gamma f)
     Gaussian    exp(-a f^2): optics and electronics with several small blurs
     pupil       the autocorrelation of a circular pupil, with or without a central obscuration
     bent        the formula, less or more by a smooth hill at middle frequencies
 
-and along the track any of them times sinc(s f), the motion during an exposure. Each is scaled so
-that its contrast at Nyquist is the one asked for.
+Along the track any of them is also multiplied by sinc(s f), the motion during an exposure. Each is
+scaled so that it has the requested contrast at Nyquist.
 """
 
 import math
@@ -24,7 +24,7 @@ from beers_deploy.profiles.response import NYQUIST, MtfTable
 Curve = NDArray[np.float64]
 
 FREQUENCIES: Curve = np.linspace(0, NYQUIST, 26)
-"""Of a drawn table, in cycles per target pixel."""
+"""Frequencies of a drawn table, in cycles per target pixel."""
 
 OBSCURATIONS = (0.0, 0.15, 0.3, 0.45)
 """Diameter of the central obscuration over that of the pupil."""
@@ -56,7 +56,10 @@ def draw_table(across: float, along: float, generator: np.random.Generator) -> M
 
 
 def _drawn_optics(generator: np.random.Generator) -> Callable[[float], Curve]:
-    """Draw a kind of optics: its contrast at FREQUENCIES, for a wanted contrast at Nyquist."""
+    """Draw a kind of optics, and return a function of the contrast at Nyquist.
+
+    The function returns the contrast at FREQUENCIES.
+    """
     kind = generator.choice(["Gaussian", "pupil", "bent"], p=[0.25, 0.35, 0.4])
     share = FREQUENCIES / NYQUIST
     if kind == "Gaussian":
@@ -72,8 +75,9 @@ def _drawn_optics(generator: np.random.Generator) -> Callable[[float], Curve]:
 
 
 def pupil_contrast(contrast: float, obscuration: float) -> Curve:
-    """The contrast at FREQUENCIES behind a pupil whose cut-off frequency leaves `contrast` at
-    Nyquist.
+    """Compute the contrast at FREQUENCIES of a pupil.
+
+    Its cut-off frequency is chosen such that the contrast at Nyquist is `contrast`.
     """
     frequency, contrasts = _pupil(obscuration)
     # It falls, but for rounding: read backwards it can be searched.
@@ -83,8 +87,10 @@ def pupil_contrast(contrast: float, obscuration: float) -> Curve:
 
 @lru_cache
 def _pupil(obscuration: float) -> tuple[Curve, Curve]:
-    """Frequencies over the cut-off frequency, and the contrast that a pupil with an obscuration
-    leaves there.
+    """Compute the MTF of a pupil with a central obscuration.
+
+    Returns:
+        Frequencies relative to the cut-off frequency, and the contrast at each.
     """
     # The grid is twice as wide as the pupil: its autocorrelation does not wrap around.
     place = (np.arange(2 * PUPIL_GRID) - PUPIL_GRID + 0.5) / (PUPIL_GRID / 2)

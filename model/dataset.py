@@ -1,9 +1,9 @@
-"""Datasets of simulated pairs: 12-bit TIFF patches and a manifest, in parallel, resumable, the same
-bytes always.
+"""Write datasets of simulated pairs: 12-bit TIFF patches and a manifest, in parallel, resumable and
+reproducible byte for byte.
 
-A patch's pixels depend on the recipe and its number alone, not on the process that makes it. The
-recipe lies beside the pairs, and who takes them learns from it which sensors made them, and of
-which scenes.
+The pixels of a patch depend on the recipe and its number only, not on the process that makes it.
+The recipe is stored next to the pairs, so that a reader knows which sensors and scenes they come
+from.
 """
 
 import json
@@ -44,7 +44,7 @@ DRAWN_SIDE_PX = 3000
 
 @dataclass(frozen=True)
 class DatasetRecipe:
-    """All that decides a dataset's pixels."""
+    """The parameters that determine the pixels of a dataset."""
 
     scenes: tuple[Path | None, ...]  # None stands for a drawn scene.
     degraded: Sensor
@@ -61,7 +61,7 @@ class DatasetRecipe:
         require_same_units(self.degraded, self.reference)
 
     def to_json(self) -> dict[str, object]:
-        """The recipe as a file keeps it; scenes by name and digest."""
+        """Return the recipe as it is stored in a file; scenes are stored by name and digest."""
         scenes = [
             {"name": p.name, "sha256": sha256(p)} if p else {"name": "drawn"} for p in self.scenes
         ]
@@ -70,8 +70,8 @@ class DatasetRecipe:
 
 @dataclass(frozen=True)
 class Window:
-    """One patch: its number in the dataset, its scene, and the top left of its margin in scene
-    pixels.
+    """The position of one patch: its number in the dataset, its scene, and the top left of its
+    margin in scene pixels.
     """
 
     number: int
@@ -84,7 +84,7 @@ class Window:
 
 
 def plan_windows(recipe: DatasetRecipe) -> list[Window]:
-    """Every patch of a dataset, in order."""
+    """Plan every patch of a dataset, in order, or raise ImageError if a scene is too small."""
     windows: list[Window] = []
     for index, path in enumerate(recipe.scenes):
         scene_windows = list(_scene_windows(recipe, index, len(windows)))
@@ -113,7 +113,7 @@ def _scene_windows(recipe: DatasetRecipe, index: int, first: int) -> Iterator[Wi
 
 
 def load(recipe: DatasetRecipe, index: int) -> Scene:
-    """A scene of the recipe, its radiance scaled."""
+    """Load a scene of the recipe, with its radiance and size scaled."""
     path = recipe.scenes[index]
     if path is None:
         generator = Draw(recipe.seed, index).generator("drawn scene")
@@ -156,7 +156,7 @@ def _make_patch(recipe: DatasetRecipe, window: Window, radiance: np.ndarray) -> 
 
 
 PLAN = "plan"
-"""Key of what was simulated of a role, which depends on the scene's pixels."""
+"""Key of the simulated effects of a role, which depend on the pixels of the scene."""
 
 
 def _drawn(recipe: DatasetRecipe, window: Window) -> tuple[dict[str, Any], dict[str, Instrument]]:
@@ -176,8 +176,9 @@ def _drawn(recipe: DatasetRecipe, window: Window) -> tuple[dict[str, Any], dict[
 
 
 def _is_drawn(recipe: DatasetRecipe, window: Window, text: str) -> bool:
-    """Return True if a line of the manifest states what the recipe draws: whoever forges it can
-    make its digest.
+    """Return True if a line of the manifest states what the recipe draws.
+
+    A digest alone does not prove that, because whoever forges a line can compute it.
     """
     line: Any = parse_json(text)
     del line[DIGESTS]
@@ -188,9 +189,11 @@ def _is_drawn(recipe: DatasetRecipe, window: Window, text: str) -> bool:
 
 
 CHUNK = 32
-"""Patches of one call: few enough to lose little to a kill."""
+"""The number of patches per call: small enough to lose little if the run is killed."""
 MOST_PROCESSES = 61 if sys.platform == "win32" else 1 << 16
-"""Windows waits for no more at once, and Python refuses a larger pool."""
+"""The maximum number of processes: Windows cannot wait for more, and Python refuses a larger pool
+there.
+"""
 
 
 def write_dataset(
@@ -202,18 +205,18 @@ def write_dataset(
 ) -> dict[str, float]:
     """Write a dataset of 12-bit TIFF patches and its manifest.
 
-    Pairs of an earlier run stay if they match the digests in their lines of the manifest; others
-    are made again.
+    Pairs of an earlier run remain if they match the digests in their lines of the manifest; others
+    are simulated again.
 
     Args:
-        recipe: what decides the pixels.
+        recipe: the parameters that determine the pixels.
         out: the dataset's folder.
-        workers: processes here that make patches, or calls that the pool runs at once.
-        resume: whether to go on with a dataset that the folder holds in part.
-        pool: makes them instead of processes here; only this process writes.
+        workers: the number of processes on this host, or of calls that the pool runs at once.
+        resume: whether to continue a dataset that the folder holds in part.
+        pool: runs the calls instead of processes on this host; only this process writes.
 
     Returns:
-        patches, and the share of drawn SNR pairs that were impossible and drawn again.
+        The number of patches, and the share of drawn SNR pairs that were impossible and redrawn.
     """
     # First of all, so that a scene that cannot be read is refused before anything is written.
     windows = plan_windows(recipe)
@@ -298,7 +301,7 @@ def _lines_left(
 def _made(
     recipe: DatasetRecipe, waiting: dict[Path, list[Window]], workers: int, pool: Executor | None
 ) -> Generator[tuple[Path, list[Patch]], None, None]:
-    """The patches of each part, in order; two calls for each worker are under way."""
+    """Yield the patches of each part in order; two calls per worker run at any time."""
     if pool is None:
         for path, chunk in waiting.items():
             yield path, make_patches(recipe, chunk)
@@ -340,7 +343,7 @@ def _check_folder(recipe: DatasetRecipe, out: Path, resume: bool) -> None:
 
 
 def _read_summary(path: Path) -> dict[str, float]:
-    """Patches, and the share of SNR pairs that were drawn again."""
+    """Read the number of patches and the share of redrawn SNR pairs from a manifest."""
     try:
         lines: list[Any] = [
             parse_json(line) for line in path.read_text(encoding="utf-8").split("\n") if line

@@ -1,4 +1,4 @@
-"""Where a sensor's MTF departs from the curves that a network was trained on."""
+"""Detect where the MTF of a sensor differs from the curves that a network was trained on."""
 
 import math
 
@@ -18,8 +18,8 @@ from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import NYQUIST
 
 MARGIN = 0.05
-"""How far a curve may lie outside those of training, as a share: networks lose 0.1 dB and more from
-there on (measured).
+"""How far a curve may lie outside the training curves, as a share. Beyond it networks lose 0.1 dB
+and more (measured).
 """
 
 
@@ -62,9 +62,7 @@ def departure(sensor: Instrument, kernels: Kernels) -> str:
 
 
 def _known_curves(contrast: float, kernels: Kernels) -> list[Curve]:
-    """Curves at FREQUENCIES that hold between them all that training draws for a contrast at
-    Nyquist.
-    """
+    """Compute curves at FREQUENCIES that enclose all training curves of a contrast at Nyquist."""
     detector = np.sinc(FREQUENCIES)
     share = FREQUENCIES / NYQUIST
     if kernels == "cut":

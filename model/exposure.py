@@ -1,14 +1,14 @@
-"""Exposure: dark parts of an image are multiplied before a network sees them, and divided
-afterwards.
+"""Choose the exposure: dark parts of an image are multiplied before a network sees them, and
+divided afterwards.
 
-Inside a network, and in INT8 above all, everything is relative to full scale: its steps add about 2
-DN rms at every level, so in the dark it hardly denoises. An image of digital numbers times a factor
-is the image of a sensor of as many times the gain, and a network that is conditioned on its sensor
-can be given just that sensor. So the same weights restore dark ground as well as bright ground.
+Inside a network, and in INT8 above all, errors are relative to full scale: its steps add about 2 DN
+rms at every level, so in the dark it hardly denoises. An image multiplied by a factor is the image
+of a sensor whose gain is larger by that factor. A network that is conditioned on its sensor can be
+given that sensor. The same weights therefore restore dark ground as well as bright ground.
 
-A pixel takes the highest factor at which no pixel within the network's receptive radius exceeds
-HEADROOM of full scale. So the choice depends on nothing but the pixels that the network reads
-anyway, and tiles with an exact halo choose as the whole image does.
+A pixel gets the highest factor at which no pixel within the network's receptive radius exceeds
+HEADROOM of full scale. The choice depends only on the pixels that the network reads anyway, so
+tiles with an exact halo choose as the whole image does.
 """
 
 from collections.abc import Iterable
@@ -26,7 +26,7 @@ FACTORS = (2, 4, 8)
 """Powers of two, by which an image is multiplied without rounding."""
 
 MOST_FACTORS = 2
-"""Only the highest of the possible factors are used: each one that a tile asks for costs one more
+"""Only the highest of the possible factors are used. Each factor that a tile needs costs one more
 run of the network, and a factor of 2 below 4 and 8 gains less than 0.02 dB (measured on training
 places).
 """
@@ -39,7 +39,7 @@ scale, bright scenes lost 0.2 dB; from 0.4 to 0.8 none lost (measured on trainin
 """
 
 NOISE_BEYOND = 1.25
-"""How far the noise may lie above what training saw.
+"""How far the noise may exceed that of the training range.
 
 At 1.25 times the networks still gain 0.1 to 0.8 dB, at 1.4 times they lose 0.2 dB in some scenes,
 at twice 4 dB (measured).
@@ -50,8 +50,8 @@ def factors_for(sensor: Instrument) -> tuple[int, ...]:
     """Return the factors that a network conditioned on `sensor` can use, 1 among them, in rising
     order.
 
-    A factor raises the noise over full scale. A factor is left out if the noise leaves the range of
-    training by more than NOISE_BEYOND.
+    A factor raises the noise over full scale. It is excluded if the noise exceeds the training
+    range by more than NOISE_BEYOND.
     """
     usable = [factor for factor in FACTORS if _within_training(sensor, factor)]
     return (1, *usable[-MOST_FACTORS:])

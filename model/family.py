@@ -1,8 +1,9 @@
-"""The sensors that a network for every sensor is trained on, and what it is told of each.
+"""Define the sensors on which a network for every sensor is trained, and the sensor vector that it
+is conditioned on.
 
-The network sees images over full scale, so a sensor's noise is stated over full scale too, at 1/16
-and at 1/4 of it: that is at 25 and at 100 W/m2/sr/um where full scale is 400. This is NumPy alone,
-so that a restoration begins without torch.
+The network sees images relative to full scale. A sensor's noise is therefore also stated relative
+to full scale, at 1/16 and at 1/4 of it: at 25 and at 100 W/m2/sr/um if full scale is 400. This
+module uses NumPy only, so that a restoration starts without loading torch.
 """
 
 import math
@@ -20,34 +21,37 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "sigma_dark": (0.00056, 0.0072),
     "sigma_bright": (0.0011, 0.0072),
 }
-"""What a network can know of its sensor, in this order: MTF at Nyquist across (horizontal) and
-along the track (vertical), and the noise's standard deviation over full scale at 1/16 and at 1/4 of
-it. The logarithm of each, -1 to 1 from end to end, is the sensor vector.
+"""The quantities that condition a network on its sensor, in this order: MTF at Nyquist across
+(horizontal) and along the track (vertical), and the standard deviation of the noise over full scale
+at 1/16 and at 1/4 of it. The sensor vector is the logarithm of each, scaled such that the range
+becomes -1 to 1.
 """
 
 LEAST_ALONG = 0.4
-"""The lower MTF of the two axes over the higher one: the least that is trained on."""
+"""The smallest ratio in training of the lower MTF of the two axes to the higher one."""
 
 ROUNDING = 1e-9
-"""What a ratio may miss its end by."""
+"""The tolerance for the ratio of the two axes."""
 
 SNR_BRIGHT = (35.0, 220.0)
-"""Of the sensors trained on, at 1/4 of full scale; at 1/16 all that physics allows for it."""
+"""SNR range of the training sensors at 1/4 of full scale. At 1/16 every physically possible SNR is
+drawn.
+"""
 
 EDGE = 0.05
-"""Draws reach this share of a range beyond its ends and are brought back: no draws from outside
-train the ends.
+"""Draws extend beyond a range by this share and are clamped to it. Otherwise no draws from outside
+would train its ends.
 """
 
 
 @dataclass(frozen=True)
 class SensorVector:
-    """What a network for every sensor is told of one.
+    """The description of one sensor on which a network for every sensor is conditioned.
 
     Attributes:
-        values: four of them as in `RANGES`, each in [-1, 1].
-        outside: a sentence for each value that lies outside its range, and was moved to the nearest
-            end of it; and one for axes that differ more than any sensor did in training.
+        values: four values in the order of `RANGES`, each in [-1, 1].
+        outside: a sentence for each value that was outside its range and was clamped; and one for
+            axes that differ more than those of any training sensor.
     """
 
     values: tuple[float, ...]
@@ -55,7 +59,7 @@ class SensorVector:
 
 
 def sensor_values(sensor: Instrument) -> dict[str, float]:
-    """The four values of `RANGES`, smear and rounding noise counted."""
+    """Compute the four values of `RANGES`, including smear and rounding noise."""
     # A network knows no smear of its own: what that leaves of the contrast along the track is
     # counted there.
     smear_contrast = abs(float(np.sinc(0.5 * sensor.smear_px)))
@@ -65,8 +69,11 @@ def sensor_values(sensor: Instrument) -> dict[str, float]:
 
 
 def noise_over_full_scale(sensor: Instrument, part: int = 4) -> float:
-    """Standard deviation of noise at that part of full scale, that of rounding counted, over full
-    scale.
+    """Compute the standard deviation of the noise over full scale, including rounding noise.
+
+    Args:
+        sensor: the instrument.
+        part: the signal is full scale divided by this number.
     """
     full_scale = sensor.max_dn / sensor.gain_dn_per_radiance
     rounding = 1 / (12 * sensor.gain_dn_per_radiance**2)
@@ -74,7 +81,7 @@ def noise_over_full_scale(sensor: Instrument, part: int = 4) -> float:
 
 
 def sensor_vector(sensor: Instrument) -> SensorVector:
-    """The sensor vector, clamped to the ranges."""
+    """Compute the sensor vector, clamped to the ranges."""
     values = sensor_values(sensor)
     entries = list[float]()
     outside = list[str]()
@@ -98,11 +105,11 @@ def sensor_vector(sensor: Instrument) -> SensorVector:
 
 @dataclass(frozen=True)
 class SensorFamily:
-    """The sensors that a network is trained on: every number log-uniform over its range.
+    """The sensors that a network is trained on: every number is log-uniform over its range.
 
     Attributes:
-        like: gives gain and bits; its MTF and noise do not matter.
-        snr_bright: at a quarter of full scale.
+        like: the sensor whose gain and bits are used; its MTF and noise do not matter.
+        snr_bright: SNR range at a quarter of full scale.
         other_curves: share of the sensors whose MTF has another curve than the formula's, see
             `model.curves`.
     """
@@ -112,7 +119,10 @@ class SensorFamily:
     other_curves: float = 0.0
 
     def draw(self, generator: np.random.Generator) -> Instrument:
-        """One sensor. The MTF along the track is more often near that across than far below it."""
+        """Draw one sensor.
+
+        Its MTF along the track is more often near the one across it than far below it.
+        """
         mtf = _log_uniform(generator, *RANGES["mtf_across"])
         # The square draws more sensors with axes that are nearly alike, as real ones have.
         along = max(mtf * LEAST_ALONG ** float(generator.uniform() ** 2), RANGES["mtf_along"][0])

@@ -15,13 +15,13 @@ from beers_deploy.model.io.files import sha256
 from beers_deploy.profiles.toml import parse_json
 
 Line = dict[str, object]
-"""Of the manifest: one patch."""
+"""A line of the manifest, which describes one pair."""
 ROLES = ("degraded", "reference")
 DIGESTS = "sha256"
 
 
 def image_of(out: Path, role: str, name: object) -> Path:
-    """Return where a dataset keeps an image of the pair `name`."""
+    """Return the path in a dataset of an image of the pair `name`."""
     return out / role / f"{name}.tif"
 
 

@@ -16,7 +16,7 @@ from beers_deploy.profiles.validation import validated
 
 @dataclass(frozen=True)
 class PairsRecipe:
-    """The sensors that made a folder of pairs, and the scenes that they saw."""
+    """The sensors that made a folder of pairs, and their scenes."""
 
     degraded: Sensor
     reference: Sensor
@@ -24,10 +24,9 @@ class PairsRecipe:
     scenes: tuple[str | None, ...]
 
     def site(self, stem: str) -> str:
-        """The site of the pair NUMBER-SCENE or NUMBER-SCENE-PATCH: two frames of a site, or two
-        patches, are one.
+        """Return the site of the pair NUMBER-SCENE or NUMBER-SCENE-PATCH.
 
-        A drawn scene is a site of its own.
+        Two frames of a site, or two patches, belong to one site. A drawn scene is its own site.
         """
         number = stem.split("-", 1)[0]
         is_number = number.isdecimal() and int(number) < len(self.scenes)
@@ -36,7 +35,7 @@ class PairsRecipe:
 
 
 def read_pairs_recipe(folder: Path) -> PairsRecipe | None:
-    """The recipe beside a folder's pairs; None where there is none."""
+    """Read the recipe next to a folder's pairs, or return None if there is none."""
     path = folder / "recipe.json"
     if not path.exists():
         return None
@@ -58,8 +57,12 @@ def profiles_for(
     reference: SensorLike | None,
     recipe: PairsRecipe | None,
 ) -> tuple[Sensor, Sensor]:
-    """The profiles of degraded and reference images: the recipe's where there is one, else those
-    named.
+    """Return the profiles of the degraded and the reference images.
+
+    Args:
+        sensor: the named sensor; None for that of the recipe, or the default.
+        reference: the named reference, likewise.
+        recipe: of the pairs; a named sensor must agree with it. None if there is none.
     """
     if recipe is None:
         degraded = Sensor.load(sensor or SENSOR)

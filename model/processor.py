@@ -1,8 +1,8 @@
-"""This machine's processor: its name, and what its kernels do, asked of the runtimes that run them.
+"""Identify this machine's processor, and test how the kernels of the installed runtimes compute.
 
-The name decides nothing. Lists of features would not serve either: an emulator shows its host's,
-other systems show none, and a runtime may not use what is there. So each question is a tiny
-computation whose right answer is known, put once a process, when somebody needs it.
+The name has no effect. Lists of CPU features are not used either: an emulator shows those of its
+host, other systems show none, and a runtime may not use them. Each question is therefore a tiny
+computation with a known result, run at most once per process when it is needed.
 """
 
 import os
@@ -23,35 +23,35 @@ CHANNELS = 32
 SIDE_PX = 3
 ACTIVATION = 255
 WEIGHT = 127
-"""Two neighbouring products of these make 64 770: twice what int16 holds."""
+"""Two neighbouring products of this weight sum to 64 770, twice the range of int16."""
 RESULT = 200
-"""What the sum of a whole window becomes in 8 bits."""
+"""The 8-bit result of the sum of a whole window."""
 
 _decided: dict[str, str] = {}
 
 
 def decided() -> dict[str, str]:
-    """What was asked in this process so far, and the answer in words."""
+    """Return the questions answered in this process so far, with the answers in words."""
     return dict(_decided)
 
 
 Convolve = Callable[[bytes, "np.ndarray"], "np.ndarray"]
-"""Runs an ONNX model, given as a file's bytes, on an image (1, C, H, W) uint8."""
+"""A function that runs an ONNX model, given as bytes, on an image (1, C, H, W) uint8."""
 
 
 @lru_cache(maxsize=1)
 def int8_adds_exactly() -> bool:
-    """Whether onnxruntime adds products of uint8 activations and int8 weights without saturation:
+    """Return True if onnxruntime adds products of uint8 and int8 without saturation;
     see `asked`.
     """
     return asked("onnxruntime", _on_onnxruntime)
 
 
 def asked(runtime: str, convolve: Convolve) -> bool:
-    """Whether a runtime's integer convolutions add exactly, told by one of the largest numbers.
+    """Return True if a runtime's integer convolutions add without saturation.
 
-    x86 kernels without VNNI add pairs of products of uint8 and int8 in saturating int16, and give
-    half of this sum.
+    x86 kernels without VNNI add pairs of products of uint8 and int8 in saturating int16. They
+    return half of the sum of the largest numbers, with which this is tested.
     """
     import numpy as np
 
@@ -73,7 +73,7 @@ def _on_onnxruntime(model: bytes, image: "np.ndarray") -> "np.ndarray":
 
 
 def _largest_convolution() -> bytes:
-    """An ONNX file: one window over the whole image, all weights the largest, the sum scaled to
+    """Build an ONNX file: one window over the whole image, all weights largest, the sum scaled to
     RESULT.
     """
     import numpy as np
@@ -103,16 +103,16 @@ def _largest_convolution() -> bytes:
 
 COMM = Path("/proc/self/comm")
 CPUINFO = Path("/proc/cpuinfo")
-"""Linux: what runs this process, and one block of lines for each core."""
+"""On Linux, the description of the processor: one block of lines per core."""
 WINDOWS_KEY = r"HARDWARE\DESCRIPTION\System\CentralProcessor\0"
 
 
 @lru_cache(maxsize=1)
 def processor_name() -> str | None:
-    """Such as "AMD EPYC 7763 64-Core Processor" or "Apple M2".
+    """Return the name of the processor, such as "AMD EPYC 7763 64-Core Processor" or "Apple M2".
 
-    None where the system tells no name, and under user-mode emulation, where the one it tells is of
-    the processor beneath the emulated one.
+    None if the system states no name, and under user-mode emulation, where the stated name is that
+    of the host's processor.
     """
     ways = {"Linux": _linux_name, "Darwin": _macos_name, "Windows": _windows_name}
     try:
@@ -138,8 +138,8 @@ def _linux_name() -> str:
 
 
 def _fields(cpuinfo: str) -> dict[str, list[str]]:
-    """The different values of each field, in order: large and small cores have
-    names of their own.
+    """Return the distinct values of each field in order, because large and small cores differ in
+    name.
     """
     fields: dict[str, list[str]] = {}
     for line in cpuinfo.splitlines():
@@ -166,12 +166,14 @@ def _windows_name() -> str:
 
 
 SEEDS = 2**62
-"""The largest seed: torch takes one of 64 bits, and other draws of a run add to it."""
+"""The largest seed: torch accepts 64 bits, and other draws of a run add to it."""
 
 
 def require_cores(option: str, asked: int) -> None:
-    """Refuse more threads or processes than this machine has logical cores; 0 is the option's own
-    default.
+    """Raise OptionError if more threads or processes are requested than this machine has logical
+    cores.
+
+    0 stands for the option's default.
     """
     cores = os.cpu_count() or 1
     if not 0 <= asked <= cores:

@@ -1,9 +1,9 @@
-"""Long work: its progress is shown, and Ctrl-C waits for a good moment.
+"""Show the progress of long work, and delay Ctrl-C until a step is complete.
 
-`steps` counts work whose length is known, `progress` names one step after the other where it is
-not, and `step` names a step from within. On a terminal and in Jupyter they are one bar of rich,
-elsewhere plain lines on standard error. An interrupt arrives between two steps, never within one: a
-half-made update cannot be resumed.
+`steps` counts work whose length is known, `progress` names one step after the other if it is not,
+and `step` names a step from within. On a terminal and in Jupyter they are one bar of rich,
+elsewhere plain lines on standard error. An interrupt arrives between two steps, never within one,
+because a half-made update cannot be resumed.
 """
 
 import logging
@@ -33,12 +33,12 @@ LINE_EVERY_S = 5.0
 
 @dataclass(frozen=True)
 class Step:
-    """How far a piece of work is.
+    """The progress of a piece of work.
 
     Attributes:
-        what: is being done.
-        done: number of steps that are done.
-        total: number of all steps, or None if that is unknown.
+        what: description of the work.
+        done: the number of steps that are done.
+        total: the number of all steps, or None if unknown.
     """
 
     what: str
@@ -47,8 +47,8 @@ class Step:
 
 
 Progress = bool | Callable[[Step], None] | None
-"""How a caller wants to see progress: a function, False for not at all, None or True for a bar or
-plain lines.
+"""How a caller wants to see progress: a function that is called; False for not at all; None or True
+for a bar or plain lines.
 """
 
 _sink: ContextVar[Progress] = ContextVar("progress", default=None)
@@ -56,7 +56,7 @@ _sink: ContextVar[Progress] = ContextVar("progress", default=None)
 
 @contextmanager
 def reporting(wanted: Progress) -> Iterator[None]:
-    """Report the work of this block as a caller wants; None leaves it as it is."""
+    """Report the work of this block as a caller wants; None changes nothing."""
     token = _sink.set(_sink.get() if wanted is None else wanted)
     try:
         yield
@@ -133,7 +133,7 @@ class Steps:
         self._printed = time.monotonic()
 
     def advance(self, steps: int = 1, note: str = "") -> None:
-        """Report that so many further steps are done."""
+        """Report that further steps are done."""
         self.done += steps
         sink = _sink.get()
         text = f"{self.label} {note}".strip()
@@ -191,7 +191,7 @@ def progress(label: str) -> Iterator[None]:
 
 
 def step(name: str) -> None:
-    """Name the step that begins now, for whoever shows the progress of this work."""
+    """Name the step that begins now, for the progress report of this work."""
     work = _work.get()
     sink = _sink.get()
     if work is None or sink is False:
@@ -212,7 +212,7 @@ def _line(text: str) -> None:
 
 
 class Interrupt:
-    """True in `asked` if somebody asked to stop."""
+    """A flag: `asked` is True if the user asked to stop."""
 
     asked = False
 

@@ -1,5 +1,5 @@
-"""The self-check: blurred as the sensor blurs, a restored image must differ from the raw one by
-noise alone.
+"""Check a restoration: blurred as the sensor blurs, the restored image must differ from the raw one
+by noise only.
 
     chi2 = mean over a block of (y - H x)^2 / variance(y)
 
@@ -7,22 +7,22 @@ y is the raw image, x the restored one, and H the blur that leads from the refer
 sensor's, as in `model.consistency`. The variance is that of the sensor's profile. No reference and
 no model of a fault is needed.
 
-1. Blur the restored image by H. Its kernel is cut at REACH_PX, and what is cut off (0.3 % of its
-   sum) is spread evenly.
-2. Divide the residual by the variance of the noise at the light that H x shows.
-3. Take the means over blocks of BLOCK_PX, without pixels that no residual is known of: missing and
-   saturated ones, those close to one, and those at the image's border.
+1. Blur the restored image by H. Its kernel is cut at REACH_PX, and the rest (0.3 % of its sum) is
+   spread evenly.
+2. Divide the residual by the variance of the noise at the light of H x.
+3. Average over blocks of BLOCK_PX, without pixels whose residual is unknown: missing and saturated
+   ones, those close to one, and those at the image's border.
 
-A restoration that is right leaves a chi2 between about 0.2 and 0.9, because it keeps a part of the
-noise. A chi2 above MOST_CHI2 means that x is no image that the sensor shows as y: another
-network's file, a broken tile, a flipped weight.
+A correct restoration has a chi2 between about 0.2 and 0.9, because it retains a part of the noise.
+A chi2 above MOST_CHI2 means that the sensor would not show x as y. Reasons are another network's
+file, a broken tile or a flipped weight.
 
-Where the scene is smooth, a wrong restoration changes little. `sharpening`, the mean of
-(x - H x)^2 / variance(y), is what the restoration could have got wrong, in the same unit. Below
-LEAST_SHARPENING a block within the bound says nothing: it is not decidable.
+If the scene is smooth, a wrong restoration changes little. `sharpening`, the mean of (x - H x)^2 /
+variance(y), is the largest error that the restoration could have made, in the same unit. If it is
+below LEAST_SHARPENING, a block within the bound is no evidence: it is not decidable.
 
-What the check cannot see: a profile that is itself wrong, because the same wrong H restored the
-image and blurs it again. That is the task of the sensor check.
+The check cannot detect a profile that is itself wrong, because the same wrong H restored the image
+and blurs it again. The sensor check detects that.
 """
 
 from dataclasses import dataclass
@@ -47,9 +47,7 @@ the radius (measured on a drawn scene of 480 DN rms).
 """
 
 LEAST_TERM = 1e-5
-"""Share of the largest term below which the kernel's terms are left out. They sum to 0.001
-(measured).
-"""
+"""Terms of the kernel below this share of the largest are omitted. They sum to 0.001 (measured)."""
 
 NEAR_PX = 16
 """Pixels this close to a missing or saturated one, or to the image's border, do not count: 2 % of
@@ -73,11 +71,11 @@ SMOOTH = 2
 
 @dataclass(frozen=True)
 class Judged:
-    """What is seen of the blocks of an image, (n, m) each; NaN where too few pixels count.
+    """The measurements of the blocks of an image, (n, m) each; NaN if too few pixels count.
 
     Attributes:
         chi2: the mean squared residual over the variance of the noise.
-        sharpening: the mean square of what the restoration changed, over the same variance.
+        sharpening: the mean square of the restoration's change, over the same variance.
     """
 
     chi2: Array
@@ -200,7 +198,7 @@ class SelfCheck:
             reached = maximum_filter(unknown, 2 * NEAR_PX + 1, mode="constant")
         inside = []
         for placed, side in zip((down, across), raw.shape, strict=True):
-            # Only the image's own border is left out, so that tiles give the same figures as the
+            # Only the image's own border is excluded, so that tiles give the same figures as the
             # whole image.
             places = np.arange(placed.start, placed.start + side)
             inside.append((places >= NEAR_PX) & (places < placed.size_px - NEAR_PX))

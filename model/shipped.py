@@ -1,4 +1,4 @@
-"""Where the shipped weights lie; nothing is loaded to find them."""
+"""Locate the shipped weights without loading anything."""
 
 from pathlib import Path
 
@@ -9,24 +9,24 @@ SHIPPED = Path(__file__).parent / "weights"
 VARIANT = "convbeers-s"
 
 INT8 = "-int8"
-"""Behind a network's name: that network in INT8."""
+"""The suffix of a network's name that denotes the network in INT8."""
 
 SENSOR = "pleiades-degraded"
-"""The sensor profile of a command that names none: the same for all.
+"""The default sensor profile of all commands.
 
-(`train` alone defaults to a range of sensors, and `restore` to a sensor that is not known.)
+(Only `train` defaults to a range of sensors, and `restore` to an unknown sensor.)
 """
 
 
 def shipped_names() -> list[str]:
-    """The names of the shipped networks: each the weights of one network for
-    every sensor in range.
-    """
+    """List the names of the shipped networks; each is one network for every sensor in range."""
     return sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
 
 
 def shipped_weights(name: str) -> Path:
-    """The shipped weights of that name."""
+    """Return the path of the shipped weights of that name, or raise ModelError if
+    there are none.
+    """
     if name not in shipped_names():
         raise ModelError(
             f"There are no shipped weights {name!r}, only {', '.join(shipped_names())}. Give one "

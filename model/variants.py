@@ -1,7 +1,6 @@
-"""The sizes of ConvBEERS by name, and the tensors that each is made of; nothing is loaded to know
-them.
+"""Define the sizes of ConvBEERS by name, and the tensors of each, without loading anything.
 
-The paper's family works at full resolution. A variant of scale 2 sees each square of 2 x 2 pixels
+The paper's family works at full resolution. A variant of scale 2 treats each square of 2 x 2 pixels
 as one place of four channels, and so works at half resolution: its maps have a quarter of the
 places.
 """
@@ -14,14 +13,15 @@ from typing import Literal
 from beers_deploy.profiles.errors import OptionError
 
 Kernels = Literal["cut", "fitted"]
-"""How the filters in front of a network become kernels of 7 x 7: cut out of the whole, or fitted.
+"""How the filters in front of a network are reduced to kernels of 7 x 7: cut from the whole filter,
+or fitted.
 
-Networks behind the second kind were trained on many curves of the MTF (`model.curves`).
+Networks behind fitted kernels were trained on many curves of the MTF (`model.curves`).
 """
 
 BANK_PLANES = 5
 SENSOR_VALUES = 4
-"""What a head behind a bank reads: the image and four planes of each pixel, and the numbers of a
+"""The inputs of a head behind a bank: the image and four planes of each pixel, and the values of a
 sensor vector.
 """
 
@@ -43,14 +43,14 @@ class Variant:
 
     @property
     def pixels(self) -> int:
-        """Pixels of one place of the maps, each a channel of the network's ends."""
+        """The number of pixels of one place of the maps, which are the channels of the network's
+        input and output.
+        """
         return self.scale**2
 
     @property
     def convolutions(self) -> Mapping[str, tuple[int, int]]:
-        """(outputs, inputs) of each 3 x 3 convolution by name, in the order in which an image meets
-        them.
-        """
+        """(outputs, inputs) of each 3 x 3 convolution by name, in the order of computation."""
         places = product(range(self.blocks), ("first", "second"))
         body = [f"body.{block}.{place}" for block, place in places]
         square = (self.features, self.features)
@@ -70,7 +70,7 @@ class Variant:
 
     @property
     def banked_shapes(self) -> dict[str, tuple[int, ...]]:
-        """As `shapes`, behind a bank of four filters: its head reads their planes, and is told a
+        """The same as `shapes`, behind a bank of four filters: the head reads their planes and the
         sensor vector.
         """
         head = self.features, BANK_PLANES * self.pixels, 3, 3
@@ -87,7 +87,7 @@ VARIANTS = {
 
 
 def variant_named(name: str) -> Variant:
-    """The variant of that name."""
+    """Return the variant of that name, or raise OptionError if there is none."""
     if name not in VARIANTS:
         raise OptionError(f"`variant` must be one of {', '.join(VARIANTS)}, got {name!r}.")
     return VARIANTS[name]

@@ -1,5 +1,6 @@
-"""Read NumPy's files, which may come from anyone: nothing is unpickled, and any damage is one
-reason in words.
+"""Read NumPy files from untrusted sources, without unpickling.
+
+Any damage is reported as one reason.
 """
 
 from pathlib import Path
@@ -9,16 +10,15 @@ import numpy as np
 from beers_deploy.profiles.toml import unreadable
 
 ZIP = b"PK"
-"""What an archive begins with, also a truncated one."""
+"""The first bytes of a ZIP archive, which a truncated archive has too."""
 ALONE = ""
-"""Name of the array of a .npy file."""
+"""The name under which the array of a .npy file is returned."""
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a .npz file by name, or that of a .npy file, mapped, under the name
-    `ALONE`.
+    """Load the arrays of a .npz file by name, or that of a .npy file, memory-mapped, as `ALONE`.
 
-    The content tells which of the two a file is, not its name.
+    The content determines which of the two a file is, not its name.
 
     Raises:
         ValueError: a file that holds no arrays, or damaged ones; the message is the reason.
@@ -31,7 +31,7 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
             is_archive = stream.read(len(ZIP)) == ZIP
         if not is_archive:
             return {ALONE: np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))}
-        # NumPy leaves a broken archive open, so that the stream is ours to close.
+        # NumPy leaves a broken archive open, so the stream is closed here.
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             return {name: np.asarray(archive[name]) for name in archive.files}
     except (AttributeError, ImportError, NameError):

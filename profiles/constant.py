@@ -1,4 +1,4 @@
-"""A number, or a list of names, and where it comes from: what a profile holds."""
+"""Define the constants that a profile stores: a number or a list of names, with its provenance."""
 
 import sys
 from collections.abc import Mapping
@@ -13,8 +13,10 @@ from beers_deploy.profiles.errors import printable
 from beers_deploy.profiles.validation import CONFIG
 
 Status = Literal["published", "inferred", "measured", "assumed", "stated"]
-"""published: in a document; measured: on the instrument; inferred: computed from such; assumed: our
-choice; stated: the user's own.
+"""Where a value comes from.
+
+"published": in a document. "measured": on the instrument. "inferred": computed from published or
+measured values. "assumed": chosen by this project. "stated": given by the user.
 """
 
 
@@ -76,17 +78,17 @@ class Constant(Stated):
 
     @property
     def low(self) -> float:
-        """The smallest value it can take."""
+        """The smallest value of the range."""
         return self.value[0] if isinstance(self.value, tuple) else self.value
 
     @property
     def high(self) -> float:
-        """The largest value it can take."""
+        """The largest value of the range."""
         return self.value[1] if isinstance(self.value, tuple) else self.value
 
     @property
     def middle(self) -> float:
-        """The middle of what it can be."""
+        """The middle of the range."""
         return (self.low + self.high) / 2
 
     def __str__(self) -> str:
@@ -95,8 +97,8 @@ class Constant(Stated):
 
 @dataclass(frozen=True, config=CONFIG)
 class Words(Stated):
-    """A list of names, which may be empty, with its provenance: what an operation can be fused
-    with.
+    """A list of names with its provenance, for example the activations that an operation can be
+    fused with. It may be empty.
     """
 
     value: tuple[str, ...]
@@ -106,19 +108,19 @@ class Words(Stated):
 
 
 NEARLY_0 = 1e-12
-"""A lower limit up to here stands for "above 0": the number is divided by."""
+"""A lower limit that stands for "above 0", for numbers that are used as divisors."""
 
 
 @plain_dataclass(frozen=True)
 class Limits:
-    """The numbers that a constant can have, both ends included: `Annotated[Constant, Limits(0, 5)]`
-    is a type that pydantic checks.
+    """The valid values of a constant, both ends included: `Annotated[Constant, Limits(0, 5)]` is a
+    type that pydantic checks.
 
     Attributes:
         low: the smallest.
         high: the largest.
         whole: True if the number counts something.
-        single: True if the number defines what others mean, so that there is no range to draw from.
+        single: True if other numbers depend on this one, so that it cannot be a range to draw from.
         hint: a sentence that follows the one about a wrong number.
     """
 

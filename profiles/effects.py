@@ -1,9 +1,9 @@
-"""The effects that a sensor or a scene may call for beside blur, noise and digitising: one class a
+"""Define the effects that a sensor or a scene may add to blur, noise and digitising: one class per
 TOML table.
 
-A profile calls for an effect by having its table. A class has its parameters with their limits,
-what it does to an image, the most that it may change of it, and what that costs. At their neutral
-values they leave the image as it is.
+A profile adds an effect by having its table. A class has its parameters with their limits, applies
+the effect to an image, and states the largest change and the cost of it. At their neutral values
+the parameters leave the image unchanged.
 """
 
 from abc import ABC, abstractmethod
@@ -18,16 +18,16 @@ from beers_deploy.profiles.constant import Constant, Limits
 from beers_deploy.profiles.validation import CONFIG, check_keys
 
 PATTERN_LIMIT = 4.0
-"""Detectors further out are rejected at the factory: draws are clipped here, so that bounds can be
-proven.
+"""Random numbers are clipped to this many standard deviations, so that bounds can be proven. The
+factory rejects detectors further out.
 """
 
 Generator = Callable[[], np.random.Generator]
-"""Makes the generator of an effect, for those that draw."""
+"""Makes the generator of an effect that draws random numbers."""
 
 
 class Digitiser(Protocol):
-    """What an effect needs of the instrument that it belongs to."""
+    """The properties of an instrument that its effects use."""
 
     @property
     def gain_dn_per_radiance(self) -> float:
@@ -62,22 +62,24 @@ class PixelEffect(Effect, ABC):
     acts_on: ClassVar[Literal["radiance", "DN"]]
     cost: ClassVar[str] = "1 pass"
     unseen: ClassVar[str] = ""
-    """Why a scene cannot show it where its bound is zero; without it, its
-    parameters are neutral.
+    """The reason why a scene cannot show the effect if its bound is zero. If empty, its parameters
+    are neutral then.
     """
 
     @property
     def growth(self) -> float:
-        """The largest factor by which it enlarges a change of the image that it is given."""
+        """The largest factor by which the effect enlarges a change of its input image."""
         return 1.0
 
     @abstractmethod
     def apply(self, image: np.ndarray, sensor: Digitiser, generator: Generator) -> np.ndarray:
-        """An image (..., H, W) with the effect."""
+        """Return an image (..., H, W) with the effect applied."""
 
     @abstractmethod
     def bound_dn(self, sensor: Digitiser, low: float, high: float) -> float:
-        """Largest change of any pixel, in DN, for a signal between `low` and `high` radiance."""
+        """Return the largest change of any pixel, in DN, for a signal between `low` and `high`
+        radiance.
+        """
 
 
 @dataclass(frozen=True)
@@ -145,13 +147,15 @@ class FullWell(PixelEffect):
         return np.asarray(np.minimum(image, self.radiance))
 
     def bound_dn(self, sensor: Digitiser, low: float, high: float) -> float:
-        # What is cut off, and what is spilt, is no more than the excess.
+        # Neither the clipped nor the spread radiance exceeds the excess.
         return sensor.gain_dn_per_radiance * max(high - self.radiance, 0.0)
 
 
 @dataclass(frozen=True)
 class Prnu(PixelEffect):
-    """Relative spread of the detectors' responses, one detector a column; 0 is none."""
+    """Relative standard deviation of the detectors' responses, one detector per
+    column; 0 is none.
+    """
 
     rms: Annotated[float, Limits(0.0, 0.2)]
     acts_on = "radiance"
@@ -171,7 +175,7 @@ class Prnu(PixelEffect):
 
 @dataclass(frozen=True)
 class Dsnu(PixelEffect):
-    """Spread of the detectors' offsets in DN, one detector a column; 0 is none."""
+    """Standard deviation of the detectors' offsets in DN, one detector per column; 0 is none."""
 
     rms_dn: Annotated[float, Limits(0.0, 1e4)]
     acts_on = "DN"
@@ -253,11 +257,16 @@ TABLES: dict[str, type[Effect]] = {
     "offset": Offset,
     "defects": Defects,
 }
-"""By their tables; those of the image in the order in which they apply."""
+"""Effects by the name of their table; those on the image are in the order in which they apply."""
 
 
 def pixel_effects(effects: Mapping[str, Effect], acts_on: str) -> dict[str, PixelEffect]:
-    """The effects on radiance, or those on DN, in the order in which they apply."""
+    """Return the effects on radiance or those on DN, in the order in which they apply.
+
+    Args:
+        effects: all effects, by name.
+        acts_on: the unit that the effects must act on.
+    """
     effects_in_order = ((name, effects.get(name)) for name in TABLES)
     return {
         name: effect
@@ -267,7 +276,7 @@ def pixel_effects(effects: Mapping[str, Effect], acts_on: str) -> dict[str, Pixe
 
 
 def _columns(image: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """One clipped standard normal number a column, (W,) float32."""
+    """Draw one clipped standard normal number per column, (W,) float32."""
     draw = generator.standard_normal(image.shape[-1], dtype=np.float32)
     return np.asarray(np.clip(draw, -PATTERN_LIMIT, PATTERN_LIMIT))
 

@@ -1,4 +1,4 @@
-"""What can go wrong with what a user hands us.
+"""Define the exceptions for bad input.
 
 BeersError              one sentence, no traceback, exit code 2
   ProfileError          a sensor or target profile
@@ -21,19 +21,19 @@ CRASHED = 70
 """Exit code of a fault in this program or its installation (sysexits' EX_SOFTWARE)."""
 
 LONGEST = 400
-"""Characters of a file that a message shows at most."""
+"""The maximum number of characters from a file that a message shows."""
 
 LONGEST_MESSAGE = 2400
-"""Characters of a whole message at most."""
+"""The maximum number of characters of a whole message."""
 
 
 class BeersError(Exception):
-    """Bad input: a message for the person who gave it.
+    """Bad input, with a message for the person who gave it.
 
     Args:
-        message: a sentence that says what is wrong, with the value and the file or the parameter,
-            and one that says what to do. Names of parameters stand in backquotes: the command line
-            replaces them by its options.
+        message: a sentence on what is wrong, with the value and the file or the parameter, and one
+            on what to do. Names of parameters stand in backquotes: the command line replaces them
+            by its options.
 
     Examples:
         >>> try:
@@ -48,13 +48,13 @@ class BeersError(Exception):
 
 
 def printable(text: str, longest: int = LONGEST) -> str:
-    """One line that a terminal shows as it is, whatever a file held."""
+    """Return text from a file as one printable line, cut to `longest` characters."""
     return one_line(text[:longest]) + ("..." if len(text) > longest else "")
 
 
 def reason_of(error: BaseException) -> str:
-    """Return the message of a library's error for a sentence of ours: on one line, cut where it is
-    long, and without a full stop.
+    """Return the message of a library's error on one line, shortened and without a full stop, for
+    use in a sentence.
     """
     return printable(" ".join(str(error).split())).rstrip(".")
 
@@ -69,22 +69,22 @@ def one_line(text: str) -> str:
 
 
 def encodable(text: str) -> str:
-    """Return the text with an escape for what UTF-8 cannot hold: bytes of a file's name in another
+    """Return the text with escapes for what UTF-8 cannot encode, such as a file name in another
     encoding.
     """
     return text.encode(errors="backslashreplace").decode()
 
 
 def visible(text: str) -> str:
-    """The text, lines and tabs kept, with each other character that a terminal would obey or hide
-    as its escape.
-    """
+    """Return the text with every other unprintable character than a line break or a tab escaped."""
     return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
 
 
 def sizes(*counts_bytes: float) -> list[str]:
-    """Numbers of bytes, each in its own unit, with as many digits (three or more) as tell different
-    ones apart.
+    """Format numbers of bytes, each in its own unit.
+
+    All have the same number of significant digits, three or more, so that different numbers give
+    different texts.
     """
     for digits in range(3, 17):
         texts = [_size(count, digits) for count in counts_bytes]
@@ -102,7 +102,7 @@ def _size(count_bytes: float, digits: int) -> str:
 
 
 class ProfileError(BeersError, ValueError):
-    """A sensor or target profile that does not hold together."""
+    """A sensor or target profile whose contents are missing, wrong or contradictory."""
 
 
 class ImageError(BeersError, ValueError):
@@ -110,7 +110,7 @@ class ImageError(BeersError, ValueError):
 
 
 class ModelError(BeersError, ValueError):
-    """A weights or ONNX file that is not what the command needs."""
+    """A weights or ONNX file that the command cannot use."""
 
 
 class OptionError(BeersError, ValueError):
@@ -118,18 +118,18 @@ class OptionError(BeersError, ValueError):
 
 
 class MachineError(BeersError, RuntimeError):
-    """Something this host lacks: memory, disk space, workers."""
+    """This host lacks a resource: memory, disk space or workers."""
 
 
 class MissingExtraError(MachineError, ImportError):
-    """An optional package that is not installed, and the extra that brings it."""
+    """An optional package is not installed. The message names the extra that installs it."""
 
 
 CODE_FAULTS = (AttributeError, ImportError, NameError, TypeError)
-"""What code raises that does not fit the version of a library.
+"""The exceptions that code raises if it does not fit the version of a library.
 
-A damaged file leads a compiled library to none of them. A library that is written in Python may
-raise them for both.
+A damaged file makes a compiled library raise none of them. A library written in Python may raise
+them for both reasons.
 """
 
 

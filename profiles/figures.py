@@ -1,8 +1,9 @@
-"""What a reported figure is: a number with its unit, its mode and its source; rows of them, and
-checks of a limit.
+"""Define reported figures: a number with its unit, mode and source; rows of them; and checks
+against a limit.
 
-A figure is measured (here), predicted (by a model, with an interval) or published (by a named
-document); what could not be had is unavailable, with the reason, and never a zero.
+A figure is measured (on this machine), predicted (by a model, with an interval) or published (in a
+named document). A figure that could not be determined is unavailable, with the reason. It is never
+reported as zero.
 """
 
 import math
@@ -16,14 +17,16 @@ Mode = Literal["measured", "predicted", "published", "unavailable"]
 
 
 DIGITS = {"measured": 4, "predicted": 3, "published": 12, "unavailable": 4}
-"""Significant digits shown: a prediction deserves fewer, a published figure stays as printed."""
+"""The number of significant digits shown for each mode. A prediction deserves fewer, and a
+published figure stays as printed.
+"""
 
 NOT_FINITE = "the result is not a finite number"
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A finite number with its unit, its mode and its source, or none and the reason why."""
+    """A finite number with its unit, mode and source, or no number and the reason why."""
 
     value: float | None
     unit: str
@@ -37,7 +40,7 @@ class Figure:
             raise ValueError(f"a figure that is not finite: {self.value} {self.interval or ''}")
 
     def to_json(self) -> dict[str, object]:
-        """The figure as the schema wants it."""
+        """Return the figure as a dictionary that matches the results schema."""
         if self.mode == "unavailable":
             return {"value": None, "unit": self.unit, "mode": self.mode, "reason": self.reason}
         interval = list(self.interval) if self.interval else None
@@ -63,10 +66,16 @@ class Figure:
 def measured(
     value: float, unit: str, source: str, interval: tuple[float, float] | None = None
 ) -> Figure:
-    """A number that this run observed on this machine, and how far a repetition might lie from it
-    where known.
+    """Build a figure that this run measured on this machine.
 
-    Unavailable where it is NaN or infinite; without an interval where that is.
+    The figure is unavailable if `value` is NaN or infinite. It has no interval if an end of
+    `interval` is.
+
+    Args:
+        value: the number.
+        unit: its unit.
+        source: how it was measured.
+        interval: the range in which a repetition is expected, if known.
     """
     if not math.isfinite(value):
         return unavailable(unit, f"{NOT_FINITE} ({float(value)}): {source}")
@@ -77,8 +86,15 @@ def measured(
 
 
 def predicted(value: float, unit: str, interval: tuple[float, float], source: str) -> Figure:
-    """A number that a model computed, and how far off it may be; unavailable where any of them is
-    not finite.
+    """Build a figure that a model computed, with its uncertainty interval.
+
+    It is unavailable if the value or an end of the interval is not finite.
+
+    Args:
+        value: the number.
+        unit: its unit.
+        interval: the range in which the true value is expected.
+        source: the model.
     """
     if not all(math.isfinite(number) for number in (value, *interval)):
         return unavailable(unit, f"{NOT_FINITE} ({float(value)}): {source}")
@@ -86,18 +102,19 @@ def predicted(value: float, unit: str, interval: tuple[float, float], source: st
 
 
 def published(value: float, unit: str, source: str) -> Figure:
-    """A number that a document prints."""
+    """Build a figure that a document prints."""
     return Figure(float(value), unit, "published", source)
 
 
 def unavailable(unit: str, reason: str) -> Figure:
-    """A number that could not be had."""
+    """Build a figure without a number, and with the reason why there is none."""
     return Figure(None, unit, "unavailable", reason=reason)
 
 
 def number(value: float, digits: int) -> str:
-    """So many significant digits, thousands grouped, no exponent where a person would not write
-    one.
+    """Format a value with `digits` significant digits and with its thousands grouped.
+
+    From 1000 upwards no exponent is used.
     """
     rounded = float(f"{value:.{digits}g}")
     if abs(rounded) < 1000:
@@ -109,7 +126,7 @@ def number(value: float, digits: int) -> str:
 
 @dataclass(frozen=True)
 class Row:
-    """One line of a table: a name, its figures, and plain words beside them."""
+    """One row of a table: a name, its figures, and a text."""
 
     table: str
     name: str
@@ -118,7 +135,7 @@ class Row:
 
 
 def by_table(rows: Iterable[Row]) -> dict[str, list[Row]]:
-    """The rows of each table, in the order in which the tables first appear."""
+    """Group rows by table, in the order in which the tables first appear."""
     tables: dict[str, list[Row]] = {}
     for row in rows:
         tables.setdefault(row.table, []).append(row)
@@ -128,24 +145,23 @@ def by_table(rows: Iterable[Row]) -> dict[str, list[Row]]:
 Bound = Literal["at most", "at least"]
 
 IN_THE_NAME = {"ratio", "node", "layer", "ReLU", "fault", "step", "opset", "size", "network"}
-"""Units that a check's name tells a reader already."""
+"""Units that are not printed, because the name of the check already states them."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that a gate looks at: a value and its limit.
+    """One check of a gate: a value and its limit.
 
-    The number decides, and NaN keeps no limit.
+    NaN never passes.
 
     Attributes:
-        name: what is measured, for example "MAE".
-        value: what was found, in `unit`; infinite or NaN where a network gave that.
-        limit: the largest value that passes, or the smallest where `bound` says "at least";
-            infinity for none.
-        unit: of both; a count has the name of what is counted, for example "node".
+        name: of the measured quantity, for example "MAE".
+        value: the measured value, in `unit`; infinite or NaN if a network returned that.
+        limit: the largest value that passes, or the smallest if `bound` is "at least"; infinity for
+            none.
+        unit: of both; a count has the name of the counted objects, for example "node".
         bound: the side of the limit that passes.
-        detail: where the value was found, or where the limit comes from; empty where there is
-            nothing to add.
+        detail: where the value was measured, or where the limit comes from; may be empty.
     """
 
     name: str
@@ -157,26 +173,29 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether the value keeps its limit."""
+        """True if the value is within its limit."""
         return self.value >= self.limit if self.bound == "at least" else self.value <= self.limit
 
     @property
     def found(self) -> str:
-        """The value with its unit and its detail, for a person."""
+        """The value with its unit and detail, formatted for a person."""
         unit = "" if self.unit in IN_THE_NAME else f" {self.unit}"
         # A detail may hold the name of a node of another's file: it must stay on its line of a log.
         return f"{self.value:.4g}{unit}" + (f" ({printable(self.detail)})" if self.detail else "")
 
     @property
     def allowed(self) -> str:
-        """The limit, for a person."""
+        """The limit, formatted for a person."""
         return f"{self.bound} {self.limit:.4g}"
 
     def __str__(self) -> str:
         return f"{self.name} {self.found}, allowed {self.allowed}"
 
     def to_json(self) -> dict[str, object]:
-        """The check as the results schema wants it; None for what JSON has no number for."""
+        """Return the check as a dictionary that matches the results schema.
+
+        A value or limit that is not finite becomes None, because JSON has no number for it.
+        """
         return {
             "name": self.name,
             "value": _finite(self.value),

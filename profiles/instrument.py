@@ -1,4 +1,4 @@
-"""One instrument, every number settled, and the physics that its numbers follow."""
+"""Define one instrument, with a single value for every parameter, and its physical model."""
 
 import math
 from collections.abc import Mapping
@@ -11,46 +11,47 @@ from beers_deploy.profiles.effects import Effect, Table
 from beers_deploy.profiles.response import PointSpread, Response
 
 MAX_DN = 4095
-"""The largest digital number of 12 bits: full scale, unless a sensor says otherwise."""
+"""The largest digital number of 12 bits, which is full scale unless a sensor states otherwise."""
 MTF_NYQUIST_MAX = 2 / math.pi
-"""A perfect lens over a square detector: sinc(0.5).
+"""The MTF at Nyquist of a perfect lens over a square detector: sinc(0.5).
 
-Nothing above it is a blur: its gamma would be negative.
+A higher value is no blur: its gamma would be negative.
 """
 OFFSET = "offset"
 ROUNDING = 1e-14
-"""What float64 may leave of a variance that ought to be 0, of the larger of the two variances."""
+"""The relative float64 rounding error of a variance that should be 0, as a share of the larger of
+the two variances.
+"""
 
 E = TypeVar("E", Effect, Table)
 
 
 @dataclass(frozen=True)
 class Instrument:
-    """One instrument, every number settled.
+    """One instrument, with a single value for every parameter.
 
-    One is drawn for every training patch, so it is a plain dataclass: the profile that it is drawn
-    from has been checked.
+    One is drawn for every training patch, so it is a plain dataclass without validation. The
+    profile that it is drawn from has been validated.
 
-    The noise variance is alpha * L + beta, L in W/m2/sr/um (paper, section 3.3, signal-dependent
-    noise).
+    The noise variance is alpha * L + beta, with L in W/m2/sr/um (paper, section 3.3,
+    signal-dependent noise).
 
     Attributes:
-        mtf_nyquist: contrast kept at 0.5 cycles per pixel; across the track where the two axes
-            differ.
+        mtf_nyquist: contrast at 0.5 cycles per pixel; across the track if the two axes differ.
         alpha: signal-dependent variance per radiance, in W/m2/sr/um.
         beta: variance in the dark, in (W/m2/sr/um)^2.
         gain_dn_per_radiance: digital numbers per W/m2/sr/um.
-        bits: of a digital number.
-        effects: beside blur, noise and digitising, by name.
-        mtf_nyquist_along: contrast kept along the track; None where it is that across. A
-            pushbroom's line of detectors lies across the track: image rows are lines in time, so
-            "across" is the horizontal axis (along a row, fx) and "along" the vertical one (down a
-            column, fy).
-        radiance_1: of what is bright in its scenes, in W/m2/sr/um: the brighter point at which its
-            SNR is stated.
-        response: the blur in full, by a table or a point-spread function; its contrasts at Nyquist
-            then stand in `mtf_nyquist` and `mtf_nyquist_along`. None for the formula's blur, which
-            these two settle.
+        bits: number of bits of a digital number.
+        effects: effects in addition to blur, noise and digitising, by name.
+        mtf_nyquist_along: contrast along the track; None if it equals the contrast across it. The
+            detector line of a pushbroom lies across the track, so image rows are lines in time.
+            "Across" is therefore the horizontal axis (along a row, fx) and "along" the vertical one
+            (down a column, fy).
+        radiance_1: radiance of bright objects in its scenes, in W/m2/sr/um: the brighter point at
+            which its SNR is stated.
+        response: the complete blur, as a table or a point-spread function. Its contrasts at Nyquist
+            are then repeated in `mtf_nyquist` and `mtf_nyquist_along`. None if the formula's blur
+            applies, which these two contrasts determine.
     """
 
     mtf_nyquist: float
@@ -72,15 +73,15 @@ class Instrument:
 
     @property
     def blur(self) -> tuple[float, float] | Response:
-        """What settles the MTF at every frequency: the response where there is one, else the two
-        contrasts.
+        """The parameters that determine the MTF at every frequency: the response if there is one,
+        otherwise the two contrasts at Nyquist.
         """
         return self.mtf_axes if self.response is None else self.response
 
     @property
     def symmetry(self) -> tuple[bool, bool]:
-        """Whether its images still are images of this sensor when (mirrored,
-        turned by a quarter).
+        """Two flags: True if its images remain valid images of this sensor when (mirrored, rotated
+        by 90 degrees).
         """
         if isinstance(self.response, PointSpread):
             # A point-spread function may have no symmetry at all.
@@ -92,7 +93,7 @@ class Instrument:
 
     @property
     def mtf_axes(self) -> tuple[float, float]:
-        """Contrast kept at 0.5 cycles per pixel, (across the track, along it): horizontally and
+        """Contrast at 0.5 cycles per pixel (across the track, along it), that is horizontally and
         vertically.
         """
         return (
@@ -121,8 +122,8 @@ class Instrument:
         return float(getattr(self.effects.get("smear"), "length_px", 0))
 
     def in_units_of(self, other: "Instrument") -> "Instrument":
-        """This sensor's blur and noise in the digital numbers of `other`: its gain, bits and
-        offset.
+        """Return an instrument with this blur and noise, and with the gain, bits and offset of
+        `other`.
         """
         effects = with_offset_of(other.effects, self.effects)
         return replace(
@@ -130,24 +131,24 @@ class Instrument:
         )
 
     def noise_sigma(self, radiance: float) -> float:
-        """Standard deviation of the noise at `radiance`, both in W/m2/sr/um."""
+        """Return the standard deviation of the noise at `radiance`, both in W/m2/sr/um."""
         # A sharp blur rings below zero, where the variance would be negative and have no root.
         return math.sqrt(max(self.alpha * radiance + self.beta, 0.0))
 
 
 def with_offset_of(others: Mapping[str, E], own: Mapping[str, E]) -> dict[str, E]:
-    """Return the own effects, but the offset of others."""
+    """Return `own` effects with the offset of the other ones."""
     return {name: effect for name, effect in own.items() if name != OFFSET} | {
         name: effect for name, effect in others.items() if name == OFFSET
     }
 
 
 def mtf_limit(antialias_sigma_px: float = 0.0) -> float:
-    """The highest MTF at Nyquist, that of a perfect lens: 2 / pi for a square detector, times the
-    filter's gain.
+    """Return the highest possible MTF at Nyquist: 2 / pi (a perfect lens over a square detector)
+    times the gain of the anti-alias filter.
 
-    A Gaussian filter of sigma target pixels keeps exp(-2 pi^2 sigma^2 f^2) at f = 0.5 cycles per
-    pixel.
+    The gain of a Gaussian filter of sigma target pixels is exp(-2 pi^2 sigma^2 f^2) at f = 0.5
+    cycles per pixel.
     """
     return MTF_NYQUIST_MAX * math.exp(-2 * (math.pi * antialias_sigma_px * 0.5) ** 2)
 
@@ -175,8 +176,16 @@ def _rounded_off(difference: float, rounding: float) -> float:
 
 
 def snr_0_bounds(radiance_0: float, radiance_1: float, snr_1: float) -> tuple[float, float]:
-    """The SNRs at `radiance_0` that leave alpha >= 0 (lower bound) and beta >= 0 (upper bound)."""
-    # Alpha >= 0 asks for sigma_0 <= sigma_1, and beta >= 0 for sigma_0^2 / L_0 >= sigma_1^2 / L_1;
-    # sigma is L / SNR.
+    """Return the SNRs at `radiance_0` for which alpha = 0 (lower bound) and beta = 0 (upper bound).
+
+    Between them alpha and beta are both at least 0.
+
+    Args:
+        radiance_0: the darker radiance, in W/m2/sr/um.
+        radiance_1: the brighter radiance, in the same unit.
+        snr_1: the SNR at `radiance_1`.
+    """
+    # Alpha >= 0 requires sigma_0 <= sigma_1, and beta >= 0 requires sigma_0^2 / L_0 >= sigma_1^2 /
+    # L_1; sigma is L / SNR.
     ratio = radiance_0 / radiance_1
     return snr_1 * ratio, snr_1 * math.sqrt(ratio)

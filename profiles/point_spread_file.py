@@ -1,4 +1,4 @@
-"""A point-spread function as a sensor's file names it: a .npy file next to the profile."""
+"""Read a point-spread function that a sensor's file names: a .npy file next to the profile."""
 
 import math
 from pathlib import Path
@@ -19,11 +19,11 @@ from beers_deploy.profiles.toml import unreadable
 from beers_deploy.profiles.validation import CONFIG, validated
 
 FILE_SIDE = 4096
-"""Samples a side of a file at most."""
+"""The maximum number of samples along one side of a file."""
 CUT_SHARE = 1e-6
-"""Of the absolute weight: rows and columns at the rim that hold less are cut.
+"""Rows and columns at the border with less than this share of the absolute weight are removed.
 
-No frequency changes by more than twice as much.
+No frequency changes by more than twice this share.
 """
 OFF_CENTRE_PX = 1.0
 
@@ -33,8 +33,8 @@ class PointSpreadFile:
     """The keys of [mtf] that state a point-spread function.
 
     Attributes:
-        psf: path of the .npy file, from the profile's folder.
-        psf_samples_per_px: how many samples, in each direction, make one target pixel.
+        psf: path of the .npy file, relative to the folder of the profile.
+        psf_samples_per_px: the number of samples per target pixel in each direction.
     """
 
     psf: str
@@ -83,7 +83,7 @@ def _lies_within(folder: Path, name: str) -> bool:
 
 
 def _normalised(where: str, samples: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the samples scaled to a sum of 1, or refuse those that can have none."""
+    """Scale the samples to a sum of 1, or raise ProfileError if that is not possible."""
     finite = bool(np.isfinite(samples).all())
     # The largest is brought to 1 first, because the sum of finite samples may overflow.
     samples = samples / max(float(np.abs(samples).max()), 1e-300) if finite else samples
@@ -98,9 +98,7 @@ def _normalised(where: str, samples: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def _trimmed(samples: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Without the rows and columns at the rim that hold, all together, less than CUT_SHARE of the
-    weight.
-    """
+    """Remove border rows and columns that hold, in total, less than CUT_SHARE of the weight."""
     weight = np.abs(samples)
     parts = []
     for axis in (1, 0):
@@ -112,7 +110,7 @@ def _trimmed(samples: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _read_samples(where: str, path: Path) -> NDArray[np.float64]:
-    """The samples of a .npy file, (H, W)."""
+    """Read the samples (H, W) of a .npy file, or raise ProfileError."""
     reason = unreadable(path) if path.suffix.lower() == ".npy" else f"it ends in {path.suffix!r}"
     if reason:
         raise ProfileError(

@@ -1,4 +1,6 @@
-"""The reference of a sensor: what a restoration aims at, in the sensor's digital numbers."""
+"""Define the reference sensor that a restoration aims at, in the digital numbers of the degraded
+one.
+"""
 
 import logging
 import os
@@ -11,7 +13,7 @@ logger = logging.getLogger(__name__)
 
 
 def require_same_units(degraded: Sensor, reference: Sensor) -> None:
-    """Refuse a reference that another digitiser made: its images differ from the degraded ones by a
+    """Raise ProfileError if the reference has another digitiser: its images would differ by a
     factor.
     """
     if degraded.units != reference.units:
@@ -23,7 +25,7 @@ def require_same_units(degraded: Sensor, reference: Sensor) -> None:
 
 
 def describe_units(profile: Sensor) -> str:
-    """Return what a digital number of the profile means, in words."""
+    """Return a sentence on the meaning of a digital number of the profile."""
     gain, bits, offset_dn = profile.units
     return f"{gain:g} DN per W/m2/sr/um, {bits:g} bits" + (
         f", {offset_dn:g} DN of offset" if offset_dn else ""

@@ -1,10 +1,10 @@
-"""The blur of a whole instrument, detector included, where more is known of it than its contrast at
-Nyquist.
+"""Define the complete blur of an instrument, detector included, if more is known than its contrast
+at Nyquist.
 
-Either a tabulated MTF or a point-spread function: plain values, which compare, hash and travel in
-JSON. What a file states is checked. What is drawn for a patch of the training is not, because a
-check takes as long as 600 tables. Frequencies are in cycles per target pixel; "across" the track is
-horizontal (fx, along a row), "along" it vertical.
+It is either a tabulated MTF or a point-spread function. Both are plain values that can be compared,
+hashed and serialized as JSON. Blurs from a file are validated. Blurs drawn for a training patch are
+not, because a check takes as long as drawing 600 tables. Frequencies are in cycles per target
+pixel; "across" the track is horizontal (fx, along a row), "along" it vertical.
 """
 
 import base64
@@ -30,25 +30,24 @@ from beers_deploy.profiles.errors import printable
 from beers_deploy.profiles.validation import CONFIG
 
 NYQUIST = 0.5
-"""Cycles per pixel."""
+"""The Nyquist frequency in cycles per pixel."""
 Frequencies = NDArray[np.floating]
 
 
 READING = 0.005
-"""How far a table may lie above what the square detector leaves: half the last digit of two.
-
-The detector counts.
-"""
+"""How far a table may exceed the MTF of the square detector: half of the last of two decimals."""
 MOST_FREQUENCIES = 1000
 LEAST_STEP = 1e-4
 KEPT_SIDE = 1024
-"""Samples a side, which a recipe holds as text."""
+"""The maximum number of samples along one side, because a recipe stores them as text."""
 
 R = TypeVar("R", bound="MtfTable | PointSpread")
 
 
 def _require_contrast(response: R) -> R:
-    """Refuse a blur that leaves more contrast at Nyquist than a square detector can, or none."""
+    """Raise ValueError if the contrast at Nyquist is not above 0, or above that of a square
+    detector.
+    """
     limit = float(np.sinc(NYQUIST))
     for axis, contrast in zip(("across", "along"), response.at_nyquist, strict=True):
         if not 0 < contrast <= limit:
@@ -85,9 +84,10 @@ class MtfTable:
     """Contrast at some frequencies, measured on each axis.
 
     Attributes:
-        frequency: ascending from 0, to 0.5 at least and below 1, in cycles per target pixel.
-        across: contrast across the track at each, 1 at frequency 0, above 0 everywhere.
-        along: likewise along the track.
+        frequency: ascending from 0 to at least 0.5 and below 1, in cycles per target pixel.
+        across: contrast across the track at each frequency: 1 at frequency 0 and above 0
+            everywhere.
+        along: the same along the track.
     """
 
     frequency: Numbers
@@ -142,13 +142,13 @@ class MtfTable:
         return _contrast_at_nyquist(self)
 
     def at(self, fx: Frequencies, fy: Frequencies) -> NDArray[np.float64]:
-        """The MTF at fx (1, W) and fy (H, 1): (H, W).
+        """Return the MTF (H, W) at the frequencies fx (1, W) and fy (H, 1).
 
-        What the square detector leaves is divided out; -log of the rest is interpolated linearly
-        over the radius r, which gives each axis its gamma(r) = -log / r. Then as the formula's two
-        axes: exp(-sqrt((gamma_x fx)^2 + (gamma_y fy)^2)) sinc(fx) sinc(fy). A table of the formula
-        gives the formula. Beyond the last frequency gamma stays what it was there: contrast falls
-        on.
+        The MTF of the square detector is divided out. The logarithm of the rest is interpolated
+        linearly over the radius r, which gives each axis its gamma(r) = -log / r. The two axes are
+        then combined as in the formula: exp(-sqrt((gamma_x fx)^2 + (gamma_y fy)^2)) sinc(fx)
+        sinc(fy). A table of the formula therefore reproduces the formula. Beyond the last frequency
+        gamma stays constant, so the contrast continues to fall.
         """
         radius = np.hypot(fx, fy)
         gamma_x, gamma_y = (self._gamma(radius, contrast) for contrast in (self.across, self.along))
@@ -159,8 +159,8 @@ class MtfTable:
         frequency = np.array(self.frequency)
         # Rounded tables exceed the detector's own contrast by a little at low frequencies.
         loss = np.maximum(-np.log(np.array(contrast) / np.sinc(frequency)), 0.0)
-        # Towards 0, where there is nothing to divide by, and beyond the end gamma stays what it
-        # was.
+        # Gamma is constant beyond the last frequency, and towards 0, where the loss cannot be
+        # divided by f.
         inside = np.clip(radius, frequency[1], frequency[-1])
         return np.asarray(np.interp(inside, frequency, loss) / inside)
 
@@ -174,13 +174,13 @@ class MtfTable:
 @with_config(CONFIG)
 @dataclass(frozen=True)
 class PointSpread:
-    """The image of a point, (height, width) samples, down the track and across it.
+    """The image of a point: (height, width) samples, along the track and across it.
 
     Attributes:
-        height: rows of samples.
-        width: columns of samples.
-        samples_per_px: how many of them, in each direction, make one target pixel; 2 or more.
-        samples: their values as text (`packed`), which a set, a cache and JSON take as it is.
+        height: the number of rows.
+        width: the number of columns.
+        samples_per_px: the number of samples per target pixel in each direction; 2 or more.
+        samples: their values as text (see `packed`), which is hashable and can be stored in JSON.
     """
 
     height: Side
@@ -205,16 +205,15 @@ class PointSpread:
 
     @property
     def at_nyquist(self) -> tuple[float, float]:
-        """Contrast at 0.5 cycles per pixel, across and along the track, whatever its sign."""
+        """Contrast at 0.5 cycles per pixel, across and along the track, as a magnitude."""
         return _contrast_at_nyquist(self)
 
     def at(self, fx: Frequencies, fy: Frequencies) -> NDArray[np.complex128]:
-        """Its Fourier transform at fx (1, W) and fy (H, 1), complex (H, W): the sum itself, exact
-        to rounding.
+        """Return the Fourier transform, complex (H, W), at the frequencies fx (1, W) and fy (H, 1).
 
-        Samples are taken at points; their sum counts as 1 and their centroid lies at 0, so that the
-        blur keeps radiance and shifts nothing. Beyond half its sampling frequency a sampled
-        function says nothing: 0 there.
+        It is the discrete sum itself, exact to rounding. The samples are normalised to a sum of 1
+        and centred on their centroid, so that the blur preserves radiance and does not shift the
+        image. Beyond half of the sampling frequency the function is not defined, and 0 is returned.
         """
         values, y_px, x_px = _grid(self)
         waves_y, waves_x = (
@@ -254,8 +253,9 @@ def unpacked(point: PointSpread) -> NDArray[np.float64]:
 
 
 def centroid(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Row and column of the centre of gravity of samples (H, W) whose sum is not 0, counted from
-    the middle.
+    """Return the row and column of the centroid of samples (H, W), relative to the middle.
+
+    The sum of the samples must not be 0.
     """
     rows, columns = ((np.arange(size) - (size - 1) / 2) for size in values.shape)
     total = values.sum()
@@ -264,8 +264,9 @@ def centroid(values: NDArray[np.float64]) -> tuple[float, float]:
 
 @lru_cache(maxsize=8)
 def _grid(point: PointSpread) -> tuple[NDArray[np.float64], ...]:
-    """Samples of sum 1, and where their rows and columns lie from the centroid,
-    in target pixels.
+    """Return the samples scaled to a sum of 1, and the positions of their rows and columns.
+
+    Positions are relative to the centroid, in target pixels.
     """
     values = unpacked(point)
     places = (

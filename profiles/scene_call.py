@@ -1,5 +1,5 @@
-"""What a scene calls for: light, and effects that it adds to a sensor or forbids (night port, haze
-over sea, ...).
+"""Define what a scene requires: its light, and the effects that it adds to a sensor or forbids
+(night port, haze over sea, ...).
 """
 
 from collections.abc import Collection
@@ -19,9 +19,9 @@ from beers_deploy.profiles.validation import CONFIG, check_keys, validated
 
 @dataclass(frozen=True, config=CONFIG)
 class SceneCall:
-    """One TOML file under `profiles/scenes/`.
+    """The content of one TOML file under `profiles/scenes/`.
 
-    `radiance_scale` multiplies the scene's radiance: photographs are of a clear day.
+    `radiance_scale` multiplies the radiance of the scene, because photographs show a clear day.
     """
 
     name: str
@@ -55,7 +55,7 @@ class SceneCall:
 
 
 def typical_effects() -> dict[str, Table]:
-    """Return typical values of every optional effect (`profiles/effects.toml`): what `--with NAME`
+    """Return typical values of every optional effect (`profiles/effects.toml`), which `--with NAME`
     adds.
     """
     label, raw = read_toml("", str(HERE / "effects.toml"))
@@ -68,8 +68,19 @@ def calling_for(
     add: Collection[str] = (),
     forbid: Collection[str] = (),
 ) -> Sensor:
-    """The profile with a scene's effects and `add`, without `forbid`; stated values win over
-    typical ones.
+    """Return the profile with the effects of a scene and those in `add`, and without those in
+    `forbid`.
+
+    Values that the profile or the scene states take precedence over typical ones.
+
+    Args:
+        profile: the sensor.
+        scene: the scene, if any; it may add effects and forbid others.
+        add: names of effects to add with typical values.
+        forbid: names of effects to remove.
+
+    Raises:
+        OptionError: if a name is not that of an effect.
     """
     for name in (*add, *forbid):
         if name not in TABLES:
@@ -92,10 +103,11 @@ def origins(
     add: Collection[str] = (),
     forbid: Collection[str] = (),
 ) -> dict[str, str]:
-    """Of each effect of `calling_for`'s profile where it comes from; of one that it lost, who
-    leaves it out.
+    """Return, by name of the effect, where each effect of `calling_for`'s profile comes from.
+
+    An effect that was removed is listed with the sensor, scene or option that removed it.
     """
-    # What is stated wins over what is added.
+    # Stated effects take precedence over added ones.
     sources = dict.fromkeys(add, "`with_`")
     sources |= dict.fromkeys(("mtf", "noise", *profile.effects), f"sensor {profile.name}")
     if scene:

@@ -57,7 +57,9 @@ def _dark(fields: dict[str, Constant]) -> Constant:
 
 
 def _response(raw: object) -> object:
-    """Read a response from JSON, where its keys say which of the two it is."""
+    """Read a response from JSON; its keys determine whether it is a table or a point-spread
+    function.
+    """
     if raw is None or isinstance(raw, MtfTable | PointSpread):
         return raw
     if not isinstance(raw, Mapping):
@@ -70,10 +72,10 @@ def _response(raw: object) -> object:
 
 @dataclass(frozen=True, repr=False, config=CONFIG)
 class Sensor:
-    """What one TOML file under `profiles/sensors/` states, each constant with its source.
+    """The content of one TOML file under `profiles/sensors/`, each constant with its source.
 
-    Its noise is stated by two SNRs, at `radiance_0` and `radiance_1`, or by `alpha` and `beta`. Its
-    blur is that of a table or a point-spread function where `response` is one.
+    The noise is stated by two SNRs, at `radiance_0` and `radiance_1`, or by `alpha` and `beta`. The
+    blur is that of `response`, a table or a point-spread function, if there is one.
 
     Examples:
         >>> sensor = bd.Sensor.load("pleiades-degraded").replace(mtf_nyquist=0.05)
@@ -108,7 +110,9 @@ class Sensor:
 
     @model_validator(mode="after")
     def _noise_is_possible(self) -> Self:
-        """Refuse noise that is stated in no way or in both, or that no alpha and beta can have."""
+        """Raise ValueError if the noise is stated in neither way or in both, or is physically
+        impossible.
+        """
         ways = [self.snr_0, self.snr_1], [self.alpha, self.beta]
         begun = [way for way in ways if any(way)]
         if len(begun) != 1 or not all(begun[0]):
@@ -137,7 +141,9 @@ class Sensor:
 
     @model_validator(mode="after")
     def _blur_is_possible(self) -> Self:
-        """Refuse a response with other contrasts, and an anti-alias filter that leaves less."""
+        """Raise ValueError if the response contradicts the contrasts, or if they exceed the
+        anti-alias filter.
+        """
         axes = [self.mtf_nyquist, self.mtf_nyquist_along or self.mtf_nyquist]
         if self.response and not np.allclose([c.low for c in axes], self.response.at_nyquist):
             raise ValueError(
@@ -163,8 +169,9 @@ class Sensor:
 
     @classmethod
     def load(cls, sensor: "Sensor | str | os.PathLike[str]") -> "Sensor":
-        """A shipped sensor by its name, the user's own by the path of its .toml file, or the sensor
-        given.
+        """Load a shipped sensor by its name, or a user's sensor by the path of its .toml file.
+
+        A `Sensor` is returned unchanged.
 
         Raises:
             ProfileError: unknown name, wrong or missing key, or numbers that no instrument can
@@ -181,7 +188,7 @@ class Sensor:
         return validated(Sensor, fields, label, GROUPS)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the profile as a TOML file that `load` reads; a point-spread function lies beside
+        """Write the profile as a TOML file that `load` reads, with a point-spread function next to
         it as .npy.
         """
         path = Path(path)
@@ -211,7 +218,7 @@ class Sensor:
         return Stated(value, self.mtf_nyquist.status, self.mtf_nyquist.source)
 
     def replace(self, **numbers: float | tuple[float, float]) -> "Sensor":
-        """This sensor with other numbers, each a value or a range (low, high).
+        """Return this sensor with some numbers replaced, each by a value or a range (low, high).
 
         Args:
             numbers: by the names of the file's keys, such as mtf_nyquist=0.1 or snr_1=(90, 110).
@@ -243,19 +250,21 @@ class Sensor:
 
     @property
     def reference(self) -> "Sensor":
-        """The shipped sensor that a restoration aims at, in this one's digital numbers."""
+        """The shipped sensor that a restoration aims at, in the digital numbers of this sensor."""
         return Sensor.load(REFERENCE).in_units_of(self)
 
     def to_radiance(self, pixels: Any) -> Any:
-        """Digital numbers as radiance in W/m2/sr/um: an array of any kind, of the same kind and
-        shape.
+        """Convert digital numbers to radiance in W/m2/sr/um.
+
+        Accepts a number or an array of any kind, and returns the same kind and shape.
         """
         gain, _, offset_dn = self.units
         return (pixels - offset_dn) / gain
 
     def to_dn(self, radiance: Any) -> Any:
-        """Radiance in W/m2/sr/um as digital numbers, neither rounded nor clipped; an array of any
-        kind.
+        """Convert radiance in W/m2/sr/um to digital numbers, without rounding or clipping.
+
+        Accepts a number or an array of any kind, and returns the same kind and shape.
         """
         gain, _, offset_dn = self.units
         return radiance * gain + offset_dn
@@ -278,15 +287,18 @@ class Sensor:
 
     @property
     def units(self) -> tuple[float, float, float]:
-        """What a digital number means: DN per W/m2/sr/um, bits, and the DN of the dark."""
+        """The meaning of a digital number: DN per W/m2/sr/um, the number of bits, and the DN in the
+        dark.
+        """
         offset = self.effects[OFFSET]["offset_dn"].low if OFFSET in self.effects else 0.0
         return self.gain_dn_per_radiance.low, self.bits.low, offset
 
     def in_units_of(self, other: "Sensor") -> "Sensor":
-        """This profile with the gain, bits and offset of `other`; itself where they are the same.
+        """Return this profile with the gain, bits and offset of `other`, or itself if they are
+        equal.
 
-        Two acquisitions of one scene compare, pixel by pixel, only where a digital number means the
-        same in both.
+        Two acquisitions of one scene can be compared pixel by pixel only if their digital numbers
+        mean the same.
         """
         if self.units == other.units:
             return self
@@ -302,7 +314,9 @@ class Sensor:
         return self.draw_counted(generator)[0]
 
     def draw_counted(self, generator: np.random.Generator) -> tuple[Instrument, int]:
-        """As `draw`, with the number of SNR pairs that were rejected as impossible."""
+        """Draw an instrument as `draw` does, and also return the number of rejected, impossible SNR
+        pairs.
+        """
 
         def number(constant: Constant) -> float:
             return float(generator.uniform(constant.low, constant.high))
@@ -315,7 +329,7 @@ class Sensor:
         mtf = number(self.mtf_nyquist)
         noise, rejected = self._draw_noise(number)
         effects = settled(self.effects, parameter)
-        # Drawn last: a profile without it draws what it always drew.
+        # Drawn last, so that a profile without it draws the same numbers as before.
         along = self.mtf_nyquist_along
         mtf_along = None if along is None else number(along)
         return self._instrument(mtf, noise, effects, mtf_along), rejected
@@ -332,7 +346,10 @@ class Sensor:
         raise ProfileError(f"The sensor profile {self.name} {self._impossible_snr()}")
 
     def nominal(self) -> Instrument:
-        """The middle of every range (the SNR at radiance_0 moved to the nearest physical value)."""
+        """Return the instrument in the middle of every range.
+
+        The SNR at `radiance_0` is moved to the nearest physically possible value.
+        """
         effects = settled(self.effects, lambda constant: constant.middle)
         along = self.mtf_nyquist_along
         mtf_along = None if along is None else along.middle
@@ -374,7 +391,7 @@ class Sensor:
         return Instrument(mtf, *noise, gain, bits, effects, mtf_along, radiance_1, self.response)
 
     def _impossible_snr(self) -> str:
-        """Return what is wrong with SNRs that no alpha and beta can have."""
+        """Return the error message for SNRs that no alpha and beta can have."""
         snr_0, snr_1 = self.snr_pair
         low, high = snr_0_bounds(self.radiance_0.low, self.radiance_1.low, snr_1.high)
         return (
@@ -386,4 +403,4 @@ class Sensor:
 
 
 SensorLike = Sensor | str | os.PathLike[str]
-"""A profile, the name of a shipped one, or a .toml file."""
+"""A profile, the name of a shipped one, or the path of a .toml file."""

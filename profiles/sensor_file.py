@@ -1,4 +1,4 @@
-"""A sensor's TOML file: the keys of its tables, the fields of a `Sensor` that they state, and its
+"""Define a sensor's TOML file: the keys of its tables, the `Sensor` fields that they state, and its
 text.
 """
 
@@ -18,7 +18,9 @@ from beers_deploy.profiles.validation import check_keys, validated
 
 LEAST = 1e-12
 MOST = 1e12
-"""Of any constant that is not 0: beyond lies no instrument, and powers of it no float."""
+"""The largest absolute value of a constant: no instrument exceeds it, and powers of larger ones
+overflow.
+"""
 
 Contrast = Annotated[
     Constant,
@@ -45,8 +47,8 @@ TABLES: dict[str, tuple[tuple[tuple[str, ...], tuple[str, ...]], ...]] = {
     ),
     "digitiser": ((("bits", "gain_dn_per_radiance"), ()),),
 }
-"""Every table that a profile has, and the ways to fill it: the keys that each needs, and those that
-it may have.
+"""Every table of a profile and the alternative ways to fill it: the required keys and the optional
+keys of each.
 """
 
 RESPONSE = ("frequency", "across", "along", "psf", "psf_samples_per_px")

@@ -1,4 +1,4 @@
-"""The numbers of a sensor profile, without their provenance: what decides its images."""
+"""Read the numbers of a sensor profile that determine its images, without their provenance."""
 
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.sensor import Sensor

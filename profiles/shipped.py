@@ -1,5 +1,6 @@
-"""The shipped profiles by name, and those that stand for a default. Nothing is read or checked
-here, so that `--help` loads neither NumPy nor pydantic.
+"""Name the shipped profiles and the defaults.
+
+No file is read or validated here, so that `--help` loads neither NumPy nor pydantic.
 """
 
 import re
@@ -8,21 +9,22 @@ from pathlib import Path
 HERE = Path(__file__).parent
 
 REFERENCE = "pleiades-reference"
-"""The shipped profile of the image that restoration aims at, unless another is named."""
+"""The shipped profile that restoration aims at, unless another is named."""
 
 BLIND = "blind"
 BLIND_PROFILE = "pleiades-variable"
-"""The name of a sensor that is not known, and the profile in whose ranges it then counts to be."""
+"""The profile whose ranges describe an unknown sensor, which a user calls by the name above."""
 
 DEFAULT_TARGET = "vck190"
-"""The board of the paper: what a command takes where no board is named."""
+"""The board of the paper, which a command uses if no board is named."""
 
 MODEL_SUFFIX = "-model"
-"""What `bench` adds to a board's name: its figures are of a model of the board."""
+"""The suffix that `bench` adds to a board's name, because its figures come from a model of the
+board.
+"""
 
 TILE_PX = 640
-"""Side of a tile unless somebody asks for another: what the paper's network was given on the board.
-"""
+"""The default side of a tile: the size at which the paper's network runs on the board."""
 
 
 def shipped_names(kind: str) -> list[str]:
@@ -31,7 +33,7 @@ def shipped_names(kind: str) -> list[str]:
 
 
 def profile_path(kind: str, name: str) -> Path:
-    """Return where a profile lies: in `profiles/KIND/`, or where the user's own path says."""
+    """Return the path of a profile: in `profiles/KIND/`, or the user's own path."""
     return Path(name) if name.endswith(".toml") else HERE / kind / f"{name}.toml"
 
 

@@ -1,7 +1,7 @@
-"""Target profiles: what a processing board can do, every constant with its source.
+"""Define target profiles: the capabilities of a processing board, every constant with its source.
 
-A file may begin with `base = "zcu102"`: what it does not state is then that shipped board's. So a
-board with a DPU of a known kind states its cores, clock and memory, and nothing else.
+A file may begin with `base = "zcu102"`: the keys that it does not state are then those of that
+shipped board. So a board with a known DPU only needs to state its cores, clock and memory.
 """
 
 import os
@@ -19,22 +19,20 @@ from beers_deploy.profiles.toml import read_toml
 from beers_deploy.profiles.validation import CONFIG, check_keys, validated
 
 FUSED = ("ReLU", "ReLU6", "LeakyReLU", "PReLU", "hard-sigmoid", "hard-swish")
-"""The activations that a board's file can list, as its manual names them."""
+"""The activations that a board's file can list, by the names in its manual."""
 PLACES = frozenset({"conv", "depthwise", "pool", "sum", "alone"})
-"""Where: behind a convolution, a depthwise one, a pool, an add or a mul; or by themselves, behind
-anything.
-"""
+"""The operations that an activation can follow; "alone" means that it may follow any operation."""
 DOCUMENTS = frozenset({"operators", "numbers", "quantiser"})
-"""Where a DPU's operators are listed, where its numbers are described, and the quantiser that knows
-their windows.
+"""The documents of a DPU: the list of its operators, the description of its numbers, and the
+quantiser that knows the limits of its windows.
 """
 NPU = frozenset({"device", "int8", "no_int8"})
-"""Of an NPU in place of a DPU's list: the compiler's name of it, and the operators that it has or
-lacks in INT8.
+"""The keys of an NPU, in place of a DPU's list: the compiler's name of the device, and the
+operators that it supports or lacks in INT8.
 """
 
 WATTS = "_w"
-"""How the names of measured powers end, which no board takes from another."""
+"""The suffix of measured powers, which no board inherits from another."""
 
 
 def _activations(words: Words) -> Words:
@@ -48,13 +46,13 @@ def _activations(words: Words) -> Words:
 
 @dataclass(frozen=True, repr=False, config=CONFIG)
 class TargetProfile:
-    """What one TOML file under `profiles/targets/` states, its base included.
+    """The content of one TOML file under `profiles/targets/`, its base included.
 
-    `tables` maps a topic ("array", "memory", "conv", "power", ...) to its constants;
-    `configurations` maps the name of a build of the accelerator to its constants, and is empty
-    where there is but one. `activations` says what is fused with which operation, `documents` names
-    the manuals; both are empty of a board without a DPU. `npu` says which operators an NPU
-    computes, and is empty of every other board.
+    `tables` maps a topic ("array", "memory", "conv", "power", ...) to its constants.
+    `configurations` maps the name of a build of the accelerator to its constants, and is empty if
+    there is only one build. `activations` states which activations are fused with which operation,
+    and `documents` names the manuals; both are empty for a board without a DPU. `npu` states which
+    operators an NPU supports, and is empty for every other board.
     """
 
     name: str
@@ -78,11 +76,10 @@ class TargetProfile:
 
     @classmethod
     def load(cls, board: "TargetProfile | str | os.PathLike[str]") -> Self:
-        """A shipped board by its name, the user's own by the path of its .toml file, or the board
-        given.
+        """Load a shipped board by its name, or a user's board by the path of its .toml file.
 
-        A board's cost model has the name of the board: `vck190-model`, as `bench` calls it, is
-        `vck190`.
+        A `TargetProfile` is returned as an instance of this class. The cost model of a board has
+        the name of the board: `vck190-model`, as `bench` prints it, is `vck190`.
 
         Raises:
             ProfileError: unknown name, wrong or missing key, or a number that no board can have.
@@ -98,11 +95,13 @@ class TargetProfile:
         return f"{type(self).__name__}({self.name!r}{builds})"
 
     def value(self, table: str, key: str) -> float:
-        """The single value of a constant that states no range."""
+        """Return the value of a constant; it must not be a range."""
         return self.constant(table, key).low
 
     def constant(self, table: str, key: str) -> Constant:
-        """A constant with its range and source."""
+        """Return a constant with its range and source, or raise ProfileError if the profile lacks
+        it.
+        """
         try:
             return self.tables[table][key]
         except KeyError:
@@ -146,7 +145,7 @@ def _read(name: str) -> TargetProfile:
 
 
 def _with_base(label: str, raw: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """The file's own tables over those of its base, key by key; a configuration's too."""
+    """Merge the file's own tables over those of its base, key by key, configurations included."""
     base = raw.pop("base", None)
     if base is None:
         return label, raw
@@ -178,7 +177,7 @@ def _joined(above: Mapping[str, Any], below: Mapping[str, Any]) -> dict[str, Any
 
 
 def require_side(tile_px: int) -> int:
-    """The side of a tile, refused where it is none."""
+    """Return the side of a tile, or raise OptionError if it is below 1 px."""
     if tile_px < 1:
         raise OptionError(f"`tile` must be at least 1 px, got {tile_px} px. Choose another.")
     return tile_px

@@ -1,8 +1,8 @@
-"""Which numbers a board can have: limits of every key of a target's file, so that no figure follows
-from nonsense.
+"""Define the limits of every number in a target's file, so that no figure is computed from
+nonsense.
 
-The limits are wide: they keep out what no board has (no cores, a negative clock, half a kernel),
-not what is unusual.
+The limits are wide: they exclude impossible boards (no cores, a negative clock, half a kernel), not
+unusual ones.
 """
 
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from beers_deploy.profiles.constant import Constant, Limits
 
 SMALLEST = 1e-30
-"""Stands for what is above 0, and is divided by."""
+"""The lower limit of numbers that must be above 0 because they are used as divisors."""
 
 COUNT = Limits(1, 1e6, whole=True)
 LANES = Limits(1, 1e6)
@@ -45,7 +45,7 @@ CONFIGURATION = {
     "peak_tops": POSITIVE,
     **SIZES,
 }
-"""Of a table [configurations.NAME]."""
+"""Limits of the keys of a table [configurations.NAME]."""
 
 TABLES: Mapping[str, Mapping[str, Limits]] = {
     "array": {
@@ -114,7 +114,7 @@ TABLES: Mapping[str, Mapping[str, Limits]] = {
     "measurement": {"min_time_s": POSITIVE, "min_runs": COUNT},
     "file": {"opset_max": COUNT},
 }
-"""Limits of each key by its table."""
+"""Limits of each key, by its table."""
 
 ANY_KEY = dict.fromkeys(
     (
@@ -128,13 +128,13 @@ ANY_KEY = dict.fromkeys(
     ),
     OPEN,
 )
-"""Tables in which other keys may stand than are known here, such as a quoted network's name, and
-their limits.
+"""Tables that may have further keys, such as the name of a published network, and the limits of
+those.
 """
 
 
 def check_limits(place: str, limits: Mapping[str, Limits], table: Mapping[str, Constant]) -> None:
-    """Refuse a number that no board can have.
+    """Raise ValueError if a number is outside its limits.
 
     Args:
         place: the dotted name of the table.

@@ -13,16 +13,19 @@ from beers_deploy.profiles.errors import ProfileError, printable
 from beers_deploy.profiles.shipped import profile_path, shipped_names
 
 TOML_BYTES = 1 << 16
-"""The largest shipped profile takes a fifth of it."""
+"""The maximum size of a file, five times the largest shipped profile."""
 JSON_BYTES = 1 << 26
 TOO_DEEP = "too many levels of nesting"
 LFS_POINTER = b"version https://git-lfs"
 QUOTED = 80
-"""Characters of a line at fault that a message shows at most."""
+"""The maximum number of characters that a message shows of a line with an error."""
 
 
 def read_toml_text(path: Path) -> dict[str, object]:
-    """A TOML file as plain values; it may say inf, nan, or a whole number of any size."""
+    """Read a TOML file as plain values, or raise ValueError with the reason.
+
+    The values may include inf, nan and integers of any size.
+    """
     # Some editors on Windows begin a file with a byte order mark.
     text = read_whole(path, TOML_BYTES).decode("utf-8-sig")
     try:
@@ -37,8 +40,9 @@ def read_toml_text(path: Path) -> dict[str, object]:
 
 
 def _line_at_fault(text: str, reason: str) -> str:
-    """The line quoted, its number, and tomllib's reason, which ends in "(at line 3, column 9)" or
-    "(at end ...)".
+    """Return the number of the line with the error, the line itself, and tomllib's reason.
+
+    tomllib's message ends in "(at line 3, column 9)" or "(at end ...)".
     """
     what, _, where = reason.rpartition(" (at ")
     lines = text.rstrip().split("\n")
@@ -73,8 +77,8 @@ def parse_json(text: str) -> object:
 
 
 def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
-    """Return an object; raise ValueError for a key that stands in it twice, of which readers take
-    either.
+    """Return an object; raise ValueError if it has a key twice, because readers disagree about its
+    value.
     """
     members = dict(pairs)
     if len(members) < len(pairs):
@@ -107,9 +111,9 @@ def read_whole(path: Path, limit_bytes: int) -> bytes:
 
 
 def unreadable(path: Path) -> str | None:
-    """Why there is no file to be read at a path, in words for its user; None where there is one.
+    """Return the reason why a path cannot be read as a file, or None if it can.
 
-    Git LFS leaves a pointer in place of each large file that was not fetched: 130 bytes of text
+    Git LFS stores a pointer in place of each large file that was not fetched: 130 bytes of text
     under its name.
     """
     try:

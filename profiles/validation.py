@@ -1,4 +1,4 @@
-"""Check what a file states with a pydantic type, and say in one sentence what is wrong with it."""
+"""Validate the content of a file with a pydantic type, and describe an error in one sentence."""
 
 from collections.abc import Collection, Mapping, Sequence
 from difflib import get_close_matches
@@ -11,7 +11,7 @@ from beers_deploy.profiles.errors import ProfileError, printable
 T = TypeVar("T")
 
 CONFIG = ConfigDict(extra="forbid")
-"""Of every model here: a misspelt key is refused, never ignored."""
+"""The configuration of every model: an unknown key is an error and never ignored."""
 
 TABLE_TYPES = ("dataclass_type", "dict_type", "mapping_type", "model_type")
 EXPECTED = {
@@ -19,29 +19,29 @@ EXPECTED = {
     "string_type": ("a text", "Write it in quotes."),
     "tuple_type": ("a list", "Write it in square brackets, with commas between."),
 }
-"""TOML's words for pydantic's types of errors, and what to do; of the others pydantic's own message
-is shown, which names the allowed values.
+"""TOML's names for pydantic's types of errors, and what to do. For other types pydantic's own
+message is shown, which lists the allowed values.
 """
 EXAMPLES = {
     "description": 'description = "our camera"',
     "status": 'status = "measured"',
     "source": 'source = "data sheet, page 3"',
 }
-"""Lines that show how to write a key that is missing."""
+"""Lines that show how to write a missing key."""
 
 
 def validated(kind: type[T], raw: object, label: str, groups: Mapping[str, str] | None = None) -> T:
-    """Return the value of a type that plain values state.
+    """Convert plain values to a type, or raise ProfileError.
 
     Args:
         kind: any type that pydantic can check.
         raw: plain values, as TOML and JSON hold them.
         label: names the file in messages.
-        groups: the dotted key of a field of the type, where it is not its name; "" for a field that
-            only groups tables of the file.
+        groups: the dotted key of a field of the type, if it differs from its name; "" for a field
+            that only groups tables of the file.
 
     Raises:
-        ProfileError: the file, the dotted key, what is wrong with its value and what to do.
+        ProfileError: the file, the dotted key, the error in its value and what to do.
     """
     try:
         return TypeAdapter(kind).validate_python(raw)
@@ -87,14 +87,14 @@ def check_keys(
     required: Collection[str],
     optional: Collection[str] = (),
 ) -> None:
-    """Refuse a table with an unknown key, or without a required one.
+    """Raise ProfileError if a table has an unknown key, or lacks a required one.
 
-    For tables whose keys depend on more than a type.
+    It is for tables whose keys depend on more than a type.
 
     Args:
         where: names the file and the table in messages.
         raw: the table.
-        required: the keys that it must have; as a mapping also what each can be.
+        required: the keys that it must have; as a mapping also the values that each can have.
         optional: keys that it may have.
     """
     allowed = sorted({*required, *optional})
@@ -115,7 +115,7 @@ def _missing(where: str, key: str, kind: str = "") -> str:
 def _spelling(key: str, names: Sequence[str], choices: str = "") -> str:
     """Return the key, the keys to choose from, and the one that was meant."""
     stated = "; ".join(filter(None, (printable(repr(key)), choices)))
-    # Most often the unit or the second half of a name is left out.
+    # Most often the unit or the second half of a name is missing.
     for name in names:
         if name.startswith(f"{key}_"):
             return f"{stated}. Write {name!r} (the unit belongs to the name)."

@@ -1,17 +1,17 @@
-"""The numbers: from a float network to INT8 under a DPU's rules, and what that costs.
+"""The numbers: from a float network to INT8 under a DPU's rules, and the accuracy that this costs.
 
 float ONNX (`onnx_file`) -> `graph` -> `samples` -> `passes` -> integer `core` -> two
 `encodings`: the host's file for onnxruntime, the board's for its own flow
 
-- `quantize` does it in one call;
+- `quantize` runs all of it in one call;
 - `session` runs networks on onnxruntime, `kernels` in ways that add exactly on this processor;
-- `integer` is the core's arithmetic in integers, `bounds` proves what holds for any input;
-- `gate` measures what INT8 changes, `limits` and `structure` judge it, `sensitivity` says which
-  layers err;
-- `tiling` says how an image may be cut for a network: lattice, halo and scale; `samples` are
-  simulated patches or a user's own;
-- `onnx` has the one graph of a file, `simplify` folds what exporters leave in a float one, and
-  `untrusted` checks files before they are used.
+- `integer` is the core's arithmetic in integers, `bounds` proves bounds for any input;
+- `gate` measures the effect of INT8, `limits` and `structure` judge it, `sensitivity` measures the
+  error of each layer;
+- `tiling` determines how an image may be cut into tiles for a network: lattice, halo and scale;
+  `samples` are simulated patches or a user's own;
+- `onnx` represents the one graph of a file, `simplify` folds what exporters leave in a float one,
+  and `untrusted` checks files before they are used.
 """
 
 import os
@@ -19,12 +19,12 @@ import sys
 
 
 def _switch_off_telemetry() -> None:
-    """Keep onnxruntime and OpenVINO from reporting their use.
+    """Prevent onnxruntime and OpenVINO from reporting their use.
 
-    onnxruntime's wheels (1.29 and later) keep an identifier in the home folder and send events from
-    native code. That begins as the library is loaded, so its switch must be set before. OpenVINO
-    reports its import through a package beside it; where that cannot be imported it takes a stub of
-    its own. A choice made before is kept.
+    onnxruntime's wheels (1.29 and later) store an identifier in the home folder and send events
+    from native code. That begins when the library is loaded, so its switch must be set before.
+    OpenVINO reports its import through another package. If that cannot be imported, it uses a stub
+    of its own. An earlier choice of the user is respected.
     """
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     absent: dict[str, object] = sys.modules  # type: ignore[assignment]  # None is Python's mark for "do not import"

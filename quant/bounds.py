@@ -1,6 +1,4 @@
-"""What an INT8 network's integers can be over all images, by interval arithmetic on its own
-weights.
-"""
+"""Bound the integers of an INT8 network over all images, by interval arithmetic on its weights."""
 
 from dataclasses import dataclass
 from itertools import product
@@ -21,12 +19,12 @@ from beers_deploy.quant.graph import (
 from beers_deploy.quant.integer.arithmetic import activated, activation_table, mean_factor
 
 Range = tuple[np.ndarray, np.ndarray]
-"""Smallest and largest whole number of each channel."""
+"""The smallest and the largest integer of each channel."""
 
 
 @dataclass(frozen=True)
 class LayerBound:
-    """What the operation of this name can do, over all images."""
+    """Bounds of the operation of this name over all images."""
 
     name: str
     bits: float  # that its accumulator needs at most, without the sign
@@ -35,12 +33,12 @@ class LayerBound:
 
     @property
     def saturates(self) -> bool:
-        """Whether any image might bring a result to int8's ends."""
+        """True if an image might bring a result to an end of int8."""
         return self.low <= INT8_MIN or self.high >= INT8_MAX
 
 
 def layer_bounds(core: IntCore) -> list[LayerBound]:
-    """Of every operation, in order."""
+    """Compute the bounds of every operation, in order."""
     ranges: dict[str, Range] = {PLANES: _planes(core)}
     bounds = []
     for op in core.ops:
@@ -60,7 +58,7 @@ def _planes(core: IntCore) -> Range:
 
 
 Accumulated = tuple[np.ndarray, np.ndarray, int]
-"""The accumulators' interval, zero padding included, and the shift to int8."""
+"""The interval of the accumulators, including zero padding, and the shift to int8."""
 
 
 def _accumulated(core: IntCore, op: IntConv | Op, inputs: list[Range]) -> Accumulated:
@@ -86,7 +84,7 @@ def _accumulated(core: IntCore, op: IntConv | Op, inputs: list[Range]) -> Accumu
 
 
 def _moved(core: IntCore, op: Op, inputs: list[Range]) -> Range:
-    """Behind what hands values on, or looks them up."""
+    """Compute the range of an operation that only moves values or looks them up."""
     low, high = (np.concatenate([ends[k] for ends in inputs]) for k in (0, 1))
     if isinstance(op, Concat):
         return low, high

@@ -1,8 +1,8 @@
-"""The integer core: int8 weights and bias, and a power-of-two scale for every tensor, as the DPU
-demands.
+"""Define the integer core: int8 weights and bias, and a power-of-two scale for every tensor, as the
+DPU requires.
 
-A tensor with n fractional bits holds whole multiples of 2^-n, its scale, in [-128, 127] times that
-(UG1414 3.5, vai_q). `frac_bits` is n everywhere; a finer scale has more of them.
+A tensor with n fractional bits holds integer multiples of its scale 2^-n, in [-128, 127] times that
+(UG1414 3.5, vai_q). `frac_bits` is n everywhere; a finer scale has more fractional bits.
 """
 
 from collections.abc import Mapping
@@ -29,12 +29,12 @@ from beers_deploy.quant.host_part import ONE_CHANNEL, HostPart
 INT8_MIN = -128
 INT8_MAX = 127
 CANDIDATES = 6
-"""Scales tried: the one that clips nothing, and the finer ones after it."""
+"""The number of scales that are tried: the one that clips nothing, and the next finer ones."""
 
 
 def quantize(values: np.ndarray, frac_bits: int) -> np.ndarray:
-    """Whole numbers in [-128, 127], rounded half away from zero as the DPU does for weights and
-    bias.
+    """Round to integers in [-128, 127], half away from zero as the DPU does for
+    weights and bias.
     """
     scaled = np.asarray(values, dtype=np.float64) * 2.0**frac_bits
     # AMD's quantiser rounds these away from zero, unlike activations, which round half up.
@@ -43,19 +43,21 @@ def quantize(values: np.ndarray, frac_bits: int) -> np.ndarray:
 
 
 def unclipped_frac_bits(max_abs: float) -> int:
-    """The finest scale that clips nothing (0 for a tensor of zeros)."""
+    """Return the fractional bits of the finest scale that clips nothing; 0 for a
+    tensor of zeros.
+    """
     return int(np.floor(np.log2(INT8_MAX / max_abs))) if max_abs > 0 else 0
 
 
 CACHED = 2**16
-"""As many values as a core's cache holds with all that is computed from them: three times
-faster.
+"""The number of values whose intermediate results fit a core's cache, which is
+three times faster.
 """
 
 
 def squared_errors(values: np.ndarray, first: int) -> np.ndarray:
-    """Sum of squared rounding and clipping errors with first .. first + CANDIDATES - 1 fractional
-    bits, float64.
+    """Compute the squared rounding and clipping errors with first .. first + CANDIDATES - 1
+    fractional bits, float64.
     """
     errors = np.zeros(CANDIDATES)
     for part in np.array_split(values, max(values.size // CACHED, 1)):
@@ -69,7 +71,7 @@ def squared_errors(values: np.ndarray, first: int) -> np.ndarray:
 
 
 def best_frac_bits(values: np.ndarray) -> int:
-    """The least-squares scale of one array."""
+    """Return the fractional bits of the least-squares scale of one array."""
     first = unclipped_frac_bits(float(np.abs(values).max(initial=0.0)))
     return first + int(np.argmin(squared_errors(np.asarray(values, dtype=np.float32), first)))
 
@@ -79,16 +81,16 @@ class Shifts:
     """The shift windows of the DPU's arithmetic (UG1414 3.5 and the quantiser's source, Vitis-AI
     3.0).
 
-    They are what the quantiser writes within; what any file is checked against stands in
+    The quantiser writes within these windows. Files are checked against
     `deploy.dpu.checker.number_rules`, which allows a little more (a bias finer than the
     accumulator).
 
     Attributes:
-        cut: fractional bits of a convolution's weight and input less those of its result.
-        bias: those of weight and input less those of the int8 bias; below 0 it would be finer than
-            the accumulator.
-        read: by how many fractional bits the inputs of an add may differ.
-        write: those of an add's coarsest input less those of its result.
+        cut: fractional bits of a convolution's weight and input minus those of its result.
+        bias: fractional bits of weight and input minus those of the int8 bias; below 0 the bias
+            would be finer than the accumulator.
+        read: the difference of fractional bits between the inputs of an add.
+        write: fractional bits of an add's coarsest input minus those of its result.
     """
 
     cut: tuple[int, int] = (0, 16)
@@ -101,7 +103,7 @@ SHIFTS = Shifts()
 
 
 def target_shifts(target: TargetProfile) -> Shifts:
-    """The windows that a target's profile states."""
+    """Return the windows that a target's profile states."""
 
     def window(key: str) -> tuple[int, int]:
         constant = target.constant("numbers", key)
@@ -113,19 +115,19 @@ def target_shifts(target: TargetProfile) -> Shifts:
 
 
 def clamp(value: int, window: tuple[int, int]) -> int:
-    """The nearest value within the window."""
+    """Return the nearest value within the window."""
     return min(max(value, window[0]), window[1])
 
 
 ROUNDS = 8
-"""An add may move a tensor that was written long before, whose writer must then follow; two rounds
-do, if any.
+"""The maximum number of rounds. An add may change the scale of an earlier tensor, whose writer must
+then follow. Two rounds suffice in practice.
 """
 
 
 @dataclass(frozen=True)
 class IntConv(OneInput):
-    """int8 convolution: sum of products, plus bias << shift_bias, activation, shifted right by
+    """An int8 convolution: sum of products, plus bias << shift_bias, activation, shifted right by
     shift_cut, clipped.
     """
 
@@ -140,14 +142,14 @@ class IntConv(OneInput):
 
     @property
     def float_bias(self) -> np.ndarray:
-        """The values (O,) float64 that the bias stands for."""
+        """The real values (O,) float64 that the integer bias represents."""
         return np.asarray(self.bias * 2.0**-self.bias_frac_bits)
 
 
 @dataclass(frozen=True)
 class IntCore:
-    """Operations in order, convolutions in integers; the scale of every tensor; and the host's
-    part around.
+    """The integer core: operations in order with integer convolutions, the scale of every tensor,
+    and the host's part.
     """
 
     ops: tuple[IntConv | Op, ...]
@@ -155,23 +157,23 @@ class IntCore:
     host_part: HostPart = ONE_CHANNEL
 
     def scale(self, tensor: str) -> float:
-        """The value of one unit of a tensor, 2^-n."""
+        """Return the value of one unit of a tensor, 2^-n."""
         return float(2.0 ** -self.frac_bits[tensor])
 
     @property
     def convolutions(self) -> list[IntConv]:
-        """Those of its operations that have weights."""
+        """The operations that have weights."""
         return [op for op in self.ops if isinstance(op, IntConv)]
 
 
 def dequantized(op: Conv, whole: IntConv) -> Conv:
-    """The same convolution in float, with the values that its int8 weights and bias stand for."""
+    """Return the float convolution with the values that the int8 weights and bias represent."""
     weight = (whole.weight * 2.0**-whole.weight_frac_bits).astype(np.float32)
     return replace(op, weight=weight, bias=whole.float_bias.astype(np.float32))
 
 
 def rounded_to(values: np.ndarray, frac_bits: int) -> np.ndarray:
-    """To whole multiples of 2^-n, half up, and clipped, as the DPU does."""
+    """Round to integer multiples of 2^-n, half up, and clip, as the DPU does."""
     scale = np.float32(2.0**frac_bits)
     # np.rint would round half to even, as onnxruntime does.
     units = np.floor(values * scale + np.float32(0.5))
@@ -179,8 +181,9 @@ def rounded_to(values: np.ndarray, frac_bits: int) -> np.ndarray:
 
 
 RoundedConvs = dict[tuple[str, int, int], tuple[Conv, IntConv, int]]
-"""Convolutions rounded before, by name and the fractional bits asked of input and output: the
-float one, its integers, and the fractional bits that the output got.
+"""Convolutions that were rounded before, by name and the requested fractional bits of input and
+output. The values are the float convolution, the integer one, and the fractional bits of its
+output.
 """
 
 
@@ -231,7 +234,9 @@ def _in_one_round(
     host_part: HostPart,
     earlier: RoundedConvs,
 ) -> IntCore:
-    """Every operation within reach of the scales before it, which it may move."""
+    """Quantise every operation within the shifts' reach of the scales before it, which it may
+    change.
+    """
     ops: list[IntConv | Op] = []
     for op in graph:
         if isinstance(op, Conv):
@@ -287,8 +292,16 @@ def _activation(op: Conv, frac_bits: int) -> Activation:
 def quantize_bias(
     bias: np.ndarray, product: int, shifts: Shifts = SHIFTS
 ) -> tuple[np.ndarray, int]:
-    """An int8 bias (O,) and its scale, within reach of the accumulator's
-    `product` fractional bits.
+    """Quantise a bias (O,) to int8.
+
+    Args:
+        bias: in float.
+        product: fractional bits of the accumulator.
+        shifts: the windows of the target.
+
+    Returns:
+        The integers and their fractional bits, from which the accumulator can be reached by a
+        shift.
     """
     # Any scale holds zeros; the accumulator's own needs no shift.
     best = best_frac_bits(bias) if bias.any() else product
@@ -305,8 +318,8 @@ def _move_add(op: Add, frac_bits: dict[str, int], shifts: Shifts) -> None:
 
 
 def _tie(op: Op, frac_bits: dict[str, int]) -> None:
-    """One scale for what it reads and writes: the coarsest that one of them needs; that of the
-    planes is fixed.
+    """Set one scale for all inputs and the output: the coarsest of them, or that of the planes,
+    which is fixed.
     """
     names = (*op.inputs, op.output)
     # The host writes the planes with a scale of their own; a finer scale than the coarsest clips.
@@ -315,7 +328,9 @@ def _tie(op: Op, frac_bits: dict[str, int]) -> None:
 
 
 def shift_faults(core: IntCore, shifts: Shifts = SHIFTS) -> list[str]:
-    """Every shift outside its window, one sentence each; empty for a legal core."""
+    """List every shift outside its window, one sentence each; the list is empty for a
+    legal core.
+    """
     faults = []
     for op in core.ops:
         for rule, value, window in op_shifts(op, core.frac_bits, shifts):
@@ -327,7 +342,7 @@ def shift_faults(core: IntCore, shifts: Shifts = SHIFTS) -> list[str]:
 def op_shifts(
     op: IntConv | Op, frac_bits: Mapping[str, int], shifts: Shifts
 ) -> list[tuple[str, int, tuple[int, int]]]:
-    """(name, value, window) of the shifts that one operation needs."""
+    """Return (name, value, window) of each shift that an operation needs."""
     inputs = [frac_bits[i] for i in op.inputs]
     output = frac_bits[op.output]
     if isinstance(op, Add):

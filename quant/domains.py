@@ -1,8 +1,9 @@
-"""Whose operator a node is: ONNX knows an operator by its domain and its name together.
+"""Determine the domain of a node's operator, because ONNX identifies an operator by domain and
+name.
 
-A `Relu` of another domain, or of a function that the file itself defines, may compute anything. So
-wherever nodes are told apart by a name, it is `operator_name`: ONNX's own operators have their bare
-names, and all others have their domain in front of it, so that no table of ours holds them.
+A `Relu` of another domain, or of a function that the file itself defines, may compute anything.
+Nodes are therefore always distinguished by `operator_name`: ONNX's own operators have their bare
+names, and all others are prefixed with their domain, so that they match no table of this project.
 """
 
 from collections.abc import Collection
@@ -11,7 +12,9 @@ from onnx import ModelProto, NodeProto
 
 OPSET = 17
 IR_VERSION = 8
-"""The version of ONNX's operators, and of its files, that we write."""
+"""The versions of ONNX's operators (OPSET) and file format (IR_VERSION) that this
+project writes.
+"""
 STANDARD = ("", "ai.onnx")
 MICROSOFT = "com.microsoft"
 SEPARATOR = "::"
@@ -30,8 +33,9 @@ INTEGER_OPERATORS = {
     "QLinearWhere",
     "QuantizeLinear",
 }
-"""Of onnxruntime's domain: what ONNX lacks, and the pair that ONNX has too, with the same meaning
-for int8 and uint8. Not its QLinearConv, which may read (N, H, W, C).
+"""Operators of onnxruntime's domain: those that ONNX lacks, and the pair that ONNX also has with
+the same meaning for int8 and uint8. QLinearConv is not among them, because it may read (N, H, W,
+C).
 """
 
 INLINE = "inline its functions first: onnx.inliner.inline_local_functions(model)"
@@ -86,7 +90,7 @@ def is_foreign(name: str) -> bool:
 
 
 def foreign_remedy(domain: str, op_type: str) -> str:
-    """Return what a user can do about a foreign operator."""
+    """Return advice for a user about a foreign operator."""
     if op_type.startswith("Dynamic"):
         return FLOAT
     if "QuantizeLinear" in op_type or op_type == "FixNeuron":

@@ -1,8 +1,8 @@
-"""What an INT8 file computes in float.
+"""Find the layers that an INT8 file computes in float.
 
-Such a file may hold a whole float network in front of its integer core or behind it: then the two
-networks agree and the gate would pass what no DPU computes. Its metadata cannot be asked, because
-the judged file wrote them.
+Such a file may contain a whole float network before or behind its integer core. Both networks then
+agree, and the gate would pass a file that no DPU computes. Its metadata is no evidence, because the
+judged file wrote it.
 """
 
 import onnx
@@ -33,12 +33,12 @@ LAYERS = {
     "RNN",
     "Scan",
 }
-"""Operators with weights, and those that hold a graph of their own."""
+"""Operators with weights, and those that contain a graph of their own."""
 
 
 def float_nodes(model: onnx.ModelProto) -> list[Node]:
-    """Return the nodes that compute in float: all but those on integers and those that only say how
-    to read them.
+    """Return the nodes that compute in float: all except those on integers and those that only
+    define how integers are read.
     """
     graph = OnnxGraph(model)
     integers = Integers(graph)
@@ -58,8 +58,8 @@ def float_layers_check(model: onnx.ModelProto) -> Check:
 def float_note(model: onnx.ModelProto) -> list[str]:
     """Return a note that names the float operators of another quantiser's file.
 
-    In a file of ours they are the host part, which `encoding_faults` compares with the integers
-    node by node.
+    In a file of this project they are the host part, which `encoding_faults` compares with the
+    integers node by node.
     """
     try:
         read_core(model)

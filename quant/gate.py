@@ -1,5 +1,5 @@
-"""What INT8 changes: both networks run once on all patches, and are compared with each other and
-with the references.
+"""Measure the effect of INT8: run both networks once on all patches, and compare them with each
+other and with the references.
 """
 
 import math
@@ -21,22 +21,24 @@ from beers_deploy.quant.untrusted import times
 
 SCALE = "of full scale"
 MOST = 0.5
-"""Share of a float network's results that lie in [0, 1] where they are an image, and not of another
-scale.
+"""The least share of a float network's results in [0, 1] from which they count as an image, not as
+values of another scale.
 """
 NEARLY_ALL = 0.99
 AROUND_UNIT = -0.1, 1.1
-"""Where nearly all results of a network lie that returns an image in [0, 1], overshoot included."""
+"""The range of nearly all results of a network that returns an image in [0, 1],
+overshoot included.
+"""
 
 
 @dataclass(frozen=True)
 class Metric:
-    """What a user measures results by.
+    """A metric by which a user judges results.
 
     Attributes:
         unit: of the figure.
-        larger_is_better: whether it is.
-        value: of a result (1, C, H, W) and its reference of the same shape.
+        larger_is_better: whether a larger value is better.
+        value: function of a result (1, C, H, W) and its reference of the same shape.
     """
 
     unit: str
@@ -88,7 +90,7 @@ class Spread:
         return float(np.sqrt(np.average((dn - mean) ** 2, weights=self.counts)))
 
     def share_beyond(self, dn: int) -> float:
-        """Return the share of the pixels that differ by more than so many whole DN."""
+        """Return the share of the pixels that differ by more than a number of integer DN."""
         return 1 - float(self.counts[MAX_DN - dn : MAX_DN + dn + 1].sum() / self.counts.sum())
 
     def worst(self, count: int) -> list[int]:
@@ -150,19 +152,19 @@ class GateResult:
 
     @property
     def metric_loss(self) -> float:
-        """What INT8 loses by the user's metric: above 0 it is worse than float."""
+        """The loss of INT8 by the user's metric; above 0 it is worse than float."""
         drop = self.metric_float - self.metric_int8
         return drop if METRICS[self.metric].larger_is_better else -drop
 
     @property
     def source(self) -> str:
-        """Where the figures come from."""
+        """A description of the samples that the figures come from."""
         kind = "simulated patches of 128 x 128" if self.simulated else "samples"
         return f"{self.patches} {kind}"
 
     @property
     def drop_db(self) -> float:
-        """PSNR lost against the reference."""
+        """PSNR that INT8 loses against the reference."""
         return self.psnr_float_db - self.psnr_int8_db
 
     @property
@@ -172,9 +174,10 @@ class GateResult:
 
     @property
     def std_over_mae(self) -> float:
-        """1.25 for rounding, which is Gaussian in the end; clipping drives it up.
+        """Standard deviation over MAE: 1.25 for rounding, whose errors are nearly Gaussian, and
+        more with clipping.
 
-        0 where nothing differs.
+        It is 0 if there is no difference.
         """
         return 0.0 if self.mae == 0 else self.std / self.mae
 
@@ -185,25 +188,24 @@ def compare(
     patches: Patches,
     metric: str = "",
 ) -> GateResult:
-    """Run both networks on patches; images are clipped as a file would.
+    """Run both networks on patches; images are clipped as in a file.
 
     Images of other ranges than [0, 1] are compared as shares of these. The patches' own ranges
     count, because an INT8 file that stated a wide one would make its errors small.
 
-    Without references, or where they have another size than what is compared, the PSNRs to them are
-    NaN.
+    Without references, or if they differ in size from the results, the PSNRs to them are NaN.
 
     Args:
         float_session: the float network's.
         int8_session: the INT8 network's.
         patches: that both are run on.
-        metric: one of `METRICS`, by which results are compared with the references too.
+        metric: one of `METRICS`, by which results are also compared with the references.
 
     Raises:
         ModelError: results of different shapes.
-        ImageError: a reference of the results' size outside [0, 1], or a sample without one where
+        ImageError: a reference of the results' size outside [0, 1], or a sample without one if
             others have it.
-        OptionError: references that the metric does not take.
+        OptionError: references that the metric does not accept.
     """
     counts = np.zeros(BINS, np.int64)
     dn_counts = np.zeros(2 * MAX_DN + 1, np.int64)
@@ -319,8 +321,12 @@ def _name(patches: Patches, number: int) -> str:
 
 
 def unfit_reference(patches: Patches, number: int, purpose: str) -> ImageError:
-    """Return the error of a reference of another size than the network's results, which `purpose`
-    needs.
+    """Return the error of a reference that differs in size from the network's results.
+
+    Args:
+        patches: the samples.
+        number: of the sample.
+        purpose: that needs the reference, for the message.
     """
     shape = patches.pairs[number][1].shape
     fault = f"its reference has {times(shape[1:])}" if math.prod(shape) else "it has none"
@@ -335,11 +341,12 @@ def _psnr_db(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 def gate_row(result: GateResult, shares: Mapping[str, float] | None = None) -> Row:
-    """Return what INT8 changes as a row of the table "gate".
+    """Return the effect of INT8 as a row of the table "gate".
 
     Args:
-        result: what was measured.
-        shares: of each layer's results the share at the ends of 8 bits, which a gate also prints.
+        result: the measurements.
+        shares: for each layer the share of its results at the ends of 8 bits, which a gate also
+            prints.
     """
     entries = {
         "MAE": (result.mae, SCALE),
@@ -376,7 +383,7 @@ def _figure(value: float, unit: str, result: GateResult) -> Figure:
 
 
 def _saturation(shares: Mapping[str, float], source: str) -> Figure:
-    """Return the share of results at the ends of 8 bits, in the layer where it is largest."""
+    """Return the largest share of a layer's results at the ends of 8 bits, with the layer."""
     if not shares:
         return unavailable("%", "no result in the file is rounded to 8 bits")
     layer = max(shares, key=lambda name: shares[name])

@@ -1,8 +1,8 @@
-"""The ranges of a network's input, where its channels are not all in [0, 1].
+"""Handle the ranges of a network's input if its channels are not all in [0, 1].
 
 A network may read pixels of 0 to 255, normalised ones such as (x - 0.485) / 0.229, or a map of
-noise levels next to the image. Images and samples have the network's own units; figures are shares
-of a range, so that 1 is full scale for every network.
+noise levels in addition to the image. Images and samples have the network's own units. Figures are
+shares of a range, so that 1 is full scale for every network.
 """
 
 from collections.abc import Iterable
@@ -12,16 +12,18 @@ import numpy as np
 from beers_deploy.profiles.errors import OptionError, printable
 
 Ranges = tuple[tuple[float, float], ...]
-"""(low, high) of each channel of the image; empty where all are in [0, 1]."""
+"""(low, high) of each channel of the image; empty if all are in [0, 1]."""
 
 UNIT = (0.0, 1.0)
 KEY = "input_range"
-"""Of the metadata of an INT8 file: the ranges in words, and whether samples alone tell them."""
+"""The metadata key in an INT8 file of the ranges in words, and of whether they come from samples
+only.
+"""
 FROM_SAMPLES = "found in the samples"
 LARGEST = 1 + 1e-6
-"""The largest share of a range that counts as 1: rounding may have left it above."""
+"""The largest share of a range that counts as 1, which allows for rounding."""
 SIZES = 1e-6, 65536.0
-"""The smallest and the largest size of the end of a range."""
+"""The smallest and the largest absolute value of the end of a range."""
 
 
 def read_ranges(option: object, channels: int) -> Ranges:

@@ -1,22 +1,22 @@
-"""INT8 operators that add exactly, also on processors whose fast kernels do not.
+"""Run INT8 operators that add exactly, also on processors whose fast kernels do not.
 
 x86 processors without VNNI multiply unsigned activations by signed weights and add neighbouring
-products in saturating int16 (`vpmaddubsw`). What lies beyond is clipped without a word, which gives
-other numbers than the DPU's. There a session computes each operator in the fastest way that is
-proven exact, chosen as the file is opened:
+products in saturating int16 (`vpmaddubsw`). Values beyond the range are clipped silently, which
+gives other numbers than the DPU's. On such processors a session computes each operator in the
+fastest way that is proven exact, chosen when the file is opened:
 
-1. SIGNED: weights stay as they are, for no two neighbouring products can leave int16, whatever the
-  activations. a. A tensor behind a ReLU is stored as 128..255 around 128. Moved down to 0..127
-  around 0, no weights saturate. b. Otherwise all pairs of weights that a kernel may form are
-  checked.
-2. UNSIGNED: weights stored as uint8, 128 higher and around 128. These kernels add in int32, at half
-  the speed.
-3. CONVERTED: the same for signed activations, which are moved to uint8 before the operator, and
-  back behind it.
+1. SIGNED: weights are not changed, because no two neighbouring products can leave int16, for any
+   activations. a. A tensor behind a ReLU is stored as 128..255 around 128. Moved down to 0..127
+   around 0, no weights saturate. b. Otherwise all pairs of weights that a kernel may form are
+   checked.
+2. UNSIGNED: weights are stored as uint8, 128 higher and around 128. These kernels add in int32, at
+   half the speed.
+3. CONVERTED: the same for signed activations, which are converted to uint8 before the operator, and
+   back behind it.
 
-Each is the same sum of the same integers, so the results are those of an exact processor, bit
-for bit. Float operators between 8-bit tensors (QDQ), of which onnxruntime makes integer ones, are
-checked as what they become.
+Each is the same sum of the same integers, so the results are those of an exact processor, bit for
+bit. Float operators between 8-bit tensors (QDQ), of which onnxruntime makes integer ones, are
+checked as those integer operators.
 """
 
 import hashlib
@@ -42,7 +42,7 @@ UINT8_MAX = 255
 
 
 class Way(StrEnum):
-    """How an operator is computed where the fast kernels saturate."""
+    """The way in which an operator is computed if the fast kernels saturate."""
 
     signed = "int8 weights, proven not to saturate"
     unsigned = "uint8 weights"
@@ -51,8 +51,8 @@ class Way(StrEnum):
 
 @dataclass(frozen=True)
 class Places:
-    """Where an operator holds its activations' zero point, its weights, their zero point and its
-    result's.
+    """The inputs at which an operator has its activations' zero point, its weights, their zero
+    point and the zero point of its result.
     """
 
     zero: int
@@ -73,11 +73,13 @@ Activations are the first input; a None result is int32.
 """
 
 FLOAT_OPERATORS = {"Conv": "QLinearConv", "MatMul": "QLinearMatMul", "Gemm": "QLinearMatMul"}
-"""Operators on dequantised tensors (QDQ), and which integer operator onnxruntime makes of each."""
+"""Operators on dequantised tensors (QDQ), and the integer operator that
+onnxruntime makes of each.
+"""
 
 REQUANTISING = {"QLinearConv": 7, "QLinearAdd": 7}
-"""What may write a tensor behind which a ReLU is moved down, and where it holds its result's zero
-point.
+"""Operators whose result may be stored 128 lower if a ReLU follows, and the input that holds the
+zero point of that result.
 """
 
 
@@ -90,7 +92,7 @@ class _Rewriting(ABC):
 
     @abstractmethod
     def around(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
-        """Return what replaces a node."""
+        """Return the nodes that replace a node."""
 
     def rewritten(self) -> onnx.ModelProto:
         """Replace every node, and return the model."""
@@ -171,10 +173,10 @@ class _Exact(_Rewriting):
         self.moved: set[str] = set()
 
     def move_relu_down(self, relu: onnx.NodeProto) -> None:
-        """Store what is behind max(result, its zero point) around 0: min(result moved down, what is
-        left of 255).
+        """Store the result of a ReLU, max(result, its zero point), around 0: the result is moved
+        down, and the ReLU becomes a Min.
 
-        Left as it is where anything but the operators above would notice.
+        Nothing is changed if another operator than those above reads the tensor.
         """
         source = relu.input[0]
         result = relu.output[0]
@@ -218,7 +220,7 @@ class _Exact(_Rewriting):
         )
 
     def around(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
-        """Return the node computed in an exact way, with what converts before and behind it."""
+        """Return the node computed in an exact way, with the conversions before and behind it."""
         if node.op_type in FLOAT_OPERATORS:
             return self._between(node)
         places = OPERATORS.get(node.op_type)
@@ -245,7 +247,9 @@ class _Exact(_Rewriting):
         return self._converted(node, places) if signed else [node]
 
     def _between(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
-        """Return a float operator on dequantised weights, after what dequantises uint8 ones."""
+        """Return a float operator on dequantised weights, after the nodes that dequantise uint8
+        ones.
+        """
         source = self.writers.get(node.input[1])
         weight = (
             self.arrays.get(source.input[0])
@@ -273,13 +277,15 @@ class _Exact(_Rewriting):
         """Store int8 constants as uint8, 128 higher."""
         for place in places:
             node.input.extend([""] * (place + 1 - len(node.input)))
-            # A zero point that is left out is 0.
+            # A missing zero point is 0.
             value = self.arrays.get(node.input[place], np.zeros((), np.int8))
             # The sum is formed in int16, because int8 wraps around above 127.
             node.input[place] = self.constant((value.astype(np.int16) + MIDDLE).astype(np.uint8))
 
     def _converted(self, node: onnx.NodeProto, places: Places) -> list[onnx.NodeProto]:
-        """Return the node on uint8 activations, between what moves these up and its result down."""
+        """Return the node on uint8 activations, between the nodes that convert these and its
+        result.
+        """
         self._lift(node, places.zero)
         before, node.input[0] = self._moved(node.input[0], MIDDLE, TensorProto.UINT8)
         if places.result_zero is None:
@@ -294,7 +300,9 @@ class _Exact(_Rewriting):
     def _moved(
         self, source: str, by: int, kind: int, result: str = ""
     ) -> tuple[list[onnx.NodeProto], str]:
-        """Return what moves an 8-bit tensor to another type of 8 bits, once for all its readers."""
+        """Return the node that converts an 8-bit tensor to another 8-bit type, once for all its
+        readers.
+        """
         result = result or f"{source}.unsigned"
         if result in self.moved:
             return [], result
@@ -314,7 +322,7 @@ class _Exact(_Rewriting):
 FEWEST_OUTPUTS = 16
 INPUTS_OF = 4
 FIRST_OPSET = 11
-"""From here on Pad and Slice take their places as inputs."""
+"""The first opset in which Pad and Slice have their positions as inputs."""
 
 
 def filled(model: onnx.ModelProto) -> onnx.ModelProto:
@@ -334,7 +342,7 @@ class _ChannelPadding(_Rewriting):
         self.wide_inputs = set[str]()
 
     def around(self, node: onnx.NodeProto) -> list[onnx.NodeProto]:
-        """Return the node, and what widens its input and narrows its output."""
+        """Return the node, and the nodes that widen its input and narrow its output."""
         weight = self.arrays.get(node.input[3]) if node.op_type == "QLinearConv" else None
         if weight is None or weight.ndim != 4 or not self._takes_zeros(node):
             return [node]
@@ -356,8 +364,8 @@ class _ChannelPadding(_Rewriting):
         return middle is not None and not middle.any() and not grouped
 
     def _widen(self, node: onnx.NodeProto, outputs: int, inputs: int) -> None:
-        """Weights of zero; scales and zero points that are a channel's own get more, which matter
-        to nobody.
+        """Pad the weights with zeros, and extend scales and zero points per channel, which have no
+        effect there.
         """
         name = node.output[0]
         weight = self.arrays[node.input[3]]

@@ -1,5 +1,5 @@
-"""The limits of the gate: their defaults, the values that make sense, the TOML file that sets them,
-and a check of each.
+"""Define the limits of the gate: their defaults, their valid values, the TOML file that sets them,
+and the check of each.
 """
 
 import math
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 # Of 17 tampered files this stopped 15, all that cost more than 0.03 dB.
 MAE_GROWTH = 1.05
-"""How many times the MAE of a baseline is allowed where no limit says otherwise."""
+"""The default limit of the MAE, as a multiple of that of a baseline."""
 
 
 @dataclass(frozen=True)
@@ -29,18 +29,18 @@ class Limits:
     Attributes:
         mae: mean absolute difference of INT8 from float. The default suits networks that change an
             image as little as ConvBEERS does (0.01 of full scale).
-        p999: 99.9th percentile of the size of the difference.
+        p999: 99.9th percentile of the absolute difference.
         std_over_mae: standard deviation of the difference over the MAE. Rounding alone gives 1.25
             in one image and up to 2.3 over images of all brightnesses, a few clipped edges give 4;
-            clipped ground drives it up.
-        drop_share: PSNR lost against the reference, as a share of what the float network gains over
-            its input. It applies where the float network gains anything and where the references
-            have the size of the results.
+            clipped ground gives more.
+        drop_share: PSNR lost against the reference, as a share of the float network's gain over its
+            input. It applies if the float network has a gain and the references have the size of
+            the results.
         psnr_drop_db: PSNR lost against the reference.
         min_psnr_float_int8_db: smallest PSNR of INT8 against float.
-        metric_loss: what INT8 loses by the metric that is chosen.
-        saturated: share of a layer's results at the ends of 8 bits, of the layer with most.
-        mae_growth: how many times a stored baseline's MAE; 1.05 where there is a baseline and no
+        metric_loss: loss of INT8 by the chosen metric.
+        saturated: largest share of a layer's results at the ends of 8 bits.
+        mae_growth: MAE as a multiple of a stored baseline's; 1.05 if there is a baseline and no
             such limit.
 
     Examples:
@@ -82,7 +82,7 @@ def limits_of(
     given: "Limits | Mapping[str, float] | str | os.PathLike[str] | None",
     max_mae: float | None = None,
 ) -> Limits:
-    """Return the limits of a TOML file or a mapping; what they leave out has its default.
+    """Read the limits of a TOML file or a mapping; limits that are missing have their defaults.
 
     Args:
         given: limits, a mapping or a TOML file such as `mae = 0.0007`; the defaults if None.
@@ -151,7 +151,7 @@ def _is_limit(value: object) -> bool:
 
 
 AT_LEAST = "PSNR float-INT8"
-"""The one figure of which a large value is good."""
+"""The only figure for which a larger value is better."""
 
 
 def judge(
@@ -163,11 +163,11 @@ def judge(
     """Check every limit that is set.
 
     Args:
-        result: what INT8 changes.
+        result: the measured effect of INT8.
         limits: the largest values allowed.
         baseline_mae: the MAE of an earlier gate, if there is a baseline.
-        shares: of each layer's results the share at the ends of 8 bits; None leaves them out, and
-            no limit is kept where nothing is 8-bit.
+        shares: for each layer the share of its results at the ends of 8 bits. With None it is not
+            checked; without 8-bit tensors its limit is not met.
     """
     figures: list[tuple[str, float, float | None, str, str]] = [
         ("MAE", result.mae, limits.mae, "of full scale", ""),
@@ -175,7 +175,7 @@ def judge(
         ("std / MAE", result.std_over_mae, limits.std_over_mae, "ratio", ""),
         ("PSNR drop", result.drop_db, limits.psnr_drop_db, "dB", ""),
     ]
-    # Without references the gain is NaN, and where float gains nothing a share of it says nothing.
+    # Without references the gain is NaN, and without a gain a share of it is meaningless.
     if result.gain_db > 0:
         gained = f"the float network gains {result.gain_db:.2f} dB"
         share = result.drop_db / result.gain_db

@@ -1,8 +1,7 @@
-"""ONNX files, read and written without trusting them: one sentence for whatever is not a sound
-model.
+"""Read and write ONNX files without trusting them: an invalid model is reported in one sentence.
 
-Also what a network's file says of itself: its metadata, and the tile that it is fixed to. How an
-image may be cut into tiles for it is `quant.tiling`'s matter.
+This module also reads what a network's file states about itself: its metadata, and the tile that it
+is fixed to. How an image may be cut into tiles is determined in `quant.tiling`.
 """
 
 import re
@@ -43,16 +42,15 @@ REMEDY = (
 
 
 def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
-    """Read an ONNX model, with weights that it keeps beside it: the one way by which a file comes
-    in.
+    """Read an ONNX model with its external weights; every file is read by this function.
 
-    A float network comes as its simplest equal (`quant.simplify`), an INT8 one as it is. One
-    that no runtime may get comes as it is too, where it is only looked at.
+    A float network is simplified (`quant.simplify`), an INT8 one is returned unchanged. So is a
+    model that is only inspected.
 
     Args:
         path: the file.
-        to_run: whether a runtime may get it; False where its nodes are only looked at, whosever
-            they are.
+        to_run: whether a runtime may open it; False if its nodes are only inspected, from any
+            domain.
 
     Raises:
         ModelError: missing, empty, not ONNX, of weights that are not finite, or not to be trusted
@@ -69,7 +67,9 @@ def load_onnx(path: Path, to_run: bool = True) -> onnx.ModelProto:
 
 
 def read_onnx(content: bytes, where: str) -> onnx.ModelProto:
-    """As `load_onnx`, of the bytes of a network that holds all its weights."""
+    """Read a network from bytes as `load_onnx` does from a file; the bytes must contain all
+    weights.
+    """
     return _simplified(parse_onnx(content, where), where, True)
 
 
@@ -90,8 +90,13 @@ def _simplified(model: onnx.ModelProto, where: str, to_run: bool) -> onnx.ModelP
 def parse_onnx(
     content: bytes, where: str, to_run: bool = True, path: Path | None = None
 ) -> onnx.ModelProto:
-    """As `load_onnx`, of a file's bytes, and what is read stays as it is; with a path weights may
-    lie beside it.
+    """Parse and check a model from bytes as `load_onnx` does, without simplifying it.
+
+    Args:
+        content: the bytes of the file.
+        where: name of the network for messages.
+        to_run: whether a runtime will open it.
+        path: of the file, next to which weights may be stored; None if all are in `content`.
     """
     if not content:
         raise ModelError(f"{where} is an empty file. {REMEDY}")
@@ -102,7 +107,7 @@ def parse_onnx(
         model.ParseFromString(content)
         if path is not None:
             take_in(model, path)
-        # Before onnx's checker, which looks for the files that weights are said to be in.
+        # Before onnx's checker, which opens the files that hold external weights.
         check_content(model, where)
         sort_nodes(model.graph)
         onnx.checker.check_model(model)
@@ -138,14 +143,20 @@ def save_onnx(model: onnx.ModelProto, path: Path) -> None:
 
 
 def metadata(model: onnx.ModelProto) -> dict[str, str]:
-    """The key-value pairs that a model carries about itself."""
+    """Return the key-value pairs of a model's metadata."""
     return {item.key: item.value for item in model.metadata_props}
 
 
 def make_model(
     graph: onnx.GraphProto, about: dict[str, str], microsoft: bool = False
 ) -> onnx.ModelProto:
-    """A model of our opset around a graph; `microsoft` adds onnxruntime's own operator domain."""
+    """Build a model of this project's opset around a graph.
+
+    Args:
+        graph: the graph.
+        about: metadata of the model.
+        microsoft: whether to add onnxruntime's own operator domain.
+    """
     opsets = [onnx.helper.make_opsetid("", OPSET)]
     opsets += [onnx.helper.make_opsetid(MICROSOFT, 1)] if microsoft else []
     model = onnx.helper.make_model(
@@ -156,10 +167,10 @@ def make_model(
 
 
 class GraphWriter:
-    """Collects the nodes and the constants of a graph; a constant of one name is written once."""
+    """Collects the nodes and the constants of a graph; each constant is stored once by its name."""
 
     domain: str | None = None
-    """Of operators that name none; the empty one is ONNX's own, stated."""
+    """The domain of operators that state none; the empty one is ONNX's own, stated explicitly."""
 
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
@@ -174,8 +185,15 @@ class GraphWriter:
         domain: str | None = None,
         **attributes: int | float | str | list[int],
     ) -> str:
-        """Append an operator of one result, named as its result unless it has a name; returns the
-        result's.
+        """Append an operator with one result, and return the name of the result.
+
+        Args:
+            kind: the operator.
+            output: name of the result.
+            inputs: names of its inputs.
+            name: of the node; that of the result if empty.
+            domain: of the operator; None for the domain of the writer.
+            attributes: of the node.
         """
         node = onnx.helper.make_node(
             kind, inputs, [output], name=name or output, domain=domain or self.domain
@@ -192,20 +210,20 @@ class GraphWriter:
         return name
 
     def unit(self, frac_bits: int) -> str:
-        """The constant 2^-frac_bits: one unit of a tensor."""
+        """Add the constant 2^-frac_bits, one unit of a tensor, and return its name."""
         return self.constant(f"scale_2^{-frac_bits}", np.array(2.0**-frac_bits, np.float32))
 
     def graph(
         self, name: str, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
     ) -> onnx.GraphProto:
-        """The ONNX graph of the nodes and constants collected so far."""
+        """Build the ONNX graph of the nodes and constants collected so far."""
         return onnx.helper.make_graph(
             self.nodes, name, inputs, outputs, list(self.weights.values())
         )
 
 
 def image_info(name: str, channels: int, tile_px: int | None) -> onnx.ValueInfoProto:
-    """An (N, channels, H, W) tensor: a fixed tile of one image, or any number and size."""
+    """Describe a tensor (N, channels, H, W): a fixed tile of one image, or any number and size."""
     shape: list[str | int | None] = (
         [1, channels, tile_px, tile_px] if tile_px else ["N", channels, "H", "W"]
     )
@@ -213,7 +231,7 @@ def image_info(name: str, channels: int, tile_px: int | None) -> onnx.ValueInfoP
 
 
 def with_outputs(model: onnx.ModelProto, kinds: Mapping[str, int]) -> onnx.ModelProto:
-    """The model with these tensors, of these ONNX types, as outputs behind its own."""
+    """Return the model with these tensors, of these ONNX types, as additional outputs."""
     extended = deepcopy(model)
     names = {value.name for value in extended.graph.output}
     extended.graph.output.extend(
@@ -225,11 +243,11 @@ def with_outputs(model: onnx.ModelProto, kinds: Mapping[str, int]) -> onnx.Model
 
 
 OUTPUT = "output"
-"""In the metadata of a network with one of its outputs alone: the name of that."""
+"""The metadata key of the name of the output, in a network with only one of its outputs."""
 
 
 def with_one_output(model: onnx.ModelProto, name: str, where: str) -> onnx.ModelProto:
-    """Return the network with one of its outputs, and only what that is computed of.
+    """Return the network with one of its outputs, and only the nodes that compute it.
 
     Raises:
         OptionError: no such output.
@@ -255,7 +273,7 @@ def with_one_output(model: onnx.ModelProto, name: str, where: str) -> onnx.Model
 
 
 def fixed_tile_px(model: onnx.ModelProto) -> int | None:
-    """The tile side that a model is fixed to, or None when it takes any size."""
+    """Return the tile side that a model is fixed to, or None if it accepts any size."""
     sizes = []
     if model.graph.input:
         sizes = [d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim]
@@ -269,8 +287,10 @@ def fixed_tile_px(model: onnx.ModelProto) -> int | None:
 
 
 def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
-    """A network of convolutions that is fixed to one tile, for images of any size; any other as it
-    is.
+    """Return a network that is fixed to one tile as a network for any size.
+
+    Only networks whose inputs and outputs have four sizes can be changed; others are returned
+    unchanged.
     """
     if fixed_tile_px(model) is None:
         return model
@@ -288,7 +308,7 @@ def any_size(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def is_quantized(model: onnx.ModelProto) -> bool:
-    """Whether any node computes on, makes or reads quantised numbers."""
+    """Return True if any node reads, writes or computes with quantised numbers."""
     kinds = {node.op_type.lower() for node in model.graph.node}
     marks = ("qlinear", "quantizelinear", "integer")
     return any(mark in kind for kind, mark in product(kinds, marks))

@@ -1,18 +1,19 @@
-"""What each restriction of a DPU costs: the float network with one more of them a step.
+"""Measure the cost of each restriction of a DPU: each step adds one restriction to the float
+network.
 
 Each step rounds weights and tensors as such hardware would, and computes in float between:
 
 1. 8 bits: a scale for the weights of each output channel, and 256 steps from the smallest to the
    largest value of each tensor.
-2. No zero point: the steps lie around 0, so what is never negative has 128 of them.
+2. No zero point: the steps lie around 0, so a tensor that is never negative has 128 of them.
 3. One scale for all weights of a convolution.
 4. Powers of two as scales, the finest that clip nothing.
-5. The INT8 network: also shifts, scales that tensors share and biases of 8 bits, against what the
-   passes and fine-tuning win back.
+5. The INT8 network: also shifts, shared scales and 8-bit biases, minus the gain of the passes and
+   of fine-tuning.
 
-Ranges are those of the samples that are measured, so that steps 1 to 4 clip nothing. The image
-enters, and is added at the end, as the host of the INT8 network does it. What clipping costs in
-step 5 is the difference to the same integers in tensors whose values have no end.
+Ranges are those of the measured samples, so that steps 1 to 4 clip nothing. The image enters, and
+is added at the end, as in the host's part of the INT8 network. The cost of clipping in step 5 is
+the difference to the same integers in tensors without limits.
 """
 
 import math
@@ -45,7 +46,7 @@ from beers_deploy.quant.session import open_any_size, open_session, planes_of, r
 
 BITS = 8
 SAMPLES = 16
-"""That are measured, of those that calibration did not see."""
+"""The maximum number of measured samples that were held out from calibration."""
 PER_CHANNEL = (1, 2, 3)
 """Axes of weights (O, I, kh, kw) over which a scale for each output channel is shared."""
 
@@ -223,11 +224,11 @@ class Measured:
 
 
 def price_rows(result: Quantized, held_out: Patches) -> list[Row]:
-    """Return a row for the loss of each step, and one for what clipping costs in the last.
+    """Return a row for the loss of each step, and one for the cost of clipping in the last.
 
     Args:
-        result: the INT8 network, which knows the float one.
-        held_out: samples that calibration did not see. At most SAMPLES of them are measured.
+        result: the INT8 network, with its float one.
+        held_out: samples that are held out from calibration. At most SAMPLES of them are measured.
 
     Returns:
         Rows of the table "price", in the order of the steps. "price" is the loss that a step adds

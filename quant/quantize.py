@@ -1,14 +1,14 @@
-"""Static INT8 in one call: float ONNX and calibration patches in, the integer core and its file for
-the host out.
+"""Quantise a network in one call: float ONNX and calibration patches in, the integer core and its
+file for the host out.
 
 1. Read the network, and let it read bit planes.
 2. Find the residual groups and the single tensors, whose channels may be scaled.
 3. Choose the scale of each tensor by least squares.
-4. Leave groups out in which int8 could not end at a ReLU6's six.
-5. Write a result that nothing is added to in windows.
+4. Exclude groups in which int8 could not end at a ReLU6's six.
+5. Write a result to which nothing is added in windows.
 6. Equalize the channels of the groups, then those of the single tensors.
 7. Round the graph, which writes its copies last, to the integer core.
-8. Train the integers and move scales, if asked to.
+8. Train the integers and change scales, if requested.
 """
 
 import logging
@@ -85,16 +85,16 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 PASSES = "fine_planes, least_squares, shared_residual_scale, equalise, dual_gain"
-"""What a file records as done beyond rounding each tensor, in the words of the first files."""
+"""The record in a file of the applied passes, in the words of the first files."""
 
 FINETUNE = "finetune"
-"""What a file calls its fine-tuning."""
+"""The key of the record of fine-tuning in a file."""
 
 
 @dataclass(frozen=True)
 class Quantized:
-    """One network in integers, also as the host's file, the float graph that was rounded, and the
-    float network as it was read.
+    """One network in integers, also as the host's file, with the float graph that was rounded and
+    the original float network.
     """
 
     host: onnx.ModelProto
@@ -105,15 +105,15 @@ class Quantized:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be quantised.
+    """The parts of a quantisation.
 
     Attributes:
-        graph: that reads the planes, in float.
+        graph: a float graph that reads the planes.
         host_part: the host's part.
         groups: residual groups, each of one scale.
-        singles: what is equalized in addition to the groups, or where there are none.
+        singles: tensors that are equalized in addition to the groups, or without groups.
         shifts: the windows of the target.
-        passes: that reduce the error.
+        passes: the passes that reduce the error.
         effort: of the search for equalization factors.
     """
 
@@ -166,21 +166,20 @@ def quantize_model(
     """Quantise a float network under the DPU's rules: int8, symmetric, per tensor, power-of-two
     scales.
 
-    The global add, where there is one, stays on the host, in 12 bits: only the correction is
-    computed in int8.
+    If there is a global add, it remains on the host, in 12 bits: only the correction is computed in
+    int8.
 
     Args:
         model: the float network.
-        patches: that it is calibrated on.
+        patches: the calibration patches.
         about: metadata of the files.
         shifts: the windows of the target.
-        tuning: on what, how long and how fast the integers are trained at last; None leaves them
-            and their scales.
-        passes: that reduce the error.
+        tuning: the parameters of fine-tuning; None does not train the integers.
+        passes: the passes that reduce the error.
         effort: of the search for equalization factors.
 
     Raises:
-        ModelError: an operation that the DPU does not compute, or weights of no sensible size.
+        ModelError: an operation that the DPU does not compute, or weights of absurd size.
     """
     # 1.
     network = read_network(model)
@@ -221,8 +220,9 @@ def quantize_model(
 
 
 def _singles(graph: Graph, host_part: HostPart, groups: list[ResidualGroup]) -> SingleTensors:
-    """Return what is equalized in addition to these groups: nothing where there are some, and no
-    depthwise convolutions.
+    """Return the tensors that are equalized in addition to these groups.
+
+    There are none if there are groups and no depthwise convolutions.
     """
     depthwise = any(isinstance(op, Conv) and op.groups > 1 for op in graph)
     # Next to a group this made no dense network for one sensor better: see `equalize_single`.
@@ -257,8 +257,8 @@ def rounded(plan: Plan, images: Sequence[np.ndarray]) -> tuple[IntCore, Graph]:
 def _equalized(
     graph: Graph, plan: Plan, frac_bits: Mapping[str, int], images: Sequence[np.ndarray]
 ) -> Graph:
-    """Equalize the channels of the groups, then those of the single tensors, and report before how
-    long it takes.
+    """Equalize the channels of the groups, then those of the single tensors, and report the
+    expected time before.
     """
     first_crop, *others = crops(images[0], 0 if halo_of(graph) is not None else None)
     count = crop_count(first_crop, len(images) * (1 + len(others)))
@@ -269,7 +269,7 @@ def _equalized(
     earlier: RoundedConvs = {}
     trials = CropTrials(lambda candidate: plan.core(candidate, frac_bits, earlier), targets)
     graph = plan.singles.scaled(graph, plan.singles.unscaled(frac_bits))
-    # The time is only reported: what is tried depends on counted work alone.
+    # The time is only reported: the candidates depend on counted work alone.
     start = time.perf_counter()
     trials(graph, tensors(graph))(graph)(None)
     seconds = max((time.perf_counter() - start) * limit.runs, 1)
@@ -283,7 +283,7 @@ def _equalized(
 def _equalized_groups(
     graph: Graph, plan: Plan, trials: Trials, images: Sequence[np.ndarray], most_groups: int
 ) -> Graph:
-    """Equalize group after group, the others by a first guess until their turn comes."""
+    """Equalize one group after the other; groups that follow have a first guess until then."""
     ranges = [channel_ranges(plan.graph, group, images, plan.host_part) for group in plan.groups]
     guesses = [first_guess(group_ranges, GAMMAS[0], 1.0) for group_ranges in ranges]
     for group, guess in list(zip(plan.groups, guesses, strict=True))[1:]:
@@ -305,8 +305,9 @@ def _equalized_groups(
 def _equalized_singles(
     graph: Graph, plan: Plan, trials: Trials, images: Sequence[np.ndarray], most_groups: int
 ) -> Graph:
-    """Equalize the single tensors; what the image itself passes through clips nothing that
-    calibration sees.
+    """Equalize the single tensors.
+
+    If the image itself is in these tensors, they are scaled such that no calibration value clips.
     """
     if not plan.singles.tensors:
         return graph

@@ -1,8 +1,8 @@
-"""Which layer costs what: each one in int8 while all others stay in float.
+"""Measure the error of each layer: one in int8 while all others remain in float.
 
-A convolution errs by its int8 weights and bias, and by rounding and clipping its result. An add
-errs by what it does to sums of integers: in a group of one scale nothing, but where it
-saturates. What a layer's inputs had already lost does not count.
+The error of a convolution comes from its int8 weights and bias, and from rounding and clipping its
+result. The error of an add comes from integer sums: in a group of one scale it is zero unless the
+sum saturates. Errors of a layer's inputs do not count.
 """
 
 import math
@@ -45,19 +45,21 @@ from beers_deploy.quant.session import (
 )
 
 IN_INT8 = ".in_int8"
-"""Behind the name of a tensor: as int8 weights and bias make it of float
-inputs, not yet rounded.
+"""Suffix of the name of a tensor: its value computed by int8 weights and bias from float inputs,
+not yet rounded.
 """
 
 WORST = 4
 BEYOND_DN = (1, 2, 4, 8, 16, 32, 64)
 ROUNDING = 1.4
 CLIPPING = 1.6
-"""std / MAE, 1.25 for a Gaussian: up to the first it is rounding, beyond the second clipping."""
+"""Limits of std / MAE, which is 1.25 for a Gaussian: below the first the errors are rounding, above
+the second clipping.
+"""
 
 
 class Loss:
-    """The difference of results from what was wanted, added up array by array."""
+    """The difference between results and targets, accumulated array by array."""
 
     def __init__(self) -> None:
         self._signal = 0.0
@@ -66,7 +68,7 @@ class Loss:
         self._count = 0
 
     def add(self, result: np.ndarray, target: np.ndarray, offset: np.ndarray | float = 0.0) -> None:
-        """Count further values; the signal is what was wanted less an offset."""
+        """Count further values; the signal is the target minus an offset."""
         difference = np.subtract(result, target, dtype=np.float64)
         self._noise += float(np.square(difference).sum())
         self._signal += float(np.square(np.subtract(target, offset, dtype=np.float64)).sum())
@@ -75,8 +77,8 @@ class Loss:
 
     @property
     def sqnr_db(self) -> float:
-        """10 log10 of the signal's energy over that of the difference; infinite where nothing is
-        lost.
+        """10 log10 of the energy of the signal over that of the difference; infinite without a
+        difference.
         """
         return (
             10 * math.log10(self._signal / self._noise)
@@ -86,18 +88,18 @@ class Loss:
 
     @property
     def mae(self) -> float:
-        """Mean size of the difference."""
+        """Return the mean absolute difference."""
         return self._size / self._count
 
     @property
     def squared(self) -> float:
-        """Mean squared difference."""
+        """Return the mean squared difference."""
         return self._noise / self._count
 
 
 @dataclass(frozen=True)
 class LayerError:
-    """What one layer in int8 loses, all others in float.
+    """The error of one layer in int8, with all others in float.
 
     Attributes:
         name: of the layer.
@@ -113,11 +115,10 @@ class LayerError:
 def layer_errors(
     graph: Graph, core: IntCore, crops: Iterable[np.ndarray]
 ) -> tuple[list[LayerError], Loss]:
-    """Return what each layer of a network loses, and what all lose jointly, over crops (1, C, H,
-    W).
+    """Measure the error of each layer of a network, and of all jointly, over crops (1, C, H, W).
 
     Args:
-        graph: plane-reading, in float: what the core was rounded from.
+        graph: a float graph that reads the planes, from which the core was rounded.
         core: the same operations in integers.
         crops: each passes through the network once for every layer.
     """
@@ -193,7 +194,7 @@ def _in_int8(op: Op, core: IntCore, exact: Mapping[str, np.ndarray]) -> np.ndarr
 
 
 def layer_error_rows(result: Quantized, patches: Patches) -> list[Row]:
-    """Return a row for every layer in int8 by itself, and one for all of them."""
+    """Return a row for every layer that alone is in int8, and one for all of them."""
     crops = few_crops(patches.degraded, result.host)
     layers, together = layer_errors(result.graph, result.core, crops)
     source = f"{len(crops)} patches, all other layers in float"
@@ -222,7 +223,7 @@ def _sqnr(loss: Loss, source: str) -> Figure:
 
 
 def worst_row(number: int, patches: Patches, spread: Spread) -> Row:
-    """Return the errors of a patch; of a simulated one also what it shows through which sensor."""
+    """Return the errors of a patch; for a simulated one also its content and its sensor."""
     errors = {"MAE": spread.mae[number], "max": spread.largest[number]}
     kind = "simulated patch" if patches.views else "sample"
     figures = {
@@ -260,19 +261,20 @@ def sizes_row(spread: Spread) -> Row:
 
 
 MUCH_DB = 0.2
-"""From here on, or below, a network has lost so much that it is worth asking where."""
+"""The PSNR drop above which the costliest layers are listed."""
 
 
 def losses(
     result: Quantized, gate: GateResult, patches: Patches, layers: Sequence[Row] = ()
 ) -> str:
-    """Return the loss of INT8 in a sentence, on the worst patch too; where it is large, also which
-    tensors cost most and what to try.
+    """Describe the loss of INT8 in a sentence, also for the worst patch.
+
+    If the loss is large, the costliest layers and advice are added.
 
     Args:
         result: the network.
         gate: the differences on the patches.
-        patches: that calibration did not see.
+        patches: held out from calibration.
         layers: of `layer_error_rows`, if they were computed before.
     """
     if math.isnan(gate.drop_db):
@@ -297,7 +299,7 @@ def losses(
 
 
 MOST = 3
-"""Layers that are named."""
+"""The maximum number of layers that are named."""
 
 
 def _costliest(layers: Sequence[Row]) -> list[tuple[str, float]]:
@@ -319,7 +321,7 @@ def headline(gate: GateResult, layers: Sequence[Row]) -> str:
 
 
 def kind_of_error(std_over_mae: float) -> str:
-    """Return what std / MAE says, in one sentence."""
+    """Return one sentence on the meaning of std / MAE."""
     sentence = f"std / MAE is {std_over_mae:.2f}, where a Gaussian has 1.25"
     if std_over_mae <= ROUNDING:
         return f"{sentence}: the errors are mostly those of rounding."

@@ -1,7 +1,7 @@
-"""Networks run on onnxruntime: a session, set up once for the whole project, and large images in
+"""Run networks on onnxruntime: a session, set up once for the whole project, and large images in
 tiles.
 
-Looking at every tensor of a network at once costs memory that grows with the image; tiles do not.
+Reading every tensor of a network at once needs memory that grows with the image; tiles do not.
 """
 
 from collections.abc import Iterable, Iterator
@@ -39,17 +39,17 @@ def open_session(
     optimise: bool = True,
     exact: bool | None = None,
 ) -> ort.InferenceSession:
-    """Open a model on the CPU, such that its integers are added exactly whatever the processor
+    """Open a model on the CPU such that its integers are added exactly on every processor
     (`quant.kernels`).
 
     Args:
         model: a file or a model in memory.
-        threads: 0 takes every core.
+        threads: 0 uses every core.
         optimise: False runs the graph as written.
-        exact: take the ways of a processor whose int8 kernels saturate; None asks the processor.
+        exact: use the ways of a processor whose int8 kernels saturate; None tests the processor.
 
     Raises:
-        ModelError: a file that is not to be trusted, or onnxruntime refuses the model.
+        ModelError: a file that is not to be trusted, or that onnxruntime rejects.
     """
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
@@ -57,8 +57,8 @@ def open_session(
     options.enable_mem_pattern = False
     # An error is raised, so onnxruntime need not print it as well.
     options.log_severity_level = 4
-    # Threads that wait for this session's next run take a core from whoever runs meanwhile, for
-    # tens of milliseconds.
+    # Threads that wait for this session's next run occupy a core for tens of milliseconds, which
+    # other work lacks.
     options.add_session_config_entry("session.force_spinning_stop", "1")
     if not optimise:
         options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
@@ -122,7 +122,7 @@ def tensors_of(
 
 
 def require_finite(values: Iterable[np.ndarray], name: str) -> None:
-    """Raise ModelError if what a network computed from an image in [0, 1] is not finite.
+    """Raise ModelError if the results of a network for an image in [0, 1] are not finite.
 
     Args:
         values: its results.
@@ -144,13 +144,13 @@ def _unfit(reason: str) -> ModelError:
 
 
 TILE_PX = 128
-"""Side of the largest tile, halo not counted."""
+"""Side of the largest tile, without halo."""
 
 
 def crops(image: np.ndarray, halo_px: int | None = 0) -> list[np.ndarray]:
     """Return crops (1, C, h, w) of at most TILE_PX a side that tile an image (1, C, H, W).
 
-    Where the network has no halo, None, the image is left whole: as `tensor_values` does.
+    If the network has no halo (None), the image is not divided, as in `tensor_values`.
     """
     return [image[..., slice(*rows), slice(*columns)] for rows, columns in _places(image, halo_px)]
 
@@ -162,12 +162,12 @@ def tensor_values(
     halo_px: int | None,
     host_part: HostPart = ONE_CHANNEL,
 ) -> Iterator[list[np.ndarray]]:
-    """Yield the named tensors (1, C, h, w) of a plane-reading float network for an image
-    (1, C', H, W), tile by tile.
+    """Yield the named tensors (1, C, h, w) of a plane-reading float network for an image (1, C', H,
+    W), tile by tile.
 
     Each tile is computed with a halo of the pixels that its values depend on, which is then cut
-    off: together the tiles hold what the whole image would have given, its zero-padded borders
-    included. Without a halo (None) the image is one tile.
+    off. The tiles together equal the result of the whole image, zero-padded borders included.
+    Without a halo (None) the image is one tile.
     """
     for (top, bottom), (left, right) in _places(image, halo_px):
         around_px = halo_px or 0
@@ -198,10 +198,10 @@ def planes_of(image: np.ndarray, host_part: HostPart = ONE_CHANNEL) -> np.ndarra
 
 
 def halo_of(graph: Graph) -> int | None:
-    """Return the pixels on each side that a value can depend on: no path passes more than all
-    convolutions.
+    """Return the number of pixels on each side that a value can depend on: no path passes more than
+    all convolutions.
 
-    None where values are not on the image's own lattice, or windows do not keep it.
+    None if values are not on the image's own lattice, or if windows do not preserve it.
     """
     if not all(
         isinstance(op, Add | Mul | Concat | Pointwise) or _keeps_lattice(op) for op in graph
@@ -217,8 +217,9 @@ def _keeps_lattice(op: Op) -> bool:
 def _places(
     image: np.ndarray, halo_px: int | None
 ) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
-    """(top, bottom) and (left, right) of every tile, all about equally large; without a halo the
-    one that is all.
+    """Return (top, bottom) and (left, right) of every tile, all about equally large.
+
+    Without a halo there is one tile, the whole image.
     """
     counts = [-(-size // TILE_PX) if halo_px is not None else 1 for size in image.shape[-2:]]
     edges = [
@@ -233,7 +234,7 @@ LAYER_PATCHES = 4
 
 def few_crops(images: Iterable[np.ndarray], model: onnx.ModelProto) -> list[np.ndarray]:
     """Return one crop of each of the first few images, for figures of each layer; the whole image
-    where a size is fixed.
+    if its size is fixed.
     """
     halo_px = None if fixed_tile_px(model) is not None else 0
     return [crops(image, halo_px)[0] for image in islice(images, LAYER_PATCHES)]

@@ -1,11 +1,12 @@
-"""What an INT8 file itself shows: results that come to the ends of 8 bits, lost ReLUs, faults of
-its encoding.
+"""Check an INT8 file by itself: results at the ends of 8 bits, lost ReLUs, and faults of its
+encoding.
 
-Saturation: whatever a node rounds to 8 bits is looked at, in any encoding (integer kernels or QDQ),
-as the graph is written; what lies beyond the ends is clipped, and lost. Two ends are no loss: the
-lower one where it stands for zero or where a ReLU reads it, for that is the ReLU, and those of the
-fine copy, which the coarse one is there for (`quant.passes.dual_range`). ReLUs are counted because
-quantisers have been seen to drop them without a word.
+Saturation: every tensor that a node rounds to 8 bits is checked, in any encoding (integer kernels
+or QDQ), as the graph is written. Values beyond the ends are clipped, and lost. Two ends are no
+loss. One is the lower end if it represents zero or if a ReLU reads it, because that is the ReLU.
+The others are the ends of the fine copy, which the coarse copy replaces
+(`quant.passes.dual_range`). ReLUs are counted because quantisers have been seen to drop them
+silently.
 """
 
 from collections.abc import Iterable
@@ -33,9 +34,9 @@ RELUS = ("Relu", "Max")
 HARD = (Activation.hard_sigmoid, Activation.hard_swish)
 BYTES = ("int8", "uint8")
 ENCODING = "faults of the encoding"
-"""The check of an INT8 file that describes its integers."""
+"""The name of the check of an INT8 file that describes its integers."""
 TABLE = 256
-"""Values of 8 bits, each of which a table of ours maps."""
+"""The number of 8-bit values, each of which an activation table maps."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,10 @@ class Rounded:
     Attributes:
         name: of the tensor.
         scale: its scale, zero point and integer type.
-        low_is_relu: True if a ReLU reads the tensor, so that what is clipped at the lower end would
+        low_is_relu: True if a ReLU reads the tensor, so that values clipped at the lower end would
             have become zero anyway.
-        counted: the channels that count. Of a result in several copies these are the coarse ones,
-            which hold what others clip.
+        counted: the channels that count. In a result of several copies these are the coarse ones,
+            which hold the values that others clip.
     """
 
     name: str
@@ -166,12 +167,13 @@ def _rounded(graph: OnnxGraph, core: IntCore | None) -> list[Rounded]:
 
 @dataclass(frozen=True)
 class Relus:
-    """How many a file has.
+    """The number of ReLUs in a file.
 
     Attributes:
-        explicit: nodes that are one: Relu, or the larger of a value and zero.
+        explicit: nodes that are a ReLU: Relu, or the larger of a value and zero.
         folded: convolutions whose 8 bits begin at zero, which is a ReLU, unless their results were
-            never below zero; and those of which our file says that saturation is their ReLU.
+            never below zero; and those whose saturation is their ReLU according to the description
+            in the file.
     """
 
     explicit: int
@@ -184,7 +186,7 @@ class Relus:
         more favourable case.
 
         Args:
-            expected: the number of ReLUs that the file should have.
+            expected: the expected number of ReLUs of the file.
         """
         return max(expected - self.explicit - self.folded, self.explicit - expected, 0)
 
@@ -280,7 +282,7 @@ def _is_table_of_relu(table: np.ndarray | None) -> bool:
 
 
 def _begins_at_zero(node: Node, tensors: dict[str, Rounded], convolved: set[str]) -> bool:
-    """Return True if a convolution's result is rounded to numbers of which none is below zero.
+    """Return True if a convolution's result is rounded to numbers that are all at least zero.
 
     Args:
         node: any node.
@@ -296,14 +298,14 @@ def _begins_at_zero(node: Node, tensors: dict[str, Rounded], convolved: set[str]
 def structure_checks(
     float_model: onnx.ModelProto, int8: onnx.ModelProto, must_describe: bool = False
 ) -> list[Check]:
-    """Check that the INT8 file keeps its ReLUs, is encoded as meant, and does not depend on
+    """Check that the INT8 file has its ReLUs, is encoded correctly, and does not depend on
     optimisations.
 
     Args:
         float_model: the float network.
         int8: the INT8 network.
         must_describe: if True, a file that does not describe its integers fails. Otherwise their
-            encoding is left out, because files of other quantisers have no description.
+            encoding is not checked, because files of other quantisers have no description.
 
     Returns:
         The checks of the ReLUs, of the encoding if it is known, of float layers, and of the results

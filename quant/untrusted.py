@@ -1,4 +1,4 @@
-"""Check that an ONNX file holds what it states, before anything is made of it.
+"""Check that an ONNX file holds what it states, before any of it is used.
 
 Whether a runtime may open it is checked by `quant.onnx.runnable`.
 """
@@ -23,11 +23,13 @@ DAMAGE = (
     TypeError,
     ValueError,
 )
-"""What reading a damaged description raises, of Python and of NumPy."""
+"""Exceptions that reading a damaged description raises, from Python and from NumPy."""
 
 FILE_BYTES = 1 << 30
 VALUES = 1 << 28
-"""Of one tensor that a file sizes without holding it: 1 GiB of float32."""
+"""The maximum number of values of one tensor that a file sizes without storing it: 1 GiB of
+float32.
+"""
 RANK = 16
 
 FLOATS = (TensorProto.FLOAT, TensorProto.DOUBLE, TensorProto.FLOAT16, TensorProto.BFLOAT16)
@@ -39,7 +41,7 @@ VALUE_BYTES: dict[int, int] = {
     **dict.fromkeys((TensorProto.FLOAT, TensorProto.INT32, TensorProto.UINT32), 4),
     **dict.fromkeys((TensorProto.DOUBLE, TensorProto.INT64, TensorProto.UINT64), 8),
 }
-"""Bytes of a value of each type of plain numbers."""
+"""The number of bytes per value of each plain number type."""
 
 
 def check_content(model: onnx.ModelProto, where: str) -> None:
@@ -86,7 +88,13 @@ def contradictions(where: str) -> Iterator[None]:
 
 
 def check_size(name: str, sizes: Iterable[float], where: str) -> None:
-    """Raise ModelError if a file states an absurd size of a tensor; 0 and -1 are open sizes."""
+    """Raise ModelError if a file states an absurd size of a tensor.
+
+    Args:
+        name: of the tensor, for the message.
+        sizes: its sizes; 0 and -1 are open sizes.
+        where: name of the network, for the message.
+    """
     sizes = list(sizes)
     allowed = len(sizes) <= RANK and min(sizes, default=0) >= -1
     # Written so that NaN is refused as well: it compares as False.
@@ -98,12 +106,15 @@ def check_size(name: str, sizes: Iterable[float], where: str) -> None:
 
 
 def times(sizes: Iterable[float]) -> str:
-    """Sizes as a person writes them: 64 x 3 x 3."""
+    """Format sizes for a person: 64 x 3 x 3."""
     return " x ".join(f"{size:.12g}" for size in sizes)
 
 
 def held_tensors(graph: onnx.GraphProto) -> Iterator[TensorProto]:
-    """Every constant, also of graphs within; protobuf itself ends their nesting at a hundred."""
+    """Yield every constant, including those of nested graphs.
+
+    protobuf itself limits their nesting to a hundred.
+    """
     yield from graph.initializer
     for sparse in graph.sparse_initializer:
         yield from (sparse.values, sparse.indices)
@@ -139,8 +150,9 @@ def _check_tensor(tensor: TensorProto, where: str) -> None:
 
 
 def _check_finite(tensor: TensorProto, where: str) -> None:
-    """Of a plain number infinity may be meant, as a bound of Clip; of weights nothing that is not
-    finite.
+    """Raise ModelError if weights are not finite.
+
+    A single number may be infinite, for example as a bound of Clip, but not NaN.
     """
     if tensor.data_type not in FLOATS:
         return

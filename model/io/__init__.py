@@ -1,5 +1,5 @@
-"""What is read from disk and written to it, whole files or none; images are `model.raster`'s.
+"""Read and write files, each completely or not at all; images are read by `model.raster`.
 
-- `files`: outputs that are written whole, and never over an input;
+- `files`: outputs that are written completely, and never over an input;
 - `tensors`: weights as safetensors.
 """

@@ -1,8 +1,8 @@
-"""Whole files or none, and never over what a run reads or writes elsewhere.
+"""Write files completely or not at all, and never over a file that a run reads or writes elsewhere.
 
-One rule for every output of every command: it is a regular file or a new name, no input and no
-other output. Symbolic links, pipes and devices are refused: what is renamed over them would stand
-in their place.
+One rule applies to every output of every command: it is a regular file or a new name, no input and
+no other output. Symbolic links, pipes and devices are rejected, because a file renamed over them
+would replace them.
 """
 
 import hashlib
@@ -18,14 +18,14 @@ from beers_deploy.profiles.errors import MachineError, OptionError, printable
 TIFF_SUFFIXES = {".tif", ".tiff"}
 IMAGE_SUFFIXES = TIFF_SUFFIXES | {".png", ".jpg", ".jpeg"}
 READ_SUFFIXES = IMAGE_SUFFIXES | {".onnx", ".safetensors", ".pth"}
-"""What a command takes from a folder that it reads; an earlier run's figures may lie there and be
-renewed.
+"""The suffixes of files that a command reads from a folder. Results of an earlier run may lie in
+the same folder and be overwritten.
 """
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; rename it to `path` when the block ends well, else
+    """Yield a temporary path next to `path`; rename it to `path` if the block succeeds, otherwise
     remove it.
     """
     require_regular(path)
@@ -48,15 +48,15 @@ def whole_file(path: Path) -> Iterator[Path]:
 def require_writable(
     *paths: Path | None, inputs: Iterable[Path | None] = (), folders: Iterable[Path | None] = ()
 ) -> None:
-    """Find out before long work, not after it, that an output may not or cannot be written; None
-    asks for no output.
+    """Raise an error before long work if an output may not or cannot be written; None means no
+    output.
 
     Args:
         paths: files that are to be written.
-        inputs: files that are read, and folders from which files are; what does not exist is passed
-            over. A hard link or a symbolic link to an input is that input.
-        folders: are to be filled with images whose names are not known yet: no image that is read
-            may lie there.
+        inputs: files that are read, and folders from which files are read; a path that does not
+            exist is ignored. A hard link or a symbolic link to an input is that input.
+        folders: folders that are to be filled with images whose names are not known yet; no image
+            that is read may lie there.
     """
     outputs = [path for path in paths if path is not None]
     image_folders = [path for path in folders if path is not None]
@@ -72,13 +72,13 @@ def require_writable(
 def _require_apart(
     outputs: list[Path], image_folders: list[Path], inputs: Iterable[Path | None]
 ) -> None:
-    """Refuse an output that is an input or another output, and a folder to be filled where images
-    are read.
+    """Raise an error if an output is an input or another output, or a folder to be filled contains
+    inputs.
     """
     sources = [path for path in inputs if path is not None]
     files = list(chain.from_iterable(map(_files_of, sources)))
     images = [file for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
-    # What does not exist has no identity, and is in nobody's way.
+    # A path that does not exist has no identity, and cannot collide with another.
     identities = {_identity(file) for file in files} - {None}
     homes = {_identity(image.parent) for image in images} - {None}
     for places, occupied, use in (
@@ -95,9 +95,7 @@ def _require_apart(
 
 
 def require_regular(path: Path) -> None:
-    """Refuse an output at which a folder, a link, a pipe or a device stands; a regular file or
-    nothing may.
-    """
+    """Raise MachineError if an output is an existing folder, link, pipe or device."""
     if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
         kind = "is not a regular file"
         if path.is_symlink():
@@ -111,8 +109,8 @@ def require_regular(path: Path) -> None:
 
 
 def _probe(path: Path) -> None:
-    """Try to write below the nearest folder that exists: a new one would outlive a command that is
-    refused later.
+    """Try to write in the nearest existing folder: a new one would remain if the command fails
+    later.
     """
     path = path.absolute()
     folder = next(parent for parent in path.parents if os.path.lexists(parent))
@@ -131,7 +129,7 @@ def _part_of(path: Path) -> Path:
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """What all names of a file have in common; None where there is none."""
+    """Return device and inode of a file, which all its names share; None if it cannot be read."""
     try:
         status = path.stat()
     except OSError:
@@ -140,7 +138,9 @@ def _identity(path: Path) -> tuple[int, int] | None:
 
 
 def _files_of(path: Path) -> list[Path]:
-    """An input as files: itself, or those of a folder that a command may read."""
+    """Return an input as a list of files: itself, or the files in a folder that a
+    command may read.
+    """
     if not path.is_dir():
         return [path]
     return [file for file in path.glob("*") if file.suffix.lower() in READ_SUFFIXES]
@@ -165,6 +165,6 @@ def write_text(path: Path, text: str) -> None:
 
 
 def sha256(path: Path) -> str:
-    """Hex digest of a file's bytes, read in pieces."""
+    """Compute the hex digest of a file, read in pieces."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -1,11 +1,11 @@
-"""Recognise files of networks in formats that are not read here, to say in one sentence what to do
-with them.
+"""Recognise network files in formats that are not supported, to explain in one sentence how to
+convert them.
 """
 
 from typing import NamedTuple
 
 HEAD_BYTES = 4096
-"""Of a file, by which its format is recognised."""
+"""The number of leading bytes from which the format of a file is recognised."""
 
 FROM_TORCH = (
     "export the network itself with torch.onnx.export, because weights alone lack its layers"
@@ -14,11 +14,11 @@ FROM_TENSORFLOW = "convert it with tf2onnx"
 
 
 class OtherFormat(NamedTuple):
-    """A format that is recognised and not read.
+    """A format that is recognised but not supported.
 
     Attributes:
-        name: as a sentence says it.
-        remedy: how a network of this format becomes an ONNX file.
+        name: the name of the format in a sentence.
+        remedy: how to convert a network of this format to an ONNX file.
     """
 
     name: str
@@ -54,7 +54,7 @@ MAGIC: tuple[tuple[int, bytes, OtherFormat], ...] = (
         OtherFormat("an array of NumPy", "export the network that it belongs to as ONNX"),
     ),
 )
-"""Place of the bytes that a format's files have in common, these bytes, and the format."""
+"""Position of the bytes that all files of a format share, these bytes, and the format."""
 
 
 def other_format(head: bytes) -> OtherFormat | None:

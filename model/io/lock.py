@@ -1,5 +1,5 @@
-"""One run at a time on one output: the system holds the lock, so that a killed process blocks
-nobody.
+"""Allow one run at a time on one output. The system holds the lock, so that a killed process does
+not block others.
 """
 
 import errno
@@ -14,27 +14,28 @@ from beers_deploy.profiles.errors import MachineError
 
 
 def part_folder(out: Path) -> Path:
-    """The folder beside `out` in which a run keeps what it needs for it."""
+    """Return the folder next to `out` in which a run stores its temporary files."""
     return out.with_name(f".{out.name}.part")
 
 
 NAME = "lock"
 GRACE_S = 0.2
-"""How long to wait for a run that ends just now: it takes the lock's file along, and who waits
-makes a new one.
+"""How long to wait for a run that is just ending. It removes the lock file, and the waiting run
+creates a new one.
 """
 ENOTSUPP = 524
-"""Linux's own number beside ENOTSUP, which some network file systems let out."""
+"""An error number of Linux, in addition to ENOTSUP, that some network file systems return."""
 NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, ENOTSUPP)
 
 
 @contextmanager
 def only_run(out: Path) -> Iterator[None]:
-    """Hold the folder where a run keeps what it needs for `out`; in the end it is gone, unless rows
-    were left in it.
+    """Lock the folder in which a run stores its temporary files for `out`, and remove it at the
+    end.
 
-    Folders above it that were made for it are gone then, too, unless something was written there.
-    It locks nothing on a disk that has no locks, as some of networks.
+    The folder remains if it still contains rows. Parent folders that were created for it are
+    removed too, unless something was written there. On a disk without locks, such as some network
+    disks, nothing is locked.
     """
     folder = part_folder(out)
     created = [parent for parent in folder.parents if not parent.exists()]
@@ -42,8 +43,8 @@ def only_run(out: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        # Removed while it is ours: whoever has opened it finds out and begins again. Windows
-        # removes no open file: there it goes with the release.
+        # Removed while the lock is held: another run that has opened it detects that and begins
+        # again. Windows cannot remove an open file: there it is removed by the release.
         with suppress(OSError):
             (folder / NAME).unlink()
         with suppress(OSError):
@@ -55,7 +56,7 @@ def only_run(out: Path) -> Iterator[None]:
 
 
 def _take(out: Path, folder: Path) -> BaseFileLock:
-    """The lock, held; where there are no locks it holds nothing."""
+    """Acquire the lock and return it; if the file system has no locks, it is not acquired."""
     # A file that only stands for a lock would outlive a killed run: rather none where the system
     # has none.
     if folder.is_symlink():

@@ -1,4 +1,4 @@
-"""Pictures of 12-bit images: the same stretch for all that are compared."""
+"""Render pictures of 12-bit images, with one stretch for all compared images."""
 
 import base64
 import io
@@ -16,17 +16,17 @@ GAP_PX = 4
 
 @dataclass(frozen=True)
 class Stretch:
-    """Digital numbers shown as black and as white."""
+    """The digital numbers that are shown as black and as white."""
 
     black: float
     white: float
 
     def to_bytes(self, dn: np.ndarray) -> np.ndarray:
-        """(H, W) digital numbers to 8-bit grey, with a gamma for the eye."""
+        """Convert digital numbers (H, W) to 8-bit grey values with a gamma."""
         return np.asarray(np.rint(255 * self._share(dn) ** GAMMA), np.uint8)
 
     def to_srgb(self, dn: np.ndarray) -> np.ndarray:
-        """(H, W) digital numbers to (H, W, 3) float32 in [0, 1], by sRGB's curve, in three equal
+        """Convert digital numbers (H, W) to sRGB, (H, W, 3) float32 in [0, 1] with three equal
         bands.
         """
         light = self._share(dn)
@@ -40,16 +40,16 @@ class Stretch:
 
 
 def stretch_of(dn: np.ndarray) -> Stretch:
-    """Black and white at the 0.5th and 99.5th percentile."""
+    """Compute the stretch with black at the 0.5th and white at the 99.5th percentile."""
     black, white = np.percentile(dn, (0.5, 99.5))
     return Stretch(float(black), float(white))
 
 
 def busiest_windows(dn: np.ndarray, side_px: int) -> list[tuple[int, int]]:
-    """(top, left) of the window with the strongest gradients in the upper and in the lower half of
-    an image.
+    """Return (top, left) of the windows with the strongest gradients in the upper and in the lower
+    half.
 
-    Only one where the image is too low for two.
+    Returns a single window if the image is too low for two.
     """
     half = dn.shape[0] // 2
     if half < side_px:
@@ -70,7 +70,7 @@ def _busiest(dn: np.ndarray, side_px: int) -> tuple[int, int]:
 
 
 def picture_url(grey: np.ndarray) -> str:
-    """An (H, W) or (H, W, 3) uint8 picture as a data: address."""
+    """Encode a picture (H, W) or (H, W, 3) uint8 as a data: URL."""
     buffer = io.BytesIO()
     Image.fromarray(grey).save(buffer, "PNG", optimize=True)
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
@@ -83,8 +83,15 @@ def strip(
     zoom: int,
     stretch: Stretch,
 ) -> Image.Image:
-    """The same crops of several (H, W) images: a column an image under its name, a row a window, no
-    smoothing.
+    """Draw the same crops of several images (H, W) as a grid: one column per image under its name,
+    one row per window.
+
+    Args:
+        images: by name; all of one shape.
+        windows: (top, left) of each crop.
+        side_px: side of a crop.
+        zoom: width of an image pixel in the picture, without smoothing.
+        stretch: for all images.
     """
     rows = [
         strip_row(
@@ -96,20 +103,22 @@ def strip(
 
 
 def strip_row(crops: Iterable[np.ndarray], stretch: Stretch) -> list[np.ndarray]:
-    """Crops of digital numbers as grey."""
+    """Convert crops of digital numbers to grey."""
     return [stretch.to_bytes(crop) for crop in crops]
 
 
 def error_row(errors: Iterable[np.ndarray], white_dn: float) -> list[np.ndarray]:
-    """Sizes of errors as grey: black none, white `white_dn` and more, linear."""
+    """Convert absolute errors to grey, linearly from 0 (black) to `white_dn` and above (white)."""
     return [np.rint(255 * np.clip(error / white_dn, 0, 1)).astype(np.uint8) for error in errors]
 
 
 def grid(names: list[str], rows: list[list[np.ndarray]], zoom: int) -> Image.Image:
-    """Rows of equally large uint8 cells, each column under its name, every pixel `zoom` pixels
-    wide.
+    """Draw rows of equally large uint8 cells, with a name above each column.
 
-    Cells are (h, w), or all of them (h, w, 3).
+    Args:
+        names: of the columns.
+        rows: cells (h, w), or all of them (h, w, 3).
+        zoom: width of a cell's pixel in the picture.
     """
     height, width = (side * zoom for side in rows[0][0].shape[:2])
     size = len(names) * (width + GAP_PX) - GAP_PX, len(rows) * (height + GAP_PX) + LABEL_PX
@@ -125,7 +134,7 @@ def grid(names: list[str], rows: list[list[np.ndarray]], zoom: int) -> Image.Ima
 
 
 def _font_for(name: str, width_px: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """The largest font that keeps a name within its column."""
+    """Return the largest font in which a name fits into its column."""
     for size in range(LABEL_PX - 6, 7, -1):
         font = ImageFont.load_default(size=size)
         if font.getlength(name) <= width_px - 2:

@@ -1,8 +1,8 @@
-"""Weights as safetensors: named arrays and a JSON header, read and written without torch, and
-validated as read.
+"""Read and write weights as safetensors: named arrays and a JSON header, without torch and
+validated.
 
-A file of ours states its variant and the recipe that made it; where the network is told its sensor
-also its kind, and the ranges of sensors that it was trained for.
+A weights file of this project states its variant and the recipe that made it. If the network is
+conditioned on a sensor, it also states its kind and the ranges of its training sensors.
 """
 
 import json
@@ -24,14 +24,14 @@ from beers_deploy.profiles.errors import ModelError, printable, reason_of
 from beers_deploy.profiles.toml import parse_json, unreadable
 
 BANKED = "behind the bank of its sensor"
-"""The kind, in the header, of weights that need a sensor before they are a network; plain ones
-state none.
+"""The kind, in the header, of weights that need a sensor to form a network; plain weights state
+none.
 """
 
 TRAINED = "Give a file written by 'beers-deploy train'"
 
 FAULTS = (AttributeError, LookupError, TypeError, ValueError, OverflowError, RuntimeError)
-"""What reading a header or filling a network may raise on a file that is not ours."""
+"""Exceptions that reading a header or filling a network may raise for a file of another origin."""
 
 Arrays = Mapping[str, np.ndarray]
 """Arrays of any shape by name."""
@@ -39,10 +39,10 @@ Arrays = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Weights:
-    """What a file of weights holds; a conditioned network is told its sensor, and stands behind the
-    bank of it.
+    """The content of a weights file. A conditioned network accepts a sensor and stands behind its
+    bank.
 
-    `kernels` says what the kernels of that bank are.
+    `kernels` names the kind of kernels of that bank.
     """
 
     tensors: Arrays
@@ -104,8 +104,8 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
 
 
 def write_weights(path: Path, weights: Weights) -> None:
-    """Write a network's weights, its variant and recipe; of one that is told its sensor the ranges
-    it knows, too.
+    """Write a network's weights, variant and recipe; for a conditioned network also its sensor
+    ranges.
     """
     header: dict[str, object] = {"variant": asdict(weights.variant), "recipe": weights.recipe}
     if weights.conditioned:
@@ -114,7 +114,7 @@ def write_weights(path: Path, weights: Weights) -> None:
 
 
 def read_weights(path: Path) -> Weights:
-    """The weights of a network, plain or told its sensor."""
+    """Read the weights of a network, plain or conditioned on a sensor, or raise ModelError."""
     tensors, header = read_tensors(path)
     try:
         conditioned = _conditioned(header)
@@ -141,7 +141,7 @@ def read_weights(path: Path) -> Weights:
 
 
 def read_plain(path: Path) -> Weights:
-    """The weights of a plain network."""
+    """Read the weights of a plain network, or raise ModelError if it is conditioned on a sensor."""
     weights = read_weights(path)
     if weights.conditioned:
         raise ModelError(
@@ -152,7 +152,7 @@ def read_plain(path: Path) -> Weights:
 
 
 def read_conditioned(path: Path) -> Weights:
-    """The weights of a network that is told its sensor."""
+    """Read the weights of a network that is conditioned on a sensor, or raise ModelError."""
     weights = read_weights(path)
     if not weights.conditioned:
         raise ModelError(
@@ -163,17 +163,19 @@ def read_conditioned(path: Path) -> Weights:
 
 
 def is_conditioned(path: Path) -> bool:
-    """Whether a weights file states that it holds a network that must be told its sensor."""
+    """Return True if a weights file states that its network is conditioned on a sensor."""
     return read_tensors(path)[1].get("kind") is not None
 
 
 def all_finite(tensors: Arrays) -> bool:
-    """Whether every value of every array is finite."""
+    """Return True if every value of every array is finite."""
     return all(bool(np.isfinite(tensor).all()) for tensor in tensors.values())
 
 
 def _conditioned(header: Mapping[str, object]) -> bool:
-    """Whether the network is told its sensor."""
+    """Return True if the network is conditioned on its sensor; raise ValueError for
+    other versions.
+    """
     kind = header.get("kind")
     if kind not in (None, BANKED):
         raise ValueError(f"its weights are {kind}, as another version wrote them")
@@ -183,7 +185,9 @@ def _conditioned(header: Mapping[str, object]) -> bool:
 
 
 def _check_like(tensors: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Compare with what a network has."""
+    """Raise ValueError if the tensors differ in shape from those of a network, or are not finite
+    float32.
+    """
     for name, shape in shapes.items():
         if tensors[name].shape != shape:
             raise ValueError(f"{name} has the shape {tensors[name].shape} instead of {shape}")

@@ -1,4 +1,4 @@
-"""How far a mean over images can be trusted: a bootstrap over the sites that they come from."""
+"""Estimate the uncertainty of a mean over images by a bootstrap over their sites."""
 
 from collections.abc import Sequence
 
@@ -9,26 +9,26 @@ LEVEL = 0.95
 WORDS = "95 % bootstrap interval over sites"
 
 LEAST_SITES = 5
-"""Of fewer sites no interval is shown: drawn with replacement, they vary far less than others of
-their kind would.
-"""
+"""No interval is shown for fewer sites: their bootstrap varies far less than other sites would."""
 
 
 def site_interval(
     values: Sequence[float], sites: Sequence[str], generator: np.random.Generator
 ) -> tuple[tuple[float, float] | None, str]:
-    """Percentile interval (95 %) of the mean of `values`, whole sites drawn with replacement: the
-    one rule of all.
+    """Compute the 95 % percentile interval of the mean of `values` by drawing whole sites with
+    replacement.
 
-    Images of one site resemble one another: drawn one by one, they would promise too much.
+    Images of one site resemble one another. Drawing single images would make the interval too
+    narrow.
 
     Args:
-        values: (N,) a figure an image.
-        sites: (N,) the site of each.
-        generator: of the draws.
+        values: (N,) one figure per image.
+        sites: (N,) the site of each image.
+        generator: for the draws.
 
     Returns:
-        The interval and what it is in words; None, and the reason, below five sites.
+        The interval and its description; or None and the reason, if there are fewer than five
+        sites.
     """
     count = len(set(sites))
     if count < LEAST_SITES:
@@ -47,13 +47,13 @@ def site_interval(
 
 
 def percentiles(draws: np.ndarray) -> tuple[float, float]:
-    """The interval (95 %) of a figure: between percentiles of its draws (N,)."""
+    """Compute the 95 % interval of a figure from percentiles of its draws (N,)."""
     low, high = np.percentile(draws, [50 * (1 - LEVEL), 50 * (1 + LEVEL)])
     return float(low), float(high)
 
 
 def too_few(sites: int) -> str:
-    """A sentence on why no interval over so many sites is shown; empty where one is."""
+    """Return a sentence on why no interval is shown for this number of sites, or "" if one is."""
     if sites >= LEAST_SITES:
         return ""
     return (

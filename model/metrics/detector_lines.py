@@ -1,9 +1,9 @@
 """Measure the lines of one direction in the pixels of one band: their difference from their
 neighbours, and constant ones.
 
-A detector gives its fault to one column (pushbroom), one row or one pixel, and leaves its
-neighbours alone. A line is measured in several blocks along it: detectors repeat themselves in all
-blocks, and scenes do not. `detector_stripes` judges what was measured.
+A faulty detector affects one column (pushbroom), one row or one pixel, and not its neighbours. A
+line is measured in several blocks along it: detector faults repeat in all blocks, and scenes do
+not. `detector_stripes` evaluates the measurements.
 """
 
 from collections.abc import Sequence
@@ -13,14 +13,16 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 ROUNDS = 4
-"""Of the estimate of location: it moves by at most three times its clipping range a round."""
+"""The number of iterations of the location estimate; it moves by at most three times its clipping
+range in each.
+"""
 FEW = 8
-"""Pixels of a line that tell nothing."""
+"""A line with fewer valid pixels than this cannot be measured."""
 LEVEL_LINES = 9
 """Lines over whose median a line's level is taken, so that its own fault does not matter."""
 REACH = 3
-"""Lines to either side of which a single line is the largest, and what is not judged along a
-border.
+"""A single line must be the largest within this number of lines on either side. Lines this close to
+a border are not evaluated.
 """
 
 
@@ -103,10 +105,10 @@ def _location(values: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def constant_columns(pixels: np.ndarray) -> np.ndarray:
-    """Return which columns of (h, w) pixels have one value, alone or in pairs, between columns that
-    vary.
+    """Return True for columns of (h, w) pixels with one value, alone or in pairs, between columns
+    that vary.
 
-    NaN is a missing pixel, which says nothing.
+    NaN marks a missing pixel, which is ignored.
     """
     constant = np.fmax.reduce(pixels, axis=0) == np.fmin.reduce(pixels, axis=0)
     counts = np.isfinite(pixels).sum(0)

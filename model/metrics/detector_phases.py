@@ -12,9 +12,9 @@ import numpy as np
 from scipy.ndimage import convolve1d, maximum_filter
 
 SMOOTH = np.array([1, 4, 6, 4, 1], np.float32) / 16
-"""Removes a pattern of period 2 and keeps what is smooth."""
+"""A filter that removes a pattern of period 2 and preserves smooth structure."""
 EDGE_PX = 2
-"""Pixels along a border that the filter cannot judge."""
+"""The number of pixels along a border that the filter cannot evaluate."""
 CLIP = 2.0
 """Multiple of the mean absolute deviation at which texture is clipped."""
 TEXTURE = 2.0
@@ -64,7 +64,7 @@ def measure_phases(pixels: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, n
     smooth = convolve1d(convolve1d(pixels, SMOOTH, axis=0), SMOOTH, axis=1)
     inside_border = (slice(EDGE_PX, -EDGE_PX),) * 2
     residuals = (pixels - smooth)[inside_border]
-    # The filter spreads what is no measurement over its reach.
+    # The filter spreads invalid pixels over its reach.
     mask = np.ones(residuals.shape, bool)
     if not valid.all():
         mask = ~maximum_filter(~valid, 2 * EDGE_PX + 1)[inside_border]
@@ -87,11 +87,11 @@ def measure_phases(pixels: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, n
 def judge_phases(
     measured: Sequence[tuple[np.ndarray, np.ndarray]], least: float
 ) -> tuple[Pattern, ...]:
-    """Say what the sections of an image show of each pattern.
+    """Evaluate the measurements of an image's sections for each pattern.
 
     Args:
         measured: of each section, as `measure_phases` returns it.
-        least: the difference that matters, over the level.
+        least: the smallest relevant difference, over the level.
     """
     if not measured:
         return ()
@@ -103,8 +103,7 @@ def judge_phases(
             continue
         difference = differences[mask, number]
         error = errors[mask, number]
-        # The squares hold the noise as well. Its variance is taken off, without the factor for
-        # texture.
+        # The squares include the noise. Its variance is subtracted, without the factor for texture.
         power = float(np.mean(np.square(difference) - np.square(error / TEXTURE)))
         strong = np.abs(difference) > SIGNIFICANT * error
         rms = float(np.sqrt(max(power, 0)))

@@ -1,9 +1,8 @@
 """Find single pixels that no blurred image can have: dead ones, hot ones, hits of particles.
 
-The optics spread a point over its neighbours. Where the MTF at Nyquist is 30 % (a Gaussian), the
-four pixels beside the brightest one of a point source hold 0.22 of its excess in the mean, wherever
-it lies in that pixel; where it is lower, they hold more. A faulty pixel leaves its neighbours
-alone.
+The optics spread a point over its neighbours. If the MTF at Nyquist is 30 % (a Gaussian), the four
+pixels next to the brightest one of a point source hold on average 0.22 of its excess, wherever it
+lies in that pixel. With a lower MTF they hold more. A faulty pixel does not affect its neighbours.
 """
 
 import numpy as np
@@ -11,19 +10,23 @@ import numpy as np
 PATCH_PX = 4
 """Pixels around one that are compared with it."""
 LEAST = 9.0
-"""Standard deviations of the texture and noise around by which a wrong pixel is off at least."""
+"""The least deviation of a wrong pixel, in standard deviations of the texture and
+noise around it.
+"""
 ISOLATED = 0.75
 SURE = 1.5
-"""Least isolation of a wrong pixel, so many standard errors taken off: 1 for a detector.
+"""The number of standard errors that are subtracted from the isolation of a pixel before it is
+compared with its limit. The isolation is 1 for a detector fault.
 
-Of a point of light it is 0.70, 0.46, 0.27 and 0.02 where the MTF at Nyquist is 30, 20, 15 and 10 %
-(a Gaussian centred on a pixel).
+For a point of light it is 0.70, 0.46, 0.27 and 0.02 if the MTF at Nyquist is 30, 20, 15 and 10 % (a
+Gaussian centred on a pixel).
 """
 DEAD = 0.3
 BRIGHT = 0.6
 DARK = 10.0
-"""A pixel below the first share of its ground, whose neighbours are all above the second: no shadow
-is that narrow. Ground below so many standard deviations is too dark to tell.
+"""A pixel is dead if it is below the first share of its ground and all neighbours are above the
+second, because no shadow is that narrow. Ground below this number of standard deviations is too
+dark to decide.
 """
 CANDIDATE = 2.0
 """Multiple of the mean step between neighbours by which a candidate lies outside of all its
@@ -32,23 +35,23 @@ neighbours.
 CUT = 0.3
 CUT_NOISE = 0.03
 CUT_STEPS = 3.0
-"""Share of equal pixels from which the ground is taken to be cut off, and the noise, over the
-ground and in steps, that is then assumed.
+"""Share of equal pixels from which the ground counts as clipped; and the noise that is then
+assumed, over the ground and in steps.
 """
 QUIET = 0.001
 """Noise over the ground that is assumed at least."""
 KNOWN = 60
-"""Of the 81 pixels around, those that must be known."""
+"""The least number of known pixels among the 81 around a pixel."""
 
 
 def wrong_pixels(pixels: np.ndarray, step: float = 0.0) -> np.ndarray:
     """Return the rows and columns (n, 2) of single wrong pixels, in the order of rows.
 
-    Pixels within `PATCH_PX` of a border are not judged.
+    Pixels within `PATCH_PX` of a border are not evaluated.
 
     Args:
         pixels: (h, w) float32, NaN where they are unknown.
-        step: between the values that pixels can have; 0 where it is not known.
+        step: between the values that pixels can have; 0 if it is not known.
     """
     size = 2 * PATCH_PX + 1
     if min(pixels.shape) < size:
@@ -81,11 +84,11 @@ def _candidates(pixels: np.ndarray) -> np.ndarray:
 
 
 def _wrong(patches: np.ndarray, step: float) -> np.ndarray:
-    """Return which patches (n, 9, 9) have a centre that is no light; NaN is unknown.
+    """Return True for patches (n, 9, 9) whose centre cannot be light; NaN is unknown.
 
     The second difference along both axes, x - (its 4 sides) / 2 + (its 4 diagonals) / 4, removes
-    planes and edges. A single pixel of excess e leaves e there, -e/2 beside it and 0 two pixels on;
-    a point of light leaves less beside it and more two pixels on.
+    planes and edges. A single pixel of excess e leaves e there, -e/2 next to it and 0 two pixels
+    away. A point of light leaves less next to it and more two pixels away.
     """
     along = patches[:, 1:-1] - (patches[:, :-2] + patches[:, 2:]) / 2
     both = along[:, :, 1:-1] - (along[:, :, :-2] + along[:, :, 2:]) / 2

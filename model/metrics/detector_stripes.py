@@ -1,8 +1,8 @@
-"""Find lines of another gain and dead lines among the measured lines of single detectors.
+"""Find lines with a different gain and dead lines among the measured lines of single detectors.
 
-A scene cannot look like them: the optics spread a line over several pixels. Every test here
-compares a line with its neighbours, asks for the share that blurred light would have given them,
-and weighs the difference with the noise and texture around.
+A scene cannot look like them, because the optics spread a line over several pixels. Every test here
+compares a line with its neighbours, requires less than the share that blurred light would have
+spread to them, and weights the difference by the noise and texture around.
 """
 
 from collections.abc import Sequence
@@ -19,14 +19,14 @@ PARITY_LINES = 63
 lines.
 """
 SIGNIFICANT = 6.0
-"""Standard errors. Noise of 40 000 lines reaches it once in 10 000 images."""
+"""Significance limit in standard errors. Noise of 40 000 lines reaches it once in 10 000 images."""
 CLEAR = 12.0
 """Standard errors within one block from which a part of a line is judged alone."""
 SURE = 1.0
 """Standard errors by which a part of a line is alone."""
 ASKEW = 0.3
-"""Of a line's deviation, by how much the lines around may depart from what a single one leaves
-there.
+"""The largest deviation of the lines around from the pattern of a single line, relative to the
+deviation of that line.
 """
 PART = 0.02
 """Least gain of a part of a line."""
@@ -34,17 +34,17 @@ AGREE = 0.75
 """Share of the blocks in which a line must be off to the same side."""
 ISOLATED = 0.75
 LEAST_ISOLATED = 0.55
-"""Least isolation of a line that is measured well, and of any: 1 for a detector.
+"""Least isolation of a line that is measured well, and of any line; it is 1 for a detector.
 
-Of a thin bright line it is 0.70, 0.46, 0.27 and 0.02 where the MTF at Nyquist is 30, 20, 15 and 10
-% (a Gaussian centred on a pixel).
+For a thin bright line it is 0.70, 0.46, 0.27 and 0.02 if the MTF at Nyquist is 30, 20, 15 and 10 %
+(a Gaussian centred on a pixel).
 """
 SPREAD_SIGNIFICANT = 4.0
 """Standard errors of the covariance from which the spread of all lines is significant."""
 LEVELS = 1.3
-"""Ratio of the levels of blocks from which gains are told from offsets."""
+"""The least ratio between the levels of blocks that distinguishes gains from offsets."""
 LINES = 16
-"""Lines from which their spread can be told."""
+"""The least number of lines from which their spread is determined."""
 WHITE = -0.35
 """Correlation of neighbouring second differences: -2/3 for independent detectors; it was above -0.1
 for scenes.
@@ -76,16 +76,16 @@ class Line:
 
 @dataclass(frozen=True)
 class Stripes:
-    """What the lines of one direction show.
+    """The evaluation of the lines of one direction.
 
     Attributes:
         spread: standard deviation of the lines' gains without noise, over the level; None if it
-            cannot be seen.
+            cannot be determined.
         spread_error: its standard error.
         seen: whether the spread is significant, and of independent lines.
-        off: single lines that are off, the largest deviation first.
-        dead: lines that are constant where their neighbours are not.
-        grows_with_level: True for gains, False for offsets; None where the levels do not tell.
+        off: single deviating lines, the largest deviation first.
+        dead: lines that are constant while their neighbours are not.
+        grows_with_level: True for gains, False for offsets; None if the levels do not decide.
     """
 
     spread: float | None = None
@@ -102,11 +102,11 @@ class Stripes:
 
 
 def judge_lines(blocks: Blocks, least: float) -> Stripes:
-    """Say what lines show that were measured in blocks.
+    """Evaluate lines that were measured in blocks.
 
     Args:
         blocks: of all lines.
-        least: the gain that matters, over the level.
+        least: the smallest relevant gain, over the level.
     """
     measurable = np.isfinite(blocks.second) & np.isfinite(blocks.level)
     # A dead line is constant in all blocks where anything is known of it.
@@ -135,7 +135,7 @@ def judge_lines(blocks: Blocks, least: float) -> Stripes:
 
 
 def _without_parity(gains: np.ndarray) -> np.ndarray:
-    """Return (blocks, lines) without what alternate lines have in common nearby."""
+    """Return (blocks, lines) without the part that alternate lines nearby have in common."""
     sign = 1 - 2.0 * (np.arange(gains.shape[1]) % 2)
     size = min(PARITY_LINES, gains.shape[1])
     bound = 3 * np.nanmedian(np.abs(gains), axis=1, keepdims=True)
@@ -192,7 +192,7 @@ def _covariance(first: np.ndarray, other: np.ndarray) -> tuple[float, float]:
     of_sum, of_difference = (
         np.square(MAD * np.median(np.abs(values))) for values in (first + other, first - other)
     )
-    # Second differences of neighbouring lines are no independent numbers: half as many count.
+    # Second differences of neighbouring lines are not independent, so half of their number counts.
     error = MAD_ERROR * np.hypot(of_sum, of_difference) / 4 / np.sqrt(max(len(first) / 2, 1))
     return float(of_sum - of_difference) / 4, float(error)
 
@@ -226,9 +226,10 @@ def _single(
 
 
 def _partly(gains: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """Return which lines are off in some of the blocks, such as a hot column below its hot pixel.
+    """Return True for lines that deviate in some of the blocks, such as a hot column below its hot
+    pixel.
 
-    Most blocks say nothing of such a line, so that light must be excluded in each of the others.
+    Most blocks contain no evidence of such a line, so light must be excluded in each of the others.
     """
     with np.errstate(invalid="ignore"):
         clear = np.abs(gains) > np.maximum(CLEAR * errors, PART)
@@ -242,11 +243,10 @@ def _partly(gains: np.ndarray, errors: np.ndarray) -> np.ndarray:
 
 
 def _alone(second: np.ndarray, error: np.ndarray, margin: float) -> np.ndarray:
-    """Return which lines are alone with their deviation, by so many standard errors more than
-    `ISOLATED`.
+    """Return True for lines that deviate alone, by a number of standard errors above `ISOLATED`.
 
     The second differences around a single line of gain g are (0, -g/2, g, -g/2, 0), and those of a
-    blurred bright line fall off over five lines: with r and q, the sums over the next lines and the
+    blurred bright line fall off over five lines. With r and q, the sums over the next lines and the
     ones after them over -g, the isolation r - q is 1 for a detector.
     """
     padded = np.pad(second, REACH, constant_values=np.nan)
@@ -271,11 +271,10 @@ def _alone(second: np.ndarray, error: np.ndarray, margin: float) -> np.ndarray:
 
 
 def _grows(gains: np.ndarray, errors: np.ndarray, level: np.ndarray) -> bool | None:
-    """Say whether the pattern of lines grows with the level; None where blocks of other levels do
-    not tell.
+    """Return True if the pattern of lines grows with the level; None if the blocks do not decide.
 
     The pattern of the other blocks is fitted to each block. Over the level, gains fit all blocks
-    alike, and offsets fall as 1 / level: the slope of the logarithms is 0 or -1.
+    equally, and offsets fall as 1 / level: the slope of the logarithms is 0 or -1.
     """
     fits, fit_errors = (
         np.array(numbers)
@@ -298,8 +297,8 @@ def _grows(gains: np.ndarray, errors: np.ndarray, level: np.ndarray) -> bool | N
 
 
 def _fit(gains: np.ndarray, errors: np.ndarray, number: int) -> tuple[float, float]:
-    """Return by what factor the pattern of the other blocks fits one block, and the standard error
-    of that.
+    """Return the factor by which the pattern of the other blocks fits one block, and its standard
+    error.
     """
     others, _ = _combined(np.delete(gains, number, 0), np.delete(errors, number, 0))
     pattern = np.nan_to_num(others)

@@ -1,14 +1,14 @@
-"""The blur of an instrument from short straight edges, fitted by the curve that a sensor profile
-states.
+"""Measure the blur of an instrument from short straight edges, fitted by the curve that a sensor
+profile states.
 
 `slanted_edge` measures a whole MTF curve across one long edge. Here a profile's own curve is fitted
-instead, MTF(f) = exp(-gamma f) sinc(f) (`simulator.mtf`): one number an edge, for which 17 x 17
-pixels are enough. All edges together tell how much steeper the curve falls, by a Gaussian part
-exp(-shape f^2).
+instead, MTF(f) = exp(-gamma f) sinc(f) (`simulator.mtf`): one number per edge, for which 17 x 17
+pixels are enough. All edges jointly determine how much more steeply the curve falls, by a Gaussian
+part exp(-shape f^2).
 
-What has been sharpened, or was never a step, does not fit and is told apart by that: of 21 000
-steep places that six sensors saw in ten aerial photographs not one passed. A hedge or a shore is
-softer than any step, and would be taken for blur.
+An edge that was sharpened, or was never a step, does not fit and is excluded. Of 21 000 steep
+places that six sensors saw in ten aerial photographs not one passed. A hedge or a shore is softer
+than any step, and would be mistaken for blur.
 """
 
 import math
@@ -30,29 +30,31 @@ from beers_deploy.model.metrics.edge_fit import (
 from beers_deploy.profiles.instrument import MTF_NYQUIST_MAX
 
 SHAPES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0, 13.0)
-"""Of the Gaussian part: 0 is the profile's curve.
+"""Values of the Gaussian part's coefficient; 0 is the profile's curve.
 
-Smear, jitter and diffraction fall more steeply than it.
+Smear, jitter and diffraction fall more steeply than that curve.
 """
 
 MIN_STEEPNESS = 6
-"""Of a gradient over its noise."""
+"""The least ratio of a gradient to its noise."""
 MAX_ROUGHNESS = 0.03
-"""Of the outer columns of a square, beyond noise, of the step: more is no plateau."""
+"""The largest scatter of a square's outer columns beyond noise, relative to the step. A plateau has
+less.
+"""
 MARGIN_PX = HALF_PX + 2
-"""Room that a square needs around its middle, and the gradient there."""
+"""The room that a square needs around its middle, with that for the gradient."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is tried to find edges in an image: it bounds the time.
+    """The effort of searching edges in an image, which limits the time.
 
     Attributes:
-        step_px: only every so many rows are searched; edges are longer than that.
-        cell_px: rows, in multiples of `step_px`, and columns of the cells of which only the
-            steepest place is tried.
-        candidates: steepest places of which squares are compared with plain edges.
-        fits: squares that are fitted, the steepest first.
+        step_px: only every `step_px`-th row is searched, because edges are longer than that.
+        cell_px: rows, in multiples of `step_px`, and columns of a cell; only the steepest place of
+            each cell is tried.
+        candidates: the number of steepest places whose squares are compared with plain edges.
+        fits: the number of squares that are fitted, the steepest first.
     """
 
     step_px: int
@@ -62,13 +64,13 @@ class Effort:
 
 
 THOROUGH = Effort(step_px=1, cell_px=(4, 2), candidates=6000, fits=400)
-"""With cells twice as large fewer edges are found: of 80 wrong MTFs of drawn towns 41 are seen, not
-47 (measured).
+"""The most thorough search. With cells twice as large fewer edges are found: of 80 wrong MTFs of
+drawn towns 41 are detected instead of 47 (measured).
 """
 
 
 def blurs_of(squares: np.ndarray, noise: Noise) -> list[EdgeBlur]:
-    """The blurs of those of the squares (N, S, S) that hold an edge."""
+    """Fit the blurs of those squares (N, S, S) that contain an edge."""
     return [fit for fit in fit_blurs(squares, noise, FOUND) if isinstance(fit, EdgeBlur)]
 
 
@@ -97,7 +99,7 @@ def plain_squares(
 
 
 def _squares(image: np.ndarray, noise: Noise, effort: Effort) -> np.ndarray:
-    """Squares (N, S, S) around the steepest places, no centre in another's middle."""
+    """Cut squares (N, S, S) around the steepest places, none centred in the middle of another."""
     rows, columns = _steepest(_steepness(image, noise, effort.step_px), effort)
     occupied = np.zeros(image.shape, bool)
     numbers = list[int]()
@@ -133,9 +135,10 @@ def _steepest(steepness: np.ndarray, effort: Effort) -> tuple[np.ndarray, np.nda
 
 
 def _steepness(image: np.ndarray, noise: Noise, step_px: int) -> np.ndarray:
-    """Rise along the rows over its noise, of every `step_px`-th row that has room for a square.
+    """Compute the rise along the rows over its noise, for every `step_px`-th row with room for a
+    square.
 
-    It is the difference over 4 columns of the mean of 5 rows, and 0 where the rise down the columns
+    It is the difference over 4 columns of the mean of 5 rows. It is 0 if the rise down the columns
     is larger.
     """
     height, width = image.shape
@@ -157,7 +160,9 @@ def _steepness(image: np.ndarray, noise: Noise, step_px: int) -> np.ndarray:
 
 
 def _flat(squares: np.ndarray, noise: Noise, roughness: float) -> np.ndarray:
-    """Whether the three outer columns on either side scatter by noise alone: (N,) of bool."""
+    """Return True for each square whose three outer columns on either side scatter by noise alone,
+    (N,).
+    """
     left = squares[:, :, :3]
     right = squares[:, :, -3:]
     step = np.abs(right.mean((1, 2)) - left.mean((1, 2)))
@@ -175,19 +180,21 @@ def _scatter(side: np.ndarray) -> np.ndarray:
 
 MIN_FOUND = 3
 FLOOR = 0.05
-"""Least standard error of gamma: what the fit is off on edges along the grid (measured), 2.5 % of
+"""Least standard error of gamma: the error of the fit on edges along the grid (measured), 2.5 % of
 the MTF.
 """
 ROBUST = 1.4826
-"""Of a median absolute deviation: the standard deviation of normal values."""
+"""The ratio of the standard deviation of normal values to their median absolute deviation."""
 LONE_ERROR = 0.1
-"""Scatter of gamma between edges where only one is known."""
+"""Assumed scatter of gamma between edges if only one edge is known."""
 SHAPED_EDGES = 40
-"""As many tell the shape."""
+"""The number of edges from which the shape is determined."""
 WORST = 1e12
-"""Sum of squares over noise that stands for no fit at all."""
+"""Sum of squares over noise that is used if the fit fails."""
 OTHER_SHAPES = 0.25
-"""Standard error for shapes that no Gaussian part has, of what the Gaussian part changes."""
+"""Standard error for shapes without a Gaussian part, relative to the change that the Gaussian part
+makes.
+"""
 
 
 @dataclass(frozen=True)
@@ -195,11 +202,11 @@ class AxisMtf:
     """The MTF at Nyquist along one axis.
 
     Attributes:
-        mtf_nyquist: contrast kept at 0.5 cycles per pixel, of whichever shapes of the curve explain
+        mtf_nyquist: contrast at 0.5 cycles per pixel, averaged over the curve shapes that explain
             the edges.
-        interval: 95 % interval of it, from the scatter between edges and between such shapes.
-        edges: how many.
-        nearest: that of the profile's curve that comes nearest to the edges, whatever their own
+        interval: its 95 % interval, from the scatter between edges and between such shapes.
+        edges: the number of edges.
+        nearest: contrast of the profile's curve that is nearest to the edges, whatever their own
             shape.
     """
 
@@ -210,10 +217,13 @@ class AxisMtf:
 
 
 def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
-    """The MTF along one axis from the edges across it, at least one, and those across the other
-    axis.
+    """Estimate the MTF along one axis from the edges across it.
 
-    The shape of the curve is left open: each one counts by what it leaves unexplained of the edges.
+    The shape of the curve is not fixed: each shape is weighted by how well it explains the edges.
+
+    Args:
+        own: the edges across this axis, at least one.
+        others: the edges across the other axis.
     """
     # Imported here: who measures no sensor need not wait for SciPy.
     from scipy.special import stdtrit
@@ -228,8 +238,8 @@ def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
     scatter = np.maximum(chi2.min(0) / [edge.count for edge in shaped], 1.0)
     # The median and not the sum: an edge that another crosses nearby has a shape of its own.
     weights = -len(shaped) / 2 * np.median((chi2 - chi2[0]) / scatter, axis=1)
-    # Before any edge is seen, half of the belief is in the profile's curve: of few edges nothing
-    # else can be said.
+    # The prior gives half of its weight to the profile's curve, because few edges cannot determine
+    # another one.
     belief = np.gradient(SHAPES)
     belief[0] = belief[1:].sum()
     weights = np.exp(weights - weights.max()) * belief
@@ -248,11 +258,14 @@ def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
 def _of_shape(
     edges: Sequence[EdgeBlur], other_gamma: float | None, shape: float
 ) -> tuple[float, float, np.ndarray]:
-    """Logarithm of the MTF at Nyquist over a perfect lens', its standard error, and what each edge
-    leaves over.
+    """Fit one shape of the curve to all edges.
 
-    gamma^2 of a leaning edge is (gamma_x cos)^2 + (gamma_y sin)^2: the other axis has a part in it.
-    An edge that the shape cannot be fitted to leaves more than any other.
+    gamma^2 of an inclined edge is (gamma_x cos)^2 + (gamma_y sin)^2, so the other axis contributes
+    to it. An edge that the shape cannot be fitted to has a larger residual than any other.
+
+    Returns:
+        The logarithm of the MTF at Nyquist relative to a perfect lens, its standard error, and the
+        residual of each edge.
     """
     fits = _reshaped(edges[:SHAPED_EDGES], shape) if shape else list(edges)
     blurs = [fit for fit in fits if isinstance(fit, EdgeBlur)] or list(edges)
@@ -277,8 +290,9 @@ def _reshaped(edges: Sequence[EdgeBlur], shape: float) -> list[Fit]:
 
 
 def _centre(values: np.ndarray, errors: np.ndarray) -> tuple[float, float]:
-    """Weighted mean (N,) without what lies 3 robust deviations off the median, and its standard
-    error.
+    """Compute the weighted mean of values (N,), and its standard error.
+
+    Values more than 3 robust deviations from the median are excluded.
     """
     if values.size == 1:
         return float(values[0]), math.hypot(float(errors[0]), LONE_ERROR)

@@ -1,14 +1,14 @@
-"""The MTF along one axis, as a table with its interval, from all edges across it together.
+"""Measure the MTF along one axis, as a table with its interval, from all edges across it jointly.
 
 1. Fit each edge's line and planes to a first curve (`uneven_edge`), then the curve to all edges, a
-  few times.
-2. Of edges found by search, keep those as sharp as the sharpest, but for chance: in nature an edge
-  is a step or softer. Edges that a person vouches for all count; those that contradict the others
-  are named.
+   few times.
+2. Among edges found by search, use those as sharp as the sharpest within chance: in nature an edge
+   is a step or softer. Edges that a person confirms are all used; those that contradict the others
+   are named.
 3. Draw edges, and strips along them, with replacement: the spread is the interval.
 
-ISO 12233 averages pixels in bins of a quarter pixel first. Here each pixel keeps its own distance
-from the edge, its noise and its texture: nothing is lost to bins, and short edges along the grid do
+ISO 12233 averages pixels in bins of a quarter pixel first. Here each pixel has its own distance
+from the edge, its noise and its texture. Nothing is lost to bins, and short edges along the grid do
 not leave bins empty.
 """
 
@@ -39,68 +39,68 @@ from beers_deploy.model.metrics.uneven_edge import (
 from beers_deploy.profiles.response import NYQUIST
 
 FREQUENCIES = np.round(np.arange(0.0, 0.71, 0.05), 2)
-"""Of the table, in cycles per pixel: up to the corner of the spectrum, where restoration still uses
-the curve.
+"""Frequencies of the table, in cycles per pixel, up to the corner of the spectrum, where
+restoration still uses the curve.
 """
 PASSES = 2
 ROUNDS = 5
 
 TIERS = ((0.012, 3, 0.02), (0.03, 8, 0.08), (0.06, 10, 0.08))
-"""Of edges found by search: largest texture over step, how many such edges are needed, and the
-least relative standard error of their curve. Among 1200 steep places of photographs, those of the
-first kind were all within 0.5 px of a step's softness; of the second, one in three was not
-(measured).
+"""For edges found by search: the largest texture over step, the number of such edges that is
+needed, and the least relative standard error of their curve. Among 1200 steep places of
+photographs, those of the first tier were all within 0.5 px of a step's softness; of the second, one
+in three was not (measured).
 """
 MAX_ERROR_PX = 0.6
-"""Standard error of softness of an edge found by search."""
+"""The largest standard error of the softness of an edge found by search."""
 NATURAL_PX = 0.3
 """How much softer than a step the sharpest edges of a scene may be, and how much sharper thin
-things beside them make them look: it widens the interval.
+objects next to them make them appear; it widens the interval.
 """
 MOST_FITTED = 600
-"""Of more edges, every so many are fitted."""
+"""If there are more edges, every n-th one is fitted, such that at least this number is."""
 FEW_EDGES = 7
-"""Of so many or fewer, strips along the edges are drawn; of more, whole edges."""
+"""Up to this number of edges, strips along the edges are drawn; with more, whole edges."""
 EVEN = 0.012
-"""Texture over step up to which noise alone is drawn along an edge: it has no texture to draw
-strips of.
+"""Texture over step up to which only noise is drawn along an edge, because there is no texture to
+draw strips of.
 """
 UNEVEN_PX = 20.0
-"""By how much texture as large as the step scatters the softness of edges found by search
-(measured).
-"""
+"""The scatter in softness of edges found by search, per texture over step (measured)."""
 
 SCATTER_PX = 0.15
 SOFT_PX = 0.3
 OUTLIERS = 0.05
 OUTLIER_RANGE_PX = 8.0
-"""Of softness: scatter of steps beyond their errors, and mean excess of others, both before any
-edge is seen; share of edges that are neither, and where these lie.
+"""Priors of the softness: the scatter of steps beyond their errors, and the mean excess of other
+edges; the share of outliers, and the range of their softness.
 """
 KEPT_DEVIATIONS = 2.5
 CONTRADICTION_DEVIATIONS = 3.0
 CONTRADICTION_PX = 0.4
-"""0.4 px is 18 % of the contrast at Nyquist."""
+"""The least difference of softness that counts as a contradiction; 0.4 px is 18 % of the contrast
+at Nyquist.
+"""
 
 SHARP_CPX = 0.25
 SHARPEST = 0.96
-"""Contrast there over that of a perfect lens, above which no blurred edge lies."""
+"""Contrast at SHARP_CPX relative to a perfect lens, which no blurred edge exceeds."""
 
 DRAWS = 200
 LOW_PERCENT = 5.0
 HIGH_PERCENT = 95.0
 NORMAL_QUANTILE = 1.645
 FLOOR = 0.02
-"""Least relative standard error of edges that somebody vouches for, of what the model cannot know:
-far tails, bows, aliasing.
+"""Least relative standard error of edges that a person confirms, because the model cannot know
+everything: far tails, bows, aliasing.
 """
 WIDEST = 1.5
-"""Factor by which either end of the interval at Nyquist may differ from the figure."""
+"""The largest factor by which either end of the interval at Nyquist may differ from the figure."""
 MOST_MISSING = 100
-"""More edges than that nobody has."""
+"""The largest number of missing edges that is reported; no user has more."""
 LEAST_AT_NYQUIST = 1e-3
-"""A lower end of the interval below it cannot be told from 0: edges that are no steps, such as
-lawn, end there.
+"""A lower end of the interval below this value cannot be distinguished from 0. Edges that are no
+steps, such as lawn, result in such values.
 """
 LEAST_CONTRAST = 1e-4
 
@@ -113,11 +113,12 @@ class MtfCurve:
         contrast: (F,) at FREQUENCIES, falling from 1.
         low: (F,) lower end of the 90 % interval of each.
         high: (F,) upper end.
-        edges: how many it rests on.
+        edges: the number of edges that it is based on.
         contradicting: labels of edges that differ from the others.
-        lean: mean squared sine of the edges' angle to the axis: how much of the other axis is in
-            it.
-        missing_edges: how many more such edges would narrow the interval at Nyquist to WIDEST.
+        lean: mean squared sine of the edges' angle to the axis, which is the share of the other
+            axis.
+        missing_edges: the number of further such edges that would narrow the interval at Nyquist to
+            WIDEST.
     """
 
     contrast: np.ndarray
@@ -129,16 +130,16 @@ class MtfCurve:
     missing_edges: int = 0
 
     def at(self, frequency: float) -> tuple[float, tuple[float, float]]:
-        """Contrast at one of FREQUENCIES, and its interval."""
+        """Return the contrast at the nearest of FREQUENCIES, and its interval."""
         place = int(np.argmin(np.abs(FREQUENCIES - frequency)))
         return float(self.contrast[place]), (float(self.low[place]), float(self.high[place]))
 
 
 def measure_curve(edges: Sequence[Edge], generator: np.random.Generator) -> MtfCurve | Refusal:
-    """Find the curve that edges share which somebody vouches for, all near the vertical.
+    """Measure the common curve of edges that a person confirms, all near the vertical.
 
     Args:
-        edges: pixels, and where the edge runs roughly.
+        edges: pixels, and the approximate line of each edge.
         generator: for the draws of the interval.
     """
     fitted = _first_fits(edges)
@@ -158,12 +159,12 @@ def measure_curve(edges: Sequence[Edge], generator: np.random.Generator) -> MtfC
 
 
 def search_curve(edges: Sequence[Edge], generator: np.random.Generator) -> MtfCurve | Refusal:
-    """Find the curve of the sharpest among edges found by search, all near the vertical.
+    """Measure the curve of the sharpest among edges found by search, all near the vertical.
 
-    Even edges are enough if they are a few; of uneven ones it takes more.
+    A few even edges are enough; more are needed if they are uneven.
 
     Args:
-        edges: pixels, and where the edge runs roughly.
+        edges: pixels, and the approximate line of each edge.
         generator: for the draws of the interval.
     """
     sample = edges[:: max(len(edges) // MOST_FITTED, 1)]
@@ -216,7 +217,7 @@ def _curve_of_sharpest(
 
 
 def _first_fits(edges: Sequence[Edge]) -> list[FittedEdge]:
-    """Return those of the edges that keep to their pixels, fitted to the curve to begin with."""
+    """Return those edges whose line stays within their pixels, fitted to the initial curve."""
     fits = (fit_edge(pixels, line, START, FIRST_PASSES) for pixels, line in edges)
     return [edge for edge in fits if edge is not None]
 
@@ -242,11 +243,11 @@ def _softness(edges: Sequence[FittedEdge], weights: np.ndarray) -> tuple[np.ndar
 
 
 def sharpest(values: np.ndarray, errors: np.ndarray) -> float:
-    """The softness of the steps among edges that are steps or softer, never sharper.
+    """Estimate the softness of the steps among edges that are steps or softer, never sharper.
 
-    softness = that of a step + what the edge itself adds, 0 or more + an error: an exponential and
-    a normal distribution added, and few outliers. The most likely value, with weak expectations of
-    both widths.
+    The model is: softness = that of a step + an edge's own softness, 0 or more + an error. The two
+    terms have an exponential and a normal distribution, and few edges are outliers. The maximum of
+    the posterior is returned, with weak priors for both widths.
 
     Args:
         values: (N,) softness.
@@ -305,7 +306,7 @@ def _drawn_along(
     """
     if edge.unevenness <= EVEN:
         gram, moment = normal_equations(edge, weights)
-        # Noise of 1 in the pixels gives the moments the covariance `gram`.
+        # With noise of 1 in the pixels the moments have the covariance `gram`.
         sizes, axes = np.linalg.eigh(gram)
         noise = axes @ (np.sqrt(np.maximum(sizes, 0.0)) * generator.standard_normal(PARTS))
         return gram, moment + noise
@@ -332,7 +333,9 @@ def _with_interval(
     contradicting: tuple[str, ...],
     floor: float,
 ) -> MtfCurve:
-    """Return the curve with the interval that the draws give, wider for few looks."""
+    """Return the curve with the interval of the draws, which is wider for few
+    independent strips.
+    """
     from scipy.special import stdtrit
 
     detector = np.sinc(FREQUENCIES)
@@ -378,10 +381,11 @@ def _missing(contrast: np.ndarray, low: np.ndarray, high: np.ndarray, edges: int
 
 
 def apart(own: MtfCurve, other: MtfCurve) -> MtfCurve:
-    """The curve along its axis alone: what leaning edges hold of the other axis is taken out.
+    """Return the curve along its own axis only, by removing the part of the other axis in inclined
+    edges.
 
-    The loss of an edge's normal is sqrt((c loss_own)^2 + (s loss_other)^2), c and s of its angle,
-    as in a profile's formula (`profiles.response.MtfTable`).
+    The loss along an edge's normal is sqrt((c loss_own)^2 + (s loss_other)^2), with c and s the
+    cosine and sine of its angle, as in a profile's formula (`profiles.response.MtfTable`).
     """
     detector = np.sinc(FREQUENCIES)
     own_loss, other_loss = (np.log(detector / curve.contrast) ** 2 for curve in (own, other))

@@ -1,10 +1,10 @@
-"""The blur across short straight edges, each in a few pixels around it, fitted by the curve that a
+"""Fit the blur across short straight edges, each in a few pixels around it, by the curve that a
 profile states.
 
 MTF(f) = exp(-gamma f) sinc(f) (`simulator.mtf`) has one number, for which 17 x 17 pixels are
 enough. Gauss-Newton finds it together with the edge's place, its slope and the levels of both
-sides. Many squares are fitted at once: one at a time takes ten times as long (measured), because
-each step is a few hundred multiplications.
+sides. Many squares are fitted at once, because fitting one at a time takes ten times as long
+(measured): each step is only a few hundred multiplications.
 """
 
 import math
@@ -29,8 +29,8 @@ PER_PX = 16
 REACH_PX = 24
 PERIOD_PX = 250
 HIGHEST_F = 2.5
-"""The tabulated edge repeats after so many pixels, with the other sign; waves beyond so many cycles
-a pixel are 0.
+"""The tabulated edge repeats after PERIOD_PX pixels, with the opposite sign; waves above HIGHEST_F
+cycles per pixel are 0.
 """
 START_GAMMA = 4.0
 LEAST_GAMMA = 0.05
@@ -38,12 +38,14 @@ LARGEST_GAMMA = 9.9
 MAX_PLACE_PX = 3.0
 MAX_SLOPE = math.tan(math.radians(35))
 MAX_STEP = np.array([0.7, 0.1, 1.5])
-"""Of place, slope and gamma in one pass."""
+"""The largest change of place, slope and gamma in one pass."""
 PASSES = 15
 CONVERGED = 1e-3
 
 Noise = Callable[[np.ndarray], np.ndarray]
-"""Variance of the noise of pixels with these values, of any shape, in the square of their unit."""
+"""A function that returns the variance of the noise of pixels with these values, of any shape, in
+the square of their unit.
+"""
 
 
 @dataclass(frozen=True)
@@ -74,12 +76,12 @@ Fit = EdgeBlur | Refusal
 
 @dataclass(frozen=True)
 class Limits:
-    """What an edge must keep to count.
+    """The limits that an edge must keep to be used.
 
     Attributes:
         step_sigma: least difference of the plateaus over the noise of a pixel. A fainter edge may
-            hide in noise that it is none.
-        misfit: largest root mean square of what the noise does not explain, of the step.
+            be no edge at all.
+        misfit: largest root mean square that the noise does not explain, relative to the step.
         error: largest standard error of gamma; 0.6 is a third of the MTF.
     """
 
@@ -90,16 +92,20 @@ class Limits:
 
 FOUND = Limits(30, 0.012)
 ANY = Limits(0, math.inf, math.inf)
-"""For edges found by search among much that is none, and for those that are edges for certain."""
+"""Limits for edges found by search, among many candidates that are none, and for places that
+certainly are edges.
+"""
 
 
 @lru_cache(maxsize=16)
 def _responses(shape: float) -> np.ndarray:
-    """A step of 1 at 0, blurred, for each of GAMMAS and each distance: (101, 2 * REACH_PX * PER_PX
-    + 1).
+    """Compute the image of a step of 1 at 0 for each of GAMMAS and each distance.
 
     It is the sum over f of MTF(f) sin(2 pi f d) / (pi f), by a Fourier transform over f = (k + 1/2)
-    / PERIOD_PX: as a matrix product it occupies every core for far longer than the sum takes.
+    / PERIOD_PX. As a matrix product the sum would occupy every core for far longer.
+
+    Returns:
+        Responses (101, 2 * REACH_PX * PER_PX + 1).
     """
     f = (np.arange(int(HIGHEST_F * PERIOD_PX)) + 0.5) / PERIOD_PX
     waves = np.exp(-np.outer(GAMMAS, f) - shape * f**2) * np.sinc(f) / (math.pi * f * PERIOD_PX)
@@ -135,12 +141,12 @@ def fit_blurs(regions: np.ndarray, noise: Noise, limits: Limits) -> list[Fit]:
 
     Args:
         regions: (N, H, W) finite values of any linear unit, rising or falling from left to right.
-        noise: of the pixels.
-        limits: what an edge must keep to.
+        noise: variance of the noise of the pixels.
+        limits: the limits that an edge must keep.
 
     Returns:
-        The blur by the profile's curve, or, of an edge that no shape of the curve fits, why there
-            is none.
+        The blur by the profile's curve; or, for an edge that no shape of the curve fits, the reason
+        why there is none.
     """
     # Over their noise: residuals are then in its standard deviations.
     pixels = regions / np.sqrt(noise(regions).mean((1, 2)))[:, None, None]
@@ -159,8 +165,8 @@ def fit_blurs(regions: np.ndarray, noise: Noise, limits: Limits) -> list[Fit]:
 
 
 class _Lines(NamedTuple):
-    """Where edges are thought to run, (N,) each, about the middle of a region, and how soft they
-    are.
+    """The assumed lines of edges, (N,) each, relative to the middle of a region, and their
+    softness.
     """
 
     place: np.ndarray
@@ -189,8 +195,12 @@ class _Solved(NamedTuple):
 
 
 def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fit]:
-    """As `fit_blurs`, for pixels (N, H, W) whose noise is 1, by the curve with one Gaussian part
-    alone.
+    """Fit edges as `fit_blurs` does, with one Gaussian part only.
+
+    Args:
+        pixels: (N, H, W), scaled such that their noise is 1.
+        limits: the limits that an edge must keep.
+        shape: coefficient of the Gaussian part.
     """
     count, height, width = pixels.shape
     fits: list[Fit] = [Refusal("no straight edge near to an axis")] * count
@@ -232,7 +242,7 @@ def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fi
 
 
 def centroids(regions: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> _Lines:
-    """The lines through the centres of what rises in each row of regions (N, H, W)."""
+    """Fit lines through the centroids of the rise in each row of regions (N, H, W)."""
     rise = np.diff(regions, axis=2)
     rise = np.maximum(rise * np.sign(rise.sum((1, 2)))[:, None, None], 0) * np.hamming(
         rise.shape[2]
@@ -297,7 +307,7 @@ def _judged(
     limits: Limits,
     steeper: bool,
 ) -> Fit:
-    """Return edge `k` if it keeps to the limits."""
+    """Return edge `k` if it is within the limits, otherwise the reason why not."""
     gamma = float(lines.gamma[k])
     chi2 = float(solved.chi2[k])
     step = float(solved.step[k])

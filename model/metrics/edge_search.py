@@ -1,4 +1,4 @@
-"""Edges to measure an MTF on: searched in an image, or the one that crosses a box.
+"""Find edges to measure an MTF on: by searching an image, or the one that crosses a box.
 
 An edge is a square or box of pixels and the line that runs through it; `edge_curve` fits both again
 together with the curve.
@@ -26,12 +26,12 @@ START = weights_of(np.exp(-4.0 * CORNERS))
 """The curve to begin with: 8.6 % at Nyquist."""
 FIRST_PASSES = 6
 MOST_EDGES = 60
-"""The least uneven count; more take time and add little."""
+"""The maximum number of edges, the least uneven first; more take time and improve little."""
 
 SEARCHED = Limits(20, 0.12, 0.8)
 MAX_ROUGHNESS = 0.15
-"""What a square must keep to be fitted: looser than for a target, because its planes and texture
-are fitted too.
+"""Limits for a square to be fitted. They are looser than for a target, because its planes and
+texture are fitted too.
 """
 POINTED_STEP_SIGMA = 10.0
 POINTED_UNEVENNESS = 0.2
@@ -40,14 +40,14 @@ Edge = tuple[EdgePixels, EdgeLine]
 
 
 def find_edges(image: np.ndarray, noise: Noise, clipped_at: float, label: str) -> list[Edge]:
-    """Squares around near-vertical edges of an image (H, W), and where the edges run; transpose it
-    for others.
+    """Find squares around near-vertical edges of an image (H, W), and the line of each edge.
 
-    Of more than MOST_EDGES, those that fit a blurred step best.
+    Transpose the image for near-horizontal edges. Of more than MOST_EDGES, those that fit a blurred
+    step best are returned.
 
     Args:
         image: finite values.
-        noise: of the pixels.
+        noise: variance of the noise of the pixels.
         clipped_at: values from here on are clipped, and so are those from 0 down.
         label: names the image.
     """
@@ -65,15 +65,22 @@ def find_edges(image: np.ndarray, noise: Noise, clipped_at: float, label: str) -
 
 
 def centre_line(region: np.ndarray) -> EdgeLine:
-    """The line through the centres of what rises in each row of a region (H, W)."""
+    """Fit a line through the centroids of the rise in each row of a region (H, W)."""
     rows, columns = (np.arange(size) - (size - 1) / 2 for size in region.shape)
     lines = centroids(region[None], rows, columns)
     return EdgeLine(float(lines.place[0]), float(np.clip(lines.slope[0], -MAX_SLOPE, MAX_SLOPE)))
 
 
 def edge_in(region: np.ndarray, noise: Noise, label: str) -> Edge | Refusal:
-    """The one near-vertical edge that crosses a region (H, W) from top to bottom, or why there is
-    none.
+    """Find the one near-vertical edge that crosses a region (H, W) from top to bottom.
+
+    Args:
+        region: pixels.
+        noise: variance of the noise of the pixels.
+        label: names the edge to the user.
+
+    Returns:
+        The edge, or the reason why there is none.
     """
     scale = math.sqrt(float(noise(region).mean()))
     pixels = EdgePixels(region, noise(region), label)

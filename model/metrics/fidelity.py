@@ -1,4 +1,6 @@
-"""PSNR and SSIM of an image beside its reference, in float64, with the data range always stated."""
+"""Compute PSNR and SSIM of an image against its reference, in float64 and with an explicit data
+range.
+"""
 
 import math
 
@@ -13,9 +15,9 @@ MIN_SIDE_PX = 2 * SSIM_RADIUS_PX + 1
 
 
 def psnr_db(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
-    """Peak signal-to-noise ratio in dB: 10 log10(range^2 / mean squared error).
+    """Compute the peak signal-to-noise ratio in dB: 10 log10(range^2 / mean squared error).
 
-    Infinite for identical images, NaN where pixels are not finite. scikit-image's agrees to
+    It is infinite for identical images, and NaN if pixels are not finite. scikit-image agrees to
     rounding, but divides by zero for identical images.
 
     Args:
@@ -32,13 +34,12 @@ def psnr_db(image: np.ndarray, reference: np.ndarray, data_range: float) -> floa
 
 
 def ssim(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
-    """Mean structural similarity (Wang et al.
+    """Compute the mean structural similarity (Wang et al. 2004) by scikit-image: 1 for identical
+    images, without a unit.
 
-    2004), by scikit-image: 1 for identical images, without a unit.
-
-    With the paper's Gaussian window of 11 x 11 pixels, sigma 1.5, and the biased covariance; the
-    mean is over the pixels that the whole window fits around, NaN where one of the images is not
-    finite.
+    It uses the paper's Gaussian window of 11 x 11 pixels, sigma 1.5, and the biased covariance. The
+    mean is over the pixels around which the whole window fits. It is NaN if one of the images is
+    not finite.
 
     Args:
         image: (H, W), at least 11 pixels a side.
@@ -63,8 +64,16 @@ def ssim(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
 def fidelity_db(
     dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray, max_dn: int = MAX_DN
 ) -> float:
-    """PSNR over full scale without the pixels that clipped in the input or the reference: their
-    truth is unknown.
+    """Compute the PSNR over full scale without the pixels that are clipped in the input or the
+    reference.
+
+    The true values of clipped pixels are unknown. If all pixels are clipped, all are used.
+
+    Args:
+        dn: digital numbers of the restored image.
+        reference: those of the reference.
+        degraded: those of the input of the restoration.
+        max_dn: full scale.
     """
     sound = (reference < max_dn) & (degraded < max_dn)
     return (

@@ -1,10 +1,10 @@
-"""Blur and noise of a sensor, measured on raw images of any scene.
+"""Measure the blur and noise of a sensor on raw images of any scene.
 
 `characterize` writes them into a profile; the sensor check compares them with one.
 
 - Noise: blocks of 16 x 16 pixels (`noise_blocks`), and the line that fits them (`noise_line`).
 - Blur: straight edges along both axes. Short ones give the MTF at Nyquist by the curve that a
-  profile states (`edge_blur`); all together give a curve of any shape (`edge_curve`).
+  profile states (`edge_blur`); all edges jointly give a curve of any shape (`edge_curve`).
 """
 
 import math
@@ -30,29 +30,32 @@ from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.profiles.response import NYQUIST
 
 AXES = ("across", "along")
-"""The track: edges near the vertical show the blur across it."""
+"""The axes relative to the track. Edges near the vertical show the blur across it."""
 SEED = 0
-"""Of the draws of intervals: one image has one result."""
+"""Seed of the draws for intervals, so that one image always gives the same result."""
 
 EDGES = 20
-"""Short edges that suffice along an axis: more would take time and tell no more."""
+"""The number of short edges that suffices along an axis. More would take time without improving the
+result.
+"""
 STEP_PX = 4
 CELL_PX = (8, 4)
 FEW_WINDOWS = 4
-"""Every so many rows are searched for short edges, by such cells. An image of few windows may have
-few edges, so it is searched as thoroughly as by `characterize`.
+"""The search for short edges: every STEP_PX-th row, in cells of CELL_PX. An image of at most this
+number of windows may have few edges, so it is searched as thoroughly as by `characterize`.
 """
 CANDIDATES = 6000
 CANDIDATES_OF_WINDOW = 400
-"""Steepest places along an axis that are compared with plain edges, of all windows and of each at
-least.
+"""The number of steepest places along an axis that are compared with plain edges: of all windows,
+and at least of each.
 """
 FITS = 128
 FITS_OF_WINDOW = 8
-"""Squares along an axis that are fitted, of all windows and of each at least: 1 ms each (measured).
+"""The number of squares along an axis that are fitted: of all windows, and at least of each. A fit
+takes 1 ms (measured).
 """
 WINDOWS_AT_ONCE = 4
-"""Whose squares are fitted together: fewer at a time take longer."""
+"""The number of windows whose squares are fitted together; fewer at a time take longer."""
 
 
 def image_blocks(images: Iterable[np.ndarray], clipped_at: float, black_dn: float = 0.0) -> Blocks:
@@ -147,7 +150,7 @@ def axis_curves(
 
 
 def _narrow(curve: MtfCurve | Refusal) -> MtfCurve | Refusal:
-    """Return the curve, or why it is too uncertain, and what would help."""
+    """Return the curve; if it is too uncertain, return the reason and what would help."""
     if isinstance(curve, Refusal) or not curve.missing_edges:
         return curve
     value, (low, high) = curve.at(NYQUIST)

@@ -1,10 +1,10 @@
-"""A falling MTF as a sum of simple ones, and the edge that each of them would show.
+"""Represent a falling MTF as a sum of simple ones, and compute the edge image of each.
 
     MTF(f) = sinc(f) * sum_k w_k P_k(f),    w_k >= 0,    sum w_k = 1
 
 sinc is the square detector. P_k falls linearly from 1 to 0 within one step of 0.05 cycles per
 pixel, each at its own frequency; the last one never falls. Any curve that falls from 1 is such a
-sum, and the image of an edge is the same sum of the edges' images: that makes finding the curve a
+sum. The image of an edge is the same sum of the edges' images, so that finding the curve is a
 linear problem.
 """
 
@@ -15,64 +15,66 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 STEP_CPX = 0.05
-"""Cycles per pixel over which one part falls."""
+"""The width in cycles per pixel over which one part falls."""
 CORNERS = np.linspace(0, 1, 21)
-"""Frequencies between which the parts fall."""
+"""The frequencies between which the parts fall."""
 PARTS = CORNERS.size
-"""The last part stands for what is left beyond 1 cycle per pixel."""
+"""The number of parts. The last one represents the contrast beyond 1 cycle per pixel."""
 
 SAMPLES_PER_PX = 16
 REACH_PX = 24
 HIGHEST_CPX = 2.5
 WAVES = 1250
-"""Waves that make the tabulated edge: it repeats after 500 pixels."""
+"""The number of waves that form the tabulated edge; it repeats after 500 pixels."""
 
 BENDS = (0.2, 0.4, 0.8)
-"""Standard deviations of the second differences of the weights over the weights there, of which
-edges choose one.
+"""Candidate standard deviations of the second differences of the weights, relative to the weights
+there. The edges choose one.
 
-exp(-gamma f), a Gaussian and diffraction with 2 to 30 % at Nyquist have 0.05 to 0.3 (computed);
-where a pupil cuts off, 1.
+exp(-gamma f), a Gaussian and diffraction with 2 to 30 % at Nyquist have 0.05 to 0.3 (computed). At
+the cut-off of a pupil it is 1.
 """
 FIRST_BEND = 0.1
-"""Standard deviation of the first of them: a curve may begin with a sudden loss (stray light, far
-tails).
+"""Standard deviation of the first second difference: a curve may begin with a sudden loss (stray
+light, far tails).
 """
 LEAST_WEIGHT = 0.002
-"""Below it bends are as those of this weight."""
+"""Smaller weights are treated as this weight when their bends are computed."""
 SMOOTHING = np.array([1.0, 2.0, 3.0, 2.0, 1.0]) / 9
-"""Over which the weights are averaged before their bends are expected."""
+"""Window over which the weights are averaged before their expected bends are computed."""
 
 
 def parts_at(frequencies: ArrayLike) -> np.ndarray:
-    """P_k at frequencies of any shape (...): (..., PARTS)."""
+    """Evaluate all P_k at frequencies of any shape (...), giving (..., PARTS)."""
     frequency = np.asarray(frequencies, np.float64)[..., None]
     falling = np.clip((CORNERS[1:] - frequency) / STEP_CPX, 0.0, 1.0)
     return np.concatenate([falling, np.ones(frequency.shape)], axis=-1)
 
 
 def mtf_at(frequencies: ArrayLike, weights: np.ndarray) -> np.ndarray:
-    """The MTF of weights (PARTS,) at frequencies of any shape, in cycles per pixel."""
+    """Evaluate the MTF with the weights (PARTS,) at frequencies of any shape, in
+    cycles per pixel.
+    """
     frequency = np.asarray(frequencies, np.float64)
     return np.asarray(np.sinc(frequency) * (parts_at(frequency) @ weights))
 
 
 def weights_of(contrast: np.ndarray) -> np.ndarray:
-    """The weights (PARTS,) of optics with these contrasts at CORNERS, 1 at the first."""
+    """Return the weights (PARTS,) of optics with these contrasts at CORNERS, 1 at the first."""
     return np.append(-np.diff(contrast), contrast[-1])
 
 
 def softened(weights: np.ndarray, softness_px: float) -> np.ndarray:
-    """The weights of a curve times exp(-softness f)."""
+    """Return the weights of a curve multiplied by exp(-softness f)."""
     contrast = np.append(1.0, 1.0 - np.cumsum(weights[:-1]))
     return weights_of(contrast * np.exp(-softness_px * CORNERS))
 
 
 @cache
 def responses() -> tuple[np.ndarray, np.ndarray]:
-    """What a detector sees of a step of 1 at 0, and of a thin line there, behind each part.
+    """Compute the image of a step of 1 at 0, and of a thin line there, for each part.
 
-    The step behind an MTF is 1/2 + the sum over f of MTF(f) sin(2 pi f d) / (pi f); the line is its
+    The step behind an MTF is 1/2 + the sum over f of MTF(f) sin(2 pi f d) / (pi f). The line is its
     derivative.
 
     Returns:
@@ -87,8 +89,10 @@ def responses() -> tuple[np.ndarray, np.ndarray]:
 
 
 def at_distances(table: np.ndarray, distance_px: np.ndarray) -> np.ndarray:
-    """A tabulated edge or line, (T,) or (T, PARTS), at distances (N,) from it:
-    (N,) or (N, PARTS).
+    """Interpolate a tabulated edge or line, (T,) or (T, PARTS), at distances (N,) from it.
+
+    Returns:
+        Values (N,) or (N, PARTS).
     """
     # The last sample has no neighbour on its right.
     place = np.clip((distance_px + REACH_PX) * SAMPLES_PER_PX, 0, len(table) - 1.001)
@@ -103,8 +107,10 @@ SECOND_DIFFERENCES = np.pad(np.diff(np.eye(PARTS - 1), 2, axis=0), ((0, 0), (0, 
 
 
 def expected_bends(weights: np.ndarray, bend: float) -> np.ndarray:
-    """(PARTS - 3, PARTS): second differences of weights over what is expected of them around
-    `weights` (PARTS,).
+    """Build the matrix (PARTS - 3, PARTS) of the second differences of weights over their expected
+    size.
+
+    The expected size is that around `weights` (PARTS,).
     """
     padded = np.pad(weights[:-1], 2, mode="edge")
     size = np.maximum(np.convolve(padded, SMOOTHING, mode="valid"), LEAST_WEIGHT)[1:-1] * bend
@@ -119,15 +125,14 @@ def solve(
     bend: float,
     bends: np.ndarray | None = None,
 ) -> np.ndarray:
-    """The weights that fit best, none negative and of sum 1.
+    """Solve for the best-fitting weights, which are not negative and have the sum 1.
 
     Args:
         gram: (PARTS, PARTS) of the least-squares problem, in units of the noise.
         moment: (PARTS,) its right side.
-        near: (PARTS,) weights near the solution: larger ones may bend more.
-        bend: by how much, of them.
-        bends: (PARTS - 3,) what the second differences are expected to be, over their deviations; 0
-            without.
+        near: (PARTS,) weights near the solution; larger ones may bend more.
+        bend: the expected bend, as a share of these weights.
+        bends: (PARTS - 3,) expected second differences over their deviations; None for 0.
     """
     # Imported here: who measures no sensor need not wait for SciPy.
     from scipy.optimize import nnls
@@ -144,7 +149,9 @@ def solve(
 
 
 def likeliest_bend(gram: np.ndarray, moment: np.ndarray, near: np.ndarray) -> float:
-    """Which of BENDS explains the edges best: the largest marginal likelihood of normal weights.
+    """Return the value of BENDS that explains the edges best.
+
+    It has the largest marginal likelihood of normally distributed weights.
 
     Args:
         gram: (PARTS, PARTS) of the least-squares problem, in units of the noise.

@@ -1,7 +1,8 @@
-"""Blocks of an image by the energy of their waves: slow ones are structure, the finest are noise.
+"""Measure the energy of blocks of an image by spatial frequency: low frequencies are structure, the
+highest are noise.
 
-The blur of an instrument leaves next to no texture in the corners of the spectrum, beyond 0.55
-cycles per pixel, and noise is white.
+The blur of an instrument leaves almost no texture in the corners of the spectrum, beyond 0.55
+cycles per pixel, whereas noise is white.
 """
 
 import math
@@ -17,9 +18,9 @@ PART_BLOCKS = 4
 SLOW = 0.2
 MIDDLE = 0.5
 FINE = 0.55
-"""Cycles per pixel."""
+"""Limits of the frequency bands, in cycles per pixel."""
 SPECTRUM = (0.3, 0.4, 0.5, 0.55, 0.6, 0.65, 0.7071)
-"""Ends of the bands in which noise is shown, cycles per pixel; the last is the corner of the
+"""Ends of the bands in which noise is reported, in cycles per pixel; the last is the corner of the
 spectrum.
 """
 ROUNDING = 1 / 12
@@ -47,18 +48,19 @@ class Blocks(NamedTuple):
     part: np.ndarray
 
     def only(self, chosen: np.ndarray) -> "Blocks":
-        """The blocks that `chosen`, bool or indices, picks."""
+        """Return the blocks that `chosen` (bool or indices) selects."""
         return Blocks(*(column[chosen] for column in self))
 
     def noise(self, fit: np.ndarray) -> np.ndarray:
-        """Variance (N,) that a line (alpha, beta, ...) gives each block, that
-        of rounding at least.
+        """Return the variance (N,) of the noise of each block by the line (alpha, beta, ...).
+
+        It is at least the variance of rounding.
         """
         return np.asarray(np.maximum(fit[0] * self.mean + fit[1], ROUNDING))
 
 
 def join(images: Sequence[Blocks]) -> Blocks:
-    """The blocks of several images as one; their parts stay apart."""
+    """Join the blocks of several images; their parts remain separate."""
     starts = np.cumsum([0] + [int(b.part.max(initial=-1)) + 1 for b in images])
     renumbered = [b._replace(part=b.part + start) for b, start in zip(images, starts, strict=False)]
     return Blocks(*(np.concatenate(column) for column in zip(*renumbered, strict=True)))
@@ -75,10 +77,15 @@ def cut_blocks(image: np.ndarray, clipped_at: float) -> Blocks:
 
 
 def cut_pair(first: np.ndarray, second: np.ndarray, clipped_at: float) -> Blocks:
-    """Blocks of the noise alone, of two images (H, W) of one still scene: their difference over the
-    root of 2.
+    """Cut blocks of noise from two images (H, W) of one still scene.
 
-    This is photon transfer: the scene cancels, and so does what every detector does always.
+    A block is the difference of the images over the root of 2 (photon transfer). The scene cancels,
+    and so do the fixed deviations of each detector.
+
+    Args:
+        first: digital numbers.
+        second: those of the other image.
+        clipped_at: blocks with a value from here on, or of 0, are excluded.
     """
     ones, part = _side_by_side(first)
     others, _ = _side_by_side(second)
@@ -113,7 +120,9 @@ def _measured(mean: np.ndarray, pixels: np.ndarray, part: np.ndarray) -> Blocks:
 
 
 def _energies(pixels: np.ndarray) -> np.ndarray:
-    """Squared cosine coefficients (N, S, S) of blocks less their planes."""
+    """Compute the squared cosine coefficients (N, S, S) of blocks after subtracting a plane from
+    each.
+    """
     # Imported here, and SciPy below: who measures no sensor need not wait for it.
     from scipy.fft import dctn
 

@@ -1,13 +1,14 @@
-"""The noise line of an instrument, variance = alpha L + beta, from blurred images of anything.
+"""Fit the noise line of an instrument, variance = alpha L + beta, to blurred images of any scene.
 
-Natural scenes of a few hundred pixels have no homogeneous areas. The blur helps: it leaves next to
+Natural scenes of a few hundred pixels have no homogeneous areas. The blur helps: it leaves almost
 no texture in the corners of the spectrum, beyond 0.55 cycles per pixel, and noise is white.
 
-1. Cut blocks (`noise_blocks`); the energy of a block's waves up to 0.2 cycles per pixel is its
-  structure, that beyond 0.55 its noise.
-2. Keep the blocks of little structure. Noise does not choose: the two bands share no wave.
-3. Fit noise = alpha L + beta + leak * structure, none of them negative: what texture leaks is taken
-  off.
+1. Cut blocks (`noise_blocks`). The energy of a block's waves up to 0.2 cycles per pixel is its
+   structure, that beyond 0.55 its noise.
+2. Use the blocks of little structure. That does not select by noise, because the two bands share no
+   wave.
+3. Fit noise = alpha L + beta + leak * structure, none of them negative, which subtracts leaked
+   texture.
 4. Draw parts of the images with replacement: the spread is the interval.
 """
 
@@ -20,40 +21,48 @@ from beers_deploy.model.metrics.noise_blocks import ROUNDING, Blocks
 from beers_deploy.model.metrics.refusal import Refusal
 
 STRUCTURES = (10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
-"""How much structure a block may have, of its noise: the least that leaves enough blocks."""
+"""Limits of a block's structure relative to its noise; the smallest that leaves enough blocks is
+used.
+"""
 ENOUGH = 300
 LEAST = 60
 LEAST_PARTS = 5
 MAX_LEAK = 0.5
-"""Of the energy of the corners, what may come from texture."""
+"""The largest share of the energy in the corners that may come from texture."""
 MAX_COLOUR = 0.15
 COLOUR_SCATTER = 3.0
-"""What the noise at middle frequencies may differ from that of the corners by: white noise does
-not.
+"""Limits of the difference between the noise at middle frequencies and in the corners, which white
+noise does not exceed.
 """
 MOSAIC = 0.2
-"""Of the noise at the finest detail, what a mosaic of colour filters leaves at middle frequencies,
-at most.
+"""The largest noise at middle frequencies, relative to the finest detail, of an image from a mosaic
+of colour filters.
 """
 MIN_RANGE = 0.25
-"""Least spread of the blocks' means, of the brightest: less gives no line."""
+"""Least spread of the blocks' means, relative to the brightest; a smaller one does not determine a
+line.
+"""
 LEAST_NOISE = 0.5 * ROUNDING
 QUIET_PERCENT = 5.0
-"""Above rounding, DN^2, in the quietest blocks: what was restored or resampled has less."""
+"""The least noise above rounding, in DN^2, of the quietest blocks; restored or resampled images
+have less.
+"""
 DRAWS = 200
 PASSES = 6
 FINE_WAVES = 21
 MAX_SCATTER = 3.5
-"""Waves beyond FINE in a block; how many deviations of their mean square, by chance, a block may
-lie off.
+"""The number of waves beyond FINE in a block; and the largest deviation of their mean square, in
+standard deviations.
 """
 EDGE_PERCENT = 2.0
-"""Of the blocks lie below, and above, the radiances that are said to be measured."""
+"""This share of the blocks lies below, and above, the radiances that are reported as measured."""
 
 
 @dataclass(frozen=True)
 class Variance:
-    """Variance of the noise at one value: DN^2, without the rounding, and its 95 % interval."""
+    """Variance of the noise at one value in DN^2, without that of rounding, and its
+    95 % interval.
+    """
 
     value: float
     interval: tuple[float, float]
@@ -62,20 +71,20 @@ class Variance:
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Variance of the noise in DN^2, alpha * DN + beta, the rounding taken off.
+    """Variance of the noise in DN^2, alpha * DN + beta, without that of rounding.
 
     Attributes:
         alpha: DN.
         beta: DN^2.
         draws: (D, 2) alpha and beta of each draw of the bootstrap.
-        blocks: how many were used.
-        measured_dn: means that the blocks reach from and to.
-        leak: share of texture in the corners of the spectrum, taken off.
+        blocks: the number of blocks that were used.
+        measured_dn: the smallest and the largest mean of the blocks.
+        leak: share of texture in the corners of the spectrum, which was subtracted.
         colour: noise at middle frequencies over that at the finest; 1 for white noise. The line is
             that of the stronger of the two.
-        white: whether the two are equal, but for chance.
-        one_level: whether it was seen at one level of light alone, so that how it grows with light
-            is assumed.
+        white: whether the two are equal within chance.
+        one_level: whether noise was measured at only one level of light, so that its growth with
+            light is assumed.
         spectrum: noise in the bands of SPECTRUM over that beyond FINE.
     """
 
@@ -91,18 +100,20 @@ class NoiseModel:
     spectrum: tuple[float, ...] = ()
 
     def total(self, dn: np.ndarray) -> np.ndarray:
-        """Variance in the pixels, of the values `dn` of any shape: the rounding included."""
+        """Return the variance of pixels with the values `dn` (any shape), including that of
+        rounding.
+        """
         return np.asarray(self.alpha * np.maximum(dn, 0) + self.beta + ROUNDING)
 
     def at(self, dn: float) -> Variance:
-        """Variance at one value; the further it lies outside what was measured, the wider the
-        interval.
+        """Return the variance at one value and its interval, which is wider outside the measured
+        range.
         """
         value = self.alpha * dn + self.beta
         low, high = np.percentile(self.draws @ (dn, 1.0), [2.5, 97.5])
         dark, bright = self.measured_dn
         beyond = max(math.log(dark / dn), math.log(dn / bright), 0.0)
-        # What texture leaked is taken off by a straight line, which may be wrong by a part of it.
+        # A straight line is subtracted for the leaked texture, which may be wrong by a part of it.
         wider = 1 + beyond
         model = 0.04 + 0.2 * self.leak
         low, high = (value + wider * (end - value) for end in (min(low, value), max(high, value)))
@@ -112,13 +123,13 @@ class NoiseModel:
 def fit_noise_model(
     blocks: Blocks, generator: np.random.Generator, incomplete: bool = False
 ) -> NoiseModel | Refusal:
-    """Fit the line to blocks of any number of images of one instrument; or say why there is none.
+    """Fit the line to blocks of any number of images of one instrument, or return why there is
+    none.
 
     Args:
         blocks: of all images.
         generator: for the draws of the interval.
-        incomplete: whether noise that is not white is taken as well, and noise of one level of
-            light alone.
+        incomplete: whether to accept noise that is not white, and noise at only one level of light.
     """
     if blocks.mean.size < LEAST:
         return Refusal(f"{blocks.mean.size} blocks of 16 x 16 unclipped pixels, {LEAST} are needed")
@@ -165,11 +176,11 @@ def _judged(model: NoiseModel, incomplete: bool) -> NoiseModel | Refusal:
 def _of_one_level(
     blocks: Blocks, fit: np.ndarray, draws: np.ndarray, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return fit and draws of noise whose growth with light is not seen: any part of it may be that
-    of photons.
+    """Return fit and draws of noise whose growth with light is unknown: any part may be photon
+    noise.
 
-    The fit takes all: told too much noise in bright light, a restoration smooths, told too little
-    it makes grain. The draws take from none to all.
+    The fit attributes all of it to photons. Given too much noise in bright light, a restoration
+    smooths; given too little, it produces grain. The draws range from none to all.
     """
     level = float(np.median(blocks.mean))
 
@@ -185,8 +196,10 @@ def _of_one_level(
 
 
 def _choose(blocks: Blocks) -> tuple[Blocks, np.ndarray]:
-    """The blocks of least structure that are enough, and their fit; what is enough shrinks with the
-    images.
+    """Choose the blocks with the least structure that are numerous enough, and fit them.
+
+    Returns:
+        The blocks and their fit. If no limit leaves enough blocks, those of the last limit.
     """
     for limit in STRUCTURES:
         quiet, fit = _quiet(blocks, limit)
@@ -196,8 +209,9 @@ def _choose(blocks: Blocks) -> tuple[Blocks, np.ndarray]:
 
 
 def _quiet(blocks: Blocks, limit: float) -> tuple[Blocks, np.ndarray]:
-    """The blocks of so little structure whose finest detail is what the others' is, but for chance;
-    and the fit.
+    """Return the blocks with little structure, and their fit.
+
+    Blocks whose finest detail differs from that of the others by more than chance are excluded.
     """
     noise = expected = np.full(blocks.mean.size, max(np.percentile(blocks.fine, 10), ROUNDING))
     for _ in range(PASSES):
@@ -215,8 +229,9 @@ def _quiet(blocks: Blocks, limit: float) -> tuple[Blocks, np.ndarray]:
 
 
 def _fitted(blocks: Blocks, weights: np.ndarray, band: np.ndarray | None = None) -> np.ndarray:
-    """(alpha, beta, leak), none negative, of a band (N,), the finest if none; a mean square
-    scatters by its size.
+    """Fit (alpha, beta, leak), none negative, to a band (N,), by default the finest.
+
+    The scatter of a mean square is proportional to its size, so residuals are weighted by it.
     """
     from scipy.optimize import nnls
 
@@ -237,24 +252,24 @@ def _fitted(blocks: Blocks, weights: np.ndarray, band: np.ndarray | None = None)
 
 
 def _weights(part: np.ndarray, parts: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """How often each block is drawn, (N,), when parts are drawn with replacement."""
+    """Draw parts with replacement, and return how often each block is drawn, (N,)."""
     counts = np.bincount(generator.integers(parts.size, size=parts.size), minlength=parts.size)
     return counts[np.searchsorted(parts, part)].astype(np.float64)
 
 
 def _unrounded(fit: np.ndarray) -> tuple[float, float]:
-    """Alpha and beta of the instrument: the rounding's variance taken off, first of what does not
-    grow.
+    """Return alpha and beta of the instrument, with the variance of rounding
+    subtracted from beta.
     """
     return float(fit[0]), max(float(fit[1]) - ROUNDING, 0.0)
 
 
 def _with_colour(blocks: Blocks, model: NoiseModel) -> NoiseModel:
-    """Return the line with the spectrum of the noise; where that is not flat, the line of its
+    """Return the line with the spectrum of the noise; if that is not flat, return the line of its
     stronger part.
 
-    What is told to a restoration should rather be too much noise than too little: noise that it
-    takes for detail comes out amplified.
+    A restoration should rather be given too much noise than too little, because noise that it
+    mistakes for detail is amplified.
     """
     place = np.array([float(np.median(blocks.mean)), 1.0])
     ones = np.ones(blocks.mean.size)

@@ -1,12 +1,14 @@
-"""LPIPS and DISTS, differentiable, over a backbone that the user brings: SqueezeNet 1.1 or VGG16.
+"""Compute LPIPS and DISTS, differentiable, over a backbone that the user provides: SqueezeNet 1.1
+or VGG16.
 
 Both follow the arithmetic of their authors' packages, `lpips` 0.1.4 with the v0.1 weights and
-`DISTS-pytorch` 0.1, whose published channel weights lie in `weights/`. The paper this project
-reproduces does not say which LPIPS it used, so no figure from here compares with its own.
+`DISTS-pytorch` 0.1. Their published channel weights are stored in `weights/`. The paper that this
+project reproduces does not state which LPIPS it used, so no figure from here can be compared with
+its own.
 
-The backbones' feature layers are named as in torchvision, and written here because that does not
-import beside the CPU build of torch. Their weights come from a user's file (`find_backbone`):
-ImageNet weights are never shipped or fetched.
+The feature layers of the backbones have torchvision's names. They are defined here because
+torchvision cannot be imported together with the CPU build of torch. Their weights come from a
+user's file (`find_backbone`): ImageNet weights are never shipped or downloaded.
 """
 
 import os
@@ -28,7 +30,7 @@ from beers_deploy.profiles.toml import unreadable
 
 @dataclass(frozen=True)
 class BackboneSpec:
-    """What is known of a backbone before any weights are there."""
+    """The architecture of a backbone, known without its weights."""
 
     # What torchvision calls it, and the start of its file's name.
     file_stem: str
@@ -47,7 +49,9 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 class Fire(nn.Module):
-    """SqueezeNet's block: a narrow 1x1 convolution, then 1x1 and 3x3 ones side by side."""
+    """A block of SqueezeNet: a narrow 1x1 convolution, then 1x1 and 3x3 convolutions
+    side by side.
+    """
 
     def __init__(self, inputs: int, squeezed: int, expanded: int) -> None:
         super().__init__()
@@ -56,7 +60,7 @@ class Fire(nn.Module):
         self.expand3x3 = nn.Conv2d(squeezed, expanded, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(N, inputs, H, W) to (N, 2 expanded, H, W)."""
+        """Map (N, inputs, H, W) to (N, 2 expanded, H, W)."""
         x = functional.relu(self.squeeze(x))
         return functional.relu(torch.cat([self.expand1x1(x), self.expand3x3(x)], dim=1))
 
@@ -67,7 +71,7 @@ class L2Pool(nn.Module):
     """
 
     def forward(self, x: Tensor) -> Tensor:
-        """(N, C, H, W) to (N, C, ceil(H / 2), ceil(W / 2))."""
+        """Map (N, C, H, W) to (N, C, ceil(H / 2), ceil(W / 2))."""
         taps = x.new_tensor([0.25, 0.5, 0.25])
         kernel = (taps[:, None] * taps[None, :]).expand(x.shape[1], 1, 3, 3)
         energy = functional.conv2d(x * x, kernel, stride=2, padding=1, groups=x.shape[1])
@@ -75,9 +79,9 @@ class L2Pool(nn.Module):
 
 
 class Backbone(nn.Module):
-    """The feature layers of "squeeze" or "vgg", with random weights until some are loaded.
+    """The feature layers of "squeeze" or "vgg", with random weights until weights are loaded.
 
-    `l2_pool` puts DISTS's pooling in the place of the max pooling.
+    `l2_pool` replaces max pooling by DISTS's pooling.
     """
 
     def __init__(self, network: str, *, l2_pool: bool = False) -> None:
@@ -90,11 +94,12 @@ class Backbone(nn.Module):
         self.features = nn.Sequential(*layers)
 
     def forward(self, image: Tensor) -> list[Tensor]:
-        """Grey (N, 1, H, W), 0 to 1, as three equal channels, and its compared feature maps, each
-        after a ReLU.
+        """Compute the compared feature maps, each after a ReLU, of grey images (N, 1, H, W) from 0
+        to 1.
 
-        The image takes the precision of the parameters; the features do so without autocast. The
-        scaling layer of `lpips` is ImageNet's figures after [-1, 1].
+        The image is repeated in three channels and prepended to the maps. It has the precision of
+        the parameters; without autocast, so have the features. The scaling layer of `lpips` equals
+        ImageNet's mean and deviation after scaling to [-1, 1].
         """
         colour = image.to(next(self.parameters()).dtype).expand(-1, 3, -1, -1)
         mean, std = (colour.new_tensor(x)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD))
@@ -141,12 +146,11 @@ NAMED = "Give the feature layers named as in torchvision (features.0.weight ...)
 
 
 def find_backbone(network: str, place: Path | None = None) -> Path | None:
-    """The weights file of "squeeze" or "vgg" (DISTS's), or None: then `not_found(network)` is the
-    reason to show.
+    """Find the weights file of "squeeze" or "vgg" (for DISTS), or return None.
 
-    A file as `place` is taken at its word. Without a place, a file or a folder, the environment
-    variable BEERS_LPIPS_WEIGHTS is asked; a file that it names counts only for the network its name
-    begins with.
+    If it is None, `not_found(network)` is the reason to show. A file given as `place` is returned
+    unchecked. Without `place` (a file or a folder), the environment variable BEERS_LPIPS_WEIGHTS is
+    read. A file that it names is used only for the network with which its name begins.
     """
     stem = BACKBONES[network].file_stem
     if place is not None and not place.is_dir():
@@ -161,14 +165,18 @@ def find_backbone(network: str, place: Path | None = None) -> Path | None:
 
 
 def not_found(network: str) -> str:
-    """Why a metric is unavailable when `find_backbone` found nothing."""
+    """Return the reason why a metric is unavailable if `find_backbone` returned None."""
     names = " or ".join(f"{BACKBONES[network].file_stem}*{suffix}" for suffix in SUFFIXES)
     return f"weights not found: no {names}; set {WEIGHTS_VARIABLE} to the file or its folder"
 
 
 def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbone:
-    """A `Backbone` with its parameters from a file, by name; whatever else the file holds is left
-    aside.
+    """Load a `Backbone` with its parameters from a file, by name; other tensors in it are ignored.
+
+    Args:
+        network: "squeeze" or "vgg".
+        path: the weights file.
+        l2_pool: whether to use DISTS's pooling.
     """
     backbone = Backbone(network, l2_pool=l2_pool)
     parameters = backbone.state_dict()
@@ -186,7 +194,9 @@ def load_backbone(network: str, path: Path, *, l2_pool: bool = False) -> Backbon
 
 
 def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
-    """The named tensors, of any shape, of a .safetensors or .npz file, as float32."""
+    """Read the tensors in `names` from a .safetensors or .npz file as float32, or
+    raise ModelError.
+    """
     if path.suffix not in SUFFIXES:
         raise ModelError(
             f"{path} must be a .safetensors or .npz file; '{path.suffix}' is not read. {CONVERT}"
@@ -213,7 +223,7 @@ def read_tensors(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
 
 
 def _read(path: Path, names: Iterable[str]) -> dict[str, Tensor]:
-    """Those of the named tensors that a file holds."""
+    """Read the tensors in `names` that exist in the file."""
     if path.suffix == ".npz":
         # np.load leaves a file open that turns out to be broken.
         with path.open("rb") as raw:
@@ -232,12 +242,12 @@ MIN_NORM = 1e-3
 
 
 class Lpips(nn.Module):
-    """Learned perceptual image patch similarity (Zhang et al.
+    """Learned perceptual image patch similarity (Zhang et al. 2018, v0.1): 0 for identical images,
+    no upper bound.
 
-    2018, v0.1): 0 for identical images, no upper bound.
-
-    Name it with its network, "LPIPS-squeeze" (`label`): the networks' figures do not compare with
-    each other. The heads (C,), one for each compared layer, say how much each channel counts.
+    Name it with its network, "LPIPS-squeeze" (`label`), because figures of different networks
+    cannot be compared. The heads (C,), one for each compared layer, are the weights of the
+    channels.
     """
 
     heads: Tensor
@@ -251,7 +261,7 @@ class Lpips(nn.Module):
 
     @classmethod
     def load(cls, network: str, path: Path) -> Self:
-        """The metric with its published heads, over the backbone in a file (see
+        """Load the metric with its published heads, over the backbone in a file (see
         `find_backbone`).
         """
         backbone = load_backbone(network, path)
@@ -260,8 +270,9 @@ class Lpips(nn.Module):
         return cls(backbone, [heads[name] for name in names])
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
-        """The distance (N,) of each pair (N, 1, H, W), 0 to 1 of full scale; its gradient is finite
-        everywhere.
+        """Compute the distance (N,) of each pair (N, 1, H, W), 0 to 1 of full scale.
+
+        Its gradient is finite everywhere.
         """
         _check_pair(self.label, self.backbone, image, reference)
         with torch.autocast(image.device.type, enabled=False):
@@ -271,12 +282,11 @@ class Lpips(nn.Module):
 
 
 class Dists(nn.Module):
-    """Deep image structure and texture similarity (Ding et al.
+    """Deep image structure and texture similarity (Ding et al. 2020): 0 for identical images, at
+    most 1.
 
-    2020): 0 for identical images, at most 1.
-
-    Over VGG16 with L2 pooling. `alpha` (1475,) says how much the mean (texture) of the image and of
-    each of its channels counts, `beta` (1475,) how much their covariance (structure).
+    It uses VGG16 with L2 pooling. `alpha` (1475,) weights the mean (texture) of the image and of
+    each of its channels, `beta` (1475,) their covariance (structure).
     """
 
     label = "DISTS"
@@ -293,7 +303,7 @@ class Dists(nn.Module):
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """The metric with its published weights, over the VGG16 in a file
+        """Load the metric with its published weights, over the VGG16 in a file
         (`find_backbone("vgg")`).
         """
         backbone = load_backbone("vgg", path, l2_pool=True)
@@ -301,8 +311,9 @@ class Dists(nn.Module):
         return cls(backbone, weights["alpha"], weights["beta"])
 
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:
-        """The distance (N,) of each pair (N, 1, H, W), 0 to 1 of full scale; its gradient is finite
-        everywhere.
+        """Compute the distance (N,) of each pair (N, 1, H, W), 0 to 1 of full scale.
+
+        Its gradient is finite everywhere.
         """
         _check_pair(self.label, self.backbone, image, reference)
         with torch.autocast(image.device.type, enabled=False):
@@ -313,20 +324,23 @@ class Dists(nn.Module):
 
 
 def _unit(features: Tensor) -> Tensor:
-    """Each pixel's features at length 1.
+    """Normalise the features of each pixel to length 1.
 
-    The package divides by sqrt(sum) + 1e-10, whose gradient is NaN where all features are zero and
-    unbounded near it. With a floor under the sum the value is the same and the gradient at most 1 /
-    MIN_NORM.
+    The package divides by sqrt(sum) + 1e-10. The gradient of that is NaN where all features are
+    zero, and unbounded near it. A lower limit of the sum gives the same values and a gradient of at
+    most 1 / MIN_NORM.
     """
     return features / features.square().sum(dim=1, keepdim=True).clamp(min=MIN_NORM**2).sqrt()
 
 
 def _texture_and_structure(a: Tensor, b: Tensor, small: float = 1e-6) -> tuple[Tensor, Tensor]:
-    """1 minus the similarity of the means, and of the covariances, of each channel: two (N, C).
+    """Compute 1 minus the similarity of the means, and of the covariances, of each channel.
 
-    Written as differences, not as 1 - (2 x y + c) / (x^2 + y^2 + c): identical images then give 0
-    to the last digit.
+    Both are computed from differences and not as 1 - (2 x y + c) / (x^2 + y^2 + c), so that
+    identical images give exactly 0.
+
+    Returns:
+        Two tensors (N, C).
     """
     mean_a = a.mean(dim=(2, 3), keepdim=True)
     mean_b = b.mean(dim=(2, 3), keepdim=True)

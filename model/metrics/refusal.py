@@ -1,11 +1,14 @@
-"""Why an instrument gives no figure, so that a table can say "unavailable: reason"."""
+"""Represent the reason why a measurement returns no figure, so that a table can print "unavailable:
+reason".
+"""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """No figure, and that is no error: the image does not hold what the instrument needs.
+    """The result of a measurement without a figure. It is no error: the image lacks what the
+    measurement needs.
 
     `reason` is one sentence with the numbers behind it.
     """

@@ -1,18 +1,17 @@
-"""A slanted edge whose angle is known: how it is drawn as a scene, and the MTF that an image of it
-has.
+"""Draw a slanted edge with a known angle as a scene, and measure the MTF of an image of it.
 
 ISO 12233:2017 with another DC:
 
 1. The angle and the middle are those that the edge was drawn with; a shift along the rows is
-  measured.
-2. Fit the plateaus: they give the step, which is the MTF's DC, and the far tails of the
-  point-spread function.
-3. Take off an edge with these tails, whose MTF is known. Average what it leaves in bins of a
-  quarter pixel, differentiate, window, transform; add the known MTF.
+   measured.
+2. Fit the plateaus. They determine the step, which is the MTF's DC, and the far tails of the
+   point-spread function.
+3. Subtract an edge with these tails, whose MTF is known. Average the residual in bins of a quarter
+   pixel, differentiate, window, transform, and add the known MTF.
 
 ISO 12233 divides by the windowed derivative's own sum instead. With the tails of optics, MTF =
-exp(-gamma f), that sum lacks 4 to 12 % of the step, and the MTF comes out too high by as much. The
-window resolves some 0.1 cycles per pixel: a narrower peak of the curve comes out flatter.
+exp(-gamma f), that sum lacks 4 to 12 % of the step, and the MTF is too high by the same amount. The
+window resolves some 0.1 cycles per pixel: a narrower peak of the curve appears flatter.
 """
 
 import math
@@ -40,17 +39,17 @@ def edge_mtf(image: np.ndarray, angle_deg: float, saturated: float = math.inf) -
     """Measure the MTF at Nyquist across an edge that runs through the middle of an image, dark on
     the left.
 
-    The figure is that along the edge's normal: a square detector keeps 0.6 % more at 15 degrees
-    than along the axis.
+    The figure is that along the edge's normal: the contrast of a square detector is 0.6 % higher at
+    15 degrees than along the axis.
 
     Args:
         image: (H, W) pixels of any linear unit, 12-bit DN or radiance; about 80 x 80.
-        angle_deg: as `slanted_edge` was told, 2 to 15 degrees.
+        angle_deg: the angle given to `slanted_edge`, 2 to 15 degrees.
         saturated: the value at which pixels clip, in the image's unit. They also clip at 0.
 
     Returns:
-        Contrast kept at 0.5 cycles per pixel, below 0 by noise or where contrast is reversed; or
-            why there is none.
+        Contrast at 0.5 cycles per pixel, below 0 by noise or if contrast is reversed; or the reason
+        why there is none.
     """
     pixels = np.asarray(image, np.float64)
     distance = _unusable(pixels, saturated) or _distance(pixels, math.radians(angle_deg))
@@ -74,11 +73,10 @@ def _unusable(image: np.ndarray, saturated: float) -> Refusal | None:
 
 
 def _distance(image: np.ndarray, angle: float) -> np.ndarray | Refusal:
-    """Signed distance (H, W) of every pixel to the edge along its normal, in pixels.
+    """Compute the signed distance (H, W) of every pixel to the edge along its normal, in pixels.
 
-    The centroid of the derivative says by how much the edge lies off the middle: noise does not
-    then add up to a contrast that is not there, nor does a restoration that moves its image lose
-    one.
+    The position of the edge is the centroid of the derivative. Noise is therefore not mistaken for
+    contrast, and a restoration that shifts its image loses none.
     """
     rows, columns = (np.arange(side) - (side - 1) / 2 for side in image.shape)
     across = columns[None, :] + rows[:, None] * math.tan(angle)
@@ -97,19 +95,22 @@ def _distance(image: np.ndarray, angle: float) -> np.ndarray | Refusal:
 
 
 def _hamming(place: np.ndarray) -> np.ndarray:
-    """Hamming window of half width WINDOW_PX around 0, and 0 beyond; `place` in pixels, of any
-    shape.
+    """Evaluate a Hamming window of half width WINDOW_PX around 0; it is 0 beyond.
+
+    `place` is in pixels and may have any shape.
     """
     window = 0.54 + 0.46 * np.cos(np.pi * place / WINDOW_PX)
     return np.asarray(np.where(np.abs(place) <= WINDOW_PX, window, 0.0))
 
 
 SOFTNESS_PX = 0.35 * 1.2 ** np.arange(12)
-"""What the model may have, 0.35 to 2.6 px: quarter pixels sample the least of it without alias."""
+"""Candidate softness of the model, 0.35 to 2.6 px: quarter pixels sample the smallest without
+aliasing.
+"""
 
 MODEL_FREQUENCIES = np.arange(0.01, 2, 0.02)
-"""Where the model's spectrum is added up, cycles per pixel; it ends before 2, and its tails are cut
-at 50 px.
+"""Frequencies at which the model's spectrum is summed, in cycles per pixel. It ends before 2, and
+its tails are cut at 50 px.
 """
 
 
@@ -132,15 +133,17 @@ class Plateaus:
     sigma: float
 
     def transfer(self, frequencies: ArrayLike, softness_px: float) -> np.ndarray:
-        """MTF of an edge with these tails and a Gaussian of that standard deviation, of frequencies
-        of any shape.
+        """Return the MTF of an edge with these tails and a Gaussian blur, at frequencies of any
+        shape.
+
+        The Gaussian has the standard deviation `softness_px`.
         """
         frequencies = np.asarray(frequencies)
         gaussian = np.exp(-2 * (math.pi * softness_px * frequencies) ** 2)
         return np.asarray(np.exp(-2 * math.pi * self.tail_px * frequencies) * gaussian)
 
     def model(self, distance: np.ndarray, softness_px: float) -> np.ndarray:
-        """That edge itself: (N,) for distances (N,) of a few pixels."""
+        """Return the image of that edge, (N,), at distances (N,) of a few pixels."""
         f = MODEL_FREQUENCIES
         waves = np.sin(2 * math.pi * f * distance[:, None]) / (math.pi * f)
         return np.asarray(
@@ -149,7 +152,7 @@ class Plateaus:
 
 
 def _fit_plateaus(image: np.ndarray, distance: np.ndarray) -> Plateaus:
-    """Least squares over all pixels beyond the window, both sides at once."""
+    """Fit both sides by least squares, using all pixels beyond the window."""
     beyond_window = np.abs(distance) > WINDOW_PX
     d = distance[beyond_window]
     v = image[beyond_window]
@@ -161,10 +164,10 @@ def _fit_plateaus(image: np.ndarray, distance: np.ndarray) -> Plateaus:
 
 
 def _mtf(image: np.ndarray, distance: np.ndarray, plateaus: Plateaus) -> float:
-    """The MTF of the model that comes closest to the edge, and that of what it leaves.
+    """Compute the MTF at Nyquist: that of the best-fitting model plus that of its residual.
 
-    Without the tails what is left is compact, so the window around it costs next to nothing. The
-    model only has to have the right tails: what else it gets wrong stands in the bins.
+    Without the tails the residual is compact, so the window around it loses almost nothing. The
+    model only needs the right tails, because the bins hold its other errors.
     """
     mask = np.abs(np.rint(distance * BINS_PER_PX)) <= HALF
     place = distance[mask] * BINS_PER_PX
@@ -190,9 +193,11 @@ def _mtf(image: np.ndarray, distance: np.ndarray, plateaus: Plateaus) -> float:
 
 
 def _at_centres(averages: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Bin averages moved from their pixels' mean place to the bins' centres, to second order.
+    """Correct bin averages from the mean position of their pixels to the bin centres, to second
+    order.
 
-    Few rows or an unlucky angle (a slope of 1/4) leave a bin's pixels on one side of its centre.
+    With few rows or an unlucky angle (a slope of 1/4) the pixels of a bin lie on one side of its
+    centre.
     """
     place = np.arange(averages.size) + shift
     slope = np.gradient(averages, place)
@@ -200,10 +205,10 @@ def _at_centres(averages: np.ndarray, shift: np.ndarray) -> np.ndarray:
 
 
 def _transform(variance_px2: float) -> np.ndarray:
-    """(B,) what each bin adds to the transform at Nyquist: derivative, window and cosine, the
-    losses undone.
+    """Compute the weight (B,) of each bin in the transform at Nyquist.
 
-    `variance_px2` is that of the pixels' places within a bin: the blur that averaging adds.
+    It combines derivative, window and cosine, and compensates their losses. `variance_px2` is the
+    variance of the positions of the pixels within a bin, which adds blur by averaging.
     """
     place = np.arange(-HALF + 1, HALF) / BINS_PER_PX
     wave = np.cos(2 * math.pi * NYQUIST * place) * _hamming(place)
@@ -217,24 +222,24 @@ def _transform(variance_px2: float) -> np.ndarray:
 def slanted_edge(
     side_px: int, oversampling: int, angle_deg: float, radiance: tuple[float, float] = (40.0, 200.0)
 ) -> np.ndarray:
-    """A straight edge through the middle of a square scene, (S, S) with S = side_px * oversampling.
+    """Draw a straight edge through the middle of a square scene, (S, S) with S = side_px *
+    oversampling.
 
-    Simulate a scene much larger than the part you measure: its borders wrap around, which puts a
+    Simulate a scene much larger than the part you measure: its borders wrap around, which creates a
     second edge there. 240 target pixels for a central part of 80 leave an error of 0.05 MTF points
     (measured).
 
     Args:
         side_px: side of the scene in target pixels.
         oversampling: scene pixels per target pixel.
-        angle_deg: from the vertical; positive leans the edge's lower end to the left.
+        angle_deg: angle from the vertical; a positive one moves the lower end of the edge to the
+            left.
         radiance: W/m2/sr/um on the left and on the right.
 
     Returns:
         (side_px * oversampling,) * 2 float32 radiance. Edge pixels hold the share that the edge
-            covers; the blur of
-        that averaging, 1.6 % at Nyquist for an oversampling of 5, is taken off again to fourth
-            order, at the price
-        of an overshoot of some 4 % of the step.
+        covers. The blur of that averaging, 1.6 % at Nyquist for an oversampling of 5, is removed to
+        fourth order, with an overshoot of some 4 % of the step.
     """
     angle = math.radians(angle_deg)
     place = np.arange(-2, side_px * oversampling + 2) - (side_px * oversampling - 1) / 2
@@ -245,11 +250,10 @@ def slanted_edge(
 
 
 def _covered(distance: np.ndarray, width: float, height: float) -> np.ndarray:
-    """Share of a unit square on the right of an edge at `distance` from its centre, whose
-    projections are given.
+    """Compute the share of a unit square on the right of an edge at `distance` from its centre.
 
-    The square seen along the edge is a box of `width` smeared by one of `height`: the share is its
-    double integral.
+    `width` and `height` are the projections of the square onto the normal. Along the edge the
+    square is a box of `width` smeared by one of `height`: the share is its double integral.
     """
     small, large = sorted((width, height))
     # An edge along the grid is a box that nothing smears: the formula would divide by 0.
@@ -262,8 +266,9 @@ def _covered(distance: np.ndarray, width: float, height: float) -> np.ndarray:
 
 
 def _sharpened(image: np.ndarray) -> np.ndarray:
-    """The image without 1/24 of its second differences, which undoes a box of one pixel; 2 pixels a
-    side shorter.
+    """Subtract 1/24 of the second differences, which compensates the blur of a box of one pixel.
+
+    The result is 2 pixels a side shorter.
     """
     rows = image[1:-1] - (image[2:] - 2 * image[1:-1] + image[:-2]) / 24
     both = rows[:, 1:-1] - (rows[:, 2:] - 2 * rows[:, 1:-1] + rows[:, :-2]) / 24

@@ -1,14 +1,13 @@
-"""One straight edge between uneven sides: where it runs, what lies on either side, and what it says
-of the MTF.
+"""Fit one straight edge between uneven sides, and derive what it contributes to the MTF.
 
-Roofs, kerbs and shadows are no calibration targets. Each side is a plane of its own, and what
-remains of its texture counts as noise: it lowers the weight of the edge instead of refusing it.
+Roofs, kerbs and shadows are no calibration targets. Each side is a plane of its own, and the rest
+of its texture counts as noise: it lowers the weight of the edge instead of excluding it.
 
     pixel = left plane * (1 - E(d)) + right plane * E(d)
     d     = distance to the edge along its normal
 
 E is the image of a step (`mtf_basis`). Gauss-Newton with Huber's weights finds the line and the
-planes for a known E; what they leave over is linear in the weights of E, and is handed on as normal
+planes for a known E. The residual is linear in the weights of E, and is returned as normal
 equations.
 """
 
@@ -21,31 +20,33 @@ import numpy as np
 from beers_deploy.model.metrics.mtf_basis import PARTS, at_distances, responses, softened
 
 HALF_PX = 8.0
-"""How far from the edge pixels are fitted."""
+"""The distance from the edge up to which pixels are fitted."""
 STRIP_PX = 5
 """Length of the strips along the edge that count as independent looks: longer
 than blurred texture.
 """
 
 GRADIENT = 0.08
-"""Standard deviation of what a plane changes away from the edge over HALF_PX, of the step.
+"""Standard deviation of a plane's change over HALF_PX away from the edge, relative to the step.
 
-Far tails of the blur look the same; a wider one lets gradients take their place.
+Far tails of the blur look the same. With a larger value gradients would replace them.
 """
 BOW_PX = 0.3
 """Standard deviation of how far an edge bends off a straight line at its ends:
 distortion, kerbs.
 """
 HUBER = 2.5
-"""Robust deviations from which a pixel counts less: cars, branches and drains lie beside edges."""
+"""The number of robust deviations from which a pixel is weighted less: cars, branches and drains
+lie next to edges.
+"""
 MAD = 1.4826
 """Standard deviation over the median absolute deviation, of normal values."""
 
 LEVELS = 6
 NUMBERS = 9
-"""Numbers of both planes; with those of the line."""
+"""The number of parameters of both planes; and with those of the line."""
 MAX_STEP = np.array([0.7, 0.1, 0.3])
-"""Of place, slope and bow in one pass."""
+"""The largest change of place, slope and bow in one pass."""
 SOFTER_PX = 0.05
 """Small change of softness by which the derivative is taken."""
 
@@ -66,8 +67,8 @@ class EdgePixels:
 
 
 class EdgeLine(NamedTuple):
-    """Where an edge runs: x = place + slope * y + bow * (2 y / H)^2, from the
-    middle of its pixels.
+    """The line of an edge: x = place + slope * y + bow * (2 y / H)^2, from the middle of its
+    pixels.
     """
 
     place_px: float
@@ -92,16 +93,17 @@ class FittedEdge:
 
     Attributes:
         pixels: of the edge.
-        line: where it runs.
+        line: of the edge.
         levels: (6,) left and right plane: in the middle, change over half the length, change over
             HALF_PX.
-        weights: (P,) one over the standard deviation of each pixel near the edge, texture and
-            Huber's weight in it.
+        weights: (P,) one over the standard deviation of each pixel near the edge, including texture
+            and Huber's weight.
         step: difference of the planes at the edge.
-        unevenness: root mean square of the texture that the planes leave, of the step.
-        normal: (P + 9, 9) derivatives by planes and line, weighted, with what is expected of them.
+        unevenness: root mean square of the residual texture of the planes, relative to the step.
+        normal: (P + 9, 9) weighted derivatives by planes and line, followed by their
+            regularisation.
         curve: (P + 9, PARTS) derivatives by the weights of the curve.
-        rest: (P + 9,) what is left over.
+        rest: (P + 9,) the residual.
         strip: (P,) number of the strip that each pixel lies in.
     """
 
@@ -156,7 +158,7 @@ def fit_edge(
         by_levels = np.hstack([plane * (1 - share), plane * share])
         rest = near.values - by_levels @ levels
         scale = max(MAD * float(np.median(np.abs(rest))), 1e-9)
-        # Cars, branches and drains lie beside edges: what departs far counts less.
+        # Cars, branches and drains lie next to edges, so pixels with large residuals count less.
         huber = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(rest), 1e-9))
         # What the noise does not explain is texture, which lowers the weight of the edge.
         texture = max(float(np.average(rest**2, weights=huber)) - float(near.variance.mean()), 0.0)
@@ -194,7 +196,7 @@ def fit_edge(
 
 
 def _near(pixels: EdgePixels, line: EdgeLine) -> Side:
-    """The pixels within HALF_PX of the line, a side both."""
+    """Return the pixels within HALF_PX of the line on both sides."""
     height, width = pixels.values.shape
     y, x = np.mgrid[:height, :width].astype(np.float64)
     y -= (height - 1) / 2
@@ -206,7 +208,7 @@ def _near(pixels: EdgePixels, line: EdgeLine) -> Side:
 
 
 def _plane(near: Side, height: int) -> np.ndarray:
-    """(P, 3) what each number of a plane adds to each pixel."""
+    """Return the derivatives (P, 3) of each pixel by the three parameters of a plane."""
     return np.stack(
         [np.ones_like(near.along_px), 2 * near.along_px / height, near.distance_px / HALF_PX],
         axis=1,
@@ -214,8 +216,9 @@ def _plane(near: Side, height: int) -> np.ndarray:
 
 
 def _by_line(near: Side, line: EdgeLine, slope: np.ndarray, height: int) -> np.ndarray:
-    """(P, 3) derivatives of the pixels by place, slope and bow; `slope` (P,) is that by the
-    distance.
+    """Return the derivatives (P, 3) of the pixels by place, slope and bow.
+
+    `slope` (P,) is the derivative by the distance.
     """
     by_place = -slope / math.hypot(1, line.slope)
     along = near.along_px
@@ -223,7 +226,7 @@ def _by_line(near: Side, line: EdgeLine, slope: np.ndarray, height: int) -> np.n
 
 
 def _expectations(levels: np.ndarray, line: EdgeLine, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (9, 9) that hold gradients and bow near 0, and their right side (9,)."""
+    """Build rows (9, 9) that regularise gradients and bow towards 0, and their right side (9,)."""
     rows = np.zeros((NUMBERS, NUMBERS))
     right = np.zeros(NUMBERS)
     gradient = GRADIENT * abs(step)
@@ -239,12 +242,13 @@ def _expectations(levels: np.ndarray, line: EdgeLine, step: float) -> tuple[np.n
 def normal_equations(
     edge: FittedEdge, weights: np.ndarray, counts: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What one edge says of the curve, whatever its line and planes.
+    """Compute the normal equations of the curve from one edge, with its line and planes projected
+    out.
 
     Args:
         edge: fitted to `weights`.
         weights: (PARTS,) of the curve.
-        counts: how often each strip along the edge counts; once each without.
+        counts: how often each strip along the edge counts; None counts each once.
 
     Returns:
         (PARTS, PARTS) and (PARTS,): left and right side for the weights of the curve.
@@ -266,16 +270,15 @@ def normal_equations(
 
 
 def strips_of(edge: FittedEdge) -> int:
-    """How many independent looks along the edge there are."""
+    """Return the number of independent strips along the edge."""
     return max(int(edge.pixels.values.shape[0]) // STRIP_PX, 2)
 
 
 def softness(edge: FittedEdge, weights: np.ndarray) -> tuple[float, float]:
-    """By how much an edge is softer than a curve: s of a further factor exp(-s f), in pixels; and
-    its standard error.
+    """Estimate by how much an edge is softer than a curve, and the standard error of that.
 
-    The error is the larger of what noise and texture leave and of what the strips along the edge
-    differ by.
+    The softness is s in pixels of a further factor exp(-s f). Its error is the larger of two: that
+    from noise and texture, and that from the differences between the strips along the edge.
     """
     by_softness = edge.curve @ (softened(weights, SOFTER_PX) - weights) / SOFTER_PX
     basis, _ = np.linalg.qr(edge.normal)

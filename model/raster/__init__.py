@@ -1,9 +1,9 @@
-"""The one reader and writer of images, on GDAL by way of rasterio.
+"""The only reader and writer of images, on GDAL through rasterio.
 
-facts        what is known of an image before its pixels are read: `Raster`, `Place`
+facts        properties of an image before its pixels are read: `Raster`, `Place`
 source       an image as a source of rows: `Source`, `ArraySource`
 index        indexes of tiles (VRT, DIMAP), checked before GDAL follows them
-description  what GDAL states of an open image
+description  the properties that GDAL states of an open image
 reader       `open_raster`: any file by rows
 images       whole images, and the images of a folder
 full_scale   which pixel value is full scale

@@ -1,4 +1,4 @@
-"""The compressions of an output. It imports nothing, so that '--help' stays quick."""
+"""Define the compressions of an output. It imports nothing, so that '--help' stays fast."""
 
 from typing import Literal
 

@@ -1,4 +1,6 @@
-"""What GDAL states of an open image, and refusals of pixels that cannot be restored."""
+"""Read the properties that GDAL states of an open image, and reject pixels that
+cannot be restored.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -23,8 +25,8 @@ from beers_deploy.profiles.errors import ImageError, printable
 DARK = {"palette", "hue", "saturation", "lightness", "cyan", "magenta", "yellow", "black"}
 """GDAL's interpretations of bands whose pixels are not brighter where they are larger."""
 UNKEPT = ("STATISTICS_", "TIFFTAG_", "NITF_", "AREA_OR_POINT", "METADATATYPE")
-"""Beginnings of metadata items that a restored image does not keep: they describe the raw pixels or
-the raw file, or are written from other facts.
+"""Prefixes of metadata items that are not copied to a restored image: they describe the raw pixels
+or the raw file, or are written from other facts.
 """
 
 
@@ -34,7 +36,9 @@ def mask_file(path: Path) -> Path:
 
 
 def raster_of(path: Path, dataset: Any) -> Raster:
-    """Return what GDAL states of an image; refuse one whose pixels cannot be restored."""
+    """Return the properties that GDAL states of an image; raise ImageError if it cannot be
+    restored.
+    """
     name = str(path)
     _require_one_image(name, dataset)
     mask_kind = _mask_kind(name, dataset)
@@ -73,7 +77,7 @@ def raster_of(path: Path, dataset: Any) -> Raster:
 
 
 def _require_one_image(name: str, dataset: Any) -> None:
-    """Refuse a file of several images, such as the pages of a TIFF."""
+    """Raise ImageError if a file has several images, such as the pages of a TIFF."""
     count = len(dataset.subdatasets)
     if dataset.count == 0 or count > 1:
         how = f" with 'gdal_translate {dataset.subdatasets[0]} one.tif'" if count else ""
@@ -84,7 +88,7 @@ def _require_one_image(name: str, dataset: Any) -> None:
 
 
 def _mask_kind(name: str, dataset: Any) -> MaskKind:
-    """Return what marks missing pixels besides the nodata value."""
+    """Return what marks missing pixels in addition to the nodata value."""
     is_alpha = [values.name == "alpha" for values in dataset.colorinterp]
     flags = {flag.name for flag in dataset.mask_flag_enums[0]}
     if any(is_alpha[:-1]) or is_alpha == [True]:
@@ -105,7 +109,7 @@ def _mask_kind(name: str, dataset: Any) -> MaskKind:
 
 
 def _require_alike(name: str, dataset: Any, bands: int) -> None:
-    """Refuse bands of different types or nodata values."""
+    """Raise ImageError if bands differ in type or nodata value."""
     for kind, values in (
         ("types", dataset.dtypes),
         ("nodata values", dataset.nodatavals[:bands]),
@@ -116,7 +120,7 @@ def _require_alike(name: str, dataset: Any, bands: int) -> None:
 
 
 def _require_light(name: str, dataset: Any) -> None:
-    """Refuse pixels that are not brighter where they are larger."""
+    """Raise ImageError if larger pixel values are not brighter."""
     structure = dataset.tags(ns="IMAGE_STRUCTURE")
     dark = sorted({values.name for values in dataset.colorinterp} & DARK)
     if structure.get("MINISWHITE") == "YES":
@@ -161,5 +165,5 @@ def _place(dataset: Any) -> Place:
 
 
 def _kept(tags: dict[str, str]) -> tuple[tuple[str, str], ...]:
-    """Return the metadata items that a restored image keeps."""
+    """Return the metadata items that are copied to a restored image."""
     return tuple((key, text) for key, text in sorted(tags.items()) if not key.startswith(UNKEPT))

@@ -1,4 +1,4 @@
-"""What is known of an image before its pixels are read: size, type, missing pixels, and place."""
+"""Describe an image before its pixels are read: size, type, missing pixels, and place."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,8 +10,8 @@ from beers_deploy.profiles.errors import ImageError
 
 SIDE_PX = 1 << 22
 BANDS = 1 << 12
-"""An image has a plan of its tiles before any pixel is read, so a header alone must not make that
-plan large.
+"""The maximum size of an image. Its tiles are planned before any pixel is read, so a header alone
+must not make that plan large.
 """
 
 RESTORED = "beers-deploy restore"
@@ -25,7 +25,7 @@ OFFSET_DN = 40
 RGB_BANDS = ("red", "green", "blue")
 
 MaskKind = Literal["", "mask", "alpha"]
-"""What marks missing pixels besides NaN and the nodata value."""
+"""What marks missing pixels in addition to NaN and the nodata value."""
 
 ControlPoint = tuple[float, float, float, float, float]
 """A ground control point: row and column in pixels, then x, y and z in the reference system."""
@@ -52,14 +52,14 @@ def extent_of(pixels: np.ndarray, known: np.ndarray | bool = True) -> Extent:
 
 @dataclass(frozen=True)
 class Place:
-    """Where an image lies on Earth, in GDAL's terms.
+    """The position of an image on Earth, in GDAL's terms.
 
     Attributes:
         crs: the coordinate reference system of `transform` or of the ground control points.
         transform: the affine transform from pixel corners (column, row) to coordinates.
         gcps: ground control points; GDAL reads these or a transform.
         rpcs: rational polynomial coefficients, by GDAL's names.
-        area_or_point: what a pixel's value stands for, GDAL's AREA_OR_POINT.
+        area_or_point: whether a pixel's value is that of an area or a point, GDAL's AREA_OR_POINT.
     """
 
     crs: Any = None
@@ -105,7 +105,9 @@ def _number(text: str) -> float:
 
 @dataclass(frozen=True)
 class BandInfo:
-    """What a file states of one band: its name, its unit, and how pixels become physical values."""
+    """The description of one band in a file: its name, its unit, and the conversion from pixels to
+    physical values.
+    """
 
     name: str = ""
     unit: str = ""
@@ -148,7 +150,7 @@ class Raster:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Bands, height and width, (bands, H, W) in pixels."""
+        """The number of bands, height and width, (bands, H, W) in pixels."""
         return self.bands, self.height_px, self.width_px
 
     @property
@@ -181,7 +183,7 @@ class Raster:
 
     @property
     def may_miss(self) -> bool:
-        """Whether any pixel could be missing at all."""
+        """True if any pixel could be missing."""
         return self.dtype.kind == "f" or self.nodata is not None or bool(self.mask_kind)
 
     def fill_margin_px(self, radius_px: int) -> int:
@@ -209,7 +211,7 @@ class Raster:
 
 
 def require_size(name: str, bands: int, height_px: int, width_px: int) -> None:
-    """Refuse an image that is too large to be planned."""
+    """Raise ImageError if an image is too large to be planned."""
     if max(height_px, width_px) > SIDE_PX or bands > BANDS:
         raise ImageError(
             f"{name} has {bands} bands of {width_px} x {height_px} pixels, but at most {BANDS} "
@@ -218,7 +220,7 @@ def require_size(name: str, bands: int, height_px: int, width_px: int) -> None:
 
 
 def require_numbers(name: str, dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the type of the pixels; refuse complex numbers."""
+    """Return the type of the pixels; raise ImageError for complex numbers."""
     if dtype.kind not in "uif":
         raise ImageError(
             f"{name} must have integer or float pixels, got {dtype}. Convert it to uint16."
@@ -227,7 +229,13 @@ def require_numbers(name: str, dtype: np.dtype[Any]) -> np.dtype[Any]:
 
 
 def require_small_offset(name: str, offset: float, scale: float) -> None:
-    """Refuse pixels whose 0 is far from no light: value = scale x pixel + offset."""
+    """Raise ImageError if pixel value 0 is far from no light: value = scale x pixel + offset.
+
+    Args:
+        name: of the image, for the message.
+        offset: of the pixels.
+        scale: of the pixels.
+    """
     if abs(offset) > OFFSET_DN * abs(scale):
         dark = -offset / (scale or 1)
         raise ImageError(
@@ -253,7 +261,9 @@ def is_restored(software: str, metadata: object) -> bool:
 
 
 def require_raw(name: str, restored: bool, force: bool) -> None:
-    """Refuse a restored image unless `force`: a second restoration over-sharpens it."""
+    """Raise ImageError if the image was restored before, unless `force`: a second restoration
+    over-sharpens it.
+    """
     if restored and not force:
         raise ImageError(
             f"{name} is not a raw image, because 'restore' has written it. Give the raw one, or "

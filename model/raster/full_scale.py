@@ -1,4 +1,4 @@
-"""Settle which pixel value is full scale: the one that is 1.0 to a network."""
+"""Determine which pixel value is full scale: the value that a network receives as 1.0."""
 
 from collections.abc import Iterable
 
@@ -9,13 +9,14 @@ from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.instrument import MAX_DN
 
 UNIT_MAX = 2.0
-"""Floats no larger may be shares of full scale, or reflectances, which pass 1 on snow and glint.
+"""Floats up to this value may be shares of full scale, or reflectances, which exceed 1 on snow and
+glint.
 
-A raw image has a pixel above 2 DN wherever it sees anything at all.
+A raw image has a pixel above 2 DN wherever there is any light.
 """
 RADIANCE_SHARE = 0.2
-"""Floats that are no whole numbers and no larger than this share of full scale may be radiances:
-those of a bright scene, in W/m2/sr/um, stay below some 700.
+"""Non-integer floats up to this share of full scale may be radiances. Those of a bright scene stay
+below some 700 W/m2/sr/um.
 """
 
 ADVICE = "Give the pixel value that is full scale as `full_scale`"
@@ -29,17 +30,15 @@ def settled_scale(
     usual: float = MAX_DN,
     remedy: str | None = None,
 ) -> float:
-    """The pixel value that is full scale.
+    """Determine the pixel value that is full scale, or raise ImageError if it is ambiguous.
 
     Args:
         name: of the image, for the message.
         dtype: of the pixels.
-        extents: of each part of the image, drawn for floats only and no further than to the first
-            that decides.
-        asked: as the user gave it; None lets type and values decide.
+        extents: of each part of the image; read for floats only, up to the first part that decides.
+        asked: the value that the user gave; None lets type and values decide.
         usual: the full scale of digital numbers.
-        remedy: what to do about pixels that leave it open, a sentence, where the caller has no
-            `full_scale`.
+        remedy: a sentence on what to do if it is ambiguous and the caller has no `full_scale`.
     """
     if asked is not None:
         check_scale(asked, dtype.kind)
@@ -81,8 +80,9 @@ def check_scale(full_scale: float, kind: str) -> None:
 
 
 def remedy_outside(low: float, high: float, remedy: str) -> str:
-    """Return a sentence on what to do about values from `low` to `high` that no sensor gives:
-    `remedy` if they are only too large.
+    """Return a sentence of advice about values from `low` to `high` that no sensor produces.
+
+    It is `remedy` if they are only too large.
     """
     if not np.isfinite([low, high]).all():
         return (

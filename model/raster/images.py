@@ -1,4 +1,4 @@
-"""Read whole images, list those of a folder, and tell frames of one site apart."""
+"""Read whole images, list those of a folder, and determine which of them are frames of one site."""
 
 import re
 from math import prod
@@ -15,18 +15,18 @@ from beers_deploy.profiles.errors import ImageError, MachineError, sizes
 from beers_deploy.profiles.instrument import MAX_DN
 
 CAMERA = r"[_-](?:dji|img|image|dsc[nf]?|fhd|mos|gopr|frame|p)[_-]?"
-"""How cameras and programs begin the names of their files, after the name of a place."""
+"""The parts of file names that cameras and programs add after the name of a place."""
 
 FRAME_NUMBERS = re.compile(
     rf"(?:(?:_|{CAMERA})[0-9a-f]*\d[0-9a-f]*(?:-[0-9]+)*(?:_(?:pre|post)(?=_|$))?)+$", re.IGNORECASE
 )
-"""The end of a name that tells frames of one site apart: _0034, _5dded5bc_23, _DJI_0005, _P1010012,
-_386690-220241, _2016_pre_1. Nothing else can be known by a name: the site is what it begins with.
+"""The end of a name that distinguishes frames of one site: _0034, _5dded5bc_23, _DJI_0005,
+_P1010012, _386690-220241, _2016_pre_1. The rest of the name is the site.
 """
 
 WORKING_COPIES = 12
-"""Float copies of an image that a command may hold at once: reading refuses what would not fit in
-memory.
+"""The number of float copies of an image that a command may hold at once; an image that would not
+fit in memory is rejected.
 """
 
 RESCALE = "Rescale it to the sensor's digital numbers."
@@ -73,7 +73,7 @@ def image_size_px(path: Path) -> tuple[int, int]:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The image files of a folder, sorted by name."""
+    """List the image files of a folder, sorted by name, or raise ImageError if there are none."""
     # A folder that does not exist has no files either.
     images = sorted(path for path in folder.glob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
     if not images:
@@ -85,7 +85,7 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def site_of(name: str) -> str:
-    """Return the site of an image: its name without the end that tells frames of one site apart.
+    """Return the site of an image: its name without the end that distinguishes frames of one site.
 
     Examples:
         >>> site_of("zebra_DJI_0005.jpg"), site_of("lake_2016_pre_1.tif")
@@ -97,15 +97,14 @@ def site_of(name: str) -> str:
 def read_acquisition(
     path: Path, full_scale: float | None = None, remedy: str | None = RESCALE, max_dn: int = MAX_DN
 ) -> np.ndarray:
-    """Digital numbers (H, W) float32 in 0..max_dn of a mono image: of at most 12 bits unless a
-    sensor says otherwise.
+    """Read the digital numbers (H, W) float32 of a mono image, from 0 to max_dn.
 
     Args:
         path: a TIFF, PNG or JPEG file.
         full_scale: the pixel value that is full scale; None lets the pixels' type and values
             decide.
-        remedy: a sentence on what to do about pixels that leave it open; None names `full_scale`.
-        max_dn: the sensor's largest digital number.
+        remedy: a sentence on what to do if full scale is ambiguous; None names `full_scale`.
+        max_dn: the sensor's largest digital number, by default that of 12 bits.
     """
     pixels = read_pixels(path)
     if pixels.ndim != 2:

@@ -1,8 +1,7 @@
-"""Untrusted indexes: an XML file that names an image's tiles is read here before GDAL follows it
-anywhere.
+"""Read untrusted indexes, XML files that name an image's tiles, before GDAL follows them.
 
-Whatever a VRT or a DIMAP names must be an image that lies in its folder or below, unless the user
-trusts it. Code in Python is never run: GDAL is told so when it opens one.
+Every file that a VRT or a DIMAP names must be an image in its folder or below, unless the user
+trusts it. Python code in an index is never run, because GDAL opens it with that option off.
 
 Sources: https://gdal.org/en/stable/drivers/raster/vrt.html, and GDAL's
 frmts/dimap/dimapdataset.cpp.
@@ -17,14 +16,16 @@ from beers_deploy.profiles.toml import read_whole
 
 INDEX_SUFFIXES = {".vrt", ".xml"}
 INDEX_BYTES = 1 << 23
-"""A tile takes some 500 bytes of a VRT: over ten thousand tiles."""
+"""The maximum size of an index. A tile takes some 500 bytes of a VRT, so it suffices for over ten
+thousand tiles.
+"""
 
 MAGIC = (
     *(b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"),  # TIFF and BigTIFF
     *(b"\0\0\0\x0cjP  \r\n\x87\n", b"\xff\x4f\xff\x51"),  # JPEG 2000
     *(b"NITF", b"NSIF", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"),  # NITF, PNG, JPEG
 )
-"""How the files begin that an index may name: none of them names others."""
+"""The first bytes of the files that an index may name; none of these formats names other files."""
 
 VRT = "VRTDataset"
 VRT_PATHS = {"sourcefilename", "sourcedataset"}
@@ -40,14 +41,16 @@ class _NoDoctype(ET.TreeBuilder):
     """
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:  # noqa: ARG002
-        """Refuse it."""
+        """Raise ValueError, because a document type may declare entities."""
         raise ValueError("it has a document type, which may declare entities")
 
 
 def parse_xml(content: str | bytes) -> ET.Element:
-    """The root of untrusted XML; a ValueError, LookupError or RecursionError where it is none.
+    """Parse untrusted XML and return its root; raise ValueError, LookupError or RecursionError if
+    it is invalid.
 
-    With entities a file of a hundred bytes could grow to gigabytes: a document type is refused.
+    With entities a file of a hundred bytes could expand to gigabytes, so a document type is
+    rejected.
     """
     try:
         return ET.fromstring(content, ET.XMLParser(target=_NoDoctype()))  # noqa: S314 - without one no entities
@@ -56,13 +59,13 @@ def parse_xml(content: str | bytes) -> ET.Element:
 
 
 def read_xml(path: Path, limit_bytes: int, kind: str, advice: str) -> ET.Element:
-    """Return the root of a file of untrusted XML, of at most `limit_bytes`.
+    """Read a file of untrusted XML, of at most `limit_bytes`, and return its root.
 
     Args:
         path: of the file.
-        limit_bytes: more is refused.
-        kind: what the file should be, for the message.
-        advice: what to do if it is not, a sentence.
+        limit_bytes: a larger file is rejected.
+        kind: the expected kind of file, for the message.
+        advice: a sentence on what to do if it is not of that kind.
 
     Raises:
         ImageError: the file cannot be read as XML.
@@ -76,18 +79,20 @@ def read_xml(path: Path, limit_bytes: int, kind: str, advice: str) -> ET.Element
 
 
 def is_index(path: Path) -> bool:
-    """Whether a file names an image's tiles instead of holding them, by its name."""
+    """Return True if the suffix is that of a file that names an image's tiles instead of containing
+    them.
+    """
     return path.suffix.lower() in INDEX_SUFFIXES
 
 
 def index_files(path: Path, trusted: bool = False) -> tuple[Path, ...]:
-    """The files that an index, and the indexes it names, make an image of; none for a file that is
-    no index.
+    """List the files that an index, and the indexes it names, combine into an image.
+
+    The result is empty for a file that is no index.
 
     Args:
         path: of any image.
-        trusted: whether tiles may lie outside the index's folder; what lies at a URL is then not
-            looked at.
+        trusted: whether tiles may lie outside the index's folder; URLs are then not checked.
     """
     if not is_index(path):
         return ()
@@ -106,7 +111,7 @@ def index_files(path: Path, trusted: bool = False) -> tuple[Path, ...]:
 
 
 def _named(index: Path, home: Path, trusted: bool) -> Iterator[Path]:
-    """The files that one index names; `home` is the folder of the first one."""
+    """Yield the files that one index names; `home` is the folder of the first index."""
     root = _parsed(index)
     paths = _of_vrt(index, root) if root.tag == VRT else _of_dimap(index, root)
     for text, folder, pixels in paths:
@@ -148,11 +153,11 @@ def _parsed(path: Path) -> ET.Element:
 
 
 Named = Iterator[tuple[str, Path, bool]]
-"""A path as an index has it, the folder that it counts from, and whether pixels are there."""
+"""A path as written in an index, the folder that it is relative to, and whether it holds pixels."""
 
 
 def _of_vrt(path: Path, root: ET.Element) -> Named:
-    """Paths by element or by attribute, which are the same to GDAL."""
+    """Yield the paths in elements and attributes of a VRT, which are equivalent to GDAL."""
     for element in root.iter():
         for key, text in ((element.tag, element.text or ""), *element.attrib.items()):
             if key.lower() in VRT_PATHS:
@@ -162,7 +167,10 @@ def _of_vrt(path: Path, root: ET.Element) -> Named:
 
 
 def _of_dimap(path: Path, root: ET.Element) -> Named:
-    """Paths by attribute, or by an element in an attribute's place, which are the same to GDAL."""
+    """Yield the paths of a DIMAP in attributes, or in elements that replace them.
+
+    Both are equivalent to GDAL.
+    """
     for element in root.iter():
         name = element.tag.rpartition("}")[2].lower()
         if name in DIMAP_PATHS:
@@ -175,14 +183,17 @@ def _of_dimap(path: Path, root: ET.Element) -> Named:
 
 
 def _is_elsewhere(text: str) -> bool:
-    """Whether GDAL would take it for more than a path: a URL, a virtual file, XML itself, a part of
-    a file.
+    """Return True if GDAL would not read the text as a plain path.
+
+    It is then a URL, a virtual file, XML itself, or a part of a file.
     """
     return "://" in text or text.startswith(("/vsi", "<")) or (":" in text and not Path(text).drive)
 
 
 def _located(index: Path, text: str, folder: Path, home: Path | None) -> Path:
-    """A path that an index names; in `home` or below, unless that is None."""
+    """Resolve a path that an index names; raise ImageError if it lies outside `home`, unless that
+    is None.
+    """
     try:
         file = (folder / text).resolve()
         # A name that the system does not accept raises here and not in the middle of a run.
@@ -203,10 +214,10 @@ def _located(index: Path, text: str, folder: Path, home: Path | None) -> Path:
 
 
 def dimap_bits(path: Path) -> int | None:
-    """The bits per pixel of a DIMAP's product; None where it states none, or is none.
+    """Read the bits per pixel of a DIMAP's product; None if it states none, or for another file.
 
-    Dynamic_Range/PRODUCT_RANGE, else Raster_Encoding/NBITS, as Airbus' Pleiades Imagery User Guide
-    has them.
+    It is Dynamic_Range/PRODUCT_RANGE, otherwise Raster_Encoding/NBITS, as in Airbus' Pleiades
+    Imagery User Guide.
     """
     if path.suffix.lower() != ".xml":
         return None

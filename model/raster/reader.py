@@ -1,10 +1,10 @@
 """Open images by windows with GDAL: TIFF, PNG, JPEG, JPEG 2000, NITF, HFA, ENVI, and the indexes
-VRT and DIMAP that make one image of many tiles.
+VRT and DIMAP that combine many tiles to one image.
 
-GDAL chooses among all of its drivers by content, follows what a file names, and knows the network.
-Here the suffix chooses the driver, an index and its tiles are checked before GDAL opens them
-(`model.raster.index`), and all files that GDAL reports afterwards must lie in the image's folder,
-unless the user trusts the index.
+GDAL chooses among all of its drivers by content, opens files that a file names, and can use the
+network. Here the suffix selects the driver, and an index and its tiles are checked before GDAL
+opens them (`model.raster.index`). All files that GDAL reports afterwards must lie in the image's
+folder, unless the user trusts the index.
 """
 
 import logging
@@ -47,7 +47,7 @@ DRIVERS = {
 }
 """GDAL's drivers by suffix: others of its drivers open further files, or the network."""
 FORMATS = {"GTiff": "TIFF", "JP2OpenJPEG": "JPEG 2000"}
-"""What messages call a driver's format where its name does not say it."""
+"""The names of formats in messages, if they differ from the names of GDAL's drivers."""
 
 LEAST_CACHE_BYTES = 1 << 26
 AUX_BYTES = 1 << 20
@@ -58,7 +58,7 @@ ENVIRONMENT = {
     "GDAL_VRT_ENABLE_PYTHON": "NO",
     # A VRT could show any file of the machine as raw pixels.
     "GDAL_VRT_RAWRASTERBAND_ALLOWED_SOURCE": "NONE",
-    # Otherwise the end of a truncated JPEG is grey, and nothing is said.
+    # Otherwise the end of a truncated JPEG is grey, without any error.
     "GDAL_ERROR_ON_LIBJPEG_WARNING": "TRUE",
     # This way of reading a whole PNG leaves memory as it was where the file ends early.
     "GDAL_PNG_WHOLE_IMAGE_OPTIM": "NO",
@@ -72,7 +72,7 @@ logging.getLogger("rasterio").addHandler(logging.NullHandler())
 
 
 def require_image_file(path: Path) -> None:
-    """Refuse a path that is no file, and an empty file."""
+    """Raise ImageError if a path is no file, or an empty one."""
     reason = unreadable(path)
     if reason is not None:
         raise ImageError(f"{printable(str(path))} cannot be read: {reason}. Check the path.")
@@ -82,7 +82,7 @@ def require_image_file(path: Path) -> None:
 
 @contextmanager
 def gdal(**options: Any) -> Iterator[None]:
-    """Configure GDAL for files that nobody has checked, and silence its warnings."""
+    """Configure GDAL for untrusted files, and silence its warnings."""
     # An image need not lie anywhere on Earth, which rasterio warns about.
     with warnings.catch_warnings(action="ignore"), rasterio.Env(**ENVIRONMENT, **options):
         yield
@@ -135,7 +135,7 @@ def _driver(path: Path) -> str:
 
 
 def _require_sidecars(path: Path) -> None:
-    """Refuse a mask or metadata file beside an image that GDAL would misread or pass over."""
+    """Raise ImageError if GDAL would misread or ignore a mask or metadata file next to an image."""
     advice = "Write it again, or remove it."
     mask = mask_file(path)
     if mask.is_file():
@@ -150,7 +150,9 @@ def _require_sidecars(path: Path) -> None:
 
 
 def _files(path: Path, tiles: tuple[Path, ...], dataset: Any, trusted: bool) -> tuple[Path, ...]:
-    """Return all files that an image is read from; refuse one outside its folder."""
+    """Return all files that an image is read from; raise ImageError if one is outside
+    its folder.
+    """
     homes = {path.absolute().parent, path.resolve().parent}
     files = {path: None} | dict.fromkeys(tiles)
     resolved = {file.resolve() for file in files}
@@ -168,7 +170,7 @@ def _files(path: Path, tiles: tuple[Path, ...], dataset: Any, trusted: bool) -> 
         if real.is_file():
             files[file] = None
             resolved.add(real)
-    # A mask beside the image is among GDAL's files only once it has been looked up.
+    # GDAL lists a mask next to the image among its files only after the mask has been read.
     mask = mask_file(path)
     return tuple(files | ({mask: None} if mask.is_file() else {}))
 
@@ -263,7 +265,9 @@ class GdalSource:
 
 
 def _require_whole(path: Path, dataset: Any) -> None:
-    """Refuse a TIFF that ends before its last strip or tile: a long run would find out late."""
+    """Raise ImageError if a TIFF ends before its last strip or tile, which a long run would detect
+    late.
+    """
     if dataset.driver != "GTiff":
         return
     size = path.stat().st_size
@@ -281,7 +285,9 @@ def _require_whole(path: Path, dataset: Any) -> None:
 
 
 def _require_memory(path: Path, source: GdalSource) -> None:
-    """Refuse an image whose strips or tiles do not fit in memory, before one is decoded."""
+    """Raise MachineError if the strips or tiles of an image do not fit in memory, before one is
+    decoded.
+    """
     needed = source.held_bytes(1)
     free = psutil.virtual_memory().available
     if needed > max(free, 2 * LEAST_CACHE_BYTES):

@@ -1,4 +1,4 @@
-"""An image as a source of rows: a `Raster` of facts, and pixels as they are asked for."""
+"""Define an image as a source of rows: a `Raster` of facts, and pixels that are read on request."""
 
 import hashlib
 from collections.abc import Iterable, Iterator
@@ -12,7 +12,7 @@ from beers_deploy.model.raster.facts import Raster
 
 
 class Source(Protocol):
-    """An image that gives its rows.
+    """An image that is read by rows.
 
     Attributes:
         raster: the facts.
@@ -26,14 +26,14 @@ class Source(Protocol):
     def read(self, start: int, stop: int) -> np.ndarray:
         """Read rows `start` to `stop` (excluded) of every band as stored, (bands, rows, width).
 
-        It is a masked array where the image has a mask or alpha.
+        The result is a masked array if the image has a mask or alpha.
         """
 
     def read_mask(self, start: int, stop: int) -> np.ndarray:
         """Read the same rows of the mask or of alpha, (rows, width); 0 marks a missing pixel."""
 
     def held_bytes(self, rows_px: int) -> int:
-        """Return the memory that reading `rows_px` rows at a time takes besides the rows."""
+        """Return the memory, in addition to the rows, for reading `rows_px` rows at a time."""
 
 
 class ArraySource:
@@ -67,8 +67,8 @@ def strips(height_px: int, step_px: int) -> Iterator[tuple[int, int]]:
 def fingerprint(files: Iterable[Path]) -> str:
     """Return one digest of the whole content of some files.
 
-    Size and time alone, or the ends of a file, do not tell two images apart. SHA-256 reads 0.9 GB/s
-    on one core: for a 12-bit image that is 0.2 % of a restoration's processor time (measured).
+    Size and time alone, or the ends of a file, do not distinguish two images. SHA-256 reads 0.9
+    GB/s on one core: for a 12-bit image that is 0.2 % of a restoration's processor time (measured).
     """
     return hashlib.sha256("".join(map(sha256, files)).encode()).hexdigest()
 

@@ -1,8 +1,8 @@
 """Write images: TIFFs by rows, from rows that are read twice; and Cloud-Optimised GeoTIFFs.
 
-GDAL compresses in threads, which lose the errors of a full disk, and it writes the last blocks when
-the file is closed, where rasterio reports none. So a file that was written is read again and
-compared with what it was written from.
+GDAL compresses in threads, which lose the errors of a full disk. It writes the last blocks when the
+file is closed, for which rasterio reports no errors. A written file is therefore read again and
+compared with the given pixels.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,7 +37,7 @@ LEVELS = {"zlib": {"ZLEVEL": 1}, "zstd": {"ZSTD_LEVEL": 1}}
 
 
 class Pixels(Protocol):
-    """What is written: rows of bands and of the mask, which may be asked for more than once."""
+    """The rows to write, of bands and of the mask; they may be requested more than once."""
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
         """Return rows `start` to `stop` (excluded) of one band, (rows, width)."""
@@ -47,7 +47,7 @@ class Pixels(Protocol):
 
 
 def require_codec(compression: Compression) -> None:
-    """Refuse a compression that the installed GDAL does not have, before a long run."""
+    """Raise OptionError before a long run if the installed GDAL lacks a compression."""
     options = {"driver": "GTiff", "width": 16, "height": 16, "count": 1, "dtype": "uint16"}
     try:
         with gdal(), MemoryFile() as memory:
@@ -72,13 +72,13 @@ def write_raster(
 
     Args:
         path: of the TIFF; its folder exists.
-        raster: what the file states of the image.
-        pixels: gives the rows to write.
+        raster: the properties that the file states.
+        pixels: the rows to write.
         compression: of the tiles.
         software: the program that the file names.
 
     Raises:
-        OSError: a disk that cannot be written, or a file that differs from what was written.
+        OSError: a disk that cannot be written, or a file that differs from the given pixels.
     """
     with disk_errors(), gdal(GDAL_CACHEMAX=LEAST_CACHE_BYTES, GDAL_TIFF_INTERNAL_MASK="YES"):
         with rasterio.open(path, "w", **_profile(raster, compression)) as file:
@@ -93,7 +93,7 @@ def write_raster(
 
 
 def require_equal(path: Path, raster: Raster, pixels: Pixels) -> None:
-    """Raise OSError if bands, mask or alpha of a TIFF differ from what it was written from."""
+    """Raise OSError if bands, mask or alpha of a TIFF differ from the pixels that were written."""
     with disk_errors(), gdal(), rasterio.open(path, driver="GTiff") as file:
         for plane, window, rows in _planes(raster, pixels):
             if plane == MASK:
@@ -173,7 +173,7 @@ def _profile(raster: Raster, compression: Compression) -> dict[str, Any]:
 
 
 def _describe(file: Any, raster: Raster) -> None:
-    """Write the place, and what is known of the bands, into an open TIFF."""
+    """Write the place and the properties of the bands into an open TIFF."""
     if raster.place.area_or_point:
         file.update_tags(AREA_OR_POINT=raster.place.area_or_point)
     if raster.place.rpcs:
@@ -202,14 +202,14 @@ def _describe_bands(file: Any, bands: Sequence[BandInfo]) -> None:
 
 
 def write_cog(plain: Path, cog: Path, compression: Compression, about: Mapping[str, str]) -> None:
-    """Write a TIFF again as a Cloud-Optimised GeoTIFF: tiles, overviews, and a head that says where
-    they lie (https://gdal.org/en/stable/drivers/raster/cog.html).
+    """Rewrite a TIFF as a Cloud-Optimised GeoTIFF: tiles, overviews, and a header with their
+    positions (https://gdal.org/en/stable/drivers/raster/cog.html).
 
     Args:
         plain: the TIFF; `about` is added to its metadata.
         cog: the file to write.
         compression: of the tiles.
-        about: metadata items that say what was done to the image.
+        about: metadata items on the processing of the image.
     """
     options: dict[str, Any] = {
         "COMPRESS": CODECS[compression],
@@ -236,10 +236,10 @@ def padded_px(shape: tuple[int, int, int], tile_px: int = TILE_PX) -> int:
 
 
 def cog_bytes(shape: tuple[int, int, int], itemsize: int) -> int:
-    """Return the disk that writing a COG of an image (bands, height, width) takes at most.
+    """Return the maximum disk space for writing a COG of an image (bands, height, width).
 
-    The driver halves the image until it is one block, and writes these overviews into a file of
-    their own first. Nothing is assumed to be compressed.
+    The driver halves the image until it is one block, and writes these overviews into a separate
+    file first. No compression is assumed.
     """
     bands, height, width = shape
     full = padded_px(shape, COG_TILE_PX)

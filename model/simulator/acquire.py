@@ -1,5 +1,5 @@
-"""One scene, seen by one sensor or by two: blur, sampling, then what `detector` does in the order
-of its lists.
+"""Simulate one scene acquired by one or two sensors: blur, sampling, then the steps of `detector`
+in order.
 """
 
 from collections.abc import Collection, Iterable
@@ -16,20 +16,20 @@ from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.instrument import Instrument
 
 MARGIN_PX = 32
-"""Target pixels cropped on each side: the FFT wraps around, and the PSF's tail is long (10.8 DN at
-32).
+"""Target pixels cropped on each side, because the FFT wraps around and the tail of the PSF is long
+(10.8 DN at 32).
 """
 LEAST_SIDE_PX = 48
-"""Target pixels a side that evaluation and validation want of an image, without its margins."""
+"""The least side in target pixels, without margins, that evaluation and validation need."""
 NOISE = ("noise", "digitising")
-"""What an acquisition leaves out to be free of noise: that of the light and the detector, and that
-of rounding.
+"""Steps that are skipped for an acquisition without noise: that of the light and the detector, and
+rounding.
 """
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two acquisitions of one scene, (..., H, W) float32 holding whole digital numbers."""
+    """Two acquisitions of one scene, (..., H, W) float32 that hold integer digital numbers."""
 
     degraded: np.ndarray
     reference: np.ndarray
@@ -37,8 +37,8 @@ class Pair:
 
 @dataclass(frozen=True)
 class PreparedScene:
-    """A scene (H, W) in W/m2/sr/um on its way to several sensors: what they
-    share is computed once.
+    """A scene (H, W) in W/m2/sr/um, with the results that several sensors share, so that they are
+    computed once.
     """
 
     radiance: np.ndarray
@@ -51,9 +51,7 @@ class PreparedScene:
 
     @cached_property
     def spectrum(self) -> np.ndarray:
-        """Half spectrum (H, W // 2 + 1) of the scene, computed when the first
-        plan asks for a blur.
-        """
+        """Half spectrum (H, W // 2 + 1) of the scene, computed when it is first needed."""
         return scene_spectrum(self.radiance)
 
 
@@ -70,8 +68,18 @@ def simulate_planned(
     role: str = "degraded",
     margin_px: int = MARGIN_PX,
 ) -> np.ndarray:
-    """A scene with only the effects that its plan calls for: digital numbers (H / r - 2 margin, W /
-    r - 2 margin).
+    """Simulate a scene with only the effects that its plan applies.
+
+    Args:
+        scene: the prepared scene (H, W).
+        sensor: the instrument.
+        draw: seed and patch number of the random effects.
+        plan: the decision for each effect.
+        role: "degraded" or "reference"; keeps the two noises of a pair independent.
+        margin_px: target pixels cropped on each side.
+
+    Returns:
+        Digital numbers (H / r - 2 margin, W / r - 2 margin).
     """
     if "mtf" not in plan.skipped:
         instrument = without(sensor, plan.skipped)
@@ -95,7 +103,7 @@ def simulate_planned(
 
 
 def without(sensor: Instrument, skipped: Collection[str]) -> Instrument:
-    """The sensor without some of its effects."""
+    """Return the sensor without the effects in `skipped`."""
     return replace(sensor, effects={k: v for k, v in sensor.effects.items() if k not in skipped})
 
 
@@ -107,8 +115,18 @@ def simulate_pair(
     draw: Draw,
     margin_px: int = MARGIN_PX,
 ) -> Pair:
-    """A scene (..., H, W) in W/m2/sr/um twice, each (..., H / r - 2 margin, W / r - 2 margin) with
-    its own noise.
+    """Simulate two acquisitions of a scene (..., H, W) in W/m2/sr/um, each with its own noise.
+
+    Args:
+        radiance: the scene.
+        degraded: the sensor of the first image.
+        reference: the sensor of the second image.
+        oversampling: r, scene pixels per target pixel.
+        draw: seed and patch number of the random effects.
+        margin_px: target pixels cropped on each side.
+
+    Returns:
+        The pair, each (..., H / r - 2 margin, W / r - 2 margin).
     """
     radiance = crop_divisible(radiance, oversampling)
     spectrum = scene_spectrum(radiance)
@@ -130,8 +148,7 @@ def acquire(
     margin_px: int = MARGIN_PX,
     skip: Collection[str] = (),
 ) -> np.ndarray:
-    """Digital numbers (h, w) of one acquisition: blur and sampling, then what `detect` does on the
-    target grid.
+    """Simulate one acquisition: blur and sampling, then `detect` on the target grid.
 
     Args:
         spectrum: see `sampling.scene_spectrum`.
@@ -142,7 +159,10 @@ def acquire(
         role: "degraded" or "reference"; keeps the two noises of a pair independent.
         offset_px: sub-pixel phase of the sampling grid, in scene pixels.
         margin_px: target pixels cropped on each side.
-        skip: what to leave out of `detect`.
+        skip: effects to omit in `detect`.
+
+    Returns:
+        Digital numbers (h, w).
     """
     transfer = sensor_transfer(spectrum.shape[-2], width, oversampling, sensor)
     # The transform wraps around: without a margin the far border leaks into the near one.
@@ -153,8 +173,10 @@ def acquire(
 def acquire_three(
     scene: PreparedScene, degraded: Instrument, reference: Instrument, draw: Draw
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A pair of one scene, and the reference once more without noise and rounding: digital numbers
-    (h, w) each.
+    """Simulate a pair of one scene, and the reference once more without noise and rounding.
+
+    Returns:
+        Digital numbers (h, w) each.
     """
 
     def by(sensor: Instrument, role: str, skip: Collection[str] = ()) -> np.ndarray:
@@ -174,11 +196,11 @@ def acquire_three(
 def acquire_padded(
     radiance: np.ndarray, sensor: Instrument, oversampling: int, draw: Draw, role: str
 ) -> np.ndarray:
-    """Acquire a scene (H, W) whole, (ceil(H / r), ceil(W / r)): a mirror image lies where the
-    margin is cut off.
+    """Acquire a whole scene (H, W), (ceil(H / r), ceil(W / r)): the margin is a mirror image of the
+    scene.
 
-    Pixel n covers scene pixels r*n to r*n + r - 1: a place x of the scene, pixel i from i to i + 1,
-    lies at x / r.
+    Pixel n covers scene pixels r*n to r*n + r - 1. A position x of the scene, with pixel i from i
+    to i + 1, is mapped to x / r.
     """
     margin_px = MARGIN_PX * oversampling
     # The last target pixel may lack scene pixels: size % -oversampling is minus their number.
@@ -190,8 +212,12 @@ def acquire_padded(
 def fitting_oversampling(
     radiance: np.ndarray, oversamplings: Iterable[int], side_px: int
 ) -> int | None:
-    """The first oversampling that leaves `side_px` target pixels within the margin of a scene (H,
-    W), or None.
+    """Return the first oversampling that leaves `side_px` target pixels within the margin, or None.
+
+    Args:
+        radiance: the scene (H, W).
+        oversamplings: candidates, in order of preference.
+        side_px: the least side without margins.
     """
     target_px = side_px + 2 * MARGIN_PX
     return next(

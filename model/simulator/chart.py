@@ -1,9 +1,8 @@
-"""A drawn chart: squares of flat ground, faint bars, zone plates, soft texture, discs and points,
+"""Draw a chart of squares: flat ground, faint bars, zone plates, soft texture, discs and points,
 dark and bright.
 
-Photographs show faint and fine patterns rarely, and never without a camera's noise. What a network
-should do with them it learns from charts: to keep what the raw image shows, and to add nothing to
-what is flat.
+Photographs rarely show faint and fine patterns, and never without a camera's noise. Charts teach a
+network to preserve what the raw image shows of them, and to add nothing to flat areas.
 """
 
 import math
@@ -17,14 +16,16 @@ from beers_deploy.model.simulator.sampling import Scene
 
 SIDE_PX = 1080
 SQUARE_PX = 180
-"""Of a chart, and of each square: whole target pixels at every oversampling from 2 to 6."""
+"""Side of each square. It is a multiple of the target pixel at every oversampling from 2 to 6, as
+is the side of a chart.
+"""
 
 LEVELS = (3.0, 390.0)
 """Radiance of the ground in W/m2/sr/um, log-uniform."""
 PERIODS_PX = (3.0, 24.0)
-"""Of bars, in scene pixels, log-uniform."""
+"""Period of bars in scene pixels, log-uniform."""
 CONTRASTS = (0.01, 0.6)
-"""Of bars, plates and discs: half of the difference over the mean, log-uniform."""
+"""Contrast of bars, plates and discs: half of the difference over the mean, log-uniform."""
 POINTS = (50.0, 20_000.0)
 """Radiance of a point of one scene pixel, log-uniform."""
 
@@ -54,12 +55,12 @@ def chart(generator: np.random.Generator) -> NDArray[np.float32]:
 
 
 def flat(level: float, _generator: np.random.Generator) -> Pattern:
-    """One radiance everywhere."""
+    """Return a square with one radiance everywhere."""
     return np.full((SQUARE_PX, SQUARE_PX), level)
 
 
 def bars(level: float, generator: np.random.Generator) -> Pattern:
-    """Bars of any direction, between a sine and a square wave."""
+    """Draw bars of any direction, between a sine and a square wave."""
     y, x = _coordinates()
     angle = float(generator.uniform(0, math.pi))
     # Rows and columns are the commonest direction, and the hardest: they alias.
@@ -71,7 +72,7 @@ def bars(level: float, generator: np.random.Generator) -> Pattern:
 
 
 def zone_plate(level: float, generator: np.random.Generator) -> Pattern:
-    """Rings whose period falls from the middle outwards, to PERIODS_PX[0] at the most."""
+    """Draw rings whose period falls outwards, down to PERIODS_PX[0] at most."""
     y, x = _coordinates()
     # The local frequency of a r^2 is a r / pi.
     steepest = math.pi / (PERIODS_PX[0] * SQUARE_PX / math.sqrt(2))
@@ -79,13 +80,13 @@ def zone_plate(level: float, generator: np.random.Generator) -> Pattern:
 
 
 def soft_texture(level: float, generator: np.random.Generator) -> Pattern:
-    """Texture of fields, lawn and water: 1/f, of little contrast."""
+    """Draw 1/f texture of low contrast, as of fields, lawn and water."""
     pattern = np.log(texture(SQUARE_PX, SQUARE_PX, generator))
     return np.asarray(level * np.exp(pattern * float(generator.uniform(0.05, 1.0))), np.float64)
 
 
 def discs(level: float, generator: np.random.Generator) -> Pattern:
-    """Discs a little brighter or darker than the ground."""
+    """Draw discs that are a little brighter or darker than the ground."""
     y, x = _coordinates()
     pattern = np.full((SQUARE_PX, SQUARE_PX), level)
     for _ in range(12):
@@ -98,7 +99,7 @@ def discs(level: float, generator: np.random.Generator) -> Pattern:
 
 
 def points(level: float, generator: np.random.Generator) -> Pattern:
-    """Points of light on flat ground."""
+    """Draw points of light on flat ground."""
     pattern = np.full((SQUARE_PX, SQUARE_PX), level)
     for _ in range(30):
         row, column = generator.integers(SQUARE_PX, size=2)

@@ -1,9 +1,9 @@
-"""What the detectors and the electronics do to the sampled signal, on the target grid: the order
-stands here.
+"""Simulate detectors and electronics on the target grid; this module defines the order of the
+effects.
 
-Haze before the instrument, saturation and what spills over, fixed-pattern noise of a push-broom
-sensor, noise that grows with the light, dead and hot pixels, and the converter. Each random effect
-has a generator of its own, keyed by (seed, patch, effect).
+The effects are haze in front of the instrument, saturation and blooming, fixed-pattern noise of a
+push-broom sensor, signal-dependent noise, dead and hot pixels, and the converter. Each random
+effect has its own generator, keyed by (seed, patch, effect).
 """
 
 import zlib
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 Pixels = TypeVar("Pixels", np.ndarray, "Tensor")
-"""The traditional pipeline computes with tensors."""
+"""Arrays or tensors, because the traditional pipeline computes with tensors."""
 
 NOISE_LIMIT = 6.0
 """Draws are clipped here (two in a billion), so that the effect of noise has a bound."""
 
 
 def noise_sigma(radiance: np.ndarray, sensor: Instrument) -> np.ndarray:
-    """sigma(L) = sqrt(alpha L + beta), in W/m2/sr/um, for radiances of any shape (paper, section
-    3.3).
+    """Compute sigma(L) = sqrt(alpha L + beta), in W/m2/sr/um, for radiances of any shape (paper,
+    section 3.3).
 
-    Ringing can push L below zero, where there is no light to be noisy about: L counts as 0 there. A
-    negative variance (possible only for a sensor built by hand) counts as 0 too.
+    Ringing can make L negative, where there is no photon noise: L counts as 0 there. A negative
+    variance (possible only for a sensor built by hand) also counts as 0.
     """
     return np.asarray(np.sqrt(np.maximum(sensor.alpha * np.maximum(radiance, 0) + sensor.beta, 0)))
 
@@ -40,7 +40,7 @@ def noise_sigma(radiance: np.ndarray, sensor: Instrument) -> np.ndarray:
 def add_noise(
     radiance: np.ndarray, sensor: Instrument, generator: np.random.Generator
 ) -> np.ndarray:
-    """L + sigma(L) * n, n standard normal and independent per pixel; any shape."""
+    """Add noise: L + sigma(L) * n, with n standard normal and independent per pixel; any shape."""
     normal = generator.standard_normal(radiance.shape, dtype=np.float32)
     # The plan of effects needs a bound of the noise, and a normal number has none.
     np.clip(normal, -NOISE_LIMIT, NOISE_LIMIT, out=normal)
@@ -57,20 +57,23 @@ def digitise(dn: np.ndarray, sensor: Instrument) -> np.ndarray:
 
 
 def to_radiance(dn: Pixels, sensor: Instrument) -> Pixels:
-    """Radiance in W/m2/sr/um of digital numbers of any shape, the offset taken off."""
+    """Convert digital numbers of any shape to radiance in W/m2/sr/um, after
+    subtracting the offset.
+    """
     return (dn - sensor.offset_dn) / sensor.gain_dn_per_radiance
 
 
 def to_dn(radiance: Pixels, sensor: Instrument) -> Pixels:
-    """Digital numbers of radiances of any shape: `to_radiance` backwards, clipped to the range and
-    not rounded.
+    """Convert radiance of any shape to digital numbers, clipped to the range and not rounded.
+
+    It is the inverse of `to_radiance` within the range.
     """
     return (radiance * sensor.gain_dn_per_radiance + sensor.offset_dn).clip(0, sensor.max_dn)
 
 
 def to_uint16(dn: np.ndarray) -> np.ndarray:
-    """Whole digital numbers of at most 16 bits, of any shape, as the array that
-    a TIFF file takes.
+    """Round digital numbers of any shape to uint16, clipped to 16 bits, as stored in
+    a TIFF file.
     """
     # A cast without a clip would wrap values below 0 around to 65535.
     return np.asarray(np.rint(dn).clip(0, 65535), np.uint16)
@@ -78,14 +81,15 @@ def to_uint16(dn: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Draw:
-    """What names a patch's randomness: the run's seed and the patch's number."""
+    """The key of a patch's random numbers: the seed of the run and the number of the patch."""
 
     seed: int
     patch: int = 0
 
     def generator(self, effect: str) -> np.random.Generator:
-        """The generator of one effect of this patch; counter-based (Philox), the same on every
-        machine.
+        """Return the generator of one effect of this patch.
+
+        It is counter-based (Philox), so that it is the same on every machine.
         """
         # Python's own hash of a text differs from process to process, CRC-32 does not.
         entropy = (self.seed, self.patch, zlib.crc32(effect.encode()))
@@ -95,16 +99,18 @@ class Draw:
 def detect(
     signal: np.ndarray, sensor: Instrument, draw: Draw, role: str, skip: Collection[str] = ()
 ) -> np.ndarray:
-    """Digital numbers of a blurred, sampled signal (..., H, W) in W/m2/sr/um: whole ones, unless
-    told otherwise.
+    """Compute the digital numbers of a blurred, sampled signal (..., H, W) in W/m2/sr/um.
 
     Args:
         signal: radiance on the target grid.
-        sensor: the instrument; it has an effect by having its table.
-        draw: seed and patch number; each effect takes its own generator from it.
+        sensor: the instrument; it has an effect if it has its table.
+        draw: seed and patch number; each effect derives its own generator from it.
         role: "degraded" or "reference", so that the two draws of a pair differ.
-        skip: effects to leave out, see `plan.Plan.skipped`; without "digitising" they are clipped
-            and not rounded.
+        skip: effects to omit, see `plan.Plan.skipped`; without "digitising" digital numbers are
+            clipped and not rounded.
+
+    Returns:
+        Digital numbers, which are integers unless "digitising" is skipped.
     """
     effects = {name: effect for name, effect in sensor.effects.items() if name not in skip}
 

@@ -1,5 +1,5 @@
-"""The modulation transfer function: how much contrast an instrument keeps at each spatial
-frequency.
+"""Compute the modulation transfer function: the contrast that an instrument transfers at each
+spatial frequency.
 """
 
 import math
@@ -36,27 +36,27 @@ def gamma_from_mtf(mtf_nyquist: float, antialias_sigma_px: float = 0.0) -> float
 
 
 Blur = float | tuple[float, float] | Response
-"""What settles an MTF: its contrast at Nyquist, one for both axes or (across the track, along it),
-that is horizontal and vertical; or the whole of it, by a table or a point-spread function.
+"""The parameters of an MTF: its contrast at Nyquist, one for both axes or (across the track, along
+it), that is horizontal and vertical; or a complete table or point-spread function.
 """
 
 
 def mtf(
     fx: ArrayLike, fy: ArrayLike, blur: Blur, antialias_sigma_px: float = 0.0
 ) -> NDArray[np.inexact]:
-    """MTF(fx, fy) = exp(-gamma * sqrt(fx^2 + fy^2)) * sinc(fx) * sinc(fy) * G(fx, fy) (paper,
-    section 3.3).
+    """Compute MTF(fx, fy) = exp(-gamma * sqrt(fx^2 + fy^2)) * sinc(fx) * sinc(fy) * G(fx, fy)
+    (paper, section 3.3).
 
     With a second MTF, along the track, gamma * sqrt(fx^2 + fy^2) becomes sqrt((gamma_x fx)^2 +
-    (gamma_y fy)^2): each axis keeps the contrast stated for it, and equal ones give the paper's
-    formula to the last bit. A table or a point-spread function gives its own: see
+    (gamma_y fy)^2). Each axis then has its stated contrast, and equal contrasts give the paper's
+    formula to the last bit. A table or a point-spread function is evaluated directly: see
     `profiles.response`.
 
     Args:
         fx: horizontal frequencies (1, W) in cycles per TARGET pixel, float64; for the formula any
             shape that broadcasts against fy.
-        fy: vertical frequencies (H, 1), likewise. Beyond 1 the sinc is negative, and stays so.
-        blur: contrast kept at 0.5 cycles per pixel, the anti-alias filter G included; or the whole
+        fy: vertical frequencies (H, 1), likewise. Beyond 1 the sinc is negative, and remains so.
+        blur: contrast at 0.5 cycles per pixel, the anti-alias filter G included; or the complete
             response.
         antialias_sigma_px: standard deviation of that filter in target pixels; 0 is none (G = 1).
 
@@ -89,22 +89,26 @@ def mtf(
 
 
 def gaussian_response(frequency: ArrayLike, sigma_px: float) -> NDArray[np.float64]:
-    """exp(-2 pi^2 sigma^2 f^2), the transform of a Gaussian filter, at frequencies of any shape; 1
-    for sigma 0.
+    """Compute exp(-2 pi^2 sigma^2 f^2), the transform of a Gaussian filter, at frequencies of any
+    shape.
+
+    It is 1 for sigma 0.
     """
     return np.asarray(np.exp(-2 * (math.pi * sigma_px * np.asarray(frequency, np.float64)) ** 2))
 
 
 def smear_response(fy: ArrayLike, length_px: float) -> NDArray[np.float64]:
-    """sinc(length * fy), for fy of any shape: uniform motion along the track during an exposure; 1
-    for length 0.
+    """Compute sinc(length * fy) for fy of any shape: uniform motion along the track during an
+    exposure.
+
+    It is 1 for length 0.
     """
     return np.asarray(np.sinc(length_px * np.asarray(fy, np.float64)))
 
 
 def sensor_mtf(fx: ArrayLike, fy: ArrayLike, sensor: Instrument) -> NDArray[np.inexact]:
-    """What a sensor's blur and smear leave of each frequency, fx (1, W) and fy (H, 1) as in `mtf`:
-    (H, W).
+    """Compute the MTF of a sensor's blur and smear at fx (1, W) and fy (H, 1), as in
+    `mtf`: (H, W).
     """
     response = mtf(fx, fy, sensor.blur, sensor.antialias_px)
     return response * smear_response(fy, sensor.smear_px) if sensor.smear_px else response
@@ -113,8 +117,8 @@ def sensor_mtf(fx: ArrayLike, fy: ArrayLike, sensor: Instrument) -> NDArray[np.i
 def sensor_transfer(
     height: int, width: int, oversampling: int, sensor: Instrument
 ) -> NDArray[np.inexact]:
-    """All the linear, shift-invariant effects of a sensor as one transfer
-    function (H, W // 2 + 1).
+    """Compute the transfer function (H, W // 2 + 1) of all linear, shift-invariant effects of a
+    sensor.
     """
     return transfer_function(
         height, width, oversampling, sensor.blur, sensor.antialias_px, sensor.smear_px
@@ -130,11 +134,11 @@ def transfer_function(
     antialias_sigma_px: float = 0.0,
     smear_px: float = 0.0,
 ) -> NDArray[np.inexact]:
-    """MTF and smear on the half spectrum of a scene: (H, W // 2 + 1) float32, ready to multiply an
-    rfft2.
+    """Compute MTF and smear on the half spectrum of a scene: (H, W // 2 + 1) float32, to multiply
+    an rfft2.
 
-    `height` and `width` are in scene pixels, `oversampling` of which make one target pixel.
-    Complex64 for a point-spread function, which may be lopsided or lie aslant.
+    `height` and `width` are in scene pixels, and `oversampling` scene pixels make one target pixel.
+    It is complex64 for a point-spread function, which may be asymmetric or inclined.
     """
     aslant = isinstance(blur, PointSpread)
     # Only a transfer that is even in fy can be computed from half of the rows.

@@ -1,12 +1,12 @@
-"""Which effects a scene calls for: decided, proven and explained before a pixel is made.
+"""Decide which effects a scene needs, with a proof and a reason, before any pixel is computed.
 
 Each effect is applied, or skipped because
 
-1. not called for: neither sensor nor scene has its table, or it is left out;
-2. neutral: its parameters change nothing;
-3. this scene cannot show it: a bound proves that no pixel changes by more than the tolerance.
+1. not called for: neither sensor nor scene has its table, or it is excluded; 2. neutral: its
+parameters change nothing; 3. cannot show: a bound proves that no pixel of this scene changes by
+more than the tolerance.
 
-What is skipped for the third reason stays within the tolerance all together: bounds are added up,
+All effects skipped for the third reason together stay within the tolerance: their bounds are added,
 the smallest first.
 """
 
@@ -26,7 +26,7 @@ from beers_deploy.profiles.instrument import Instrument, mtf_limit
 
 @dataclass(frozen=True)
 class SceneStats:
-    """What a scene can show, radiances in W/m2/sr/um on the scene's own grid."""
+    """Statistics of a scene; radiances are in W/m2/sr/um on the scene's own grid."""
 
     low: float
     high: float
@@ -38,7 +38,7 @@ class SceneStats:
 
 
 def scene_stats(radiance: np.ndarray, oversampling: int) -> SceneStats:
-    """Statistics of a scene's radiance (H, W), in one pass over it."""
+    """Compute the statistics of a scene's radiance (H, W) in one pass over it."""
     low = float(radiance.min())
     high = float(radiance.max())
     step = max(
@@ -50,12 +50,13 @@ def scene_stats(radiance: np.ndarray, oversampling: int) -> SceneStats:
 
 
 def ringing_of(sensor: Instrument, stats: SceneStats) -> float:
-    """Sum of the absolute values of the blur's kernel on the scene's grid: 1 without ringing.
+    """Compute the sum of the absolute values of the blur's kernel on the scene's grid: 1 without
+    ringing.
 
-    A blurrier sensor is a sharper one followed by a positive kernel of sum 1, which cannot enlarge
-    the sum: so the MTF is rounded up to the next whole percent, and sensors share what was computed
-    once. Of two axes rounded each by itself that would not hold, nor of a table or a point-spread
-    function: they are taken as they are.
+    A blurrier sensor is a sharper one followed by a positive kernel of sum 1, which cannot increase
+    the sum. The MTF is therefore rounded up to the next integer percent, so that sensors share
+    results. That does not hold for two axes rounded separately, nor for a table or a point-spread
+    function, which are used unrounded.
     """
     across, along = sensor.mtf_axes
     blur: Blur = sensor.blur
@@ -72,8 +73,10 @@ def _kernel_sum(height: int, width: int, oversampling: int, blur: Blur, sigma_px
 
 @lru_cache(maxsize=256)
 def smear_moments(height: int, oversampling: int, length_px: float) -> tuple[float, float]:
-    """Of the smear's kernel less a unit pulse: half its absolute sum, and its absolute first moment
-    in pixels.
+    """Compute two moments of the smear's kernel minus a unit pulse.
+
+    Returns:
+        Half of its absolute sum, and its absolute first moment in pixels.
     """
     fy = np.fft.fftfreq(height, 1 / oversampling)
     kernel = np.fft.ifft(smear_response(fy, length_px)).real
@@ -83,10 +86,19 @@ def smear_moments(height: int, oversampling: int, length_px: float) -> tuple[flo
 
 
 def behind(name: str, change_dn: float, sensor: Instrument) -> float:
-    """What a change of the signal by the effect `name` may become through those that come after it.
+    """Bound how much a change of the signal by the effect `name` may grow through the later
+    effects.
 
-    Spilling adds its share, PRNU its largest gain, and noise changes with the signal under it:
-    |sqrt(a) - sqrt(b)| <= min(sqrt|a - b|, |a - b| / (2 sqrt(beta))).
+    Blooming adds its share, PRNU its largest gain, and noise changes with the signal: |sqrt(a) -
+    sqrt(b)| <= min(sqrt|a - b|, |a - b| / (2 sqrt(beta))).
+
+    Args:
+        name: of the effect.
+        change_dn: the largest change by the effect itself.
+        sensor: the instrument.
+
+    Returns:
+        The bound in DN.
     """
     gain = sensor.gain_dn_per_radiance
     change = change_dn
@@ -102,7 +114,9 @@ def behind(name: str, change_dn: float, sensor: Instrument) -> float:
 
 
 TOLERANCE_DN = 0.25
-"""Before digitising; a quarter of a digital number is below the converter's own rounding."""
+"""The tolerance before digitising: a quarter of a digital number is below the converter's own
+rounding.
+"""
 
 Choice = Literal["applied", "not called for", "neutral", "cannot show"]
 
@@ -110,7 +124,7 @@ PIXEL_EFFECTS = {name: kind for name, kind in TABLES.items() if issubclass(kind,
 
 
 def costs(acts_on: str) -> dict[str, str]:
-    """Of the effects on radiance, or on DN."""
+    """Return the cost of each effect on radiance, or on DN."""
     return {name: kind.cost for name, kind in PIXEL_EFFECTS.items() if kind.acts_on == acts_on}
 
 
@@ -124,17 +138,17 @@ COSTS = {
     "digitising": "1 pass",
 }
 ORDER = tuple(COSTS)
-"""That of the light."""
+"""The effects in the order in which the light meets them."""
 
 UNSEEN = {"mtf": "the scene is constant"} | {
     name: kind.unseen for name, kind in PIXEL_EFFECTS.items()
 }
-"""Why an effect whose bound is zero cannot show, where that is the scene's doing."""
+"""The reason why an effect cannot show if its bound is zero because of the scene."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What becomes of one effect, and why."""
+    """The decision about one effect, and its reason."""
 
     effect: str
     choice: Choice
@@ -153,20 +167,26 @@ class Plan:
 
     @property
     def skipped(self) -> frozenset[str]:
-        """The effects that are left out."""
+        """The effects that are not applied."""
         return frozenset(d.effect for d in self.decisions if d.choice != "applied")
 
     def to_json(self) -> dict[str, object]:
-        """The plan as a dataset's manifest keeps it."""
+        """Return the plan as a dataset's manifest stores it."""
         return {"tolerance_dn": self.tolerance_dn, "decisions": [asdict(d) for d in self.decisions]}
 
 
 def make_plan(sensor: Instrument, stats: SceneStats, tolerance_dn: float = TOLERANCE_DN) -> Plan:
-    """Decide for every effect of a sensor on a scene of these statistics."""
+    """Decide about every effect of a sensor for a scene with these statistics.
+
+    Args:
+        sensor: the instrument.
+        stats: of the scene.
+        tolerance_dn: the largest change by all effects that are skipped as negligible.
+    """
     bounds = effect_bounds(sensor, stats)
     spent = 0.0
     negligible = set()
-    # Smallest first: as many effects as the tolerance can pay for are left out.
+    # Smallest first, so that as many effects as the tolerance allows are skipped.
     for name, change in sorted(bounds.items(), key=lambda item: item[1]):
         if change > 0 and spent + change <= tolerance_dn:
             spent += change
@@ -181,8 +201,8 @@ def make_plan(sensor: Instrument, stats: SceneStats, tolerance_dn: float = TOLER
 
 
 def effect_bounds(sensor: Instrument, stats: SceneStats) -> dict[str, float]:
-    """Largest change of any pixel by each effect that can be left out, in DN, through all that
-    comes after it.
+    """Bound the change of any pixel by each effect that can be skipped, in DN, including later
+    effects.
     """
     gain = sensor.gain_dn_per_radiance
     ringing = ringing_of(sensor, stats)
@@ -235,7 +255,7 @@ def _decide(
     negligible: set[str],
     tolerance_dn: float,
 ) -> tuple[Choice, str, float | None]:
-    """What becomes of an effect, why, and its bound."""
+    """Return the decision about an effect, its reason, and its bound."""
     if name in ("sampling", "digitising"):
         return "applied", "every sensor has it", None
     if name in TABLES and name not in sensor.effects:

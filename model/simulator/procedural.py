@@ -1,11 +1,11 @@
-"""A drawn scene: fields, forest, streets, houses, cars and a resolution pattern, as radiance in
+"""Draw a scene: fields, forest, streets, houses, cars and a resolution pattern, as radiance in
 W/m2/sr/um.
 
 It is the built-in input, so that everything runs without a single image file. Radiances are those
 of a clear day: asphalt 30, grass 45, roofs 60 to 160, concrete 120, white paint 260.
 
-Pillow draws it. scikit-image has no lines of a width and fills other pixels at the borders of
-shapes (701 of the 118 000 of a parcel, measured): every simulated pair would have other bytes.
+Pillow draws it. scikit-image has no lines with a width and fills other pixels at the borders of
+shapes (701 of the 118 000 of a parcel, measured), so every simulated pair would have other bytes.
 """
 
 import math
@@ -22,10 +22,10 @@ from beers_deploy.profiles.instrument import Instrument
 
 SCENES = 3
 SCENE_SIDE_PX = 2400
-"""Drawn where no folder of images is given."""
+"""Side of the scenes that are drawn if no folder of images is given."""
 
 Point = tuple[float, float]
-"""(x, y) in the canvas's pixels."""
+"""(x, y) in pixels of the canvas."""
 
 SHADOW = 12.0
 ASPHALT = 30.0
@@ -37,7 +37,7 @@ WATER = 16.0
 
 
 def procedural_scene(height_px: int, width_px: int, generator: np.random.Generator) -> Scene:
-    """Draw a scene of that many pixels, a 10 cm world: a car is some 40 pixels long."""
+    """Draw a scene of this size, with pixels of 10 cm: a car is some 40 pixels long."""
     canvas = Image.new("F", (width_px, height_px), GRASS)
     draw = ImageDraw.Draw(canvas)
     _fields(draw, canvas.size, generator)
@@ -54,7 +54,7 @@ def procedural_scene(height_px: int, width_px: int, generator: np.random.Generat
 def _fields(
     draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.random.Generator
 ) -> None:
-    """A patchwork of parcels, each with crop rows of its own direction."""
+    """Draw a patchwork of parcels, each with crop rows of its own direction."""
     width, height = size
     step = 700
     for top in range(-step, height + step, step):
@@ -69,7 +69,7 @@ def _fields(
 def _rows(
     draw: ImageDraw.ImageDraw, parcel: list[Point], base: float, generator: np.random.Generator
 ) -> None:
-    """Crop rows 6 to 14 pixels apart, between two opposite sides of the parcel."""
+    """Draw crop rows 6 to 14 pixels apart, between two opposite sides of the parcel."""
     (ax, ay), (bx, by), (cx, cy), (dx, dy) = parcel
     count = int(700 / generator.uniform(6, 14))
     contrast = generator.uniform(0.85, 1.2)
@@ -83,9 +83,7 @@ def _rows(
 def _forest(
     draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.random.Generator
 ) -> None:
-    """Tree crowns: a shadow, a dark disc and a sunlit side, over the left third
-    of the lower half.
-    """
+    """Draw tree crowns, each a shadow, a dark disc and a sunlit side, over the lower left."""
     width, height = size
     for _ in range(int(width * height / 2600)):
         x = generator.uniform(0, width * 0.42)
@@ -98,7 +96,7 @@ def _forest(
 def _river(
     draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.random.Generator
 ) -> None:
-    """A winding river along the left edge, with pale banks."""
+    """Draw a winding river along the left edge, with pale banks."""
     width, height = size
     phase = generator.uniform(0, math.tau)
     middle = [
@@ -111,7 +109,7 @@ def _river(
 
 
 def _town(draw: ImageDraw.ImageDraw, size: tuple[int, int], generator: np.random.Generator) -> None:
-    """Blocks of houses along turned streets, over the right part."""
+    """Draw blocks of houses along rotated streets, over the right part."""
     width, height = size
     angle = float(generator.uniform(-0.25, 0.25))
     place = turn(width * 0.72, height * 0.55, angle)
@@ -163,7 +161,7 @@ def _house(
     v: float,
     generator: np.random.Generator,
 ) -> None:
-    """A gable roof, one slope in the sun, its shadow, a chimney and a tree in the yard."""
+    """Draw a gable roof with one slope in the sun, its shadow, a chimney and sometimes a tree."""
     length = generator.uniform(90, 130)
     width = generator.uniform(64, 92)
     sunlit = float(generator.uniform(60, 160))
@@ -190,8 +188,8 @@ def _house(
 
 
 def _pattern(draw: ImageDraw.ImageDraw, size: tuple[int, int]) -> None:
-    """A calibration site at the top: a slanted edge, a Siemens star and bar groups on a concrete
-    pad.
+    """Draw a calibration site at the top: a slanted edge, a Siemens star and bar groups on
+    concrete.
     """
     side = min(size) * 0.22
     left = size[0] * 0.36
@@ -220,7 +218,9 @@ def _star(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, sectors:
 
 
 def texture(height_px: int, width_px: int, generator: np.random.Generator) -> np.ndarray:
-    """Multiplicative 1/f texture around 1, some 12 % rms: nothing on the ground is flat."""
+    """Draw multiplicative 1/f texture around 1, some 12 % rms, because nothing on the ground is
+    flat.
+    """
     white = generator.standard_normal((height_px, width_px), dtype=np.float32)
     fy = np.fft.fftfreq(height_px)[:, None]
     fx = np.fft.rfftfreq(width_px)[None, :]
@@ -234,7 +234,7 @@ def texture(height_px: int, width_px: int, generator: np.random.Generator) -> np
 def tree(
     draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, generator: np.random.Generator
 ) -> None:
-    """A shadow, a dark crown around (x, y) with sunlit and darker leaves."""
+    """Draw a shadow and a dark crown around (x, y) with sunlit and darker leaves."""
     draw.ellipse(around(x + 0.6 * radius, y + 0.6 * radius, radius), fill=SHADOW)
     draw.ellipse(around(x, y, radius), fill=float(generator.uniform(24, 34)))
     draw.ellipse(
@@ -247,13 +247,13 @@ def tree(
 
 
 def box(corner: Point, width: float, height: float, angle: float) -> list[Point]:
-    """A rectangle turned about its corner."""
+    """Return the corners of a rectangle rotated about its first corner."""
     place = turn(*corner, angle)
     return [place(0, 0), place(width, 0), place(width, height), place(0, height)]
 
 
 def rectangle(half_long: float, half_wide: float) -> list[Point]:
-    """A rectangle around (0, 0)."""
+    """Return the corners of a rectangle around (0, 0)."""
     return [
         (-half_long, -half_wide),
         (half_long, -half_wide),
@@ -263,33 +263,32 @@ def rectangle(half_long: float, half_wide: float) -> list[Point]:
 
 
 def turn(x: float, y: float, angle: float) -> Callable[[float, float], Point]:
-    """From a turned frame centred at (x, y) to the canvas."""
+    """Return a function that maps a rotated frame centred at (x, y) to the canvas."""
     cosine = math.cos(angle)
     sine = math.sin(angle)
     return lambda u, v: (x + cosine * u - sine * v, y + sine * u + cosine * v)
 
 
 def shift(point: Point, by: float) -> Point:
-    """A point moved right and down: where the shadow of something of that height falls."""
+    """Move a point right and down, to where the shadow of an object of that height falls."""
     return (point[0] + by, point[1] + by)
 
 
 def around(x: float, y: float, radius: float) -> tuple[float, float, float, float]:
-    """The square (left, top, right, bottom) around a circle."""
+    """Return the square (left, top, right, bottom) around a circle."""
     return (x - radius, y - radius, x + radius, y + radius)
 
 
 def load_scenes(
     folder: Path | None, sensor: Instrument, seed: int, most: int = SCENES
 ) -> list[Scene]:
-    """The scenes of a folder of images, or drawn ones, other for every seed and no more than are of
-    use.
+    """Load the scenes of a folder of images, or draw scenes if there is no folder.
 
     Args:
-        folder: of images; None draws scenes.
+        folder: of images; None draws scenes, different ones for every seed.
         sensor: whose full scale is white in a photograph.
         seed: of drawn scenes.
-        most: of these that can be of use.
+        most: the maximum number of drawn scenes.
     """
     if folder is not None:
         return [read_scene(path, sensor) for path in list_images(folder)]
@@ -297,6 +296,6 @@ def load_scenes(
 
 
 def draw_scenes(count: int, seed: int) -> list[Scene]:
-    """Drawn scenes, each with its own generator."""
+    """Draw `count` scenes, each with its own generator."""
     generators = np.random.default_rng(seed).spawn(count)
     return [procedural_scene(SCENE_SIDE_PX, SCENE_SIDE_PX, g) for g in generators]

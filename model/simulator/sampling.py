@@ -1,7 +1,7 @@
-"""From a scene to the sensor's grid: radiance in W/m2/sr/um, read from an image file, blurred and
-sampled.
+"""Read a scene from an image file as radiance in W/m2/sr/um, blur it and sample it onto the
+sensor's grid.
 
-Every r-th point of the blurred scene is taken, centred, without a shift.
+Every r-th point of the blurred scene is sampled, centred, without a shift.
 """
 
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ from beers_deploy.profiles.instrument import Instrument
 
 
 def scene_spectrum(radiance: np.ndarray) -> np.ndarray:
-    """Half spectrum (..., H, W // 2 + 1) of a scene (..., H, W), to be sampled through any number
-    of sensors.
+    """Compute the half spectrum (..., H, W // 2 + 1) of a scene (..., H, W), for any number of
+    sensors.
     """
     return np.asarray(fft.rfft2(radiance))
 
@@ -72,15 +72,15 @@ def crop_divisible(radiance: np.ndarray, oversampling: int) -> np.ndarray:
 
 
 def resample(radiance: np.ndarray, height: int, width: int) -> np.ndarray:
-    """A scene (H, W) on another grid over the same ground, band-limited: for ratios that are no
-    whole number.
+    """Resample a scene (H, W) onto another grid over the same ground, band-limited, for non-integer
+    ratios.
 
-    Frequencies that the new grid cannot hold are cut, others kept as they are; new ones are zero.
-    Pixel n of the new grid lies at (n + 1/2) H / height - 1/2 of the old: the ground does not
-    shift. The borders wrap.
+    Frequencies beyond the new grid are cut, and the others are unchanged. Frequencies that only the
+    new grid has are zero. Pixel n of the new grid lies at (n + 1/2) H / height - 1/2 of the old, so
+    that the ground does not shift. The borders wrap.
 
-    Not scikit-image's `resize`: its splines blur and alias, on a photograph by 26 of 255 and more
-    (measured).
+    scikit-image's `resize` is not used, because its splines blur and alias, on a photograph by 26
+    of 255 and more (measured).
     """
     old_height, old_width = radiance.shape[-2:]
     fy = np.fft.fftfreq(old_height)
@@ -109,7 +109,7 @@ def _ramp(frequency: np.ndarray, shift_px: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Scene:
-    """Radiance (H, W) float32 in W/m2/sr/um, and the name it goes by."""
+    """The radiance (H, W) float32 of a scene in W/m2/sr/um, and its name."""
 
     name: str
     radiance: np.ndarray
@@ -118,16 +118,16 @@ class Scene:
 def read_scene(path: Path, sensor: Instrument) -> Scene:
     """Read a scene from an image file.
 
-    1. 8-bit RGB or mono: sRGB, linearised, the bands averaged (a panchromatic band weighs the
-      visible evenly: an assumption); white stands for the sensor's full scale.
-    2. 16-bit mono TIFF or PNG: digital numbers, made radiance by the sensor's gain.
-    3. float mono TIFF: radiance in W/m2/sr/um as it stands.
+    1. 8-bit RGB or mono: sRGB, linearised, the bands averaged (it is assumed that a panchromatic
+       band weights the visible evenly); white corresponds to the sensor's full scale.
+    2. 16-bit mono TIFF or PNG: digital numbers, converted to radiance by the sensor's gain.
+    3. float mono TIFF: radiance in W/m2/sr/um.
     """
     return scene_of(path.name, read_pixels(path), sensor)
 
 
 def scene_of(name: str, pixels: np.ndarray, sensor: Instrument) -> Scene:
-    """As `read_scene`, of the pixels of an image."""
+    """Convert the pixels of an image to a scene, as `read_scene` does for a file."""
     radiance: np.ndarray
     if pixels.dtype == np.uint8:
         radiance = _linear(pixels) * (sensor.max_dn / sensor.gain_dn_per_radiance)
@@ -144,10 +144,11 @@ def scene_of(name: str, pixels: np.ndarray, sensor: Instrument) -> Scene:
 
 
 def _linear(pixels: np.ndarray) -> np.ndarray:
-    """8-bit sRGB, (H, W) or (H, W, bands), to linear light (H, W) in [0, 1], the bands averaged
-    (IEC 61966-2-1).
+    """Convert 8-bit sRGB, (H, W) or (H, W, bands), to linear light (H, W) in [0, 1] (IEC
+    61966-2-1).
 
-    scikit-image linearises only on the way to XYZ, which weighs the bands as an eye does.
+    The bands are averaged. scikit-image linearises only in its conversion to XYZ, which weights the
+    bands as an eye does.
     """
     code = np.arange(256) / 255
     table = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(

@@ -1,8 +1,7 @@
-"""MTF compensation: from the contrast that one sensor keeps to the contrast that another would have
-kept.
+"""Compensate the MTF: convert the contrast of one sensor to that of another.
 
-A finite filter: each pixel depends on those within RADIUS_PX and on no other, so that strips,
-missing pixels and borders reach no further.
+The filter is finite. Each pixel depends on those within RADIUS_PX only, so strips, missing pixels
+and borders have no effect beyond that distance.
 """
 
 from collections.abc import Iterable, Iterator
@@ -31,12 +30,14 @@ BLOCK_PX = 384
 
 
 def filter_strips(strips: Iterable[Tensor], height: int, kernel: Tensor) -> Iterator[Tensor]:
-    """Filter an image (H, W) that comes in strips (any, W), by a kernel (K, K); it goes in strips
-    of BLOCK_PX rows.
+    """Filter an image (H, W) that arrives in strips (any, W) with a kernel (K, K).
 
-    Unit and mean are kept, and borders mirrored. Blocks lie on a grid of their own, so the strips
-    that came change no bit. NaN pixels are filled from their neighbours first, and NaN again in the
-    end.
+    Unit and mean are preserved, and borders are mirrored. Blocks lie on a grid of their own, so
+    that the result does not depend on the input strips, bit for bit. NaN pixels are filled from
+    their neighbours first, and are NaN again in the result.
+
+    Yields:
+        Strips of BLOCK_PX rows.
     """
     # The grid of blocks is fixed from row 0: the result may not depend on how the strips were cut.
     rows = Rows(strips)
@@ -49,11 +50,10 @@ def filter_strips(strips: Iterable[Tensor], height: int, kernel: Tensor) -> Iter
 
 
 def _block(rows: Tensor, kernel: Tensor, left: int) -> Tensor:
-    """The filtered pixels of columns left..left + BLOCK_PX - 1, `radius` rows fewer above and
-    below.
+    """Filter columns left..left + BLOCK_PX - 1; the result has `radius` rows fewer above and below.
 
-    On one thread: with several inside, a transform adds in another order, and other last bits come
-    out.
+    It runs on one thread, because with several threads a transform adds in another order, which
+    changes the last bits.
     """
     radius = kernel.shape[0] // 2
     width = rows.shape[1]
@@ -73,10 +73,15 @@ def _block(rows: Tensor, kernel: Tensor, left: int) -> Tensor:
 
 
 def compensation_kernel(blur_from: Blur, blur_to: Blur, epsilon: float) -> Tensor:
-    """The filter whose gain is `compensation_gain`, cut at RADIUS_PX: (2 R + 1, 2 R + 1) float64,
-    of sum 1.
+    """Compute the filter with the gain `compensation_gain`, cut at RADIUS_PX: (2 R + 1, 2 R + 1)
+    float64, sum 1.
 
-    The gain is exact at DC, and away from it by more than some cycles per 2 R pixels.
+    The gain is exact at DC and at frequencies above some cycles per 2 R pixels.
+
+    Args:
+        blur_from: blur of the image, as in `compensation_gain`.
+        blur_to: the blur to reach, likewise.
+        epsilon: regularisation, 0 or more.
     """
     # Sampled this finely, the slow tail folds back onto the filter little.
     side = 8 * RADIUS_PX
@@ -87,18 +92,20 @@ def compensation_kernel(blur_from: Blur, blur_to: Blur, epsilon: float) -> Tenso
 def compensation_gain(
     height: int, width: int, blur_from: Blur, blur_to: Blur, epsilon: float
 ) -> NDArray[np.inexact]:
-    """G = T H* / (|H|^2 + epsilon r^2) on the half spectrum, (height, width // 2 + 1) float64.
+    """Compute G = T H* / (|H|^2 + epsilon r^2) on the half spectrum, (height, width // 2 + 1)
+    float64.
 
-    Complex128 where H or T is that of a point-spread function, H* its conjugate. H is the MTF to
-    undo, T the one to reach, r = |f| / f_Nyquist. Limits: epsilon = 0 gives T / H, with up to 20
-    times the noise at the corner of the spectrum for 3 to 25 %; a large epsilon blurs.
+    It is complex128 if H or T is that of a point-spread function; H* is the conjugate of H. H is
+    the MTF to compensate, T the one to reach, r = |f| / f_Nyquist. Limits: epsilon = 0 gives T / H,
+    with up to 20 times the noise at the corner of the spectrum for 3 to 25 %; a large epsilon
+    blurs.
 
     Args:
         height: rows of the image.
         width: columns of the image.
         blur_from: MTF at Nyquist of the image, in (0, 2 / pi], one, or across and along the track;
             or its response.
-        blur_to: what to reach, likewise.
+        blur_to: the MTF to reach, likewise.
         epsilon: regularisation, 0 or more.
     """
     if not 0 <= epsilon < float("inf"):

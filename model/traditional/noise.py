@@ -1,4 +1,4 @@
-"""The noise that NL-Bayes removes: white, or coloured by a filter that came before."""
+"""Model the noise that NL-Bayes removes: white, or coloured by a previous filter."""
 
 import math
 from dataclasses import dataclass, replace
@@ -9,24 +9,25 @@ from torch import Tensor
 from beers_deploy.profiles.instrument import Instrument
 
 LAG_PX = 6
-"""The largest between two pixels of a patch, whose side is 7 at most."""
+"""The largest lag between two pixels of a patch, whose side is 7 at most."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Stationary Gaussian noise on an image: a pixel's standard deviation, and the correlation of
-    two; None if white.
+    """Stationary Gaussian noise of an image: the standard deviation of a pixel, and the correlation
+    of two pixels (None if white).
 
-    The latter by their lag (dy + L, dx + L), (2 L + 1, 2 L + 1), L at least a patch's side less
-    one.
+    The correlation is indexed by the lag (dy + L, dx + L), (2 L + 1, 2 L + 1), with L at least a
+    patch's side minus one.
     """
 
     sigma: float
     correlation: Tensor | None = None
 
     def covariance(self, side_px: int) -> Tensor:
-        """Covariance of the pixels of a patch of side k: (k * k, k * k) float64, in the image's
-        unit squared.
+        """Return the covariance of the pixels of a patch of side k, (k * k, k * k) float64.
+
+        It is in the unit of the image squared.
         """
         if self.correlation is None:
             return torch.eye(side_px**2, dtype=torch.float64) * self.sigma**2
@@ -39,11 +40,11 @@ class Noise:
 
 
 def coloured_by(kernel: Tensor, sigma: float) -> Noise:
-    """Noise that filtering by `kernel` (K, K), K odd, makes of white noise of standard deviation
-    `sigma`.
+    """Return the noise that filtering white noise of standard deviation `sigma` by `kernel` (K, K)
+    gives; K is odd.
 
-    The autocorrelation of the kernel: r(d) = sum over p of k(p) k(p + d), sigma times the root of
-    r(0).
+    Its correlation is the autocorrelation of the kernel, r(d) = sum over p of k(p) k(p + d), over
+    r(0). Its standard deviation is sigma times the root of r(0).
     """
     # So large that no lag wraps around.
     size = kernel.shape[-1] + 2 * LAG_PX
@@ -60,13 +61,13 @@ def with_rounding_noise(sensor: Instrument) -> Instrument:
 
 
 def stabilise(radiance: Tensor, sensor: Instrument) -> Tensor:
-    """f(L) = 2 L / (sqrt(alpha L + beta) + sqrt(beta)), which is 2 (sqrt(alpha L + beta) -
-    sqrt(beta)) / alpha.
+    """Compute f(L) = 2 L / (sqrt(alpha L + beta) + sqrt(beta)), which equals 2 (sqrt(alpha L +
+    beta) - sqrt(beta)) / alpha.
 
-    Written without the difference, that vanishes in float32 for small alpha. f is monotone, with f'
-    = 1 / sigma(L). Limits: alpha = 0 gives L / sqrt(beta); beta = 0 gives 2 sqrt(L / alpha); below
-    L = 0 the noise is that of the dark, and f goes on as L / sqrt(beta) (as 0 where beta = 0). L
-    has any shape and is in W/m2/sr/um; alpha and beta are at least 0 and not both 0.
+    The first form avoids the difference, which vanishes in float32 for small alpha. f is monotone,
+    with f' = 1 / sigma(L). Limits: alpha = 0 gives L / sqrt(beta); beta = 0 gives 2 sqrt(L /
+    alpha). Below L = 0 the noise is that of the dark, and f continues as L / sqrt(beta) (as 0 if
+    beta = 0). L has any shape and is in W/m2/sr/um; alpha and beta are at least 0 and not both 0.
     """
     sigma_dark = math.sqrt(sensor.beta)
     # Without the difference of two roots, which vanishes in float32 for small alpha.
@@ -76,19 +77,19 @@ def stabilise(radiance: Tensor, sensor: Instrument) -> Tensor:
 
 
 def destabilise(stable: Tensor, sensor: Instrument) -> Tensor:
-    """L = t sqrt(beta) + alpha t^2 / 4, any shape: the inverse of `stabilise`; t sqrt(beta) below t
-    = 0.
+    """Compute L = t sqrt(beta) + alpha t^2 / 4, any shape: the inverse of `stabilise`.
 
-    The mean of noisy values t lies below f(mean L), f being concave: see `bias_radiance`.
+    Below t = 0 it is t sqrt(beta). The mean of noisy values t lies below f(mean L), because f is
+    concave: see `bias_radiance`.
     """
     return stable * math.sqrt(sensor.beta) + sensor.alpha / 4 * stable.clamp(min=0).square()
 
 
 def bias_radiance(sensor: Instrument) -> float:
-    """What averaging on the stabilised scale loses: alpha / 4, in W/m2/sr/um.
+    """Return the bias of averaging on the stabilised scale: alpha / 4, in W/m2/sr/um.
 
     To second order E[f(L + n)] = f(L) + f''(L) var / 2 = f(L) - alpha / (4 sigma(L)), and L moves
-    by sigma(L) times that. Exact to higher order only where sigma(L) is small beside L + beta /
-    alpha, as on any lit scene.
+    by sigma(L) times that. It is exact to higher order only if sigma(L) is small compared with L +
+    beta / alpha, as in any lit scene.
     """
     return sensor.alpha / 4

@@ -16,7 +16,7 @@ T = TypeVar("T", int, float)
 
 
 ALIKE_RMS = 4.0
-"""Pass 2 takes every patch within this RMS distance, in grey levels (tau = 16 k^2)."""
+"""Pass 2 includes every patch within this RMS distance, in grey levels (tau = 16 k^2)."""
 
 
 FLAT_GAMMA = 1.05
@@ -27,11 +27,11 @@ area criterion).
 
 @dataclass(frozen=True)
 class Quality:
-    """How dense the references are, and how large a group of pass 2 may grow.
+    """The density of the references, and the largest size of a group of pass 2.
 
-    `stride_px` lies between neighbouring references; `group_cap` counts in multiples of the usual
+    `stride_px` is the distance of neighbouring references; `group_cap` is in multiples of the usual
     group. The published method has no cap, and visits every second pixel unless an earlier group
-    held it.
+    contained it.
     """
 
     stride_px: int
@@ -43,14 +43,15 @@ QUALITIES = {"fast": Quality(4, 2), "standard": Quality(3, 4), "best": Quality(2
 
 @dataclass(frozen=True)
 class PassSettings:
-    """What one pass works with; sigma and distances in grey levels.
+    """The parameters of one pass; sigma and distances are in grey levels.
 
     Attributes:
         side_px: k, the side of a patch.
         similar: N, the patches of a group.
         most_similar: the largest group, where more than N patches lie within ALIKE_RMS.
         excess: beta, the factor on the noise variance.
-        clean_guide: of pass 2: the guide's covariance is that of the signal alone, noise removed.
+        clean_guide: True in pass 2, in which the guide's covariance is that of the signal alone,
+            without noise.
     """
 
     side_px: int
@@ -61,14 +62,16 @@ class PassSettings:
 
     @property
     def window_px(self) -> int:
-        """Candidates along each axis of the search window: about N / 2, odd so that it has a
-        middle.
+        """The number of candidates along each axis of the search window: about N / 2, odd so that
+        there is a middle.
         """
         return self.similar // 2 | 1
 
     @property
     def margin_px(self) -> int:
-        """What a reference centred on a border pixel sees beyond it."""
+        """The number of pixels beyond the border that a reference centred on a border
+        pixel needs.
+        """
         return self.window_px // 2 + self.side_px // 2
 
 
@@ -88,7 +91,7 @@ def second_pass(sigma: float, quality: Quality) -> PassSettings:
 
 
 def _below(sigma: float, table: dict[int, T], otherwise: T) -> T:
-    """The value of the first bound that sigma stays below."""
+    """Return the value of the first bound that is above sigma, or `otherwise`."""
     return next((value for bound, value in table.items() if sigma < bound), otherwise)
 
 
@@ -102,14 +105,14 @@ Up to 1e-2 costs less than 0.01 dB (measured).
 def estimate_groups(
     noisy: Tensor, guide: Tensor, taken: Tensor | None, noise: Noise, settings: PassSettings
 ) -> Tensor:
-    """Posterior mean of every patch: P - beta Sigma S^-1 (P - mean of P), Sigma the covariance of
-    the noise.
+    """Compute the posterior mean of every patch: P - beta Sigma S^-1 (P - mean of P), with Sigma
+    the covariance of the noise.
 
     1. Pass 1: S is the covariance of the noisy patches, signal and noise together.
     2. Pass 2: S is the covariance of the guide's patches plus beta Sigma.
-    3. A flat group of pass 1 (variance of all its pixels below gamma sigma^2): every pixel becomes
-      their mean.
-    4. No Cholesky factor of S: the noisy patches stay.
+    3. In a flat group of pass 1 (variance of all its pixels below gamma sigma^2) every pixel
+       becomes their mean.
+    4. If S has no Cholesky factor, the noisy patches are returned.
 
     Both S give P_mean + C S^-1 (P - P_mean) with C the signal's covariance, so only S needs an
     inverse (IPOL 2013, estimates of the first and the second step; there Sigma = sigma^2 I).
@@ -117,8 +120,8 @@ def estimate_groups(
     Args:
         noisy: (B, N, k * k) groups of patches.
         guide: the same patches of the guide image; in pass 1 `noisy` itself.
-        taken: (B, N) of 0 and 1: which patches the group counts, None for all; the others'
-            estimates mean nothing.
+        taken: (B, N) of 0 and 1: which patches belong to the group, None for all; estimates of the
+            others are meaningless.
         noise: that of `noisy`.
         settings: those of the pass.
     """
@@ -151,17 +154,19 @@ def _moments(patches: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tens
 
 
 def _is_flat(mean: Tensor, covariance: Tensor, bound: float) -> Tensor:
-    """(B,) whether the variance of all the pixels of a group stays below `bound`.
+    """Return True for each group (B,) if the variance of all its pixels is below `bound`.
 
-    It is the variance within the k * k positions, the trace, plus that between them: two small
-    sums, where the sum of the squared pixels would drown sigma^2 in float32.
+    The variance is that within the k * k positions (the trace) plus that between them. Both sums
+    are small, whereas in the sum of the squared pixels sigma^2 would be lost in float32.
     """
     within = covariance.diagonal(dim1=1, dim2=2).mean(1)
     return within + mean[:, 0].var(1, correction=0) < bound
 
 
 def _shrinkage(covariance: Tensor, noise: Noise, settings: PassSettings) -> Tensor:
-    """The matrix beta S^-1 Sigma, for patches as rows, or 0 where S has no Cholesky factor."""
+    """Compute the matrix beta S^-1 Sigma, for patches as rows, or 0 where S has no
+    Cholesky factor.
+    """
     sigma_matrix = noise.covariance(settings.side_px).to(covariance) * settings.excess
     diagonal = covariance.diagonal(dim1=1, dim2=2)
     # A drawn or saturated area has rank 0 or 1: the covariance is then no better known than its own

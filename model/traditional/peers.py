@@ -1,8 +1,8 @@
-"""Restorations of scikit-image, as peers for tables: each made to aim at the reference's MTF, none
-tuned further.
+"""Define restorations of scikit-image as baselines for tables; each aims at the reference's MTF and
+is not tuned further.
 
-The three deconvolutions undo the degraded MTF whole; the result is blurred to the reference's.
-Non-local means stands in the place of NL-Bayes in the pipeline.
+The three deconvolutions undo the degraded MTF completely, and the result is blurred to the
+reference's. Non-local means replaces NL-Bayes in the pipeline.
 """
 
 from collections.abc import Callable
@@ -34,22 +34,24 @@ NLM_DISTANCE_PX = 6
 NLM_STRENGTH = 0.6
 
 Peer = Callable[[Tensor, Chain], Tensor]
-"""(H, W) digital numbers of the degraded sensor, and the two sensors, to those of the reference."""
+"""A function of digital numbers (H, W) of the degraded sensor and the two sensors. It returns those
+of the reference.
+"""
 
 
 def wiener(image: np.ndarray, blur: np.ndarray) -> np.ndarray:
-    """scikit-image's Wiener filter with a Laplacian regulariser, balance 0.01."""
+    """Apply scikit-image's Wiener filter with a Laplacian regulariser, balance 0.01."""
     return np.asarray(restoration.wiener(image, blur.astype(complex), WIENER_BALANCE, clip=False))
 
 
 def unsupervised_wiener(image: np.ndarray, blur: np.ndarray) -> np.ndarray:
-    """scikit-image's Wiener filter that estimates its own regularisation (seed 0)."""
+    """Apply scikit-image's Wiener filter that estimates its own regularisation (seed 0)."""
     restored, _ = restoration.unsupervised_wiener(image, blur.astype(complex), clip=False, rng=0)
     return np.asarray(restored)
 
 
 def richardson_lucy(image: np.ndarray, blur: np.ndarray) -> np.ndarray:
-    """scikit-image's Richardson-Lucy deconvolution, 20 steps."""
+    """Apply scikit-image's Richardson-Lucy deconvolution with 20 iterations."""
     side = 2 * PAD_PX + 1
     psf = np.roll(fft.irfft2(blur, s=image.shape), (PAD_PX, PAD_PX), (0, 1))[:side, :side]
     # Richardson-Lucy is defined for kernels that are nowhere negative, and this one may ring below
@@ -63,8 +65,9 @@ def richardson_lucy(image: np.ndarray, blur: np.ndarray) -> np.ndarray:
 
 
 def nl_means(dn: Tensor, chain: Chain) -> Tensor:
-    """The chain with scikit-image's non-local means, 5 x 5 patches within 6 pixels, h = 0.6 sigma:
-    (H, W) DN.
+    """Run the chain with scikit-image's non-local means, and return (H, W) DN.
+
+    It uses 5 x 5 patches within 6 pixels and h = 0.6 sigma.
     """
     sensor = with_rounding_noise(chain.degraded)
     stable = stabilise(to_radiance(dn, chain.degraded), sensor)
@@ -83,7 +86,7 @@ def _deconvolved(
     """Undo the degraded MTF on mirrored borders, at a scale of 1 for full scale, and blur to the
     reference's.
 
-    `deconvolve` takes an image (H, W) and the half spectrum of its blur, (H, W // 2 + 1).
+    `deconvolve` accepts an image (H, W) and the half spectrum of its blur, (H, W // 2 + 1).
     """
     full_scale = chain.degraded.max_dn / chain.degraded.gain_dn_per_radiance
     rows, columns = (mirrored(-PAD_PX, size + PAD_PX, size) for size in dn.shape)

@@ -1,9 +1,10 @@
-"""The two traditional pipelines. Every number comes from the two sensors and from the image.
+"""Chain the two traditional pipelines. Every parameter derives from the two sensors and from the
+image.
 
-- denoise first: stabilise, NL-Bayes, inverse, MTF compensation. NL-Bayes meets the white noise that
-  it supposes; what it leaves is amplified afterwards.
-- deconvolve first: MTF compensation, stabilise, NL-Bayes, inverse. The noise that NL-Bayes meets is
-  amplified and coloured by the filter, and it is told how.
+- denoise first: stabilise, NL-Bayes, inverse, MTF compensation. NL-Bayes sees the white noise that
+  it assumes; the residual noise is amplified afterwards.
+- deconvolve first: MTF compensation, stabilise, NL-Bayes, inverse. The noise that NL-Bayes sees is
+  amplified and coloured by the filter, and it is given the colour.
 """
 
 from collections.abc import Iterable, Iterator
@@ -42,11 +43,12 @@ Order = Literal["denoise-first", "deconvolve-first"]
 
 @dataclass(frozen=True)
 class Chain:
-    """How to restore what `degraded` acquired to what `reference` would have, without its noise.
+    """The parameters of a restoration from images of `degraded` to those that `reference` would
+    have acquired without its noise.
 
     `quality` is one of `patch_groups.QUALITIES`. `epsilon` regularises the MTF compensation. With
-    None it is derived from each image: by `restore_traditional` itself, by `fitted_to` for an image
-    that comes in strips.
+    None it is derived from each image: by `restore_traditional` itself, or by `fitted_to` for an
+    image that arrives in strips.
     """
 
     degraded: Instrument
@@ -59,7 +61,7 @@ class Chain:
         """Return the pipeline with the epsilon for an image in strips (any, W) of digital numbers,
         NaN where missing.
 
-        A chain that has an epsilon is returned as it is, and no strip is read.
+        A chain that has an epsilon is returned unchanged, and no strip is read.
         """
         if self.epsilon is not None:
             return self
@@ -79,20 +81,19 @@ class Chain:
 
 
 def restore_traditional(dn: Tensor, chain: Chain) -> Tensor:
-    """Digital numbers (H, W) float32 of the degraded sensor to those of the reference, clipped and
-    not rounded.
+    """Restore digital numbers (H, W) float32 of the degraded sensor to those of the reference.
 
-    NaN marks missing pixels, and stays.
+    The result is clipped and not rounded. NaN marks missing pixels, and remains.
     """
     return torch.cat(list(restore_strips([dn], dn.shape[0], chain.fitted_to([dn]))))
 
 
 def restore_strips(strips: Iterable[Tensor], height: int, chain: Chain) -> Iterator[Tensor]:
-    """Restore as `restore_traditional`, bit for bit, an image that comes and goes in strips of
-    rows, (any, W) each.
+    """Restore an image that arrives in strips of rows, (any, W) each, with the same bits as
+    `restore_traditional`.
 
-    The chain needs an epsilon (see `Chain.fitted_to`), because the strips are read only once. Holds
-    some 700 rows of the image, and the tallest strip.
+    The chain needs an epsilon (see `Chain.fitted_to`), because the strips are read only once. Some
+    700 rows of the image, and the tallest strip, are held in memory.
     """
     radiance = (to_radiance(strip, chain.degraded) for strip in finite_or_missing(strips))
     # The converter's rounding adds a twelfth of a squared DN, which NL-Bayes must know of.
@@ -119,8 +120,15 @@ def restore_strips(strips: Iterable[Tensor], height: int, chain: Chain) -> Itera
 def denoise_radiance(
     radiance: Iterable[Tensor], height: int, sensor: Instrument, noise: Noise, quality: Quality
 ) -> Iterator[Tensor]:
-    """NL-Bayes on the stabilised scale: strips (any, W) in W/m2/sr/um, of variance alpha L + beta,
-    to the same.
+    """Denoise strips (any, W) in W/m2/sr/um with NL-Bayes on the stabilised scale, and yield
+    strips.
+
+    Args:
+        radiance: strips with noise of the variance alpha L + beta.
+        height: the number of rows of all strips.
+        sensor: its alpha and beta.
+        noise: on the stabilised scale.
+        quality: density of the references and size of the groups.
     """
     scale = noise.sigma
     stable = (stabilise(strip, sensor) * scale for strip in radiance)

@@ -121,11 +121,11 @@ def measure(strips: Iterable[Tensor], sensor: Instrument) -> NoiseAndScene:
     are missing.
 
     Missing pixels do not count, and neither do blocks whose known pixels are all saturated. A
-    single saturated pixel counts, because epsilon would otherwise jump where a bright point comes
+    single saturated pixel counts, because epsilon would otherwise jump when a bright point begins
     to saturate.
 
-    The result does not depend, to the last bit, on how the strips are cut: the image is measured in
-    bands of rows on a grid of its own, and the sums of the bands are added in their order.
+    The result does not depend, to the last bit, on how the strips are cut. The image is measured in
+    bands of rows on a grid of its own, and the sums of the bands are added in order.
     """
     digitised = with_rounding_noise(sensor)
     sums = np.zeros(4)
@@ -149,9 +149,7 @@ def derived_epsilon(measured: NoiseAndScene, sensor: Instrument, fit: Fit = FIT)
 
 
 def bands(strips: Iterable[Tensor]) -> Iterator[Tensor]:
-    """Yield the rows of strips (any, W) in bands of BLOCK_PX rows, the last one
-    with what is left.
-    """
+    """Yield the rows of strips (any, W) in bands of BLOCK_PX rows; the last band may have fewer."""
     remainder: Tensor | None = None
     for strip in strips:
         rows = strip if remainder is None else torch.cat([remainder, strip])

@@ -1,4 +1,4 @@
-"""Images as strips of rows, so that no step needs the whole of one."""
+"""Process images as strips of rows, so that no step needs the whole image."""
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -11,9 +11,7 @@ from torch.nn.functional import pad
 
 
 class Rows:
-    """Rows of an image as they come, strip by strip; what lies behind the last
-    window is forgotten.
-    """
+    """The rows of an image that arrive strip by strip; rows above the last window are discarded."""
 
     def __init__(self, strips: Iterable[Tensor]) -> None:
         self._strips: Iterator[Tensor] = iter(strips)
@@ -21,7 +19,7 @@ class Rows:
         self._top = 0
 
     def window(self, rows: Tensor) -> Tensor:
-        """The rows of those numbers: (R,) to (R, W); windows must move downwards."""
+        """Return the rows with the numbers (R,) as (R, W); windows must move downwards."""
         top = int(rows.min())
         bottom = int(rows.max()) + 1
         while self._top + sum(map(len, self._held)) < bottom:
@@ -34,10 +32,10 @@ class Rows:
 
 
 def mirrored(start: int, stop: int, size: int) -> Tensor:
-    """Pixel numbers (stop - start,) of an image mirrored at its borders, the edge repeated: c b a |
-    a b c | c b a.
+    """Return pixel numbers (stop - start,) of an image mirrored at its borders, the edge repeated:
+    c b a | a b c | c b a.
 
-    Folded back into 0..size - 1: the mirror has period 2 * size, whatever the size.
+    They are folded back into 0..size - 1, because the mirror has the period 2 * size.
     """
     number = torch.arange(start, stop) % (2 * size)
     return torch.minimum(number, 2 * size - 1 - number)
@@ -48,10 +46,11 @@ Result = TypeVar("Result")
 
 
 def map_tiles(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """`map(work, items)` on as many threads as torch has, the results in the order of the items.
+    """Run `map(work, items)` on as many threads as torch has, with the results in the order of the
+    items.
 
-    A tile is thousands of operations on small tensors. Split up inside, each ends with its threads
-    waiting for one another: on a busy machine five times slower with two threads than with one
+    A tile is thousands of operations on small tensors. If each of them were split across threads,
+    these would wait for one another: on a busy machine two threads are five times slower than one
     (measured).
     """
     with one_thread_per_operation() as threads, ThreadPoolExecutor(threads) as pool:
@@ -60,7 +59,7 @@ def map_tiles(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator
 
 @contextmanager
 def one_thread_per_operation() -> Iterator[int]:
-    """Hold torch to one thread per operation meanwhile; gives the number there was."""
+    """Limit torch to one thread per operation within the block, and yield the previous number."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -73,9 +72,9 @@ def fill_with_local_means(image: Tensor, known: Tensor) -> Tensor:
     """Fill the pixels of (H, W) that are not `known` with the mean of the nearest known ones
     around.
 
-    A pyramid: each level takes its missing pixels from the next, of half the resolution. 0 where
-    nothing is known. scikit-image's biharmonic inpainting gives other values, by up to 117 of 255
-    in a striped photograph (measured).
+    It uses a pyramid: each level fills its missing pixels from the next, of half the resolution.
+    The value is 0 if no pixel is known. scikit-image's biharmonic inpainting gives other values, by
+    up to 117 of 255 in a striped photograph (measured).
     """
     filled = image.where(known, 0.0)
     if bool(known.all()) or max(image.shape) == 1:

@@ -1,6 +1,6 @@
-"""What a run is told, what stops one that has gone wrong, and a run on disk.
+"""Define the parameters of a run, the guards that stop a failing run, and its checkpoint on disk.
 
-That is safetensors, with all that an exact resume needs; nothing is unpickled.
+A checkpoint is a safetensors file with everything that an exact resume needs; nothing is unpickled.
 """
 
 import hashlib
@@ -24,19 +24,20 @@ from beers_deploy.profiles.errors import ModelError, OptionError, printable
 
 @dataclass(frozen=True)
 class TrainingRecipe:
-    """The numbers of a run; a checkpoint belongs to one recipe.
+    """The parameters of a run; a checkpoint belongs to one recipe.
 
     Attributes:
-        steps: gradient steps.
-        batch: patches a step, on every worker.
+        steps: the number of gradient steps.
+        batch: patches per step, on every worker.
         learning_rate: the highest, after warm-up.
-        warm_up_steps: of a linear rise from 0.
-        gradient_norm: larger gradients are cut to it; the L1 loss of a restoration is small, far
-            above is a burst.
-        ema_decay: of the running average of the weights, which is what is shipped.
+        warm_up_steps: the number of steps of a linear rise from 0.
+        gradient_norm: larger gradients are clipped to it; the L1 loss of a restoration is small, so
+            that a far larger one is a burst.
+        ema_decay: decay of the running average of the weights, which is shipped.
         loss: weights of the loss's terms.
         seed: of the first weights and of the patches.
-        rounding: the digest of the INT8 file that maps are rounded as; "" rounds none.
+        rounding: the digest of the INT8 file whose rounding is applied to the maps; "" for no
+            rounding.
     """
 
     steps: int
@@ -61,7 +62,7 @@ class TrainingRecipe:
                 )
 
     def rate_at(self, step: int) -> float:
-        """Learning rate of a step: linear warm-up, then a cosine down to zero."""
+        """Return the learning rate of a step: a linear warm-up, then a cosine down to zero."""
         if step < self.warm_up_steps:
             return self.learning_rate * (step + 1) / self.warm_up_steps
         share = (step - self.warm_up_steps) / max(self.steps - self.warm_up_steps, 1)
@@ -69,28 +70,28 @@ class TrainingRecipe:
 
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
-"""What Adam keeps of each parameter, besides its step."""
+"""The state that Adam stores for each parameter, in addition to its step."""
 
 LOWER_RATE = "Lower the learning rate or check the images."
 MAX_BAD_STEPS = 10
 WINDOW_STEPS = 200
 TEST_PLACES = 65
 DIVERGED = 5.0
-"""A mean loss this many times the best one so far is no fluctuation: batches vary by a factor of
-two.
+"""A mean loss of this many times the best one so far is no fluctuation, because batches vary by a
+factor of two.
 """
 
 
 @dataclass
 class Guards:
-    """Counts skipped steps, and compares the loss of each window of steps with the best window so
-    far.
+    """Counts skipped steps, and compares the loss of each window of steps with that of the best
+    window so far.
 
     Attributes:
-        bad_steps: steps whose gradient was not finite: skipped.
+        bad_steps: the number of steps that were skipped because their gradient was not finite.
         best: the lowest mean loss of a window; None before the first.
-        sum: of the losses of the present window.
-        count: of its steps.
+        sum: sum of the losses of the present window.
+        count: the number of its steps.
     """
 
     bad_steps: int = 0
@@ -146,9 +147,9 @@ def require_finite_output(
 
 
 def checkpoint_sha256(tensors: Mapping[str, Tensor], header: Mapping[str, object]) -> str:
-    """Return the hex digest of named tensors and of what the header states beside it.
+    """Return the hex digest of named tensors and of the other content of the header.
 
-    Safetensors has none, and a flipped bit is a plausible weight or another step.
+    Safetensors has no digest, and a flipped bit would be a plausible weight or another step.
     """
     content = {key: value for key, value in header.items() if key != "sha256"}
     digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
@@ -162,14 +163,16 @@ def checkpoint_sha256(tensors: Mapping[str, Tensor], header: Mapping[str, object
 def read_checkpoint(
     path: Path, network: Network, recipe: TrainingRecipe, data: str = ""
 ) -> tuple[dict[str, Tensor], int, Guards]:
-    """The parts of a checkpoint by name (see `Trainer.save`), its step and its guards, once all is
-    as it must be.
+    """Read and validate a checkpoint, or raise ModelError.
 
     Args:
         path: the file.
         network: a network of the same size.
-        recipe: that it was begun with.
-        data: digest of all that it was begun to learn from.
+        recipe: the recipe with which the training was begun.
+        data: digest of all data that the training learns from.
+
+    Returns:
+        Its tensors by name (see `Trainer.save`), its step and its guards.
     """
     parts, header = read_tensors(path)
     tensors = {name: torch.from_numpy(array) for name, array in parts.items()}

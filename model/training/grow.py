@@ -15,13 +15,17 @@ N = TypeVar("N", bound=Network)
 
 
 def grow(network: N, variant: Variant, generator: torch.Generator) -> N:
-    """A network of `variant` with the outputs of `network`, up to rounding; the same size is
-    copied.
+    """Build a network of `variant` with the outputs of `network`, up to rounding.
 
-    Features are copied, and their weights shared out among the copies (Net2Net, Chen et al. 2016).
-    Added blocks lie evenly between the others; their second convolution is zero, so that each hands
-    on what it is given until it has learnt something. At a larger scale each feature becomes one
-    for each pixel of a place (see `_coarser`).
+    A network of the same size is copied. Features are duplicated, and their weights are divided
+    among the copies (Net2Net, Chen et al. 2016). Added blocks are distributed evenly between the
+    others. Their second convolution is zero, so that each initially passes on its input. At a
+    larger scale each feature becomes one for each pixel of a place (see `_coarser`).
+
+    Args:
+        network: the smaller network.
+        variant: the size of the new one.
+        generator: of the shares by which weights are divided.
     """
     sources = _sources(network.variant, variant)
     large = type(network)(variant)
@@ -37,7 +41,7 @@ def grow(network: N, variant: Variant, generator: torch.Generator) -> N:
             weight.copy_(_widened(coarse, weight.shape, generator))
             bias.copy_(_repeated(small[f"{source}.bias"], bias.shape, factor))
         elif name.endswith("second"):
-            # An added block hands on its input until it has learnt something.
+            # An added block passes on its input until it has learnt something.
             weight.zero_()
     # The head's bias is linear in the sensor vector, so that its weights grow with the features.
     if isinstance(large, BankedConvBEERS):
@@ -48,8 +52,11 @@ def grow(network: N, variant: Variant, generator: torch.Generator) -> N:
 
 
 def _sources(small: Variant, large: Variant) -> dict[str, str | None]:
-    """The convolution of the small network that each of the large one's is made from; None for an
-    added one.
+    """Map each convolution of the large network to the one of the small network that initialises
+    it.
+
+    An added convolution has the source None. Raises ModelError if the small network cannot grow to
+    the large one.
     """
     factor = large.scale // small.scale
     fits = small.scale in (1, large.scale) and large.features % (small.features * factor**2) == 0
@@ -70,15 +77,13 @@ def _sources(small: Variant, large: Variant) -> dict[str, str | None]:
 
 
 def _repeated(rows: Tensor, shape: Sequence[int], factor: int) -> Tensor:
-    """A row for each feature, (F, ...), to those of the large network."""
+    """Repeat rows of the features, (F, ...), to the number of features of the large network."""
     coarse = rows.repeat_interleave(factor**2, 0)
     return coarse.repeat(shape[0] // len(coarse), *[1] * (rows.ndim - 1))
 
 
 def _coarser(weight: Tensor, factor: int) -> Tensor:
-    """(O, I, 3, 3) to (O S^2, I S^2, 3, 3): the same convolution where S x S places are the
-    channels of one.
-    """
+    """Rewrite a convolution (O, I, 3, 3) for S x S places in the channels: (O S^2, I S^2, 3, 3)."""
     outputs, inputs = weight.shape[:2]
     places = factor**2
     coarse = torch.from_numpy(in_places(weight.flatten(0, 1).double().numpy(), factor)).to(weight)
@@ -87,8 +92,9 @@ def _coarser(weight: Tensor, factor: int) -> Tensor:
 
 
 def _widened(weight: Tensor, channels: Sequence[int], generator: torch.Generator) -> Tensor:
-    """(O, I, kh, kw) to as many `channels`: copies along both, divided among the copies of an
-    input.
+    """Widen weights (O, I, kh, kw) to `channels` by duplication.
+
+    The weights of an input are divided among its copies at random.
     """
     copies_out = channels[0] // weight.shape[0]
     copies_in = channels[1] // weight.shape[1]

@@ -1,8 +1,7 @@
-"""How the ground of a pass may look: its light, its contrast and its softness.
+"""Vary how the ground looks in a pass: its light, contrast and softness.
 
-Aerial photographs are bright, sharp and rich in contrast, more so than most of what a satellite
-sees. A network that learns from nothing else restores dark, hazy and soft ground worse than it
-could.
+Aerial photographs are bright, sharp and rich in contrast, more than most satellite images. A
+network that learns from them only restores dark, hazy and soft ground worse than it could.
 """
 
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Look:
-    """How one pass over a scene looks.
+    """The appearance of one pass over a scene.
 
     Attributes:
         light: factor on the scene's radiance.
@@ -32,15 +31,15 @@ class Look:
 
 @dataclass(frozen=True)
 class Looks:
-    """What looks are drawn.
+    """The distribution from which looks are drawn.
 
     Attributes:
         exposures: light of an ordinary day, uniform: darker and brighter than the photograph's.
-        lit_share: of the passes, those in any light at all.
+        lit_share: share of the passes with any light.
         lights: from deep shade to saturated areas, log-uniform.
-        calm_share: of the passes, those with less contrast.
-        contrasts: what is left of it, log-uniform.
-        soft_share: of the passes, those over softer ground.
+        calm_share: share of the passes with reduced contrast.
+        contrasts: share of the contrast that is left in them, log-uniform.
+        soft_share: share of the passes over softer ground.
         softness_px: in target pixels, uniform.
     """
 
@@ -67,4 +66,4 @@ class Looks:
 
 
 ORDINARY = Looks()
-"""Photographs as they are, on days of different light."""
+"""Unchanged photographs, on days of different light."""

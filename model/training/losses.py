@@ -1,17 +1,18 @@
-"""The paper's loss: 1.0 L1 + 0.5 LPIPS + 0.1 FFT-L1 (paper, training section), each term reported.
+"""Compute the paper's loss: 1.0 L1 + 0.5 LPIPS + 0.1 FFT-L1 (paper, training section), each term
+reported.
 
-Besides, an L2 term for who wants the highest PSNR, which is a mean of squares: L1 forgives the
-strongest edges; and a PSNR term, its mean over the patches, in which a sharp and quiet sensor's
-small errors count as much as a blurred and noisy one's large ones (as in NAFNet, Chen et al., ECCV
-2022).
+Two more terms are available. An L2 term serves the highest PSNR, which is a mean of squares,
+whereas L1 tolerates errors at the strongest edges. A PSNR term is its mean over the patches: small
+errors of a sharp and quiet sensor count as much as large ones of a blurred and noisy sensor (as in
+NAFNet, Chen et al., ECCV 2022).
 
-The consistency step of a restoration removes what an image errs at low spatial frequencies, because
-the raw image shows them as they are. `coarse` below 1 makes an error there count less, so that a
-network spends itself on the rest: G of `model.consistency` is taken of the error, and all but that
-share of it is left out.
+The consistency step of a restoration removes errors at low spatial frequencies, because the raw
+image shows these correctly. `coarse` below 1 makes an error there count less, so that a network
+concentrates on the rest. G of `model.consistency` is applied to the error, and all but that share
+of the result is subtracted.
 
-LPIPS needs weights that are not shipped; without them the loss is L1 + FFT-L1, and the recipe says
-so.
+LPIPS needs weights that are not shipped; without them the loss is L1 + FFT-L1, and the recipe
+records that.
 """
 
 from collections.abc import Mapping
@@ -28,9 +29,9 @@ from beers_deploy.profiles.instrument import MAX_DN
 
 @dataclass(frozen=True)
 class LossWeights:
-    """How much each term counts, one of weight 0 is not computed.
+    """The weight of each term; a term of weight 0 is not computed.
 
-    `coarse` is the share, in all of them, of what the consistency step removes from an error.
+    `coarse` is the share, in all terms, of the part of an error that the consistency step removes.
     """
 
     l1: float = 1.0
@@ -44,8 +45,8 @@ PAPER = LossWeights()
 
 
 class RestorationLoss:
-    """The weighted sum of the terms, in float32 whatever the autocast around it; that of LPIPS
-    where it is given.
+    """The weighted sum of the terms, computed in float32 even within autocast. It includes LPIPS if
+    `perceptual` is given.
     """
 
     def __init__(self, weights: LossWeights = PAPER, perceptual: Lpips | None = None) -> None:
@@ -53,8 +54,10 @@ class RestorationLoss:
         self.perceptual = perceptual if weights.lpips else None
 
     def __call__(self, restored: Tensor, reference: Tensor) -> tuple[Tensor, Mapping[str, Tensor]]:
-        """The loss, and its terms before weighting, of images (N, 1, H, W) in [0, 1] of full scale,
-        not clipped.
+        """Compute the loss, and its terms before weighting, of images (N, 1, H, W) in [0, 1] of
+        full scale.
+
+        The images are not clipped.
         """
         weights = self.weights
         # In bfloat16 the differences of nearly equal images would lose most of their digits.
@@ -76,8 +79,8 @@ class RestorationLoss:
 
 
 def coarse(error: Tensor) -> Tensor:
-    """Means over blocks, interpolated bilinearly between their centres: of (N, 1, H, W), whole
-    blocks, the same.
+    """Average (N, 1, H, W) over whole blocks, and interpolate bilinearly between the centres of the
+    blocks.
     """
     means = avg_pool2d(error, BLOCK_PX)
     interpolated: Tensor = interpolate(
@@ -87,10 +90,10 @@ def coarse(error: Tensor) -> Tensor:
 
 
 def log_mse(restored: Tensor, reference: Tensor) -> Tensor:
-    """Mean over the batch of ln(1 + mean squared error in DN^2 of 12 bits): 10 / ln 10 of it is
-    lost PSNR in dB.
+    """Compute the mean over the batch of ln(1 + mean squared error in DN^2 of 12 bits).
 
-    Of (N, 1, H, W) float32. The 1 keeps it above 0, and forgives what rounding does to a patch.
+    10 / ln 10 of it is lost PSNR in dB. Images are (N, 1, H, W) float32. The 1 keeps the argument
+    above 0, and tolerates the rounding of a patch.
     """
     squares = ((restored - reference) * MAX_DN).square().mean((1, 2, 3))
     distance: Tensor = torch.log1p(squares).mean()
@@ -98,12 +101,12 @@ def log_mse(restored: Tensor, reference: Tensor) -> Tensor:
 
 
 def fft_l1(restored: Tensor, reference: Tensor) -> Tensor:
-    """Mean size of the difference of the spectra, orthonormal: about 1.1 times the L1, whatever the
-    patch size.
+    """Compute the mean absolute difference of the orthonormal spectra: about 1.1 times the L1 for
+    any patch size.
 
-    Of (N, 1, H, W) float32. Without that normalisation it would be 142 times the L1 at 128 pixels,
-    and twice that at
-    256. The size is taken by abs(), whose gradient at 0 is 0; that of sqrt(re^2 + im^2) is NaN.
+    Images are (N, 1, H, W) float32. Without that normalisation it would be 142 times the L1 at 128
+    pixels, and twice that at 256. The absolute value is computed by abs(), whose gradient at 0 is
+    0; that of sqrt(re^2 + im^2) is NaN.
     """
     # Orthonormal, so that the term does not grow with the patch. abs() has a gradient at 0.
     size: Tensor = torch.fft.rfft2(restored - reference, norm="ortho").abs().mean()

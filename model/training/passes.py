@@ -1,8 +1,9 @@
-"""One simulated pass of two sensors over a scene, in torch, so that a GPU can do it too.
+"""Simulate one pass of two sensors over a scene in torch, so that it can run on a GPU.
 
-The same physics as `model.simulator`: blur and sampling by FFT, then the detector. A scene's
-spectrum is computed once; each pass blurs, samples and folds it anew. What a pass draws comes from
-a NumPy generator; noise alone comes from torch's, whose numbers differ between a CPU and a GPU.
+The physics is that of `model.simulator`: blur and sampling by FFT, then the detector. The spectrum
+of a scene is computed once, and each pass blurs, samples and folds it again. Random numbers of a
+pass come from a NumPy generator. Only the noise comes from torch's generator, whose numbers differ
+between a CPU and a GPU.
 """
 
 import math
@@ -23,14 +24,14 @@ from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import MtfTable, PointSpread
 
 GAMMAS = 513
-"""Radii at which a table's gamma is known; between them it is interpolated, which is off by 1e-4 at
-most.
+"""The number of radii at which a table's gamma is known. It is interpolated between them, with an
+error of 1e-4 at most.
 """
 
 
 @dataclass(frozen=True)
 class Visited:
-    """A scene ready to be visited.
+    """A scene whose spectrum is computed.
 
     Attributes:
         spectrum: (H, W // 2 + 1) complex64.
@@ -42,18 +43,18 @@ class Visited:
 
     @property
     def sides(self) -> tuple[int, int]:
-        """Rows and columns of the scene in pixels."""
+        """The number of rows and columns of the scene."""
         return self.spectrum.shape[0], self.width
 
 
 @dataclass(frozen=True)
 class Pass:
-    """What the two acquisitions of a pass share.
+    """The parameters that the two acquisitions of a pass share.
 
     Attributes:
         oversampling: scene pixels per target pixel.
-        phase_px: shift (down, right) of the sampling grid in scene pixels: one for both, because
-            restoring must not shift anything.
+        phase_px: shift (down, right) of the sampling grid in scene pixels; the same for both,
+            because a restoration must not shift the image.
         look: of the ground.
         margin_px: target pixels cropped on each side.
     """
@@ -71,8 +72,13 @@ def prepare(scene: Scene, multiple: int, device: torch.device | str = "cpu") -> 
 
 
 def folded_signals(scene: Visited, sensors: tuple[Instrument, ...], passage: Pass) -> list[Tensor]:
-    """Blurred and sampled radiance (h, w) on the target grid, of each sensor,
-    without the margin.
+    """Compute the blurred and sampled radiance (h, w) of each sensor on the target grid, without
+    the margin.
+
+    Args:
+        scene: with its spectrum.
+        sensors: the instruments.
+        passage: the parameters of the pass.
     """
     height, width = scene.sides
     device = scene.spectrum.device
@@ -97,17 +103,17 @@ def folded_signals(scene: Visited, sensors: tuple[Instrument, ...], passage: Pas
 
 
 def within_margin(image: Tensor, margin_px: int) -> Tensor:
-    """Cut so many pixels from every side of (H, W)."""
+    """Cut `margin_px` pixels from every side of (H, W)."""
     height, width = image.shape
     return image[margin_px : height - margin_px, margin_px : width - margin_px]
 
 
 def looked(spectrum: Tensor, look: Look, fy: Tensor, fx: Tensor) -> Tensor:
-    """Give the ground of a half spectrum a look; its mean changes with the light alone.
+    """Apply a look to the half spectrum of the ground; its mean changes with the light only.
 
     Args:
         spectrum: (H, W // 2 + 1) complex.
-        look: see there.
+        look: the look.
         fy: vertical frequencies (H,) in cycles per target pixel.
         fx: horizontal frequencies (W // 2 + 1,), likewise.
 
@@ -132,8 +138,9 @@ def _ramp(frequency: Tensor, shift_px: float) -> Tensor:
 def frequencies(
     height: int, width: int, oversampling: int, device: torch.device | str
 ) -> tuple[Tensor, Tensor]:
-    """Vertical (H,) and horizontal (W // 2 + 1,) frequencies of a half spectrum, in cycles per
-    target pixel.
+    """Return the vertical (H,) and horizontal (W // 2 + 1,) frequencies of a half spectrum.
+
+    They are in cycles per target pixel.
     """
     down = torch.fft.fftfreq(height, 1 / oversampling, device=device)
     return down, torch.fft.rfftfreq(width, 1 / oversampling, device=device)
@@ -149,9 +156,9 @@ def transfer_of(
     smear_px: float,
     device: str,
 ) -> Tensor:
-    """As `model.simulator.mtf.transfer_function`, (H, W // 2 + 1) float32 on a device.
+    """Compute `model.simulator.mtf.transfer_function` on a device, (H, W // 2 + 1) float32.
 
-    A point-spread function is left to that function.
+    A point-spread function is passed to that function, and its result is complex64.
     """
     if isinstance(blur, PointSpread):
         transfer = transfer_function(height, width, oversampling, blur, antialias_px, smear_px)
@@ -175,7 +182,7 @@ def transfer_of(
 
 
 def _table_gammas(table: MtfTable, radius: Tensor) -> list[Tensor]:
-    """What `MtfTable.at` interpolates, gamma across and along the track at each radius."""
+    """Interpolate gamma across and along the track at each radius, as `MtfTable.at` does."""
     frequency = np.array(table.frequency)
     evenly = np.linspace(frequency[1], frequency[-1], GAMMAS)
     place = (radius.clamp(evenly[0], evenly[-1]) - evenly[0]) * (
@@ -196,7 +203,15 @@ def _table_gammas(table: MtfTable, radius: Tensor) -> list[Tensor]:
 def detected(
     signal: Tensor, sensor: Instrument, role: str, generator: np.random.Generator
 ) -> Tensor:
-    """Digital numbers of a sampled signal (h, w), over full scale."""
+    """Simulate the detector for a sampled signal (h, w), and return digital numbers over full
+    scale.
+
+    Args:
+        signal: radiance in W/m2/sr/um.
+        sensor: the instrument.
+        role: "degraded" or "reference", so that the two draws of a pair differ.
+        generator: of the seed of the noise.
+    """
     seed = int(generator.integers(2**31))
     if any(pixel_effects(sensor.effects, acts_on) for acts_on in ("radiance", "DN")):
         acquired = detector.detect(signal.cpu().numpy(), sensor, Draw(seed), role)
@@ -211,6 +226,6 @@ def detected(
 
 
 def noiseless(signal: Tensor, sensor: Instrument) -> Tensor:
-    """As `detected`, without noise and rounding."""
+    """Simulate the detector as `detected` does, without noise and rounding."""
     dn = signal * sensor.gain_dn_per_radiance + sensor.offset_dn
     return dn.clamp(0, sensor.max_dn) / sensor.max_dn

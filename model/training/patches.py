@@ -1,5 +1,5 @@
-"""How training patches are drawn from scenes and turned, and where stored pairs of them lie;
-nothing needs torch.
+"""Define how training patches are drawn from scenes and turned, and find stored pairs; without
+torch.
 """
 
 from dataclasses import dataclass
@@ -17,18 +17,19 @@ from beers_deploy.profiles.sensor import Sensor
 
 @dataclass(frozen=True)
 class PatchRecipe:
-    """How patches are drawn from scenes.
+    """The parameters by which patches are drawn from scenes.
 
     Attributes:
-        degraded: draws the sensor of each pass over a scene.
-        reference: draws the sensor of the wanted image, in the units of `degraded`.
+        degraded: the profile from which the sensor of each pass is drawn.
+        reference: the profile from which the sensor of the target image is drawn, in the units of
+            `degraded`.
         patch_px: side of a patch.
-        oversamplings: ratios to draw from; every ratio shows the same ground at another scale.
+        oversamplings: ratios to draw from; each shows the same ground at another scale.
         looks: of the ground.
         margin_px: target pixels cropped on each side.
-        family: draws the sensors instead of `degraded`; each patch then comes with what a network
-            is told of its sensor, and dark patches are brightened as a restoration brightens them.
-        noisy_reference: whether the wanted image has the reference's noise.
+        family: the sensors to draw from instead of `degraded`. Each patch then comes with the
+            description of its sensor, and dark patches are brightened as in a restoration.
+        noisy_reference: whether the target image has the noise of the reference.
     """
 
     degraded: Sensor
@@ -47,7 +48,7 @@ class PatchRecipe:
 def turn(
     patches: np.ndarray, generator: np.random.Generator, quarters: bool = True, mirrors: bool = True
 ) -> np.ndarray:
-    """Patches (..., P, P) in one of the square's eight symmetries, the same for all; see
+    """Apply one random symmetry of the square to patches (..., P, P), the same to all; see
     `draw_turn`.
     """
     return turned(patches, *draw_turn(generator, quarters, mirrors))
@@ -56,12 +57,15 @@ def turn(
 def draw_turn(
     generator: np.random.Generator, quarters: bool, mirrors: bool = True
 ) -> tuple[int, bool]:
-    """Quarter turns, and whether to mirror afterwards; an odd number of quarters makes columns of
-    rows.
+    """Draw the number of quarter turns, and whether to mirror afterwards.
 
-    A plain network learns one sensor. Where its two axes differ they must not change places, and
-    `quarters` is False: four symmetries are left. Where its blur is lopsided it stays as it is, and
-    `mirrors` is False.
+    An odd number of quarter turns swaps rows and columns. A plain network learns one sensor. If its
+    two axes differ, they must not be swapped: four symmetries remain.
+
+    Args:
+        generator: of the draws.
+        quarters: whether odd quarter turns are allowed.
+        mirrors: False if the blur is asymmetric; patches are then not changed at all.
     """
     # Both are drawn whatever is allowed: the generator goes on in the same way.
     quarter = int(generator.integers(4))
@@ -72,7 +76,7 @@ def draw_turn(
 
 
 def turned(patches: np.ndarray, quarter: int, mirrored: bool) -> np.ndarray:
-    """Patches (..., P, P) turned by quarters, then mirrored."""
+    """Rotate patches (..., P, P) by quarter turns, then mirror them."""
     rotated = np.rot90(patches, quarter, (-2, -1))
     return rotated[..., ::-1] if mirrored else rotated
 
@@ -82,7 +86,9 @@ Files = tuple[Path, Path]
 
 
 def pair_files(folder: Path) -> list[Files]:
-    """The pairs FOLDER/degraded/NAME and FOLDER/reference/NAME, by name."""
+    """List the pairs FOLDER/degraded/NAME and FOLDER/reference/NAME by name, or raise
+    ImageError.
+    """
     degraded, reference = (
         {p.stem: p for p in list_images(folder / role)} for role in ("degraded", "reference")
     )

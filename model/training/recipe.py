@@ -1,7 +1,7 @@
-"""A recipe: everything that makes a shipped network, as a TOML file.
+"""Read a recipe: a TOML file with everything that is needed to reproduce a shipped network.
 
-`model/recipes/NAME.toml` holds the recipe of each shipped network. `beers-deploy train --recipe
-NAME` runs it.
+`model/recipes/NAME.toml` is the recipe of each shipped network. `beers-deploy train --recipe NAME`
+runs it.
 """
 
 from collections.abc import Callable, Mapping
@@ -63,13 +63,13 @@ class Stage:
 
     Attributes:
         name: of its folder.
-        steps: gradient steps.
-        batch: patches a step.
+        steps: the number of gradient steps.
+        batch: patches per step.
         learning_rate: the highest; a cosine leads it down to 0.
         rounding: whether maps are rounded as in the INT8 file of the weights that the stage begins
             with.
         precision: of the blocks, float32 or bfloat16.
-        average: decay a step of the running average of the weights, which is what is kept.
+        average: decay per step of the running average of the weights, which is stored.
     """
 
     name: str
@@ -83,16 +83,16 @@ class Stage:
 
 @dataclass(frozen=True)
 class NetworkRecipe:
-    """All that makes a network.
+    """The complete parameters of a network's training.
 
     Attributes:
         variant: its size.
-        stages: in their order; each begins with the weights of the one before.
+        stages: in order; each begins with the weights of the one before.
         start: shipped network whose weights, grown, the first stage begins with; "" draws weights.
         seed: of weights, charts and patches; each stage adds its number.
         patch_px: side of a patch.
-        charts: drawn charts beside the images.
-        held_out: sites that are not trained on; one is chosen by them.
+        charts: the number of drawn charts in addition to the images.
+        held_out: sites that are not trained on, and by which a network is selected.
         other_curves: share of sensors with an MTF of another curve than the formula's.
         looks: of the ground.
         loss: weights of its terms.
@@ -115,12 +115,15 @@ class NetworkRecipe:
 
 
 def recipe_names() -> list[str]:
-    """The names of the shipped recipes."""
+    """List the names of the shipped recipes."""
     return sorted(path.stem for path in RECIPES.glob("*.toml"))
 
 
 def recipe_file(name: str) -> Path:
-    """Where a recipe lies: a shipped name, or the path of one's own .toml file."""
+    """Return the path of a recipe: a shipped name, or the path of a .toml file.
+
+    Raises ProfileError if there is no such recipe.
+    """
     if name.endswith(".toml"):
         return Path(name)
     if name not in recipe_names():
@@ -177,7 +180,7 @@ def load_recipe(name: str) -> NetworkRecipe:
 
 
 def _made(kind: type[T], where: str, raw: object) -> T:
-    """A dataclass of a table's values, each of the kind of the field's default."""
+    """Build a dataclass from a table, with each value checked against the type of its field."""
     if not isinstance(raw, Mapping):
         raise ProfileError(f"{where} must be a table, got {printable(repr(raw))}.")
     fields_by_name = {field_.name: field_ for field_ in fields(kind)}  # type: ignore[arg-type]
@@ -196,7 +199,10 @@ def _made(kind: type[T], where: str, raw: object) -> T:
 
 
 def _value(where: str, kind: object, value: object) -> object:
-    """A value of a file as its field has it; a part that is read already stays as it is."""
+    """Return a value of a file as its field stores it, or raise ProfileError.
+
+    A value of another type than those in KINDS, such as a nested dataclass, is returned unchanged.
+    """
     if kind not in KINDS:
         return value
     fits, expected = KINDS[kind]

@@ -1,4 +1,4 @@
-"""A training run from options to a folder: checkpoint, logs, validation pictures, weights with
+"""Run a training from options to a folder: checkpoint, logs, validation pictures, and weights with
 their recipe.
 
 RUN/checkpoint.safetensors  RUN/log.csv  RUN/validation.csv  RUN/validation.png
@@ -45,20 +45,21 @@ from beers_deploy.profiles.sensor_numbers import numbers_of
 logger = logging.getLogger(__name__)
 
 STEP = re.compile(r"[0-9]{1,18}(?=,)")
-"""What a line of a log begins with."""
+"""The step at the beginning of a line of a log."""
 
 SENSOR_VIEWS = 4
-"""Sensors that each validation image is seen by where the network is conditioned: they differ by
-far more.
+"""The number of sensors that view each validation image if the network is conditioned, because they
+differ by far more.
 """
 
 
 @dataclass(frozen=True)
 class Run:
-    """What the command's options say, or a stage of a recipe.
+    """The options of the command, or a stage of a recipe.
 
     Attributes:
-        held_out: sites that are not trained on; where none is named, a twentieth of the images is.
+        held_out: sites that are not trained on; if none is named, a twentieth of the images is held
+            out.
     """
 
     variant: str
@@ -79,17 +80,23 @@ class Run:
 
     @property
     def checkpoint(self) -> Path:
-        """Where the run can be resumed from."""
+        """The file from which the run can be resumed."""
         return self.out / "checkpoint.safetensors"
 
     @property
     def weights(self) -> Path:
-        """Where the averaged weights go in the end."""
+        """The file to which the averaged weights are written at the end."""
         return self.out / f"{self.variant}.safetensors"
 
 
 def train(run: Run, resume: bool, worker: Worker) -> None:
-    """Run or resume a training to its end, and log whether LPIPS is part of the loss."""
+    """Run or resume a training to its end, and log whether LPIPS is part of the loss.
+
+    Args:
+        run: the options.
+        resume: whether to continue from the checkpoint of the run.
+        worker: this process among those of the run.
+    """
     variant = variant_named(run.variant)
     require_whole_places(run, variant)
     loss, message = loss_of(run)
@@ -127,8 +134,9 @@ def require_whole_places(run: Run, variant: Variant) -> None:
 
 
 def _given(run: Run, path: Path) -> Network:
-    """A network from its file, of the kind that the run trains; refused where it gives NaN, as
-    every step would.
+    """Load a network of the kind that the run trains, or raise an error if it does not fit.
+
+    A network that returns NaN is rejected too, because it would in every step.
     """
     network, _ = load_network(path)
     kind = ConvBEERS if run.patches.family is None else BankedConvBEERS
@@ -154,7 +162,7 @@ def _given(run: Run, path: Path) -> Network:
 
 
 def loss_of(run: Run) -> tuple[RestorationLoss, str]:
-    """The loss of the recipe, and a sentence on whether LPIPS is part of it."""
+    """Build the loss of the recipe, and a sentence on whether LPIPS is part of it."""
     if not run.recipe.loss.lpips:
         return RestorationLoss(run.recipe.loss), ""
     backbone = find_backbone("squeeze", run.lpips)
@@ -167,12 +175,12 @@ def loss_of(run: Run) -> tuple[RestorationLoss, str]:
 
 
 def data_sha256(run: Run, loss: RestorationLoss) -> str:
-    """Return one digest of all that a run learns from: a resumed run must learn from the same, or
-    it is none.
+    """Return one digest of all data that a run learns from, because a resumed run must learn from
+    the same.
 
     Args:
-        run: what the options say.
-        loss: with or without LPIPS, whose weights may be missing at the second time.
+        run: the options.
+        loss: with or without LPIPS, whose weights may be missing when the run is resumed.
     """
     patches = run.patches
     files = list(chain.from_iterable(map(list_images, run.images)))
@@ -197,7 +205,11 @@ def data_sha256(run: Run, loss: RestorationLoss) -> str:
 
 
 def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
-    """Where batches come from, the images held out, and the names of those trained on."""
+    """Prepare the training data of a run.
+
+    Returns:
+        The source of batches, the validation, and the names of the training images.
+    """
     recipe = run.recipe
     sensors = (run.patches.family or run.patches.degraded, run.patches.reference)
     if run.pairs is not None:
@@ -237,7 +249,7 @@ def data(run: Run, trainer: Trainer) -> tuple[Batches, Validation, list[str]]:
 
 
 def read_scenes(run: Run) -> list[Scene]:
-    """The images of the run's folders."""
+    """Read the images in the folders of the run."""
     files = list(chain.from_iterable(map(list_images, run.images)))
     scenes = list[Scene]()
     if not files:
@@ -278,8 +290,8 @@ def _train(run: Run, trainer: Trainer, batches: Batches, validation: Validation)
 
 
 class Log:
-    """A CSV file that grows by a line a report; lines beyond the step that a run resumes from are
-    dropped.
+    """A CSV file with one line per report. When a run is resumed, lines beyond its step are
+    removed.
     """
 
     def __init__(self, path: Path, step: int) -> None:
@@ -307,7 +319,7 @@ class Log:
 def about(
     run: Run, images: Sequence[str], held_out: Sequence[str], loss: RestorationLoss
 ) -> dict[str, object]:
-    """The recipe kept in the weights' header: everything but the machine."""
+    """Return the recipe that is stored in the header of the weights: everything but the machine."""
     patches = run.patches
     return {
         "training": asdict(run.recipe),

@@ -1,6 +1,6 @@
-"""Training patches, simulated as they are needed from whole scenes.
+"""Simulate training patches from whole scenes when they are needed.
 
-A scene's spectrum is computed once; each visit blurs, samples and folds it anew with another
+The spectrum of a scene is computed once. Each visit blurs, samples and folds it again with another
 sensor, scale, phase and look. Visiting whole scenes yields many patches for one transform.
 """
 
@@ -34,12 +34,14 @@ from beers_deploy.profiles.instrument import Instrument
 
 
 class Batch(NamedTuple):
-    """Patches (N, 1, P, P) in [0, 1]; of a network that is told its sensor also what it is told.
+    """Patches (N, 1, P, P) in [0, 1]; for a conditioned network also the description of their
+    sensors.
 
     Attributes:
-        degraded: what the network sees.
-        reference: what it should give.
-        condition: of the sensor of each, as the patch lies; None for a plain network.
+        degraded: the input of the network.
+        reference: the target of the network.
+        condition: description of the sensor of each, oriented as the patch; None for a plain
+            network.
     """
 
     degraded: Tensor
@@ -52,7 +54,7 @@ class Visit(NamedTuple):
 
     Attributes:
         patches: (N, 2, P, P), degraded and reference in [0, 1].
-        condition: what a network is told of each; None without a family of sensors.
+        condition: description of the sensor of each; None without a family of sensors.
     """
 
     patches: Tensor
@@ -63,9 +65,11 @@ class PatchSource:
     """Endless batches of patches; the same for the same seed."""
 
     SHARD_BATCHES = 16
-    """Batches mixed together: enough scenes in one batch, little memory."""
+    """The number of batches that are shuffled together: enough scenes in one batch,
+    little memory.
+    """
     MOST_THREADS = 8
-    """Shards are made ahead by so many: each is some tens of megabytes."""
+    """The maximum number of shards prepared in advance; each takes some tens of megabytes."""
 
     def __init__(
         self,
@@ -86,16 +90,17 @@ class PatchSource:
         self._scenes = [prepare(scene, common, device) for scene in scenes]
 
     def batches(self, first: int = 0) -> Iterator[Batch]:
-        """Batch number `first` and all that follow: a resumed run goes on where it stopped.
+        """Yield batch number `first` and all that follow, so that a resumed run continues where it
+        stopped.
 
-        The next shards are made while the present one is used, on half of the cores: a GPU waits
-        for patches.
+        The next shards are prepared while the present one is used, on half of the cores, because a
+        GPU waits for patches.
         """
         number, within = divmod(first, self.SHARD_BATCHES)
         threads = min(max((os.cpu_count() or 1) // 2, 1), self.MOST_THREADS)
-        # One core a thread: each would start as many more as there are cores otherwise. A thread
-        # that has not asked for its number before takes the last one that any thread has set: this
-        # one must ask first.
+        # One core per thread: otherwise each would start as many threads as there are cores. A
+        # thread that has not read its number before uses the last one that any thread has set, so
+        # this one must read it first.
         torch.get_num_threads()
         with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as ahead:
             waiting = deque(ahead.submit(self._shard, number + k) for k in range(threads))
@@ -147,15 +152,14 @@ def _mixed(visits: Sequence[Visit], order: np.ndarray) -> Batch:
 
 
 def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -> Visit | None:
-    """All the patches of one simulated pass over a scene; None where it holds none."""
+    """Simulate one pass over a scene and return all its patches, or None if none fits."""
     ratio = int(generator.choice(recipe.oversamplings))
     room = min(scene.sides) // ratio - 2 * recipe.margin_px
     if room < recipe.patch_px:
         return None
     images, sensor = _acquire_pair(scene, recipe, ratio, generator)
     patches = cut(images, recipe.patch_px, generator)
-    # A conditioned network learns that a sensor's axes changed places, and is told so; a plain one
-    # cannot.
+    # A conditioned network is given the swapped axes of a sensor; a plain one cannot learn them.
     mirrors, quarters = sensor.symmetry
     quarter, mirrored = draw_turn(generator, quarters or recipe.family is not None, mirrors)
     if recipe.family is None:
@@ -166,7 +170,11 @@ def visit(scene: Visited, recipe: PatchRecipe, generator: np.random.Generator) -
 def _acquire_pair(
     scene: Visited, recipe: PatchRecipe, ratio: int, generator: np.random.Generator
 ) -> tuple[Tensor, Instrument]:
-    """Degraded and reference, (2, H, W) over full scale, and the sensor of the degraded one."""
+    """Simulate degraded and reference images, (2, H, W) over full scale.
+
+    Returns:
+        The images, and the sensor of the degraded one.
+    """
     look = recipe.looks.draw(generator)
     phase_y, phase_x = (float(v) for v in generator.uniform(-ratio / 2, ratio / 2, 2))
     sensors = (recipe.family or recipe.degraded).draw(generator), recipe.reference.draw(generator)
@@ -182,8 +190,8 @@ def _acquire_pair(
 
 
 def _conditioned(patches: Tensor, sensor: Instrument, quarter: int, mirrored: bool) -> Visit:
-    """Brighten dark patches (N, 2, P, P) as a restoration does, and add what a network is told of
-    each.
+    """Brighten dark patches (N, 2, P, P) as a restoration does, and add the description of their
+    sensors.
     """
     factors = np.ones(len(patches), np.int64)
     brightest = patches[:, 0].amax((1, 2)).cpu().numpy()
@@ -201,8 +209,8 @@ def _conditioned(patches: Tensor, sensor: Instrument, quarter: int, mirrored: bo
 def _condition_of(
     sensor: Instrument, factor: int, quarter: int, mirrored: bool
 ) -> tuple[Tensor, Bank]:
-    """The vector (4,) and the bank of a sensor of `factor` times the gain, for patches that were
-    turned.
+    """Return the vector (4,) and the bank of a sensor of `factor` times the gain, for turned
+    patches.
     """
     brighter = replace(sensor, gain_dn_per_radiance=sensor.gain_dn_per_radiance * factor)
     vector = vector_tensor(brighter)
@@ -215,13 +223,15 @@ def _condition_of(
 
 
 def cut(images: Tensor, patch_px: int, generator: np.random.Generator) -> Tensor:
-    """Cut (C, H, W) into as many whole patches as fit, from a random corner: (N, C, P, P)."""
+    """Cut (C, H, W) into the largest number of whole patches, from a random corner:
+    (N, C, P, P).
+    """
     top, left = (int(generator.integers(size % patch_px + 1)) for size in images.shape[-2:])
     windows = images[:, top:, left:].unfold(1, patch_px, patch_px).unfold(2, patch_px, patch_px)
     return windows.permute(1, 2, 0, 3, 4).reshape(-1, len(images), patch_px, patch_px)
 
 
 def turned(patches: Tensor, quarter: int, mirrored: bool) -> Tensor:
-    """Patches (..., P, P) turned by quarters, then mirrored."""
+    """Rotate patches (..., P, P) by quarter turns, then mirror them."""
     rotated = torch.rot90(patches, quarter, (-2, -1))
     return rotated.flip(-1) if mirrored else rotated

@@ -1,8 +1,8 @@
-"""One gradient step, as a device computes it: nothing in it waits for a result.
+"""Compute one gradient step on a device, without waiting for any result.
 
-So a GPU records the step once as a CUDA graph and replays it: the launch of some hundred kernels,
-which takes longer than they do for a small network, is paid once. A step whose loss or gradient is
-not finite changes no weight.
+A GPU can therefore record the step once as a CUDA graph and replay it. The launch of some hundred
+kernels takes longer than the kernels of a small network, and is paid only once. A step whose loss
+or gradient is not finite changes no weight.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,21 +17,25 @@ from beers_deploy.model.training.losses import RestorationLoss
 from beers_deploy.model.training.source import Batch
 
 WARM_UPS = 3
-"""Forward and backward passes before a recording, in which the libraries choose their kernels."""
+"""The number of forward and backward passes before a recording, in which the libraries choose their
+kernels.
+"""
 
 Agree = Callable[[Tensor], Tensor]
-"""Of several workers, whether any has raised a flag; of one, the flag."""
+"""A function of a flag: for several workers, whether any has raised it; for one,
+the flag itself.
+"""
 
 
 @dataclass
 class Inputs:
-    """What a step reads, on its device; a recorded step reads the same memory each time.
+    """The inputs of a step on its device. A recorded step reads the same memory each time.
 
     Attributes:
-        batch: the patches, and what the network is told.
-        steps: what maps are rounded to; none leaves them as they are.
+        batch: the patches, and the description of their sensors.
+        steps: step sizes to which maps are rounded; without any they are not rounded.
         rate: learning rate.
-        share: of the new weights in their running average.
+        share: weight of the new weights in their running average.
     """
 
     batch: Batch
@@ -40,7 +44,7 @@ class Inputs:
     share: Tensor
 
     def tensors(self) -> list[Tensor]:
-        """All of it, in one order."""
+        """Return all tensors in a fixed order."""
         condition = () if self.batch.condition is None else self.batch.condition.parts
         return [
             self.batch.degraded,
@@ -53,16 +57,16 @@ class Inputs:
 
 
 class Step:
-    """Forward, loss, backward, clipped gradients, Adam and the running average.
+    """One gradient step: forward, loss, backward, clipped gradients, Adam and the running average.
 
     Args:
         network: on its device.
-        loss: of what it gives.
-        forward: the network, or what averages its gradients over workers.
-        gradient_norm: larger gradients are cut to it.
+        loss: function of its output.
+        forward: the network, or a wrapper that averages its gradients over workers.
+        gradient_norm: larger gradients are clipped to it.
         bfloat16: whether the blocks are computed in it.
-        rounding: how maps are rounded; None leaves them as they are.
-        agree: see there; None for a single worker.
+        rounding: how maps are rounded; None does not round them.
+        agree: see `Agree`; None for a single worker.
 
     Attributes:
         average: the running average of the weights by name.
@@ -184,7 +188,7 @@ class Step:
             self.optimiser.zero_grad(set_to_none=True)
         torch.cuda.current_stream().wait_stream(stream)
         self._graph = torch.cuda.CUDAGraph()
-        # Other threads simulate patches on the device meanwhile, which a recording forbids unless
-        # told otherwise.
+        # Other threads simulate patches on the device meanwhile, which a recording forbids by
+        # default.
         with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
             self._outputs = self._taken(inputs)

@@ -1,4 +1,4 @@
-"""Batches of patches from pairs on disk, as `beers-deploy simulate` writes them."""
+"""Draw batches of patches from pairs on disk, as `beers-deploy simulate` writes them."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class StoredPairs:
     mirrors: bool = True
 
     def batches(self, first: int = 0) -> Iterator[Batch]:
-        """Batch number `first` and all that follow."""
+        """Yield batch number `first` and all that follow."""
         number = first
         while True:
             # Keyed by the batch's number and not drawn in sequence: a resumed run draws the same.
@@ -46,7 +46,7 @@ class StoredPairs:
             number += 1
 
     def _patch(self, generator: np.random.Generator) -> Tensor:
-        """One patch (2, P, P) of a random pair."""
+        """Read one patch (2, P, P) at a random place of a random pair."""
         files = self.files[int(generator.integers(len(self.files)))]
         images = [read_acquisition(file, remedy=RESCALE, max_dn=self.max_dn) for file in files]
         height, width = images[0].shape

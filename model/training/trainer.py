@@ -1,5 +1,5 @@
-"""The steps of a run: Adam, warm-up and cosine, clipped gradients, averaged weights, on several
-processes.
+"""Run the steps of a training: Adam, warm-up and cosine, clipped gradients, averaged weights, on
+one or several processes.
 
 Batches are keyed by (seed, step): a run that was killed and resumed ends with the same weights as
 one that was not.
@@ -44,7 +44,9 @@ from beers_deploy.profiles.errors import MachineError, OptionError
 
 @dataclass(frozen=True)
 class Worker:
-    """This process among those of the run: torchrun starts them, and says so in the environment."""
+    """This process among those of the run; torchrun starts them and sets their environment
+    variables.
+    """
 
     rank: int = 0
     count: int = 1
@@ -52,11 +54,11 @@ class Worker:
 
     @property
     def first(self) -> bool:
-        """Whether this one writes and reports."""
+        """True if this worker writes and reports."""
         return self.rank == 0
 
     def device(self, name: str) -> torch.device:
-        """The device of that name; of several GPUs, this worker's own."""
+        """Return the device of that name; with several GPUs, the one of this worker."""
         device = torch.device(name)
         if device.type == "cuda" and not torch.cuda.is_available():
             raise MachineError(
@@ -68,7 +70,7 @@ class Worker:
         return device
 
     def any(self, flag: bool, device: torch.device) -> bool:
-        """Whether any worker raises the flag; all get the same answer."""
+        """Return True if any worker raises the flag; all workers get the same answer."""
         if self.count == 1:
             return flag
         raised: Tensor = torch.tensor(float(flag), device=device)
@@ -91,24 +93,24 @@ def joined(device: str) -> Iterator[Worker]:
 
 
 Batches = Callable[[int], Iterator[Batch]]
-"""The batches from a number on, of patches made on the fly or of stored pairs."""
+"""A function that returns all batches from a number on, of simulated patches or of stored pairs."""
 
 UNSEEN_STEPS = 25
-"""On a GPU so many steps are taken before anybody looks at what they gave."""
+"""The number of steps on a GPU before their results are read."""
 
 Precision = Literal["float32", "bfloat16"]
 """The number format of the blocks.
 
-Head, tail and what is added stay float32: 8 bits would round a 12-bit image.
+Head, tail and sums remain float32, because 8 bits of precision would round a 12-bit image.
 """
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How often a run reports, looks at the validation images, and saves.
+    """The number of steps between reports, validations and checkpoints.
 
-    `report` is told the step, the means of the loss's terms since the last report, and how fast it
-    went.
+    `report` is called with the step, the means of the loss's terms since the last report, and the
+    speed.
     """
 
     report_steps: int = 100
@@ -120,10 +122,10 @@ class Schedule:
 
 @dataclass(frozen=True)
 class Speed:
-    """How fast some steps went.
+    """The speed of some steps.
 
     Attributes:
-        patches_per_s: trained on.
+        patches_per_s: patches trained on per second.
         waited: share of the time in which the steps waited for patches.
     """
 
@@ -132,7 +134,7 @@ class Speed:
 
 
 class Spent:
-    """Time since it was made, and how much of it went into waiting for patches."""
+    """Measures the time since its creation, and the share of it spent waiting for patches."""
 
     def __init__(self) -> None:
         self.begun = time.monotonic()
@@ -140,19 +142,19 @@ class Spent:
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
-        """Count the time of what is done within as waiting."""
+        """Count the time within the block as waiting."""
         begun = time.monotonic()
         yield
         self.waited_s += time.monotonic() - begun
 
     def figures(self, patches: int) -> Speed:
-        """How fast so many patches were trained on."""
+        """Return the speed of training on `patches` patches."""
         elapsed_s = max(time.monotonic() - self.begun, 1e-9)
         return Speed(patches / elapsed_s, self.waited_s / elapsed_s)
 
 
 def largest_of_all(flag: Tensor) -> Tensor:
-    """The largest flag of all workers."""
+    """Return the maximum of a flag over all workers."""
     torch.distributed.all_reduce(flag, torch.distributed.ReduceOp.MAX)
     return flag
 
@@ -162,19 +164,19 @@ class Trainer:
 
     Args:
         variant: the network's size.
-        recipe: see there.
-        loss: the loss that the recipe weighs.
+        recipe: the parameters of the run.
+        loss: the loss that the recipe weights.
         worker: this process among those of the run.
-        device: where the steps are computed.
-        start: a network of the same kind and size to go on from; None draws new weights.
-        precision: what the body is computed in; it is the machine's, and a resumed run may take
+        device: on which the steps are computed.
+        start: a network of the same kind and size to continue from; None draws new weights.
+        precision: number format of the body; it depends on the machine, and a resumed run may use
             another.
         conditioned: whether the network is given the sensor of each patch.
-        rounding: of a conditioned network's maps, as its INT8 file rounds them; None leaves them as
-            they are.
+        rounding: of a conditioned network's maps, as its INT8 file rounds them; None does not round
+            them.
 
     Attributes:
-        data: digest of all that the run learns from; a checkpoint belongs to one.
+        data: digest of all data that the run learns from; a checkpoint belongs to one.
     """
 
     def __init__(
@@ -216,9 +218,9 @@ class Trainer:
         """Train to the last step. Ctrl-C leaves a checkpoint of the last whole step.
 
         Args:
-            batches: from a number on, all that follow.
+            batches: function that returns all batches from a number on.
             checkpoint: the file.
-            schedule: see there; of several workers, the first keeps to it.
+            schedule: when to report, validate and save; with several workers, the first does.
         """
         schedule = schedule if self.worker.first else Schedule()
         spent = Spent()
@@ -256,25 +258,27 @@ class Trainer:
             raise KeyboardInterrupt
 
     def _due(self, every: int) -> bool:
-        """Whether so many steps have passed again, or it is the end; of 0 it never is."""
+        """Return True if `every` steps have passed again, or at the last step; never if it is 0."""
         return every > 0 and (self.step % every == 0 or self.step == self.recipe.steps)
 
     @property
     def _full(self) -> bool:
-        """Whether it is time to look at what the last steps gave: a GPU is not made to wait for it
-        at each.
+        """True if the results of the last steps should be read. On a GPU they are read rarely, so
+        that it does not wait.
         """
         return len(self._unseen) >= (UNSEEN_STEPS if self.device.type == "cuda" else 1)
 
     def _means(self, rows: Sequence[Sequence[float]]) -> dict[str, float]:
-        """Of the steps since the last report: the means of their terms, but of those skipped."""
+        """Return the means of the terms of the steps since the last report, without
+        skipped steps.
+        """
         counted = [terms for skipped, _, *terms in rows if not skipped]
         if not counted:
             return {}
         return dict(zip(self._take.names, np.mean(counted, 0).tolist(), strict=True))
 
     def train_step(self, batch: Batch) -> None:
-        """One step on a batch; what it gave is kept for `seen`."""
+        """Take one step on a batch; `seen` reads its result later."""
         # Early on the average follows fast, or the first random weights would stay in it for long.
         step = self.step + 1
         decay = min(self.recipe.ema_decay, (1 + step) / (10 + step))
@@ -282,10 +286,10 @@ class Trainer:
         self.step = step
 
     def seen(self) -> list[list[float]]:
-        """Look at what the steps since the last look gave, and stop a run that has gone wrong.
+        """Read the results of the steps since the last call, and stop a failing run.
 
         Returns:
-            Of each step 1 if it was skipped, else 0; its loss; and the loss's terms.
+            For each step 1 if it was skipped, else 0; its loss; and the loss's terms.
         """
         rows: list[list[float]] = torch.stack(self._unseen).tolist() if self._unseen else []
         first = self.step - len(rows) + 1
@@ -298,7 +302,9 @@ class Trainer:
         return rows
 
     def averaged(self) -> Network:
-        """The network with its running-average weights, on the CPU: the one to ship."""
+        """Return the network with its running-average weights on the CPU: the one that is
+        shipped.
+        """
         network = type(self.network)(self.network.variant)
         network.load_state_dict(self.average)
         return network.eval()
@@ -324,7 +330,7 @@ class Trainer:
         write_tensors(path, arrays(tensors), header)
 
     def resume(self, path: Path) -> None:
-        """Go on from a checkpoint of the same recipe, begun on this processor or another."""
+        """Continue from a checkpoint of the same recipe, written on this device or another."""
         tensors, self.step, self.guards = read_checkpoint(
             path, self.network, self.recipe, self.data
         )

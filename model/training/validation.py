@@ -1,4 +1,4 @@
-"""Validation on sites that are not trained on: which they are, figures, and a picture."""
+"""Validate on sites that are not trained on: choose them, compute figures, and draw a picture."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,7 +30,7 @@ VALIDATION_CROP_PX = 96
 ZOOM = 2
 
 SHARE = 0.05
-"""Of the images: sites are held out, the ones with the fewest images first, until so many are."""
+"""Sites with the fewest images are held out first, until this share of the images is held out."""
 
 SIDE_PX = 192
 OVERSAMPLINGS = (4, 3, 2, 1)
@@ -39,15 +39,18 @@ OVERSAMPLINGS = (4, 3, 2, 1)
 def split_by_site(
     names: Sequence[str], excluded: Sequence[str] = ()
 ) -> tuple[list[int], list[int]]:
-    """Numbers of the images to train on, and of those held out: whole sites, always the same ones.
+    """Split images into those to train on and those held out, by whole sites and always equally.
 
     Args:
         names: of the images.
-        excluded: sites to hold out; without any, those with the fewest images are, and of fewer
-            than three none is.
+        excluded: sites to hold out. Without any, those with the fewest images are held out; with
+            fewer than three sites none is.
+
+    Returns:
+        The numbers of the images to train on, and of those held out.
 
     Raises:
-        OptionError: no image shows a wanted site.
+        OptionError: no image shows an excluded site.
     """
     sites: dict[str, list[int]] = {}
     for number, name in enumerate(names):
@@ -72,7 +75,7 @@ def split_by_site(
 class Validation:
     """Pairs (1, 1, H, W) in [0, 1] from scenes that are not trained on, the same in every run.
 
-    Scenes too small to leave anything within the margin are left out.
+    Scenes that are too small for the margin are excluded.
     """
 
     def __init__(
@@ -99,9 +102,9 @@ class Validation:
             self.sensors.append(sensors[0])
 
     def restore(self, network: Network) -> list[np.ndarray]:
-        """Each degraded image through the network in float32, (H, W), clipped to [0, 1].
+        """Restore each degraded image with the network in float32, (H, W), clipped to [0, 1].
 
-        A conditioned network is told the sensor that acquired the image. An image whose sides are
+        A conditioned network is given the sensor that acquired the image. An image whose sides are
         no multiples of the network's scale is extended by copies of its last row and column, as in
         a restoration.
         """
@@ -117,8 +120,11 @@ class Validation:
         return restored
 
     def judge(self, network: Network) -> dict[str, float]:
-        """Means over the pairs of a network on the CPU, PSNR over full scale: by the names of a
-        log's columns.
+        """Compute means of the figures over all pairs, for a network on the CPU; PSNR is over full
+        scale.
+
+        Returns:
+            The means, by the names of a log's columns.
         """
         restored = self.restore(network)
         references = [reference[0, 0].numpy() for _, reference in self.pairs]
@@ -137,7 +143,7 @@ class Validation:
 
 
 def write_picture(validation: Validation, network: Network, path: Path) -> None:
-    """The busiest crop of each validation image: degraded, restored, reference."""
+    """Draw the busiest crop of each validation image: degraded, restored, reference."""
     rows: list[list[np.ndarray]] = []
     for (degraded, reference), restored in zip(
         validation.pairs, validation.restore(network), strict=True

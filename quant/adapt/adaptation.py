@@ -1,8 +1,8 @@
-"""Choose how each kind of operator that a DPU lacks is replaced, and measure what that costs.
+"""Choose how each kind of operator that a DPU lacks is replaced, and measure the loss.
 
 1. Replace each kind by the other function, alone, and compensate.
-2. Where that still loses more than `ENOUGH_DB`, take the exact replacement if there is one: it
-   loses nothing in float, but takes more operations.
+2. Where that still loses more than `ENOUGH_DB`, use the exact replacement if there is one: it loses
+   nothing in float, but needs more operations.
 3. Replace all kinds as chosen, and compensate jointly.
 """
 
@@ -32,25 +32,25 @@ from beers_deploy.quant.session import open_any_size
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 
 ADAPTED = "adapted"
-"""The table of replaced operators, and what an INT8 file calls its record of them."""
+"""The table of replaced operators, and the key of its record in an INT8 file."""
 ENOUGH_DB = 0.05
-"""An approximation that loses no more PSNR than this is preferred to an exact replacement."""
+"""An approximation is preferred to an exact replacement up to this loss of PSNR."""
 NEAR_DB = 60.0
-"""The same without references, as PSNR to the original's results: where these restore to 40 dB, an
-error of 60 dB loses 0.04 dB.
+"""The same limit without references, as PSNR to the original's results: if these restore to 40 dB,
+an error of 60 dB loses 0.04 dB.
 """
 FIT_IMAGES = 32
 FIT_PX = 48
-"""What convolutions are fitted on: at most so many images, of so many pixels a side."""
+"""The maximum number of images, and their side in pixels, on which convolutions are fitted."""
 
 
 @dataclass(frozen=True)
 class Adapted:
-    """A float network of operators that a DPU computes, and what the replacement costs.
+    """A float network of operators that a DPU computes, and the loss of the replacement.
 
     Attributes:
         model: the network.
-        rows: what became of each kind of operator, and the loss in float.
+        rows: the replacement of each kind of operator, and the loss in float.
         record: the same in words, for the metadata of a file; empty if nothing was replaced.
     """
 
@@ -61,10 +61,11 @@ class Adapted:
 
 @dataclass(frozen=True)
 class Trial:
-    """A replacement as it is and compensated, each compared with the original network.
+    """A replacement without and with compensation, each compared with the original network.
 
     Attributes:
-        model: the compensated network, or the one without if that is nearer to the original.
+        model: the compensated network, or the one without compensation if that is nearer to the
+            original.
         before: the difference without compensation.
         after: the difference of `model`.
     """
@@ -75,7 +76,7 @@ class Trial:
 
     @property
     def is_enough(self) -> bool:
-        """Return True if the loss is small enough to do without an exact replacement."""
+        """Return True if the loss is small enough to make an exact replacement unnecessary."""
         if math.isnan(self.after.drop_db):
             return self.after.psnr_between_db >= NEAR_DB
         return self.after.drop_db <= ENOUGH_DB
@@ -111,7 +112,7 @@ def adapt(model: onnx.ModelProto, samples: Patches, held_out: Patches) -> Adapte
     if not counts:
         return Adapted(model)
     exact = {kind for kind in counts if kind not in APPROXIMATIONS}
-    # Refuses what is still no operator of the DPU before the work of fitting.
+    # Raises an error for operators that the DPU still lacks before the work of fitting.
     read_network(replaced(model, counts.keys() - exact, exact))
     images = _fit_images(model, samples.degraded)
     # 1. and 2.

@@ -1,11 +1,12 @@
 """Fit the convolutions around replaced activations to the original network, without training.
 
-1. HardSwish and HardSigmoid are nearest to SiLU and Sigmoid over other ranges than as they stand.
-   Each channel gets the factor k with which a line through HardSwish(k x), or HardSigmoid(k x), is
-   nearest to the original. The convolutions in front and behind hold k and 1 / k.
-2. Each convolution that reads what has changed is fitted in order, by least squares: of the adapted
-   network's tensors it shall compute what it computed of the original's. That includes a scale for
-   each channel, the correction of the bias, and what the layers before have left.
+1. HardSwish and HardSigmoid approximate SiLU and Sigmoid better over scaled ranges. Each channel
+   gets the factor k with which a line through HardSwish(k x), or HardSigmoid(k x), is nearest to
+   the original. The convolutions in front and behind are multiplied by k and 1 / k.
+2. Each convolution that reads changed tensors is fitted in order, by least squares. From the
+   adapted network's tensors it computes approximately what it computed from the original ones. That
+   includes a scale for each channel, the correction of the bias, and the remaining error of the
+   layers before.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -24,20 +25,22 @@ from beers_deploy.quant.session import open_any_size, tensors_of
 from beers_deploy.quant.simplify.fold_affine import is_convolution
 
 MOST_UNKNOWNS = 2304
-"""Weights of one result, as of 256 channels and 3 x 3; of more the equations take too long."""
+"""The maximum number of weights of one result, as of 256 channels and 3 x 3. The equations of more
+take too long.
+"""
 ROWS_OF_EACH_UNKNOWN = 16
 LEAST_ROWS = 8192
 RIDGE = 1e-5
-"""The penalty on leaving the old weights, in mean squares of what a convolution reads."""
+"""The penalty on changing the weights, relative to the mean square of a convolution's input."""
 FACTORS = np.geomspace(0.6, 3.6, 31)
 """Candidates of k."""
 VALUES = 256
-"""Of a channel that are compared for k, from each image."""
+"""The number of values of a channel, from each image, that are compared for k."""
 
 
 @dataclass(frozen=True)
 class Networks:
-    """The original network and the adapted one, in which tensors keep their names.
+    """The original network and the adapted one, in which tensors have the same names.
 
     Attributes:
         original: the original network.
@@ -63,7 +66,9 @@ class Networks:
         return weight, np.zeros(len(weight), np.float32) if bias is None else bias
 
     def set_weights(self, node: Node, weight: np.ndarray, bias: np.ndarray) -> None:
-        """Give a convolution weights of its own, in the model too."""
+        """Set the weights and bias of a convolution in graph and model, without changing those of
+        other nodes.
+        """
         numbers = {"weight": weight, "bias": bias}
         names = [self.graph.add_constant(f"{node.name}.{role}", v) for role, v in numbers.items()]
         node.inputs = (node.inputs[0], *names)
@@ -109,7 +114,7 @@ def compensated(
 
 @dataclass(frozen=True)
 class Target:
-    """What the original network computes at some places of a map.
+    """The values that the original network computes at some places of a map.
 
     Attributes:
         rows: (K,) of the places.
@@ -123,7 +128,7 @@ class Target:
 
 
 def _targets(networks: Networks, nodes: Sequence[Node]) -> list[list[Target]]:
-    """Return for each convolution what it computes of each image, in one run of the original."""
+    """Return the results of each convolution for each image, in one run of the original."""
     targets = [list[Target]() for _ in nodes]
     if not nodes:
         return targets
@@ -184,7 +189,7 @@ def _may_scale(networks: Networks, node: Node) -> bool:
 
 
 def _best_factors(is_swish: bool, source: np.ndarray, result: np.ndarray) -> np.ndarray:
-    """Return k (C,) for what an activation reads and what the original computes, (C, K)."""
+    """Return the best k (C,) from the input of an activation and the original's output, (C, K)."""
     residuals = []
     centred = result - result.mean(1, keepdims=True)
     for factor in FACTORS:
@@ -205,7 +210,7 @@ def _fit(
     Args:
         networks: both.
         node: the convolution of the adapted one.
-        targets: what it computes in the original one, for each image.
+        targets: its results in the original one, for each image.
         factors: k (O,) of its results, None for 1.
     """
     weight, bias = networks.weights(node)
@@ -232,7 +237,9 @@ class Equations:
     """The normal equations of a convolution's weights and bias, added up image by image."""
 
     def __init__(self, groups: int, unknowns: int, results: int) -> None:
-        """Begin those of `results` results in each group, of so many weights each."""
+        """Start equations for `results` results in each group, each with the same number of
+        weights.
+        """
         self._shape = groups, unknowns, results
         self._gram = np.zeros((groups, unknowns, unknowns))
         self._moment = np.zeros((groups, unknowns, results))
@@ -241,7 +248,7 @@ class Equations:
         self._count = 0
 
     def add(self, reads: np.ndarray, errors: np.ndarray) -> None:
-        """Add what a convolution reads for K results (K, I, kh, kw), and their errors (K, O)."""
+        """Add the inputs of a convolution for K results (K, I, kh, kw), and their errors (K, O)."""
         groups, unknowns, results = self._shape
         x = reads.reshape(-1, groups, unknowns).transpose(1, 2, 0).astype(np.float64)
         y = errors.reshape(-1, groups, results).swapaxes(0, 1).astype(np.float64)
@@ -269,7 +276,7 @@ class Equations:
 def _windows(
     source: np.ndarray, kernel: Pair, window: Window, places: tuple[np.ndarray, np.ndarray]
 ) -> np.ndarray:
-    """Return what a convolution reads of a map (I, H, W) for its results at some places.
+    """Return the input windows of a convolution in a map (I, H, W) for its results at some places.
 
     Returns:
         (K, I, kh, kw) for K places.

@@ -63,7 +63,7 @@ EXACT = {
     Kind.leaky_relu: "ReLU in a second branch, and an Add",
     Kind.prelu: "ReLU in a second branch, and an Add",
 }
-"""What computes the same as each kind (4 and 5)."""
+"""The exact replacement of each kind (4 and 5)."""
 
 
 def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
@@ -139,7 +139,7 @@ def _by_constant(graph: OnnxGraph, node: Node, source: str) -> bool:
 
 
 def slopes_of(graph: OnnxGraph, node: Node) -> np.ndarray | None:
-    """Return the slopes (C,) or (1,) of a LeakyReLU or PReLU; None of another node."""
+    """Return the slopes (C,) or (1,) of a LeakyReLU or PReLU; None for another node."""
     if node.op_type == "LeakyRelu":
         return np.array([node.attributes.get("alpha", 0.01)], np.float32)
     return per_channel(graph.value(node, 1)) if node.op_type == "PRelu" else None
@@ -160,7 +160,7 @@ def replaced(
 ) -> onnx.ModelProto:
     """Return a copy of a network with some kinds of nodes replaced.
 
-    Tensors keep their names, but for those within an exact replacement.
+    Tensors have the same names, except those within an exact replacement.
 
     Args:
         model: a simplified float network; not changed.

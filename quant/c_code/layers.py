@@ -1,4 +1,6 @@
-"""The operations of a core in C: the constants of each layer, and the call that computes it."""
+"""Write the operations of a core in C: the constants of each layer, and the call
+that computes it.
+"""
 
 from collections.abc import Callable, Mapping
 from textwrap import fill
@@ -35,22 +37,22 @@ SUM_BITS = 30
 """Bits of the largest sum: int32 must also hold the half of a step that rounding adds."""
 LANES = 16
 CHANNELS = 4
-"""As in `kernels/convolve.c`."""
+"""The same values as in `kernels/convolve.c`."""
 
 Shape = tuple[int, ...]
-"""Channels, rows, columns."""
+"""The number of channels, rows and columns."""
 
 
 class LayerWriter:
-    """Collects the C text of operations, and what it needs.
+    """Collects the C text of operations, and the definitions that it needs.
 
     Attributes:
-        constants: definitions of constants, each behind a comment on its layer.
+        constants: definitions of constants, each after a comment on its layer.
         calls: statements, in order.
         kernels: files in `kernels/`, each named by the function that is called.
-        constant_bytes: of all weights, biases and tables.
-        line_length: values of the longest `line` in `kernels/convolve.c`.
-        weights_length: values of the most `weights` there.
+        constant_bytes: the size of all weights, biases and tables.
+        line_length: the number of values of the longest `line` in `kernels/convolve.c`.
+        weights_length: the largest number of values of `weights` there.
     """
 
     def __init__(self, core: IntCore, shapes: Mapping[str, Shape]) -> None:

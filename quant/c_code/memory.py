@@ -1,4 +1,6 @@
-"""Static buffers for the tensors of a core: tensors that are never needed together share one."""
+"""Assign static buffers to the tensors of a core: tensors that are never needed at the same time
+share one.
+"""
 
 from collections.abc import Mapping
 
@@ -6,7 +8,7 @@ from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.graph import CORRECTION, PLANES, Add, Mul, Op, Pointwise
 
 IN_PLACE = (Add, Mul, Pointwise)
-"""Operations that read of each input only the value at the place that they write."""
+"""Operations that read of each input only the value at the position that they write."""
 
 
 def share_buffers(core: IntCore, sizes: Mapping[str, int]) -> tuple[dict[str, int], list[int]]:

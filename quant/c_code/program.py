@@ -1,4 +1,4 @@
-"""A core as one C99 file with the function `run`."""
+"""Write a core as one C99 file with the function `run`."""
 
 import math
 from importlib.resources import files

@@ -1,8 +1,9 @@
-"""The integer core as ONNX, in three encodings of the same numbers, and read back.
+"""Encode the integer core as ONNX in three encodings of the same numbers, and read it back.
 
-The host's file runs on stock onnxruntime by integer kernels, from image to restored image; the
-board's is the core by itself as QDQ ONNX, with int8 bias and power-of-two scales; VINT8 is that in
-the layout that AMD's NPU flow takes. Reading a host file back gives numbers to reason about.
+The host's file runs on stock onnxruntime by integer kernels, from image to restored image. The
+board's file is the core alone as QDQ ONNX, with int8 bias and power-of-two scales. VINT8 is the
+same in the layout that AMD's NPU flow accepts. Reading a host file back returns the numbers for
+analysis.
 """
 
 from beers_deploy.quant.encodings.board import (

@@ -1,8 +1,9 @@
-"""The board's files: the integer core by itself as QDQ ONNX, with int8 bias and power-of-two
+"""Write the board's files: the integer core alone as QDQ ONNX, with int8 bias and power-of-two
 scales; and VINT8.
 
-HardSigmoid, HardSwish and the mean of a window that is no power of two are ONNX's own in both, and
-the host's file has the DPU's approximations of them: there results may differ by a few steps.
+HardSigmoid, HardSwish and means over windows whose size is no power of two are ONNX's own operators
+in both files. The host's file has the DPU's approximations of them, so that results may differ by a
+few steps.
 """
 
 import json
@@ -37,13 +38,16 @@ from beers_deploy.quant.untrusted import contradictions
 def board_model(
     core: IntCore, about: dict[str, str], tile_px: int | None = None
 ) -> onnx.ModelProto:
-    """`planes` (N, C, H, W) float32, as q * 2^-7, to `correction` (N, C', H', W') float32;
-    `tile_px` is the image's.
+    """Write the core as a QDQ model from `planes` to `correction`.
 
-    Where the host moves pixels into channels first, the file says of how many pixels a place of the
-    planes is.
+    `planes` are (N, C, H, W) float32, as q * 2^-7, and `correction` is (N, C', H', W') float32. Its
+    channels come in the copies that `HostPart.decode` combines to one value. If the host rearranges
+    pixels into channels first, the file records the number of pixels per place of the planes.
 
-    The correction's channels come in the copies that `HostPart.decode` turns into one value.
+    Args:
+        core: the integer core.
+        about: metadata of the file.
+        tile_px: side of the image's tile; None for any size.
     """
     writer = BoardWriter()
     writer.quantized("planes.dequantised", PLANES, core.frac_bits[PLANES])
@@ -85,10 +89,11 @@ def _core_file(
 
 
 def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:
-    """A host's file whose core is described in it as the board gets it; any other model as it is.
+    """Return the board's model of the core that a host's file describes; return any other model
+    unchanged.
 
-    What the host spells with several operators, such as a transposed convolution, is one of the
-    DPU's own.
+    Operators that the host expresses by several nodes, such as a transposed convolution, are single
+    operators there.
     """
     if KEY not in metadata(model):
         return model
@@ -98,10 +103,10 @@ def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 class BoardWriter(GraphWriter):
-    """Writes tensors as the board's flow reads them: quantised to int8, and seen as float again."""
+    """Writes tensors as the board's flow reads them: quantised to int8, then dequantised."""
 
     def scale(self, tensor: str, frac_bits: int) -> list[str]:  # noqa: ARG002 - tensors of one scale share it here
-        """Scale and zero point of a tensor."""
+        """Return the names of scale and zero point of a tensor."""
         return [self.unit(frac_bits), self.constant("zero_point", np.array(0, np.int8))]
 
     def quantized(self, output: str, source: str, frac_bits: int) -> None:
@@ -114,8 +119,8 @@ class BoardWriter(GraphWriter):
         )
 
     def operation(self, op: IntConv | Op, feeds: list[str], output: str) -> None:
-        """Write an operation on tensors seen as float, a convolution's weights and bias as int8
-        seen so too.
+        """Write an operation on dequantised tensors; weights and bias of a convolution are
+        dequantised int8.
         """
         if isinstance(op, IntConv):
             weight = onnx_weight(op.weight, op.transposed)
@@ -134,19 +139,19 @@ class BoardWriter(GraphWriter):
 
 
 CONFIG = "vitisai_config.json"
-"""What AMD's compiler reads beside the network."""
+"""The file that AMD's compiler reads in addition to the network."""
 CLAMPS = (Activation.relu, Activation.relu6)
 
 
 def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> onnx.ModelProto:
-    """VINT8, the file that AMD's current NPU flow compiles: the numbers of the board's file in
-    another layout.
+    """Write VINT8, the file that AMD's current NPU flow compiles: the numbers of the board's file
+    in another layout.
 
-    One image of one tile, every size stated; a pair of Q and DQ for each reader of a tensor; a
-    scale and a zero point of its own for each tensor; and a pair between an operation and a clamp
-    behind it, which AMD's quantiser writes there too. On the result's own grid it does not matter
-    whether a value is clamped before it is rounded or after, so no bit changes. LeakyReLU is no
-    clamp: it stays behind the sums, as the core computes it.
+    It is for one image of one tile, with every size stated. Each reader of a tensor has its own
+    pair of Q and DQ, and each tensor its own scale and zero point. A pair also separates an
+    operation from the clamp behind it, as AMD's quantiser writes it. On the grid of the result it
+    does not matter whether a value is clamped before or after rounding, so no bit changes.
+    LeakyReLU is no clamp: it follows the sums directly, as the core computes it.
 
     Raises:
         OptionError: no tile.
@@ -178,7 +183,7 @@ def required_tile(tile_px: int | None, use: str) -> int:
 
 
 def _apart(op: IntConv | Op) -> Iterator[IntConv | Op]:
-    """An operation, and by itself the clamp behind it."""
+    """Yield an operation, and the clamp behind it as a separate operation."""
     if not isinstance(op, IntConv | Add) or op.activation not in CLAMPS:
         yield op
         return
@@ -189,7 +194,7 @@ def _apart(op: IntConv | Op) -> Iterator[IntConv | Op]:
 
 
 class _PairWriter(BoardWriter):
-    """Writes each tensor once in float, and once more as int8 for each of its readers."""
+    """Writes each tensor once in float, and once as int8 for each of its readers."""
 
     def __init__(self, frac_bits: dict[str, int]) -> None:
         super().__init__()
@@ -197,17 +202,17 @@ class _PairWriter(BoardWriter):
         self._readers = Counter[str]()
 
     def scale(self, tensor: str, frac_bits: int) -> list[str]:
-        """Scale and zero point of a tensor, which no other shares."""
+        """Return scale and zero point of a tensor, which no other tensor shares."""
         # AMD's quantiser adjusts a scale in place, which would move all tensors that share it.
         scale = self.constant(f"{tensor}.scale", np.array(2.0**-frac_bits, np.float32))
         return [scale, self.constant(f"{tensor}.zero_point", np.array(0, np.int8))]
 
     def source(self, tensor: str) -> str:
-        """The name of a tensor in float, before it is rounded."""
+        """Return the name of a tensor in float, before it is rounded."""
         return tensor if tensor == PLANES else f"{tensor}.float"
 
     def read(self, tensor: str, name: str = "") -> str:
-        """One more reader of a tensor: a pair for it alone. Returns the name of what it reads."""
+        """Add a Q/DQ pair for one more reader of a tensor, and return the name that it reads."""
         self._readers[tensor] += 1
         reader = f"{tensor}.{self._readers[tensor]}"
         numbers = self.scale(tensor, self._frac_bits[tensor])
@@ -216,8 +221,8 @@ class _PairWriter(BoardWriter):
 
 
 def save_config(core: Path, device: str) -> Path:
-    """Write what AMD's compiler reads beside the file of a core: the device, and for the rest its
-    own defaults.
+    """Write the file that AMD's compiler reads next to a core: the device, and defaults for the
+    rest.
     """
     names = ("init", "vaiml_partition")
     vaiml = {"device": device, "optimize_level": 2}

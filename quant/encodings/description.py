@@ -1,8 +1,8 @@
-"""What a host's file says of its core in its metadata: the operations and scales, without weights
-and biases.
+"""Describe a core in the metadata of a host's file: the operations and scales, without weights and
+biases.
 
-An operation such as a transposed convolution is several nodes there. Written again from the
-description and the file's own weights, all nodes must come out the same
+An operation such as a transposed convolution is several nodes there. When the file is written again
+from the description and its own weights, all nodes must be the same
 (`quant.encodings.encoding_faults`).
 """
 
@@ -33,15 +33,15 @@ from beers_deploy.quant.untrusted import DAMAGE
 
 KEY = "core"
 PLACE_PX = "place_px"
-"""In the metadata of a board's file: the side in pixels of the square of the image that is one
-place of its planes; 1 where nothing is said.
+"""The metadata key in a board's file of the side in pixels of the square of the image that is one
+place of its planes; 1 if it is missing.
 """
 BORDER_PX = "border_px"
-"""Likewise: by how many pixels the planes reach beyond the image on each side; 0 where nothing is
-said.
+"""The metadata key of the number of pixels by which the planes extend beyond the image on each
+side; 0 if it is missing.
 """
 LARGEST = 1 << 16
-"""Channels, windows, strides and factors of whatever a DPU runs are smaller still."""
+"""The limit of channels, windows, strides and factors; those of every DPU network are smaller."""
 HOST_PART = "ends"
 """The key of the host's part in the description."""
 KINDS: dict[str, type] = {
@@ -51,7 +51,7 @@ KINDS: dict[str, type] = {
 
 
 def describe(core: IntCore) -> str:
-    """The core as JSON, without its arrays."""
+    """Return the core as JSON, without its arrays."""
     ops = [{"kind": type(op).__name__, **_plain(op)} for op in core.ops]
     return json.dumps(
         {
@@ -96,7 +96,7 @@ def _described(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
 
 
 def _require_small(value: object) -> None:
-    """Numbers that size something are looked at before anything is made of them."""
+    """Raise ValueError if a number is large enough to make an object of absurd size."""
     parts: Iterable[object] = ()
     if isinstance(value, dict):
         parts = value.values()
@@ -133,11 +133,14 @@ def _op(
 
 
 def phases(weight: np.ndarray, stride: int) -> tuple[np.ndarray, int]:
-    """The weights (stride^2 O, I, J, J) of a transposed convolution's phases, and their padding, J
-    - 1.
+    """Rearrange the weights of a transposed convolution into those of a convolution with one output
+    per phase.
 
-    Output row q stride + f takes x[q - j] w[f + stride j]: a convolution over rows q - J + 1 .. q
-    for each f. The phases come first in the channels, as ONNX's own DepthToSpace wants them.
+    Output row q stride + f reads x[q - j] w[f + stride j]: a convolution over rows q - J + 1 .. q
+    for each f. The phases come first in the channels, as ONNX's DepthToSpace requires.
+
+    Returns:
+        Weights (stride^2 O, I, J, J), and their padding, J - 1.
     """
     outputs, inputs, *kernel = weight.shape
     reach = max(-(-k // stride) for k in kernel)
@@ -150,7 +153,9 @@ def phases(weight: np.ndarray, stride: int) -> tuple[np.ndarray, int]:
 
 
 def of_phases(weight: np.ndarray, shape: tuple[int, ...], stride: int) -> np.ndarray:
-    """The weights (O, I, kh, kw) that `phases` made (stride^2 O, I, J, J) of."""
+    """Return the weights (O, I, kh, kw) from those that `phases` returned, (stride^2
+    O, I, J, J).
+    """
     outputs, inputs, rows, columns = shape
     reach = weight.shape[2]
     taps = weight.reshape(stride, stride, outputs, inputs, reach, reach).transpose(2, 3, 4, 0, 5, 1)

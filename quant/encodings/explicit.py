@@ -1,8 +1,10 @@
-"""Files that leave nothing to a default, as the draft of ONNX's safety-related profile asks.
+"""Make files explicit: nothing is left to a default, as the draft of ONNX's safety-related profile
+requires.
 
 The profile (SONNX, working group of ONNX) forbids default values of attributes (REQ-OP-070) and
-shape inference (REQ-GR-000), and wants inputs and outputs described (REQ-FO-040). Its requirements
-are in onnx/working-groups, safety-related-profile/deliverables/reqs, read at commit 1598dbc.
+shape inference (REQ-GR-000), and requires descriptions of inputs and outputs (REQ-FO-040). Its
+requirements are in onnx/working-groups, safety-related-profile/deliverables/reqs, read at commit
+1598dbc.
 """
 
 from collections.abc import Iterator
@@ -19,7 +21,7 @@ WINDOW_DEFAULTS = {
     "pads": [0, 0, 0, 0],
     "output_padding": [0, 0],
 }
-"""Defaults that ONNX states in words only, of windows over rows and columns."""
+"""Defaults of windows over rows and columns, which ONNX states in prose only."""
 OPERATORS = frozenset(
     """Abs Add Cast Clip Concat Constant ConstantOfShape Conv ConvTranspose Div Equal Erf Exp
     Expand Flatten Gather Gemm GlobalAveragePool GRU HardSwish Identity LeakyRelu Less Log LSTM
@@ -50,7 +52,7 @@ def made_explicit(model: onnx.ModelProto, texts: dict[str, str]) -> onnx.ModelPr
 
 
 def implicit_parts(model: onnx.ModelProto) -> dict[str, list[str]]:
-    """Return what a model leaves implicit, by the rule of the profile that forbids it.
+    """Return the implicit parts of a model, by the rule of the profile that forbids them.
 
     Args:
         model: any ONNX model.

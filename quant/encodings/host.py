@@ -1,14 +1,14 @@
-"""The host's file: the integer core on stock onnxruntime by integer kernels, from image to restored
-image.
+"""Write the host's file: the integer core on stock onnxruntime by integer kernels, from image to
+restored image.
 
-Every operation rounds once, ties to even, and adds exactly. What onnxruntime has no integer
-operator for is written with those it has: transposed convolution and bilinear enlargement as
-convolutions and a pixel shuffle, average pooling as a depthwise convolution, activations by
-themselves as tables of 256, LeakyReLU on the convolution's sums.
+Every operation rounds once, ties to even, and adds exactly. Operations without an integer operator
+in onnxruntime are expressed by others. Transposed convolution and bilinear enlargement become
+convolutions and a pixel shuffle. Average pooling becomes a depthwise convolution, a separate
+activation a table of 256 values, and LeakyReLU is computed on the convolution's sums.
 
-It describes its operations in its metadata, without weights and scales: those are its nodes' own.
-What is read back is written again, so that any node or constant which differs from what the numbers
-ask for is a fault.
+The file describes its operations in its metadata, without weights and scales, which are in its
+nodes. A file that is read back is written again, so that any differing node or constant is detected
+as a fault.
 """
 
 import math
@@ -55,12 +55,19 @@ from beers_deploy.quant.onnx_file import fixed_tile_px, image_info, make_model, 
 from beers_deploy.quant.untrusted import contradictions
 
 LEGAL = "int8 legal"
-"""What the metadata of a file that `quantize` wrote state as its precision."""
+"""The precision in the metadata of a file that `quantize` wrote."""
 
 
 def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None) -> onnx.ModelProto:
-    """The whole INT8 network on stock onnxruntime, (N, C, H, W) float32 in [0, 1] to what its float
-    network gives.
+    """Write the whole INT8 network for stock onnxruntime, with the input and output of its float
+    network.
+
+    The image is (N, C, H, W) float32 in [0, 1].
+
+    Args:
+        core: the integer core.
+        about: metadata of the file.
+        tile_px: side of the image's tile; None for any size.
     """
     writer = HostWriter()
     core.host_part.write_front(writer)
@@ -77,8 +84,10 @@ def host_model(core: IntCore, about: dict[str, str], tile_px: int | None = None)
 
 
 def part_model(core: IntCore, start: int, stop: int) -> onnx.ModelProto:
-    """Return operations `start` to `stop` of a core on onnxruntime, from the tensors in front of
-    them that they read to those that are read behind them.
+    """Return operations `start` to `stop` of a core as a model for onnxruntime.
+
+    Its inputs are the tensors in front of the part that it reads, and its outputs those that are
+    read behind it.
     """
     writer = HostWriter()
     part = core.ops[start:stop]
@@ -100,8 +109,9 @@ def part_model(core: IntCore, start: int, stop: int) -> onnx.ModelProto:
 
 
 def live_tensors(core: IntCore, at: int) -> list[str]:
-    """Return the tensors in front of operation `at` that it or one behind it reads; behind the last
-    one, the result.
+    """Return the tensors in front of operation `at` that it or a later operation reads.
+
+    Behind the last operation it is the result.
     """
     written = [PLANES, *(op.output for op in core.ops[:at])]
     reads = {CORRECTION, *chain.from_iterable(op.inputs for op in core.ops[at:])}
@@ -128,7 +138,7 @@ def _conv(w: HostWriter, core: IntCore, op: IntConv) -> None:
 
 
 def _bias(core: IntCore, op: IntConv) -> np.ndarray:
-    """At the accumulator's scale, (O,) int32."""
+    """Return the bias at the accumulator's scale, (O,) int32."""
     shift = op.weight_frac_bits + core.frac_bits[op.input] - op.bias_frac_bits
     return op.bias.astype(np.int32) << shift
 
@@ -150,8 +160,10 @@ def _qlinear(w: HostWriter, core: IntCore, op: IntConv, bias: np.ndarray) -> Non
 
 
 def _weight_zero(w: HostWriter, name: str) -> str:
-    """One a weight: where onnxruntime rewrites weights (see quant.session), it trips over a shared
-    one.
+    """Add a zero point for one weight tensor.
+
+    Each weight needs its own: where onnxruntime rewrites weights (see quant.session), it fails on a
+    shared one.
     """
     return w.constant(f"{name}.weight_zero_point", np.array(0, np.int8))
 
@@ -161,12 +173,12 @@ def _attributes(op: IntConv) -> dict[str, Any]:
 
 
 def _unclamped(op: IntConv | Add) -> str:
-    """The name of a result in front of its activation."""
+    """Return the name of a result before its activation."""
     return op.output if op.activation is Activation.none else f"{op.output}.linear"
 
 
 def _clamp(w: HostWriter, core: IntCore, op: IntConv | Add) -> None:
-    """ReLU and ReLU6 of what is rounded already: they only clip."""
+    """Write ReLU or ReLU6 on a rounded result, which they only clip."""
     if op.activation is Activation.none:
         return
     relu = op.output if op.activation is Activation.relu else f"{op.output}.above_0"
@@ -178,7 +190,7 @@ def _clamp(w: HostWriter, core: IntCore, op: IntConv | Add) -> None:
 
 
 def _leaky(w: HostWriter, core: IntCore, op: IntConv) -> None:
-    """max(256 x, 26 x) of the int32 sums, exact in float64, rounded once."""
+    """Write LeakyReLU as max(256 x, 26 x) of the int32 sums, exact in float64 and rounded once."""
     name = op.output
     product = op.weight_frac_bits + core.frac_bits[op.input]
     feeds = [
@@ -208,8 +220,8 @@ def _leaky(w: HostWriter, core: IntCore, op: IntConv) -> None:
 
 
 def _transposed(w: HostWriter, core: IntCore, op: IntConv) -> None:
-    """One convolution for each phase of the enlarged lattice, then a pixel shuffle, then the pads
-    cut.
+    """Write a transposed convolution: a convolution with one output per phase, a pixel shuffle, and
+    a crop of the pads.
     """
     stride = op.window.strides[0]
     first_row = op.window.pads[0]
@@ -226,7 +238,7 @@ def _transposed(w: HostWriter, core: IntCore, op: IntConv) -> None:
         f"{op.name}.shuffle", phased.output, f"{op.output}.whole", stride, True, False
     )
     write_shuffle(w, shuffle, shuffle.input, shuffle.output)
-    # Behind the last pixel the phases go on: as many rows and columns as the kernel does not reach
+    # The phases continue behind the last pixel: the rows and columns that the kernel does not reach
     # are cut as well.
     rows, columns = (stride * (reach + 1) - k for k in op.weight.shape[2:])
     ends = [-(op.window.pads[2] + rows), -(op.window.pads[3] + columns)]
@@ -267,8 +279,9 @@ def _weighted(
     shift: int,
     window: Window,
 ) -> None:
-    """Weights (K, 1, kh, kw) for each channel: a depthwise convolution whose result has its input's
-    scale.
+    """Write a depthwise convolution with the weights (K, 1, kh, kw) for each channel.
+
+    Its result has the scale of its input.
     """
     channels = channels_of(core.ops, {PLANES: core.host_part.planes})[op.input]
     unit = w.unit(core.frac_bits[op.input])
@@ -321,7 +334,7 @@ _WRITERS: dict[type, Callable[..., Any]] = {
 
 
 def read_core(model: onnx.ModelProto) -> IntCore:
-    """The core of an INT8 file of `quantize`.
+    """Read the core of an INT8 file that `quantize` wrote.
 
     Raises:
         ModelError: a file that describes none.
@@ -336,10 +349,10 @@ def read_core(model: onnx.ModelProto) -> IntCore:
 
 
 def encoding_faults(model: onnx.ModelProto) -> list[str] | None:
-    """Where a file of `quantize` is not what its integers ask for: the host's part, ReLUs, a
-    reader's scale.
+    """List where a file of `quantize` differs from what its integers define: constants, nodes, or
+    their number.
 
-    None for a file that does not describe its integers and does not state that `quantize` wrote it.
+    Returns None for a file that neither describes its integers nor states that `quantize` wrote it.
     """
     about = metadata(model)
     if KEY not in about and about.get("precision") != LEGAL:

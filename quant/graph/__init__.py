@@ -1,11 +1,12 @@
-"""A network as the short list of operations that a DPU computes: what quantisation works on.
+"""Represent a network as the short list of operations that a DPU computes, which quantisation works
+on.
 
-- `operations`: what there is, convolutions to pixel shuffles, which tensors must share a scale, and
-  how 12 bits enter int8;
+- `operations`: the operations, from convolutions to pixel shuffles; which tensors must share a
+  scale; and how 12 bits enter int8;
 - `reader`: from float ONNX (`node_operations`, one by one) to a `split_network`, cut where the
   host's part ends; `plain` accepts networks of ConvBEERS' kind only;
 - `writer`: back to float ONNX;
-- `pixel_shuffle`, `resize`, `quantized`: what checker and tiling read of a file as well.
+- `pixel_shuffle`, `resize`, `quantized`: what checker and tiling read from a file as well.
 """
 
 from beers_deploy.quant.graph.operations import (

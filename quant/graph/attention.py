@@ -1,12 +1,13 @@
-"""Spatial attention of RFDN and RLFN (ESA), and the same on whole fractions of a map.
+"""Align the spatial attention of RFDN and RLFN (ESA) with integer fractions of a map.
 
-It shrinks a map by an unpadded convolution of stride 2 and an unpadded maximum of stride 3, and
-enlarges what convolutions make of that to the map's size: by a factor that is no whole number.
+It reduces a map by an unpadded convolution of stride 2 and an unpadded maximum of stride 3. It then
+enlarges the result of convolutions on that to the map's size, by a non-integer factor.
 
 1. Padded, and with a maximum of stride 4, its inner map has an eighth of the sides.
 2. Two bilinear enlargements, by 4 and by 2, lead back to the map's size.
 
-That is another function, which `quant.adapt` puts in its place, measures and compensates.
+That is another function. `quant.adapt` replaces the original by it, measures the loss and
+compensates it.
 """
 
 import numpy as np
@@ -15,7 +16,7 @@ from beers_deploy.quant.graph.resize import Resizing
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 
 BETWEEN = {"Conv", "LeakyRelu", "PRelu", "Relu"}
-"""What stands between the maximum and the enlargement."""
+"""The operators between the maximum and the enlargement."""
 
 
 def shrinking(graph: OnnxGraph, node: Node) -> list[Node]:
@@ -59,7 +60,7 @@ def _writer(graph: OnnxGraph, name: str) -> Node | None:
 
 
 def aligned(graph: OnnxGraph, node: Node) -> dict[Node, list[Node]]:
-    """Return the nodes that take the place of a Resize and of what shrinks in front of it.
+    """Return the nodes that replace a Resize and the reducing nodes in front of it.
 
     Args:
         graph: that the node belongs to; its constants are extended.

@@ -1,6 +1,6 @@
-"""Read one node of a float network as the operation of the short list that it is.
+"""Read one node of a float network as an operation of the short list.
 
-Each function raises ModelError with the rule that a node breaks. The graph gives the constants.
+Each function raises ModelError with the rule that a node breaks. The graph provides the constants.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +32,14 @@ SHRINK = "Shrink by a pool or a strided convolution, or cut the network in front
 
 
 def require(condition: bool, node: Node, rule: str, remedy: str = REMEDY) -> None:
-    """Raise ModelError unless a node meets a rule: "must ..." or "has ..."."""
+    """Raise ModelError unless a condition holds.
+
+    Args:
+        condition: whether the node meets the rule.
+        node: that the message names.
+        rule: a verb phrase for the message: "must ..." or "has ...".
+        remedy: a sentence on what to do.
+    """
     if not condition:
         raise unsupported(f"{node} {rule}.", remedy)
 
@@ -73,7 +80,7 @@ def _read_conv(node: Node, graph: OnnxGraph) -> Op:
 
 
 def _read_transposed_conv(node: Node, graph: OnnxGraph) -> Op:
-    """Read a transposed convolution that enlarges rows and columns alike."""
+    """Read a transposed convolution that enlarges rows and columns by the same factor."""
     weight, bias = _weights(node, graph)
     attributes = node.attributes
     strides = attributes.get("strides", [1, 1])
@@ -195,7 +202,7 @@ READERS: dict[str, Callable[[Node, OnnxGraph], Op]] = {
     "SpaceToDepth": _read_shuffle,
     **dict.fromkeys(MOVES, _read_shuffle),
 }
-"""Operators that are an operation whatever stands before them."""
+"""Operators that are one operation, independent of the nodes before them."""
 
 ACTIVATIONS = {
     "Relu": Activation.relu,

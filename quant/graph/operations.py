@@ -1,7 +1,8 @@
-"""The short list of operations that a DPU computes, and what quantisation works on: a network as a
-tuple of them.
+"""Define the short list of operations that a DPU computes, on which quantisation works: a network
+is a tuple of them.
 
-Every operation reads and writes tensors (N, C, H, W) by their names, each written once.
+Every operation reads and writes tensors (N, C, H, W) by their names, and each tensor is written
+once.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -16,18 +17,18 @@ from beers_deploy.quant.onnx.window import Pair, Window
 
 IMAGE = "image"
 CORRECTION = "correction"
-"""What a network reads, and what its last operation writes."""
+"""The names of the input of a network and of the output of its last operation."""
 
 LEAKY_SLOPE = 26 / 256
-"""The one slope of LeakyReLU that a DPU computes."""
+"""The only slope of LeakyReLU that a DPU computes."""
 SIX = 6
-"""Where ReLU6 clips."""
+"""The value at which ReLU6 clips."""
 SIXTH = 2731 / 2**14
-"""What its fixed-point HardSigmoid has for 1/6 (UG1414)."""
+"""The DPU's fixed-point value of 1/6 in HardSigmoid (UG1414)."""
 
 
 class Activation(StrEnum):
-    """What follows an operation at once, by ONNX's names."""
+    """An activation that follows an operation immediately, by ONNX's names."""
 
     none = ""
     relu = "Relu"
@@ -37,13 +38,15 @@ class Activation(StrEnum):
     hard_swish = "HardSwish"
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Of values of any shape, as the DPU computes it, in their own type."""
+        """Apply the activation to values of any shape, as the DPU computes it, in their
+        own type.
+        """
         return _FUNCTIONS[self](values)
 
     @property
     def homogeneous(self) -> bool:
-        """Whether f(k x) = k f(x) for k above 0: what lets factors pass, as ReLU6 does once its six
-        is scaled.
+        """True if f(k x) = k f(x) for k above 0, so that factors pass. They also pass ReLU6 once
+        its six is scaled.
         """
         return self in (Activation.none, Activation.relu, Activation.leaky_relu)
 
@@ -65,11 +68,11 @@ _FUNCTIONS: Mapping[Activation, Callable[[np.ndarray], np.ndarray]] = {
 
 
 class Op(Protocol):
-    """What all operations have."""
+    """The properties of every operation."""
 
     @property
     def name(self) -> str:
-        """Its name, of no other operation."""
+        """Its name, which is unique."""
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -97,8 +100,8 @@ Graph = tuple[Op, ...]
 
 
 def same(weight: np.ndarray) -> Window:
-    """Of stride 1, with the padding that keeps the size: for weights (O, I, kh,
-    kw) of odd sides.
+    """Return the window of stride 1 whose padding preserves the size, for weights (O, I, kh, kw) of
+    odd sides.
     """
     rows = weight.shape[2] // 2
     columns = weight.shape[3] // 2
@@ -121,11 +124,11 @@ class OneInput:
 
 @dataclass(frozen=True)
 class Conv(OneInput):
-    """A convolution with zero padding and an activation; `groups` is 1, or as many as channels
+    """A convolution with zero padding and an activation; `groups` is 1, or the number of channels
     (depthwise).
 
-    Transposed, its weights stay (O, I, kh, kw), O the channels that it writes, and `window` is
-    ONNX's: its strides enlarge, its pads cut.
+    If it is transposed, its weights are still (O, I, kh, kw), with O the channels that it writes.
+    `window` then has ONNX's meaning: its strides enlarge, and its pads crop.
     """
 
     weight: np.ndarray  # (O, I / groups, kh, kw) float32
@@ -139,7 +142,7 @@ class Conv(OneInput):
 
     @property
     def ceilings(self) -> np.ndarray:
-        """(O,) where ReLU6 clips each channel."""
+        """The values (O,) at which ReLU6 clips each channel."""
         return np.full(len(self.bias), float(SIX)) if self.ceiling is None else self.ceiling
 
 
@@ -164,12 +167,12 @@ class Mul(SeveralInputs):
 
 
 class Concat(SeveralInputs):
-    """Tensors one behind the other along the channels; they share a scale."""
+    """A concatenation of tensors along the channels; they share a scale."""
 
 
 @dataclass(frozen=True)
 class MaxPool(OneInput):
-    """The largest value of each window; what is padded never is."""
+    """The largest value of each window; padding never counts."""
 
     kernel: Pair
     window: Window = field(default_factory=Window)
@@ -177,8 +180,8 @@ class MaxPool(OneInput):
 
 @dataclass(frozen=True)
 class AveragePool(OneInput):
-    """The mean of each window, padding counted as zeros; `kernel` None is the whole image (global
-    pooling).
+    """The mean of each window, with padding counted as zeros; if `kernel` is None, the mean of the
+    whole image (global pooling).
     """
 
     kernel: Pair | None
@@ -187,7 +190,9 @@ class AveragePool(OneInput):
 
 @dataclass(frozen=True)
 class Resize(OneInput):
-    """Rows and columns `factor` times as many: nearest, or bilinear with half-pixel centres."""
+    """An enlargement of rows and columns by `factor`: nearest, or bilinear with
+    half-pixel centres.
+    """
 
     factor: int
     bilinear: bool = False
@@ -195,11 +200,11 @@ class Resize(OneInput):
 
 @dataclass(frozen=True)
 class Shuffle(OneInput):
-    """Pixel shuffle: blocks of block^2 channels become block x block pixels; or, `up` False, the
-    other way round.
+    """A pixel shuffle: blocks of block^2 channels become block x block pixels; or the inverse, if
+    `up` is False.
 
-    `columns_first` is torch's order of the channels (ONNX's CRD), without it ONNX's own (DCR, and
-    SpaceToDepth).
+    `columns_first` is torch's order of the channels (ONNX's CRD). Otherwise it is ONNX's own (DCR,
+    and SpaceToDepth).
     """
 
     block: int
@@ -207,7 +212,7 @@ class Shuffle(OneInput):
     columns_first: bool = True
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """The values (N, C, H, W), of any type, moved."""
+        """Move values (N, C, H, W) of any type."""
         count, channels, height, width = values.shape
         r = self.block
         # ONNX's DCR has the block's place before the channel, CRD (torch's order) behind it.
@@ -223,14 +228,14 @@ class Shuffle(OneInput):
 
     @property
     def inverse(self) -> "Shuffle":
-        """The one that moves all values back."""
+        """The shuffle that moves all values back."""
         return replace(self, up=not self.up)
 
 
 @dataclass(frozen=True)
 class Pointwise(OneInput):
-    """An activation by itself: a function of each value, which the integer core keeps as a table of
-    256.
+    """A separate activation: a function of each value, which the integer core stores as a table of
+    256 values.
     """
 
     activation: Activation
@@ -240,14 +245,15 @@ TYING = (Concat, MaxPool, AveragePool, Resize, Shuffle)
 
 
 def ties_scales(op: Op) -> bool:
-    """Whether all that an operation reads and writes has one scale, as the DPU wants of what hands
-    values on.
+    """Return True if all inputs and the output of an operation must share one scale.
+
+    The DPU requires that of operations that only pass values on.
     """
     return isinstance(op, TYING)
 
 
 def united(links: Iterable[Iterable[str]]) -> dict[str, str]:
-    """For every name, the first of those that it is linked with, however indirectly."""
+    """Map every name to the first name that it is linked with, directly or indirectly."""
     leader: dict[str, str] = {}
 
     def find(name: str) -> str:
@@ -262,8 +268,9 @@ def united(links: Iterable[Iterable[str]]) -> dict[str, str]:
 
 
 def tied(graph: Graph) -> dict[str, str]:
-    """For every tensor, the first of those that must share its scale: by concat, pooling, resizing,
-    shuffling.
+    """Map every tensor to the first of the tensors that must share its scale.
+
+    Concat, pooling, resizing and shuffling require that.
     """
     links: list[tuple[str, ...]] = []
     # A link of one name lists each tensor, also those that share their scale with none.
@@ -274,28 +281,27 @@ def tied(graph: Graph) -> dict[str, str]:
 
 
 def tensors(graph: Graph) -> list[str]:
-    """The names of all results, in order."""
+    """Return the names of all results, in order."""
     return [op.output for op in graph]
 
 
 PLANES = "planes"
-"""How an image of 12 bits enters a network of int8: each channel a coarse plane, its remainder, and
-a third for finer weights, (N, C, H, W) to (N, 3 C, H, W), all coarse planes first. Convolutions
-alone read them.
+"""The tensor by which a 12-bit image enters an int8 network. Each channel becomes a coarse plane,
+its remainder, and a third plane for finer weights: (N, C, H, W) to (N, 3 C, H, W), all coarse
+planes first. Only convolutions read them.
 """
 STEP = 32
 COARSE_MAX = 127
 QUARTER = 4
 PLANES_FRAC_BITS = 7
-"""The planes' scale is 2^-7: coarse 127 stands for about 1, the full scale."""
+"""The planes have the scale 2^-7: coarse 127 represents about 1, the full scale."""
 
 
 def read_planes(graph: Graph, full_scale: np.ndarray | None = None) -> Graph:
-    """The same graph, the convolutions that read the image reading the planes (as q * 2^-7)
-    instead.
+    """Return the graph in which the convolutions on the image read the planes instead, as q * 2^-7.
 
     Args:
-        graph: that reads the image.
+        graph: a graph that reads the image.
         full_scale: (C,) the value of each channel that is encoded as 1; None for 1.
     """
     return tuple(

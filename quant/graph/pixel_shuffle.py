@@ -1,7 +1,7 @@
 """Find the pixel shuffles that exporters write as Reshape and Transpose.
 
-torch writes PixelUnshuffle so, and PixelShuffle in old opsets. What such nodes do is tried out on
-an image of numbered pixels.
+torch writes PixelUnshuffle so, and PixelShuffle in old opsets. The effect of such nodes is
+determined on an image of numbered pixels.
 """
 
 import math
@@ -24,14 +24,15 @@ MOVES: dict[str, tuple[str, Callable[[np.ndarray, list[int]], np.ndarray]]] = {
     "Transpose": ("perm", lambda image, axes: image.transpose(axes or None)),
     "Unsqueeze": ("axes", lambda image, axes: np.expand_dims(image, tuple(axes))),
 }
-"""Operators that only move pixels: what they state, in an input or an attribute, and what they do.
+"""Operators that only move pixels: the name of their parameter, an input or an attribute, and their
+effect.
 """
 ORDERS = {"CRD": True, "DCR": False}
 """The modes of ONNX's DepthToSpace, and whether columns come first."""
 SIDES_PX = 24, 35
-"""Sides of images that moves are tried on: blocks of 2 to 8 fit one of them."""
+"""Sides of the test images: blocks of 2 to 8 fit one of them."""
 VALUES = 1 << 22
-"""The largest image of a stated size that moves are tried on."""
+"""The largest image of a stated size on which nodes are tested."""
 
 
 def with_shuffles(model: onnx.ModelProto) -> OnnxGraph:
@@ -68,15 +69,15 @@ def _chains(graph: OnnxGraph) -> list[list[Node]]:
 
 
 def _shuffle(chain: list[Node], sizes: tuple[int, ...], graph: OnnxGraph) -> Node | None:
-    """Return the pixel shuffle that a chain makes of an image; 0 stands for free sizes.
+    """Return the pixel shuffle that is equivalent to a chain of nodes; 0 stands for free sizes.
 
-    None if the chain makes no shuffle.
+    None if the chain is no shuffle.
     """
     for side_px in SIDES_PX if len(sizes) == 4 and sizes[1] else ():
         shape = sizes[0] or 1, sizes[1], sizes[2] or side_px, sizes[3] or 2 * side_px
         if math.prod(shape) > VALUES:
             continue
-        # Each pixel has a number of its own, so that the result says where each one went.
+        # Each pixel has a unique number, so that the result shows where each one moved.
         image = np.arange(math.prod(shape)).reshape(shape)
         result = _moved(chain, image, graph)
         growth = _growth(result, shape)

@@ -1,4 +1,6 @@
-"""Networks of ConvBEERS' kind: what proofs, the stress battery and bit flips accept."""
+"""Read networks of ConvBEERS' kind, the only ones that proofs, the stress battery and bit flips
+accept.
+"""
 
 import onnx
 
@@ -10,9 +12,9 @@ from beers_deploy.quant.graph.split_network import SplitNetwork, unsupported
 def plain_network(model: onnx.ModelProto) -> SplitNetwork:
     """Read a network of ConvBEERS' kind.
 
-    It adds a correction to an image of one channel, and computes it by same-size convolutions of
-    stride 1, ReLU and adds; at full resolution, or at a lower one, with the image's pixels
-    rearranged into channels and back.
+    It adds a correction to an image of one channel. The correction is computed by same-size
+    convolutions of stride 1, ReLU and adds. It may run at full resolution, or at a lower one with
+    the image's pixels rearranged into channels and back.
     """
     network = read_network(model)
     blocks = [[shuffle.block for shuffle in end] for end in (network.front, network.back)]

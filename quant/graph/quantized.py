@@ -1,10 +1,10 @@
-"""Which nodes of a file compute on integers, with which scales, and which nodes are mere notation
-for that.
+"""Determine which nodes of a file compute on integers, with which scales, and which nodes are mere
+notation.
 
-A tensor holds one of four things: float numbers that the host computes with; "int8", written by
-QuantizeLinear, a cast or an integer kernel (or the same numbers as uint8 around 128); int8 "seen"
-as float, behind DequantizeLinear; or a "wide" sum of products of such, on its way to a
-QuantizeLinear.
+A tensor holds one of four kinds of values. They are float numbers that the host computes with, or
+"int8", written by QuantizeLinear, a cast or an integer kernel (or the same numbers as uint8 around
+128). They may also be int8 "seen" as float, behind DequantizeLinear, or a "wide" sum of products of
+such, on its way to a QuantizeLinear.
 """
 
 import math
@@ -25,12 +25,12 @@ FORMATS: dict[str, dict[int, tuple[int, int]]] = {
     "QuantizeLinear": {RESULT: (1, 2)},
     "DequantizeLinear": {0: (1, 2)},
 }
-"""Where an operator names the scale and zero point of input i, or of its result."""
+"""The inputs at which an operator names scale and zero point of input i, or of its result."""
 
 
 @dataclass(frozen=True)
 class Scale:
-    """How a quantised tensor is to be read: value = scale * (q - zero_point)."""
+    """The number format of a quantised tensor: value = scale * (q - zero_point)."""
 
     scales: tuple[float, ...]
     zero_points: tuple[int, ...]
@@ -38,13 +38,13 @@ class Scale:
 
     @property
     def symmetric(self) -> bool:
-        """Whether zero stands for zero: int8 around 0, or the same numbers as uint8 around 128."""
+        """True if zero represents zero: int8 around 0, or the same numbers as uint8 around 128."""
         middle = 128 if self.integer_type == "uint8" else 0
         return self.integer_type in ("int8", "uint8", "int32") and set(self.zero_points) == {middle}
 
     @property
     def frac_bits(self) -> int | None:
-        """The p of a scale 2^-p, None for any other scale."""
+        """The exponent p of a scale 2^-p; None for any other scale."""
         if len(self.scales) != 1:
             return None
         # `frexp` splits off a fraction in [0.5, 1), which of a power of two is exactly 0.5.
@@ -53,7 +53,7 @@ class Scale:
 
 
 def stated(node: Node, graph: OnnxGraph) -> Iterator[tuple[str, Scale]]:
-    """The tensors whose format a node names, constants among them, each with that format."""
+    """Yield the tensors whose format a node states, constants included, each with that format."""
     places = FORMATS.get(node.op_type, {})
     if node.op_type == "QLinearConcat":
         places = {RESULT: (0, 1)} | {i: (i + 1, i + 2) for i in range(2, len(node.inputs), 3)}
@@ -61,8 +61,8 @@ def stated(node: Node, graph: OnnxGraph) -> Iterator[tuple[str, Scale]]:
         name = node.outputs[0] if place == RESULT else node.inputs[place]
         scales = graph.constants.get(node.inputs[scale], np.zeros(0))
         zeros = graph.value(node, zero_point)
-        # A zero point that is left out is 0, of the constant's own type, of the one that
-        # `output_dtype` asks for, or of ONNX's default, which is uint8.
+        # A missing zero point is 0. Its type is that of the constant, that of `output_dtype`, or
+        # ONNX's default, which is uint8.
         if zeros is None:
             output_dtype = node.attributes.get("output_dtype") or TensorProto.UINT8
             dtype = helper.tensor_dtype_to_np_dtype(output_dtype)
@@ -80,7 +80,7 @@ OPERANDS = {
     **dict.fromkeys(("QLinearAdd", "QLinearMul"), slice(0, 4, 3)),
     "QLinearConcat": slice(2, None, 3),
 }
-"""Which inputs are tensors of the network; the rest are scales and zero points."""
+"""The inputs that are tensors of the network; the others are scales and zero points."""
 ELEMENTWISE = {"Add", "Mul", "Concat", "QLinearAdd", "QLinearMul", "QLinearConcat"}
 """Operators whose constant operands are numbers of the network."""
 
@@ -107,28 +107,30 @@ class Integers:
             self._follow(node)
 
     def resolve(self, name: str) -> str:
-        """The tensor that a name stands for once notation is dissolved."""
+        """Return the tensor that a name represents once notation is removed."""
         while name in self._same:
             name = self._same[name]
         return name
 
     def constant(self, name: str) -> np.ndarray | None:
-        """A constant, dequantised or not, as it is stored; None of what nodes compute."""
+        """Return a constant as it is stored, dequantised or not; None for a tensor that nodes
+        compute.
+        """
         return self._constants.get(self.resolve(name))
 
     def weight(self, node: Node) -> np.ndarray | None:
-        """The weights of a convolution as stored; None where there are none, or
-        nodes compute them.
+        """Return the weights of a convolution as stored; None if there are none, or if nodes
+        compute them.
         """
         place = WEIGHTS.get(node.op_type, len(node.inputs))
         return self.constant(node.inputs[place]) if place < len(node.inputs) else None
 
     def is_integer(self, node: Node) -> bool:
-        """Whether the file computes this node on integers."""
+        """Return True if the file computes this node on integers."""
         return node.outputs[0] in self._int8 or node.outputs[0] in self._wide
 
     def is_notation(self, node: Node) -> bool:
-        """Whether a node only says how its neighbours' integers are to be read."""
+        """Return True if a node only defines how the integers of its neighbours are read."""
         result = node.outputs[0]
         if node.op_type == "DequantizeLinear" and result not in self._same:
             readers = self._graph.readers.get(result, [])
@@ -136,21 +138,23 @@ class Integers:
         return result in self._same
 
     def activations(self, node: Node) -> tuple[str, ...]:
-        """The tensors of the network that a node reads."""
+        """Return the tensors of the network that a node reads."""
         names = [name for name in self._operands(node) if name]
         if self.is_integer(node) and node.op_type != "QuantizeLinear":
             names = [self._seen.get(name, name) for name in names]
         return tuple(name for name in map(self.resolve, names) if name not in self._constants)
 
     def operand(self, node: Node) -> np.ndarray | None:
-        """The first constant among what an operator computes with, as stored."""
+        """Return the first constant operand of an operator, as stored."""
         constants = (self.constant(name) for name in self._operands(node))
         return next((value for value in constants if value is not None), None)
 
     def formats(self, node: Node) -> dict[str, tuple[Scale, ...]]:
-        """Of a node's tensors by role: "input 0", ..., "weight", "bias", "constant 1", "output".
+        """Return the formats of a node's tensors by role: "input 0", ..., "weight", "bias",
+        "constant 1", "output".
 
-        Several where the file contradicts itself, the writer's first; none where it says nothing.
+        There are several if the file contradicts itself, the writer's first, and none if it states
+        none.
         """
         stated_scales = dict(stated(node, self._graph))
         numbers = self._numbers(node)
@@ -164,8 +168,8 @@ class Integers:
         }
 
     def numbers(self, node: Node) -> dict[str, np.ndarray | None]:
-        """The constants of a node as stored, by role as in `formats`; None for one that other nodes
-        compute.
+        """Return the constants of a node as stored, by role as in `formats`; None for one that
+        nodes compute.
         """
         return {role: self.constant(name) for role, name in self._numbers(node).items()}
 
@@ -174,7 +178,7 @@ class Integers:
         return node.inputs[OPERANDS.get(node.op_type, default)]
 
     def _tensors(self, node: Node) -> dict[str, str]:
-        """The activations that an integer node reads and writes, by role."""
+        """Return the activations that an integer node reads and writes, by role."""
         if not self.is_integer(node):
             return {}
         inputs = {f"input {i}": name for i, name in enumerate(self.activations(node))}
@@ -182,7 +186,7 @@ class Integers:
         return inputs | {"output": result if result in self._int8 else self._becomes[result]}
 
     def _numbers(self, node: Node) -> dict[str, str]:
-        """What an integer node computes with besides activations, by role."""
+        """Return the names of an integer node's operands other than activations, by role."""
         names: dict[str, str] = {}
         if not self.is_integer(node):
             return names
@@ -200,7 +204,7 @@ class Integers:
         return {role: name for role, name in names.items() if name}
 
     def _follow(self, node: Node) -> None:
-        """Work out what a node's results hold, from what its inputs hold."""
+        """Determine the kind of a node's results from the kinds of its inputs."""
         source = node.inputs[0] if node.inputs else ""
         result = node.outputs[0]
         if node.op_type == "DequantizeLinear":
@@ -229,13 +233,19 @@ class Integers:
         return rounds or self._reads(node, self._int8)
 
     def _reads(self, node: Node, *tensors: Container[str]) -> bool:
-        """Whether all that it reads is among these, constants left out, and there is any."""
+        """Return True if a node reads at least one tensor, and all of its tensors are in the
+        groups.
+
+        Constants are ignored.
+        """
         resolved = map(self.resolve, filter(None, node.inputs))
         names = [name for name in resolved if name not in self._constants]
         return bool(names) and all(any(name in group for group in tensors) for name in names)
 
     def _rounded(self) -> dict[str, str]:
-        """The int8 tensor that each one becomes that is rounded next, or behind activations."""
+        """Map each tensor to the int8 tensor to which it is rounded next, directly or behind
+        activations.
+        """
         int8_names: dict[str, str] = {}
         for node in reversed(self._graph.nodes):
             readers = self._graph.readers.get(node.outputs[0], [])
@@ -249,8 +259,10 @@ class Integers:
         return int8_names
 
     def _read_formats(self, node: Node) -> None:
-        """A constant's format is its reader's own: two nodes may read the same
-        bytes at two scales.
+        """Record the formats that a node states.
+
+        The format of a constant is that of its reader, because two nodes may read the same bytes at
+        two scales.
         """
         for name, scale in stated(node, self._graph):
             if name not in self._constants:

@@ -1,6 +1,6 @@
 """Read a float ONNX network as the short list of operations, split into host and DPU part.
 
-A file from outside is checked once, here; behind it nothing asks again.
+A file from outside is checked once, here; later code does not check it again.
 """
 
 from copy import deepcopy
@@ -77,7 +77,7 @@ REMEDIES = {
         "(.safetensors)."
     ),
 }
-"""What to do about an operator that no DPU computes."""
+"""Advice for each operator that no DPU computes."""
 OTHER_REMEDY = "Replace it by one that the DPU computes, or cut the network in front of it."
 
 
@@ -95,7 +95,7 @@ def read_network(model: onnx.ModelProto) -> SplitNetwork:
 
 
 def refusal(model: onnx.ModelProto) -> str:
-    """Return the sentence that says why a float network cannot be quantised; "" if it can."""
+    """Return a sentence on why a float network cannot be quantised; "" if it can."""
     try:
         check_runnable(model, "the float network")
         read_network(model)
@@ -135,9 +135,10 @@ class _Reader:
         return network
 
     def _take_mirror(self) -> int:
-        """Remove a Pad that mirrors the image, and return its border in pixels; the host does it.
+        """Remove a Pad that mirrors the image, and return its border in pixels; the host does the
+        padding.
 
-        The sum with the image is the host's too, so it may read the image as it is.
+        The host also adds the image to the result, so the sum may read the image without the Pad.
         """
         source = self.source
         pads = [node for node in source.readers[self.image] if node.op_type == "Pad"]
@@ -195,7 +196,9 @@ class _Reader:
         return sized(graph, (rows, columns)) if pools else graph
 
     def _check_whole(self) -> None:
-        """Raise ModelError for what concerns all of the network, or no size of image would help."""
+        """Raise ModelError for faults of the whole network, and for those that no image size would
+        avoid.
+        """
         require_one_image(self.source.inputs, self.source.outputs)
         (result,) = self.source.outputs
         dims = self.source.result_sizes[result]
@@ -214,7 +217,7 @@ class _Reader:
     def _limits(self, node: Node) -> tuple[float, ...]:
         """Return the limits of a Clip, within those of the one behind it; empty for another node.
 
-        ReLU6 is the DPU's.
+        ReLU6 is left to the DPU.
         """
         ends = [self.source.value(node, place) for place in (1, 2)]
         if node.op_type != "Clip" or any(end is None or end.size != 1 for end in ends):
@@ -240,7 +243,7 @@ class _Reader:
         self.ops.append(op)
 
     def _channels_of(self, tensor: str) -> int:
-        """Return the channels of what an operation has written."""
+        """Return the number of channels of an operation's result."""
         if not self._measured:
             self._widths[self.image] = self.channels()
         add_channels(self._widths, self.ops[self._measured :])
@@ -283,7 +286,7 @@ class _Reader:
         return Conv(node.name, source, node.outputs[0], weight, shift, groups=channels)
 
     def _activation(self, node: Node) -> None:
-        """Fuse an activation into the operation before it, or append it by itself."""
+        """Fuse an activation into the operation before it, or append it as a separate operation."""
         activation = read_activation(node, self.source)
         # HardSigmoid and HardSwish are functions of a rounded value, the others of the exact sums.
         on_sums = activation not in (Activation.hard_sigmoid, Activation.hard_swish)

@@ -1,4 +1,4 @@
-"""Resizes of all opsets, with ONNX's defaults filled in."""
+"""Read Resize nodes of all opsets, with ONNX's defaults filled in."""
 
 import math
 from collections.abc import Callable
@@ -12,7 +12,7 @@ PLACES: dict[str, Callable[[int, float], float]] = {
     "pytorch_half_pixel": lambda pixel, factor: (pixel + 0.5) / factor - 0.5,
     "tf_half_pixel_for_nn": lambda pixel, factor: (pixel + 0.5) / factor,
 }
-"""Where a pixel of an enlarged image lies in the image before.
+"""The position in the source of a pixel of an enlarged image.
 
 ONNX's other coordinates depend on the sizes.
 """
@@ -28,7 +28,8 @@ ROUNDINGS: dict[str, Callable[[float], int]] = {
 class Resizing:
     """A Resize, or an Upsample of older opsets, with ONNX's defaults filled in.
 
-    `factors` are those of N, C, H and W; none where they are computed, or a size is stated.
+    `factors` are those of N, C, H and W; they are empty if they are computed, or if a size is
+    stated.
     """
 
     factors: tuple[float, ...]
@@ -38,7 +39,7 @@ class Resizing:
 
     @classmethod
     def of(cls, node: Node, graph: OnnxGraph) -> "Resizing":
-        """Return what a node states."""
+        """Read the attributes and inputs of a node."""
         # Before opset 11 the factors are the second input, and places start at the corner.
         old = node.op_type == "Upsample" or len(node.inputs) == 2
         attribute = node.attributes.get

@@ -1,4 +1,6 @@
-"""A network cut where the DPU's part begins and ends, and whether its operations fit together."""
+"""Split a network where the DPU's part begins and ends, and check that its
+operations fit together.
+"""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -39,17 +41,16 @@ ADAPT_EXACTLY = "'quantize --adapt' (adapt=True) rewrites it exactly."
 
 @dataclass(frozen=True)
 class SplitNetwork:
-    """A float network, cut where the DPU's part begins and ends.
+    """A float network, split where the DPU's part begins and ends.
 
     Attributes:
-        graph: from `IMAGE` to `CORRECTION`, what is computed in INT8.
+        graph: from `IMAGE` to `CORRECTION`, the part that is computed in INT8.
         channels: of the image, before `front`.
-        front: what the host does to the image first: pixel unshuffle.
-        back: what it does to the correction: pixel shuffle.
+        front: operations of the host on the image: pixel unshuffles.
+        back: operations of the host on the correction: pixel shuffles.
         adds_image: whether the image is added to the result (the global add), in the host's float
             numbers.
-        last: what it does to the sum: pixel shuffle. An image of one channel is added to each of
-            the sum's.
+        last: pixel shuffles of the sum. An image of one channel is added to each of the sum's.
         border_px: by how many pixels it mirrors the image beyond its borders.
         limits: to which it clips the result; empty if the network does not clip it.
     """
@@ -65,7 +66,7 @@ class SplitNetwork:
 
     @property
     def core_channels(self) -> int:
-        """Of what the DPU's part reads."""
+        """The number of channels that the DPU's part reads."""
         return self.channels * int(np.prod([shuffle.block**2 for shuffle in self.front], initial=1))
 
 
@@ -100,11 +101,11 @@ def require_one_image(inputs: Collection[str], outputs: Collection[str]) -> None
 
 
 def cut(graph: Graph, channels: int) -> SplitNetwork:
-    """The network of operations from `IMAGE` to `CORRECTION`: what the host does at both ends is
-    taken off.
+    """Split the operations from `IMAGE` to `CORRECTION` into the host's part at both ends and the
+    rest.
 
-    Pixel shuffles there move values and cost the host next to nothing; DPUs have been seen to
-    compute them wrongly.
+    Pixel shuffles there only move values, which costs the host almost nothing. DPUs have been seen
+    to compute them wrongly.
     """
     graph, last = _without_shuffles(graph)
     end = graph[-1] if graph else None
@@ -125,10 +126,10 @@ def cut(graph: Graph, channels: int) -> SplitNetwork:
 
 
 def _image_for_convolutions(graph: Graph, channels: int) -> Graph:
-    """The graph in which convolutions alone read the image: whatever else does gets it from one
-    that copies it.
+    """Return a graph in which only convolutions read the image.
 
-    So the image enters in all its planes, and its copy among the features has a scale of its own.
+    Other operations read it from a convolution that copies it. The image therefore enters in all
+    its planes, and its copy among the features has a scale of its own.
     """
     if all(IMAGE not in op.inputs or (isinstance(op, Conv) and not op.transposed) for op in graph):
         return graph
@@ -142,7 +143,7 @@ def _image_for_convolutions(graph: Graph, channels: int) -> Graph:
 
 
 def _without_shuffles(graph: Graph) -> tuple[Graph, tuple[Shuffle, ...]]:
-    """The graph up to the pixel shuffles that it ends with, and these in their order."""
+    """Return the graph up to the pixel shuffles at its end, and these in order."""
     shuffles: list[Shuffle] = []
     while graph and isinstance(end := graph[-1], Shuffle) and end.up:
         shuffles.insert(0, end)
@@ -162,7 +163,7 @@ def _only_reader(graph: Graph) -> Op | None:
 
 
 def renamed(op: Op, names: Mapping[str, str]) -> Op:
-    """An operation whose tensors have other names."""
+    """Return an operation with its tensors renamed."""
     changed: dict[str, Any] = {"output": names.get(op.output, op.output)}
     if hasattr(op, "input"):
         changed["input"] = names.get(op.inputs[0], op.inputs[0])
@@ -172,8 +173,8 @@ def renamed(op: Op, names: Mapping[str, str]) -> Op:
 
 
 def named_apart(ops: Sequence[Op], ends: Mapping[str, str]) -> Graph:
-    """The operations with these names for the ends, and with others where ours would mean something
-    else.
+    """Return operations with the names `ends` for their ends, and without clashes with names of
+    this project.
     """
     # A network may call its own tensors "planes" or "restored", which our files use for others.
     names = {op.output: f"net.{op.output}" for op in ops if _is_ours(op.output)} | dict(ends)
@@ -185,7 +186,7 @@ def named_apart(ops: Sequence[Op], ends: Mapping[str, str]) -> Graph:
 
 
 def _is_ours(name: str) -> bool:
-    """Whether the files that we write have a tensor of that name themselves."""
+    """Return True if the files that this project writes have a tensor of that name."""
     ours = IMAGE, CORRECTION, PLANES, "restored"
     return name in ours or name.startswith(("host_front.", "host_back.", f"{IMAGE}."))
 
@@ -214,7 +215,9 @@ def check_network(network: SplitNetwork) -> None:
 
 
 def sized(graph: Graph, size: Pair) -> Graph:
-    """The graph for images of one size (rows, columns), the windows of global pooling known."""
+    """Return the graph for images of one size (rows, columns), with the windows of global pooling
+    set.
+    """
     sizes = {IMAGE: size}
     ops = list[Op]()
     for op in graph:
@@ -239,7 +242,7 @@ def _input_size(op: Op, sizes: Mapping[str, Pair]) -> Pair:
 
 
 WHOLE_PX = 64 * 3 * 5 * 7
-"""A side that networks of use divide without a remainder."""
+"""A side that the factors of all practical networks divide without a remainder."""
 
 
 def check_result_size(graph: Graph, border_px: int) -> None:
@@ -284,14 +287,14 @@ def _size(op: Op, size: Pair) -> Pair:
 
 
 def channels_of(graph: Graph, given: Mapping[str, int]) -> dict[str, int]:
-    """Channels of every tensor, from those of the given ones."""
+    """Compute the channels of every tensor from those of the given ones."""
     widths = dict(given)
     add_channels(widths, graph)
     return widths
 
 
 def add_channels(widths: dict[str, int], ops: Iterable[Op]) -> None:
-    """Add the channels of what operations write to those of the tensors that they read."""
+    """Add the numbers of channels of operations' results to those of their inputs."""
     for op in ops:
         unwritten = [name for name in op.inputs if name not in widths]
         if unwritten:

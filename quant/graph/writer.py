@@ -1,5 +1,5 @@
-"""The operations as float ONNX: what calibration looks at, and what a board's file holds between
-its roundings.
+"""Write the operations as float ONNX, for calibration and as the operations of a board's file
+between its roundings.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,7 +30,7 @@ from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
 
 
 def graph_to_onnx(graph: Graph, outputs: list[str], channels: int = 3) -> onnx.ModelProto:
-    """The graph from `planes` (N, channels, H, W) float32 to the named tensors."""
+    """Write the graph from `planes` (N, channels, H, W) float32 to the named tensors."""
     writer = GraphWriter()
     for op in graph:
         feeds = list(op.inputs)
@@ -47,17 +47,19 @@ def graph_to_onnx(graph: Graph, outputs: list[str], channels: int = 3) -> onnx.M
 
 
 def onnx_weight(weight: np.ndarray, transposed: bool) -> np.ndarray:
-    """Weights (O, I, kh, kw) as ONNX wants them: (I, O, kh, kw) of a transposed convolution."""
+    """Return weights (O, I, kh, kw) in ONNX's order, which is (I, O, kh, kw) for a transposed
+    convolution.
+    """
     return np.ascontiguousarray(weight.swapaxes(0, 1)) if transposed else weight
 
 
 def write_float(w: GraphWriter, op: Op, feeds: Sequence[str], output: str) -> None:
-    """Write an operation as ONNX's own operators.
+    """Write an operation with ONNX's own operators.
 
     Args:
-        w: gets the nodes.
+        w: receives the nodes.
         op: the operation.
-        feeds: the names of what it reads; of a convolution with those of its weights and bias.
+        feeds: the names of its inputs; for a convolution with those of its weights and bias.
         output: the name of its result.
     """
     # The operator of a Pointwise is its activation, so that none follows.
@@ -83,7 +85,7 @@ def _conv(w: GraphWriter, op: Conv, feeds: list[str], output: str) -> None:
 
 
 def window_attributes(window: Window, groups: int = 1) -> dict[str, Any]:
-    """The attributes that differ from ONNX's defaults, and the pads."""
+    """Return the attributes that differ from ONNX's defaults, and the pads."""
     attributes: dict[str, Any] = {"pads": list(window.pads)}
     if window.strides != (1, 1):
         attributes["strides"] = list(window.strides)
@@ -134,7 +136,7 @@ def _resize(w: GraphWriter, op: Resize, feeds: list[str], output: str) -> None:
 
 
 def write_shuffle(w: GraphWriter, op: Shuffle, source: str, output: str, channels: int = 1) -> None:
-    """Write a pixel shuffle, or its inverse, of a tensor of any type with so many channels."""
+    """Write a pixel shuffle, or its inverse, of a tensor of any type."""
     if op.up:
         mode = "CRD" if op.columns_first else "DCR"
         w.node("DepthToSpace", output, [source], op.name, blocksize=op.block, mode=mode)

@@ -1,11 +1,11 @@
-"""The host's part of an INT8 network: what runs on the processor around the integer core.
+"""The host's part of an INT8 network: the computations on the processor around the integer core.
 
 - `part`: `HostPart`, which moves pixels, encodes the image, decodes the core's result and adds the
   image;
-- `input_encoding`: how an image becomes the int8 planes that the core reads;
-- `output_decoding`: how the copies that the core writes of each channel become one value;
+- `input_encoding`: encodes an image as the int8 planes that the core reads;
+- `output_decoding`: combines the copies that the core writes of each channel to one value;
 - `description`: the host's part as JSON, in the metadata of an INT8 file;
-- `writer`: what ONNX nodes of the host are written with.
+- `writer`: writes the ONNX nodes of the host.
 
 Encodings and decodings have three forms each: NumPy, ONNX nodes, and constants for a kit's
 `host.py`.

@@ -1,4 +1,4 @@
-"""The host's part as JSON, in the metadata of an INT8 file: read from it, and written to it."""
+"""Store the host's part as JSON in the metadata of an INT8 file, and read it back."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -23,7 +23,7 @@ from beers_deploy.quant.input_range import Ranges, require_ranges
 
 SHUFFLES = ("front", "back", "last")
 MOST_MARGIN_PX = 1024
-"""No network that is of use mirrors more of its image."""
+"""The maximum mirrored border; no practical network needs more."""
 
 
 def host_part_to_json(part: HostPart) -> dict[str, Any]:

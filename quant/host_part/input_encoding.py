@@ -1,4 +1,4 @@
-"""How an image in [0, 1] becomes the int8 planes that the integer core reads."""
+"""Encode an image in [0, 1] as the int8 planes that the integer core reads."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -50,7 +50,9 @@ class BitSlices:
 
     @property
     def limits(self) -> tuple[list[int], list[int]]:
-        """The smallest and the largest integer of each plane of a channel, tried on every DN."""
+        """The smallest and the largest integer of each plane of a channel, determined from every
+        DN.
+        """
         every_dn = np.arange(self.lowest_dn, MAX_DN + 1, dtype=np.float32)[None, None, None]
         planes = self.encode(every_dn / np.float32(MAX_DN))[0, :, 0]
         return planes.min(1).tolist(), planes.max(1).tolist()
@@ -113,10 +115,13 @@ class BitSlices:
 
 
 IMAGE_SLICES = BitSlices()
-"""Of a network that reads the image itself: 0 stays 0, as its zero padding is."""
+"""The encoding for a network that reads the image itself: 0 is encoded as 0, as its zero padding
+is.
+"""
 BANK_SLICES = BitSlices(16, 2, 2048, 2, SIDE_PX // 2)
-"""Of a sensor's bank, whose filters sum to 0: about the middle of the range, the steps are half as
-large. Zeros around the image would look like a black edge to the filters, so it is mirrored.
+"""The encoding for a sensor's bank, whose filters sum to 0: around the middle of the range, the
+steps are half as large. Zeros around the image would look like a black edge to the filters, so it
+is mirrored.
 """
 
 

@@ -1,7 +1,7 @@
-"""How the copies that the integer core writes of each channel become one value.
+"""Combine the copies that the integer core writes of each channel to one value.
 
 int8 has 256 steps. A copy that is finer by `GAIN` has smaller rounding errors but a smaller range,
-so a coarse copy takes its place where it is clipped. The channels of a result are ordered by copy.
+so a coarse copy is used where it is clipped. The channels of a result are ordered by copy.
 """
 
 from dataclasses import dataclass
@@ -12,13 +12,13 @@ from beers_deploy.model.bank import UNIT_STEPS, WIDE
 from beers_deploy.quant.host_part.writer import HostWriter
 
 GAIN = 8
-"""By how much a coarse copy is coarser than a fine one."""
+"""The ratio of a coarse copy's step to that of a fine copy."""
 FINE_MAX = 126
-"""The largest integer of a fine copy that counts: 127 may be a clipped value."""
+"""The largest valid integer of a fine copy, because 127 may be a clipped value."""
 ANALYTIC_COPIES = 4
-"""Of the analytic restoration, in the result of a network behind a bank."""
+"""The number of copies of the analytic restoration in the result of a network behind a bank."""
 DECODED = "host_back.correction"
-"""The tensor of the decoded values."""
+"""The name of the tensor of decoded values."""
 
 Offsets = tuple[tuple[float, ...], ...]
 Constants = dict[str, object]
@@ -26,10 +26,11 @@ Constants = dict[str, object]
 
 @dataclass(frozen=True)
 class Plain:
-    """One copy, which is the value. The decodings of several copies derive from it.
+    """One copy, which is the value. The decodings of several copies derive from this class.
 
     Attributes:
-        offsets: (windows, C) what the host adds to each of the last copies, in the result's unit.
+        offsets: (windows, C) numbers that the host adds to each of the last copies, in the result's
+            unit.
         finer_bits: fractional bits that a fine copy has in addition to those of a single one.
     """
 
@@ -38,12 +39,12 @@ class Plain:
 
     @property
     def gains(self) -> tuple[int, ...]:
-        """What the host multiplies each copy with that the last convolution writes."""
+        """The factor by which the host multiplies each copy that the last convolution writes."""
         return (1,)
 
     @property
     def copies(self) -> int:
-        """How often the core writes each channel."""
+        """The number of copies of each channel that the core writes."""
         return len(self.gains)
 
     def never_replaced(self, outputs: int) -> slice:  # noqa: ARG002 - other decodings use it
@@ -86,7 +87,7 @@ class DualRange(Plain):
 
     @property
     def gains(self) -> tuple[int, ...]:
-        """What the host multiplies each copy with."""
+        """The factor by which the host multiplies each copy."""
         return (1, GAIN)
 
     def never_replaced(self, outputs: int) -> slice:
@@ -118,13 +119,13 @@ class DualRange(Plain):
 
 @dataclass(frozen=True)
 class OffsetWindows(Plain):
-    """A coarse copy, then fine ones less an offset each: windows side by side over the range."""
+    """A coarse copy, then fine ones minus one offset each: windows side by side over the range."""
 
     finer_bits = GAIN.bit_length() - 1
 
     @property
     def gains(self) -> tuple[int, ...]:
-        """What the host multiplies each copy with."""
+        """The factor by which the host multiplies each copy."""
         return (GAIN, *[1] * len(self.offsets))
 
     def never_replaced(self, outputs: int) -> slice:
@@ -185,7 +186,7 @@ class BankSum(DualRange):
 
     @property
     def copies(self) -> int:
-        """How often the core writes each channel."""
+        """The number of copies of each channel that the core writes."""
         return len(self.gains) + ANALYTIC_COPIES
 
     @property
@@ -207,7 +208,7 @@ class BankSum(DualRange):
         fine, coarse, *analytic = np.split(result, self.copies, axis=1)
         fine_sum = np.sum(analytic[: self.fine_copies], 0) * np.float32(self._fine_gain(scale))
         if self.coarse_copies:
-            # The fine copies differ by at most one step, so one of them tells for all.
+            # The fine copies differ by at most one step, so checking one of them suffices.
             coarse_value = analytic[-1] * np.float32(self._coarse_gain(scale))
             fine_sum = np.where(_is_fine(analytic[0], scale), fine_sum, coarse_value)
         return np.asarray(_in_dual_range(fine, coarse, scale) + fine_sum)
@@ -240,7 +241,7 @@ class BankSum(DualRange):
 
 
 def _fine_limit(scale: float) -> float:
-    """Return the largest value of a fine copy that counts; half a unit keeps float error out."""
+    """Return the largest valid value of a fine copy, plus half a unit to tolerate float errors."""
     return (FINE_MAX + 0.5) * scale
 
 

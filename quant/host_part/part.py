@@ -1,4 +1,5 @@
-"""The host's part of an INT8 network: both sides of the integer core, in NumPy and as ONNX nodes.
+"""Define the host's part of an INT8 network: both sides of the integer core, in NumPy and as ONNX
+nodes.
 
 image -> pixel unshuffle -> encoding -> core -> decoding -> pixel shuffle -> + image
 
@@ -61,12 +62,12 @@ class HostPart:
     def of(
         cls, network: SplitNetwork, decoding: OutputDecoding, input_ranges: Ranges = ()
     ) -> "HostPart":
-        """Return the host's part of a float network that reads the image.
+        """Build the host's part of a float network that reads the image.
 
         Args:
-            network: the float network, split into its core and what the host computes.
+            network: the float network, split into its core and the host's part.
             decoding: of the core's result.
-            input_ranges: of the image's channels; empty where all are in [0, 1].
+            input_ranges: of the image's channels; empty if all are in [0, 1].
         """
         channels = network.core_channels
         return cls(
@@ -79,7 +80,7 @@ class HostPart:
             encoding=image_encoding(network.border_px, input_ranges),
             decoding=decoding,
             input_ranges=input_ranges,
-            # An image in [0, 1] is clipped by whoever stores it.
+            # An image in [0, 1] is clipped when it is stored.
             limits=network.limits if input_ranges or network.limits != UNIT else (),
         )
 
@@ -286,4 +287,4 @@ def image_encoding(margin_px: int, input_ranges: Ranges) -> InputEncoding:
 
 
 ONE_CHANNEL = HostPart()
-"""Of an image of one channel, to which the core's plain result is added."""
+"""The host's part for an image of one channel, to which the core's plain result is added."""

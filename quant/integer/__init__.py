@@ -1,5 +1,5 @@
-"""The DPU's arithmetic in integers: the reference that every file is held to.
+"""The DPU's arithmetic in integers: the reference with which every file is compared.
 
-- `reference`: a core run on planes, layer by layer, and how far onnxruntime agrees;
+- `reference`: a core run on planes, layer by layer, and its agreement with onnxruntime;
 - `arithmetic`: exact convolutions, maxima and means, and the DPU's fixed-point constants.
 """

@@ -1,4 +1,4 @@
-"""The integer reference's operators on integers (N, C, H, W): exact products, sums, maxima,
+"""Compute the integer reference's operators on integers (N, C, H, W): exact products, sums, maxima,
 and their bounds.
 """
 
@@ -13,20 +13,27 @@ from beers_deploy.quant.graph import Activation, AveragePool, MaxPool, Pointwise
 from beers_deploy.quant.graph.operations import SIX
 
 FLOAT32_WHOLE_MAX = 2**24
-"""Up to here float32 holds integers exactly, and sums them in any order."""
+"""float32 represents integers exactly up to this value, and sums them exactly in any order."""
 STRIP_VALUES = 1 << 22
-"""Values of the windows that are laid out at a time: 16 MB of float32."""
+"""The number of window values that are expanded at a time: 16 MB of float32."""
 LEAKY_OF_256 = 26
 
 
 def convolve(
     image: np.ndarray, weight: np.ndarray, window: Window, groups: int = 1, transposed: bool = False
 ) -> np.ndarray:
-    """Return the sums of products of a convolution with zero padding, (N, I, H, W) to
-    (N, O, H', W') int64.
+    """Compute the sums of products of a convolution with zero padding, (N, I, H, W) to (N, O, H',
+    W') int64.
 
-    A product of matrices a strip of rows, in floats that hold its sums exactly: the windows of a
-    whole image would take kh kw times its memory.
+    It computes a matrix product per strip of rows, in floats that represent its sums exactly. The
+    windows of a whole image would need kh kw times its memory.
+
+    Args:
+        image: integers (N, I, H, W).
+        weight: integers (O, I / groups, kh, kw).
+        window: strides, pads and dilations.
+        groups: 1, or the number of channels of a depthwise convolution.
+        transposed: whether strides enlarge and pads crop.
     """
     if transposed:
         wide, window = _between_zeros(image, weight, window)
@@ -100,7 +107,16 @@ def bound_of(op: IntConv, bias: np.ndarray) -> float:
 
 
 def activated(sums: np.ndarray, activation: Activation, frac_bits: int) -> tuple[np.ndarray, int]:
-    """Return the sums behind an activation, and the fractional bits that they have gained."""
+    """Apply an activation to sums.
+
+    Args:
+        sums: integers.
+        activation: of the operation.
+        frac_bits: of the sums.
+
+    Returns:
+        The results, and the number of fractional bits by which they are finer than the sums.
+    """
     if activation is Activation.relu:
         return np.maximum(sums, 0), 0
     if activation is Activation.relu6:
@@ -154,11 +170,13 @@ MEANS = {
     (7, 7): (21, 10),
 }
 MEANS[14, 14] = (21, 12)
-"""Kernels whose factors the DPU's quantiser states (Vitis-AI 3.0, nndct_shared)."""
+"""Kernels whose factors the DPU's quantiser defines (Vitis-AI 3.0, nndct_shared)."""
 
 
 def mean_factor(kernel: tuple[int, int]) -> tuple[int, int]:
-    """(m, s), m in int8, so that the DPU makes a window's mean of its sum by m / 2^s."""
+    """Return (m, s), with m in int8, such that the DPU computes a window's mean as its sum times m
+    / 2^s.
+    """
     if kernel in MEANS:
         return MEANS[kernel]
     count = kernel[0] * kernel[1]
@@ -183,7 +201,7 @@ def bilinear_weights(factor: int) -> tuple[np.ndarray, int]:
 
 
 def six_in_units(frac_bits: int) -> int:
-    """6 in whole multiples of 2^-n, or int8's end."""
+    """Return 6 in integer multiples of 2^-n, or the end of int8 if that is smaller."""
     return min(int(np.floor(6 * 2.0**frac_bits + 0.5)), INT8_MAX)
 
 

@@ -1,14 +1,14 @@
-"""The DPU's arithmetic in integers, as documented, independent of any runtime (facts: UG1414
-3.5, vai_q).
+"""Compute the DPU's arithmetic in integers, as documented and independent of any runtime (facts:
+UG1414 3.5, vai_q).
 
     convolution: int8 products added in int32, plus bias << shift_bias, ReLU,
                  >> shift_cut rounded, to [-128, 127]
     add:         the finer input aligned to the coarser, sum shifted by shift_write rounded,
                  to [-128, 127]
 
-Activations round half up; a runtime that computes in float rounds half to even. Where a shifted sum
-ends in exactly one half the two differ by one unit: `half_even` takes the runtime's rule, so that
-both can be proven and counted.
+Activations round half up; a runtime that computes in float rounds half to even. If a shifted sum
+ends in exactly one half, the two differ by one unit. `half_even` selects the runtime's rule, so
+that both can be proven and counted.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -47,11 +47,11 @@ from beers_deploy.quant.onnx_file import any_size, with_outputs
 from beers_deploy.quant.session import few_crops, open_any_size, open_session, result_of
 
 INT32_BITS = 31
-"""Of an accumulator, without the sign."""
+"""The number of bits of an accumulator, without the sign."""
 
 NARROW_BITS = 23
-"""Of a 24-bit accumulator, without the sign: the documents hint at one (facts on the DPU's rules),
-int32 has 31.
+"""The number of bits of a 24-bit accumulator, without the sign. The documents suggest one (facts on
+the DPU's rules); int32 has 31.
 """
 BITS_SOURCE = "128 times the sum of the weights' sizes, plus the bias: no input exceeds it"
 
@@ -63,8 +63,8 @@ class Faults:
     Attributes:
         shifts: wrong shifts, by operation and field: `shift_cut`, `shift_bias` of a convolution,
             `shift_write` of an add.
-        touch: what becomes of a tensor, by name, between the operation that writes it and those
-            that read it.
+        touch: function by tensor name that changes a tensor between the operation that writes it
+            and those that read it.
     """
 
     shifts: Mapping[tuple[str, str], int] = field(default_factory=dict)
@@ -80,15 +80,15 @@ SOUND = Faults()
 
 @dataclass(frozen=True)
 class LayerReport:
-    """What one operation did on the images that it was run on.
+    """The behaviour of one operation on the images that it was run on.
 
     Attributes:
         name: of the operation.
         peak_bits: bits that the largest accumulator needed, without the sign.
-        proven_bits: bits that no input can exceed: 128 times the sum of the weights' sizes, plus
-            the bias.
-        saturated: share of the results that came to int8's ends.
-        ties: share of the results whose rounding was decided by tie rounding.
+        proven_bits: bits that no input can exceed: 128 times the sum of the weights' absolute
+            values, plus the bias.
+        saturated: share of the results at the ends of int8.
+        ties: share of the results that were decided by tie rounding.
     """
 
     name: str
@@ -101,8 +101,16 @@ class LayerReport:
 def run_core(
     core: IntCore, planes: np.ndarray, half_even: bool = False, faults: Faults = SOUND
 ) -> tuple[dict[str, np.ndarray], list[LayerReport]]:
-    """Return every tensor of the core for its int8 planes (N, P, H, W), as int16, and a report a
-    layer.
+    """Run a core on int8 planes (N, P, H, W).
+
+    Args:
+        core: the integer core.
+        planes: its input.
+        half_even: whether ties are rounded to even, as onnxruntime does, instead of up.
+        faults: that are injected.
+
+    Returns:
+        Every tensor by name, as int16, and one report per operation.
     """
     tensors = {PLANES: faults.touch(PLANES, planes.astype(np.int16))}
     reports = []
@@ -120,8 +128,9 @@ def run_core(
 
 
 def correction(core: IntCore, planes: np.ndarray, half_even: bool = False) -> np.ndarray:
-    """Return the correction (N, C, H, W) for int8 planes (N, P, H, W), all its copies, as float32
-    multiples of its scale.
+    """Return the correction (N, C, H, W) for int8 planes (N, P, H, W), with all its copies.
+
+    It is float32, in multiples of its scale. `half_even` rounds ties to even, as onnxruntime does.
     """
     tensors, _ = run_core(core, planes, half_even)
     return np.asarray(tensors[CORRECTION] * np.float32(core.scale(CORRECTION)), np.float32)
@@ -141,18 +150,18 @@ many more fractional bits an activation has made these sums longer than the accu
 """
 
 INT8_BITS = 7.0
-"""Of what only moves values, without the sign."""
+"""The number of bits of values that are only moved, without the sign."""
 
 
 def layer_sums(
     core: IntCore, op: IntConv | Op, tensors: Mapping[str, np.ndarray], faults: Faults = SOUND
 ) -> Sums:
-    """Return the sums of an operation before they are rounded to int8.
+    """Compute the sums of an operation before they are rounded to int8.
 
     Args:
         core: of the operation.
         op: the operation.
-        tensors: what it reads, by name.
+        tensors: its inputs, by name.
         faults: wrong shifts.
     """
     inputs = [tensors[name] for name in op.inputs]
@@ -169,12 +178,13 @@ def layer_sums(
         return *means(inputs[0], op), 0
     if isinstance(op, Resize) and op.bilinear:
         return *enlarged(inputs[0], op.factor), 0
-    # Values that only move keep their scale, and a table's entries are rounded: no shift is left.
+    # Values that only move have the same scale, and a table's entries are rounded, so no shift
+    # remains.
     return _moving(core, op, inputs), 0, INT8_BITS, 0
 
 
 def _moving(core: IntCore, op: Op, inputs: list[np.ndarray]) -> np.ndarray:
-    """Return values that are handed on, or looked up."""
+    """Return values that are moved or looked up in a table."""
     if isinstance(op, Concat):
         return np.concatenate(inputs, axis=1)
     if isinstance(op, MaxPool):
@@ -219,7 +229,16 @@ def _add(core: IntCore, op: Add, inputs: list[np.ndarray], faults: Faults) -> Su
 
 
 def rounded(sums: np.ndarray, shift: int, half_even: bool) -> tuple[np.ndarray, float]:
-    """Return sums divided by 2^shift and rounded, not clipped; and the share that lay half-way."""
+    """Divide sums by 2^shift and round them, without clipping.
+
+    Args:
+        sums: integers.
+        shift: right shift; a negative one shifts left.
+        half_even: whether ties are rounded to even instead of up.
+
+    Returns:
+        The integers, and the share of ties.
+    """
     if shift <= 0:
         return sums << min(-shift, 8), 0.0  # by 8 all but 0 lies beyond int8
     half = 1 << (shift - 1)
@@ -294,8 +313,9 @@ def agreement(core: IntCore, host: onnx.ModelProto, image: np.ndarray) -> Agreem
 def integer_rows(
     model: onnx.ModelProto, core: IntCore, host: onnx.ModelProto, images: Iterable[np.ndarray]
 ) -> tuple[Row, ...]:
-    """Return a row for each integer operation on a crop of a few images (1, C, H, W), and last one
-    for what the DPU's tie rounding changes.
+    """Return a row for each integer operation on a crop of a few images (1, C, H, W).
+
+    The last row is for the effect of the DPU's tie rounding.
     """
     patches = few_crops(images, model)
     agreements = [agreement(core, host, crop) for crop in patches]

@@ -1,14 +1,15 @@
-"""The integer core in torch, so that its numbers can be trained: integers forwards, slopes
-backwards.
+"""Compute the integer core in torch, so that its numbers can be trained: integers forwards,
+gradients backwards.
 
-Forwards every tensor holds the very integers of `quant.integer.reference`. Backwards rounding
-counts as the identity, and clipping as what it is (the straight-through estimator, Bengio et al.
-2013). A step costs about what one of the float network does: weights carry the shift to the
-result's unit, biases what makes ties round up, and one pass over the sums clips them, another
-rounds them. Sums are of float32, which holds them exactly up to 2^22, behind LeakyReLU 2^19.
+In the forward pass every tensor holds exactly the integers of `quant.integer.reference`. In the
+backward pass rounding counts as the identity, and clipping has its own gradient (the
+straight-through estimator, Bengio et al. 2013). A step costs about as much as one of the float
+network. Weights include the shift to the result's unit, and biases the offset by which ties round
+up. One pass over the sums clips them, another rounds them. Sums are float32, which represents them
+exactly up to 2^22, behind LeakyReLU up to 2^19.
 
-A result in windows or two gains is trained as one copy of it, which is not rounded: it differs from
-what the host computes by up to half a unit. `TrainableCore.core` makes the other copies.
+A result in windows or two gains is trained as one copy of it, which is not rounded. It differs from
+the host's result by up to half a unit. `TrainableCore.core` derives the other copies.
 """
 
 import math
@@ -128,7 +129,7 @@ class TrainableCore(torch.nn.Module):
         copy = deepcopy(self)
         op = self._convs[number]
         copy._convs[number] = replace(op, weight_frac_bits=op.weight_frac_bits + by)
-        # What is clipped starts at the end of int8, where its slope is not 0.
+        # Clipped numbers start at the end of int8, where the gradient is not 0.
         copy.weights[number].data.mul_(2.0**by).clamp_(INT8_MIN, INT8_MAX)
         return copy
 
@@ -210,10 +211,11 @@ def _products(op: IntConv, image: Tensor, weight: Tensor, bias: Tensor) -> Tenso
 
 
 def _lift(activation: Activation = Activation.none) -> float:
-    """Return what sums are raised by, in their unit: ties to even become ties up, and nothing else
-    moves.
+    """Return the offset that is added to sums, in their unit: ties to even become ties up, and
+    nothing else changes.
 
-    LeakyReLU divides the unit by 128 and what is added by ten.
+    It is smaller for LeakyReLU, which divides the unit by 128 and, by its slope, the offset by
+    about ten.
     """
     # Sums are integers in their unit, so less than 1 moves none but ties across a threshold.
     return 2.0**-5 if activation is Activation.leaky_relu else 2.0**-2
@@ -290,7 +292,8 @@ def _resize(op: Resize, inputs: Sequence[Tensor], _: Bits) -> Tensor:
 
 def _shuffle(op: Shuffle, inputs: Sequence[Tensor], _: Bits) -> Tensor:
     """Move values as a pixel shuffle or its inverse does."""
-    # The operation itself says where each value goes; gathering has the inverse as its slope.
+    # The operation itself determines where each value moves; the gradient of gathering is the
+    # inverse.
     count, *shape = inputs[0].shape
     order = np.asarray(op(np.arange(math.prod(shape)).reshape(1, *shape)))
     places = torch.from_numpy(order.ravel())
@@ -324,7 +327,7 @@ _OPERATIONS: Mapping[type, Callable[..., Tensor]] = MappingProxyType(
 
 
 def _one_copy(op: IntConv, host_part: HostPart) -> IntConv:
-    """Return the first fine copy of a convolution that writes copies; any other as it is."""
+    """Return the first fine copy of a convolution that writes copies; any other unchanged."""
     if op.output != CORRECTION or host_part.decoding.copies == 1:
         return op
     first = host_part.outputs * host_part.decoding.gains.index(1)
@@ -364,7 +367,9 @@ def _all_copies(
 
 
 def _window_bias(one: IntConv, decoding: OutputDecoding) -> np.ndarray:
-    """Return what the DPU and the host add to a result in windows, (O,) in units of the bias."""
+    """Return the sum of the biases of DPU and host for a result in windows, (O,) in units of the
+    bias.
+    """
     offset = np.array(decoding.offsets[0])
     return np.asarray(one.bias + offset * 2.0**one.bias_frac_bits, np.float32)
 

@@ -1,9 +1,8 @@
-"""Weights that a model keeps in a file beside it, taken in: from the model's own folder, or not at
-all.
+"""Load weights that a model stores in a separate file: from the model's own folder only.
 
-Exporters write one for large networks, torch's newer one for all. Only initializers are taken in;
-whatever else says that it lies elsewhere is refused by `quant.untrusted.check_content`, which looks
-at all of it afterwards.
+Exporters write such a file for large networks, and torch's newer exporter for all. Only
+initializers are loaded. `quant.untrusted.check_content` runs afterwards on everything, and rejects
+other tensors that are stored elsewhere.
 """
 
 import hashlib
@@ -23,7 +22,7 @@ from beers_deploy.quant.untrusted import FILE_BYTES, VALUE_BYTES, check_size
 
 
 def take_in(model: onnx.ModelProto, path: Path) -> None:
-    """Put the weights that a model of this file keeps beside it into the model."""
+    """Load the weights of a model from the file next to it into the model."""
     used_bytes = 0
     for tensor in model.graph.initializer:
         if tensor.data_location == TensorProto.EXTERNAL:
@@ -35,7 +34,7 @@ def take_in(model: onnx.ModelProto, path: Path) -> None:
 
 
 def network_sha256(path: Path) -> str:
-    """SHA-256 of a network's file, and of the files beside it that its weights are in."""
+    """Compute the SHA-256 of a network's file and of the separate files that hold its weights."""
     digest = sha256(path)
     if path.suffix != ".onnx":
         return digest
@@ -57,11 +56,10 @@ def network_sha256(path: Path) -> str:
 
 @contextmanager
 def unchanged(path: Path) -> Iterator[str]:
-    """Give the digest of a network's file, and raise ModelError if the file is another one after it
-    was read.
+    """Yield the digest of a network's file; raise ModelError if the file changed while it was read.
 
-    So the digest is that of the bytes that were parsed. It is empty where there is no file, which
-    the reader refuses.
+    The digest is therefore that of the bytes that were parsed. It is empty if there is no file; the
+    reader then raises an error.
     """
     before = network_sha256(path) if path.is_file() else ""
     yield before
@@ -76,7 +74,7 @@ def _entries(tensor: TensorProto) -> dict[str, str]:
 
 
 def _content(tensor: TensorProto, path: Path, limit_bytes: int) -> bytes:
-    """The bytes of one tensor, as many as its sizes ask for."""
+    """Read the bytes of one tensor, of the number that its sizes require, or raise ModelError."""
     entries = _entries(tensor)
     check_size(tensor.name, tensor.dims, str(path))
     if tensor.data_type not in VALUE_BYTES or min(tensor.dims, default=0) < 0:
@@ -99,13 +97,15 @@ def _content(tensor: TensorProto, path: Path, limit_bytes: int) -> bytes:
 
 
 def _byte_count(text: str) -> int | None:
-    """A number of bytes."""
+    """Parse a number of bytes; return None if the text is none."""
     return int(text) if text.isascii() and text.isdigit() and len(text) < 19 else None
 
 
 def _beside(tensor: TensorProto, location: str, path: Path) -> Path:
-    """The regular file in the model's folder, or one within it, that is meant;
-    no link leads there.
+    """Return the regular file of the weights, in the model's folder or below and reached by no
+    link.
+
+    Raises ModelError for any other location.
     """
     # Files that were written on Windows have backslashes between folders.
     parts = PurePosixPath(location.replace("\\", "/")).parts

@@ -1,7 +1,8 @@
-"""The one graph of an ONNX file: its nodes, who writes and reads each tensor, and its constants.
+"""Represent the one graph of an ONNX file: its nodes, the writers and readers of each tensor, and
+its constants.
 
-Simplification edits it, tiling walks it, the quantiser reads typed operations from it and the
-checker sized ones. Nothing is refused here.
+Simplification edits it, tiling traverses it, the quantiser reads typed operations from it and the
+checker sized ones. Nothing is rejected here.
 """
 
 from collections import defaultdict
@@ -17,7 +18,7 @@ from beers_deploy.quant.domains import Functions, functions_of, operator_name
 from beers_deploy.quant.onnx.window import Pair, Window
 
 WEIGHTS = {"Conv": 1, "ConvInteger": 1, "ConvTranspose": 1, "QLinearConv": 3}
-"""Operators with weights, and which input holds them."""
+"""Operators with weights, and the input that holds them."""
 
 
 @dataclass(eq=False)
@@ -25,11 +26,11 @@ class Node:
     """An operator, in ONNX's words.
 
     Attributes:
-        op_type: its operator, as `quant.domains.operator_name` spells it.
+        op_type: its operator, as `quant.domains.operator_name` returns it.
         name: its own name, or that of its first result.
-        inputs: the tensors it reads; one that is left out has an empty name.
+        inputs: the tensors it reads; an omitted one has an empty name.
         outputs: the tensors it writes.
-        attributes: those that it states, text as such.
+        attributes: those that it states, strings decoded.
         proto: the message it was read from; inputs and outputs may have changed since.
     """
 
@@ -59,7 +60,7 @@ class Node:
         return f"{self.op_type} {self.name}"
 
     def written(self) -> NodeProto:
-        """Return the message of the node as it is now."""
+        """Return the current message of the node."""
         proto = NodeProto()
         proto.CopyFrom(self.proto)
         proto.input[:] = self.inputs
@@ -67,11 +68,11 @@ class Node:
         return proto
 
     def window(self, kernel: Sequence[int] = (), size: Pair = (0, 0)) -> tuple[Pair, Window] | None:
-        """Return its kernel and how that moves over rows and columns; None if the node states none.
+        """Return its kernel and its window; None if the node states none.
 
         Args:
-            kernel: sides of its weights; empty for what the node states itself.
-            size: of the map that it reads, or any that differs by whole strides: for `auto_pad`.
+            kernel: sides of its weights; empty to use the node's own attribute.
+            size: of the map that it reads, or any that differs by integer strides: for `auto_pad`.
         """
         attribute = self.attributes.get
         sides = (
@@ -98,19 +99,19 @@ class Node:
 
 
 Rewriting = Callable[["OnnxGraph", Node], list[Node] | None]
-"""Returns the nodes that take the place of a node; None if it stays."""
+"""A function that returns the nodes that replace a node; None if it stays."""
 
 
 class OnnxGraph:
-    """The nodes of a model in order, but for those that only hold a constant.
+    """The nodes of a model in order, except those that only hold a constant.
 
     Attributes:
         nodes: in order.
-        constants: initializers and what nodes of the kind Constant hold, by name.
-        inputs: tensors that are no constants, with their sizes, 0 where the file states none.
-        types: ONNX's number of what each input holds.
+        constants: initializers and the values of Constant nodes, by name.
+        inputs: tensors that are no constants, with their sizes, 0 if the file states none.
+        types: ONNX's number of the type of each input.
         outputs: the names of the results.
-        result_sizes: their sizes, 0 where the file states none; empty if it states no rank.
+        result_sizes: their sizes, 0 if the file states none; empty if it states no rank.
         readers: for each tensor the nodes that read it, one as often as it does.
         writers: for each tensor the node that writes it.
     """
@@ -142,7 +143,7 @@ class OnnxGraph:
         for node in nodes:
             for name in node.inputs:
                 self.readers[name].append(node)
-            # A result that is left out has an empty name, which nobody may read.
+            # An omitted result has an empty name, which no node may read.
             self.writers.update((name, node) for name in node.outputs if name)
 
     def rewrite(self, rewriting: Rewriting) -> None:
@@ -197,7 +198,7 @@ class OnnxGraph:
         return self.writers.get(name) if self.n_reads(name) == 1 else None
 
     def rename(self, result: str, name: str) -> None:
-        """Let a result have the name of the one that it takes the place of."""
+        """Rename a result to that of the tensor that it replaces."""
         writer = self.writers[result]
         self.writers[name] = writer
         writer.outputs = tuple(name if output == result else output for output in writer.outputs)
@@ -215,7 +216,8 @@ class OnnxGraph:
     def numbers(
         self, node: Node, place: int, key: str, otherwise: Sequence[float] = ()
     ) -> list[Any] | None:
-        """Return what a node states in a constant input or, of older opsets, in an attribute.
+        """Return the numbers that a node states in a constant input or, in older opsets, in an
+        attribute.
 
         None if other nodes compute it.
         """
@@ -226,7 +228,7 @@ class OnnxGraph:
 
 
 def constants(model: onnx.ModelProto) -> dict[str, np.ndarray]:
-    """Return the constants of a model by name: initializers, and what Constant nodes hold."""
+    """Return the constants of a model by name: initializers, and the values of Constant nodes."""
     arrays = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
     functions = functions_of(model)
     for node in model.graph.node:

@@ -1,6 +1,7 @@
-"""Put the nodes of a file in an order in which each reads what was written before.
+"""Sort the nodes of a file such that each reads only tensors that were written before.
 
-ONNX asks for such an order. Quantisers that insert nodes, such as AMD Quark, do not always keep it.
+ONNX requires such an order. Quantisers that insert nodes, such as AMD Quark, do not always preserve
+it.
 """
 
 from collections import deque
@@ -25,7 +26,7 @@ def sort_nodes(graph: GraphProto) -> None:
 def _order(nodes: Sequence[NodeProto]) -> list[int]:
     """Return the numbers of the nodes, each behind those whose results it reads.
 
-    Nodes that are sorted already keep their order.
+    The order of sorted nodes does not change.
     """
     writers: dict[str, int] = {}
     for number, node in enumerate(nodes):

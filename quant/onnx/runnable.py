@@ -1,6 +1,6 @@
 """Check that a runtime may open an ONNX file: operators of ONNX itself, and sizes within bounds.
 
-Only the file's content has been checked before (`quant.untrusted`).
+`quant.untrusted` has checked the file's content before.
 """
 
 import math
@@ -15,16 +15,16 @@ from beers_deploy.quant.domains import INLINE, MICROSOFT, STANDARD, foreign_reme
 from beers_deploy.quant.untrusted import RANK, check_size, times
 
 WINDOW_PX = 1024
-"""Kernel, stride, dilation or padding of a window, or a factor of enlargement."""
+"""The limit of kernel, stride, dilation or padding of a window, and of a factor of enlargement."""
 
 ONNXRUNTIMES = {(MICROSOFT, "QLinearAdd"), (MICROSOFT, "QLinearMul")}
-"""Its operators that we write."""
+"""onnxruntime's own operators that this project writes."""
 
 WINDOWS = {"kernel_shape", "strides", "dilations", "pads", "output_padding", "blocksize"}
 SIZES = {"CenterCropPad": (1,), "Expand": (1,), "MaxUnpool": (2,), "OneHot": (1,), "Resize": (3,)}
-"""Operators with an input that says how large the result is, and which."""
+"""Operators with an input that states the size of the result, and that input."""
 FACTORS = {"Pad": (1,), "Resize": (2,), "Tile": (1,), "Upsample": (1,)}
-"""The same, of an input that says by how much larger."""
+"""Operators with an input that states the enlargement, and that input."""
 KEEPING = {
     "Cast",
     "Constant",
@@ -38,9 +38,11 @@ KEEPING = {
     "Transpose",
     "Unsqueeze",
 }
-"""What may be computed of constants alone: no result of these is larger than what they read."""
+"""Operators that may be computed from constants alone, because their result is no larger than their
+inputs.
+"""
 FILLING = {"ConstantOfShape", "Expand", "Tile"}
-"""What may be computed of constants alone, as far as the file states how large the result is."""
+"""Operators that may be computed from constants alone if the file states the size of the result."""
 
 
 def check_runnable(model: onnx.ModelProto, where: str) -> None:
@@ -72,8 +74,8 @@ def check_runnable(model: onnx.ModelProto, where: str) -> None:
 
 
 class _Constants:
-    """What is computed of constants alone: its values, where they are a short list, and how much
-    there is of it.
+    """Results that are computed from constants alone: their values if they are a short list, and
+    their total size.
     """
 
     def __init__(self, model: onnx.ModelProto, where: str) -> None:
@@ -103,7 +105,7 @@ class _Constants:
             )
 
     def _array(self, name: str) -> np.ndarray | None:
-        """A short list, None where it is none."""
+        """Return a constant as an array if it is a short list, otherwise None."""
         tensor = self.values.get(name)
         if (
             name not in self._arrays
@@ -114,7 +116,9 @@ class _Constants:
         return self._arrays.get(name)
 
     def _check_filled(self, node: NodeProto, arrays: list[np.ndarray | None]) -> None:
-        """Weights may be filled with numbers, as far as the file states how many."""
+        """Raise ModelError if a node fills weights to a size that the file does not state, or that
+        is too large.
+        """
         if node.op_type not in FILLING:
             return
         source = self.values.get(node.input[0])
@@ -132,7 +136,7 @@ class _Constants:
 
 
 LIST_VALUES = 4096
-"""Of one list; a runtime that computes with such ones is done in a moment."""
+"""The maximum number of values of one list; a runtime computes with such lists in a moment."""
 
 COMPUTED = {
     "Add",
@@ -160,12 +164,12 @@ COMPUTED = {
 def _computed(
     node: NodeProto, values: Sequence[np.ndarray | None], opset: int
 ) -> np.ndarray | None:
-    """What a node computes of short lists, None where that is no short list of numbers or not
-    computed here.
+    """Compute the result of a node from short lists; None if it is no short list of numbers, or is
+    not supported.
 
-    Exporters leave a dozen nodes to state four sizes. They are computed by onnx's reference in
-    Python, before a runtime has the file: so the sizes that follow are looked at like those that a
-    file states. The caller has bounded what ConstantOfShape makes.
+    Exporters leave a dozen nodes to state four sizes. onnx's reference in Python computes them
+    before a runtime opens the file. The resulting sizes are therefore checked like those that a
+    file states. The caller has bounded the results of ConstantOfShape.
     """
     short = all(value is not None and value.size <= LIST_VALUES for value in values)
     if node.op_type not in COMPUTED or not short:
@@ -184,7 +188,7 @@ def _computed(
 
 
 def named(node: NodeProto) -> str:
-    """A node's operator and name, as sentences say it."""
+    """Return operator and name of a node, for a sentence."""
     return f"{node.op_type} {node.name}".strip()
 
 
@@ -231,8 +235,10 @@ def _check_windows(node: NodeProto, where: str) -> None:
 def _check_growth(
     node: NodeProto, constants: dict[str, TensorProto], of_image: set[str], where: str
 ) -> None:
-    """A size that the file holds is looked at; one of the image's own is its matter; any other
-    could be anything.
+    """Raise ModelError if a node may enlarge too much.
+
+    A size that the file stores is checked. A size that derives from the image is allowed. Any other
+    size is rejected, because it could be anything.
     """
     for places, absolute in ((SIZES, True), (FACTORS, False)):
         for name in (node.input[i] for i in places.get(node.op_type, ()) if i < len(node.input)):

@@ -1,4 +1,4 @@
-"""How a window moves over an image, and how large its result is along each axis."""
+"""Define how a window moves over an image, and compute the size of its result along each axis."""
 
 from dataclasses import dataclass, replace
 
@@ -8,7 +8,7 @@ Pair = tuple[int, int]
 
 @dataclass(frozen=True)
 class Window:
-    """How a convolution or a pool moves over the image, in ONNX's terms.
+    """The motion of a convolution or a pool over the image, in ONNX's terms.
 
     Axis 0 means the rows, axis 1 the columns. The size of the window itself is the `kernel` of the
     operation, because a convolution's weights have it.
@@ -28,7 +28,7 @@ class Window:
         return (kernel - 1) * self.dilations[axis] + 1
 
     def output_size(self, axis: int, kernel: int, size: int, ceil: bool = False) -> int:
-        """Return how many places the window has on `size` pixels.
+        """Return the number of places of the window on `size` pixels.
 
         Args:
             axis: 0 for the rows, 1 for the columns.
@@ -46,14 +46,14 @@ class Window:
         return min(-(-room // stride), (size + before - 1) // stride) + 1
 
     def transposed_size(self, axis: int, kernel: int, size: int) -> int:
-        """Return how many pixels a transposed convolution makes of `size`."""
+        """Return the size of a transposed convolution's result for `size` pixels."""
         beyond = self.extent(axis, kernel) - self.pads[axis] - self.pads[axis + 2]
         return self.strides[axis] * (size - 1) + beyond
 
     def padded(self, auto_pad: str, kernel: Pair, size: Pair) -> "Window":
-        """Return the window with the pads that `auto_pad` asks for on a map of this size.
+        """Return the window with the pads that `auto_pad` means for a map of this size.
 
-        With SAME the window has as many places as size / stride, rounded up.
+        With SAME the window has size / stride places, rounded up.
         """
         total = (0, 0)
         if auto_pad != "VALID":

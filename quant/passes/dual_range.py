@@ -2,10 +2,10 @@
 
 1. A correction that the host adds to the image is written twice: fine for nearly all pixels, and
    coarser by GAIN for the strongest edges, which clip in the fine copy.
-2. A result that nothing is added to is written in windows: fine copies side by side over all that
-   it is in float, and one coarser by GAIN for what lies outside.
-3. Nothing is done where the last operation is no convolution that can write copies, or where its
-   channels would be too many for the DPU.
+2. A result to which nothing is added is written in windows: fine copies side by side over its whole
+   float range, and one coarser by GAIN for values outside.
+3. Nothing is done if the last operation is no convolution that can write copies, or if its channels
+   would be too many for the DPU.
 """
 
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ from beers_deploy.quant.session import values_of
 
 MAX_WINDOWS = 8
 MAX_CHANNELS = 4096
-"""That a convolution of the DPU writes."""
+"""The maximum number of channels that a convolution of the DPU writes."""
 
 
 def can_write_copies(graph: Graph) -> bool:
@@ -50,13 +50,14 @@ def with_copies(graph: Graph, decoding: OutputDecoding) -> Graph:
 def with_windows(
     graph: Graph, host_part: HostPart, frac_bits: int, images: Iterable[np.ndarray]
 ) -> HostPart:
-    """Return the host part with windows over all that the result is in float, if it takes any.
+    """Return the host part with windows over the whole float range of the result, if the result
+    needs any.
 
     Args:
-        graph: plane-reading, in float.
+        graph: a float graph that reads the planes.
         host_part: of the network.
-        frac_bits: of the result's own scale, than which windows are finer by GAIN.
-        images: (1, C, H, W) that the result's range is measured on.
+        frac_bits: of the result's own scale; windows are finer by GAIN.
+        images: (1, C, H, W) on which the result's range is measured.
     """
     plain = host_part.decoding.copies == 1 and not host_part.adds_image
     # 3. One convolution of the DPU has to write the coarse copy and a window at the least.
@@ -73,8 +74,8 @@ def with_windows(
 
 
 def window_offsets(low: np.ndarray, high: np.ndarray, unit: float) -> np.ndarray:
-    """Return the middles (W, C) of as many windows of int8, its step `unit`, as hold values from
-    low to high, (C,) each.
+    """Return the middles (W, C) of the int8 windows, with the step `unit`, that cover low to high,
+    (C,) each.
     """
     # The coarse copy takes one of the places that a convolution's channels have.
     most = min(MAX_WINDOWS, MAX_CHANNELS // len(low) - 1)

@@ -1,9 +1,9 @@
 """Bound the search for equalization factors, and estimate its time before it begins.
 
 1. Count the work of a candidate: the multiply-accumulates of the operations that it runs again, and
-   what rounding and loading its weights takes.
-2. Where the likely work is too much, try fewer groups of channels, then measure on fewer crops.
-3. Where the most work that is possible is too much, go on until it is not.
+   the work of rounding and loading its weights.
+2. If the likely work is too much, try fewer groups of channels, then measure on fewer crops.
+3. If the largest possible work is too much, continue until it is not.
 
 Work is counted and not timed, because the same samples and seed must give the same file.
 """
@@ -20,11 +20,11 @@ from beers_deploy.quant.session import values_of
 
 
 class Effort(StrEnum):
-    """How long the search for equalization factors may take.
+    """The effort of the search for equalization factors.
 
-    - `fast`: first guesses alone.
+    - `fast`: first guesses only.
     - `normal`: groups of channels with similar ranges, within a bound of work.
-    - `best`: each channel by itself, without a bound.
+    - `best`: each channel separately, without a bound.
     """
 
     fast = "fast"
@@ -33,29 +33,32 @@ class Effort(StrEnum):
 
 
 MOST_GROUPS = {Effort.fast: 0, Effort.normal: 16, Effort.best: 256}
-"""Of the channels of a tensor or residual group, to be tried together."""
+"""The maximum number of groups into which the channels of a tensor or residual
+group are divided.
+"""
 FEWEST_GROUPS = 8
 FEWEST_CROPS = 24
-"""With fewer much of the gain was lost (measured), so that they may exceed the likely work: a
-quarter with 4 groups in a U-Net, all with 12 crops of 64 pixels in a residual network.
+"""With fewer groups or crops much of the gain was lost (measured). The likely work may therefore be
+exceeded: a quarter of the gain with 4 groups in a U-Net, all of it with 12 crops of 64 pixels in a
+residual network.
 """
 LIKELY_WORK = 7e11
 MOST_WORK = 2e12
-"""Multiply-accumulates: what the search should take, and what it must not exceed. On a processor
-without VNNI 1e10 took half a second to a second.
+"""Multiply-accumulates: the work that the search should need, and the work that it must not exceed.
+On a processor without VNNI 1e10 took half a second to a second.
 """
 LEAST_CROPS = 4
 
 RESULT = 64
 LEAKY_RESULT = 512
 WEIGHT = 400
-"""Multiply-accumulates that take as long as rounding a result, computing a LeakyReLU in float64,
-and rounding and loading a weight (measured).
+"""The numbers of multiply-accumulates that take as long as rounding a result, computing a LeakyReLU
+in float64, and rounding and loading a weight (measured).
 """
 TRIED = 0.35
-"""Share of the crops that a candidate is run on before it is given up, on average (measured)."""
+"""The average share of the crops on which a candidate is run before it is rejected (measured)."""
 TURNS = 4
-"""Candidates of a group of channels: larger and smaller, in two sizes."""
+"""The number of candidates for a group of channels: larger and smaller, in two sizes."""
 
 
 def channel_groups(ranges: np.ndarray, most: int) -> list[np.ndarray]:
@@ -83,18 +86,18 @@ class Stage:
     channels: int = 0
 
     def candidates(self, groups: int) -> int:
-        """Return the largest number of candidates with so many groups of channels."""
+        """Return the largest number of candidates for a number of groups of channels."""
         return self.guesses + TURNS * min(groups, self.channels)
 
 
 @dataclass(frozen=True)
 class Bound:
-    """What a search may take.
+    """The bound of a search.
 
     Attributes:
-        groups: most groups of channels of a tensor or residual group.
-        crops: number of crops that candidates are run on.
-        candidates: most candidates.
+        groups: the maximum number of groups of channels of a tensor or residual group.
+        crops: the number of crops on which candidates are run.
+        candidates: the maximum number of candidates.
         runs: likely work, in runs of the first candidate on all crops.
     """
 
@@ -107,13 +110,13 @@ class Bound:
 def bound(
     stages: Sequence[Stage], graph: Graph, work: Sequence[int], crops: int, effort: Effort
 ) -> Bound:
-    """Return what a search may take.
+    """Return the bound of a search.
 
     Args:
         stages: of the search.
         graph: that is searched.
         work: of each operation on one crop.
-        crops: number of crops, if there is no bound.
+        crops: the number of crops, if there is no bound.
         effort: allowed.
     """
 

@@ -1,14 +1,14 @@
-"""Equalize the channels of a residual group, so that one scale suits them all, at no cost in the
-network.
+"""Equalize the channels of a residual group, so that one scale suits them all, without changing the
+float network.
 
 1. Multiply the weights that write channel c of the group by k_c, and divide those that read it: the
-   float network stays the same, to rounding. A channel that uses a fraction of int8's range is
-   rounded finer for a larger k, and one that overflows is clipped less for a smaller k.
-2. Behind ReLU6 raise k until int8 ends at the six, so that its clip stands for that of ReLU6.
+   float network remains the same, to rounding. A channel that uses a fraction of int8's range is
+   rounded more finely for a larger k, and one that overflows is clipped less for a smaller k.
+2. Behind ReLU6 increase k until int8 ends at the six, so that its clip replaces that of ReLU6.
 3. Guess k = range^-gamma for a few gammas, and a few shares of int8's range for the widest channel.
-4. Try channels larger and smaller on crops of calibration images, because what counts is what a
-   channel's rounding does to the output: each by itself, or groups of similar range together. A
-   trial that is worse on the costliest crops is given up.
+4. Try channels larger and smaller on crops of calibration images, because the effect of a channel's
+   rounding on the output counts. Channels are tried separately, or in groups of similar range. A
+   trial that is worse on the costliest crops is rejected.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -26,14 +26,14 @@ from beers_deploy.quant.passes.trial import Costs, Trial
 from beers_deploy.quant.session import values_of
 
 QUANTILE = 0.9999
-"""A channel's range: the mean over tiles of this quantile of its sizes.
+"""The range of a channel is the mean over tiles of this quantile of its absolute values.
 
-The maximum would be ruled by outliers.
+Outliers would determine the maximum.
 """
 
 GAMMAS = (0.5, 0.75, 1.0)
 HEADROOM = (0.64, 0.8, 1.0, 1.25)
-"""First guesses tried: gamma, and the widest range as a share of int8's.
+"""Candidates of the first guess: gamma, and the widest range as a share of int8's.
 
 Above 1 the largest values are clipped.
 """
@@ -41,17 +41,17 @@ Above 1 the largest values are clipped.
 FIRST_GUESSES = len(GAMMAS) * len(HEADROOM)
 
 FULL = INT8_MAX * 2.0**-GROUP_FRAC_BITS
-"""Where int8 ends in tensors that are equalised."""
+"""The value at which int8 ends in tensors that are equalised."""
 
 STEPS = (1.5, 1.2)
-"""Factors by which each channel is tried larger and smaller, a sweep each."""
+"""Factors by which each channel is tried larger and smaller, one sweep each."""
 
 FIRST_CROPS = 2
 MARGIN = 0.003
-"""A trial is given up once the crops that it was tried on cost that share more than with the best
-factors so far.
+"""A trial is rejected once its error on the crops tried so far exceeds that of the best factors by
+this share.
 
-Each look doubles the crops. Some 30 % of the runs remain.
+Each check doubles the crops. Some 30 % of the runs remain.
 """
 
 
@@ -123,19 +123,37 @@ def channel_sizes(
     host_part: HostPart = ONE_CHANNEL,
     quantile: float = QUANTILE,
 ) -> Iterator[list[np.ndarray]]:
-    """Yield a quantile of each channel's sizes, (C,) a tensor, for every tile of the images."""
+    """Yield, for every tile of the images, a quantile of the absolute values of each channel: (C,)
+    per tensor.
+
+    Args:
+        graph: a float graph that reads the planes.
+        names: of the tensors.
+        images: (1, C', H, W).
+        host_part: of the graph.
+        quantile: of the absolute values.
+    """
     for results in values_of(graph, names, images, host_part):
         sizes = [np.abs(r[0]).reshape(r.shape[1], -1) for r in results]
         yield [np.quantile(size, quantile, axis=1).astype(np.float64) for size in sizes]
 
 
 def above_dead(ranges: np.ndarray) -> np.ndarray:
-    """Return ranges (C,) of which none is next to nothing: a dead channel must not be blown up."""
+    """Raise ranges (C,) that are nearly zero to a minimum, so that dead channels are
+    not amplified.
+    """
     return np.asarray(np.maximum(ranges, 1e-3 * float(ranges.max()) + 1e-12))
 
 
 def first_guess(ranges: np.ndarray, gamma: float, headroom: float) -> np.ndarray:
-    """Return factors that equalize the ranges, and fit the widest into int8."""
+    """Return factors that equalize the ranges, and scale the widest to int8.
+
+    Args:
+        ranges: of the channels, (C,).
+        gamma: exponent of the equalization; 0 leaves the ratios of the ranges unchanged, 1 makes
+            all equal.
+        headroom: the widest range as a share of int8's.
+    """
     factors = (ranges.max() / ranges) ** gamma
     return np.asarray(factors * headroom * FULL / (ranges * factors).max())
 
@@ -175,7 +193,13 @@ def search(
 def stepped(
     costs_of: Callable[[np.ndarray], Costs], channels: Sequence[np.ndarray], best: "Best"
 ) -> "Best":
-    """Return the best factors once these channels have been tried larger and smaller."""
+    """Try groups of channels larger and smaller, and return the best factors.
+
+    Args:
+        costs_of: returns the trial of some factors.
+        channels: the numbers of the channels of each group.
+        best: the best factors so far.
+    """
     trials = list(product(STEPS, channels))
     with steps("groups of channels", len(trials)) as bar:
         for size, together in trials:
@@ -193,16 +217,21 @@ def stepped(
 
 @dataclass(frozen=True)
 class Best:
-    """The best factors so far, (C,), and what they cost on each crop, (N,)."""
+    """The best factors so far, (C,), and their error on each crop, (N,)."""
 
     factors: np.ndarray
     costs: np.ndarray
 
 
 def race(costs_of: Costs, factors: np.ndarray, best: Best) -> Best:
-    """Return the better of two.
+    """Return the better of two candidates.
 
-    The costliest crops come first: six of seven trials fail, and most of them show it on two.
+    The costliest crops come first: six of seven trials fail, and most of them show it on two crops.
+
+    Args:
+        costs_of: returns the error of the new factors on some crops.
+        factors: the new factors, (C,).
+        best: the best factors so far.
     """
     order = np.argsort(-best.costs, kind="stable")
     costs = np.zeros(len(order))

@@ -1,21 +1,21 @@
-"""Equalize the channels of single tensors, which convolutions alone write and read, at no cost in
-the network.
+"""Equalize the channels of single tensors, which only convolutions write and read, without changing
+the float network.
 
 Each channel may be scaled by a factor of its own, as in `quant.passes.equalize`. A factor is any
 number, so the scale of the tensor, and that of the weights that read it, are no longer bound to
 powers of two.
 
-1. Let a channel's range be the one that most tiles keep.
-2. Guess k = range^-gamma, but let no weak channel's weights outgrow those of the stronger half: the
-   weights that write a tensor share one scale.
-3. Try the guesses on all tensors together, because the error of the worst hides what the others
-   gain.
-4. Try them on one tensor after the other, from the last, because what is rounded late reaches the
-   result. Then try its channels larger and smaller, each by itself or groups of them together.
+1. Take as a channel's range the one that most tiles stay within.
+2. Guess k = range^-gamma, but do not let the weights of a weak channel exceed those of the stronger
+   half, because the weights that write a tensor share one scale.
+3. Try the guesses on all tensors jointly, because the error of the worst tensor hides the gain of
+   the others.
+4. Try them on one tensor after the other, from the last, because late roundings reach the result
+   directly. Then try its channels larger and smaller, separately or in groups.
 
-Next to a residual group this made no network of dense convolutions better that is made for one
-sensor. It helps those with depthwise ones. It helps those behind a bank too, where one file serves
-sensors of little noise and of much, and what lies inside a block is small in most channels.
+In addition to a residual group this improved no network of dense convolutions for one sensor. It
+helps those with depthwise convolutions. It also helps those behind a bank. One file then serves
+sensors of little and of much noise, and tensors inside a block are small in most channels.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -43,26 +43,30 @@ from beers_deploy.quant.passes.trial import Costs, Trial, Trials
 
 GAMMAS = (0.0, 0.25, 0.5, 1.0)
 HEADROOM = (0.5, 0.75, 1.0, 1.4)
-"""First guesses tried, as in `quant.passes.equalize`; at 0.5 twice the range still fits."""
+"""Candidates of the first guess, as in `quant.passes.equalize`; at 0.5 twice the
+range still fits.
+"""
 TILES = 0.85
-"""A channel's range is this quantile over the tiles.
+"""The range of a channel is this quantile over the tiles.
 
-The widest tile would set the step of all others: with the brightest ground among the patches, a
-DnCNN lost 1.4 dB by it instead of 0.6 (measured on photographs).
+The widest tile would determine the step of all others: with the brightest ground among the patches,
+a DnCNN lost 1.4 dB instead of 0.6 (measured on photographs).
 """
 FEW_TENSORS = 4
-"""Of a deep network next to a residual group, to be tried one by one."""
+"""The number of tensors of a deep network with a residual group that are tried one by one."""
 
 EVERY = 8
 CLEARLY = 1.1
-"""A guess is tried on one of so many crops first, and dropped where it costs so much more there."""
+"""A guess is tried on every EVERY-th crop first, and rejected if its error there is larger by the
+factor CLEARLY.
+"""
 
 
 def _guess(ranges: np.ndarray, weights: np.ndarray, gamma: float, headroom: float) -> np.ndarray:
     """Return the factors (C,) of step 2.
 
-    A channel that is hardly ever on would else be blown up until its weights, `weights` the largest
-    of those that write each, ruled the scale of all.
+    Otherwise a channel that is rarely active would be amplified until its weights determined the
+    scale of all. `weights` are the largest of those that write each channel.
     """
     factors = first_guess(ranges, gamma, headroom)
     # The weights that write a tensor share one scale, which the largest of them sets.
@@ -85,7 +89,7 @@ class SingleTensors:
 
     @property
     def parts(self) -> dict[str, slice]:
-        """The place of each tensor's channels."""
+        """The slice of each tensor's channels."""
         ends = np.cumsum([0, *self.widths]).tolist()
         return dict(zip(self.tensors, map(slice, ends, ends[1:]), strict=True))
 
@@ -95,9 +99,9 @@ class SingleTensors:
         return self.tensors if few and most_groups else ()
 
     def guesses_alone(self, effort: Effort) -> bool:
-        """Return True if the first guesses are tried on each tensor, too.
+        """Return True if the first guesses are also tried on each tensor.
 
-        Where groups of channels are tried, these gained nothing by it (measured).
+        Where groups of channels are tried, this gained nothing (measured).
         """
         return not self.by_channel or effort is Effort.best
 
@@ -121,7 +125,7 @@ class SingleTensors:
         return graph
 
     def unscaled(self, frac_bits: Mapping[str, int]) -> np.ndarray:
-        """Return the factors that leave every tensor the scale that it has by itself."""
+        """Return the factors that leave the scale of every tensor unchanged."""
         # In the core these tensors have the groups' scale, so the factor stands for their own.
         scales = [2.0 ** (frac_bits[name] - GROUP_FRAC_BITS) for name in self.tensors]
         return np.repeat(scales, self.widths)
@@ -130,7 +134,7 @@ class SingleTensors:
 def single_ranges(
     graph: Graph, singles: SingleTensors, images: Iterable[np.ndarray], host_part: HostPart
 ) -> np.ndarray:
-    """Return the range of every channel over images (1, C, H, W), which most tiles keep."""
+    """Return the range of every channel over images (1, C, H, W) that most tiles stay within."""
     return _over_tiles(graph, singles, images, host_part, QUANTILE, TILES)
 
 
@@ -182,7 +186,9 @@ def equalize_single(
     parts = singles.parts
 
     def guessed(best: Best, names: Sequence[str], costs_of: Callable[[np.ndarray], Costs]) -> Best:
-        """Return the best of the first guesses for these tensors, the others as they are."""
+        """Return the best of the first guesses for these tensors, with the factors of the others
+        unchanged.
+        """
         shapes = list(product(GAMMAS, HEADROOM))
         with steps("first guesses", len(shapes)) as bar:
             for shape in shapes:
@@ -220,13 +226,14 @@ def equalize_single(
 
 
 def _costs_of_one(trial: Trial, graph: Graph, name: str, part: slice, factors: np.ndarray) -> Costs:
-    """Return what it costs to scale one tensor of a graph by its part of the factors."""
+    """Return the error of scaling one tensor of a graph by its part of the factors."""
     return trial(equalize(graph, only(name), factors[part]))
 
 
 def _better(factors: np.ndarray, costs_of: Callable[[np.ndarray], Costs], best: Best) -> Best:
-    """Return the better of two on all crops: so large a step may cost the hardest ones and be worth
-    it.
+    """Return the better of two candidates on all crops.
+
+    So large a step may cost the hardest crops and still be worth it.
     """
     cost = costs_of(factors)
     # An eighth of the runs shows which guesses are clearly worse.

@@ -1,19 +1,19 @@
-"""Train the integers themselves: weights and biases of the integer core, with roundings and
-clippings in the loop.
+"""Train the integers themselves: weights and biases of the integer core, with rounding and clipping
+in the loop.
 
-Rounding each tensor as well as it can be done leaves errors that meet behind many layers, and noise
-that no rounding takes back. So the core is run as it is, and its numbers follow the slope of its
-result's error (training that sees the quantiser, Jacob et al. 2018): from the reference where there
-is one, and from the float network. Gradients move no scale, because these are powers of two.
+Rounding each tensor optimally leaves errors that accumulate over many layers, and noise that no
+rounding removes. The core is therefore run as it is, and its numbers follow the gradient of its
+result's error (quantisation-aware training, Jacob et al. 2018). The error is measured from the
+reference if there is one, and from the float network. Gradients do not change scales, because these
+are powers of two.
 
 1. Hold out some of the pairs.
-2. Before each round of steps move scales one bit where the core then errs less on pairs that it is
-   trained on (`quant.passes.scales`). The core stays within the windows of the DPU's shifts.
-3. Take steps of gradient descent, and average the numbers over the last steps: single ones cross
-   the thresholds of their rounding to and fro.
-4. Every few steps round the averages, and keep the core that errs least on the held-out pairs.
-5. After a round of steps that gained little go on from the best core, more slowly; stop when the
-   slowest rate gains little.
+2. Before each round of steps change scales by one bit if that reduces the error on training pairs
+   (`quant.passes.scales`). The core stays within the windows of the DPU's shifts.
+3. Take steps of gradient descent, and average the numbers over the last steps, because single steps
+   cross rounding thresholds back and forth.
+4. Every few steps round the averages, and keep the core with the least error on the held-out pairs.
+5. Stop after a round of steps with little gain.
 """
 
 import math
@@ -39,41 +39,42 @@ from beers_deploy.quant.session import open_any_size, open_session, result_of, t
 from beers_deploy.quant.untrusted import times
 
 HELD_OUT_EVERY = 8
-"""One pair of so many is not trained on, but judges what is kept."""
+"""One of this number of pairs is not trained on, and is used to select the result."""
 MOST_HELD_OUT = 48
 BATCH_PIXELS = 4 * 128**2
-"""Of the planes in one step."""
+"""The number of pixels of the planes in one step."""
 BORDER_PX = 8
-"""Not compared with a reference in a result of at least four times as many a side: there a patch
-ends, and its image goes on. The float network has the same border.
+"""This border is not compared with a reference if the sides of the result are at least four times
+as long. A patch ends there, but its image continues. The float network has the same border.
 """
 ROUNDS = (500, 1000, 2000, 4000)
-"""Steps of each round of "auto"."""
+"""The number of steps of each round of "auto"."""
 DECAY = 0.98
-"""Of the running average of the numbers."""
+"""The decay per step of the running average of the numbers."""
 SLOWER = 4.0
 """The rate is divided by it, SLOWDOWNS times at most. Which rate is best depends on the network: a
 depthwise one gains most at the first, one with a global add may gain only at the last.
 """
 SLOWDOWNS = 2
 LEAST_GAIN = 0.02
-"""Of what INT8 lost at first: a round that wins back less gained little."""
+"""A round that recovers less than this share of the initial INT8 loss is the last one."""
 JUDGED_EVERY = 50
 JUDGING = 48
-"""Training pairs on which scales are judged."""
+"""The number of training pairs on which scales are judged."""
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """What to train on, how long and how fast.
+    """The parameters of fine-tuning.
 
     Attributes:
         pairs: images (1, C, H, W) in [0, 1] and their references, which may be empty.
-        steps: gradient steps; None adds rounds of them until pairs that are held out err no less.
-        rate: the highest rate of learning, in units of each number's scale.
+        steps: the number of gradient steps; None adds rounds until the error on held-out pairs
+            stops falling.
+        rate: the highest learning rate, in units of each number's scale.
         seed: of the order of the pairs.
         original: the float network whose results are learnt; None for that of the rounded graph,
-            which is another one where operators were replaced (`quant.adapt`).
+            which differs if operators were replaced (`quant.adapt`).
     """
 
     pairs: Sequence[Pair]
@@ -85,15 +86,15 @@ class Tuning:
 
 @dataclass(frozen=True)
 class Sample:
-    """A pair for the core: an image in, corrections (1, C, H', W') out.
+    """A pair for the core: an image as input, corrections (1, C, H', W') as targets.
 
     Attributes:
         image: (1, C, H, W) in [0, 1].
         planes: of the image, (1, P, H, W) as float32.
         floats: the float network's correction.
-        reference: the correction that would restore it wholly, or None.
-        weight: of its errors: over the float network's own, so that dark and busy patches count
-            alike. A number, or (N, 1, 1, 1) of a batch.
+        reference: the correction that would restore it completely, or None.
+        weight: of its errors: one over the float network's own error, so that dark and busy patches
+            count equally. A number, or (N, 1, 1, 1) of a batch.
     """
 
     image: np.ndarray
@@ -104,7 +105,7 @@ class Sample:
 
     @classmethod
     def batch(cls, samples: Sequence["Sample"]) -> "Sample":
-        """Return N samples of equal size as one, which runs faster than one by one."""
+        """Join N samples of equal size to one, which runs faster than one by one."""
         references = [sample.reference for sample in samples if sample.reference is not None]
         return cls(
             np.concatenate([sample.image for sample in samples]),
@@ -205,12 +206,12 @@ def descend(
 ) -> Iterator[int]:
     """Train by Adam for a round.
 
-    The learning rate falls to 0 as a half cosine. While it is high, parameters cross the thresholds
-    of their rounding to and fro, so that a judgement of the rounded core would mean little.
+    The learning rate falls to 0 as a half cosine. While it is high, parameters cross their rounding
+    thresholds back and forth, so that evaluating the rounded core would mean little.
 
     Args:
         trainable: the core, whose parameters are changed in place.
-        samples: what it is trained on; each step draws some of them with replacement.
+        samples: to train on; each step draws some of them with replacement.
         steps: the number of gradient steps.
         highest_rate: the learning rate of the first step, in units of each number's scale.
         generator: draws the samples.
@@ -238,7 +239,7 @@ def descend(
 
 
 def _batches(samples: Sequence[Sample]) -> list[Sample]:
-    """Return the samples as batches, one for each size, with references or without."""
+    """Group samples into batches, one for each size, with and without references."""
     batches: dict[tuple[torch.Size, bool], list[Sample]] = {}
     for sample in samples:
         kind = sample.planes.shape, sample.reference is None
@@ -247,7 +248,7 @@ def _batches(samples: Sequence[Sample]) -> list[Sample]:
 
 
 def _averaged(average: Tensor, number: Tensor, count: Tensor | int) -> Tensor:
-    """Return the running average after one more step, of which `count` are in it already."""
+    """Return the running average after one more step; `count` is the number of steps before it."""
     # Early steps leave the start behind sooner, so that short rounds train at all.
     decay = min(DECAY, (int(count) + 1) / (int(count) + 10))
     return average.lerp(number, 1 - decay)
@@ -311,7 +312,7 @@ def _samples(host_part: HostPart, full: Graph, tuning: Tuning) -> Iterator[Sampl
 
 
 LEAST_ERROR = 1e-9
-"""Mean squared, of full scale: below it, by 90 dB, a float network is as good as perfect."""
+"""Mean squared error over full scale (90 dB) below which a float network counts as perfect."""
 
 
 def _inner_error(result: Tensor, target: Tensor, weight: float | Tensor = 1.0) -> Tensor:

@@ -27,13 +27,13 @@ def choose_frac_bits(
 
     Args:
         graph: in float.
-        images: (1, C, H, W) in [0, 1], which are passed over twice.
+        images: (1, C, H, W) in [0, 1], which are read twice.
         host_part: the graph's host part.
-        least_squares: whether finer scales are tried; without, nothing is clipped.
+        least_squares: whether finer scales are tried; if False, nothing is clipped.
     """
     names = tensors(graph)
     shared = tied(graph)
-    # The planes' scale is fixed; -1 stands for the group of what is tied to them.
+    # The planes' scale is fixed; -1 stands for the group of tensors that are tied to them.
     groups = np.array(
         [names.index(shared[name]) if shared[name] in names else -1 for name in names]
     )

@@ -30,29 +30,29 @@ from beers_deploy.quant.graph import (
 from beers_deploy.quant.graph.operations import SIX, united
 
 GROUP_FRAC_BITS = 8
-"""Any would do: `equalize` scales the group to it."""
+"""The fractional bits of a group. Any value would do, because `equalize` scales the group to it."""
 
 
 ResidualGroup = Mapping[str, slice]
-"""Tensors that have the same factors, channel by channel: each is added to another of them, or is
-such a sum, or what a pool, an enlargement or a concat makes of them. And where in the factors the
-channels of each stand.
+"""Tensors that have the same factors, channel by channel, and the slice of the factors that belongs
+to each. Each tensor is added to another one, or is such a sum, or is derived from them by a pool,
+an enlargement or a concat.
 """
 PASSING = (Concat, MaxPool, AveragePool, Resize)
-"""What hands channels on without mixing them."""
+"""Operations that pass channels on without mixing them."""
 
 
 def only(name: str) -> ResidualGroup:
-    """Return the group of a tensor by itself."""
+    """Return a group that consists of one tensor."""
     return {name: slice(None)}
 
 
 def residual_groups(graph: Graph) -> list[ResidualGroup]:
     """Return the groups that can share a scale and be equalized, in the order of the graph.
 
-    Convolutions and adds alone write and read them, and what hands channels on, with nothing
-    between that a factor does not pass; so not where a product, a pixel shuffle or the network's
-    end reads them.
+    Only convolutions, adds and operations that pass channels on write and read them, with nothing
+    in between that blocks a factor. Groups that a product, a pixel shuffle or the network's end
+    reads are excluded.
     """
     # 1.
     linking = [op for op in graph if isinstance(op, (Add, *PASSING))]
@@ -69,9 +69,7 @@ def residual_groups(graph: Graph) -> list[ResidualGroup]:
 
 
 def _placed(linking: Sequence[Op], names: Sequence[str], graph: Graph) -> ResidualGroup:
-    """Return where the channels of these tensors stand; empty if one would have to stand in two
-    places.
-    """
+    """Return the slices of the channels of these tensors; empty if one would need two slices."""
     writers = [op for op in linking if op.output in names]
     # Only a concat puts channels at other places than those of its inputs.
     if not any(isinstance(op, Concat) for op in writers):
@@ -104,7 +102,9 @@ def _links(op: Op, widths: Mapping[str, int]) -> list[tuple[str, str, int]]:
 
 
 def exceeds_six(graph: Graph, group: ResidualGroup, frac_bits: Mapping[str, int]) -> bool:
-    """Return True if a ReLU6 writes to it, and int8 ends beyond the six in one of its tensors."""
+    """Return True if a ReLU6 writes to a group, and int8 ends beyond the six in one
+    of its tensors.
+    """
     clipped = any(
         isinstance(op, Conv) and op.activation is Activation.relu6 and op.output in group
         for op in graph
@@ -114,7 +114,7 @@ def exceeds_six(graph: Graph, group: ResidualGroup, frac_bits: Mapping[str, int]
 
 
 def single_tensors(graph: Graph) -> list[str]:
-    """Return the tensors of no group that convolutions alone write and read: each of their channels
+    """Return the tensors of no group that only convolutions write and read, so that each channel
     may have a factor.
     """
     # 4.

@@ -1,17 +1,18 @@
-"""Move scales by one fractional bit, where a core in training then errs less.
+"""Change scales by one fractional bit if that reduces the error of a core in training.
 
 Each scale was chosen by the squared error of its own tensor, before any integer was trained. A
-gradient step cannot move it, because scales are powers of two: Jain et al. (2020) train the
+gradient step cannot change it, because scales are powers of two: Jain et al. (2020) train the
 logarithm of a threshold and round that up. Here each scale is tried one bit finer, where it clips
-more, and one bit coarser, where it rounds more. What is judged is the error of the result.
+more, and one bit coarser, where it rounds more. The error of the result decides.
 
-1. Tensors move together that must share a scale. So do those that an add of one scale connects,
+1. Tensors that must share a scale change jointly. So do those that an add of one scale connects,
    because that add is exact.
-2. The planes stay, because the host writes them. So does what a ReLU6 writes, because the end of
-   int8 may stand for its six.
-3. The scales of a convolution's weights and of its biases move by themselves. Those of copies
-   stay, because the coarse copy would have to move as well.
-4. A move is left out if the DPU's shifts do not reach it, and undone if the core errs no less.
+2. The planes do not change, because the host writes them. Nor does the output of a ReLU6, because
+   the end of int8 may represent its six.
+3. The scales of a convolution's weights and of its biases change separately. Those of copies do not
+   change, because the coarse copy would have to change as well.
+4. A change is skipped if it leaves the DPU's shift windows, and undone if it does not reduce the
+   error.
 """
 
 import logging

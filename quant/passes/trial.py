@@ -1,4 +1,4 @@
-"""Measure what a candidate costs: how far INT8 results lie from float ones on a few crops.
+"""Measure the cost of a candidate: the difference of INT8 results from float ones on a few crops.
 
 1. Restore all crops of the calibration images in float, and order them by their largest correction.
 2. Keep the crops with the largest corrections, where int8 clips, and others of all sizes.
@@ -28,20 +28,24 @@ from beers_deploy.quant.session import (
 T = TypeVar("T")
 
 SEARCH_CROPS = 16
-"""What equalization is searched on, a quarter of them with the strongest edges: there int8 clips.
-Small crops say less each, so more of them are taken.
+"""The number of crops on which equalization is searched. A quarter of them has the strongest edges,
+where int8 clips. Small crops contain less information, so more of them are used.
 """
 MOST_CROPS = 64
 LEAST_CHANGE = 1e-4
-"""Of full scale, added to what a network changes in a crop: a crop that it leaves as it is must not
-decide alone.
+"""Share of full scale that is added to the change that a network makes in a crop. Otherwise a crop
+that it leaves unchanged would decide alone.
 """
 
 Costs = Callable[[np.ndarray | None], np.ndarray]
-"""The cost of one graph in INT8 on the crops of given numbers, or on all of them: an error each."""
+"""A function that returns the error of one graph in INT8 on each of the crops with the given
+numbers, or on all of them.
+"""
 Trial = Callable[[Graph], Costs]
 Trials = Callable[[Graph, Collection[str]], Trial]
-"""A trial of candidates that differ from a graph only where these tensors are written and read."""
+"""A function that returns a trial of candidates that differ from a graph only where these tensors
+are written and read.
+"""
 Values = dict[str, np.ndarray]
 """Tensors (1, C, h, w) uint8 of an integer core, by name."""
 Targets = list[tuple[np.ndarray, np.ndarray]]
@@ -49,11 +53,12 @@ Targets = list[tuple[np.ndarray, np.ndarray]]
 
 
 def crop_count(crop: np.ndarray, available: int) -> int:
-    """Return on how many crops of the size of this one (1, C, h, w) a search measures, at most.
+    """Return the maximum number of crops of this size, (1, C, h, w), on which a search measures.
 
     Args:
         crop: one of them.
-        available: about how many there are; images of other sizes than the first may have more.
+        available: the approximate number of crops; images of other sizes than the first may have
+            more.
     """
     height, width = map(int, crop.shape[2:])
     count = max(SEARCH_CROPS * TILE_PX**2 // (height * width), SEARCH_CROPS)
@@ -63,10 +68,16 @@ def crop_count(crop: np.ndarray, available: int) -> int:
 def search_targets(
     graph: Graph, host_part: HostPart, images: Sequence[np.ndarray], count: int
 ) -> Targets:
-    """Return the crops with the largest corrections, and others of all sizes: `count` of them, if
-    there are so many.
+    """Choose crops, and restore them in float: those with the largest corrections, and others of
+    all sizes.
 
-    Only the sizes of corrections are stored; the images of the chosen are simulated once more.
+    Only the sizes of corrections are stored; the images of the selected crops are simulated again.
+
+    Args:
+        graph: a float graph that reads the planes.
+        host_part: of the graph.
+        images: (1, C, H, W).
+        count: the number of crops; fewer are returned if there are not enough.
     """
     session = open_session(graph_to_onnx(graph, [CORRECTION], host_part.planes))
     halo_px = 0 if halo_of(graph) is not None else None
@@ -93,8 +104,9 @@ def search_targets(
 
 
 def hardest_and_others(order: Sequence[T], count: int) -> list[T]:
-    """Choose `count` of what is ordered by its largest values, if there are so many: a quarter from
-    the first, where int8 clips, the rest from all of the others.
+    """Select `count` items from a sequence that is ordered by its largest values.
+
+    A quarter are the first ones, where int8 clips; the rest are spread over the others.
     """
     hard = count // 4
     others = order[hard :: max((len(order) - hard) // (count - hard), 1)]
@@ -102,10 +114,10 @@ def hardest_and_others(order: Sequence[T], count: int) -> list[T]:
 
 
 class CropTrials:
-    """Measures what candidates cost on crops, running again only what they change.
+    """Measures the error of candidates on crops, and runs only the changed operations again.
 
-    What lies in front of the first changed operation is computed once. What lies behind the last
-    one stays one session.
+    The part in front of the first changed operation is computed once. The part behind the last one
+    remains one session.
     """
 
     def __init__(self, core_of: Callable[[Graph], IntCore], targets: Targets) -> None:
@@ -146,10 +158,10 @@ class CropTrials:
         """Return a function for the root mean squared difference of an integer network from the
         float one, by crop.
 
-        Squared, because clipping is rare and must count; its root, so that no single crop that
-        clips decides alone. It is relative to what the float network changes in the crop: a loss of
-        PSNR is relative too, and in absolute terms bright crops with large corrections would
-        outweigh the dark ones, where the same step costs most.
+        The difference is squared because clipping is rare and must count. Its root prevents a
+        single crop that clips from deciding alone. It is relative to the change that the float
+        network makes in the crop, as a loss of PSNR is. In absolute terms bright crops with large
+        corrections would outweigh the dark ones, where the same step costs most.
         """
 
         # 3.
@@ -198,10 +210,10 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _on_all_cores(compute: Callable[[int], T], numbers: Iterable[int]) -> list[T]:
-    """Return what is computed for each crop.
+    """Compute a function for each crop, with the crops distributed over the cores.
 
-    Small crops keep cores busier one to each than all on one: threads that share a crop wait for
-    each other.
+    For small crops one core per crop is faster than all cores on one crop, because threads that
+    share a crop wait for each other.
     """
     with ThreadPoolExecutor(os.cpu_count()) as cores:
         return list(cores.map(compute, numbers))

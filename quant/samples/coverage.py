@@ -1,7 +1,7 @@
-"""Which part of a sensor's range a set of samples covers.
+"""Determine which part of a sensor's range a set of samples covers.
 
-A limit says nothing of brightness that no sample has. So `quantize` records the range of the
-samples that a network was calibrated on, and the gate prints the range of those that it judged by.
+A limit is no evidence for brightness that no sample has. `quantize` therefore records the range of
+the calibration samples, and the gate prints the range of its own samples.
 """
 
 import json
@@ -16,16 +16,16 @@ from beers_deploy.profiles.figures import Row, measured
 from beers_deploy.profiles.toml import parse_json
 
 KEY = "calibration_range"
-"""Of the metadata of an INT8 file."""
+"""The metadata key in an INT8 file."""
 
 BINS = 4096
-"""Of the histogram over [0, 1]: one for each digital number of 12 bits.
+"""The number of bins of the histogram over [0, 1]: one for each digital number of 12 bits.
 
-Pixels in the last one are saturated.
+Pixels in the last bin are saturated.
 """
 
 SHARES = (0.01, 0.5, 0.99, 0.999)
-"""Of the percentiles of a range."""
+"""The shares of the percentiles that describe a range."""
 
 COVERED = 0.9
 """Samples whose 99.9th percentile lies at this share of full scale cover bright ground."""
@@ -56,7 +56,7 @@ class SampleRange:
         )
 
     def to_words(self) -> str:
-        """Return the range as it stands in the metadata of an INT8 file."""
+        """Return the range as text for the metadata of an INT8 file."""
         return json.dumps({name: round(value, 6) for name, value in asdict(self).items()})
 
     def row(self, name: str, source: str) -> Row:

@@ -1,9 +1,9 @@
-"""A user's own samples, as their network reads them: what any network is calibrated and judged on.
+"""Read a user's own samples in the units of their network, for calibration and evaluation.
 
-One .npy or .npz file of a batch (N, C, H, W), or a folder of images and .npy files of one image
-each, (C, H, W). Values are as the network reads them: in [0, 1] of full scale, unless another range
-is stated or found. Full scale of pixels of 8 bits in image files is 255, of more 4095. A .npz
-file may hold what the network should give in addition to what it reads, as `image` and `reference`.
+They are one .npy or .npz file of a batch (N, C, H, W), or a folder of images and .npy files of one
+image each, (C, H, W). Values are as the network reads them: in [0, 1] of full scale, unless another
+range is stated or found. Full scale of 8-bit pixels in image files is 255, of larger types 4095. A
+.npz file may contain the input and the target of the network, as `image` and `reference`.
 """
 
 import hashlib
@@ -49,21 +49,21 @@ Named = tuple[str, Pair]
 """A sample with its name, for messages."""
 
 HELD_OUT_EVERY = 4
-"""One sample of so many is held out from calibration, to judge what INT8 changes."""
+"""One of this number of samples is held out from calibration, to measure the effect of INT8."""
 CALIBRATED_ON = "calibration_samples"
-"""What an INT8 file calls the digests of the samples that it was calibrated on."""
+"""The metadata key of the digests of the calibration samples in an INT8 file."""
 DIGEST_DIGITS = 16
 LEAST_CONTRAST = 1 / MAX_DN
 
 
 @dataclass(frozen=True)
 class OwnSamples:
-    """A user's samples, in the place of `quant.samples.simulated.Calibration`.
+    """A user's samples, which replace `quant.samples.simulated.Calibration`.
 
     Attributes:
         name: of their file.
         samples: each with its name.
-        ranges: of their channels; empty where all are in [0, 1].
+        ranges: of their channels; empty if all are in [0, 1].
         stated: whether the user states the ranges.
     """
 
@@ -89,7 +89,7 @@ class OwnSamples:
 
     @property
     def unseen(self) -> Patches:
-        """Every fourth sample, which calibration does not see."""
+        """Every fourth sample, which calibration does not use."""
         # Fewer than four samples are too few to leave one out of calibration.
         return self._patches(self.samples[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] or self.samples)
 
@@ -110,7 +110,7 @@ class OwnSamples:
 
 
 def digest_of(sample: np.ndarray) -> str:
-    """Return a digest that tells a sample (1, C, h, w) from any other."""
+    """Return a digest that distinguishes a sample (1, C, h, w) from any other."""
     content = np.ascontiguousarray(sample, np.float32).tobytes()
     return hashlib.sha256(content).hexdigest()[:DIGEST_DIGITS]
 
@@ -119,12 +119,12 @@ def samples_of(
     model: onnx.ModelProto, given: object, input_range: object = None
 ) -> OwnSamples | None:
     """Read a user's samples for a network; return None if there are none and simulated patches suit
-    it.
+    the network.
 
     Args:
         model: the network.
-        given: a path, or what `samples_in` accepts; None for simulated patches.
-        input_range: the ranges that the user states; None finds them.
+        given: a path, or an input of `samples_in`; None for simulated patches.
+        input_range: the ranges that the user states; None determines them from the samples.
 
     Raises:
         OptionError: no samples, and simulated patches do not suit the network; no range.
@@ -163,19 +163,19 @@ def read_samples(
     multiple_px: int = 1,
     ranges: Ranges | None = None,
 ) -> OwnSamples:
-    """Read the samples of a file, a folder or arrays, cut to what the network takes: each
-    (1, C, h, w) float32.
+    """Read the samples of a file, a folder or arrays, cut to a size that the network accepts: (1,
+    C, h, w) float32 each.
 
     Args:
         source: the file or folder, or the samples (C, H, W) with their references.
-        channels: that the network reads.
+        channels: the number of channels that the network reads.
         fixed_px: side of the image that the network is fixed to; None cuts large samples to
             patches.
-        multiple_px: what sides must be multiples of; the rest is cut off.
-        ranges: that the values must be in; None finds them.
+        multiple_px: sides are cut to multiples of it.
+        ranges: that the values must be in; None determines them.
 
     Raises:
-        ImageError: samples that the network does not accept, or of which none has contrast.
+        ImageError: samples that the network does not accept, or samples without any contrast.
     """
     # Messages name a sample by its file or, in memory, by its place.
     label = f"`{IN_MEMORY}`"
@@ -203,8 +203,8 @@ def read_samples(
     stated = ranges is not None
     if ranges is None:
         ranges = _found(label, (image for _, (image, _) in samples))
-    # Any network keeps what is constant, so a mean over such samples would hide errors. A map of
-    # noise levels is constant in each sample.
+    # Any network preserves a constant image, so a mean over such samples would hide errors. A map
+    # of noise levels is constant in each sample.
     textured = [s for s in samples if _contrast(s[1][0], ranges) >= LEAST_CONTRAST]
     if not textured:
         raise ImageError(
@@ -233,7 +233,7 @@ def _contrast(image: np.ndarray, ranges: Ranges) -> float:
 def _valid_reference(name: str, reference: np.ndarray) -> np.ndarray:
     """Return a reference as float32; raise ImageError if it is not made of real, finite numbers.
 
-    Whether it must be an image in [0, 1] of the result's size depends on what is measured:
+    Whether it must be an image in [0, 1] of the result's size depends on the measurement:
     `quant.gate.compare`.
     """
     if reference.dtype.kind not in "fuib":

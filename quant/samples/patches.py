@@ -1,4 +1,4 @@
-"""Patches: images with their references, in memory or simulated each time they are read."""
+"""Define patches: images with their references, in memory or simulated each time they are read."""
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
@@ -46,11 +46,11 @@ class Patches:
 
     Attributes:
         pairs: (degraded, reference) of each patch.
-        degraded: the same degraded patches alone: to simulate these is half the work.
+        degraded: the same degraded patches without references, which takes half the time to
+            simulate.
         names: of a user's own samples, for messages; empty for simulated patches.
-        views: what each simulated patch shows, and the sensors that see it; empty for a user's own
-            samples.
-        ranges: of the channels of the images; empty where all are in [0, 1].
+        views: the ground of each simulated patch, and its sensors; empty for a user's own samples.
+        ranges: of the channels of the images; empty if all are in [0, 1].
     """
 
     pairs: Sequence[Pair]

@@ -1,7 +1,7 @@
-"""Simulated patches for calibration, and to judge what INT8 changes.
+"""Simulate patches for calibration, and to judge the effect of INT8.
 
-Patches are simulated anew for each pass over them, which costs a tenth of what the network does
-with them. So memory grows neither with their number nor with their size.
+Patches are simulated again for each pass over them, which costs a tenth of the network's own time.
+Memory therefore grows neither with their number nor with their size.
 """
 
 from collections.abc import Sequence
@@ -31,14 +31,14 @@ from beers_deploy.quant.samples.views import (
 )
 
 HELD_OUT_SEED = 1000
-"""Added to a run's seed where patches must be others than calibration's."""
+"""Added to the seed of a run for patches that must differ from those of calibration."""
 HELD_OUT_PATCHES = 32
 TUNING_SEED = 2000
 """Added to a run's seed for the patches that the integers are trained on."""
 TUNING_PATCHES = 256
 ROLES = "degraded", "reference"
-"""Of the sensors of a pair, each with noise of its own: a degraded patch is the same in a pair and
-alone.
+"""The sensors of a pair, each with its own noise, so that a degraded patch is the same in a pair
+and alone.
 """
 NO_LIGHTING: Lightings = {}
 
@@ -57,15 +57,15 @@ def draw_patches(
     brightness.
 
     Args:
-        scenes: that are seen.
-        degraded: the sensors that see them, unless a family does.
-        reference: the sensor of the wanted images.
-        count: of patches.
-        seed: of everything that is drawn.
+        scenes: to draw from.
+        degraded: the sensors that acquire them, unless there is a family.
+        reference: the sensor of the target images.
+        count: the number of patches.
+        seed: of all random draws.
         patch_px: side of a patch.
         family: of sensors with the gain and bits of `degraded`.
         lightings: how the ground is lit, so that the patches cover the sensor's range; without any
-            it is as bright as the scenes show it.
+            it is as bright as in the scenes.
 
     Raises:
         ImageError: no scene holds a patch.
@@ -91,8 +91,8 @@ def draw_patches(
 
 
 def _simulate(ground: Ground, sensors: Sequence[Instrument], draw: Draw) -> list[np.ndarray]:
-    """Return what the degraded sensor, and the reference if given, produce from the same ground:
-    patches (1, 1, P, P).
+    """Simulate patches (1, 1, P, P) of the same ground by the degraded sensor and, if given, the
+    reference.
     """
     radiance = ground.radiance
     spectrum = scene_spectrum(radiance)
@@ -110,7 +110,7 @@ def _simulate(ground: Ground, sensors: Sequence[Instrument], draw: Draw) -> list
 
 @dataclass(frozen=True)
 class Calibration:
-    """Where a run's patches come from."""
+    """The source of a run's patches."""
 
     sensor: Sensor
     images: Path | None
@@ -160,8 +160,8 @@ def unseen_patches(degraded: Sensor, images: Path | None, patches: int, seed: in
 
     Args:
         degraded: the sensor's profile; the reference is the one that belongs to it.
-        images: folder of scenes; None for drawn ones, which are others than calibration's.
-        patches: how many.
+        images: folder of scenes; None for drawn ones, which differ from calibration's.
+        patches: the number of patches.
         seed: of the calibration.
     """
     reference = degraded.reference

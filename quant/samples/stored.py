@@ -1,4 +1,4 @@
-"""Samples as they are stored: in a .npy or .npz file, in a folder of images, or in arrays."""
+"""Read stored samples: from a .npy or .npz file, from a folder of images, or from arrays."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -16,20 +16,20 @@ from beers_deploy.quant.untrusted import times
 
 ARRAY_SUFFIX = ".npy"
 IN_MEMORY = "samples"
-"""What messages and files call samples that are no file."""
+"""The name in messages and files of samples that are not from a file."""
 NO_REFERENCE = np.empty(0, np.float32)
 FULL_SCALE_8 = 255
 REMEDY = "See docs/reference/any-network.md for how to give samples."
 
 
 def samples_in(given: object) -> list[Pair]:
-    """Return the samples in an array, in a pair of arrays (images, references), or in what gives
-    such one after the other.
+    """Return the samples in an array, in a pair of arrays (images, references), or in an iterable
+    of these.
 
     Args:
-        given: a batch (N, C, H, W), or one image (C, H, W), of NumPy or torch; a
-            tuple of two; a simulated pair, which knows its full scale; or an iterable of any of
-            these, such as a DataLoader.
+        given: a batch (N, C, H, W), or one image (C, H, W), of NumPy or torch; a tuple of two; a
+            simulated pair, which has its full scale; or an iterable of any of these, such as a
+            DataLoader.
     """
     # A simulated pair holds digital numbers, and alone knows its full scale.
     if hasattr(given, "degraded") and hasattr(given, "reference"):
@@ -58,7 +58,7 @@ def samples_in(given: object) -> list[Pair]:
         )
     samples = list[Pair]()
     for item in given:
-        # A DataLoader gives a batch as a list: of images and references, or of images alone.
+        # A DataLoader returns a batch as a list: of images and references, or of images alone.
         batch = tuple(item) if isinstance(item, list) and len(item) == 2 else item
         alone = isinstance(batch, list | tuple) and len(batch) == 1
         samples += samples_in(batch[0] if alone else batch)
@@ -121,8 +121,8 @@ def stored_batch(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
 
 
 def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return the array of a .npy file, mapped rather than read; of a .npz file `image` and
-    `reference`, or its only array.
+    """Return the memory-mapped array of a .npy file, or `image` and `reference` or the only array
+    of a .npz file.
 
     Nothing is unpickled.
     """
@@ -157,5 +157,5 @@ def _bands_first(path: Path, pixels: np.ndarray) -> np.ndarray:
 
 
 def sizes_of(array: np.ndarray) -> str:
-    """Return the shape of an array in words."""
+    """Format the shape of an array."""
     return times(array.shape) or "no dimension"

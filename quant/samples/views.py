@@ -1,8 +1,9 @@
-"""Views: which ground a simulated patch shows, in which light, and the sensors that see it.
+"""Define views: the ground that a simulated patch shows, its light, and the sensors that acquire
+it.
 
-Scenes as they are drawn leave most of the sensor's range empty: 2 pixels in 100 000 lie above 0.7
-of full scale. A network that clips bright ground then passes the gate, and a network calibrated on
-them does clip it. So a stated share of the patches is lit as on a dark day, up to full scale, and
+Drawn scenes leave most of the sensor's range empty: 2 pixels in 100 000 lie above 0.7 of full
+scale. A network that clips bright ground then passes the gate, and a network calibrated on them
+does clip it. A stated share of the patches is therefore lit as on a dark day, up to full scale, and
 beyond it.
 """
 
@@ -21,15 +22,15 @@ from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.instrument import Instrument
 
 CANDIDATES = 8
-"""Drawn for each view."""
+"""The number of candidates that are drawn for each view."""
 Candidate = TypeVar("Candidate")
 
 DARK = (1 / 20, 1 / 4)
 """Factors on the radiance of patches lit as on a dark day, log-uniform between the two."""
 BRIGHTEST_PIXELS = 0.999
-"""The quantile of a bright patch that comes to lie near full scale."""
+"""The quantile of a bright patch that is placed near full scale."""
 BRIGHT = (0.75, 1.0)
-"""Where that quantile lies, over full scale."""
+"""The range for that quantile, over full scale."""
 SATURATED = (0.005, 0.05)
 """Share of the pixels of a saturated patch whose radiance exceeds full scale."""
 
@@ -37,10 +38,10 @@ Lightings = Mapping[str, float]
 """Ways to light the ground, and the share of the patches that are lit so."""
 
 CALIBRATION: Lightings = {"as drawn": 13 / 16, "bright": 2 / 16, "dark": 1 / 16}
-"""Up to full scale, but not beyond: at the edge of a saturated area a network corrects much and in
-vain, because the result is clipped, and steps that hold such corrections are coarser everywhere.
-With a sixteenth of saturated patches a DnCNN lost 0.2 dB more on photographs; with a quarter of
-bright and an eighth of saturated ones a U-Net lost 0.41 dB instead of 0.17 (measured).
+"""Up to full scale, but not beyond. At the edge of a saturated area the corrections of a network
+are large and useless, because the result is clipped, and they make steps coarser everywhere. With a
+sixteenth of saturated patches a DnCNN lost 0.2 dB more on photographs. With a quarter of bright and
+an eighth of saturated ones a U-Net lost 0.41 dB instead of 0.17 (measured).
 """
 JUDGING: Lightings = {
     "as drawn": 12 / 16,
@@ -73,7 +74,7 @@ class Ground:
 
     @property
     def radiance(self) -> np.ndarray:
-        """In W/m2/sr/um, on the scene's grid: a square of side_px * oversampling."""
+        """The radiance in W/m2/sr/um on the scene's grid: a square of side_px * oversampling."""
         return self.exposure * self._part(1)
 
     @property
@@ -114,7 +115,8 @@ def draw_views(
         [size // ratio - 2 * MARGIN_PX for size in scene.radiance.shape] for scene, ratio in places
     ]
     room = np.prod(sides, axis=1)  # target pixels within the margin
-    # One generator draws all of this, so the order of the draws decides what a seed gives.
+    # One generator draws all of this, so the order of the draws must not change: it determines the
+    # result of a seed.
     indices = generator.choice(len(places), CANDIDATES * count, p=room / room.sum())
     grounds = [_ground(places[k], recipe, generator) for k in indices]
     source = recipe.family or recipe.degraded
@@ -147,8 +149,16 @@ def stratified(
     count: int,
     generator: np.random.Generator,
 ) -> list[Candidate]:
-    """Return one of each of `count` equal groups of the candidates ordered by `key`, in random
-    order.
+    """Divide the candidates, sorted by `key`, into equal groups, and draw one of each.
+
+    Args:
+        candidates: at least `count` of them.
+        key: by which they are sorted.
+        count: the number of groups.
+        generator: of the draws.
+
+    Returns:
+        One candidate of each group, in random order.
     """
     ranked = sorted(candidates, key=key)
     size = len(candidates) // count

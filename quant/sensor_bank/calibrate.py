@@ -59,7 +59,7 @@ from beers_deploy.quant.sensor_bank.filters import (
 )
 
 LIKE = "pleiades-degraded"
-"""The profile that gives gain and bits; all that is computed is a share of full scale."""
+"""The profile whose gain and bits are used; all results are shares of full scale."""
 
 ANALYTIC = "analytic"
 BODY = "body.correction"
@@ -153,7 +153,7 @@ def _head(weights: Weights) -> Conv:
     # A filter's result of 1 is 128 steps here, where the trained weights count `UNIT_STEPS` as 1.
     units = 2.0**BITS / UNIT_STEPS
     copies = [(0, COPIES[0], 1.0), *((1 + k, COPIES[1], units) for k in range(FILTERS))]
-    # Copies are averaged, so each gets an equal share of the weights of what it stands for.
+    # Copies are averaged, so each gets an equal share of the weights of the result it copies.
     of_copies = chain.from_iterable(
         repeat(trained[:, kernel] * (unit / count), count) for kernel, count, unit in copies
     )
@@ -177,9 +177,17 @@ def bank_host_part(scale: int, decoding: BankSum) -> HostPart:
 def bank_results(
     image: np.ndarray, bank: Bank, vector: Sequence[float], scale: int, kernels: Kernels = "fitted"
 ) -> np.ndarray:
-    """Compute what the body reads of an image (1, 1, H, W) in [0, 1]: (1, C, H / S, W / S) float32.
+    """Compute the input of the body for an image (1, 1, H, W) in [0, 1]: (1, C, H / S, W / S)
+    float32.
 
     These are the bank's results / 128 at a gain of 1, and planes of half of a sensor's values.
+
+    Args:
+        image: the image.
+        bank: of the sensor.
+        vector: the sensor vector (4,).
+        scale: S of the network.
+        kernels: of the bank.
     """
     integers = integer_bank(bank, scale, 1, kernels)
     planes = bank_host_part(scale, BankSum()).encode(image)
@@ -276,19 +284,21 @@ def _plan(weights: Weights, shifts: Shifts, passes: Passes, effort: Effort) -> P
 
 PATCHES = 80
 SNR = (90.0, 165.0)
-"""The range of calibration sensors: their gain is near 1, at which `bank_results` are computed."""
+"""The SNR range of calibration sensors: their gain is near 1, at which
+`bank_results` are computed.
+"""
 
 
 def bank_images(
     scenes: list[Scene], scale: int, seed: int, kernels: Kernels
 ) -> Sequence[np.ndarray]:
-    """Return what a network behind a bank is calibrated on: scenes as many sensors see them, behind
-    the bank of each.
+    """Return the calibration images of a network behind a bank: scenes acquired by many sensors,
+    after the bank of each.
 
     Args:
         scenes: to simulate images of.
         scale: of the network.
-        seed: of everything that is drawn.
+        seed: of all random draws.
         kernels: of the banks.
     """
     like = Sensor.load(LIKE)

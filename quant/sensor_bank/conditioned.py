@@ -1,12 +1,12 @@
-"""An INT8 network behind a bank, calibrated over a range of sensors and conditioned on one later.
+"""Condition an INT8 network behind a bank on a sensor, after calibration over a range of sensors.
 
     planes -> bank 7 x 7 (the sensor's) -> head, blocks, end, tail -> correction, fine and coarse
                                         -> analytic restoration, in four copies
 
-All weights and scales behind the bank are the same for every sensor. What the body reads and
-computes is finer by the sensor's gain (`Bank.gain`), so its biases are multiplied with that, and
-the unit of the result is divided by it: ReLU and sums pass a positive factor on. The filters of a
-sensor, its unit and the biases are computed in milliseconds.
+All weights and scales behind the bank are the same for every sensor. The inputs and results of the
+body are finer by the sensor's gain (`Bank.gain`). Its biases are therefore multiplied by it, and
+the unit of the result is divided by it, because ReLU and sums pass a positive factor on. The
+filters of a sensor, its unit and the biases are computed in milliseconds.
 """
 
 import json
@@ -41,13 +41,13 @@ BANK = "bank"
 
 @dataclass(frozen=True)
 class ConditionedCore:
-    """The core of a network behind a bank, and what it needs for another sensor.
+    """The core of a network behind a bank, and the data to condition it on another sensor.
 
     Attributes:
-        core: for the middle of the range of sensors, or for the sensor of the file that it is from.
-        biases: of the convolutions behind the bank, by name, at a gain of 1: (O, 1), and for those
-            that read the bank (O, 5), the bias for the middle of the range and what each value of a
-            sensor vector adds.
+        core: for the middle of the range of sensors, or for the sensor of its file.
+        biases: of the convolutions behind the bank, by name, at a gain of 1: (O, 1). For those that
+            read the bank (O, 5): the bias for the middle of the range, and the addition per value
+            of a sensor vector.
         shifts: the windows of the target.
     """
 
@@ -125,7 +125,7 @@ def required_conditioned_core(model: onnx.ModelProto) -> ConditionedCore:
 
 
 def bank_layer(bank: Bank, scale: int, shifts: Shifts, kernels: Kernels) -> IntConv:
-    """Return the first convolution of a network of that scale, for one sensor."""
+    """Return the first convolution of a network of the given scale, for one sensor."""
     integers = integer_bank(bank, scale, bank.gain, kernels)
     # The offsets put each copy of a result at another place of a rounding step.
     bias = quantize_bias(integers.offsets * 2.0**-BITS, integers.frac_bits + BITS, shifts)
@@ -133,7 +133,7 @@ def bank_layer(bank: Bank, scale: int, shifts: Shifts, kernels: Kernels) -> IntC
 
 
 def delta_of_file(model: onnx.ModelProto) -> bytes:
-    """Return what the sensor of an INT8 file has changed in it, for `with_delta`.
+    """Return the data in an INT8 file that depend on its sensor, for `with_delta`.
 
     It is a line of JSON and the int8 numbers of each convolution that the line names, compressed.
     """
@@ -160,7 +160,7 @@ def with_delta(core: IntCore, delta: bytes, where: str = "The delta") -> tuple[I
     Args:
         core: of the network that the delta was made for.
         delta: its bytes.
-        where: what messages call it, at their beginning.
+        where: its name at the beginning of messages.
 
     Raises:
         ModelError: damaged bytes, or a delta of another network.
@@ -205,7 +205,7 @@ def with_delta(core: IntCore, delta: bytes, where: str = "The delta") -> tuple[I
 
 
 LARGEST_DELTA = 1 << 20
-"""In bytes, of the unpacked content."""
+"""The maximum size of the unpacked content, in bytes."""
 
 
 def _read_like(values: np.ndarray, stream: BytesIO) -> np.ndarray:

@@ -1,4 +1,5 @@
-"""The integer bank of a sensor: the first convolution of an INT8 network, from the sensor alone.
+"""Compute the integer bank of a sensor: the first convolution of an INT8 network, from the sensor
+alone.
 
 The image enters in the planes of `host_part.BANK_SLICES`: steps of 16 digital numbers (DN) about
 the middle, twice, their remainder, and half of that for finer weights. The first two share a
@@ -6,12 +7,12 @@ filter's weights, which may therefore be twice as large: half the rounding error
 rounded so that they sum to exactly 0, because flat ground must give 0, and so that their errors lie
 where natural images have little energy.
 
-The results of the filters are int8 in steps of 1/24 of a unit of a sensor whose noise is
-`model.bank.SIGMA`. A sensor's own steps are the same share of full scale, within limits
-(`Bank.gain`): the strongest edges are a share of full scale, not of noise, so that noisy sensors
-can have finer steps in their units. Each result comes in several copies, rounded at other places of
-a step: together they are more precise than one. The image itself comes in steps of 32 / gain, about
-the middle.
+The results of the filters are int8 in steps of 1/24 of a unit, for a sensor whose noise is
+`model.bank.SIGMA`. Another sensor's steps are the same share of full scale, within limits
+(`Bank.gain`). The strongest edges are a share of full scale, not of noise, so noisy sensors can
+have finer steps in their units. Each result is written in several copies, rounded at different
+offsets within a step: jointly they are more precise than one. The image itself has steps of 32 /
+gain, about the middle.
 """
 
 from dataclasses import dataclass
@@ -29,23 +30,23 @@ PART = BANK_SLICES.part
 IMAGE_STEP_DN = 32
 
 BITS = 7
-"""Fractional bits that a result is stated to have: int8 then stands for -1 to 1, which is 5.3 units
-or half of full scale.
+"""The stated fractional bits of a result: int8 then represents -1 to 1, which is 5.3 units or half
+of full scale.
 """
 
 LARGEST = 2 * 124
-"""Of the sum of two coarse weights before they are rounded: the corrections that make weights sum
-to 0 and copies complete each other still fit int8.
+"""The limit of the sum of two coarse weights before rounding. The corrections that make weights sum
+to 0, and copies complete each other, then still fit int8.
 """
 
 COPIES = (1, 2, 7)
-"""Of the image, of each filter, and of the analytic restoration: 16 channels for each pixel of a
-place.
+"""The numbers of copies of the image, of each filter, and of the analytic restoration: 16 channels
+for each pixel of a place.
 """
 
 GRID_BITS = 16
-"""Fractional bits of the numbers that weights are fitted with: weights are below 2^8, a covariance
-is at most 1, and 49 products are added, so that float64 holds all sums exactly.
+"""Fractional bits of the numbers with which weights are fitted. Weights are below 2^8, a covariance
+is at most 1, and 49 products are added, so that float64 represents all sums exactly.
 """
 
 REACH_PX = 30.0
@@ -57,9 +58,9 @@ class IntegerBank:
     """The first convolution in integers.
 
     Attributes:
-        weight: (O, 4 S^2, k, k) int8 for the planes of an image, all of one kind together.
-        frac_bits: by which a sum of products is shifted to become int8.
-        offsets: (O,) what each channel adds before it is rounded, in steps.
+        weight: (O, 4 S^2, k, k) int8 for the planes of an image, all of one kind consecutively.
+        frac_bits: the right shift that converts a sum of products to int8.
+        offsets: (O,) numbers that each channel adds before it is rounded, in steps.
     """
 
     weight: NDArray[np.int8]
@@ -91,7 +92,14 @@ def spread_over_a_step(count: int) -> list[float]:
 
 
 def integer_bank(bank: Bank, scale: int, gain: float, kernels: Kernels = "fitted") -> IntegerBank:
-    """Quantise a bank for a network of that scale, in steps finer by `gain`."""
+    """Quantise a bank for a network.
+
+    Args:
+        bank: of the sensor.
+        scale: of the network.
+        gain: the factor by which the steps of the results are finer.
+        kernels: of the bank.
+    """
     steps = np.concatenate([bank.kernels, bank.kernels[-1:] / WIDE])
     # The kernels multiply shares of full scale, but the planes hold digital numbers.
     steps *= gain * UNIT_STEPS / MAX_DN

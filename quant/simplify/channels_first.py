@@ -1,7 +1,8 @@
-"""Give a network whose image has its channels last (N, H, W, C) one with its channels first.
+"""Convert a network whose image has its channels last (N, H, W, C) to channels first.
 
 1. Exporters from TensorFlow transpose the image as the first node, and the result as the last.
-2. Where that is so, both go, and input and output are (N, C, H, W), as in all other networks.
+2. In that case both nodes are removed, and input and output are (N, C, H, W), as in all other
+   networks.
 """
 
 import onnx

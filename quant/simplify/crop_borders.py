@@ -1,8 +1,8 @@
 """Write the slices that cut a border off a map as convolutions that each read one pixel.
 
-A U-Net without padding crops its skips to the size of what it enlarged. Of a kernel of three rows
-the first and the last reach the border that is cut; the one in the middle has the only weight, 1.
-It is exact, and needs no size of the image.
+A U-Net without padding crops its skips to the size of the enlarged map. In a kernel of three rows
+the first and the last reach the border that is cut, and the one in the middle has the only weight,
+1. It is exact, and does not need the size of the image.
 """
 
 import numpy as np

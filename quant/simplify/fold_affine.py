@@ -1,14 +1,14 @@
-"""Fold what multiplies and shifts each channel by itself into the convolutions next to it.
+"""Fold operations that scale and shift each channel into the convolutions next to them.
 
-1. A Sub of what a convolution computes becomes an Add: the convolution is negated. A Sub of any
-   other map of known channels becomes one too: a convolution of one pixel negates the map.
-2. A BatchNormalization, or arithmetic with one constant a channel, is folded into the convolution
-   that it follows, if nothing else reads that one's result.
-3. What stands in front of convolutions is folded into all of them, if that is exact: the zeros that
+1. A Sub of a convolution's result becomes an Add: the convolution is negated. A Sub of any other
+   map of known channels becomes one too: a convolution of one pixel negates the map.
+2. A BatchNormalization, or arithmetic with one constant per channel, is folded into the convolution
+   that it follows, if nothing else reads that convolution's result.
+3. Operations in front of convolutions are folded into all of them, if that is exact: the zeros that
    a convolution pads with are not shifted.
-4. A BatchNormalization of images that is left becomes a depthwise convolution of one pixel.
+4. A remaining BatchNormalization of images becomes a depthwise convolution of one pixel.
 
-All of it is exact but for the rounding of float32, borders included.
+All of it is exact except for the rounding of float32, borders included.
 """
 
 from dataclasses import dataclass
@@ -30,12 +30,12 @@ class Affine:
 
     @property
     def channels(self) -> int:
-        """How many numbers it has."""
+        """The number of channels; 1 if the numbers apply to all channels."""
         return max(len(self.scale), len(self.shift))
 
 
 def add_negated(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Negate the convolution that computes what is subtracted, and add its result (1)."""
+    """Negate the convolution that computes the subtrahend, and add its result (1)."""
     if node.op_type != "Sub" or node.inputs[0] in graph.constants:
         return None
     before = graph.sole_writer(node.inputs[1])
@@ -46,7 +46,7 @@ def add_negated(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
 
 def negate_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Negate what is subtracted by a convolution of its own, and add the result (1).
+    """Negate the subtrahend by a convolution of its own, and add the result (1).
 
     Args:
         shapes: of each float tensor.
@@ -68,7 +68,7 @@ def negate_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[
 
 
 def fold_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Fold what works on each channel into the convolution that it follows (2)."""
+    """Fold an operation per channel into the convolution that it follows (2)."""
     match = affine_of(graph, node)
     if match is None:
         return None
@@ -84,7 +84,7 @@ def fold_behind(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
 
 def fold_in_front(graph: OnnxGraph, shapes: Shapes) -> None:
-    """Fold what works on each channel into the convolutions that read it (3)."""
+    """Fold an operation per channel into the convolutions that read it (3)."""
     folded = set[Node]()
     for node in graph.nodes[::-1]:
         result = node.outputs[0]
@@ -109,7 +109,7 @@ def fold_in_front(graph: OnnxGraph, shapes: Shapes) -> None:
 
 
 def convolve_normalisation(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a normalisation of images that is left by a depthwise convolution (4)."""
+    """Replace a remaining normalisation of images by a depthwise convolution (4)."""
     # The normalisation in front may just have become a convolution, which takes this one in.
     replacement = fold_behind(graph, node)
     match = affine_of(graph, node) if node.op_type == NORMALISATION else None
@@ -124,7 +124,7 @@ def convolve_normalisation(shapes: Shapes, graph: OnnxGraph, node: Node) -> list
 
 
 def affine_of(graph: OnnxGraph, node: Node) -> tuple[str, Affine] | None:
-    """Return the tensor that a node works on and what it does to each channel.
+    """Return the input tensor of a node and its scale and shift of each channel.
 
     None if the node does something else.
     """
@@ -141,7 +141,9 @@ def affine_of(graph: OnnxGraph, node: Node) -> tuple[str, Affine] | None:
 
 
 def _arithmetic(kind: str, value: np.ndarray, place: int) -> Affine | None:
-    """Return what one constant a channel does to the operand at this place."""
+    """Return scale and shift of arithmetic with one constant per channel on the operand at this
+    place.
+    """
     one = np.ones_like(value)
     zero = np.zeros_like(value)
     if kind == "Add":
@@ -164,7 +166,7 @@ def _normalisation(graph: OnnxGraph, node: Node) -> tuple[str, Affine] | None:
 
 
 def per_channel(value: np.ndarray | None) -> np.ndarray | None:
-    """Return (C,) or (1,) of a constant that is one number a channel of (N, C, H, W).
+    """Return (C,) or (1,) of a constant that is one number per channel of (N, C, H, W).
 
     None for any other.
     """
@@ -215,7 +217,9 @@ def _set_weights(graph: OnnxGraph, node: Node, weight: np.ndarray, bias: np.ndar
 
 
 def _fold(graph: OnnxGraph, node: Node, affine: Affine, into_results: bool) -> None:
-    """Fold into a convolution what is done to its results, or to the map that it reads."""
+    """Fold scale and shift of a convolution's results, or of its input map, into the
+    convolution.
+    """
     weight, bias = _weights(graph, node)
     groups = node.attributes.get("group", 1)
     split = weight.reshape(groups, -1, *weight.shape[1:])
@@ -236,7 +240,9 @@ def _fold(graph: OnnxGraph, node: Node, affine: Affine, into_results: bool) -> N
 
 
 def _may_take_in(graph: OnnxGraph, node: Node, name: str, affine: Affine) -> bool:
-    """Return True if a convolution can take in what is done to the tensor `name` that it reads."""
+    """Return True if scale and shift of the tensor `name` can be folded into a convolution that
+    reads it.
+    """
     attributes = node.attributes
     states_pads = attributes.get("auto_pad", "NOTSET") in ("NOTSET", "VALID")
     unpadded = node.op_type == "Conv" and states_pads and not any(attributes.get("pads", []))

@@ -1,13 +1,13 @@
-"""Remove what a network computes from the size of its image: shapes, and what crops, pads or
-enlarges to them.
+"""Remove computations on the size of the image: shapes, and operations that crop, pad or enlarge to
+them.
 
-1. Give the free sizes of the image numbers, so that the runtime folds arithmetic on shapes.
+1. Set the free sizes of the image to numbers, so that the runtime folds arithmetic on shapes.
 2. Write a Resize to a size as one by factors, and the pixel unshuffle of one channel as
-   SpaceToDepth; drop a Pad by nothing and a Slice of the whole map; let a convolution write a map
-   of one number a channel, such as a noise level.
-3. Do both for two sizes. If the networks are equal, the size decides nothing, and theirs is the
-   network of every image whose sides are multiples of `MULTIPLE_PX`. Otherwise the network stays
-   as it is.
+   SpaceToDepth. Remove a Pad by nothing and a Slice of the whole map. Let a convolution write a map
+   of one number per channel, such as a noise level.
+3. Do both for two sizes. If the networks are equal, the size has no effect, and theirs is the
+   network of every image whose sides are multiples of `MULTIPLE_PX`. Otherwise the network is not
+   changed.
 
 Exporters write such arithmetic for a U-Net that pads or enlarges to the size of its skips, for
 `chunk`, and for a number that is repeated over the image.
@@ -23,23 +23,23 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
 
 MULTIPLE_PX = 64
-"""Six levels of a U-Net halve sides of this many pixels without a remainder."""
+"""Six levels of a U-Net halve sides of this length without a remainder."""
 SIZES_PX = (2 * MULTIPLE_PX, 3 * MULTIPLE_PX), (4 * MULTIPLE_PX, 3 * MULTIPLE_PX)
-"""Rows and columns differ, so that a network that takes one for the other is noticed."""
+"""Rows and columns differ, so that a network that confuses them is detected."""
 SIZED = {"Concat", "Pad", "Resize", "Shape", "Size", "Slice"}
 """Operators that may need the size of an image."""
 RESHAPING = {"Flatten", "Reshape", "Squeeze", "Unsqueeze"}
 """Operators that move no value."""
 
 Fold = Callable[[onnx.ModelProto], onnx.ModelProto]
-"""Folds constants, as onnxruntime does."""
+"""A function that folds constants, as onnxruntime does."""
 
 
 def free_sizes(model: onnx.ModelProto, fold: Fold) -> onnx.ModelProto:
-    """Return the network without arithmetic on sizes; as it is if the size decides something.
+    """Return the network without arithmetic on sizes; unchanged if the size has an effect.
 
     Args:
-        model: a float network, of our opset; not changed.
+        model: a float network of this project's opset; not changed.
         fold: folds the constants of a network.
     """
     constants = {tensor.name for tensor in model.graph.initializer}
@@ -80,7 +80,7 @@ def _of_size(model: onnx.ModelProto, rows: int, columns: int, fold: Fold) -> onn
             for dim, size in zip(dims, (1, 0, rows, columns), strict=True):
                 if size and not dim.dim_value:
                     dim.dim_value = size
-    # What the file says of other tensors may contradict the numbers.
+    # The sizes of other tensors in the file may contradict the numbers.
     network.graph.ClearField("value_info")
     for value in network.graph.output:
         value.type.tensor_type.ClearField("shape")
@@ -94,7 +94,7 @@ def _of_size(model: onnx.ModelProto, rows: int, columns: int, fold: Fold) -> onn
 
 
 def _sized(graph: OnnxGraph, node: Node, sizes: dict[str, tuple[int, ...]]) -> list[Node] | None:
-    """Return what takes the place of a node whose input has a known size (2).
+    """Return the nodes that replace a node whose input has a known size (2).
 
     Args:
         graph: that the node belongs to; its constants are extended.
@@ -207,7 +207,7 @@ def _with_written_maps(
 
 
 def _content(model: onnx.ModelProto) -> tuple[list[bytes], dict[str, bytes]]:
-    """Return what a network computes with, in a form that can be compared.
+    """Return the content of a network in a form that can be compared.
 
     Args:
         model: the network. Serialization is deterministic, so equal networks give equal bytes.

@@ -1,12 +1,12 @@
 """Turn fully connected layers into convolutions as large as the map that was flattened for them.
 
-1. The nodes that flatten a map of known size are remembered: Flatten, Reshape and Squeeze.
+1. The nodes that flatten a map of known size are recorded: Flatten, Reshape and Squeeze.
 2. A Gemm on such a map becomes a convolution of the whole map.
-3. Activations on what is flat work on the map instead, and a Softmax over what is flat becomes one
-   along the channels of one pixel.
-4. A Reshape that makes the map again goes, and the flattening with it.
+3. Activations on a flat tensor are applied to the map instead, and a Softmax over a flat tensor
+   becomes one along the channels of one pixel.
+4. A Reshape that restores the map is removed, and the flattening with it.
 
-The flattening is left behind each of them, and goes where nothing reads it.
+A flattening remains behind each of them, and is removed if nothing reads it.
 """
 
 from math import prod
@@ -29,7 +29,7 @@ class ConnectByConvolutions:
         self._maps: dict[str, tuple[str, Map]] = {}
 
     def __call__(self, graph: OnnxGraph, node: Node) -> list[Node] | None:
-        """Return what takes the place of a node, None if it stays."""
+        """Return the nodes that replace a node, None if it stays."""
         name = node.inputs[0] if node.inputs else ""
         if self._flattens(graph, node):
             channels, height, width = self._shapes[name][1:]
@@ -68,7 +68,7 @@ class ConnectByConvolutions:
             return {axis % 4 for axis in operand} == {2, 3}
         if node.op_type != "Reshape" or len(operand) != 2 or node.attributes.get("allowzero", 0):
             return False
-        # In ONNX's Reshape a 0 copies the source's size and -1 stands for whatever is left.
+        # In ONNX's Reshape a 0 copies the source's size and -1 stands for the remaining values.
         rows, columns = operand
         return columns == prod(sizes[1:]) or (columns == -1 and rows in (0, sizes[0]))
 

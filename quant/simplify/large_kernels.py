@@ -1,13 +1,13 @@
 """Write a convolution of a large kernel as several of smaller ones, whose results are summed.
 
-1. Each part has every m-th row of the kernel, so that it is dilated by m, with m as small as
-   `MOST_POSITIONS` allow. Its padding is what is left of that of the whole in front of its first
-   row and behind its last one.
+1. Each part has every m-th row of the kernel, so that it is dilated by m, with the smallest m that
+   `MOST_POSITIONS` allows. Its padding is the rest of the whole kernel's padding in front of its
+   first row and behind its last one.
 2. A convolution of one pixel sums the parts, channel by channel. Behind a sum by Adds a DPU has no
    activation but ReLU, and as the network's last operation it would have 8 bits.
 
-All of it is exact but for the rounding of float32. A kernel stays if parts would begin inside the
-map, as those of a kernel without padding do, or if one of its rows is too large.
+All of it is exact except for the rounding of float32. A kernel is not split if parts would begin
+inside the map, as those of a kernel without padding do, or if one of its rows is too large.
 """
 
 import numpy as np
@@ -16,9 +16,9 @@ from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.fold_affine import is_convolution
 
 MOST_POSITIONS = 49
-"""Height times width of a part, 7 x 7: at most 53 are what every target computes."""
+"""Height times width of a part, 7 x 7. Every target computes at most 53."""
 LARGE_POSITIONS = 64
-"""Height times width, 8 x 8, up to which a kernel stays, because some targets compute it."""
+"""Height times width, 8 x 8, up to which a kernel is not split, because some targets compute it."""
 
 
 def is_large(shape: tuple[int, ...]) -> bool:

@@ -1,9 +1,9 @@
-"""Mirror the image beyond its borders where a network has no padding and makes a smaller result.
+"""Mirror the image beyond its borders if a network has no padding and its result is smaller.
 
-1. Where no layer pads, the sizes of the result for two sizes of image tell how many pixels a side
-   are missing.
-2. A Pad in front of the network mirrors half of them at each border. The result has the size of the
-   image then, or a multiple of it, and is the old one inside its border.
+1. If no layer pads, the sizes of the result for two sizes of image determine how many pixels per
+   side are missing.
+2. A Pad in front of the network mirrors half of them at each border. The result then has the size
+   of the image, or a multiple of it, and is unchanged inside its border.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ WINDOWS = {"AveragePool", "Conv", "ConvTranspose", "MaxPool", "Pad"}
 SIZES_PX = (256, 320), (384, 512)
 """Rows and columns of the two images."""
 MOST_PX = 128
-"""A larger border is not what a network without padding lacks."""
+"""The largest border that a network without padding can lack."""
 
 
 def with_missing_border(model: onnx.ModelProto) -> onnx.ModelProto:
@@ -90,7 +90,7 @@ def _result_size(model: onnx.ModelProto, size: tuple[int, int]) -> tuple[int, ..
     network.CopyFrom(model)
     network.graph.ClearField("value_info")
     dims = network.graph.input[0].type.tensor_type.shape.dim
-    # A network of one size is left as it is: nobody can tell what its result grows with.
+    # A network of one size is not changed, because the growth of its result is unknown.
     if len(dims) != 4 or any(dim.dim_value for dim in dims[2:]):
         return ()
     for dim, side_px in zip(dims[2:], size, strict=True):

@@ -1,33 +1,33 @@
-"""Turn a float ONNX file as exporters leave it into its simplest equal.
+"""Simplify a float ONNX file as exporters write it, without changing its function.
 
-`quant.onnx_file.load_onnx` does it once for whoever reads a file. Afterwards these hold of a float
-network:
+`quant.onnx_file.load_onnx` does it once for all readers of a file. Afterwards a float network has
+these properties:
 
-1. Constants are initializers, each float32 where it was float16 too, and no initializer is an
-   input.
+1. Constants are initializers, each float32 even if it was float16, and no initializer is an input.
 2. There is no Identity, Constant, Dropout, needless Cast, and no arithmetic on constants.
-3. There is no BatchNormalization, and no Mul, Add, Sub or Div by one constant a channel, behind a
-   convolution that only it reads, nor in front of convolutions where they are exact. A
-   BatchNormalization of images that is left is a depthwise 1 x 1 convolution. Zeros that Pad adds
-   are the convolution's own.
-4. Sub of two maps is Add, Sum is Add, a mean over the image is GlobalAveragePool, HardSwish is
-   itself, ReLU6 is Clip from 0 to 6, and a Clip at 0 alone is ReLU. Nothing splits or crops a map:
-   each part is computed by itself. Padded kernels have at most 64 positions. Nothing is computed
-   from the size of the image, unless it decides something. The channels of the image stand first.
+3. There is no BatchNormalization, and no Mul, Add, Sub or Div by one constant per channel, behind a
+   convolution that only it reads, nor in front of convolutions where folding is exact. A remaining
+   BatchNormalization of images is a depthwise 1 x 1 convolution. Zeros that Pad adds are the
+   convolution's own.
+4. Sub of two maps is Add, Sum is Add, a mean over the image is GlobalAveragePool. HardSwish is one
+   operator, ReLU6 is Clip from 0 to 6, and a Clip at 0 alone is ReLU. Nothing splits or crops a
+   map: each part is computed separately. Padded kernels have at most 64 positions. Nothing is
+   computed from the size of the image, unless the size has an effect. The channels of the image
+   come first.
 5. Operators are those of opset 17, unless one has no form there.
 6. The result of a network without padding has the image's size, or a multiple of it: the image is
    mirrored beyond its borders.
-7. Inputs, outputs, metadata and nodes that stay keep their names, each node has one, and no two
-   convolutions share what was folded into one of them.
+7. Inputs, outputs, metadata and remaining nodes have their original names, and each node has one.
+   No two convolutions share weights into which something was folded.
 
-A network that needs none of it is returned as it is: its results stay the same to the bit. The same
-file gives the same bytes. INT8 files do not come here.
+A network that needs none of it is returned unchanged, so that its results are the same to the bit.
+The same file gives the same bytes. INT8 files are not simplified.
 
-Constants, normalisation behind convolutions, padding and what does nothing are folded by
-onnxruntime's basic optimisation, which every installation has: it keeps to standard operators, and
+Constants, normalisation behind convolutions, padding and nodes without effect are folded by
+onnxruntime's basic optimisation, which every installation has. It uses standard operators only, and
 its own tests run on every release. (onnxsim or onnxscript's optimizer would be further packages for
-the same.) What it leaves is for the passes of this package; onnx's own converter changes the opset.
-Only what `quant.onnx.runnable` has let through may come here: a runtime opens it.
+the same.) The passes of this package do the rest, and onnx's own converter changes the opset. Only
+models that `quant.onnx.runnable` accepted are simplified, because a runtime opens them.
 """
 
 from copy import deepcopy
@@ -82,29 +82,29 @@ PLAIN = {
     "MaxPool",
     "Relu",
 }
-"""Operators behind which nothing is to be folded, where they read no constants but weights."""
+"""Operators behind which nothing can be folded if they read no constants but weights."""
 
 ALTERING = [
     "CommonSubexpressionElimination",
     "SliceConcatToSpaceToDepthFusion",
     "TransposeOptimizer",
 ]
-"""Optimisers of the runtime's that make other networks: layers of equal weights would be one,
-slices would become a Gather, and pixel shuffles that are spelled out would not be recognised.
+"""Optimisers of onnxruntime that change the network: they merge layers of equal weights, turn
+slices into a Gather, and prevent pixel shuffles from being recognised.
 """
 
 HALVES = (TensorProto.FLOAT16, TensorProto.BFLOAT16)
 
 
 NEEDS_SHAPES = {"Cast", "Gemm", "ReduceMean", "Slice", "Softmax", "Split", "Sub"}
-"""What may be rewritten where shapes are known."""
+"""Operators that may be rewritten if shapes are known."""
 
 
 def simplify(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
-    """Return the float network's simplest equal, as the module says.
+    """Simplify a float network as described in the module.
 
     Args:
-        model: what `check_content` and `check_runnable` let through; not changed.
+        model: accepted by `check_content` and `check_runnable`; not changed.
         where: name of the network for messages, such as "a.onnx".
     """
     with contradictions(where):
@@ -136,7 +136,7 @@ def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 
 
 def _run_passes(model: onnx.ModelProto) -> None:
-    """Rewrite the nodes of a network in place; its inputs and outputs keep their names."""
+    """Rewrite the nodes of a network in place, without renaming its inputs and outputs."""
     graph = OnnxGraph(model)
     for rewriting in (
         split_sums,
@@ -188,7 +188,7 @@ def _is_plain(model: onnx.ModelProto) -> bool:
 
 
 def _widen(model: onnx.ModelProto) -> None:
-    """16-bit floats become float32, where they are weights and wherever they are computed."""
+    """Convert 16-bit floats to float32, in weights and in all computations."""
     graph = model.graph
     for value in (*graph.input, *graph.output, *graph.value_info):
         if value.type.tensor_type.elem_type in HALVES:
@@ -203,7 +203,9 @@ def _widen(model: onnx.ModelProto) -> None:
 
 
 def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
-    """The network as the runtime's basic optimisation leaves it, with operators of our opset."""
+    """Apply onnxruntime's basic optimisation, and return the network with operators of this
+    project's opset.
+    """
     options = ort.SessionOptions()
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_BASIC
     options.intra_op_num_threads = 1
@@ -232,9 +234,7 @@ def _folded(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 
 
 def _of_our_opset(model: onnx.ModelProto) -> onnx.ModelProto:
-    """With operators of our opset; as it is where the converter knows no way, or ours has no such
-    operator.
-    """
+    """Convert a network to this project's opset; return it unchanged if that is not possible."""
     version = opset_of(model)
     _replace(model.opset_import, [onnx.helper.make_opsetid("", version)])
     if version == OPSET:
@@ -252,8 +252,9 @@ RESIZE_HAS_MODES = 11
 
 
 def _place_corners(model: onnx.ModelProto) -> None:
-    """What older operators enlarge starts at the corner; the converter leaves the default, half a
-    pixel off.
+    """Set the coordinates of enlargements from older opsets, which start at the corner.
+
+    The converter leaves the default, which is shifted by half a pixel.
     """
     for node in model.graph.node:
         if node.op_type == "Resize":
@@ -264,7 +265,7 @@ def _place_corners(model: onnx.ModelProto) -> None:
 
 
 def _tidy(network: onnx.ModelProto, model: onnx.ModelProto) -> None:
-    """What is said beside the graph is the file's own; constants that nothing reads are dropped."""
+    """Restore the metadata of the original file, and remove constants that no node reads."""
     network.ir_version = IR_VERSION
     network.producer_name = model.producer_name
     network.producer_version = model.producer_version
@@ -284,7 +285,7 @@ def _tidy(network: onnx.ModelProto, model: onnx.ModelProto) -> None:
 
 
 def _replace(field: object, values: object) -> None:
-    """Put other messages in the place of a repeated field's own."""
+    """Replace the messages of a repeated field."""
     messages = list(values)  # type: ignore[call-overload]
     del field[:]  # type: ignore[attr-defined]
     field.extend(messages)  # type: ignore[attr-defined]

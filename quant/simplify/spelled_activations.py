@@ -1,8 +1,8 @@
-"""Activations that exporters spell out become the one operator that a DPU has.
+"""Replace activations that exporters write as several operators by the one operator that a DPU has.
 
-1. A Clip at 0 without a limit above, and a Max with 0, are ReLU.
-2. A shift by 3, a clip from 0 to 6 and a sixth are HardSigmoid, and HardSwish if they are times the
-   tensor itself, whichever order they are in.
+1. A Clip at 0 without an upper limit, and a Max with 0, are ReLU.
+2. A shift by 3, a clip from 0 to 6 and a sixth are HardSigmoid. They are HardSwish if they are
+   multiplied by the tensor itself, in any order.
 """
 
 from collections.abc import Callable
@@ -12,9 +12,9 @@ import numpy as np
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 
 UNLIMITED = 1e30
-"""A Clip above this limits no value."""
+"""A Clip above this value limits nothing."""
 SLOPE_AND_OFFSET = {"alpha": 1 / 6, "beta": 0.5}
-"""Of the HardSigmoid that HardSwish has; ONNX's default is another slope."""
+"""Slope and offset of the HardSigmoid in HardSwish; ONNX's default slope differs."""
 
 
 def join_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
@@ -44,11 +44,11 @@ def join_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
 
 
 def join_hard_swish(graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Replace a node that completes a HardSwish, or a HardSigmoid, by it (2).
+    """Replace a node that completes a HardSwish, or a HardSigmoid, by that operator (2).
 
     Args:
         graph: that the node belongs to.
-        node: any node; what stands in front of it goes where nothing else reads it.
+        node: any node; nodes in front of it are removed if nothing else reads them.
 
     Returns:
         The activation, None if the node completes none.

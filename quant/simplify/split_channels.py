@@ -1,12 +1,12 @@
-"""Compute each part of a map's channels by operations of its own, so that nothing splits a map.
+"""Compute each part of a map's channels by separate operations, so that nothing splits a map.
 
 1. A Split, or a Slice, along the channels has parts, each a list of channels.
-2. Where only such nodes read a map, and a convolution writes it, each part becomes a convolution
-   with the weights of its channels. Activations and depthwise convolutions in between are divided
-   with it. Neither more nor less is computed.
-3. In front of anything else, a convolution of one pixel selects the channels.
+2. If only such nodes read a map, and a convolution writes it, each part becomes a convolution with
+   the weights of its channels. Activations and depthwise convolutions in between are divided with
+   it. The amount of computation does not change.
+3. In front of any other operation, a convolution of one pixel selects the channels.
 
-All of it is exact. What is divided stays behind, and goes where nothing reads it.
+All of it is exact. The divided nodes remain, and are removed if nothing reads them.
 """
 
 from functools import partial
@@ -32,7 +32,7 @@ def split_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] |
         node: any node.
 
     Returns:
-        The operations that take the node's place, None if it takes no parts.
+        The operations that replace the node, None if it does not split.
     """
     parts = _parts(graph, node, shapes)
     source = node.inputs[0] if parts else ""
@@ -48,7 +48,7 @@ def split_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] |
 
 
 def _parts(graph: OnnxGraph, node: Node, shapes: Shapes) -> list[Part]:
-    """Return the parts that a node takes from a map of known channels; none of another node.
+    """Return the parts of a map of known channels that a node selects; none for another node.
 
     Args:
         graph: that the node belongs to.
@@ -76,7 +76,8 @@ def _parts(graph: OnnxGraph, node: Node, shapes: Shapes) -> list[Part]:
 def _divide(
     graph: OnnxGraph, source: str, shapes: Shapes, channels: np.ndarray, name: str
 ) -> list[Node]:
-    """Return what computes some channels of a map, of which nobody needs the whole (2).
+    """Return the operations that compute some channels of a map that is never needed as a whole
+    (2).
 
     Args:
         graph: its constants are extended by the weights of the part.
@@ -120,7 +121,7 @@ def _divide(
 def _part_of(
     graph: OnnxGraph, source: str, shapes: Shapes, channels: np.ndarray, name: str
 ) -> list[Node]:
-    """Return what computes some channels of a map that is read by one node, or by several.
+    """Return the operations that compute some channels of a map that one node reads, or several.
 
     Args:
         graph: its constants are extended.

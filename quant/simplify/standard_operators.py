@@ -1,4 +1,4 @@
-"""Operators that exporters spell in several ways become the one operator that a DPU has."""
+"""Replace operators that exporters write in several ways by the one operator that a DPU has."""
 
 from onnx import TensorProto
 
@@ -33,9 +33,9 @@ def split_sums(_: OnnxGraph, node: Node) -> list[Node] | None:
 
 
 def drop_cast(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
-    """Remove a Cast to float32 of what is float32 already.
+    """Remove a Cast to float32 of a tensor that is float32 already.
 
-    The runtime leaves such a Cast where it writes a result.
+    The runtime leaves such a Cast if it writes a result.
     """
     if node.op_type != "Cast" or node.inputs[0] not in shapes:
         return None

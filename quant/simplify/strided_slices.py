@@ -1,10 +1,10 @@
-"""Write strided slices of rows and columns that are put side by side as one pixel unshuffle.
+"""Write strided slices of rows and columns that are concatenated as one pixel unshuffle.
 
 1. A Concat of slices that start at each place of a block, and step by the block, has the pixels of
-   SpaceToDepth; its channels may come in another order.
-2. Convolutions that read it take that order into their weights.
+   SpaceToDepth; its channels may be in another order.
+2. Convolutions that read it reorder their weights accordingly.
 
-YOLO's Focus layer is an example. Slices are tried out on an image of numbered pixels.
+YOLO's Focus layer is an example. Slices are tested on an image of numbered pixels.
 """
 
 import numpy as np
@@ -78,7 +78,7 @@ def _order(graph: OnnxGraph, node: Node, channels: int, block: int) -> np.ndarra
     shape = (1, channels, 4 * block, 6 * block)
     image = np.arange(np.prod(shape)).reshape(shape)
     parts = []
-    # Each pixel has a number of its own, so that the result says where each one went.
+    # Each pixel has a unique number, so that the result shows where each one moved.
     for name in node.inputs:
         part = image
         for each in _origin(graph, name)[1]:

@@ -1,8 +1,8 @@
-"""Networks that were exported while they were trained, and not to be used: Dropout draws,
+"""Reject networks that were exported in training mode, in which Dropout draws and
 BatchNormalization adapts.
 
-Such a network gives another result for each run or for each tile. It is refused before these nodes
-are folded away.
+Such a network returns another result for each run or for each tile. It is rejected before these
+nodes are folded.
 """
 
 import numpy as np
@@ -14,8 +14,8 @@ from beers_deploy.quant.domains import STANDARD, opset_of
 from beers_deploy.quant.onnx.graph import attributes_of, constants
 
 IS_TEST_UNTIL = 6
-"""The last opset whose operators state by `is_test` whether they are in use; without it they are in
-training.
+"""The last opset whose operators state by `is_test` whether they are in inference mode; without it
+they are in training mode.
 """
 DROPOUT_MODE_INPUT = 2
 
@@ -24,7 +24,7 @@ def require_inference(model: onnx.ModelProto, where: str) -> None:
     """Raise ModelError if a network has a node in training mode.
 
     Args:
-        model: what `check_content` let through.
+        model: accepted by `check_content`.
         where: name of the network for the message, such as "a.onnx" or "the float network".
 
     Raises:
@@ -61,8 +61,8 @@ def _drops(node: NodeProto, opset: int, values: dict[str, np.ndarray]) -> bool:
 
 
 def _adapts(node: NodeProto, opset: int, _: dict[str, np.ndarray]) -> bool:
-    """Return True if a BatchNormalization takes mean and variance from the image, and gives them as
-    further results.
+    """Return True if a BatchNormalization computes mean and variance from the image, and returns
+    them as further results.
 
     From opset 14 on an attribute states it as well.
     """

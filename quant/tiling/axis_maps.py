@@ -1,8 +1,8 @@
-"""Which pixels of its source an operator reads, along one axis of the image.
+"""Determine which pixels of its source an operator reads, along one axis of the image.
 
 `AXIS_MAPS` has each operator that reads other pixels than the one in its own place: windows,
-transposed windows, shuffles, enlargements. Sizes are followed as a share of the image's, and what a
-tensor has beyond that share. So it does not matter where pixels were padded and where windows used
+transposed windows, shuffles, enlargements. The size of a tensor is tracked as a share of the
+image's size plus an excess. So it does not matter where pixels were padded and where windows used
 them up.
 """
 
@@ -23,7 +23,7 @@ from beers_deploy.quant.untrusted import times
 
 @dataclass(frozen=True)
 class AxisMap:
-    """What an operator does along one side.
+    """The effect of an operator along one side.
 
     Attributes:
         growth: pixels of its result for one of its source.
@@ -50,7 +50,7 @@ class AxisMap:
         """
         low = math.ceil(first / self.growth + self.low)
         high = math.floor(last / self.growth + self.high)
-        # Beyond an end of the source stands what is mirrored, or copied, from within.
+        # Pixels beyond an end of the source are mirrored, or copied, from within.
         if self.mirrored:
             return min(low, 2 * (size - 1) - high), max(high, -low)
         return min(low, size - 1), max(high, 0)
@@ -65,7 +65,7 @@ class AxisNode:
         axis: 0 for the rows, 1 for the columns.
         extra: pixels that its source has beyond, or short of, its share of the image.
         graph: the node's.
-        shapes: of all constants, those included that nodes make of others.
+        shapes: of all constants, including those that nodes compute from others.
     """
 
     node: Node
@@ -75,8 +75,8 @@ class AxisNode:
     shapes: Mapping[str, tuple[int, ...]]
 
     def require(self, valid: bool, why: str) -> None:
-        """Raise ModelError unless the node can be tiled; `why` is what it does instead, a verb
-        phrase.
+        """Raise ModelError unless the node can be tiled; `why` is a verb phrase on what it does
+        instead.
         """
         if not valid:
             raise not_tileable(
@@ -89,13 +89,17 @@ class AxisNode:
         return self.node.attributes.get(key, otherwise)
 
     def numbers(self, place: int, key: str, otherwise: Sequence[float] = ()) -> list[Any]:
-        """Return what the node states in an input or, of older opsets, in an attribute."""
+        """Return the numbers that the node states in an input or, in older opsets, in an
+        attribute.
+        """
         values = self.graph.numbers(self.node, place, key, otherwise)
         self.require(values is not None, "has sizes that are computed (fold them)")
         return values or []
 
     def own(self, numbers: Sequence[Any], axes: Sequence[int], otherwise: Any) -> Any:
-        """Return this side's number, of some for these axes of (N, C, H, W)."""
+        """Return the number for this side from numbers for `axes` of (N, C, H, W), or `otherwise`
+        if it has none.
+        """
         # A negative axis counts from the last one.
         by_axis = dict(zip((int(axis) % 4 for axis in axes), numbers, strict=True))
         return by_axis.get(2 + self.axis, otherwise)
@@ -149,7 +153,7 @@ def _transpose(at: AxisNode) -> AxisMap:
 
 
 def _shuffle(at: AxisNode) -> AxisMap:
-    """Channels become squares of pixels, or squares of pixels channels."""
+    """Return the map of a pixel shuffle or its inverse."""
     block = int(at.attribute("blocksize", 1))
     window = Window((block, block))
     if at.node.op_type == "DepthToSpace":
@@ -159,7 +163,7 @@ def _shuffle(at: AxisNode) -> AxisMap:
 
 
 def _pad(at: AxisNode) -> AxisMap:
-    """Padding by itself; less than none cuts off."""
+    """Return the map of a separate Pad; negative padding crops."""
     mode = at.attribute("mode", "constant")
     at.require(mode != "wrap", "joins opposite borders")
     pads = at.numbers(1, "pads")
@@ -172,11 +176,15 @@ def _pad(at: AxisNode) -> AxisMap:
 
 
 FAR = 1 << 30
-"""An end of a slice that stands for the image's own."""
+"""An end of a slice from which on it means the image's own end."""
 
 
 def _slice(at: AxisNode) -> AxisMap:
-    """A part that is counted from the borders, or every n-th pixel."""
+    """Return the map of a Slice that cuts relative to the borders, or that selects every n-th
+    pixel.
+
+    Raises ModelError for a slice at a fixed position.
+    """
     starts = at.numbers(1, "starts")
     ends = at.numbers(2, "ends")
     axes = at.numbers(3, "axes", range(len(starts)))
@@ -191,8 +199,10 @@ def _slice(at: AxisNode) -> AxisMap:
 
 
 def _resize(at: AxisNode) -> AxisMap:
-    """Enlarging by whole factors, or taking every 2nd, 4th, ... pixel; linear where all weights are
-    exact floats.
+    """Return the map of a Resize by an integer factor, or by the inverse of one.
+
+    Linear interpolation is accepted only if all weights are exact floats. Raises ModelError for
+    anything else.
     """
     resizing = Resizing.of(at.node, at.graph)
     at.require(bool(resizing.factors), "resizes to a fixed size")
@@ -222,7 +232,7 @@ def _resize(at: AxisNode) -> AxisMap:
     exact = not linear or growth.numerator & (growth.numerator - 1) == 0
     at.require(exact, f"resizes by {growth} with weights whose rounding depends on the position")
     ways = (math.floor, math.ceil) if linear else (ROUNDINGS[resizing.rounding],)
-    # The offsets repeat after as many pixels as one pixel of the source becomes.
+    # The offsets repeat after the number of pixels that one pixel of the source becomes.
     pixels = range(growth.numerator)
     places = [(k / growth, PLACES[resizing.where](k, float(growth))) for k in pixels]
     offsets = [way(place) - share for way, (share, place) in product(ways, places)]
@@ -238,7 +248,9 @@ AXIS_MAPS: dict[str, Callable[[AxisNode], AxisMap]] = {
     "Pad": _pad,
     "Slice": _slice,
 }
-"""What reads other pixels than the one in its own place; the image is its first input."""
+"""Operators that read other pixels than the one in their own place; the image is
+their first input.
+"""
 
 
 def not_tileable(reason: str) -> ModelError:

@@ -1,23 +1,24 @@
-"""How a network's image may be cut into tiles that give the whole image's result, bit for bit.
+"""Determine how the image of a network may be cut into tiles that give the result of the whole
+image, bit for bit.
 
-The contract, of `tiling_of`: cut tiles at multiples of `alignment_px`; read each with `halo_px`
-around what is kept of it, less only where the image ends; extend the image at the bottom and right
-to a multiple of `alignment_px` first, and to `min_side_px`. Then a kept pixel is computed from the
-same numbers in the same places as in the whole image, the zeros that layers pad with included, and
-the output is `scale` times the image's size. (A runtime's float sums are the same too where it adds
-in one order: onnxruntime changes that for maps of fewer than some 80 pixels a thread, see
-docs/explanation/tiling.md.)
+`tiling_of` defines this contract. Cut tiles at multiples of `alignment_px`. Read each with
+`halo_px` around the part that is kept, less only where the image ends. Extend the image at the
+bottom and right to a multiple of `alignment_px` first, and to `min_side_px`. Then a kept pixel is
+computed from the same numbers in the same places as in the whole image, including the zeros that
+layers pad with. The output is `scale` times the image's size. (A runtime's float sums are the same
+too if it adds in one order: onnxruntime changes that for maps of fewer than some 80 pixels a
+thread, see docs/explanation/tiling.md.)
 
-It is found by a walk along the graph and back, once for the rows and once for the columns. On the
-way there each tensor is given how many pixels it has for one of the image, a fraction behind a pool
-or a stride: the lattice is the least common multiple of the denominators. On the way back it is
-given which of its pixels one cell of the lattice reads. The halo reaches to the farthest one's own
-place: a tile ends there too, and the layers behind pad at its end.
+The graph is traversed forwards and backwards, once for the rows and once for the columns. The
+forward pass computes the number of pixels of each tensor per pixel of the image, which is a
+fraction behind a pool or a stride. The lattice is the least common multiple of the denominators.
+The backward pass computes which pixels of each tensor one cell of the lattice reads. The halo
+extends to the farthest of them: a tile ends there too, and the layers behind pad at its end.
 
-Refused, with the node's name, is what does not do the same at every period of the lattice, from
-near pixels alone: ranges and means over the image, fully connected layers, sizes that are fixed,
-enlargements whose weights depend on the place by rounding (a third has no exact float), and
-constants that differ from pixel to pixel.
+A network is rejected, with the node's name, if a node does not do the same at every period of the
+lattice, from near pixels alone. Examples are ranges and means over the image, fully connected
+layers, fixed sizes and constants that differ from pixel to pixel. Others are enlargements whose
+weights depend on the place by rounding (a third has no exact float).
 """
 
 import math
@@ -35,18 +36,17 @@ from beers_deploy.quant.untrusted import contradictions
 
 @dataclass(frozen=True)
 class Tiling:
-    """How a network meets an image (see the module's own words).
+    """The geometry by which an image is tiled for a network (see the description of the module).
 
     Attributes:
-        halo_px: context around what is kept of a tile: the receptive radius, rounded up to the
+        halo_px: context around the kept part of a tile: the receptive radius, rounded up to the
             lattice.
         alignment_px: tiles begin and end at multiples of it; 1 without strides.
         scale: pixels of the output for one of the image, along either side.
-        channels_in: bands that the network reads together.
-        channels_out: bands that it gives.
-        fixed_px: the tile side that the network is fixed to; None where it takes any size.
-        min_side_px: the shortest side that it accepts: one pixel more than what it mirrors at a
-            border.
+        channels_in: the number of bands that the network reads jointly.
+        channels_out: the number of bands that it returns.
+        fixed_px: the tile side that the network is fixed to; None if it accepts any size.
+        min_side_px: the shortest side that it accepts: one pixel more than it mirrors at a border.
     """
 
     halo_px: int
@@ -58,12 +58,12 @@ class Tiling:
     min_side_px: int = 1
 
     def whole_px(self, side_px: int) -> int:
-        """What a side of an image is extended to, at the bottom and right."""
+        """Return the length to which a side of an image is extended, at the bottom and right."""
         return -(-max(side_px, self.min_side_px) // self.alignment_px) * self.alignment_px
 
     @property
     def words(self) -> str:
-        """What a message says of it."""
+        """A description for messages."""
         bands = f"of {self.channels_in} bands in and {self.channels_out} out"
         return (
             f"{bands}, a result of {self.scale} times the image's size and tiles of "
@@ -132,39 +132,43 @@ def _channels(graph: OnnxGraph, model: onnx.ModelProto) -> tuple[int, int]:
 
 
 def _channel_count(value: onnx.ValueInfoProto) -> int:
-    """0 where it is not stated, or the tensor is no image."""
+    """Return the number of channels; 0 if it is not stated, or if the tensor is no image."""
     sizes = value.type.tensor_type.shape.dim
     return sizes[1].dim_value if len(sizes) == 4 else 0
 
 
 PERIOD = 1024
-"""Most pixels of a lattice, and of a tensor's within one: networks of use stay far below."""
+"""The maximum number of pixels of a lattice, and of a tensor's within one; practical networks stay
+far below.
+"""
 
 
 @dataclass(frozen=True)
 class _Grid:
-    """A tensor's pixels along one side: so many for one of the image, and so many beyond, or short
-    of, that share.
+    """The number of pixels of a tensor along one side: pixels per pixel of the image, plus an
+    excess.
 
-    They are beyond it where something padded, until windows use them up or they are cut off.
+    The excess (or deficit) comes from padding, until windows use it up or it is cropped.
     """
 
     per_px: Fraction
     extra: int
 
     def in_cell(self, alignment_px: int) -> int:
-        """Its share of a cell of the lattice."""
+        """Return the number of pixels of the tensor in one cell of the lattice."""
         return int(self.per_px * alignment_px)
 
     def reach_px(self, first: int, last: int, alignment_px: int) -> int:
-        """How far beyond the lattice's first cell a tile must reach to have these pixels."""
+        """Return how far beyond the lattice's first cell a tile must extend to include these
+        pixels.
+        """
         end_px = math.ceil((last - self.extra + 1) / self.per_px)
         return max(-math.floor(first / self.per_px), end_px - alignment_px)
 
 
 class _Walk:
-    """Follows the image along one side, from node to node, and back what a cell of the lattice
-    reads.
+    """Traverses the graph along one side: forwards from the image, and backwards from a cell of the
+    lattice.
     """
 
     def __init__(self, graph: OnnxGraph, axis: int) -> None:
@@ -229,7 +233,9 @@ class _Walk:
         return AxisMap(Fraction(1), at.extra)
 
     def _radius_px(self, output: str) -> int:
-        """How far beyond a cell of the lattice lies what its result depends on."""
+        """Return how far the pixels on which a cell of the lattice depends extend beyond
+        that cell.
+        """
         ranges = {output: (0, self._grids[output].in_cell(self.alignment_px) - 1)}
         # A tensor's readers stand behind its writer, so backwards each range is complete when the
         # node that writes the tensor is reached.
@@ -334,14 +340,14 @@ AXES = {
     **dict.fromkeys(("BatchNormalization", "DequantizeLinear", "QuantizeLinear"), 1),
     **dict.fromkeys(("Concat", "QLinearConcat", "Softmax", "Split"), 0),
 }
-"""Point-wise where they work along the channels, or have one number for each, and the axis where
-none is stated.
+"""Operators that are point-wise if they work along the channels, or have one number per channel;
+and the axis if none is stated.
 """
 KEEPING = {"BatchNormalization", "Cast", "DequantizeLinear", "Identity", "QuantizeLinear"}
-"""What leaves the shape of constants as it is."""
+"""Operators that do not change the shape of constants."""
 WHY = {
     "reads the whole image": ("Dynamic", "Global", "Normalization", "Reduce", "Shape"),
     "is fully connected": ("Flatten", "Gemm", "MatMul"),
     "moves pixels": tuple(MOVES),
 }
-"""Why an operator is refused, by parts of its name."""
+"""The reasons why an operator is rejected, by parts of its name."""
