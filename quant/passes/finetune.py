@@ -19,6 +19,7 @@ are powers of two.
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 import onnx
@@ -177,7 +178,7 @@ def finetune(
             average.update_parameters(trainable)
             # 4. Counted from the end, so that the last step is judged, where the rate is near 0.
             if left % JUDGED_EVERY == 0 or left == steps:
-                candidate = average.module.core()
+                candidate = cast(TrainableCore, average.module).core()
                 loss = loss_of(candidate, held_out)
                 if loss < least:
                     core = candidate
