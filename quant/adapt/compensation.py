@@ -5,7 +5,9 @@
    nearest to the original. The convolutions in front and behind hold k and 1 / k.
 2. Each convolution that reads what has changed is fitted in order, by least squares: of the adapted
    network's tensors it shall compute what it computed of the original's. That includes a scale for
-   each channel, the correction of the bias, and what the layers before have left.
+   each channel, the correction of the bias, and what the layers before have left. Where the
+   samples are too few for the weights, as in the small maps of a detector, the bias alone is
+   corrected.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -27,6 +29,8 @@ MOST_UNKNOWNS = 2304
 """Weights of one result, as of 256 channels and 3 x 3; of more the equations take too long."""
 ROWS_OF_EACH_UNKNOWN = 16
 LEAST_ROWS = 8192
+LEAST_ROWS_OF_EACH = 8
+"""Results for each unknown weight, at least: fewer equations would fit these samples alone."""
 RIDGE = 1e-5
 """The penalty on leaving the old weights, in mean squares of what a convolution reads."""
 FACTORS = np.geomspace(0.6, 3.6, 31)
@@ -252,8 +256,14 @@ class Equations:
         self._count += len(reads)
 
     def solved(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the change of the weights (O, I / groups kh kw) and of the bias (O,)."""
+        """Return the change of the weights (O, I / groups kh kw) and of the bias (O,).
+
+        Few equations change the bias alone.
+        """
         groups, unknowns, results = self._shape
+        if self._count < LEAST_ROWS_OF_EACH * unknowns:
+            bias_change = (self._errors / self._count).ravel()
+            return np.zeros((groups * results, unknowns)), bias_change
         # About the means, so that the bias has no penalty.
         reads = self._reads / self._count
         errors = self._errors / self._count
