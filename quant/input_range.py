@@ -132,7 +132,8 @@ def ranges_of_result(result: np.ndarray, image: np.ndarray, ranges: Ranges) -> R
         return ranges
     shares = to_shares(result, ranges)
     is_of_image = share_within(shares, *AROUND_UNIT) >= MOST and np.ptp(shares) >= LITTLE
-    low, high = float(result.min()), float(result.max())
+    low = float(result.min())
+    high = float(result.max())
     return ranges if is_of_image or not is_range(low, high) else ((low, high),)
 
 
