@@ -25,8 +25,6 @@ SIZES = 1e-6, 65536.0
 AROUND_UNIT = -0.1, 1.1
 """Where nearly all results of a network lie that returns an image in [0, 1], overshoot included."""
 NEARLY_ALL = 0.99
-LITTLE = 0.1
-"""Part of the ranges of its image that a map of the same unit covers."""
 MOST = 0.5
 """Share of a float network's results that lie in its ranges where they are an image, and not of
 another scale.
@@ -116,9 +114,9 @@ def ranges_of_result(result: np.ndarray, image: np.ndarray, ranges: Ranges) -> R
 
     1. A network may read normalised pixels and return an image in [0, 1], of which shares of the
        input's range would hide errors: such a result has the range [0, 1].
-    2. Maps that are no image, such as a detector's, have a unit of their own. If they have another
-       number of channels than the image, and most of their values lie outside its ranges or all
-       within a small part of them, they reach from their smallest to their largest value.
+    2. Maps that are no image, such as a detector's, have a unit of their own. If they have more
+       channels than the image, and most of their values lie outside its ranges, they reach from
+       their smallest to their largest value. A network that returns fewer may read side maps.
     3. Any other result has the ranges of the image's channels.
 
     Args:
@@ -128,10 +126,9 @@ def ranges_of_result(result: np.ndarray, image: np.ndarray, ranges: Ranges) -> R
     """
     if share_within(result, *AROUND_UNIT) >= NEARLY_ALL:
         return ranges if share_within(image, *AROUND_UNIT) >= NEARLY_ALL else ()
-    if result.shape[1] == image.shape[1]:
+    if result.shape[1] <= image.shape[1]:
         return ranges
-    shares = to_shares(result, ranges)
-    is_of_image = share_within(shares, *AROUND_UNIT) >= MOST and np.ptp(shares) >= LITTLE
+    is_of_image = share_within(to_shares(result, ranges), *AROUND_UNIT) >= MOST
     low = float(result.min())
     high = float(result.max())
     return ranges if is_of_image or not is_range(low, high) else ((low, high),)
