@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from beers_deploy.model.io.files import sha256
+from beers_deploy.model.io.files import IMAGE_SUFFIXES, sha256
 from beers_deploy.model.progress import Progress, reporting
 from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.shipped import INT8, SENSOR, VARIANT, shipped_weights
@@ -61,10 +61,26 @@ class Data:
     patch_px: int = 128
     input_range: object = None
 
-    def own(self, network: Network) -> OwnSamples | None:
-        """Read the user's samples for a network, or return None for simulated patches."""
+    def own(self, network: Network, int8: Network | None = None) -> OwnSamples | None:
+        """Read the user's samples for a network, or return None for simulated patches.
+
+        Args:
+            network: the float network.
+            int8: its INT8 network if there is one. Its stated ranges say what pixels of image files
+                stand for, as in `restore`.
+        """
+        ranges = self.input_range
+        if int8 is not None and int8.input_ranges and self._has_pictures:
+            ranges = int8.stated_ranges
         with faults_named(network.label):
-            return samples_of(network.model, self.samples, self.input_range)
+            return samples_of(network.model, self.samples, ranges)
+
+    @property
+    def _has_pictures(self) -> bool:
+        if not isinstance(self.samples, str | os.PathLike):
+            return False
+        files = sample_files(Path(self.samples))
+        return any(file.suffix.lower() in IMAGE_SUFFIXES for file in files)
 
     @property
     def simulated(self) -> "Calibration":
@@ -195,7 +211,7 @@ def compare(
     floating, int8 = pair_of(float_network, int8_network, profile, output)
     data = Data(profile, samples, None if images is None else Path(images), patches, seed)
     with reporting(progress):
-        return compared(floating, int8, data, data.own(floating), metric or "")
+        return compared(floating, int8, data, data.own(floating, int8), metric or "")
 
 
 def compared(

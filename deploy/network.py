@@ -31,7 +31,7 @@ from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.domains import OPSET
 from beers_deploy.quant.encodings import CORE, board_model, read_core, vint8_model
 from beers_deploy.quant.graph import require_one_image
-from beers_deploy.quant.input_range import Ranges
+from beers_deploy.quant.input_range import FROM_SAMPLES, KEY, Ranges, in_words
 from beers_deploy.quant.onnx.external_weights import unchanged
 from beers_deploy.quant.onnx_file import (
     faults_named,
@@ -232,6 +232,22 @@ class Network:
         if CORE not in metadata(self.model):
             return ()
         return read_core(self.model).host_part.input_ranges
+
+    @property
+    def stated_ranges(self) -> Ranges:
+        """The ranges onto which 0 to full scale of an image is mapped; empty for [0, 1].
+
+        Raises:
+            ModelError: ranges of samples, which need not reach as far as full scale.
+        """
+        ranges = self.input_ranges
+        if ranges and FROM_SAMPLES in metadata(self.model).get(KEY, FROM_SAMPLES):
+            raise ModelError(
+                f"{self.label} was quantised for the range of its samples, {in_words(ranges)}, so "
+                "that it is not known which value is full scale. Quantise it again with "
+                "`input_range`."
+            )
+        return ranges
 
     @property
     def precision(self) -> str:

@@ -13,22 +13,20 @@ from beers_deploy.model.metrics.fidelity import psnr_db, ssim
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
 from beers_deploy.profiles.instrument import MAX_DN
-from beers_deploy.quant.input_range import LARGEST, Ranges, to_shares
+from beers_deploy.quant.input_range import (
+    LARGEST,
+    MOST,
+    Ranges,
+    ranges_of_result,
+    share_within,
+    to_shares,
+)
 from beers_deploy.quant.samples.coverage import BINS, SampleRange, histogram, range_from
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import result_of
 from beers_deploy.quant.untrusted import times
 
 SCALE = "of full scale"
-MOST = 0.5
-"""The least share of a float network's results in [0, 1] from which they count as an image, not as
-values of another scale.
-"""
-NEARLY_ALL = 0.99
-AROUND_UNIT = -0.1, 1.1
-"""The range of nearly all results of a network that returns an image in [0, 1],
-overshoot included.
-"""
 
 
 @dataclass(frozen=True)
@@ -229,7 +227,7 @@ def compare(
         contrasts.append(float(np.abs(in_float - in_float.mean()).mean()))
         if reference.shape != in_float.shape:
             unfit[number] = reference
-        elif patches.ranges:
+        elif ranges or patches.ranges:
             reference = to_shares(reference, ranges)
         elif not (reference.min() >= 0 and reference.max() <= LARGEST):
             raise ImageError(
@@ -297,23 +295,15 @@ def _results(
             f"{times(results[0].shape)}. The gate is for networks that make an image of an "
             "image; 'check' and 'bench' read any network."
         )
-    # The float result alone decides, so that both are treated alike. A network may read normalised
-    # pixels and return an image in [0, 1], of which shares of the input's range would hide errors.
-    reads, returns = (_share_within(x, *AROUND_UNIT) for x in (degraded, results[0]))
-    if returns >= NEARLY_ALL > reads:
-        ranges = ()
+    # The float result alone decides, so that both are treated alike.
+    ranges = ranges_of_result(results[0], degraded, ranges)
     results = [to_shares(result, ranges) for result in results]
-    is_image = results[0].shape[1] == degraded.shape[1] and _share_within(results[0], 0, 1) >= MOST
+    is_image = results[0].shape[1] == degraded.shape[1] and share_within(results[0], 0, 1) >= MOST
     in_float, in_int8 = (
         np.where(np.isinf(result), np.nan, np.clip(result, 0, 1) if is_image else result)
         for result in results
     )
     return in_float, in_int8, ranges
-
-
-def _share_within(values: np.ndarray, low: float, high: float) -> float:
-    """Return the share of the values that lie between two."""
-    return float(((values >= low) & (values <= high)).mean())
 
 
 def _name(patches: Patches, number: int) -> str:

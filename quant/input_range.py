@@ -24,6 +24,15 @@ LARGEST = 1 + 1e-6
 """The largest share of a range that counts as 1, which allows for rounding."""
 SIZES = 1e-6, 65536.0
 """The smallest and the largest absolute value of the end of a range."""
+AROUND_UNIT = -0.1, 1.1
+"""The range of nearly all results of a network that returns an image in [0, 1],
+overshoot included.
+"""
+NEARLY_ALL = 0.99
+MOST = 0.5
+"""The least share of a float network's results in its ranges from which they count as an image, not
+as values of another scale.
+"""
 
 
 def read_ranges(option: object, channels: int) -> Ranges:
@@ -85,7 +94,8 @@ def ranges_of(images: Iterable[np.ndarray]) -> Ranges:
     """Return the ranges that images span.
 
     A channel whose values are in [0, 1], but for rounding, gets [0, 1], whatever part of it they
-    cover. Another channel reaches from its smallest value, or 0, to its largest, or 0.
+    cover. Another channel reaches from its smallest value, or 0, to its largest, or 0. Codes of a
+    degradation have channels of 0 whose values are as small as -1e-7, and no scale fits those.
 
     Args:
         images: at least one image (1, C, H, W) in the network's units.
@@ -97,10 +107,40 @@ def ranges_of(images: Iterable[np.ndarray]) -> Ranges:
     low = np.minimum.reduce([low for low, _ in ends])
     high = np.maximum.reduce([high for _, high in ends])
     ranges = tuple(
-        UNIT if a >= 0 and b <= LARGEST else (min(float(a), 0.0), max(float(b), 0.0))
+        UNIT if a > -SIZES[0] and b <= LARGEST else (min(float(a), 0.0), max(float(b), 0.0))
         for a, b in zip(low, high, strict=True)
     )
     return () if set(ranges) == {UNIT} else ranges
+
+
+def ranges_of_result(result: np.ndarray, image: np.ndarray, ranges: Ranges) -> Ranges:
+    """Return the ranges of which a result is compared in shares.
+
+    1. A network may read normalised pixels and return an image in [0, 1], of which shares of the
+       input's range would hide errors: such a result has the range [0, 1].
+    2. Maps that are no image, such as a detector's, have a unit of their own. If they have more
+       channels than the image, and most of their values lie outside its ranges, they reach from
+       their smallest to their largest value. A network that returns fewer may read side maps.
+    3. Any other result has the ranges of the image's channels.
+
+    Args:
+        result: of the float network, (1, C', H', W').
+        image: (1, C, H, W) from which it was computed.
+        ranges: of the image's channels; empty where all are [0, 1].
+    """
+    if share_within(result, *AROUND_UNIT) >= NEARLY_ALL:
+        return ranges if share_within(image, *AROUND_UNIT) >= NEARLY_ALL else ()
+    if result.shape[1] <= image.shape[1]:
+        return ranges
+    is_of_image = share_within(to_shares(result, ranges), *AROUND_UNIT) >= MOST
+    low = float(result.min())
+    high = float(result.max())
+    return ranges if is_of_image or not is_range(low, high) else ((low, high),)
+
+
+def share_within(values: np.ndarray, low: float, high: float) -> float:
+    """Return the share of the values that lie between two."""
+    return float(((values >= low) & (values <= high)).mean())
 
 
 def to_shares(values: np.ndarray, ranges: Ranges) -> np.ndarray:

@@ -34,12 +34,13 @@ from beers_deploy.quant.graph import (
     PLANES,
     Conv,
     Graph,
+    fold_full_scale,
     graph_to_onnx,
     read_planes,
     tensors,
 )
 from beers_deploy.quant.host_part import HostPart
-from beers_deploy.quant.input_range import to_shares
+from beers_deploy.quant.input_range import ranges_of_result, to_shares
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.samples.patches import Pair, Patches
 from beers_deploy.quant.session import open_any_size, open_session, planes_of, result_of
@@ -121,7 +122,7 @@ class Measured:
                 array.
         """
         host_part = result.core.host_part
-        graph = read_planes(result.network.graph)
+        graph = read_planes(result.network.graph, host_part.full_scale)
         names = tensors(graph)
         session = open_session(graph_to_onnx(graph, names, host_part.planes))
         floats = []
@@ -163,8 +164,10 @@ class Measured:
         """
         maes = []
         drops_db = []
-        ranges = self.host_part.input_ranges
-        for image, in_float, (_, reference) in zip(results, self.floats, self.pairs, strict=True):
+        for image, in_float, (given, reference) in zip(
+            results, self.floats, self.pairs, strict=True
+        ):
+            ranges = ranges_of_result(in_float, given, self.host_part.input_ranges)
             float_shares, shares = (to_shares(each, ranges) for each in (in_float, image))
             maes.append(float(np.abs(shares - float_shares).mean()))
             drop_db = math.nan
@@ -194,7 +197,7 @@ class Measured:
             replace(op, weight=rounded_weight(op.weight, axes, powers))
             if isinstance(op, Conv)
             else op
-            for op in graph
+            for op in fold_full_scale(graph, self.host_part.full_scale)
         )
         grids = {
             name: grid_of(low, high, zero_point, powers)

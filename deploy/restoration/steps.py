@@ -14,18 +14,13 @@ import onnx
 from beers_deploy.model.consistency import Consistency
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.network import Network
-from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.quant.input_range import (
-    FROM_SAMPLES,
-    KEY,
     Ranges,
     from_shares,
-    in_words,
     to_shares,
 )
-from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.restoration.bands import in_order
 from beers_deploy.restoration.runtime import Infer
@@ -86,21 +81,6 @@ class InRange:
         return to_shares(self.infer(from_shares(image, self.ranges)), self.ranges)
 
 
-def _stated_ranges(network: Network) -> Ranges:
-    """Return the ranges onto which full scale is mapped for a network; empty for [0, 1].
-
-    Raises:
-        ModelError: the ranges were found in samples, so they need not reach full scale.
-    """
-    ranges = network.input_ranges
-    if ranges and FROM_SAMPLES in metadata(network.model).get(KEY, FROM_SAMPLES):
-        raise ModelError(
-            f"{network.label} was quantised for the range of its samples, {in_words(ranges)}, so "
-            "that it is not known which value is full scale. Quantise it again with `input_range`."
-        )
-    return ranges
-
-
 def exposed_networks(
     networks: Sequence[Network],
     around: Around,
@@ -125,7 +105,7 @@ def exposed_networks(
     """
     built = []
     for network in networks:
-        ranges = _stated_ranges(network)
+        ranges = network.stated_ranges
         others = exposures_of(network, around)
         infers = {factor: opened(other.model) for factor, other in others.items()}
         offset = 0.0

@@ -120,7 +120,7 @@ def gate(
     data = Data(profile, samples, scenes, patches, seed)
     earlier = baseline_for(baseline, {**data.arguments, "output": output}, allowed, metric)
     # Missing references are refused before the networks run.
-    own = data.own(floating)
+    own = data.own(floating, int8)
     require_references(own, allowed, metric)
     comparison = compared(floating, int8, data, own, metric or "")
     verdict = judged(comparison, allowed, earlier, board, own)

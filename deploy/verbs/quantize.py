@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from beers_deploy.model.shipped import SENSOR
-from beers_deploy.profiles.errors import OptionError, optional, printable
+from beers_deploy.profiles.errors import ModelError, OptionError, optional, printable
 from beers_deploy.profiles.shipped import DEFAULT_TARGET
 from beers_deploy.verbs.parameters import (
     Holds,
@@ -223,7 +223,7 @@ DETAILS = frozenset(
 
 
 def _notes(result: "Network", adapt: bool) -> list[str]:
-    """Return what the INT8 file records of its calibration, a sentence each."""
+    """Return what the INT8 file records of its calibration, and whether `restore` runs it."""
     from beers_deploy.quant.adapt.adaptation import ADAPTED
     from beers_deploy.quant.input_range import KEY
     from beers_deploy.quant.onnx_file import metadata
@@ -236,6 +236,10 @@ def _notes(result: "Network", adapt: bool) -> list[str]:
         notes.append(f"input range: {about[KEY]}")
     if adapt and ADAPTED not in about:
         notes.append("`adapt` replaced nothing: the DPU computes all activations of the network")
+    try:
+        _ = result.tiling
+    except ModelError as error:
+        notes.append(f"`restore` does not run it, and `bench` counts whole images: {error}")
     return notes
 
 

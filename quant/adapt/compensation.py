@@ -6,7 +6,8 @@
 2. Each convolution that reads changed tensors is fitted in order, by least squares. From the
    adapted network's tensors it computes approximately what it computed from the original ones. That
    includes a scale for each channel, the correction of the bias, and the remaining error of the
-   layers before.
+   layers before. If the samples are too few for the weights, as in the small maps of a detector,
+   only the bias is corrected.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -30,6 +31,8 @@ take too long.
 """
 ROWS_OF_EACH_UNKNOWN = 16
 LEAST_ROWS = 8192
+LEAST_ROWS_OF_EACH = 8
+"""The least number of results for each unknown weight. Fewer equations would overfit the samples."""
 RIDGE = 1e-5
 """The penalty on changing the weights, relative to the mean square of a convolution's input."""
 FACTORS = np.geomspace(0.6, 3.6, 31)
@@ -259,8 +262,14 @@ class Equations:
         self._count += len(reads)
 
     def solved(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the change of the weights (O, I / groups kh kw) and of the bias (O,)."""
+        """Return the change of the weights (O, I / groups kh kw) and of the bias (O,).
+
+        Few equations change the bias alone.
+        """
         groups, unknowns, results = self._shape
+        if self._count < LEAST_ROWS_OF_EACH * unknowns:
+            bias_change = (self._errors / self._count).ravel()
+            return np.zeros((groups * results, unknowns)), bias_change
         # About the means, so that the bias has no penalty.
         reads = self._reads / self._count
         errors = self._errors / self._count

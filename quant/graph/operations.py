@@ -305,20 +305,37 @@ def read_planes(graph: Graph, full_scale: np.ndarray | None = None) -> Graph:
         full_scale: (C,) the value of each channel that is encoded as 1; None for 1.
     """
     return tuple(
-        _reads_planes(op, full_scale) if isinstance(op, Conv) and op.input == IMAGE else op
+        _reads_planes(op) if isinstance(op, Conv) and op.input == IMAGE else op
+        for op in fold_full_scale(graph, full_scale)
+    )
+
+
+def fold_full_scale(graph: Graph, full_scale: np.ndarray | None) -> Graph:
+    """Return the same graph for an image whose channels are divided by their full scale.
+
+    Args:
+        graph: that reads the image, by convolutions alone.
+        full_scale: (C,) the value of each channel that becomes 1; None returns `graph` itself.
+    """
+    if full_scale is None:
+        return graph
+    gains = full_scale[:, None, None]
+    return tuple(
+        # The channels of a depthwise convolution are its results' axis.
+        replace(op, weight=op.weight * (gains if op.groups == 1 else gains[..., None]))
+        if isinstance(op, Conv) and op.input == IMAGE
+        else op
         for op in graph
     )
 
 
-def _reads_planes(op: Conv, full_scale: np.ndarray | None) -> Conv:
+def _reads_planes(op: Conv) -> Conv:
     unit = np.float32(2.0**PLANES_FRAC_BITS / MAX_DN)
     weight = op.weight
     # Each result of a depthwise convolution reads several planes of its channel, which a depthwise
     # one cannot, so it becomes an ordinary one with zeros for the other channels.
     if op.groups != 1:
         weight = weight * np.eye(op.groups, dtype=np.float32)[:, :, None, None]
-    if full_scale is not None:
-        weight = weight * full_scale[:, None, None]
     # The third plane only makes the steps of the weights finer: in float it adds nothing.
     planes = [weight * (STEP * unit), weight * unit, np.zeros_like(weight)]
     return replace(

@@ -2,20 +2,21 @@
 
 They are one .npy or .npz file of a batch (N, C, H, W), or a folder of images and .npy files of one
 image each, (C, H, W). Values are as the network reads them: in [0, 1] of full scale, unless another
-range is stated or found. Full scale of 8-bit pixels in image files is 255, of larger types 4095. A
-.npz file may contain the input and the target of the network, as `image` and `reference`.
+range is stated or found. Full scale of 8-bit pixels in image files is 255, of larger types 4095;
+0 to full scale are mapped onto a stated range, as in `restore`. A .npz file may contain the input
+and the target of the network, as `image` and `reference`.
 """
 
 import hashlib
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import onnx
 
-from beers_deploy.model.io.files import IMAGE_SUFFIXES
 from beers_deploy.profiles.errors import ImageError, ModelError, OptionError
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.input_range import (
@@ -172,7 +173,8 @@ def read_samples(
         fixed_px: side of the image that the network is fixed to; None cuts large samples to
             patches.
         multiple_px: sides are cut to multiples of it.
-        ranges: that the values must be in; None determines them.
+        ranges: that the values must be in, and onto which pixels of image files are mapped; None
+            determines them.
 
     Raises:
         ImageError: samples that the network does not accept, or samples without any contrast.
@@ -185,12 +187,8 @@ def read_samples(
         label = str(source)
         name = source.name
         folder = source.is_dir()
-        if ranges and any(file.suffix.lower() in IMAGE_SUFFIXES for file in sample_files(source)):
-            raise ImageError(
-                f"The images in {label} have values in [0, 1], but `input_range` is "
-                f"{in_words(ranges)}. Give .npy files of what the network reads."
-            )
-        items = map(stored_one, sample_files(source)) if folder else stored_batch(source)
+        read_one = partial(stored_one, ranges=ranges or ())
+        items = map(read_one, sample_files(source)) if folder else stored_batch(source)
     else:
         items = ((f"{IN_MEMORY}[{k}]", *pair) for k, pair in enumerate(source))
     samples = list[Named]()

@@ -11,6 +11,7 @@ from beers_deploy.model.raster.images import read_pixels
 from beers_deploy.profiles.arrays import load_arrays
 from beers_deploy.profiles.errors import ImageError, printable
 from beers_deploy.profiles.instrument import MAX_DN
+from beers_deploy.quant.input_range import Ranges, from_shares
 from beers_deploy.quant.samples.patches import Pair
 from beers_deploy.quant.untrusted import times
 
@@ -91,10 +92,16 @@ def sample_files(path: Path) -> list[Path]:
     )
 
 
-def stored_one(file: Path) -> tuple[str, np.ndarray, np.ndarray]:
-    """Return name, image (C, H, W) and reference of the one sample in a file of a folder."""
+def stored_one(file: Path, ranges: Ranges = ()) -> tuple[str, np.ndarray, np.ndarray]:
+    """Return name, image (C, H, W) and reference of the one sample in a file of a folder.
+
+    Args:
+        file: the path of an image file, or of a .npy file of values that the network reads.
+        ranges: of the network's channels, onto which 0 to full scale of image files are mapped;
+            empty for [0, 1].
+    """
     if file.suffix.lower() != ARRAY_SUFFIX:
-        image = _bands_first(file, read_pixels(file))
+        image = from_shares(_bands_first(file, read_pixels(file)), ranges)
     else:
         image, _ = _arrays(file)
         if image.ndim != 3:

@@ -1,9 +1,12 @@
 """Mirror the image beyond its borders if a network has no padding and its result is smaller.
 
 1. If no layer pads, the sizes of the result for two sizes of image determine how many pixels per
-   side are missing.
+   side are missing. For a network of a fixed size, other sizes are inferred too.
 2. A Pad in front of the network mirrors half of them at each border. The result then has the size
    of the image, or a multiple of it, and is unchanged inside its border.
+
+A network that pools over the whole image is not changed: a larger image would change its means, and
+so the result inside its border too.
 """
 
 import numpy as np
@@ -13,6 +16,8 @@ from onnx import helper, numpy_helper, shape_inference
 from beers_deploy.quant.onnx.graph import sizes_of
 
 WINDOWS = {"AveragePool", "Conv", "ConvTranspose", "MaxPool", "Pad"}
+WHOLE_IMAGE = "Global", "Reduce"
+"""How the names of operators begin that read the whole image."""
 SIZES_PX = (256, 320), (384, 512)
 """Rows and columns of the two images."""
 MOST_PX = 128
@@ -28,14 +33,21 @@ def with_missing_border(model: onnx.ModelProto) -> onnx.ModelProto:
     Returns:
         The network with a Pad in front, the given one if no border is missing.
     """
-    windows = [node for node in model.graph.node if node.op_type in WINDOWS]
+    nodes = model.graph.node
+    windows = [node for node in nodes if node.op_type in WINDOWS]
     # Zeros that a layer pads with would lie beyond the mirrored border, not at the image's.
-    border_px = 0 if any(map(_is_padded, windows)) else _missing_px(model)
+    is_padded = any(map(_is_padded, windows))
+    reads_all = any(node.op_type.startswith(WHOLE_IMAGE) for node in nodes)
+    border_px = 0 if is_padded or reads_all else _missing_px(model)
     if not border_px:
         return model
     network = onnx.ModelProto()
     network.CopyFrom(model)
     graph = network.graph
+    # The sizes that a file of a fixed size states are those without the border.
+    graph.ClearField("value_info")
+    for dim in graph.output[0].type.tensor_type.shape.dim[2:]:
+        dim.Clear()
     image = graph.input[0].name
     mirrored = f"{image}.mirrored"
     # 2.
@@ -90,8 +102,7 @@ def _result_size(model: onnx.ModelProto, size: tuple[int, int]) -> tuple[int, ..
     network.CopyFrom(model)
     network.graph.ClearField("value_info")
     dims = network.graph.input[0].type.tensor_type.shape.dim
-    # A network of one size is not changed, because the growth of its result is unknown.
-    if len(dims) != 4 or any(dim.dim_value for dim in dims[2:]):
+    if len(dims) != 4:
         return ()
     for dim, side_px in zip(dims[2:], size, strict=True):
         dim.dim_value = side_px

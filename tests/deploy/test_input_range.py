@@ -6,11 +6,13 @@ from typing import Any
 import numpy as np
 import onnxruntime as ort
 import pytest
+import tifffile
 import torch
 from torch import nn
 
 import beers_deploy as bd
 from beers_deploy.profiles.errors import ModelError
+from beers_deploy.quant.encodings import read_core
 from tests.deploy.command_line import done, refused
 from tests.quant.quick import one_guess
 
@@ -121,3 +123,35 @@ def test_restore_maps_full_scale_onto_a_stated_range() -> None:
     np.testing.assert_allclose(restored, np.clip(expected, 0, 1), atol=1e-5)
     with pytest.raises(ModelError, match="Quantise it again with `input_range`"):
         bd.restore(shares, network=found, **how)
+
+
+def test_image_files_are_samples_of_a_stated_range(tmp_path: Path) -> None:
+    """`quantize` and `gate` map full scale of image files onto a stated range, as `restore` does.
+
+    So they find what they find in the same values as arrays. A range that samples alone tell says
+    nothing about full scale, so that `gate` refuses image files for it.
+    """
+    convolution = nn.Conv2d(3, 3, 3, padding=1)
+    with torch.no_grad():
+        convolution.weight.normal_(0, 0.2, generator=torch.Generator().manual_seed(0))
+        convolution.bias.zero_()
+    floating = bd.Network.load(convolution, example=(1, 3, 32, 32))
+    pixels = np.random.default_rng(6).integers(0, 256, (4, 32, 32, 3), np.uint8)
+    pixels[:, 0, :2] = [[0], [255]]
+    for number, image in enumerate(pixels):
+        tifffile.imwrite(tmp_path / f"{number}.tif", image, photometric="rgb")
+    values = np.moveaxis(pixels, -1, 1) / np.float32(255) * 2 - 1
+    cores = []
+    maes = []
+    for given in (tmp_path, values):
+        with one_guess():
+            int8 = bd.quantize(floating, samples=given, input_range=(-1, 1), progress=False)
+        cores.append(read_core(int8.model).convolutions[0])
+        compared = bd.compare(floating, int8, samples=given, progress=False)
+        maes.append(compared.result.mae)
+    np.testing.assert_array_equal(cores[0].weight, cores[1].weight)
+    assert maes[0] == pytest.approx(maes[1], rel=1e-3)
+    with one_guess():
+        found = bd.quantize(floating, samples=values, progress=False)
+    with pytest.raises(ModelError, match="Quantise it again with `input_range`"):
+        bd.gate(floating, found, samples=tmp_path, progress=False)

@@ -193,3 +193,54 @@ def test_commands_do_not_contradict_each_other(
     # The whole image is one tile.
     expected = np.clip(to_shares(int8(samples[:1])[0, 0][None], (ends,)), 0, 1)[0]
     np.testing.assert_allclose(restored, expected, atol=0.01)
+
+
+def fixed(path: Path, side_px: int) -> Path:
+    """Write the network of a file again, fixed to images of a size."""
+    model = onnx.load(path)
+    for dim in model.graph.input[0].type.tensor_type.shape.dim[2:]:
+        dim.dim_value = side_px
+    onnx.save(onnx.shape_inference.infer_shapes(model), path.with_name("fixed.onnx"))
+    return path.with_name("fixed.onnx")
+
+
+def test_unpadded_networks_of_a_fixed_size_get_one_answer(tmp_path: Path) -> None:
+    """Every command takes a network without padding at a fixed size as it takes it at any."""
+    path = drawn(
+        tmp_path / "a.onnx", ["relu", "valid"], adds_image=False, clips=False, padded=False
+    )
+    path = fixed(path, 32)
+    samples = np.random.default_rng(1).uniform(0, 1, (4, 1, 32, 32)).astype(np.float32)
+    assert bd.check(path)
+    with one_guess():
+        int8 = bd.quantize(path, samples=samples, progress=False)
+    assert int8.table is not None
+    assert not any("`restore`" in note for note in int8.table.notes)
+    assert int8(samples[:1]).shape == samples[:1].shape
+    assert bd.gate(path, int8, samples=samples, max_mae=0.1, progress=False)
+    how: dict[str, Any] = {"full_scale": 1, "progress": False, "force": True, "tile": 32}
+    image = np.tile(samples[0, 0], (2, 2))
+    for network in (path, int8):
+        swath = bd.bench(network, tile=32, traditional=False)
+        assert not any("whole images" in note for note in swath.notes)
+        assert bd.restore(image, network=network, **how).shape == image.shape
+
+
+def test_quantize_says_what_restore_refuses(tmp_path: Path) -> None:
+    """A network that pools over its whole image has integers, and no tiles of a larger image."""
+    w = Drawn(1)
+    first = w.conv("image", CHANNELS, 1)
+    gate = w.add("HardSigmoid", w.conv(w.add("GlobalAveragePool", first), CHANNELS, CHANNELS))
+    w.nodes[-1].attribute.append(helper.make_attribute("alpha", 1 / 6))
+    last = w.conv(w.add("Mul", first, gate), 1, CHANNELS)
+    result = helper.make_tensor_value_info(last, onnx.TensorProto.FLOAT, ["N", 1, None, None])
+    graph = w.graph("drawn", [image_info("image", 1, None)], [result])
+    onnx.save(make_model(graph, {}), tmp_path / "a.onnx")
+    path = fixed(tmp_path / "a.onnx", 32)
+    samples = np.random.default_rng(1).uniform(0, 1, (4, 1, 32, 32)).astype(np.float32)
+    with one_guess():
+        int8 = bd.quantize(path, samples=samples, progress=False)
+    assert int8.table is not None
+    assert any("`restore` does not run it" in note for note in int8.table.notes)
+    with pytest.raises(ModelError, match="cannot be tiled"):
+        bd.restore(samples[0, 0], network=int8, full_scale=1, progress=False, force=True, tile=32)

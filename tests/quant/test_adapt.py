@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import beers_deploy as bd
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.quant.adapt.adaptation import ADAPTED, NEAR_DB, adapt
-from beers_deploy.quant.adapt.compensation import compensated
+from beers_deploy.quant.adapt.compensation import Equations, compensated
 from beers_deploy.quant.adapt.replacements import EXACT, Kind, nodes_by_kind, replaced
 from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.encodings import host_model
@@ -526,3 +526,20 @@ def test_nothing_to_replace_is_a_note_and_conditioned_weights_are_refused() -> N
     assert any("replaced nothing" in note for note in int8.table.notes)
     with pytest.raises(OptionError, match="`adapt` has no effect"):
         bd.quantize("convbeers-xs", adapt=True)
+
+
+@given(st.integers(1, 20), st.integers(1, 3))
+def test_few_results_do_not_fit_weights(unknowns: int, groups: int) -> None:
+    """Fewer than eight results for each weight change the bias alone; more find the weights."""
+    generator = np.random.default_rng(unknowns)
+    truth = generator.normal(0, 1, (groups, 2, unknowns))
+    for count, is_fitted in ((8 * unknowns - 1, False), (64 * unknowns + 64, True)):
+        reads = generator.normal(0, 1, (count, groups * unknowns, 1, 1))
+        grouped = reads.reshape(count, groups, 1, unknowns)
+        errors = (truth * grouped).sum(3).reshape(count, -1) + 3
+        equations = Equations(groups, unknowns, 2)
+        equations.add(reads, errors)
+        change, bias = equations.solved()
+        expected = truth.reshape(-1, unknowns) if is_fitted else np.zeros_like(change)
+        np.testing.assert_allclose(change, expected, atol=1e-3)
+        np.testing.assert_allclose(bias, 3 if is_fitted else errors.mean(0), atol=1e-3)

@@ -2,12 +2,14 @@
 refused.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import onnx
 import pytest
+import tifffile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import helper
@@ -18,9 +20,17 @@ from beers_deploy.quant.encodings import encoding_faults, read_core
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import read_network, read_planes
 from beers_deploy.quant.host_part import HostPart, Plain, host_part_from_json, host_part_to_json
-from beers_deploy.quant.input_range import Ranges, from_shares, ranges_of, read_ranges, to_shares
+from beers_deploy.quant.input_range import (
+    Ranges,
+    from_shares,
+    ranges_of,
+    ranges_of_result,
+    read_ranges,
+    to_shares,
+)
 from beers_deploy.quant.integer.reference import agreement, run_core
 from beers_deploy.quant.onnx_file import GraphWriter, image_info, make_model
+from beers_deploy.quant.price import price_rows
 from beers_deploy.quant.samples.own import read_samples
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session, result_of
@@ -253,6 +263,26 @@ def test_figures_do_not_depend_on_the_unit(exponents: list[int], error: float) -
     assert figures[0] == pytest.approx(figures[1], rel=1e-6, abs=1e-9)
 
 
+@pytest.mark.parametrize("block", [1, 2])
+def test_prices_do_not_depend_on_the_unit(block: int) -> None:
+    """A restriction of a DPU costs a network the same share of its range, whatever the unit.
+
+    Channels of unequal units would share a scale in the result, which has a price.
+    """
+    gains = np.full(2, 32.0)
+    images = shares(2, 14, 18)
+    images[0][..., 0, 0] = 1
+    rows = []
+    for unit in (np.ones(2), gains):
+        model = network(2, 2, gains=1 / unit, out_gains=np.repeat(unit, block**2), block=block)
+        samples = scaled(images, unit)
+        pairs = patches(samples, ranges_of(samples))
+        rows.append(price_rows(quickly(model, pairs), pairs))
+    for one, other in zip(*rows, strict=True):
+        for name in one.figures.keys() & {"MAE", "PSNR drop"}:
+            assert one.figures[name].value == pytest.approx(other.figures[name].value, rel=0.02)
+
+
 @given(RANGES)
 def test_shares_are_inverse(ranges: Ranges) -> None:
     """An image that is mapped to its range and back is the image again."""
@@ -302,30 +332,71 @@ def test_samples_tell_the_range() -> None:
         read_samples([(flat, NO_REFERENCE)], 4, None)
 
 
-def _beyond(_: Path) -> object:
-    """Return a sample whose values reach up to 2."""
-    image = shares(1)[0][0]
-    return [(2 * image, NO_REFERENCE)]
+def test_samples_outside_a_stated_range_are_refused() -> None:
+    """Values outside of the stated range are refused."""
+    beyond = [(2 * shares(1)[0][0], NO_REFERENCE)]
+    with pytest.raises(ImageError, match="must be in `input_range`, -1 to 1"):
+        read_samples(beyond, 1, None, ranges=((-1.0, 1.0),))
 
 
-def _pictures(folder: Path) -> object:
-    """Write a file of an image into the folder and return the folder."""
-    (folder / "a.png").touch()
-    return folder
+@settings(max_examples=10)
+@given(st.tuples(PAIRS, PAIRS, PAIRS))
+def test_image_files_are_mapped_onto_a_stated_range(ranges: Ranges) -> None:
+    """0 to full scale of an image file become LOW to HIGH of each channel; a .npy file stays."""
+    pixels = np.random.default_rng(4).integers(0, 256, (8, 9, 3), np.uint8)
+    pixels[0, :2] = [[0], [255]]
+    expected = from_shares(np.moveaxis(pixels, -1, 0) / np.float32(255), ranges)
+    with TemporaryDirectory() as folder:
+        tifffile.imwrite(f"{folder}/a.tif", pixels, photometric="rgb")
+        np.save(f"{folder}/b.npy", expected)
+        samples = read_samples(Path(folder), 3, None, ranges=ranges)
+    for image in samples.all.degraded:
+        np.testing.assert_allclose(image[0], expected, atol=1e-4)
+    assert samples.stated
+
+
+def test_a_channel_of_zeros_may_be_a_little_below() -> None:
+    """Rounding leaves -1e-8 in a degradation code, of which no scale is needed.
+
+    A channel that reaches as far below as the smallest range has its own.
+    """
+    image = shares(2, 8, 8, 1)[0]
+    image[:, 1] = -1e-8
+    assert ranges_of([image]) == ()
+    image[:, 1] = -1e-3
+    assert ranges_of([image]) == ((0.0, 1.0), (pytest.approx(-1e-3), 0.0))
 
 
 @pytest.mark.parametrize(
-    ("write", "message"),
-    [(_beyond, "must be in `input_range`, -1 to 1"), (_pictures, r"Give \.npy files")],
+    ("ends", "size", "is_own"),
+    [
+        ((0.0, 1.0), 0.3, False),
+        ((0.0, 1.0), 20, True),
+        ((0.0, 255.0), 150, False),
+        ((0.0, 255.0), 5, False),
+        ((0.0, 255.0), 3000, True),
+        ((-1.0, 1.0), 40, True),
+    ],
 )
-def test_samples_outside_a_stated_range_are_refused(
-    write: Callable[[Path], object], message: str, tmp_path: Path
+def test_maps_of_another_unit_are_compared_by_their_own_range(
+    ends: tuple[float, float], size: float, is_own: bool
 ) -> None:
-    """Values outside of the stated range are refused, and so are image files, which state their
-    own.
-    """
-    with pytest.raises(ImageError, match=message):
-        read_samples(write(tmp_path), 1, None, ranges=((-1.0, 1.0),))  # type: ignore[arg-type]
+    """Logits of a detector have no range of the image, unless most of them lie in it."""
+    ranges = () if ends == (0, 1) else (ends,) * 2
+    image = from_shares(shares(2, 9, 9, 1)[0], ranges)
+    maps = size * np.random.default_rng(5).uniform(-0.2, 1.5, (1, 3, 9, 9))
+    own = ((maps.min(), maps.max()),)
+    assert ranges_of_result(maps, image, ranges) == (own if is_own else ranges)
+
+
+def test_a_result_of_the_images_channels_keeps_the_range_of_the_image() -> None:
+    """An image that a network makes far too bright is an error, and no map of another unit."""
+    image = shares(3, 9, 9, 1)[0]
+    assert ranges_of_result(100 * image, image, ()) == ()
+    assert ranges_of_result(100 * image, image[:, :2], ()) != ()
+    # A restored image next to a map of noise levels.
+    colours = ((0.0, 255.0),) * 3
+    assert ranges_of_result(250 * image[:, :2], 255 * image, colours) == colours
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,16 @@ from tests.quant.simplify.networks import CHANNELS, conv, made, node
 IMAGE = np.random.default_rng(4).uniform(0, 1, (1, CHANNELS, 18, 23)).astype(np.float32)
 
 
+def sized(model: onnx.ModelProto, rows: int, columns: int) -> onnx.ModelProto:
+    """Return the network fixed to a size, with the sizes of its inner tensors, as exporters do."""
+    for dim, side_px in zip(
+        model.graph.input[0].type.tensor_type.shape.dim[2:], (rows, columns), strict=True
+    ):
+        dim.dim_value = side_px
+    model.graph.output[0].type.tensor_type.ClearField("shape")
+    return onnx.shape_inference.infer_shapes(model)
+
+
 def test_a_network_of_channels_last_becomes_one_of_channels_first() -> None:
     """TensorFlow's exporters leave a Transpose at either end."""
     first = [0, 3, 1, 2]
@@ -40,16 +50,34 @@ def test_a_network_of_channels_last_becomes_one_of_channels_first() -> None:
 
 
 @pytest.mark.parametrize("layers", [1, 2, 5])
-def test_the_image_of_a_network_without_padding_is_mirrored(layers: int) -> None:
-    """Inside the border it computes what it computed before."""
+@pytest.mark.parametrize("is_fixed", [False, True])
+def test_the_image_of_a_network_without_padding_is_mirrored(layers: int, is_fixed: bool) -> None:
+    """Inside the border it computes what it computed before, at a fixed size as at any."""
     tensors = ["x", *(f"c{k}" for k in range(1, layers)), "y"]
     model = made([conv(a, b, pad_px=0) for a, b in pairwise(tensors)])
+    if is_fixed:
+        model = sized(model, *IMAGE.shape[2:])
     short = simplify(model, "a.onnx")
     assert read_network(short).border_px == layers
+    onnx.shape_inference.infer_shapes(short, strict_mode=True)
     inner = result_of(open_session(short), IMAGE)
     assert inner.shape[2:] == IMAGE.shape[2:]
     inner = inner[:, :, layers:-layers, layers:-layers]
     np.testing.assert_allclose(inner, result_of(open_session(model), IMAGE), rtol=1e-4)
+
+
+def test_a_network_that_pools_over_the_image_gets_no_border() -> None:
+    """A larger image would change the mean, and with it the result inside the border."""
+    nodes = [
+        conv("x", "c", pad_px=0),
+        node("GlobalAveragePool", "c", to="pooled"),
+        node("Mul", "c", "pooled"),
+    ]
+    model = sized(made(nodes), *IMAGE.shape[2:])
+    short = simplify(model, "a.onnx")
+    assert "Pad" not in {n.op_type for n in short.graph.node}
+    before, after = (result_of(open_session(each), IMAGE) for each in (model, short))
+    np.testing.assert_array_equal(after, before)
 
 
 def test_layers_with_and_without_padding_together_are_refused() -> None:
