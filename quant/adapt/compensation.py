@@ -32,7 +32,7 @@ take too long.
 ROWS_OF_EACH_UNKNOWN = 16
 LEAST_ROWS = 8192
 LEAST_ROWS_OF_EACH = 8
-"""The least number of results for each unknown weight. Fewer equations would overfit the samples."""
+"""The least number of results for each unknown weight; fewer would overfit the samples."""
 RIDGE = 1e-5
 """The penalty on changing the weights, relative to the mean square of a convolution's input."""
 FACTORS = np.geomspace(0.6, 3.6, 31)
