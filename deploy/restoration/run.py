@@ -31,6 +31,12 @@ from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.cluster import open_cluster
 from beers_deploy.restoration.detectors.fault_list import FOUND, FaultList, list_beside, write_list
 from beers_deploy.restoration.detectors.fix import faults_of, fixed
+from beers_deploy.restoration.interval import (
+    HalfWidths,
+    half_widths_of,
+    interval_beside,
+    write_half_widths,
+)
 from beers_deploy.restoration.memory import peak_memory
 from beers_deploy.restoration.output import Output, require_tiff_name, what_was_done, write_output
 from beers_deploy.restoration.prepare import Pipeline, Restoration
@@ -99,6 +105,7 @@ def restore_file(
         work = pipeline.prepare(fixed(stored, faults), reading, str(image), cluster)
         checks = checks_of(reading.sensors, stored.raster, work.out_shape, work.scale.value)
         require_checkable(output.self_check, checks)
+        bands = () if output.interval is None else half_widths_of(work, output.interval)
         checkpoint = _checkpoint(output, work, faults)
         done_px = checkpoint.rows
         with _kept_for_resuming(checkpoint, bool(work.row_ends)):
@@ -111,6 +118,7 @@ def restore_file(
                 blocks.require(str(image))
         # All rows are finished: a stop now would save nothing.
         with held_back():
+            interval = _write_interval(output, HalfWidths(work.source, checkpoint.read, bands))
             about = what_was_done(work.networks, work.scale)
             write_output(checkpoint, work.source, output, about)
             write_list(faults, list_beside(out, reading.fix_detectors))
@@ -122,7 +130,8 @@ def restore_file(
     if blocks.doubt:
         logger.warning("the result fails the self-check: %s", blocks.doubt)
     row = _row(image.name, work, checkpoint, done_px, time_s, faults)
-    row = replace(row, figures={**row.figures, **_self_check_figures(blocks, self_check_s)})
+    more = {**_self_check_figures(blocks, self_check_s), **interval}
+    row = replace(row, figures={**row.figures, **more})
     listed = reading.fix_detectors not in ("", FOUND)
     return Run(
         title=f"wrote {out}",
@@ -135,7 +144,7 @@ def restore_file(
     )
 
 
-DETAILS = frozenset({"runtime", "sensor check", "self-check", "work factor"})
+DETAILS = frozenset({"runtime", "sensor check", "self-check", "interval", "work factor"})
 """Figures and words for a closer look."""
 
 
@@ -145,6 +154,18 @@ def _self_check_figures(blocks: BlockMap, time_s: float) -> dict[str, Figure]:
         return {}
     source = "the self-check of all blocks: no part of time and throughput"
     return {**blocks.figures, "self-check": measured(time_s, "s", source)}
+
+
+def _write_interval(output: Output, widths: HalfWidths) -> dict[str, Figure]:
+    """Write the half-widths next to the output if they are asked for; return the figures of it."""
+    if output.interval is None:
+        return {}
+    started = time.perf_counter()
+    path = interval_beside(output.path)
+    write_half_widths(path, widths, output.interval, output.compression)
+    logger.info("wrote %s: half-widths of the %d %% interval", path, output.interval)
+    source = f"half-widths of the {output.interval} % interval: computed, written and compared"
+    return {"interval": measured(time.perf_counter() - started, "s", source)}
 
 
 def _inputs(work: Restoration) -> list[Input]:

@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from beers_deploy.model.levels import Level
 from beers_deploy.model.raster.compression import Compression
 from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.shipped import DEFAULT_TARGET, TILE_PX
@@ -49,6 +50,7 @@ def restore(
     cog: bool = False,
     stac: OutputFile | None = None,
     self_check: OutputFile | None = None,
+    interval: Level | None = None,
     strict: bool = False,
     consistency: bool = True,
     exposure: bool = True,
@@ -94,6 +96,9 @@ def restore(
         stac: STAC item of the output to write; needs `cog`.
         self_check: TIFF to write with one pixel for each block of 64 x 64 pixels: whether the
             result, blurred as the sensor blurs, agrees with the image.
+        interval: also write OUT-interval.tif, half-widths that the error of the result stays within
+            in so many percent of the pixels; needs the sensor, and a network with a calibrated
+            interval, as shipped ones have. In Python an array returns (restored, half_width).
         strict: refuse an image whose pixels contradict the sensor, and a result that fails the
             self-check, instead of a warning.
         consistency: make the result agree with the image at low spatial frequencies, if the sensor
@@ -145,7 +150,7 @@ def restore(
         refuse_with(
             "`method` traditional",
             **given("network", "tile", "halo", "resume", "runtime", "threads", "scheduler"),
-            **given("consistency", "exposure", "dry_run"),
+            **given("consistency", "exposure", "dry_run", "interval"),
         )
     else:
         refuse_without("`method` traditional", **given("quality"))
@@ -163,6 +168,7 @@ def restore(
     output = None
     if path is not None and not dry_run:
         how: dict[str, Any] = {"compression": compression, "cog": cog, "resume": resume}
+        how["interval"] = interval
         how["self_check"] = None if self_check is None else Path(self_check)
         output = _output(out, stac, overwrite or resume, fix_detectors or "", **how)
     sensors = sensors_of(sensor)
@@ -189,7 +195,7 @@ def restore(
 
     load = _traditional(quality, unknown) if method == "traditional" else network_pipeline
     if path is None:
-        return restore_array(image, reading, load)
+        return restore_array(image, reading, load, interval)
     if output is None:
         return _preview(path, network_pipeline(), reading)
     run = restore_file(path, output, reading, load)
@@ -229,6 +235,7 @@ def _output(
 ) -> "Output":
     """Return what is written; raise OptionError if it is not named, or if it exists."""
     from beers_deploy.restoration.detectors.fault_list import list_beside
+    from beers_deploy.restoration.interval import interval_beside
     from beers_deploy.restoration.output import Output
 
     if out is None:
@@ -236,15 +243,17 @@ def _output(
             "`out` is missing. Name the TIFF to write, or add `dry_run` to see the plan only."
         )
     path = Path(out)
-    if path.exists() and not may_exist:
-        raise OptionError(
-            f"{path} exists already. Add `overwrite` to replace it, or choose another name."
-        )
+    widths = None if how["interval"] is None else interval_beside(path)
+    for each in (path, widths):
+        if each is not None and each.exists() and not may_exist:
+            raise OptionError(
+                f"{each} exists already. Add `overwrite` to replace it, or choose another name."
+            )
     if stac is not None:
         optional("pystac", "stac")
     # The list of faults is an output of its own where they are searched for.
     listed = list_beside(path, fix_detectors)
-    others = (None if stac is None else Path(stac), listed, how["self_check"])
+    others = (None if stac is None else Path(stac), listed, how["self_check"], widths)
     return Output(path, others=others, **how)
 
 
