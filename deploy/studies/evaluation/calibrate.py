@@ -95,13 +95,16 @@ def interval_from_pairs(
 
 
 def write_with_interval(source: Path, interval: PixelInterval, out: Path) -> None:
-    """Write a copy of a network's file with an interval; weights and integers stay as they are."""
+    """Write a copy of a network's file with an interval.
+
+    Weights, integers and results stay as they are; a float ONNX file becomes its simplest equal, as
+    in all that is made of it.
+    """
     text = interval.to_json()
     if source.suffix == ".safetensors":
         tensors, header = read_tensors(source)
         write_tensors(out, tensors, {**header, INTERVAL: text})
         return
-    # Not simplified, so that the copy computes what the file computes.
-    model = load_onnx(source, to_run=False)
+    model = load_onnx(source)
     onnx.helper.set_model_props(model, {**metadata(model), INTERVAL: text})
     save_onnx(model, out)
