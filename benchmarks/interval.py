@@ -54,13 +54,8 @@ REFERENCE = Sensor.load("pleiades-reference").nominal()
 FAMILY = SensorFamily(LIKE.nominal(), other_curves=0.3)
 RECIPES = SHIPPED.parent / "recipes"
 
-CROP_PX = 160
 LEAST_PX = 2 * BORDER_PX + 64
 OVERSAMPLINGS = (4, 2)
-FITTED_A_SITE = 4
-HELD_OUT_A_SITE = 20
-"""Acquisitions of each place, each by another sensor."""
-
 BLOCK_PX = 16
 JUDGED = {
     "pleiades-degraded": LIKE,
@@ -141,24 +136,41 @@ def restored(name: str, image: Acquired) -> np.ndarray:
     return network_restore(network, profile, REFERENCE, BOTH)(image.raw)
 
 
-def training_images(folders: Iterable[Path]) -> tuple[list[Acquired], list[Acquired]]:
+@dataclass(frozen=True)
+class Amount:
+    """How much is acquired, each time by another sensor.
+
+    Attributes:
+        fitted: acquisitions of a place that networks were trained on.
+        held_out: acquisitions of a place that was held out of the training.
+        crop_px: side of the window of the scene, in pixels of the sensor.
+    """
+
+    fitted: int = 4
+    held_out: int = 20
+    crop_px: int = 160
+
+
+def training_images(
+    folders: Iterable[Path], amount: Amount
+) -> tuple[list[Acquired], list[Acquired]]:
     """Acquire places that networks were trained on, and places that were held out of that."""
     recipe = tomllib.loads((RECIPES / "convbeers-s.toml").read_text(encoding="utf-8"))
     parts: tuple[list[Acquired], list[Acquired]] = ([], [])
     for number, (site, paths) in enumerate(by_site(folders).items()):
         is_held_out = site in recipe["held_out"]
-        count = HELD_OUT_A_SITE if is_held_out else FITTED_A_SITE
+        count = amount.held_out if is_held_out else amount.fitted
         for k in range(count):
             path = paths[k * len(paths) // count]
-            image = acquired(path, FAMILY.draw, (number, k), CROP_PX)
+            image = acquired(path, FAMILY.draw, (number, k), amount.crop_px)
             if image is not None:
                 parts[is_held_out].append(image)
     return parts
 
 
-def calibrate(names: Iterable[str], folders: Iterable[Path]) -> None:
+def calibrate(names: Iterable[str], folders: Iterable[Path], amount: Amount) -> None:
     """Write the intervals of shipped networks, in float32 and INT8."""
-    fitted, held_out = training_images(folders)
+    fitted, held_out = training_images(folders, amount)
     print(f"{len(fitted)} acquisitions fitted, {len(held_out)} held out", flush=True)
     for name in names:
         intervals = {}
@@ -344,9 +356,13 @@ def main() -> None:
     parser.add_argument("names", nargs="*")
     parser.add_argument("--images", type=Path, nargs="+", required=True)
     parser.add_argument("--plot", type=Path)
+    parser.add_argument("--fitted", type=int, default=Amount.fitted)
+    parser.add_argument("--held-out", type=int, default=Amount.held_out)
+    parser.add_argument("--crop", type=int, default=Amount.crop_px)
     arguments = parser.parse_args()
     if arguments.task == "calibrate":
-        calibrate(arguments.names or shipped_names(), arguments.images)
+        amount = Amount(arguments.fitted, arguments.held_out, arguments.crop)
+        calibrate(arguments.names or shipped_names(), arguments.images, amount)
         return
     first, *others = arguments.names or [f"{shipped_names()[0]}{INT8}"]
     for text in tables(first, arguments.images, arguments.plot):
