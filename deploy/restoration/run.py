@@ -16,6 +16,7 @@ from importlib.metadata import version
 from math import prod
 from pathlib import Path
 
+from beers_deploy.model.interval import HalfWidth
 from beers_deploy.model.io.files import require_writable
 from beers_deploy.model.io.lock import only_run
 from beers_deploy.model.progress import held_back, steps
@@ -118,7 +119,7 @@ def restore_file(
                 blocks.require(str(image))
         # All rows are finished: a stop now would save nothing.
         with held_back():
-            interval = _write_interval(output, HalfWidths(work.source, checkpoint.read, bands))
+            interval = _write_interval(output, work, checkpoint, bands)
             about = what_was_done(work.networks, work.scale)
             write_output(checkpoint, work.source, output, about)
             write_list(faults, list_beside(out, reading.fix_detectors))
@@ -156,13 +157,17 @@ def _self_check_figures(blocks: BlockMap, time_s: float) -> dict[str, Figure]:
     return {**blocks.figures, "self-check": measured(time_s, "s", source)}
 
 
-def _write_interval(output: Output, widths: HalfWidths) -> dict[str, Figure]:
+def _write_interval(
+    output: Output, work: Restoration, checkpoint: Checkpoint, bands: tuple[HalfWidth, ...]
+) -> dict[str, Figure]:
     """Write the half-widths next to the output if they are asked for; return the figures of it."""
     if output.interval is None:
         return {}
     started = time.perf_counter()
     path = interval_beside(output.path)
-    write_half_widths(path, widths, output.interval, output.compression)
+    widths = HalfWidths(work.source, checkpoint.read, bands)
+    with checkpoint.disk():
+        write_half_widths(path, widths, output.interval, output.compression)
     logger.info("wrote %s: half-widths of the %d %% interval", path, output.interval)
     source = f"half-widths of the {output.interval} % interval: computed, written and compared"
     return {"interval": measured(time.perf_counter() - started, "s", source)}
