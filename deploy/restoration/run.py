@@ -32,12 +32,8 @@ from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.cluster import open_cluster
 from beers_deploy.restoration.detectors.fault_list import FOUND, FaultList, list_beside, write_list
 from beers_deploy.restoration.detectors.fix import faults_of, fixed
-from beers_deploy.restoration.interval import (
-    HalfWidths,
-    half_widths_of,
-    interval_beside,
-    write_half_widths,
-)
+from beers_deploy.restoration.interval.file import interval_beside, write_half_widths
+from beers_deploy.restoration.interval.half_widths import HalfWidths, half_widths_of
 from beers_deploy.restoration.memory import peak_memory
 from beers_deploy.restoration.output import Output, require_tiff_name, what_was_done, write_output
 from beers_deploy.restoration.prepare import Pipeline, Restoration

@@ -235,7 +235,7 @@ def _output(
 ) -> "Output":
     """Return what is written; raise OptionError if it is not named, or if it exists."""
     from beers_deploy.restoration.detectors.fault_list import list_beside
-    from beers_deploy.restoration.interval import interval_beside
+    from beers_deploy.restoration.interval.file import interval_beside
     from beers_deploy.restoration.output import Output
 
     if out is None:

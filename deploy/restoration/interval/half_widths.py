@@ -1,22 +1,17 @@
-"""The half-widths of a restored image: computed from its finished rows, and written next to it.
+"""The half-widths of a restored image, computed from its finished rows.
 
 `model.interval` has the formula. A half-width depends on restored pixels within CONTEXT_PX and on
 nothing else, so the rows that are asked for, tiles and a resumed run change no byte.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 
 from beers_deploy.model.interval import CONTEXT_PX, HalfWidth, PixelInterval
-from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.levels import INTERVAL, Level
-from beers_deploy.model.raster.compression import Compression
-from beers_deploy.model.raster.facts import BandInfo, Raster
 from beers_deploy.model.raster.source import Source, strips
-from beers_deploy.model.raster.writer import write_raster
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.sensor import Sensor
@@ -28,15 +23,8 @@ from beers_deploy.restoration.prepare import Restoration
 ROWS_PX = 32
 """Rows that are computed at a time, so that all intermediate arrays stay small."""
 
-ENDING = "-interval.tif"
-
 ReadRows = Callable[[int, int, int], np.ndarray]
 """Return restored rows (rows, width) as stored, given the band, the first row and the end."""
-
-
-def interval_beside(out: Path) -> Path:
-    """Return the path of the file of half-widths of a restored image."""
-    return out.with_name(f"{out.stem}{ENDING}")
 
 
 def interval_of(network: Network) -> PixelInterval:
@@ -129,32 +117,3 @@ def require_known(sensors: Mapping[str, Sensor]) -> None:
             "`interval` needs the sensor of every band, whose noise is its unit. Name it with "
             "`sensor`, or leave `interval` out."
         )
-
-
-def write_half_widths(
-    path: Path, widths: HalfWidths, level: Level, compression: Compression
-) -> None:
-    """Write half-widths as a GeoTIFF of float32 with one plane for each band, NaN where a pixel is
-    missing, in the units and at the place of the restored image.
-    """
-    raster = widths.source.raster
-    infos = raster.band_info or (BandInfo(),) * raster.bands
-    named = tuple(
-        replace(
-            info,
-            name=f"{info.name or f'band {band}'}: half-width",
-            # An offset shifts values, and a half-width is a difference of two.
-            offset=0.0,
-            tags=(("level_percent", str(level)),),
-        )
-        for band, info in enumerate(infos, 1)
-    )
-    facts = Raster(
-        *raster.shape,
-        np.dtype(np.float32),
-        nodata=float("nan"),
-        place=raster.place,
-        band_info=named,
-    )
-    with whole_file(path) as temporary:
-        write_raster(temporary, facts, widths, compression, "beers-deploy")
