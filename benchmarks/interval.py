@@ -262,7 +262,8 @@ def block_means(pixels: np.ndarray) -> np.ndarray:
     """Return the means over whole blocks of BLOCK_PX, in one row."""
     rows, columns = (size // BLOCK_PX for size in pixels.shape)
     whole = pixels[: rows * BLOCK_PX, : columns * BLOCK_PX]
-    return whole.reshape(rows, BLOCK_PX, columns, BLOCK_PX).mean((1, 3)).ravel()
+    blocks = whole.reshape(rows, BLOCK_PX, columns, BLOCK_PX)
+    return np.asarray(blocks.mean((1, 3))).ravel()
 
 
 def judgements(
