@@ -15,6 +15,7 @@ from beers_deploy import __version__
 from beers_deploy.model.bank import FILTERS, in_places, network_bank
 from beers_deploy.model.family import sensor_vector
 from beers_deploy.model.io.tensors import Weights, read_conditioned, read_plain
+from beers_deploy.model.levels import INTERVAL
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
@@ -34,9 +35,7 @@ def float_for(path: Path, name: str, sensor: Sensor, tile_px: int | None = None)
         tile_px: as in `to_onnx`.
     """
     weights = read_conditioned(path)
-    return banked_to_onnx(
-        weights, sensor.nominal(), about(name, weights.recipe, sensor.name), tile_px
-    )
+    return banked_to_onnx(weights, sensor.nominal(), about(name, weights, sensor.name), tile_px)
 
 
 def to_onnx(
@@ -175,15 +174,22 @@ def float_model(path: Path) -> onnx.ModelProto:
     if path.suffix != ".safetensors":
         return load_onnx(path)
     weights = read_plain(path)
-    return to_onnx(weights, about(path.stem, weights.recipe))
+    return to_onnx(weights, about(path.stem, weights))
 
 
-def about(variant: str, recipe: dict[str, object], sensor: str | None = None) -> dict[str, str]:
-    """Return the metadata of an exported file. `sensor` is the name of the sensor that it was
-    conditioned on.
+def about(variant: str, weights: Weights, sensor: str | None = None) -> dict[str, str]:
+    """Return the metadata of an exported file.
+
+    Args:
+        variant: the name that the network is listed under.
+        weights: of the network.
+        sensor: the name of the one that it is conditioned on; that of the recipe if None.
     """
+    recipe = weights.recipe
+    interval = {INTERVAL: weights.interval} if weights.interval else {}
     return {
         "variant": variant,
         "sensor": sensor if sensor is not None else str(recipe.get("degraded", "")),
         "reference": str(recipe.get("reference", "")),
+        **interval,
     }

@@ -49,7 +49,7 @@ def export_float(path: Path, out: Path, sensor: SensorLike | None, tile: int | N
         )
     else:
         weights = read_plain(path)
-        model = to_onnx(weights, about(path.stem, weights.recipe), tile)
+        model = to_onnx(weights, about(path.stem, weights), tile)
     if path.parent == SHIPPED:
         save_onnx(model, out)
         logger.info("wrote %s", out)

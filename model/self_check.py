@@ -125,18 +125,16 @@ class SelfCheck:
                 itself if None.
         """
         scale = sensor.max_dn if full_scale is None else full_scale
-        unit = scale / sensor.max_dn
         kernel = centre(blur_between(sensor, reference), REACH_PX)
         # The kernel has long tails: cut without this, a constant image would come out darker.
         kernel = kernel + (1 - kernel.sum()) / kernel.size
         left, values, right = np.linalg.svd(kernel)
         terms = np.count_nonzero(values > LEAST_TERM * values[0])
-        dark_dn, growth_dn, square = _variances(sensor)
         return cls(
             rows=(left[:, :terms] * values[:terms]).T.astype(np.float32),
             columns=right[:terms].astype(np.float32),
-            variances=(dark_dn * unit**2, growth_dn * unit, square),
-            offset=sensor.offset_dn * unit,
+            variances=noise_variances(sensor, scale),
+            offset=sensor.offset_dn * scale / sensor.max_dn,
             full_scale=float(scale),
         )
 
@@ -216,13 +214,18 @@ def _beyond(placed: Placed, side: int) -> tuple[int, int]:
     return before, REACH_PX - (placed.start + side - placed.keep_stop)
 
 
-def _variances(sensor: Instrument) -> tuple[float, float, float]:
-    """Return the noise's variance in the dark in DN^2, its growth in DN, and its share of the
-    squared light.
+def noise_variances(sensor: Instrument, full_scale: float) -> tuple[float, float, float]:
+    """Return the noise's variance in the dark, its growth with the light, and its share of the
+    squared light, in pixel values.
 
     The differences of detectors that a profile states count as noise, because no single one of them
     is known. 1/12 is the variance of rounding to integers.
+
+    Args:
+        sensor: the instrument.
+        full_scale: the pixel value that is the sensor's largest digital number.
     """
+    unit = full_scale / sensor.max_dn
     gain = sensor.gain_dn_per_radiance
     dark = sensor.beta * gain**2 + 1 / 12
     square = 0.0
@@ -233,7 +236,7 @@ def _variances(sensor: Instrument) -> tuple[float, float, float]:
             dark += (effect.odd_even_dn / 2) ** 2
         elif isinstance(effect, Prnu):
             square = effect.rms**2
-    return dark, sensor.alpha * gain, square
+    return dark * unit**2, sensor.alpha * gain * unit, square
 
 
 def _filled(pixels: Image, missing: NDArray[np.bool_]) -> Image:

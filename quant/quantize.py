@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import onnx
 
+from beers_deploy.model.levels import INTERVAL
 from beers_deploy.model.progress import step
 from beers_deploy.quant.core import SHIFTS, IntCore, RoundedConvs, Shifts, build_core
 from beers_deploy.quant.encodings import host_model
@@ -195,8 +196,10 @@ def quantize_model(
     # 3. to 7.
     core, final = rounded(plan, patches.degraded)
     shares = (to_shares(image, patches.ranges) for image in patches.degraded)
+    # The interval of the float network does not hold for the integers, whose errors are others.
+    own = {key: value for key, value in metadata(model).items() if key != INTERVAL}
     about = {
-        **metadata(model),
+        **own,
         "precision": "int8 legal",
         "calibration_sha256": patches.digest,
         KEY: range_from(sum(map(histogram, shares), np.zeros(1))).to_words(),

@@ -16,6 +16,7 @@
     figures      the figures of a run
     checkpoint   the finished rows on the disk and their journal, from which a later run continues
     output       from the finished rows to the TIFF, plain or cloud-optimised
+    interval     the half-widths of the result, from its finished rows
     stac         the STAC items of a cloud-optimised output and of its networks
     run          all of this for one file: `restore_file`
     arrays       all of this for an array in memory: `restore_array`

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from beers_deploy.model.levels import Level
 from beers_deploy.model.progress import steps
 from beers_deploy.model.raster.facts import (
     MaskKind,
@@ -21,6 +22,7 @@ from beers_deploy.model.raster.facts import (
 )
 from beers_deploy.model.raster.source import ArraySource
 from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.restoration.interval.half_widths import HalfWidths, half_widths_of
 from beers_deploy.restoration.prepare import NetworkPipeline, Pipeline
 from beers_deploy.restoration.radiometry import Reading
 from beers_deploy.restoration.tiles.engine import NAME
@@ -28,8 +30,10 @@ from beers_deploy.restoration.tiles.lazy import restore_lazily
 from beers_deploy.restoration.tiles.rows import gathered
 
 
-def restore_array(image: Any, reading: Reading, load: Callable[[], Pipeline]) -> Any:
-    """Restore an array of any kind, and return the same kind.
+def restore_array(
+    image: Any, reading: Reading, load: Callable[[], Pipeline], level: Level | None = None
+) -> Any:
+    """Restore an array of any kind, and return the same kind; with a level also its half-widths.
 
     Args:
         image: (H, W) or (bands, H, W). Arrays of NumPy (masked or not) and torch are restored at
@@ -37,19 +41,32 @@ def restore_array(image: Any, reading: Reading, load: Callable[[], Pipeline]) ->
             attributes.
         reading: how its pixels are interpreted.
         load: returns the pipeline that restores it.
+        level: of the interval whose half-widths are returned too; None for none.
     """
+    results = _restored_and_width(image, reading, load, level)
+    return results[0] if level is None else tuple(results)
+
+
+def _restored_and_width(
+    image: Any, reading: Reading, load: Callable[[], Pipeline], level: Level | None
+) -> list[Any]:
+    """Return the restored array, and with a level its half-widths, of the kind of the image."""
     # Arrays of xarray and torch are recognised by their attributes, so that neither is imported.
     if hasattr(image, "coords") and hasattr(image, "dims"):
-        return _restore_labelled(image, reading, load)
+        return _restore_labelled(image, reading, load, level)
     if hasattr(image, "detach"):
-        restored = _restore(image.detach().cpu().numpy(), reading, load)
-        return import_module("torch").from_numpy(restored).to(image.device)
+        torch = import_module("torch")
+        results = _restore(image.detach().cpu().numpy(), reading, load, level)
+        return [torch.from_numpy(pixels).to(image.device) for pixels in results]
+    results = _restore(image, reading, load, level)
     if np.ma.isMaskedArray(image):
-        return _restore_masked(image, reading, load)
-    return _restore(image, reading, load)
+        return [_masked_like(image, pixels) for pixels in results]
+    return results
 
 
-def _restore_labelled(image: Any, reading: Reading, load: Callable[[], Pipeline]) -> Any:
+def _restore_labelled(
+    image: Any, reading: Reading, load: Callable[[], Pipeline], level: Level | None
+) -> list[Any]:
     """Restore an xarray.DataArray. The bands may follow the rows and columns if the name of their
     dimension identifies them.
     """
@@ -69,16 +86,16 @@ def _restore_labelled(image: Any, reading: Reading, load: Callable[[], Pipeline]
     if image.ndim == 3 and bands is None and ordered.shape[-1] <= FEW < min(ordered.shape[:-1]):
         raise _bands_last(ordered.shape, "name the dimension of the bands 'band'.")
     reading = replace(reading, full_scale=full_scale, nodata=nodata)
-    pixels = _restore(ordered.data, reading, load)
-    restored = _labelled(ordered, pixels)
-    return restored if restored.ndim != len(dims) else restored.transpose(*dims)
+    labelled = [
+        _labelled(ordered, pixels) for pixels in _restore(ordered.data, reading, load, level)
+    ]
+    return [each if each.ndim != len(dims) else each.transpose(*dims) for each in labelled]
 
 
-def _restore_masked(image: Any, reading: Reading, load: Callable[[], Pipeline]) -> Any:
-    """Restore a masked array. Masked pixels are missing and stay masked. The mask is enlarged with
-    the image.
+def _masked_like(image: Any, restored: np.ndarray) -> Any:
+    """Return restored pixels as a masked array. Masked pixels of the image stay masked. The mask is
+    enlarged with the image.
     """
-    restored = _restore(image, reading, load)
     mask = np.ma.getmaskarray(image)
     scale = restored.shape[-1] // mask.shape[-1]
     mask = mask.repeat(scale, axis=-2).repeat(scale, axis=-1)
@@ -88,25 +105,29 @@ def _restore_masked(image: Any, reading: Reading, load: Callable[[], Pipeline]) 
     return np.ma.array(restored, mask=mask)
 
 
-def _restore(image: Any, reading: Reading, load: Callable[[], Pipeline]) -> Any:
+def _restore(
+    image: Any, reading: Reading, load: Callable[[], Pipeline], level: Level | None
+) -> list[Any]:
     bands = _bands_first(image)
     raster = _raster(bands, reading.nodata)
     if not hasattr(image, "__dask_graph__"):
-        restored = _restore_now(bands, raster, reading, load())
+        results = _restore_now(bands, raster, reading, load(), level)
     elif np.ma.isMaskedArray(getattr(image, "_meta", None)):
         raise ImageError(
             "`image` is a masked Dask array, which is not supported. Fill it with "
             "dask.array.ma.filled(image, 0) and give that value as `nodata`, or compute it first."
         )
     else:
+        if level is not None:
+            raise OptionError("`interval` needs pixels in memory. Compute the Dask array first.")
         pipeline = load()
         if not isinstance(pipeline, NetworkPipeline):
             raise OptionError(
                 "`method` must be 'network' for a Dask array. Compute the array first, or use a "
                 "network."
             )
-        restored = restore_lazily(bands, raster, pipeline, reading)
-    return restored[0] if image.ndim == 2 and len(restored) == 1 else restored
+        results = [restore_lazily(bands, raster, pipeline, reading)]
+    return [each[0] if image.ndim == 2 and len(each) == 1 else each for each in results]
 
 
 def _labelled(image: Any, pixels: Any) -> Any:
@@ -145,14 +166,21 @@ def _between(places: np.ndarray, count: int) -> np.ndarray | None:
 
 
 def _restore_now(
-    bands: np.ndarray, raster: Raster, reading: Reading, pipeline: Pipeline
-) -> np.ndarray:
+    bands: np.ndarray, raster: Raster, reading: Reading, pipeline: Pipeline, level: Level | None
+) -> list[np.ndarray]:
     work = pipeline.prepare(ArraySource(bands, raster), reading, NAME)
+    widths = () if level is None else half_widths_of(work, level)
     with steps("restoring", work.ticks(0)) as bar:
         pixels, tally = gathered(work.rows(0, bar.advance), work.out_shape, raster.out_dtype)
     if not reading.force:
         tally.require(name=NAME)
-    return pixels
+    if not widths:
+        return [pixels]
+    half = HalfWidths(work.source, lambda band, top, stop: pixels[band, top:stop], widths)
+    return [
+        pixels,
+        np.stack([half.read(band, 0, raster.height_px) for band in range(raster.bands)]),
+    ]
 
 
 BAND_DIMS = ("band", "bands", "channel", "wavelength")

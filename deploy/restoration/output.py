@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from beers_deploy.model.io.files import TIFF_SUFFIXES
+from beers_deploy.model.levels import Level
 from beers_deploy.model.raster.compression import Compression
 from beers_deploy.model.raster.facts import RESTORED_BY
 from beers_deploy.model.raster.source import Source
@@ -32,6 +33,7 @@ class Output:
         cog: whether it is a Cloud-Optimised GeoTIFF.
         resume: whether a stopped run goes on.
         self_check: where the map of the self-check is written; None for nowhere.
+        interval: the level of the half-widths that are written next to the TIFF; None for none.
         others: further files that will be written, which must be no input either.
     """
 
@@ -40,6 +42,7 @@ class Output:
     cog: bool = False
     resume: bool = False
     self_check: Path | None = None
+    interval: Level | None = None
     others: tuple[Path | None, ...] = ()
 
 

@@ -16,6 +16,7 @@ from importlib.metadata import version
 from math import prod
 from pathlib import Path
 
+from beers_deploy.model.interval import HalfWidth
 from beers_deploy.model.io.files import require_writable
 from beers_deploy.model.io.lock import only_run
 from beers_deploy.model.progress import held_back, steps
@@ -32,6 +33,8 @@ from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.cluster import open_cluster
 from beers_deploy.restoration.detectors.fault_list import FOUND, FaultList, list_beside, write_list
 from beers_deploy.restoration.detectors.fix import faults_of, fixed
+from beers_deploy.restoration.interval.file import interval_beside, write_half_widths
+from beers_deploy.restoration.interval.half_widths import HalfWidths, half_widths_of
 from beers_deploy.restoration.memory import peak_memory
 from beers_deploy.restoration.output import Output, require_tiff_name, what_was_done, write_output
 from beers_deploy.restoration.prepare import Pipeline, Restoration
@@ -102,6 +105,7 @@ def restore_file(
         work = pipeline.prepare(fixed(stored, faults), reading, str(image), cluster)
         checks = checks_of(reading.sensors, stored.raster, work.out_shape, work.scale.value)
         require_checkable(output.self_check, checks)
+        bands = () if output.interval is None else half_widths_of(work, output.interval)
         checkpoint = _checkpoint(output, work, faults)
         done_px = checkpoint.rows
         with _kept_for_resuming(checkpoint, bool(work.row_ends)):
@@ -114,6 +118,7 @@ def restore_file(
                 blocks.require(str(image))
         # All rows are finished: a stop now would save nothing.
         with held_back():
+            interval = _write_interval(output, work, checkpoint, bands)
             about = what_was_done(work.networks, work.scale)
             write_output(checkpoint, work.source, output, about)
             write_list(faults, list_beside(out, reading.fix_detectors))
@@ -125,7 +130,8 @@ def restore_file(
     if blocks.doubt:
         logger.warning("the result fails the self-check: %s", blocks.doubt)
     row = _row(image.name, work, checkpoint, done_px, time_s, faults)
-    row = replace(row, figures={**row.figures, **_self_check_figures(blocks, self_check_s)})
+    more = {**_self_check_figures(blocks, self_check_s), **interval}
+    row = replace(row, figures={**row.figures, **more})
     listed = reading.fix_detectors not in ("", FOUND)
     return Run(
         title=f"wrote {out}",
@@ -139,7 +145,7 @@ def restore_file(
     )
 
 
-DETAILS = frozenset({"runtime", "sensor check", "self-check", "work factor"})
+DETAILS = frozenset({"runtime", "sensor check", "self-check", "interval", "work factor"})
 """Figures and words for a closer look."""
 
 
@@ -149,6 +155,22 @@ def _self_check_figures(blocks: BlockMap, time_s: float) -> dict[str, Figure]:
         return {}
     source = "the self-check of all blocks: no part of time and throughput"
     return {**blocks.figures, "self-check": measured(time_s, "s", source)}
+
+
+def _write_interval(
+    output: Output, work: Restoration, checkpoint: Checkpoint, bands: tuple[HalfWidth, ...]
+) -> dict[str, Figure]:
+    """Write the half-widths next to the output if they are asked for; return the figures of it."""
+    if output.interval is None:
+        return {}
+    started = time.perf_counter()
+    path = interval_beside(output.path)
+    widths = HalfWidths(work.source, checkpoint.read, bands)
+    with checkpoint.disk():
+        write_half_widths(path, widths, output.interval, output.compression)
+    logger.info("wrote %s: half-widths of the %d %% interval", path, output.interval)
+    source = f"half-widths of the {output.interval} % interval: computed, written and compared"
+    return {"interval": measured(time.perf_counter() - started, "s", source)}
 
 
 def _inputs(work: Restoration) -> list[Input]:

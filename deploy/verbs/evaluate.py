@@ -16,6 +16,7 @@ from beers_deploy.verbs.parameters import (
     Interval,
     LabelledFolder,
     Methods,
+    OutputFile,
     OutputFolder,
     Pairs,
     Progress,
@@ -45,6 +46,7 @@ def evaluate(
     reference: SensorLike | None = None,
     lpips: InputPath | None = None,
     out: Annotated[OutputFolder, Holds(PAGE, folders=("",))] | None = None,
+    calibrate: OutputFile | None = None,
     sweep: bool = False,
     brightness: Factors = "1",
     bits_per_pixel: Factors | None = None,
@@ -79,6 +81,9 @@ def evaluate(
         reference: sensor of the reference images; pleiades-reference if none.
         lpips: weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.
         out: folder for report.html and pictures.
+        calibrate: copy of the network's file to write with the interval that 'restore --interval'
+            uses, fitted on these pairs; `methods` must be that file alone. A level of 90 % takes
+            9 images at least, beyond those of the sites that the fit takes.
         sweep: also compare under 16 sensors that are known exactly, and 7 that are known wrongly.
         brightness: also compare with the radiance of the scenes times these factors, separated by
             commas, such as 0.25,0.05.
@@ -117,8 +122,8 @@ def evaluate(
     given = partial(changed, evaluate, locals())
     if detector is not None:
         steps = ("consistency", "exposure", "strict")
-        also = ("sweep", "brightness", "bits_per_pixel")
-        refuse_with("`detector`", **given("pairs", "lpips", *also, *steps))
+        others = ("pairs", "lpips", "calibrate", "sweep", "brightness", "bits_per_pixel", *steps)
+        refuse_with("`detector`", **given(*others))
         return _detection(
             methods,
             images,
@@ -139,6 +144,7 @@ def evaluate(
         # An empty folder is refused before torch is loaded.
         list_images(Path(images))
     from beers_deploy.restoration.steps import Around
+    from beers_deploy.studies.evaluation.calibrate import calibrate_network, network_to_calibrate
     from beers_deploy.studies.evaluation.compression import check_rates
     from beers_deploy.studies.evaluation.pairs import check_brightness
     from beers_deploy.studies.evaluation.run import Plan, run_evaluation
@@ -166,7 +172,10 @@ def evaluate(
         around=Around(consistency, exposure),
         seed=seed,
     )
+    source = None if calibrate is None else network_to_calibrate(plan.methods, Path(calibrate))
     table = run_evaluation(plan)
+    if source is not None and calibrate is not None:
+        calibrate_network(table, *source, Path(calibrate))
     if folder is not None:
         logger.info("wrote %s", table.report(folder))
     return table

@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from beers_deploy.model.levels import Level
 from beers_deploy.model.raster.compression import Compression
 from beers_deploy.profiles.errors import OptionError, optional
 from beers_deploy.profiles.shipped import DEFAULT_TARGET, TILE_PX
@@ -50,6 +51,7 @@ def restore(
     cog: bool = False,
     stac: OutputFile | None = None,
     self_check: OutputFile | None = None,
+    interval: Level | None = None,
     view: OutputFile | None = None,
     strict: bool = False,
     consistency: bool = True,
@@ -96,6 +98,9 @@ def restore(
         stac: STAC item of the output to write; needs `cog`.
         self_check: TIFF to write with one pixel for each block of 64 x 64 pixels: whether the
             result, blurred as the sensor blurs, agrees with the image.
+        interval: also write OUT-interval.tif, half-widths that the error of the result stays within
+            in so many percent of the pixels; needs the sensor, and a network with a calibrated
+            interval, as shipped ones have. In Python an array returns (restored, half_width).
         view: HTML file to write that shows raw and restored in a browser, to swipe and zoom.
         strict: refuse an image whose pixels contradict the sensor, and a result that fails the
             self-check, instead of a warning.
@@ -147,7 +152,7 @@ def restore(
         refuse_with(
             "`method` traditional",
             **given("network", "tile", "halo", "resume", "runtime", "threads", "scheduler"),
-            **given("consistency", "exposure", "dry_run"),
+            **given("consistency", "exposure", "dry_run", "interval"),
         )
     else:
         refuse_without("`method` traditional", **given("quality"))
@@ -165,6 +170,7 @@ def restore(
     output = None
     if path is not None and not dry_run:
         how: dict[str, Any] = {"compression": compression, "cog": cog, "resume": resume}
+        how["interval"] = interval
         how["self_check"] = None if self_check is None else Path(self_check)
         output = _output(out, (stac, view), overwrite or resume, fix_detectors or "", **how)
     sensors = sensors_of(sensor)
@@ -191,7 +197,7 @@ def restore(
 
     load = _traditional(quality, unknown) if method == "traditional" else network_pipeline
     if path is None:
-        return restore_array(image, reading, load)
+        return restore_array(image, reading, load, interval)
     if output is None:
         return _preview(path, network_pipeline(), reading)
     run = restore_file(path, output, reading, load)
@@ -238,6 +244,7 @@ def _output(
         how: the other fields of `Output`.
     """
     from beers_deploy.restoration.detectors.fault_list import list_beside
+    from beers_deploy.restoration.interval.file import interval_beside
     from beers_deploy.restoration.output import Output
     from beers_deploy.restoration.stac.network import network_paths
 
@@ -246,10 +253,12 @@ def _output(
             "`out` is missing. Name the TIFF to write, or add `dry_run` to see the plan only."
         )
     path = Path(out)
-    if path.exists() and not may_exist:
-        raise OptionError(
-            f"{path} exists already. Add `overwrite` to replace it, or choose another name."
-        )
+    widths = None if how["interval"] is None else interval_beside(path)
+    for each in (path, widths):
+        if each is not None and each.exists() and not may_exist:
+            raise OptionError(
+                f"{each} exists already. Add `overwrite` to replace it, or choose another name."
+            )
     named = [None if document is None else Path(document) for document in documents]
     if named[0] is not None:
         optional("pystac", "stac")
@@ -257,7 +266,7 @@ def _output(
         named += [item, item.with_suffix(".onnx")]
     # The list of faults is an output of its own where they are searched for.
     listed = list_beside(path, fix_detectors)
-    return Output(path, others=(*named, listed, how["self_check"]), **how)
+    return Output(path, others=(*named, listed, how["self_check"], widths), **how)
 
 
 def _write_documents(
@@ -270,10 +279,12 @@ def _write_documents(
 ) -> None:
     """Write the STAC item and the view of a run, where they are asked for."""
     from beers_deploy.report.view import write_view
+    from beers_deploy.restoration.interval.file import interval_beside
     from beers_deploy.restoration.stac.item import write_item
 
     # Rasters over the same place as the output, by the name of their layer and asset.
-    written = {"self-check": output.self_check}
+    widths = None if output.interval is None else interval_beside(output.path)
+    written = {"self-check": output.self_check, "interval": widths}
     maps = {name: raster for name, raster in written.items() if raster is not None}
     if stac is not None:
         write_item(run, Path(stac), maps)

@@ -1,6 +1,7 @@
 """Makes the shipped INT8 files anew, one for all sensors each, calibrated on photographs.
 
-Minutes a file.
+Minutes a file. A file that is made anew has no interval: `python -m benchmarks.interval calibrate`
+writes it.
 
 python docs/make/int8.py --images aerial/ [convbeers-s ...]
 """

@@ -19,6 +19,7 @@ from safetensors.numpy import save_file
 from beers_deploy.model.family import RANGES
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.io.formats import HEAD_BYTES, SAFETENSORS, other_format
+from beers_deploy.model.levels import INTERVAL
 from beers_deploy.model.variants import Kernels, Variant
 from beers_deploy.profiles.errors import ModelError, printable, reason_of
 from beers_deploy.profiles.toml import parse_json, unreadable
@@ -42,7 +43,8 @@ class Weights:
     """The content of a weights file. A conditioned network accepts a sensor and stands behind its
     bank.
 
-    `kernels` names the kind of kernels of that bank.
+    `kernels` names the kind of kernels of that bank, and `interval` is its calibrated interval
+    (`model.interval`), empty without one.
     """
 
     tensors: Arrays
@@ -50,6 +52,7 @@ class Weights:
     recipe: dict[str, object]
     conditioned: bool = False
     kernels: Kernels = "fitted"
+    interval: str = ""
 
 
 def write_tensors(path: Path, tensors: Arrays, header: Mapping[str, object]) -> None:
@@ -106,6 +109,8 @@ def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
 def write_weights(path: Path, weights: Weights) -> None:
     """Write a network's weights, variant and recipe; for a conditioned network also its sensor
     ranges.
+
+    No interval is written, because other weights make other errors.
     """
     header: dict[str, object] = {"variant": asdict(weights.variant), "recipe": weights.recipe}
     if weights.conditioned:
@@ -136,7 +141,12 @@ def read_weights(path: Path) -> Weights:
     recipe = header.get("recipe")
     kernels: Kernels = "fitted" if header.get("kernels") == "fitted" else "cut"
     return Weights(
-        tensors, variant, recipe if isinstance(recipe, dict) else {}, conditioned, kernels
+        tensors,
+        variant,
+        recipe if isinstance(recipe, dict) else {},
+        conditioned,
+        kernels,
+        str(header.get(INTERVAL, "")),
     )
 
 

@@ -90,6 +90,7 @@ REFUSED = {
                 "dry_run",
                 "consistency",
                 "exposure",
+                "interval",
             ),
             "--method traditional",
         ),
@@ -99,7 +100,10 @@ REFUSED = {
     "evaluate": [
         Refused(("images", "sweep", "brightness"), "--pairs PAIRS"),
         Refused(("labels", "split", "side", "classes"), without="--detector"),
-        Refused(("pairs", "sweep", "strict", "exposure", "bits_per_pixel"), "--detector DETECTOR"),
+        Refused(
+            ("pairs", "calibrate", "sweep", "strict", "exposure", "bits_per_pixel"),
+            "--detector DETECTOR",
+        ),
     ],
     "tradeoff": [Refused(("out",), "--dry-run")],
     "stress": [

@@ -33,6 +33,14 @@ LEFT_OUT = {
     "xdputil query": "is a program of the board",
     "xdputil benchmark core.xmodel 3": "is a program of the board",
     "beers-deploy golden results --compare kit/golden": "compares what a board wrote",
+    (
+        "beers-deploy evaluate --pairs pairs/ --sensor mine.toml --methods mine.onnx "
+        "--calibrate mine-calibrated.onnx"
+    ): "needs pairs of several places, which the tests of `calibrate` make",
+    (
+        "beers-deploy restore raw.tif restored.tif --network mine-calibrated.onnx "
+        "--sensor mine.toml --interval 90"
+    ): "restores with what that writes",
     **{
         (
             f"beers-deploy train --recipe {name} --images aerial-train/ --images aerial-train2/ "

@@ -1,0 +1,376 @@
+"""The interval of `restore --interval`: calibrated for the shipped networks, and judged.
+
+    python -m benchmarks.interval calibrate --images aerial-train/ aerial-train2/ [NAME ...]
+    python -m benchmarks.interval judge --images aerial-test/ --plot interval.svg [NAME ...]
+
+`calibrate` writes an interval into each float and INT8 file of `model/weights`, and into nothing
+else of it. Each place is acquired by sensors of the trained family: the exponents are fitted on
+places that the networks were trained on, the quantiles are taken from the places that their recipe
+held out of the training.
+
+`judge` prints tables of coverage by place, level, brightness and sensor, and draws the first
+network's reliability. No named sensor was among those of the calibration.
+"""
+
+import argparse
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import onnx
+from onnx import numpy_helper
+from scipy.stats import spearmanr
+
+from beers_deploy.model.family import SensorFamily
+from beers_deploy.model.interval import BORDER_PX, PixelInterval, Sample, calibrated
+from beers_deploy.model.io.files import sha256
+from beers_deploy.model.io.tensors import read_tensors
+from beers_deploy.model.levels import LEVELS, Level
+from beers_deploy.model.raster.images import list_images, site_of
+from beers_deploy.model.shipped import INT8, SHIPPED, shipped_names, shipped_weights
+from beers_deploy.model.simulator.acquire import (
+    MARGIN_PX,
+    acquire_three,
+    fitting_oversampling,
+    prepare_scene,
+)
+from beers_deploy.model.simulator.detector import Draw
+from beers_deploy.model.simulator.sampling import read_scene
+from beers_deploy.network import Network
+from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
+from beers_deploy.quant.sensor_bank.conditioned import WEIGHTS
+from beers_deploy.restoration.interval.half_widths import interval_of
+from beers_deploy.restoration.steps import BOTH
+from beers_deploy.studies.evaluation.calibrate import write_with_interval
+from beers_deploy.studies.evaluation.methods import network_restore, profile_of
+
+LIKE = Sensor.load("pleiades-degraded")
+REFERENCE = Sensor.load("pleiades-reference").nominal()
+FAMILY = SensorFamily(LIKE.nominal(), other_curves=0.3)
+RECIPES = SHIPPED.parent / "recipes"
+
+LEAST_PX = 2 * BORDER_PX + 64
+OVERSAMPLINGS = (4, 2)
+BLOCK_PX = 16
+JUDGED = {
+    "pleiades-degraded": LIKE,
+    "pleiades-variable": Sensor.load("pleiades-variable"),
+    "sharp and noisy": LIKE.replace(mtf_nyquist=0.12, snr_0=25, snr_1=60),
+    "blurred and quiet": LIKE.replace(mtf_nyquist=0.03, snr_0=80, snr_1=180),
+    "dior-medium": Sensor.load("dior-medium"),
+    "dior-high": Sensor.load("dior-high"),
+}
+RADIANCES = (1.0, 0.25, 0.05)
+BRIGHTNESS = (0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1)
+"""Of pixels, over full scale, for the table."""
+
+
+@dataclass(frozen=True)
+class Acquired:
+    """One acquisition of one place.
+
+    Attributes:
+        site: the place.
+        sensor: the instrument that acquired it.
+        raw: its image, (h, w).
+        truth: what the reference sees without noise, (h, w).
+    """
+
+    site: str
+    sensor: Instrument
+    raw: np.ndarray
+    truth: np.ndarray
+
+
+def by_site(folders: Iterable[Path]) -> dict[str, list[Path]]:
+    """Return the images of each place."""
+    sites = dict[str, list[Path]]()
+    for folder in folders:
+        for path in list_images(folder):
+            sites.setdefault(site_of(path.stem), []).append(path)
+    return dict(sorted(sites.items()))
+
+
+def acquired(
+    path: Path,
+    draw_sensor: Callable[[np.random.Generator], Instrument],
+    seed: Sequence[int],
+    crop_px: int | None = None,
+    radiance: float = 1.0,
+) -> Acquired | None:
+    """Acquire a scene; None if it is too small.
+
+    Args:
+        path: of the photograph.
+        draw_sensor: returns the sensor.
+        seed: of sensor, crop and noise.
+        crop_px: side of a window of the scene in pixels of the sensor; all of it if None.
+        radiance: factor of the scene's.
+    """
+    generator = np.random.default_rng(seed)
+    sensor = draw_sensor(generator)
+    scene = read_scene(path, REFERENCE).radiance * np.float32(radiance)
+    ratio = fitting_oversampling(scene, OVERSAMPLINGS, LEAST_PX)
+    if ratio is None:
+        return None
+    if crop_px is not None:
+        side = (crop_px + 2 * MARGIN_PX) * ratio
+        top, left = (int(generator.integers(max(size - side, 0) + 1)) for size in scene.shape)
+        scene = scene[top : top + side, left : left + side]
+    aim = REFERENCE.in_units_of(sensor)
+    raw, _, truth = acquire_three(
+        prepare_scene(scene, ratio), sensor, aim, Draw(int(generator.integers(1 << 30)))
+    )
+    return Acquired(site_of(path.stem), sensor, raw, truth)
+
+
+def restored(name: str, image: Acquired) -> np.ndarray:
+    """Restore an acquisition by a shipped network that knows its sensor."""
+    profile = profile_of(image.sensor, LIKE)
+    network = Network.load(name, sensor=profile)
+    return network_restore(network, profile, REFERENCE, BOTH)(image.raw)
+
+
+@dataclass(frozen=True)
+class Amount:
+    """How much is acquired, each time by another sensor.
+
+    Attributes:
+        fitted: acquisitions of a place that networks were trained on.
+        held_out: acquisitions of a place that was held out of the training.
+        crop_px: side of the window of the scene, in pixels of the sensor.
+    """
+
+    fitted: int = 4
+    held_out: int = 20
+    crop_px: int = 160
+
+
+def training_images(
+    folders: Iterable[Path], amount: Amount
+) -> tuple[list[Acquired], list[Acquired]]:
+    """Acquire places that networks were trained on, and places that were held out of that."""
+    recipe = tomllib.loads((RECIPES / "convbeers-s.toml").read_text(encoding="utf-8"))
+    parts: tuple[list[Acquired], list[Acquired]] = ([], [])
+    for number, (site, paths) in enumerate(by_site(folders).items()):
+        is_held_out = site in recipe["held_out"]
+        count = amount.held_out if is_held_out else amount.fitted
+        for k in range(count):
+            path = paths[k * len(paths) // count]
+            image = acquired(path, FAMILY.draw, (number, k), amount.crop_px)
+            if image is not None:
+                parts[is_held_out].append(image)
+    return parts
+
+
+def calibrate(names: Iterable[str], folders: Iterable[Path], amount: Amount) -> None:
+    """Write the intervals of shipped networks, in float32 and INT8."""
+    fitted, held_out = training_images(folders, amount)
+    print(f"{len(fitted)} acquisitions fitted, {len(held_out)} held out", flush=True)
+    for name in names:
+        intervals = {}
+        for each in (name, f"{name}{INT8}"):
+            samples = (
+                [Sample.of(i.raw, restored(each, i), i.truth, i.sensor) for i in part]
+                for part in (fitted, held_out)
+            )
+            intervals[each] = calibrated(*samples)
+            print(each, intervals[each].to_json(), flush=True)
+        weights = shipped_weights(name)
+        write_weights(weights, intervals[name])
+        write_int8(SHIPPED / f"{name}{INT8}.onnx", intervals[f"{name}{INT8}"], weights)
+
+
+def write_weights(path: Path, interval: PixelInterval) -> None:
+    """Write an interval into weights, and check that no weight changed."""
+    before, _ = read_tensors(path)
+    write_with_interval(path, interval, path)
+    after, _ = read_tensors(path)
+    require_equal(path, before, after)
+
+
+def write_int8(path: Path, interval: PixelInterval, weights: Path) -> None:
+    """Write an interval into an INT8 file and the digest of its weights, which have one too; check
+    that no integer changed.
+    """
+    before = arrays_of(load_onnx(path))
+    write_with_interval(path, interval, path)
+    model = load_onnx(path)
+    onnx.helper.set_model_props(model, {**metadata(model), WEIGHTS: sha256(weights)})
+    save_onnx(model, path)
+    require_equal(path, before, arrays_of(load_onnx(path)))
+
+
+def arrays_of(model: onnx.ModelProto) -> dict[str, np.ndarray]:
+    """Return all constants of a network by name."""
+    return {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
+
+
+def require_equal(path: Path, before: dict[str, np.ndarray], after: dict[str, np.ndarray]) -> None:
+    """Stop if any number of a network changed."""
+    same = before.keys() == after.keys() and all(
+        before[name].tobytes() == after[name].tobytes() for name in before
+    )
+    if not same:
+        raise SystemExit(f"{path} holds other numbers than before")
+    print(f"{path.name}: {len(after)} arrays as before", flush=True)
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What was found of one acquisition, without its border and saturated pixels.
+
+    Attributes:
+        site: the place.
+        scores: |error| over the half-width of each level, (levels, n).
+        brightness: of the pixels, over full scale, (n,).
+        blocks: mean half-width at 90 % and mean |error| of blocks, (2, blocks).
+    """
+
+    site: str
+    scores: np.ndarray
+    brightness: np.ndarray
+    blocks: np.ndarray
+
+    def coverage(self, level: Level) -> float:
+        """Return the share of pixels within the interval."""
+        return float((self.scores[LEVELS.index(level)] <= 1).mean())
+
+
+def judgement(name: str, image: Acquired, interval: PixelInterval) -> Judgement:
+    """Judge the interval of a network on one acquisition."""
+    result = restored(name, image)
+    inner = (slice(BORDER_PX, -BORDER_PX),) * 2
+    error = np.abs(result.astype(np.float64) - image.truth)[inner]
+    known = np.ones(result.shape, bool)
+    scale = image.sensor.max_dn
+    widths = [
+        interval.for_sensor(image.sensor, scale, level).of(result, known)[inner] for level in LEVELS
+    ]
+    counts = (image.raw < scale)[inner]
+    scores = np.stack([error[counts] / width[counts] for width in widths])
+    blocks = np.stack([block_means(widths[LEVELS.index(90)]), block_means(error)])
+    return Judgement(image.site, scores, image.truth[inner][counts] / scale, blocks)
+
+
+def block_means(pixels: np.ndarray) -> np.ndarray:
+    """Return the means over whole blocks of BLOCK_PX, in one row."""
+    rows, columns = (size // BLOCK_PX for size in pixels.shape)
+    whole = pixels[: rows * BLOCK_PX, : columns * BLOCK_PX]
+    blocks = whole.reshape(rows, BLOCK_PX, columns, BLOCK_PX)
+    return np.asarray(blocks.mean((1, 3))).ravel()
+
+
+def judgements(
+    name: str, folders: Iterable[Path], sensor: Sensor, radiance: float = 1.0
+) -> list[Judgement]:
+    """Judge a network on all images of some folders, each acquired by a draw of a profile."""
+    interval = interval_of(Network.load(name, sensor=LIKE))
+    found = []
+    for number, path in enumerate(p for paths in by_site(folders).values() for p in paths):
+        image = acquired(path, sensor.draw, (number,), radiance=radiance)
+        if image is not None and (image.raw < image.sensor.max_dn).any():
+            found.append(judgement(name, image, interval))
+    return found
+
+
+def place_coverage(found: Sequence[Judgement], level: Level = 90) -> dict[str, float]:
+    """Return the mean coverage of the images of each place."""
+    sites = dict[str, list[float]]()
+    for each in found:
+        sites.setdefault(each.site, []).append(each.coverage(level))
+    return {site: float(np.mean(values)) for site, values in sites.items()}
+
+
+def line(name: str, found: Sequence[Judgement]) -> str:
+    """Return the row of a table: coverage over places, and the rank correlation of blocks."""
+    places = list(place_coverage(found).values())
+    blocks = np.concatenate([each.blocks for each in found], axis=1)
+    rank = spearmanr(*blocks).statistic
+    width = np.mean([each.blocks[0].mean() for each in found])
+    return (
+        f"| {name} | {np.mean(places):.1%} | {min(places):.1%} | {max(places):.1%} | {rank:.3f} "
+        f"| {width:.1f} |"
+    )
+
+
+def tables(name: str, folders: Sequence[Path], plot: Path | None) -> Iterator[str]:
+    """Yield the lines of the tables of one network; draw its reliability."""
+    found = {each: judgements(name, folders, sensor) for each, sensor in JUDGED.items()}
+    yield "| sensor | mean of places | lowest | highest | rank correlation | half-width, DN |"
+    yield from (line(each, judged) for each, judged in found.items())
+    yield "| level | " + " | ".join(found) + " |"
+    for level in LEVELS:
+        means = [np.mean(list(place_coverage(j, level).values())) for j in found.values()]
+        yield f"| {level} % | " + " | ".join(f"{mean:.1%}" for mean in means) + " |"
+    yield "| place | " + " | ".join(found) + " |"
+    places = [place_coverage(judged) for judged in found.values()]
+    for site in places[0]:
+        yield f"| {site} | " + " | ".join(f"{place[site]:.1%}" for place in places) + " |"
+    nominal = found["pleiades-degraded"]
+    yield "| brightness | pixels | coverage |"
+    brightness = np.concatenate([each.brightness for each in nominal])
+    within = np.concatenate([each.scores[LEVELS.index(90)] <= 1 for each in nominal])
+    for low, high in pairwise(BRIGHTNESS):
+        inside = (brightness >= low) & (brightness < high)
+        if inside.any():
+            yield f"| {low:g} to {high:g} | {inside.mean():.1%} | {within[inside].mean():.1%} |"
+    for radiance in RADIANCES[1:]:
+        dimmed = judgements(name, folders, LIKE, radiance)
+        yield line(f"pleiades-degraded, radiance x {radiance:g}", dimmed)
+    if plot is not None:
+        draw(found, plot)
+
+
+def draw(found: dict[str, list[Judgement]], plot: Path) -> None:
+    """Draw coverage over level for each sensor: the mean of places, and the range of them."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(2, 3, figsize=(9, 6), sharex=True, sharey=True)
+    for axis, (name, judged) in zip(axes.flat, found.items(), strict=True):
+        places = np.array([list(place_coverage(judged, level).values()) for level in LEVELS])
+        axis.plot([45, 100], [45, 100], color="0.6", linewidth=1)
+        axis.fill_between(
+            LEVELS, *(100 * end(places, axis=1) for end in (np.min, np.max)), alpha=0.25
+        )
+        axis.plot(LEVELS, 100 * places.mean(axis=1), marker="o", markersize=4)
+        axis.set(title=name, xlim=(45, 101), ylim=(45, 101), aspect="equal")
+        axis.grid(color="0.9")
+    figure.supxlabel("level of the interval, %")
+    figure.supylabel("pixels within it, %")
+    figure.tight_layout()
+    plt.rcParams["svg.hashsalt"] = "interval"
+    figure.savefig(plot, metadata={"Date": None})
+
+
+def main() -> None:
+    """Calibrate or judge."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("task", choices=("calibrate", "judge"))
+    parser.add_argument("names", nargs="*")
+    parser.add_argument("--images", type=Path, nargs="+", required=True)
+    parser.add_argument("--plot", type=Path)
+    parser.add_argument("--fitted", type=int, default=Amount.fitted)
+    parser.add_argument("--held-out", type=int, default=Amount.held_out)
+    parser.add_argument("--crop", type=int, default=Amount.crop_px)
+    arguments = parser.parse_args()
+    if arguments.task == "calibrate":
+        amount = Amount(arguments.fitted, arguments.held_out, arguments.crop)
+        calibrate(arguments.names or shipped_names(), arguments.images, amount)
+        return
+    first, *others = arguments.names or [f"{shipped_names()[0]}{INT8}"]
+    for text in tables(first, arguments.images, arguments.plot):
+        print(text, flush=True)
+    for name in others:
+        print(line(name, judgements(name, arguments.images, LIKE)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

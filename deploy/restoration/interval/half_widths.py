@@ -1,0 +1,119 @@
+"""The half-widths of a restored image, computed from its finished rows.
+
+`model.interval` has the formula. A half-width depends on restored pixels within CONTEXT_PX and on
+nothing else, so the rows that are asked for, tiles and a resumed run change no byte.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from beers_deploy.model.interval import CONTEXT_PX, HalfWidth, PixelInterval
+from beers_deploy.model.levels import INTERVAL, Level
+from beers_deploy.model.raster.source import Source, strips
+from beers_deploy.network import Network
+from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.shipped import BLIND
+from beers_deploy.quant.onnx_file import metadata
+from beers_deploy.restoration.bands import in_order
+from beers_deploy.restoration.prepare import Restoration
+
+ROWS_PX = 32
+"""Rows that are computed at a time, so that all intermediate arrays stay small."""
+
+ReadRows = Callable[[int, int, int], np.ndarray]
+"""Return restored rows (rows, width) as stored, given the band, the first row and the end."""
+
+
+def interval_of(network: Network) -> PixelInterval:
+    """Read the calibrated interval of a network.
+
+    Raises:
+        ModelError: a network without one, or a damaged one.
+    """
+    text = metadata(network.model).get(INTERVAL)
+    if text is None:
+        raise ModelError(
+            f"{network.label} has no calibrated interval. Leave `interval` out, use a shipped "
+            "network, or fit one on pairs of your sensor with 'beers-deploy evaluate --pairs PAIRS "
+            "--methods NETWORK --calibrate OUT'."
+        )
+    return PixelInterval.from_json(text, network.label)
+
+
+@dataclass(frozen=True)
+class HalfWidths:
+    """The half-widths of a restored image, as `write_raster` reads them.
+
+    Attributes:
+        source: the raw image, which tells the missing pixels.
+        restored: returns restored rows.
+        bands: the half-width of each band.
+    """
+
+    source: Source
+    restored: ReadRows
+    bands: tuple[HalfWidth, ...]
+
+    def read(self, band: int, start: int, stop: int) -> np.ndarray:
+        """Return half-widths of rows `start` to `stop` (excluded), (rows, width) float32, NaN
+        where a pixel is missing.
+        """
+        parts = [
+            self._strip(band, start + top, start + bottom)
+            for top, bottom in strips(stop - start, ROWS_PX)
+        ]
+        return np.concatenate(parts)
+
+    def read_mask(self, start: int, stop: int) -> np.ndarray:
+        """Return the rows of the mask of the image; missing half-widths are NaN in addition."""
+        return self.source.read_mask(start, stop)
+
+    def _strip(self, band: int, start: int, stop: int) -> np.ndarray:
+        raster = self.source.raster
+        top = max(start - CONTEXT_PX, 0)
+        bottom = min(stop + CONTEXT_PX, raster.height_px)
+        pixels = self.restored(band, top, bottom)
+        known = np.ones(pixels.shape, bool)
+        if raster.may_miss:
+            known = ~raster.missing(self.source.read(top, bottom))[band]
+        return self.bands[band].of(pixels, known)[start - top : stop - top]
+
+
+def half_widths_of(work: Restoration, level: Level) -> tuple[HalfWidth, ...]:
+    """Build the half-width of each band of a restoration.
+
+    Args:
+        work: the restoration, ready.
+        level: the share of pixels within the interval, in percent.
+
+    Raises:
+        OptionError: a band of an unknown sensor, a network that gives other pixels, or a level
+            that was not calibrated.
+        ModelError: a network without a calibrated interval.
+    """
+    raster = work.source.raster
+    if tuple(work.out_shape) != raster.shape:
+        raise OptionError(
+            "`interval` needs a network that gives one pixel of the same band for each pixel. "
+            "Leave `interval` out."
+        )
+    require_known(work.reading.sensors)
+    # The networks of several bands are one file, conditioned on their sensors.
+    interval = interval_of(work.networks[0])
+    built = [
+        interval.for_sensor(sensor.nominal(), work.scale.value, level)
+        for sensor in in_order(work.reading.sensors, raster)
+    ]
+    return tuple(built[band % len(built)] for band in range(raster.bands))
+
+
+def require_known(sensors: Mapping[str, Sensor]) -> None:
+    """Raise OptionError if the sensor of any band is unknown."""
+    if not sensors or any(sensor.name == BLIND for sensor in sensors.values()):
+        raise OptionError(
+            "`interval` needs the sensor of every band, whose noise is its unit. Name it with "
+            "`sensor`, or leave `interval` out."
+        )

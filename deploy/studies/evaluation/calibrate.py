@@ -1,0 +1,110 @@
+"""The interval of a network, fitted on pairs and stored in a copy of its file."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import onnx
+
+from beers_deploy.model.interval import PixelInterval, Sample, calibrated
+from beers_deploy.model.io.tensors import read_tensors, write_tensors
+from beers_deploy.model.levels import INTERVAL
+from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
+from beers_deploy.restoration.method import Restore
+from beers_deploy.studies.evaluation.pairs import NamedPair
+from beers_deploy.studies.evaluation.run import Evaluation
+
+logger = logging.getLogger(__name__)
+
+SUFFIXES = (".onnx", ".safetensors")
+
+
+def network_to_calibrate(methods: Mapping[str, Any], out: Path) -> tuple[str, Path]:
+    """Return the name of the method whose network is calibrated, and the file of that network.
+
+    Args:
+        methods: what is compared, by name.
+        out: the copy to write.
+
+    Raises:
+        OptionError: none or several files of networks, or a copy of another suffix.
+    """
+    # NAME@SENSOR names a file with another sensor.
+    named = {name: Path(str(source).partition("@")[0]) for name, source in methods.items()}
+    files = {name: path for name, path in named.items() if path.suffix in SUFFIXES}
+    if len(files) != 1:
+        raise OptionError(
+            "`calibrate` needs one file of a network in `methods`, .onnx or .safetensors, got "
+            f"{len(files)}. Name it alone: --methods network.onnx."
+        )
+    ((name, path),) = files.items()
+    if out.suffix != path.suffix:
+        raise OptionError(
+            f"`calibrate` must end in {path.suffix}, as {path.name} does, got {out.name}."
+        )
+    return name, path
+
+
+def calibrate_network(found: Evaluation, name: str, source: Path, out: Path) -> None:
+    """Write a copy of a network's file with the interval that fits an evaluation.
+
+    Args:
+        found: the evaluation.
+        name: of the method that is the network.
+        source: the file.
+        out: the copy.
+    """
+    (method,) = (method for method in found.methods if method.name == name)
+    interval = interval_from_pairs(found.pairs, method.restore, found.sensors[0])
+    write_with_interval(source, interval, out)
+    levels = ", ".join(f"{level} %" for level in interval.quantiles)
+    logger.info("wrote %s: intervals of %s, of %d images", out, levels, interval.acquisitions)
+
+
+def interval_from_pairs(
+    pairs: Sequence[NamedPair], restore: Restore, sensor: Sensor
+) -> PixelInterval:
+    """Fit the interval of a restoration: its exponents on every second site, its quantiles on the
+    others.
+
+    Args:
+        pairs: of at least two sites. The truth is the reference without noise where it is known.
+        restore: the restoration.
+        sensor: the sensor that acquired the pairs.
+
+    Raises:
+        ImageError: pairs of one site alone.
+    """
+    sites = sorted({pair.site for pair in pairs})
+    if len(sites) < 2:
+        raise ImageError(
+            "`calibrate` needs pairs of at least two sites: one part fits the interval, the other "
+            f"calibrates it. These are all of {sites[0]}."
+        )
+    parts: tuple[list[Sample], list[Sample]] = ([], [])
+    for pair in pairs:
+        truth = pair.reference if pair.noise_free is None else pair.noise_free
+        restored = restore(pair.degraded)
+        sample = Sample.of(pair.degraded, restored, truth, sensor.nominal())
+        parts[sites.index(pair.site) % 2].append(sample)
+    # The larger part calibrates, because a level needs so many images.
+    return calibrated(*sorted(parts, key=len))
+
+
+def write_with_interval(source: Path, interval: PixelInterval, out: Path) -> None:
+    """Write a copy of a network's file with an interval.
+
+    Weights, integers and results stay as they are; a float ONNX file becomes its simplest equal, as
+    in all that is made of it.
+    """
+    text = interval.to_json()
+    if source.suffix == ".safetensors":
+        tensors, header = read_tensors(source)
+        write_tensors(out, tensors, {**header, INTERVAL: text})
+        return
+    model = load_onnx(source)
+    onnx.helper.set_model_props(model, {**metadata(model), INTERVAL: text})
+    save_onnx(model, out)

@@ -1,0 +1,236 @@
+"""`restore --interval`: half-widths of files and arrays, and what refuses them."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+
+import beers_deploy as bd
+from beers_deploy.float_onnx import to_onnx
+from beers_deploy.model.convbeers import load_network, save_network
+from beers_deploy.model.io.tensors import read_weights
+from beers_deploy.model.shipped import shipped_names, shipped_weights
+from beers_deploy.model.variants import Variant
+from beers_deploy.network_files import int8_for_sensor
+from beers_deploy.profiles.errors import ModelError, OptionError
+from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.quant.onnx_file import metadata
+from beers_deploy.restoration.interval.half_widths import interval_of
+from beers_deploy.verbs.restore import restore
+from tests.deploy.restoration.runs import stopped_after
+from tests.model.networks import plain
+
+NAME = "pleiades-degraded"
+NETWORK = "convbeers-xs-int8"
+HEIGHT = 150
+WIDTH = 214
+NODATA = 65535
+TRANSFORM = rasterio.Affine(0.5, 0.1, 500000, 0.05, -0.5, 4600000)
+
+
+@pytest.fixture(scope="module")
+def pair() -> bd.Pair:
+    made = bd.simulate(sensor=NAME, size=WIDTH, seed=3)
+    assert isinstance(made, bd.Pair)
+    return made
+
+
+@pytest.fixture(scope="module")
+def image(pair: bd.Pair, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two bands of a drawn scene, the second with missing pixels, at a place on Earth."""
+    band = pair.degraded[:HEIGHT]
+    second = band.copy()
+    second[40:70, 30:90] = NODATA
+    path = tmp_path_factory.mktemp("image") / "raw.tif"
+    with rasterio.open(
+        path, "w", driver="GTiff", width=WIDTH, height=HEIGHT, count=2, dtype="uint16",
+        crs="EPSG:32631", transform=TRANSFORM, nodata=NODATA,
+    ) as file:  # fmt: skip
+        file.write(np.stack([band, second]))
+        file.descriptions = ("blue", "red")
+    return path
+
+
+def run(image: Path, out: Path, **options: Any) -> bytes:
+    """Restore an image with half-widths, and return the bytes of their file."""
+    given = {"network": NETWORK, "sensor": NAME, "interval": 90, "progress": False, **options}
+    restore(image, out, overwrite=True, **given)
+    return out.with_name(f"{out.stem}-interval.tif").read_bytes()
+
+
+def test_the_file_lies_over_the_image_and_has_a_plane_for_each_band(
+    image: Path, tmp_path: Path
+) -> None:
+    """Half-widths are positive floats where a pixel is known, and NaN where it is missing."""
+    run(image, tmp_path / "out.tif")
+    with rasterio.open(tmp_path / "out-interval.tif") as file:
+        blue, red = file.read()
+        assert file.descriptions == ("blue: half-width", "red: half-width")
+        assert file.tags(1)["level_percent"] == "90"
+        assert (file.crs, file.transform) == ("EPSG:32631", TRANSFORM)
+        assert np.isnan(file.nodata)
+    assert blue.dtype == np.float32
+    assert (blue > 0).all()
+    missing = np.zeros(blue.shape, bool)
+    missing[40:70, 30:90] = True
+    assert_array_equal(np.isnan(red), missing)
+    # Far from the missing pixels both bands are nearly the same image.
+    assert_allclose(red[:, 150:], blue[:, 150:], rtol=0.05)
+
+
+def test_tiles_stops_and_memory_change_no_byte(image: Path, tmp_path: Path) -> None:
+    whole = run(image, tmp_path / "whole.tif", tile=512)
+    assert run(image, tmp_path / "tiles.tif", tile=64) == whole
+    assert run(image, tmp_path / "little.tif", tile=512, memory=3.0) == whole
+    out = tmp_path / "stopped.tif"
+    options: dict[str, Any] = {"network": NETWORK, "sensor": NAME, "tile": 64, "interval": 90}
+    with stopped_after(9):
+        restore(image, out, **options)
+    assert not (tmp_path / "stopped-interval.tif").exists()
+    assert run(image, out, tile=64, resume=True) == whole
+    # Negative control: another level has other half-widths.
+    assert run(image, tmp_path / "other.tif", interval=50) != whole
+
+
+def test_bands_have_the_half_widths_of_their_own_sensors(image: Path, tmp_path: Path) -> None:
+    """The blurred sensor's band, restored from the same pixels, is less certain."""
+    blurred = Sensor.load(NAME).replace(mtf_nyquist=0.03)
+    sensors = {"blue": Sensor.load(NAME), "red": blurred}
+    run(image, tmp_path / "out.tif", sensor=sensors)
+    run(image, tmp_path / "alike.tif")
+    with rasterio.open(tmp_path / "out-interval.tif") as file:
+        blue, red = file.read()
+    with rasterio.open(tmp_path / "alike-interval.tif") as file:
+        assert_array_equal(file.read(1), blue)
+    assert np.nanmean(red) > 1.2 * np.nanmean(blue)
+
+
+def test_an_array_comes_with_the_half_widths_of_the_file(
+    pair: bd.Pair, image: Path, tmp_path: Path
+) -> None:
+    run(image, tmp_path / "out.tif")
+    with rasterio.open(tmp_path / "out-interval.tif") as file:
+        wanted = file.read(1)
+    band = pair.degraded[:HEIGHT]
+    options: dict[str, Any] = {"network": NETWORK, "sensor": NAME, "interval": 90}
+    restored, half = bd.restore(band, **options)
+    assert_array_equal(half, wanted)
+    assert_array_equal(restored, bd.restore(band, network=NETWORK, sensor=NAME))
+    assert half.shape == restored.shape
+    _, of_torch = bd.restore(torch.from_numpy(band.astype(np.float32)), **options)
+    assert isinstance(of_torch, torch.Tensor)
+    # Floats are not rounded, and their deviations differ by less than rounding makes.
+    assert of_torch.numpy() == pytest.approx(half, rel=0.2)
+    hidden = np.zeros(band.shape, bool)
+    hidden[:5] = True
+    masked, masked_half = bd.restore(np.ma.array(band, mask=hidden), **options)
+    for each in (masked, masked_half):
+        assert_array_equal(np.ma.getmaskarray(each), hidden)
+
+
+def test_an_xarray_keeps_its_labels_and_dask_is_refused(pair: bd.Pair) -> None:
+    xarray = pytest.importorskip("xarray", reason="xarray is not installed")
+    dask = pytest.importorskip("dask.array", reason="dask is not installed")
+    options: dict[str, Any] = {"network": NETWORK, "sensor": NAME, "interval": 90}
+    image = xarray.DataArray(pair.degraded[:40, :50], {"y": range(40)}, ("y", "x"))
+    restored, half = bd.restore(image, **options)
+    assert half.dims == restored.dims == ("y", "x")
+    assert_array_equal(half.y, image.y)
+    with pytest.raises(OptionError, match="Compute the Dask array"):
+        bd.restore(dask.from_array(pair.degraded), **options)
+
+
+def test_most_errors_of_a_drawn_scene_lie_within_the_interval(pair: bd.Pair) -> None:
+    """Drawn scenes are no photographs, so only the order of levels and a wide range are asked."""
+    shares = []
+    for level in (50, 90):
+        restored, half = bd.restore(
+            pair.degraded, network=NETWORK, sensor=pair.profiles[0], interval=level
+        )
+        error = np.abs(restored.astype(np.float64) - pair.clean)
+        shares.append(float((error <= half)[16:-16, 16:-16].mean()))
+    assert 0.3 < shares[0] < shares[1]
+    assert 0.7 < shares[1] < 1
+
+
+@pytest.mark.parametrize(
+    ("options", "kind", "words"),
+    [
+        ({"sensor": "blind"}, OptionError, "needs the sensor of every band"),
+        ({"sensor": f"blue=blind,red={NAME}"}, OptionError, "needs the sensor of every band"),
+        ({"method": "traditional", "network": None}, OptionError, "no effect with `method`"),
+        ({"interval": 91}, OptionError, "must be one of 50, 68, 80, 90, 95, 99, got 91"),
+    ],
+)
+def test_what_has_no_interval_is_refused_before_a_file_is_written(
+    options: dict[str, Any], kind: type[Exception], words: str, image: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(kind, match=words):
+        run(image, tmp_path / "out.tif", **options)
+    assert not list(tmp_path.iterdir())
+
+
+def without_interval(model: Any) -> Any:
+    """A network without the interval in its metadata."""
+    kept = [item for item in model.metadata_props if item.key != "interval"]
+    del model.metadata_props[:]
+    model.metadata_props.extend(kept)
+    return model
+
+
+def damaged(model: Any) -> Any:
+    """A network with a damaged interval in its metadata."""
+    (item,) = (item for item in model.metadata_props if item.key == "interval")
+    item.value = item.value[:-3]
+    return model
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [(without_interval, "has no calibrated interval"), (damaged, "metadata of .* is damaged")],
+)
+def test_a_network_without_a_sound_interval_is_refused(
+    change: Callable[[Any], Any], words: str, image: Path, tmp_path: Path
+) -> None:
+    network = bd.Network.load(NETWORK, sensor=NAME)
+    path = bd.Network(change(network.model), "mine").save(tmp_path / "mine.onnx")
+    with pytest.raises(ModelError, match=words):
+        run(image, tmp_path / "out.tif", network=path)
+    assert [file.name for file in tmp_path.iterdir()] == ["mine.onnx"]
+
+
+def test_an_older_file_of_half_widths_is_not_replaced(image: Path, tmp_path: Path) -> None:
+    older = tmp_path / "out-interval.tif"
+    older.write_bytes(b"older")
+    with pytest.raises(OptionError, match=r"out-interval\.tif exists already"):
+        restore(image, tmp_path / "out.tif", network=NETWORK, sensor=NAME, interval=90)
+    assert older.read_bytes() == b"older"
+
+
+@pytest.mark.parametrize("name", shipped_names())
+def test_shipped_networks_have_an_interval_that_another_sensor_keeps(name: str) -> None:
+    """Float and INT8 have their own; it goes where a file is conditioned on another sensor."""
+    levels = [50, 68, 80, 90, 95, 99]
+    found = [interval_of(bd.Network.load(each, sensor=NAME)) for each in (name, f"{name}-int8")]
+    assert [list(interval.quantiles) for interval in found] == [levels, levels]
+    assert found[0] != found[1]
+    model = bd.Network.load(f"{name}-int8", sensor=NAME).model
+    other = int8_for_sensor(model, Sensor.load("dior-medium"))
+    assert metadata(other)["interval"] == metadata(model)["interval"]
+
+
+def test_an_interval_does_not_follow_into_other_weights(tmp_path: Path) -> None:
+    """Weights that are written again, and integers of a float network, have none."""
+    source = shipped_weights("convbeers-xs")
+    assert read_weights(source).interval
+    network, recipe = load_network(source)
+    save_network(tmp_path / "w.safetensors", network, recipe)
+    assert not read_weights(tmp_path / "w.safetensors").interval
+    model = to_onnx(plain(Variant(1, 4)), {"interval": "of the float network"})
+    int8 = bd.quantize(model, out=tmp_path / "int8.onnx", patches=2, patch=48)
+    assert "interval" not in metadata(int8.model)
