@@ -110,6 +110,7 @@ class Layers:
     memory_bytes_per_s: Array
     handlers: Array  # batch handlers of a core
     cores: Array
+    serial: Array  # 1, or 0 where the transfers queue up
 
     @classmethod
     def of(cls, works: Sequence[Work], dpu: Dpu) -> Self:
@@ -127,11 +128,12 @@ class Layers:
                 work.map_bytes,
                 work.launched,
                 *board,
+                work.serial,
             )
             for work in works
         ]
-        # The nine fields, also of a network without layers: an empty list alone has one axis.
-        return cls(*np.array(rows, dtype=np.float64).reshape(-1, 9).T)
+        # The ten fields, also of a network without layers: an empty list alone has one axis.
+        return cls(*np.array(rows, dtype=np.float64).reshape(-1, 10).T)
 
     def compute_s(self, constants: Constants) -> Array:
         """Time of the array and of the engines beside it, (n,): all batch handlers work at once."""
@@ -143,6 +145,8 @@ class Layers:
         shared = constants.memory_efficiency * self.memory_bytes_per_s
         shared_s = (self.weight_bytes + self.handlers * self.map_bytes) / shared
         port_s = (self.weight_bytes + self.map_bytes) / port
+        port_s *= 1 + (SERIAL_PORT - 1) * self.serial
+        shared_s *= 1 + (SERIAL_DDR - 1) * self.serial
         # Cores share the DDR alone: each loads its own weights through ports of its own.
         return np.maximum(port_s, (1.0 if alone else self.cores) * shared_s)
 
@@ -155,6 +159,12 @@ class Layers:
         busy = longer + (1 - structure.overlap) * shorter
         return busy + constants.layer_s * self.launched
 
+
+SERIAL_PORT = 2
+SERIAL_DDR = 3
+"""How many times as long a serial read takes through the port and from the DDR: 3.6 GB/s on a
+ZCU104, where AMD's profile of its layers has 3.2 to 3.7.
+"""
 
 Regime = Literal["host", "small maps", "large maps"]
 """What sets the rate: the host; or the DPU, on maps of at most LARGE_MAP_BYTES, or with larger
