@@ -100,7 +100,11 @@ TABLES: Mapping[str, Mapping[str, Limits]] = {
         **dict.fromkeys(("argmax_values_per_s", "softmax_values_per_s"), RATE),
         **dict.fromkeys(("sort_values_per_s", "image_values_per_s"), RATE),
         **dict.fromkeys(
-            ("width_host", "width_small_maps", "width_large_maps", "width_outside"), POSITIVE
+            [
+                f"width_{part}"
+                for part in ("array", "lanes", "memory", "start", "copies", "task", "outside")
+            ],
+            POSITIVE,
         ),
         "pair_width": POSITIVE,
         "fitted_map_bytes": BYTES,

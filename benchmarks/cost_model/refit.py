@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from beers_deploy.dpu.cost.latency import WIDTHS
+from beers_deploy.dpu.cost.model import PARTS
 from benchmarks.cost_model.fit import fit, rounded
 from benchmarks.cost_model.notation import KINDS
 from benchmarks.cost_model.published import NETWORKS, boards, written
@@ -27,6 +28,7 @@ from benchmarks.cost_model.validation import (
     outside_width,
     pair_width,
     rank_correlation,
+    settled,
 )
 
 TARGETS = Path(__file__).parents[2] / "profiles" / "targets"
@@ -69,17 +71,18 @@ def cost_table(board: str) -> Iterator[tuple[str, str, str, str]]:
         "|ln(predicted / published)| that nine of ten families keep to, from "
         f"{families}, each left out once"
     )
-    for kind, width in validation.widths.items():
-        yield WIDTHS[kind], f"{width:.3f}", "inferred", f"{left_out}; {kind}"
+    for part, width in zip(PARTS, validation.widths, strict=True):
+        yield WIDTHS[part], f"{width:.3f}", "inferred", f"{left_out}; {part}"
     covered = (
         "share of the families, each left out of fit and widths, that their intervals held "
         "with every rate"
     )
     yield "families_held", f"{coverage(validation.rows)[1]:.2f}", "inferred", covered
-    widest = max(*validation.widths.values(), outside_width(validation.cases))
+    on_dpu = validation.widths[: PARTS.index("copies")]
+    widest = max(*on_dpu, outside_width(validation.cases))
     far = (
-        "the widest, or the error of networks with the largest maps, predicted from those "
-        "with a quarter"
+        "the widest of the DPU's parts, or the error of networks with the largest maps, predicted "
+        "from those with a quarter"
     )
     yield WIDTHS["outside"], f"{widest:.3f}", "inferred", far
     pairs = (
@@ -99,7 +102,7 @@ def cost_table(board: str) -> Iterator[tuple[str, str, str, str]]:
 
 def fitted_ranges(validation: Nested) -> dict[str, tuple[float, float]]:
     """Ranges of the networks that the DPU bounds: the others tell nothing of it."""
-    bound = {row.network for row in validation.rows if row.regime != "host"}
+    bound = {row.network for row in validation.rows if not row.on_host}
     maps = [row.map_bytes for row in validation.cases.rows if row.network in bound]
     works = [sum(op.operations for op in written(name).network.operations) for name in bound]
     return {"map_bytes": (min(maps), max(maps)), "operations": (min(works), max(works))}
@@ -108,7 +111,8 @@ def fitted_ranges(validation: Nested) -> dict[str, tuple[float, float]]:
 def accuracy() -> Iterator[tuple[object, ...]]:
     """A row a board: errors of networks whose family was left out, and what the intervals held."""
     errors = "median", "mean", "largest", "Spearman"
-    yield "board", "networks", "families", "rates", *errors, "rates inside", "families"
+    held = "rates inside", "families", "width", "settled", "right"
+    yield "board", "networks", "families", "rates", *errors, *held
     for board in boards():
         validation = nested(board)
         off = by_network(
@@ -127,6 +131,8 @@ def accuracy() -> Iterator[tuple[object, ...]]:
             f"{rank_correlation(validation):.3f}",
             _percent(covered),
             _percent(total),
+            f"{np.median([row.width for row in validation.rows]):.2f}",
+            *map(_percent, settled(validation.rows)),
         )
 
 

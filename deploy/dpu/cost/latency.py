@@ -5,9 +5,9 @@ where `benchmarks/cost_model` writes what it finds on published networks. None o
 the paper's own figure is what the model is compared with, never what it is made from.
 
 The interval is FPS e^-width to FPS e^width, so wide that nine of ten families of networks, each
-left out of the fit once, lie inside. It has one width where the host sets the rate, one for small
-maps, one for large ones, and the widest where a network lies beyond all that were fitted
-(docs/explanation/cost-model.md).
+left out of the fit once, lie inside. Each part of an image's time has a width of its own, and the
+rate has their mean, weighed by how much it follows each; beyond all networks that were fitted it is
+no narrower than `width_outside` (docs/explanation/cost-model.md).
 """
 
 import math
@@ -19,19 +19,20 @@ from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.placement import Placement
 from beers_deploy.dpu.cost.model import (
     OWN_SPEEDS,
+    PARTS,
     Constants,
     Interval,
     Layers,
-    Regime,
     Structure,
     Task,
     between,
     consistency_interval_s,
     frame_rate,
+    host_parts_s,
     own_speed,
     placed_work,
     refused_interval_s,
-    regime_of,
+    shares_of,
     task_of,
 )
 from beers_deploy.dpu.cost.work import Work, count_work, largest_map_bytes
@@ -68,7 +69,6 @@ class Prediction:
         layers: what each costs, for a batch.
         host_s: time of an image on the host's cores together.
         task: what the host does with the results.
-        regime: what sets the rate.
         width: half that of the interval, in ln(FPS).
         outside: what lies beyond the fitted networks; empty where nothing does.
         refused: names of nodes that the DPU refuses and the host runs.
@@ -81,7 +81,6 @@ class Prediction:
     layers: tuple[LayerCost, ...]
     host_s: float
     task: Task
-    regime: Regime
     width: float
     outside: tuple[str, ...] = ()
     note: str = ""
@@ -98,6 +97,11 @@ class Prediction:
     def batch_time_s(self) -> float:
         """Time of one batch on the DPU: its layers, nothing else."""
         return math.fsum(layer.time_s for layer in self.layers)
+
+    @property
+    def bound(self) -> str:
+        """What sets the rate: the host or the DPU."""
+        return "host" if self.host_s > self.batch_time_s / self.batch else "DPU"
 
     @property
     def fps(self) -> float:
@@ -197,6 +201,7 @@ def predict(
     columns = Layers.of(works, dpu)
     # These are the factors of an owner's runs, and 1 without any.
     speed, host_speed = (own_speed(dpu, part) for part in OWN_SPEEDS)
+    parts_s = columns.parts_s(constants, structure) / speed
     times = (
         columns.compute_s(constants),
         columns.memory_s(constants),
@@ -209,21 +214,20 @@ def predict(
     refused_s = refused_interval_s(refused, dpu)
     task = task or task_of(placement)
     step_s = consistency_interval_s(step_px, dpu) if step_px else (0.0, 0.0)
-    host_s = float(placed_work(placement, task) @ constants.host_s_per_unit) / cores / host_speed
+    host_parts = host_parts_s(placed_work(placement, task)[None], constants) / cores / host_speed
     # Work that no rate is published for is taken at the geometric mean of its two ends.
-    host_s += between(refused_s) + between(step_s)
-    dpu_s = math.fsum(layer.time_s for layer in layers) / dpu.batch
-    map_bytes = largest_map_bytes(placement.core)
-    regime = regime_of(host_s > dpu_s, map_bytes)
-    outside = _outside(placement.core, map_bytes, dpu)
-    width = dpu.value("cost", WIDTHS["outside" if outside else regime])
+    host_parts[0, 0] += between(refused_s) + between(step_s)
+    shares = shares_of(parts_s.sum(axis=0)[None] / dpu.batch, host_parts, structure.crowding)
+    width = float(shares[0] @ [dpu.value("cost", WIDTHS[part]) for part in PARTS])
+    outside = _outside(placement.core, dpu)
+    if outside:
+        width = max(width, dpu.value("cost", WIDTHS["outside"]))
     return Prediction(
         dpu=dpu,
         alone_s=float(columns.time_s(constants, structure, alone=True).sum()) / speed,
         layers=layers,
-        host_s=host_s,
+        host_s=float(host_parts.sum()),
         task=task,
-        regime=regime,
         width=width,
         outside=outside,
         note=placement.note,
@@ -233,10 +237,7 @@ def predict(
     )
 
 
-WIDTHS = {
-    kind: f"width_{kind.replace(' ', '_')}"
-    for kind in ("host", "small maps", "large maps", "outside")
-}
+WIDTHS = {part: f"width_{part}" for part in (*PARTS, "outside")}
 """Where [cost] keeps half the width of an interval, in ln(FPS)."""
 ROUNDED = 1e-3
 """How far [cost] rounds the ends of the fitted range: the largest fitted
@@ -244,13 +245,13 @@ network is not beyond it.
 """
 
 
-def _outside(core: Sequence[Operation], map_bytes: float, dpu: Dpu) -> tuple[str, ...]:
+def _outside(core: Sequence[Operation], dpu: Dpu) -> tuple[str, ...]:
     """What of a network lies beyond the fitted ones, each with the end of the
     range that it passes.
     """
     operations = sum(op.operations for op in core)
     values = {
-        "map_bytes": ("largest map", map_bytes, 1e-6, "MB"),
+        "map_bytes": ("largest map", largest_map_bytes(core), 1e-6, "MB"),
         "operations": ("work", operations, 1e-9, "GOP"),
     }
     sentences = []

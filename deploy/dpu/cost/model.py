@@ -152,12 +152,21 @@ class Layers:
 
     def time_s(self, constants: Constants, structure: Structure, *, alone: bool = False) -> Array:
         """Time of each layer, for a batch (n,)."""
+        return self.parts_s(constants, structure, alone=alone).sum(axis=1)
+
+    def parts_s(
+        self, constants: Constants, structure: Structure, *, alone: bool = False
+    ) -> Array:
+        """Time of each layer by the first four of PARTS, for a batch (n, 4)."""
         compute = self.compute_s(constants)
         memory = self.memory_s(constants, alone=alone)
-        longer: Array = np.maximum(compute, memory)
-        shorter: Array = np.minimum(compute, memory)
-        busy = longer + (1 - structure.overlap) * shorter
-        return busy + constants.layer_s * self.launched
+        # What the longer of the two hides of the shorter counts for neither.
+        seen = 1 - structure.overlap
+        compute_s = np.where(compute >= memory, compute, seen * compute)
+        memory_s = np.where(compute >= memory, seen * memory, memory)
+        on_array = self.array_s > 0
+        start_s = constants.layer_s * self.launched
+        return np.stack([compute_s * on_array, compute_s * ~on_array, memory_s, start_s], axis=1)
 
 
 SERIAL_PORT = 2
@@ -166,18 +175,28 @@ SERIAL_DDR = 3
 ZCU104, where AMD's profile of its layers has 3.2 to 3.7.
 """
 
-Regime = Literal["host", "small maps", "large maps"]
-"""What sets the rate: the host; or the DPU, on maps of at most LARGE_MAP_BYTES, or with larger
-ones.
+PARTS = ("array", "lanes", "memory", "start", "copies", "task")
+"""What the time of an image consists of: the array, the engines beside it, transfers and starts on
+the DPU, then the host's copies and its task. The prediction of each is off by a width of its own.
 """
-LARGE_MAP_BYTES = 2 << 20
 
 
-def regime_of(host_bound: bool, map_bytes: float) -> Regime:
-    """The regime of a network, from its largest result."""
-    if host_bound:
-        return "host"
-    return "large maps" if map_bytes > LARGE_MAP_BYTES else "small maps"
+def shares_of(dpu_s: Array, host_s: Array, crowding: float) -> Array:
+    """Return by how much the rate follows each of PARTS, (n, 6), which adds up to 1.
+
+    A rate falls by h % where the host takes 1 % longer, and by 1 - h % where the DPU does.
+
+    Args:
+        dpu_s: time of an image by the first four parts, (n, 4).
+        host_s: time by the last two, on all cores, (n, 2).
+        crowding: exponent of `frame_rate`.
+    """
+    dpu, host = (times.sum(axis=1, keepdims=True) for times in (dpu_s, host_s))
+    follows_host = host**crowding / (host**crowding + dpu**crowding)
+    # Where the rates are those of the DPU alone the host takes no time.
+    host_shares = np.divide(host_s, host, out=np.zeros_like(host_s), where=host > 0)
+    parts = [(1 - follows_host) * dpu_s / dpu, follows_host * host_shares]
+    return np.concatenate(parts, axis=1)
 
 
 def frame_rate(dpu_s: float, host_s: float, crowding: float) -> float:
@@ -214,6 +233,16 @@ def host_work(bytes_in: float, bytes_out: float, values: float, task: Task) -> A
     """
     copied_bytes = 0.0 if task == "image" else bytes_out
     return np.array([1.0, bytes_in, copied_bytes, *(values * (task == name) for name in TASKS[1:])])
+
+
+COPIES = 3
+"""Units of `host_work` that are copies: the image, its bytes in and its bytes out."""
+
+
+def host_parts_s(units: Array, constants: Constants) -> Array:
+    """Time of the host's copies and of its task on one core, (n, 2), of units (n, 7)."""
+    times = units * constants.host_s_per_unit
+    return np.stack([times[:, :COPIES].sum(axis=1), times[:, COPIES:].sum(axis=1)], axis=1)
 
 
 def placed_work(placement: Placement, task: Task) -> Array:

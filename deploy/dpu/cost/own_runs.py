@@ -88,7 +88,7 @@ class OwnRuns:
                 )
                 figures[f"{key} is off by"] = predicted(off, "%", (off, off), "arithmetic")
             rows.append(
-                Row("runs", f"{run.name}, {before.dpu.name}", figures, {"bound": before.regime})
+                Row("runs", f"{run.name}, {before.dpu.name}", figures, {"bound": before.bound})
             )
         return rows
 
@@ -100,7 +100,7 @@ def read_own_runs(path: Path, dpu: Dpu) -> OwnRuns:
         for number, entry in enumerate(_read(path), 1)
     ]
     ratios = [
-        (run.predicted.regime == "host", math.log(run.fps / run.predicted.fps)) for run in runs
+        (run.predicted.bound == "host", math.log(run.fps / run.predicted.fps)) for run in runs
     ]
     on_dpu, host = (
         _factor([ratio for bound, ratio in ratios if bound is on_host]) for on_host in (False, True)
