@@ -11,6 +11,7 @@ import re
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +20,11 @@ from beers_deploy.dpu.cost.latency import WIDTHS
 from beers_deploy.dpu.cost.model import PARTS
 from benchmarks.cost_model.fit import fit, rounded
 from benchmarks.cost_model.notation import KINDS
-from benchmarks.cost_model.published import NETWORKS, boards, written
+from benchmarks.cost_model.published import NETWORKS, boards, host_cores, written
 from benchmarks.cost_model.validation import (
     Nested,
     by_network,
+    corrected,
     coverage,
     nested,
     outside_width,
@@ -172,6 +174,16 @@ def by_kind() -> Iterator[tuple[object, ...]]:
             )
 
 
+def by_kinship() -> Iterator[tuple[object, ...]]:
+    """A row a kind of kinship: what one run of an owner gains, on its board and across boards."""
+    yield "run on", "predicted on", "kinship", "pairs", "without", "with", "inside"
+    zynq = [board for board in boards() if host_cores(board) == host_cores("zcu102")]
+    for owner, board in [*((name, name) for name in boards()), *permutations(zynq, 2)]:
+        for kin, gain in corrected(owner, board).items():
+            shares = map(_percent, (gain.before, gain.after, gain.held))
+            yield (owner, board, kin, gain.pairs, *shares)
+
+
 def _spread(off: np.ndarray) -> list[str]:
     return [_percent(float(value)) for value in (np.median(off), off.mean(), off.max())]
 
@@ -206,6 +218,7 @@ def main() -> int:
     print(f"{'not as fitted' if check else 'rewritten'}: {', '.join(stale) or 'none'}\n")
     print(table(accuracy()))
     print(table(by_kind()))
+    print(table(by_kinship()))
     return int(check and bool(stale))
 
 

@@ -8,21 +8,23 @@ remain. Boards of one processor share `crowding`. `nested` is what the errors of
 the widths of [cost] come from.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import chain, combinations
+from itertools import chain, combinations, product
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.stats import binom, spearmanr
 
+from beers_deploy.dpu.board import Levels, load_dpu
+from beers_deploy.dpu.cost.kinship import correction, levels_of
 from beers_deploy.dpu.cost.model import PARTS, Array, Constants, Structure
 from beers_deploy.profiles.target import TargetProfile
 from benchmarks.cost_model.fit import Cases, fit
-from benchmarks.cost_model.published import boards, host_cores, published_cases
+from benchmarks.cost_model.published import boards, host_cores, published_cases, written
 
 CROWDINGS = (2.0, 4.0)
 """What the cross-validation chooses from."""
@@ -149,9 +151,7 @@ class Trial:
         shares = tested.shares(constants)
         on_host = hosts_of(shares)
         return [
-            LeftOut(
-                row.network, row.family, row.configuration, bound, float(error), rates, width
-            )
+            LeftOut(row.network, row.family, row.configuration, bound, float(error), rates, width)
             for row, bound, error, rates, width in zip(
                 tested.rows,
                 on_host.tolist(),
@@ -306,6 +306,59 @@ def settled(rows: Sequence[LeftOut]) -> tuple[float, float]:
         shares.append((far.mean() / counts[row.network], right.mean() / counts[row.network]))
     all_far, all_right = np.sum(shares, axis=0)
     return float(all_far / len(counts)), float(all_right / all_far)
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """Networks that one run of an owner corrects, by what they have in common.
+
+    Attributes:
+        pairs: run and network.
+        before: mean |predicted / published - 1| without the run.
+        after: the same with it.
+        held: share of the networks whose rates all lie in the narrowed intervals.
+    """
+
+    pairs: int
+    before: float
+    after: float
+    held: float
+
+
+def corrected(owner: str, board: str) -> dict[str, Corrected]:
+    """Take each published case of the owner's board as a run, to correct those of a board.
+
+    All of them are predicted without their families.
+    """
+    found = defaultdict(list)
+    theirs, ours = (
+        [(row, _levels(row, name)) for row in nested(name).rows] for name in (owner, board)
+    )
+    for (run, levels), (row, of) in product(theirs, ours):
+        if levels[-1] != of[-1]:
+            factor, left = correction(of, [(levels, -run.error)])
+            shift = np.log(factor)
+            held = np.all(np.abs(row.rates + shift) <= left * row.width)
+            found[_kin(run, row, levels, of)].append((row.error, row.error + shift, held))
+    kinds = {}
+    for kin, outcomes in sorted(found.items()):
+        before, after, held = np.array(outcomes, float).T
+        errors = [float(np.abs(np.expm1(error)).mean()) for error in (before, after)]
+        kinds[kin] = Corrected(len(outcomes), *errors, float(held.mean()))
+    return kinds
+
+
+def _levels(row: LeftOut, board: str) -> Levels:
+    dpu = load_dpu(board, row.configuration)
+    return levels_of(written(row.network).network.operations, dpu, "host" if row.on_host else "DPU")
+
+
+def _kin(run: LeftOut, row: LeftOut, levels: Levels, of: Levels) -> str:
+    if run.network == row.network:
+        return "same network"
+    if levels[1] == of[1]:
+        return "same kinds of layers"
+    return "same family" if run.family == row.family else "others"
 
 
 def rank_correlation(validation: Nested) -> float:

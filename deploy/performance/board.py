@@ -290,5 +290,5 @@ def boards_for(
     if measured is None:
         return boards, []
     own_runs = read_own_runs(measured, boards[0])
-    tables = [(own_runs.source, own_runs.factor_rows()), ("your runs", own_runs.run_rows())]
+    tables = [(own_runs.source, own_runs.run_rows())]
     return [own_runs.applied(dpu) for dpu in boards], tables

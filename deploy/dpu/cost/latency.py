@@ -12,13 +12,13 @@ no narrower than `width_outside` (docs/explanation/cost-model.md).
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
-from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.board import Dpu, Levels
 from beers_deploy.dpu.checker.placement import Placement
+from beers_deploy.dpu.cost.kinship import correction, levels_of
 from beers_deploy.dpu.cost.model import (
-    OWN_SPEEDS,
     PARTS,
     Constants,
     Interval,
@@ -29,7 +29,6 @@ from beers_deploy.dpu.cost.model import (
     consistency_interval_s,
     frame_rate,
     host_parts_s,
-    own_speed,
     placed_work,
     refused_interval_s,
     shares_of,
@@ -64,12 +63,14 @@ class Prediction:
     file.
 
     Attributes:
-        dpu: the configuration, its constants corrected by a user's runs where there are any.
+        dpu: the configuration.
         alone_s: one core's batch on the DPU while its other cores rest.
         layers: what each costs, for a batch.
         host_s: time of an image on the host's cores together.
         task: what the host does with the results.
         width: half that of the interval, in ln(FPS).
+        levels: what it has in common with runs of an owner's board.
+        speed: how many times as fast as the constants say it is by these runs.
         outside: what lies beyond the fitted networks; empty where nothing does.
         refused: names of nodes that the DPU refuses and the host runs.
         refused_s: what they take of `host_s`, least and most.
@@ -82,6 +83,8 @@ class Prediction:
     host_s: float
     task: Task
     width: float
+    levels: Levels = ()
+    speed: float = 1.0
     outside: tuple[str, ...] = ()
     note: str = ""
     refused: tuple[str, ...] = ()
@@ -199,22 +202,20 @@ def predict(
             "Give a network with convolutions."
         )
     columns = Layers.of(works, dpu)
-    # These are the factors of an owner's runs, and 1 without any.
-    speed, host_speed = (own_speed(dpu, part) for part in OWN_SPEEDS)
-    parts_s = columns.parts_s(constants, structure) / speed
+    parts_s = columns.parts_s(constants, structure)
     times = (
         columns.compute_s(constants),
         columns.memory_s(constants),
         columns.time_s(constants, structure),
     )
-    parts = zip(works, *((time_s / speed).tolist() for time_s in times), strict=True)
+    parts = zip(works, *(time_s.tolist() for time_s in times), strict=True)
     layers = tuple(LayerCost(*part) for part in parts)
     refused = [node.op for node in placement.failed]
     cores = dpu.whole("cpu", "cores")
     refused_s = refused_interval_s(refused, dpu)
     task = task or task_of(placement)
     step_s = consistency_interval_s(step_px, dpu) if step_px else (0.0, 0.0)
-    host_parts = host_parts_s(placed_work(placement, task)[None], constants) / cores / host_speed
+    host_parts = host_parts_s(placed_work(placement, task)[None], constants) / cores
     # Work that no rate is published for is taken at the geometric mean of its two ends.
     host_parts[0, 0] += between(refused_s) + between(step_s)
     shares = shares_of(parts_s.sum(axis=0)[None] / dpu.batch, host_parts, structure.crowding)
@@ -222,9 +223,9 @@ def predict(
     outside = _outside(placement.core, dpu)
     if outside:
         width = max(width, dpu.value("cost", WIDTHS["outside"]))
-    return Prediction(
+    prediction = Prediction(
         dpu=dpu,
-        alone_s=float(columns.time_s(constants, structure, alone=True).sum()) / speed,
+        alone_s=float(columns.time_s(constants, structure, alone=True).sum()),
         layers=layers,
         host_s=float(host_parts.sum()),
         task=task,
@@ -234,6 +235,27 @@ def predict(
         refused=tuple(op.name for op in refused),
         refused_s=refused_s,
         step_s=step_s,
+    )
+    return _corrected(prediction, levels_of(placement.core, dpu, prediction.bound))
+
+
+def _corrected(prediction: Prediction, levels: Levels) -> Prediction:
+    """Return a prediction as the runs of the owner's board correct it: all its times alike."""
+    speed, left = correction(levels, prediction.dpu.runs)
+    layers = tuple(
+        LayerCost(layer.work, layer.compute_s / speed, layer.memory_s / speed, layer.time_s / speed)
+        for layer in prediction.layers
+    )
+    return replace(
+        prediction,
+        alone_s=prediction.alone_s / speed,
+        layers=layers,
+        host_s=prediction.host_s / speed,
+        width=prediction.width * left,
+        levels=levels,
+        speed=speed,
+        refused_s=(prediction.refused_s[0] / speed, prediction.refused_s[1] / speed),
+        step_s=(prediction.step_s[0] / speed, prediction.step_s[1] / speed),
     )
 
 

@@ -69,15 +69,6 @@ class Constants:
 
 
 NAMES = tuple(field.name for field in fields(Constants))
-OWN_SPEEDS = ("dpu_speed", "host_speed")
-"""How many times as fast as the constants say an owner's DPU and host are: `own_runs` adds them to
-[cost].
-"""
-
-
-def own_speed(dpu: Dpu, part: str) -> float:
-    """One of OWN_SPEEDS; 1 where no owner measured."""
-    return dpu.value("cost", part) if part in dpu.tables.get("cost", {}) else 1.0
 
 
 @dataclass(frozen=True)
@@ -154,9 +145,7 @@ class Layers:
         """Time of each layer, for a batch (n,)."""
         return self.parts_s(constants, structure, alone=alone).sum(axis=1)
 
-    def parts_s(
-        self, constants: Constants, structure: Structure, *, alone: bool = False
-    ) -> Array:
+    def parts_s(self, constants: Constants, structure: Structure, *, alone: bool = False) -> Array:
         """Time of each layer by the first four of PARTS, for a batch (n, 4)."""
         compute = self.compute_s(constants)
         memory = self.memory_s(constants, alone=alone)

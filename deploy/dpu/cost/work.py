@@ -148,8 +148,8 @@ class _Flow:
     """Which results pass through memory: what banks cannot hold, or not for long, and what a concat
     joins.
 
-    An add or mul is fused with the operation before it, which stores the result. Of maps that do not
-    fit the chip the other operand is loaded, and nothing hides that.
+    An add or mul is fused with the operation before it, which stores the result. Of maps that do
+    not fit the chip the other operand is loaded, and nothing hides that.
 
     What a concat joins, and what a pixel shuffle moves, is stored pixel by pixel between what
     others store: a pixel's channels take whole bursts.

@@ -1,11 +1,18 @@
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
-from beers_deploy.dpu.cost.latency import Prediction, counted_power, layer_energy_j
+from beers_deploy.dpu.cost.latency import (
+    WIDTHS,
+    Prediction,
+    counted_power,
+    layer_energy_j,
+)
+from beers_deploy.dpu.cost.model import PARTS, frame_rate, shares_of
 from beers_deploy.dpu.cost.work import BURST_BYTES, Work, count_work
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.performance.swath import predict_network
@@ -227,24 +234,45 @@ def test_each_layer_names_its_bound(papers_prediction: Prediction) -> None:
         assert max(parts.values()) <= layer.time_s <= math.fsum(parts.values()) * (1 + 1e-12)
 
 
-def test_the_interval_is_that_of_the_regime(tmp_path: Path) -> None:
-    """3 blocks of 32 at 128 x 128 have small maps, at 640 x 640 large ones; 1024 x 1024 lies beyond
-    all fitted.
+def test_the_width_is_the_mean_of_the_widths_of_the_parts(tmp_path: Path) -> None:
+    """What the rate follows decides: the array of wide layers, transfers of large maps, the host of
+    a network with a softmax.
     """
+    widths = [DPU.value("cost", WIDTHS[part]) for part in PARTS]
     path = float_convbeers(tmp_path / "f.onnx", 3, 32)
-    small, large, outside = (predict_network(path, DPU, side) for side in (128, 640, 1024))
-    for prediction, name in (
-        (small, "width_small_maps"),
-        (large, "width_large_maps"),
-        (outside, "width_outside"),
-    ):
-        spread = math.exp(DPU.value("cost", name))
-        assert prediction.fps_interval == pytest.approx(
-            (prediction.fps / spread, prediction.fps * spread)
-        )
-    assert (small.outside, large.outside) == ((), ())
+    for side, task in ((128, None), (640, None), (128, "softmax")):
+        prediction = predict_network(path, DPU, side, task)
+        assert min(widths) < prediction.width < max(widths)
+        spread = math.exp(prediction.width)
+        ends = (prediction.fps / spread, prediction.fps * spread)
+        assert prediction.fps_interval == pytest.approx(ends)
+    ranked = predict_network(path, DPU, 128, "softmax")
+    assert ranked.bound == "host"
+    assert ranked.width == pytest.approx(DPU.value("cost", WIDTHS["task"]), rel=0.1)
+
+
+def test_beyond_the_fitted_networks_the_interval_is_no_narrower_than_the_widest(
+    tmp_path: Path,
+) -> None:
+    path = float_convbeers(tmp_path / "f.onnx", 3, 32)
+    inside, outside = (predict_network(path, DPU, side) for side in (640, 1024))
+    assert inside.outside == ()
     assert any("largest map" in word for word in outside.outside)
-    assert DPU.value("cost", "width_outside") >= DPU.value("cost", "width_large_maps")
+    assert outside.width == DPU.value("cost", WIDTHS["outside"]) > inside.width
+
+
+@pytest.mark.parametrize("crowding", [2.0, 4.0])
+def test_shares_are_by_how_much_the_rate_follows_the_parts(crowding: float) -> None:
+    """Each part 1 % longer, and the rate falls by its share of 1 %."""
+    parts = np.array([3.0, 0.5, 2, 0.1, 1.5, 2])
+    shares = shares_of(parts[None, :4], parts[None, 4:], crowding)[0]
+    assert shares.sum() == pytest.approx(1)
+    for k, share in enumerate(shares):
+        longer = parts * np.where(np.arange(6) == k, 1.0001, 1)
+        rates = [frame_rate(p[:4].sum(), p[4:].sum(), crowding) for p in (parts, longer)]
+        assert math.log(rates[0] / rates[1]) == pytest.approx(share * 1e-4, rel=1e-3)
+    alone = shares_of(parts[None, :4], np.zeros((1, 2)), crowding)[0]
+    assert alone == pytest.approx([*(parts[:4] / parts[:4].sum()), 0, 0])
 
 
 def test_a_host_that_is_slower_sets_the_rate(tmp_path: Path) -> None:
@@ -255,7 +283,7 @@ def test_a_host_that_is_slower_sets_the_rate(tmp_path: Path) -> None:
     )
     dpu_s = prediction.batch_time_s / prediction.batch
     assert prediction.host_s > dpu_s
-    assert prediction.regime == "host"
+    assert prediction.bound == "host"
     assert 1 / (prediction.host_s + dpu_s) < prediction.fps < 1 / prediction.host_s
 
 
