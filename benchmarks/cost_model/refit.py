@@ -80,6 +80,11 @@ def cost_table(board: str) -> Iterator[tuple[str, str, str, str]]:
         "with every rate"
     )
     yield "families_held", f"{coverage(validation.rows)[1]:.2f}", "inferred", covered
+    off = by_network(
+        (row.network for row in validation.rows), (row.rates for row in validation.rows)
+    )
+    mean_error = "mean |predicted / published - 1| of the networks, each left out with its family"
+    yield "error_left_out", f"{off.mean():.3f}", "inferred", mean_error
     on_dpu = validation.widths[: PARTS.index("copies")]
     widest = max(*on_dpu, outside_width(validation.cases))
     far = (

@@ -94,10 +94,10 @@ KEYS: dict[str, dict[str, tuple[str, str]]] = {
         "accumulator_bits": ("bit", "width of the accumulator"),
     },
     "power": {
-        "product_j": ("J", "energy of a multiply-accumulate, for the cross-check"),
-        "memory_byte_j": ("J", "energy of a byte through the memory, for the cross-check"),
-        "dpu_run_w": ("W", "power of the board while the DPU runs"),
-        "dpu_range_w": ("W", "interval of that power"),
+        "dpu_range_w": (
+            "W",
+            "lowest and highest published power of the board, idle or while the DPU runs",
+        ),
         "cpu_run_w": ("W", "power of the board while its processor runs the traditional pipeline"),
     },
     "tile": {"memory_bytes": ("B", "memory of the board, into which maps must fit")},
@@ -123,6 +123,7 @@ KEYS: dict[str, dict[str, tuple[str, str]]] = {
         "width_task": ("1", "the same for the host's task"),
         "width_outside": ("1", "the least of it for a network beyond those fitted"),
         "families_held": ("1", "share of the families left out that intervals held"),
+        "error_left_out": ("1", "mean error of the networks left out"),
         "pair_width": ("1", "the same for ln of the ratio of two networks' rates"),
         "fitted_map_bytes": ("B", "range of the fitted networks"),
         "fitted_operations": ("operations", "range of the fitted networks"),

@@ -236,10 +236,36 @@ def host_parts_s(units: Array, constants: Constants) -> Array:
 
 def placed_work(placement: Placement, task: Task) -> Array:
     """Units of the host's work for a network of a file, (7,): the task takes every value of the
-    results.
+    results, but of YOLO's maps one score for each box.
     """
     onto, back = _crossing_bytes(placement)
-    return host_work(onto, back, back, task)
+    return host_work(onto, back, back * (_scores(placement) if task == "sort" else 1), task)
+
+
+BOXES = 3
+LEAST = 6
+"""Boxes that a pixel of YOLO's maps has in versions 2 to 7, and the least numbers of a box: its
+place and size, a score, and a class.
+"""
+
+
+def _scores(placement: Placement) -> float:
+    """Return the share of the results that a sort reads.
+
+    The host skips a box whose score is low. A file with maps of one number of channels, a multiple
+    of BOXES, is taken as YOLO's; of others, which have classes apart from places, all is read.
+    """
+    back = {cut.tensor for cut in placement.cuts if not cut.onto_dpu}
+    channels = {
+        node.op.out_shape[0]
+        for node in placement.nodes
+        if node.op.out_shape is not None and not back.isdisjoint(node.op.outputs)
+    }
+    if len(channels) != 1:
+        return 1.0
+    (count,) = channels
+    boxes = count % BOXES == 0 and count >= LEAST * BOXES
+    return BOXES / count if boxes else 1.0
 
 
 def task_of(placement: Placement) -> Task:

@@ -9,10 +9,8 @@ from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.cost.latency import (
     WIDTHS,
     Prediction,
-    counted_power,
-    layer_energy_j,
 )
-from beers_deploy.dpu.cost.model import PARTS, frame_rate, shares_of
+from beers_deploy.dpu.cost.model import PARTS, frame_rate, placed_work, shares_of
 from beers_deploy.dpu.cost.work import BURST_BYTES, Work, count_work
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.performance.swath import predict_network
@@ -313,6 +311,20 @@ def test_a_task_that_is_stated_takes_the_place_of_what_the_file_tells(tmp_path: 
     assert ranked.batch_time_s == copied.batch_time_s
 
 
+@pytest.mark.parametrize(
+    ("channels", "read"), [((255,), 3), ((255, 255), 6), ((80,), 80), ((3,), 3), ((324, 16), 340)]
+)
+def test_of_the_maps_of_yolo_a_sort_reads_one_score_for_each_box(
+    tmp_path: Path, channels: tuple[int, ...], read: int
+) -> None:
+    """Three boxes a pixel; of other maps, such as the classes of SSD, it reads all."""
+    sketch = Sketch(8)
+    maps = [sketch.conv("image", (count, 8, 3, 3)) for count in channels]
+    path = sketch.save(tmp_path / "h.onnx", *maps)
+    placement = place(read_network(path, 32), DPU)
+    assert placed_work(placement, "sort")[5] == pytest.approx(read * 32 * 32)
+
+
 def test_latency_is_that_of_one_core_and_one_thread(tmp_path: Path) -> None:
     """Cores share the memory and the host: alone a core and a thread are no slower than among
     others.
@@ -329,21 +341,3 @@ def test_latency_is_that_of_one_core_and_one_thread(tmp_path: Path) -> None:
         prediction.alone_s + prediction.host_s * zcu102.whole("cpu", "cores")
     )
     assert zcu102.handlers / prediction.latency_s < prediction.fps
-
-
-def test_energy_counts_products_and_bytes(tmp_path: Path) -> None:
-    """One 3 x 3 layer of 32 features that stays on chip: products and a third of its weights."""
-    prediction = predict_network(float_convbeers(tmp_path / "f.onnx", 1, 32), DPU, 96)
-    low, high = layer_energy_j(prediction.layers[2], DPU)
-    products = 9 * 32 * 32 * 96 * 96
-    weights = 9 * 32 * 32
-    assert low == pytest.approx(products * 0.023e-12 + weights / 3 * 162.5e-12)
-    assert high == pytest.approx(products * 0.23e-12 + weights / 3 * 325e-12)
-
-
-def test_counted_power_lies_below_the_published_run(papers_prediction: Prediction) -> None:
-    """It leaves out control, clocks and leakage: more than the whole board's would be a fault."""
-    low, high = counted_power(papers_prediction).interval or (0, 0)
-    assert 0 < low < high < DPU.value("power", "dpu_run_w")
-    most_j = math.fsum(layer_energy_j(layer, DPU)[1] for layer in papers_prediction.layers)
-    assert most_j == pytest.approx(high / papers_prediction.fps)
