@@ -343,8 +343,8 @@ def corrected(owner: str, board: str) -> dict[str, Corrected]:
     kinds = {}
     for kin, outcomes in sorted(found.items()):
         before, after, held = np.array(outcomes, float).T
-        errors = [float(np.abs(np.expm1(error)).mean()) for error in (before, after)]
-        kinds[kin] = Corrected(len(outcomes), *errors, float(held.mean()))
+        off_before, off_after = (float(np.abs(np.expm1(e)).mean()) for e in (before, after))
+        kinds[kin] = Corrected(len(outcomes), off_before, off_after, float(held.mean()))
     return kinds
 
 

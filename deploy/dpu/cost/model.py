@@ -143,7 +143,8 @@ class Layers:
 
     def time_s(self, constants: Constants, structure: Structure, *, alone: bool = False) -> Array:
         """Time of each layer, for a batch (n,)."""
-        return self.parts_s(constants, structure, alone=alone).sum(axis=1)
+        times: Array = self.parts_s(constants, structure, alone=alone).sum(axis=1)
+        return times
 
     def parts_s(self, constants: Constants, structure: Structure, *, alone: bool = False) -> Array:
         """Time of each layer by the first four of PARTS, for a batch (n, 4)."""

@@ -10,7 +10,7 @@ from beers_deploy.dpu.cost.latency import (
     WIDTHS,
     Prediction,
 )
-from beers_deploy.dpu.cost.model import PARTS, frame_rate, placed_work, shares_of
+from beers_deploy.dpu.cost.model import PARTS, Task, frame_rate, placed_work, shares_of
 from beers_deploy.dpu.cost.work import BURST_BYTES, Work, count_work
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.performance.swath import predict_network
@@ -238,7 +238,8 @@ def test_the_width_is_the_mean_of_the_widths_of_the_parts(tmp_path: Path) -> Non
     """
     widths = [DPU.value("cost", WIDTHS[part]) for part in PARTS]
     path = float_convbeers(tmp_path / "f.onnx", 3, 32)
-    for side, task in ((128, None), (640, None), (128, "softmax")):
+    cases: list[tuple[int, Task | None]] = [(128, None), (640, None), (128, "softmax")]
+    for side, task in cases:
         prediction = predict_network(path, DPU, side, task)
         assert min(widths) < prediction.width < max(widths)
         spread = math.exp(prediction.width)
