@@ -85,9 +85,7 @@ TABLES: Mapping[str, Mapping[str, Limits]] = {
         "bias_bits": BITS,
         "zero_point": Limits(-128, 255, whole=True),
     },
-    "power": dict.fromkeys(
-        ("product_j", "memory_byte_j", "dpu_run_w", "dpu_range_w", "cpu_run_w"), POSITIVE
-    ),
+    "power": dict.fromkeys(("dpu_range_w", "cpu_run_w"), POSITIVE),
     "tile": {"memory_bytes": BYTES},
     "cost": {
         **dict.fromkeys(
@@ -100,9 +98,13 @@ TABLES: Mapping[str, Mapping[str, Limits]] = {
         **dict.fromkeys(("argmax_values_per_s", "softmax_values_per_s"), RATE),
         **dict.fromkeys(("sort_values_per_s", "image_values_per_s"), RATE),
         **dict.fromkeys(
-            ("width_host", "width_small_maps", "width_large_maps", "width_outside"), POSITIVE
+            [
+                f"width_{part}"
+                for part in ("array", "lanes", "memory", "start", "copies", "task", "outside")
+            ],
+            POSITIVE,
         ),
-        "pair_width": POSITIVE,
+        **dict.fromkeys(("pair_width", "error_left_out"), POSITIVE),
         "fitted_map_bytes": BYTES,
         "fitted_operations": BYTES,
     },

@@ -15,7 +15,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from beers_deploy.dpu.cost.model import NAMES, Array, Constants, Layers, Structure
+from beers_deploy.dpu.cost.model import (
+    NAMES,
+    Array,
+    Constants,
+    Layers,
+    Structure,
+    host_parts_s,
+    shares_of,
+)
 from benchmarks.cost_model.published import Case
 
 START = Constants(0.8, 40, 0.55, 6e-6, 5e-5, 0.4e9, 0.8e9, 0.3e9, 30e6, 60e6, 1.3e9)
@@ -140,6 +148,17 @@ class Cases:
         """Time of one batch on every core, or on one core alone (n,)."""
         times = self.layers.time_s(constants, self.structure, alone=alone)
         return np.add.reduceat(times, self._starts)
+
+    def shares(self, constants: Constants) -> Array:
+        """By how much each case's rate follows each of PARTS, (n, 6)."""
+        layers = self.layers
+        parts_s = layers.parts_s(constants, self.structure)
+        images = (layers.handlers * layers.cores)[self._starts]
+        return shares_of(
+            np.add.reduceat(parts_s, self._starts) / images[:, None],
+            host_parts_s(self._host, constants) / self.host_cores[:, None],
+            self.structure.crowding,
+        )
 
     def predicted(self, times: Times) -> Array:
         """ln(FPS) with several threads, (n,)."""

@@ -11,22 +11,26 @@ import re
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
 
 from beers_deploy.dpu.cost.latency import WIDTHS
+from beers_deploy.dpu.cost.model import PARTS
 from benchmarks.cost_model.fit import fit, rounded
 from benchmarks.cost_model.notation import KINDS
-from benchmarks.cost_model.published import NETWORKS, boards, written
+from benchmarks.cost_model.published import NETWORKS, boards, host_cores, written
 from benchmarks.cost_model.validation import (
     Nested,
     by_network,
+    corrected,
     coverage,
     nested,
     outside_width,
     pair_width,
     rank_correlation,
+    settled,
 )
 
 TARGETS = Path(__file__).parents[2] / "profiles" / "targets"
@@ -69,17 +73,23 @@ def cost_table(board: str) -> Iterator[tuple[str, str, str, str]]:
         "|ln(predicted / published)| that nine of ten families keep to, from "
         f"{families}, each left out once"
     )
-    for kind, width in validation.widths.items():
-        yield WIDTHS[kind], f"{width:.3f}", "inferred", f"{left_out}; {kind}"
+    for part, width in zip(PARTS, validation.widths, strict=True):
+        yield WIDTHS[part], f"{width:.3f}", "inferred", f"{left_out}; {part}"
     covered = (
         "share of the families, each left out of fit and widths, that their intervals held "
         "with every rate"
     )
     yield "families_held", f"{coverage(validation.rows)[1]:.2f}", "inferred", covered
-    widest = max(*validation.widths.values(), outside_width(validation.cases))
+    off = by_network(
+        (row.network for row in validation.rows), (row.rates for row in validation.rows)
+    )
+    mean_error = "mean |predicted / published - 1| of the networks, each left out with its family"
+    yield "error_left_out", f"{off.mean():.3f}", "inferred", mean_error
+    on_dpu = validation.widths[: PARTS.index("copies")]
+    widest = max(*on_dpu, outside_width(validation.cases))
     far = (
-        "the widest, or the error of networks with the largest maps, predicted from those "
-        "with a quarter"
+        "the widest of the DPU's parts, or the error of networks with the largest maps, predicted "
+        "from those with a quarter"
     )
     yield WIDTHS["outside"], f"{widest:.3f}", "inferred", far
     pairs = (
@@ -99,7 +109,7 @@ def cost_table(board: str) -> Iterator[tuple[str, str, str, str]]:
 
 def fitted_ranges(validation: Nested) -> dict[str, tuple[float, float]]:
     """Ranges of the networks that the DPU bounds: the others tell nothing of it."""
-    bound = {row.network for row in validation.rows if row.regime != "host"}
+    bound = {row.network for row in validation.rows if not row.on_host}
     maps = [row.map_bytes for row in validation.cases.rows if row.network in bound]
     works = [sum(op.operations for op in written(name).network.operations) for name in bound]
     return {"map_bytes": (min(maps), max(maps)), "operations": (min(works), max(works))}
@@ -108,7 +118,8 @@ def fitted_ranges(validation: Nested) -> dict[str, tuple[float, float]]:
 def accuracy() -> Iterator[tuple[object, ...]]:
     """A row a board: errors of networks whose family was left out, and what the intervals held."""
     errors = "median", "mean", "largest", "Spearman"
-    yield "board", "networks", "families", "rates", *errors, "rates inside", "families"
+    held = "rates inside", "families", "width", "settled", "right"
+    yield "board", "networks", "families", "rates", *errors, *held
     for board in boards():
         validation = nested(board)
         off = by_network(
@@ -127,6 +138,8 @@ def accuracy() -> Iterator[tuple[object, ...]]:
             f"{rank_correlation(validation):.3f}",
             _percent(covered),
             _percent(total),
+            f"{np.median([row.width for row in validation.rows]):.2f}",
+            *map(_percent, settled(validation.rows)),
         )
 
 
@@ -166,6 +179,16 @@ def by_kind() -> Iterator[tuple[object, ...]]:
             )
 
 
+def by_kinship() -> Iterator[tuple[object, ...]]:
+    """A row a kind of kinship: what one run of an owner gains, on its board and across boards."""
+    yield "run on", "predicted on", "kinship", "pairs", "without", "with", "inside"
+    zynq = [board for board in boards() if host_cores(board) == host_cores("zcu102")]
+    for owner, board in [*((name, name) for name in boards()), *permutations(zynq, 2)]:
+        for kin, gain in corrected(owner, board).items():
+            shares = map(_percent, (gain.before, gain.after, gain.held))
+            yield (owner, board, kin, gain.pairs, *shares)
+
+
 def _spread(off: np.ndarray) -> list[str]:
     return [_percent(float(value)) for value in (np.median(off), off.mean(), off.max())]
 
@@ -200,6 +223,7 @@ def main() -> int:
     print(f"{'not as fitted' if check else 'rewritten'}: {', '.join(stale) or 'none'}\n")
     print(table(accuracy()))
     print(table(by_kind()))
+    print(table(by_kinship()))
     return int(check and bool(stale))
 
 

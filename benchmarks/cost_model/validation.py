@@ -8,21 +8,23 @@ remain. Boards of one processor share `crowding`. `nested` is what the errors of
 the widths of [cost] come from.
 """
 
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import chain, combinations
-from typing import get_args
+from itertools import chain, combinations, product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 from scipy.stats import binom, spearmanr
 
-from beers_deploy.dpu.cost.model import Array, Constants, Regime, Structure, regime_of
+from beers_deploy.dpu.board import Levels, load_dpu
+from beers_deploy.dpu.cost.kinship import correction, levels_of
+from beers_deploy.dpu.cost.model import PARTS, Array, Constants, Structure
 from beers_deploy.profiles.target import TargetProfile
 from benchmarks.cost_model.fit import Cases, fit
-from benchmarks.cost_model.published import boards, host_cores, published_cases
+from benchmarks.cost_model.published import boards, host_cores, published_cases, written
 
 CROWDINGS = (2.0, 4.0)
 """What the cross-validation chooses from."""
@@ -40,13 +42,10 @@ CONFIDENCE = 0.75
 """That they do: of some thirty families the luck of who is among them moves a mere quantile by
 several.
 """
-SHRINK = 3
-"""A regime's typical error counts this many families of all regimes' typical
-error besides its own.
+DRAWN = 1
+"""A part's typical error is drawn to the mean error as by this many families whose rates follow
+that part alone.
 """
-
-Widths = Mapping[Regime, float]
-"""Half the width of an interval, in ln(FPS), by regime."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ class LeftOut:
         network: its name.
         family: its family.
         configuration: of the DPU.
-        regime: by the prediction.
+        on_host: whether the host sets its rate, by the prediction.
         error: ln(predicted / observed), the observed rate being the geometric mean.
         rates: ln(predicted / rate) of each published rate.
         width: half that of the interval that was predicted, in ln(FPS).
@@ -66,7 +65,7 @@ class LeftOut:
     network: str
     family: str
     configuration: str
-    regime: Regime
+    on_host: bool
     error: float
     rates: Array
     width: float
@@ -79,11 +78,11 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Nested:
-    """The outcome for a board: all networks left out in turn, and the widths that follow."""
+    """The outcome for a board: all networks left out in turn, and the width of each of PARTS."""
 
     rows: Sequence[LeftOut]
     cases: Cases
-    widths: Widths
+    widths: Array
 
 
 @cache
@@ -93,11 +92,12 @@ def nested(board: str) -> Nested:
     """
     names = _trial(board, chosen(board)).names
     predicted = [_trial(board, chosen(board, name)).left_out(name) for name in names]
-    cases = _trial(board, chosen(board)).cases
+    trial = _trial(board, chosen(board))
+    cases = trial.cases
     by_case = {(row.network, row.configuration): row for row in chain.from_iterable(predicted)}
     rows = [by_case[row.network, row.configuration] for row in cases.rows]
     errors = np.array([row.error for row in rows])
-    return Nested(rows, cases, widths_of(errors, cases, [row.regime for row in rows]))
+    return Nested(rows, cases, widths_of(errors, cases, cases.shares(trial.near)))
 
 
 @cache
@@ -148,28 +148,32 @@ class Trial:
         tested = self.cases.only(self.cases.families == name)
         constants = self.fit_without({name})
         errors = tested.errors(constants)
-        regimes = regimes_of(tested, constants)
+        shares = tested.shares(constants)
+        on_host = hosts_of(shares)
         return [
-            LeftOut(
-                row.network, row.family, row.configuration, kind, float(error), rates, widths[kind]
-            )
-            for row, kind, error, rates in zip(
-                tested.rows, regimes, errors, tested.rate_errors(errors), strict=True
+            LeftOut(row.network, row.family, row.configuration, bound, float(error), rates, width)
+            for row, bound, error, rates, width in zip(
+                tested.rows,
+                on_host.tolist(),
+                errors,
+                tested.rate_errors(errors),
+                (shares @ widths).tolist(),
+                strict=True,
             )
         ]
 
-    def inner(self, left_out: str) -> tuple[Array, Cases, list[Regime]]:
-        """Errors and regimes of all families but one, which no fit sees, by folds of the others."""
+    def inner(self, left_out: str) -> tuple[Array, Cases, Array]:
+        """Errors and shares of all families but one, which no fit sees, by folds of the others."""
         training = self.cases.only(self.cases.families != left_out)
         errors = np.zeros(len(training.rows))
-        regimes = np.zeros(len(training.rows), dtype=object)
+        shares = np.zeros((len(training.rows), len(PARTS)))
         for fold in range(FOLDS):
             tested = self.names[fold::FOLDS]
             mine = np.isin(training.families, tested)
             constants = self.fit_without({*tested, left_out})
             errors[mine] = training.only(mine).errors(constants)
-            regimes[mine] = regimes_of(training.only(mine), constants)
-        return errors, training, list(regimes)
+            shares[mine] = training.only(mine).shares(constants)
+        return errors, training, shares
 
     def score(self, left_out: str) -> float:
         """Mean over families of the mean error, all but one."""
@@ -177,33 +181,30 @@ class Trial:
         return family_mean(np.abs(errors), training.families)
 
 
-def widths_of(errors: Array, cases: Cases, regimes: Sequence[Regime]) -> Widths:
-    """Widths that SHARE of the families lie inside with every rate of all their networks.
+def widths_of(errors: Array, cases: Cases, shares: Array) -> Array:
+    """Widths of PARTS, (6,), that SHARE of the families lie inside with every rate of all networks.
 
-    What counts of a case is its rate that lies farthest off. A regime's scale is the mean over
-    families of its mean (drawn to that of all regimes); a family's score is its largest error over
-    scale; the widths are the scales times the score that SHARE of all families keep to.
+    What counts of a case is its rate that lies farthest off. The typical errors of the parts, none
+    below 0, are those whose means, weighed by the shares, come nearest to these by least squares; a
+    family's score is its largest error over its typical one; the widths are the typical errors
+    times the score that SHARE of all families keep to.
     """
     families = cases.families
-    kinds = np.array(regimes)
     sizes = np.array([np.abs(rates).max() for rates in cases.rate_errors(errors)])
     overall = family_mean(sizes, families)
-    scales = dict[Regime, float]()
-    for kind in get_args(Regime):
-        mine = kinds == kind
-        count = len(set(families[mine]))
-        own = count * family_mean(sizes[mine], families[mine]) if count else 0.0
-        # A regime with few families is drawn to the mean of all regimes.
-        scales[kind] = (own + SHRINK * overall) / (count + SHRINK)
-    score = family_quantile(sizes / np.array([scales[kind] for kind in regimes]), families)
-    return {kind: scale * score for kind, scale in scales.items()}
+    # A family counts once. A part that few rates follow is drawn to the mean of all families.
+    weights = np.array([1 / np.sum(families == name) for name in families]) ** 0.5
+    drawn = DRAWN**0.5 * np.eye(len(PARTS))
+    typical, _ = nnls(
+        np.concatenate([shares * weights[:, None], drawn]),
+        np.concatenate([sizes * weights, overall * drawn.sum(axis=1)]),
+    )
+    return np.asarray(typical * family_quantile(sizes / (shares @ typical), families))
 
 
-def regimes_of(cases: Cases, constants: Constants) -> list[Regime]:
-    """What sets each case's rate, by prediction."""
-    times = cases.times(constants)
-    bound = times.host_s / cases.host_cores > times.dpu_s
-    return [regime_of(bool(b), row.map_bytes) for b, row in zip(bound, cases.rows, strict=True)]
+def hosts_of(shares: Array) -> NDArray[np.bool_]:
+    """Where the host sets the rate, (n,)."""
+    return np.asarray(shares[:, PARTS.index("copies") :].sum(axis=1) > 0.5)
 
 
 def family_mean(sizes: Array, families: NDArray[np.str_]) -> float:
@@ -243,10 +244,8 @@ def pair_width(board: str) -> float:
         errors[names == name] = cases.only(names == name).errors(
             fit(cases.only(names != name), near=trial.near)
         )
-    kinds = regimes_of(cases, trial.near)
-    outcomes = [
-        (row, e) for row, e, kind in zip(cases.rows, errors, kinds, strict=True) if kind != "host"
-    ]
+    on_dpu = ~hosts_of(cases.shares(trial.near))
+    outcomes = [(row, e) for row, e, kept in zip(cases.rows, errors, on_dpu, strict=True) if kept]
     distances = [
         abs(x - y)
         for (a, x), (b, y) in combinations(outcomes, 2)
@@ -261,7 +260,7 @@ def outside_width(cases: Cases, share: float = 0.25) -> float:
     The largest: above `share` of the largest map of a network that the DPU bounds. Only such are
     predicted.
     """
-    bound = np.array([kind != "host" for kind in regimes_of(cases, fit(cases))])
+    bound = ~hosts_of(cases.shares(fit(cases)))
     sizes = np.array([row.map_bytes for row in cases.rows])
     large = bound & (sizes > share * sizes[bound].max())
     tested = cases.only(large)
@@ -289,6 +288,77 @@ def coverage(rows: Sequence[LeftOut]) -> tuple[float, float]:
     return networks, float(
         np.mean([all(row.held == 1 for row in rows if row.family == name) for name in families])
     )
+
+
+def settled(rows: Sequence[LeftOut]) -> tuple[float, float]:
+    """Share of questions that the intervals settle, and of these the share answered rightly.
+
+    A question is whether a network reaches a rate, asked of rates from half the published one to
+    twice, evenly in logarithms. Each network weighs the same.
+    """
+    counts = Counter(row.network for row in rows)
+    asked = np.linspace(-np.log(2), np.log(2), 401)
+    shares = []
+    for row in rows:
+        # Of a rate that was predicted too high by `rates`, asked at `asked` above the published.
+        far = np.abs(asked - row.rates[:, None]) > row.width
+        right = far & ((asked > row.rates[:, None]) == (asked > 0))
+        shares.append((far.mean() / counts[row.network], right.mean() / counts[row.network]))
+    all_far, all_right = np.sum(shares, axis=0)
+    return float(all_far / len(counts)), float(all_right / all_far)
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """Networks that one run of an owner corrects, by what they have in common.
+
+    Attributes:
+        pairs: run and network.
+        before: mean |predicted / published - 1| without the run.
+        after: the same with it.
+        held: share of the networks whose rates all lie in the narrowed intervals.
+    """
+
+    pairs: int
+    before: float
+    after: float
+    held: float
+
+
+def corrected(owner: str, board: str) -> dict[str, Corrected]:
+    """Take each published case of the owner's board as a run, to correct those of a board.
+
+    All of them are predicted without their families.
+    """
+    found = defaultdict(list)
+    theirs, ours = (
+        [(row, _levels(row, name)) for row in nested(name).rows] for name in (owner, board)
+    )
+    for (run, levels), (row, of) in product(theirs, ours):
+        if levels[-1] != of[-1]:
+            factor, left = correction(of, [(levels, -run.error)])
+            shift = np.log(factor)
+            held = np.all(np.abs(row.rates + shift) <= left * row.width)
+            found[_kin(run, row, levels, of)].append((row.error, row.error + shift, held))
+    kinds = {}
+    for kin, outcomes in sorted(found.items()):
+        before, after, held = np.array(outcomes, float).T
+        off_before, off_after = (float(np.abs(np.expm1(e)).mean()) for e in (before, after))
+        kinds[kin] = Corrected(len(outcomes), off_before, off_after, float(held.mean()))
+    return kinds
+
+
+def _levels(row: LeftOut, board: str) -> Levels:
+    dpu = load_dpu(board, row.configuration)
+    return levels_of(written(row.network).network.operations, dpu, "host" if row.on_host else "DPU")
+
+
+def _kin(run: LeftOut, row: LeftOut, levels: Levels, of: Levels) -> str:
+    if run.network == row.network:
+        return "same network"
+    if levels[1] == of[1]:
+        return "same kinds of layers"
+    return "same family" if run.family == row.family else "others"
 
 
 def rank_correlation(validation: Nested) -> float:

@@ -14,6 +14,9 @@ from beers_deploy.profiles.target_limits import CONFIGURATION
 BoardLike = TargetProfile | str | os.PathLike[str]
 """A board: its profile, its name, or the path of its .toml file."""
 
+Levels = tuple[int, ...]
+"""What a run has in common with others, from the most general (`cost/kinship.py`)."""
+
 ALL = "all"
 """Every shipped board, or every configuration."""
 
@@ -48,11 +51,18 @@ class Dpu:
 
     A board may have several cores, which share only its memory. The three of the ZCU102's B4096,
     each with one batch handler, run three images at once and load the weights three times.
+
+    Attributes:
+        target: the board.
+        name: of the configuration.
+        constants: of the configuration.
+        runs: measured on the owner's board, with ln(given / predicted); none of a shipped one.
     """
 
     target: TargetProfile
     name: str
     constants: dict[str, Constant]
+    runs: tuple[tuple[Levels, float], ...] = ()
 
     @cached_property
     def tables(self) -> dict[str, dict[str, Constant]]:

@@ -101,6 +101,7 @@ def swath_figures(
     power = dpu_power(prediction.dpu)
     latency = swath_latency(prediction, batches)
     step = {"consistency step": step_time(prediction, swath)} if swath.consistency else {}
+    runs = {"your runs": run_factor(prediction)} if prediction.dpu.runs else {}
     return {
         "tiles": exact(frames, "tile", ARITHMETIC),
         "network runs": exact(
@@ -113,7 +114,14 @@ def swath_figures(
         "energy": energy(latency, power),
         "efficiency": efficiency(swath.pixels, latency, power),
         **step,
+        **runs,
     }
+
+
+def run_factor(prediction: Prediction) -> Figure:
+    """How many times as fast as the shipped model says the owner's runs make the prediction."""
+    speed = prediction.speed
+    return predicted(speed, "x", (speed, speed), "your runs, weighed by kinship")
 
 
 def step_time(prediction: Prediction, swath: Swath) -> Figure:

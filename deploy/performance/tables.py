@@ -14,10 +14,7 @@ from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.cost.latency import (
     LayerCost,
     Prediction,
-    counted_power,
     dpu_power,
-    energy_source,
-    layer_energy_j,
 )
 from beers_deploy.dpu.cost.model import Task, between
 from beers_deploy.network import NetworkLike
@@ -60,7 +57,6 @@ def predicted_rows(name: str, prediction: Prediction, swath: Swath) -> list[Row]
     besides = {
         "one-thread latency": one_thread_latency(prediction),
         "host next to the DPU": host_time(prediction, "ms/tile"),
-        "power of products and traffic": counted_power(prediction),
     }
     words = {"fitted range": fitted_range(prediction)}
     name = f"{name}, INT8 on the DPU ({prediction.dpu.name})"
@@ -140,8 +136,8 @@ def processor_row(swath: Swath, board: TargetProfile) -> Row:
 def layer_rows(prediction: Prediction) -> list[Row]:
     """One row a layer; their times add up to that of a batch, the last row.
 
-    The columns are those of AMD's vaitrace, with what bounds the layer; bytes and energy are those
-    of one image.
+    The columns are those of AMD's vaitrace, with what bounds the layer; bytes are those of one
+    image.
     """
     rows = [_layer_row(layer, prediction) for layer in prediction.layers]
     total = f"sum: one batch of {prediction.batch}"
@@ -152,8 +148,6 @@ def layer_rows(prediction: Prediction) -> list[Row]:
 def _layer_row(layer: LayerCost, prediction: Prediction) -> Row:
     work = layer.work
     batch = prediction.batch
-    dpu = prediction.dpu
-    low_j, high_j = layer_energy_j(layer, dpu)
     moved_bytes = batch * work.map_bytes + work.weight_bytes
     # A concat takes no time of its own: over an infinite time its rates are 0.
     seconds = layer.time_s or math.inf
@@ -178,9 +172,6 @@ def _layer_row(layer: LayerCost, prediction: Prediction) -> Row:
         ),
         "bandwidth": scaled(moved_bytes / seconds / 1e9, "GB/s", prediction),
         "array use": exact(100 * work.array_use, "%"),
-        "energy": predicted(
-            500 * (low_j + high_j), "mJ", (1e3 * low_j, 1e3 * high_j), energy_source(dpu)
-        ),
     }
     return Row(LAYERS, work.name, figures, {"bound": layer.bound})
 

@@ -95,6 +95,24 @@ def cpu_load() -> Figure:
     )
 
 
+def own_cpu_s() -> float:
+    """CPU time that this process has taken, in seconds."""
+    times = psutil.Process().cpu_times()
+    return float(times.user + times.system)
+
+
+def load_of_others(load: Figure, own_s: float, elapsed_s: float) -> float:
+    """Return the share of all CPUs that other processes took.
+
+    Args:
+        load: of all CPUs over a window.
+        own_s: CPU time of this process over it.
+        elapsed_s: length of the window.
+    """
+    cpus = psutil.cpu_count() or 1
+    return max((load.value or 0.0) / 100 - own_s / (cpus * max(elapsed_s, 1e-9)), 0.0)
+
+
 def resident_bytes() -> int:
     """Resident memory of this process."""
     return int(psutil.Process().memory_info().rss)

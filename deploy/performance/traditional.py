@@ -17,7 +17,7 @@ from beers_deploy.model.traditional.pipeline import Chain, restore_traditional
 from beers_deploy.performance.host import conditions_of
 from beers_deploy.performance.swath import Swath, chain_rate, efficiency
 from beers_deploy.performance.tables import TABLE
-from beers_deploy.performance.timing import cpu_load, timed
+from beers_deploy.performance.timing import cpu_load, load_of_others, own_cpu_s, timed
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted
 from beers_deploy.profiles.sensor import Sensor
 
@@ -40,6 +40,8 @@ class ChainTime:
     power: Figure
     conditions: dict[str, Figure]
     crop: str
+    others: float
+    """Share of all CPUs that other processes took meanwhile."""
 
     def row(self, swath: Swath) -> Row:
         """The swath by proportion; the interval is that of the fastest and the slowest crop."""
@@ -66,14 +68,16 @@ def measure_chain(dn: np.ndarray, degraded: Sensor, reference: Sensor) -> ChainT
     restore_traditional(crops[0][:32, :32], chain)
     # The load is measured from one call to the next: this one opens the window of the timed run.
     cpu_load()
-    times_s, _, power = timed(
+    before_s = own_cpu_s()
+    times_s, elapsed_s, power = timed(
         lambda: [timed(partial(restore_traditional, crop, chain))[1] for crop in crops]
     )
     per_mpx = [1e6 * time_s / crop.numel() for time_s, crop in zip(times_s, crops, strict=True)]
     height, width = crops[0].shape
-    return ChainTime(
-        per_mpx, power, conditions_of(torch.get_num_threads()), f"{width} x {height} pixels"
-    )
+    own_s = own_cpu_s() - before_s
+    conditions = conditions_of(torch.get_num_threads())
+    others = load_of_others(conditions["CPU load"], own_s, elapsed_s)
+    return ChainTime(per_mpx, power, conditions, f"{width} x {height} pixels", others)
 
 
 def drawn_acquisition(

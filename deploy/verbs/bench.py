@@ -40,6 +40,8 @@ OF_BOARDS = [
     "consistency",
 ]
 """Parameters that count for what is predicted of a board."""
+BUSY = 0.2
+"""Share of this machine that others may take while something is measured, without a warning."""
 NO_PROXY = "Time on this CPU is no proxy for the DPU: here INT8 may even run slower than float."
 
 
@@ -197,5 +199,12 @@ def _with_traditional(table: "Bench", swath: "Swath") -> "Bench":
 
     sensors = Sensor.load(SENSOR), Sensor.load(REFERENCE)
     dn = drawn_acquisition(swath, *sensors) if table.dn is None else table.dn
-    row = measure_chain(dn, *sensors).row(swath)
-    return replace(table, rows=(*table.rows, row))
+    chain = measure_chain(dn, *sensors)
+    headings = dict(table.headings)
+    if chain.others > BUSY:
+        first = table.rows[0].table
+        headings[first] += (
+            f". This machine is busy: other programs took {chain.others:.0%} of it while the "
+            "traditional pipeline was measured, whose time is too long"
+        )
+    return replace(table, rows=(*table.rows, chain.row(swath)), headings=headings)

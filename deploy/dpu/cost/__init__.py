@@ -4,7 +4,7 @@
 - `model`: the constants of a target's [cost], and the times of layers, host and processor that
   follow;
 - `latency`: the prediction with its interval, power;
-- `own_runs`: the constants corrected by runs of a user's own board.
+- `own_runs`: the runs of a user's own board, by which `kinship` corrects predictions.
 
 The constants are fitted by `benchmarks/cost_model`.
 """

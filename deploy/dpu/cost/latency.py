@@ -5,33 +5,33 @@ where `benchmarks/cost_model` writes what it finds on published networks. None o
 the paper's own figure is what the model is compared with, never what it is made from.
 
 The interval is FPS e^-width to FPS e^width, so wide that nine of ten families of networks, each
-left out of the fit once, lie inside. It has one width where the host sets the rate, one for small
-maps, one for large ones, and the widest where a network lies beyond all that were fitted
-(docs/explanation/cost-model.md).
+left out of the fit once, lie inside. Each part of an image's time has a width of its own, and the
+rate has their mean, weighed by how much it follows each; beyond all networks that were fitted it is
+no narrower than `width_outside` (docs/explanation/cost-model.md).
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
-from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.board import Dpu, Levels
 from beers_deploy.dpu.checker.placement import Placement
+from beers_deploy.dpu.cost.kinship import correction, levels_of
 from beers_deploy.dpu.cost.model import (
-    OWN_SPEEDS,
+    PARTS,
     Constants,
     Interval,
     Layers,
-    Regime,
     Structure,
     Task,
     between,
     consistency_interval_s,
     frame_rate,
-    own_speed,
+    host_parts_s,
     placed_work,
     refused_interval_s,
-    regime_of,
+    shares_of,
     task_of,
 )
 from beers_deploy.dpu.cost.work import Work, count_work, largest_map_bytes
@@ -63,13 +63,14 @@ class Prediction:
     file.
 
     Attributes:
-        dpu: the configuration, its constants corrected by a user's runs where there are any.
+        dpu: the configuration.
         alone_s: one core's batch on the DPU while its other cores rest.
         layers: what each costs, for a batch.
         host_s: time of an image on the host's cores together.
         task: what the host does with the results.
-        regime: what sets the rate.
         width: half that of the interval, in ln(FPS).
+        levels: what it has in common with runs of an owner's board.
+        speed: how many times as fast as the constants say it is by these runs.
         outside: what lies beyond the fitted networks; empty where nothing does.
         refused: names of nodes that the DPU refuses and the host runs.
         refused_s: what they take of `host_s`, least and most.
@@ -81,8 +82,9 @@ class Prediction:
     layers: tuple[LayerCost, ...]
     host_s: float
     task: Task
-    regime: Regime
     width: float
+    levels: Levels = ()
+    speed: float = 1.0
     outside: tuple[str, ...] = ()
     note: str = ""
     refused: tuple[str, ...] = ()
@@ -98,6 +100,11 @@ class Prediction:
     def batch_time_s(self) -> float:
         """Time of one batch on the DPU: its layers, nothing else."""
         return math.fsum(layer.time_s for layer in self.layers)
+
+    @property
+    def bound(self) -> str:
+        """What sets the rate: the host or the DPU."""
+        return "host" if self.host_s > self.batch_time_s / self.batch else "DPU"
 
     @property
     def fps(self) -> float:
@@ -195,35 +202,33 @@ def predict(
             "Give a network with convolutions."
         )
     columns = Layers.of(works, dpu)
-    # These are the factors of an owner's runs, and 1 without any.
-    speed, host_speed = (own_speed(dpu, part) for part in OWN_SPEEDS)
+    parts_s = columns.parts_s(constants, structure)
     times = (
         columns.compute_s(constants),
         columns.memory_s(constants),
         columns.time_s(constants, structure),
     )
-    parts = zip(works, *((time_s / speed).tolist() for time_s in times), strict=True)
+    parts = zip(works, *(time_s.tolist() for time_s in times), strict=True)
     layers = tuple(LayerCost(*part) for part in parts)
     refused = [node.op for node in placement.failed]
     cores = dpu.whole("cpu", "cores")
     refused_s = refused_interval_s(refused, dpu)
     task = task or task_of(placement)
     step_s = consistency_interval_s(step_px, dpu) if step_px else (0.0, 0.0)
-    host_s = float(placed_work(placement, task) @ constants.host_s_per_unit) / cores / host_speed
+    host_parts = host_parts_s(placed_work(placement, task)[None], constants) / cores
     # Work that no rate is published for is taken at the geometric mean of its two ends.
-    host_s += between(refused_s) + between(step_s)
-    dpu_s = math.fsum(layer.time_s for layer in layers) / dpu.batch
-    map_bytes = largest_map_bytes(placement.core)
-    regime = regime_of(host_s > dpu_s, map_bytes)
-    outside = _outside(placement.core, map_bytes, dpu)
-    width = dpu.value("cost", WIDTHS["outside" if outside else regime])
-    return Prediction(
+    host_parts[0, 0] += between(refused_s) + between(step_s)
+    shares = shares_of(parts_s.sum(axis=0)[None] / dpu.batch, host_parts, structure.crowding)
+    width = float(shares[0] @ [dpu.value("cost", WIDTHS[part]) for part in PARTS])
+    outside = _outside(placement.core, dpu)
+    if outside:
+        width = max(width, dpu.value("cost", WIDTHS["outside"]))
+    prediction = Prediction(
         dpu=dpu,
-        alone_s=float(columns.time_s(constants, structure, alone=True).sum()) / speed,
+        alone_s=float(columns.time_s(constants, structure, alone=True).sum()),
         layers=layers,
-        host_s=host_s,
+        host_s=float(host_parts.sum()),
         task=task,
-        regime=regime,
         width=width,
         outside=outside,
         note=placement.note,
@@ -231,12 +236,30 @@ def predict(
         refused_s=refused_s,
         step_s=step_s,
     )
+    return _corrected(prediction, levels_of(placement.core, dpu, prediction.bound))
 
 
-WIDTHS = {
-    kind: f"width_{kind.replace(' ', '_')}"
-    for kind in ("host", "small maps", "large maps", "outside")
-}
+def _corrected(prediction: Prediction, levels: Levels) -> Prediction:
+    """Return a prediction as the runs of the owner's board correct it: all its times alike."""
+    speed, left = correction(levels, prediction.dpu.runs)
+    layers = tuple(
+        LayerCost(layer.work, layer.compute_s / speed, layer.memory_s / speed, layer.time_s / speed)
+        for layer in prediction.layers
+    )
+    return replace(
+        prediction,
+        alone_s=prediction.alone_s / speed,
+        layers=layers,
+        host_s=prediction.host_s / speed,
+        width=prediction.width * left,
+        levels=levels,
+        speed=speed,
+        refused_s=(prediction.refused_s[0] / speed, prediction.refused_s[1] / speed),
+        step_s=(prediction.step_s[0] / speed, prediction.step_s[1] / speed),
+    )
+
+
+WIDTHS = {part: f"width_{part}" for part in (*PARTS, "outside")}
 """Where [cost] keeps half the width of an interval, in ln(FPS)."""
 ROUNDED = 1e-3
 """How far [cost] rounds the ends of the fitted range: the largest fitted
@@ -244,13 +267,13 @@ network is not beyond it.
 """
 
 
-def _outside(core: Sequence[Operation], map_bytes: float, dpu: Dpu) -> tuple[str, ...]:
+def _outside(core: Sequence[Operation], dpu: Dpu) -> tuple[str, ...]:
     """What of a network lies beyond the fitted ones, each with the end of the
     range that it passes.
     """
     operations = sum(op.operations for op in core)
     values = {
-        "map_bytes": ("largest map", map_bytes, 1e-6, "MB"),
+        "map_bytes": ("largest map", largest_map_bytes(core), 1e-6, "MB"),
         "operations": ("work", operations, 1e-9, "GOP"),
     }
     sentences = []
@@ -264,41 +287,14 @@ def _outside(core: Sequence[Operation], map_bytes: float, dpu: Dpu) -> tuple[str
 
 
 def dpu_power(dpu: Dpu) -> Figure:
-    """Power in W while the DPU runs, with the range assumed for it; unavailable where none is
-    published.
+    """Power in W while the DPU runs: the range of what is published of the board, for any network.
+
+    The published points contradict each other: above idle the VCK190 takes 0.8 pJ for an operation
+    with YOLOv8s and 2.3 pJ with ConvBEERS, so no energy for an operation or a byte can be told.
     """
-    if "dpu_run_w" not in dpu.tables.get("power", {}):
+    if "dpu_range_w" not in dpu.tables.get("power", {}):
         return unavailable("W", f"no power of {dpu.target.name} under its DPU is published")
-    anchor = dpu.limit("power", "dpu_run_w")
-    assumed = dpu.limit("power", "dpu_range_w")
-    source = f"assumption anchored at {anchor.source}; range: {assumed.source}"
-    return predicted(anchor.low, "W", (assumed.low, assumed.high), source)
-
-
-def layer_energy_j(layer: LayerCost, dpu: Dpu) -> Interval:
-    """Least and most energy of a layer for one image, its share of the batch's weights included."""
-    work = layer.work
-    moved_bytes = work.map_bytes + work.weight_bytes / dpu.batch
-    product = dpu.limit("power", "product_j")
-    byte = dpu.limit("power", "memory_byte_j")
-    # An operation is a product or a sum: there are half as many products.
-    products = work.operations / 2
-    return (
-        products * product.low + moved_bytes * byte.low,
-        products * product.high + moved_bytes * byte.high,
-    )
-
-
-def counted_power(prediction: Prediction) -> Figure:
-    """Power of products and traffic at the predicted rate, in W; its range is that of the published
-    figures.
-    """
-    dpu = prediction.dpu
-    ends_j = zip(*(layer_energy_j(layer, dpu) for layer in prediction.layers), strict=True)
-    low, high = (sum(end_j) * prediction.fps for end_j in ends_j)
-    return predicted((low + high) / 2, "W", (low, high), energy_source(dpu))
-
-
-def energy_source(dpu: Dpu) -> str:
-    """Where the figures a step come from."""
-    return "; ".join(dpu.limit("power", key).source for key in ("product_j", "memory_byte_j"))
+    known = dpu.limit("power", "dpu_range_w")
+    ends = known.low, known.high
+    source = f"not predictable from public data: the range of what is published: {known.source}"
+    return predicted(between(ends), "W", ends, source)

@@ -69,15 +69,6 @@ class Constants:
 
 
 NAMES = tuple(field.name for field in fields(Constants))
-OWN_SPEEDS = ("dpu_speed", "host_speed")
-"""How many times as fast as the constants say an owner's DPU and host are: `own_runs` adds them to
-[cost].
-"""
-
-
-def own_speed(dpu: Dpu, part: str) -> float:
-    """One of OWN_SPEEDS; 1 where no owner measured."""
-    return dpu.value("cost", part) if part in dpu.tables.get("cost", {}) else 1.0
 
 
 @dataclass(frozen=True)
@@ -110,6 +101,7 @@ class Layers:
     memory_bytes_per_s: Array
     handlers: Array  # batch handlers of a core
     cores: Array
+    serial: Array  # 1, or 0 where the transfers queue up
 
     @classmethod
     def of(cls, works: Sequence[Work], dpu: Dpu) -> Self:
@@ -127,11 +119,12 @@ class Layers:
                 work.map_bytes,
                 work.launched,
                 *board,
+                work.serial,
             )
             for work in works
         ]
-        # The nine fields, also of a network without layers: an empty list alone has one axis.
-        return cls(*np.array(rows, dtype=np.float64).reshape(-1, 9).T)
+        # The ten fields, also of a network without layers: an empty list alone has one axis.
+        return cls(*np.array(rows, dtype=np.float64).reshape(-1, 10).T)
 
     def compute_s(self, constants: Constants) -> Array:
         """Time of the array and of the engines beside it, (n,): all batch handlers work at once."""
@@ -143,31 +136,57 @@ class Layers:
         shared = constants.memory_efficiency * self.memory_bytes_per_s
         shared_s = (self.weight_bytes + self.handlers * self.map_bytes) / shared
         port_s = (self.weight_bytes + self.map_bytes) / port
+        port_s *= 1 + (SERIAL_PORT - 1) * self.serial
+        shared_s *= 1 + (SERIAL_DDR - 1) * self.serial
         # Cores share the DDR alone: each loads its own weights through ports of its own.
         return np.maximum(port_s, (1.0 if alone else self.cores) * shared_s)
 
     def time_s(self, constants: Constants, structure: Structure, *, alone: bool = False) -> Array:
         """Time of each layer, for a batch (n,)."""
+        times: Array = self.parts_s(constants, structure, alone=alone).sum(axis=1)
+        return times
+
+    def parts_s(self, constants: Constants, structure: Structure, *, alone: bool = False) -> Array:
+        """Time of each layer by the first four of PARTS, for a batch (n, 4)."""
         compute = self.compute_s(constants)
         memory = self.memory_s(constants, alone=alone)
-        longer: Array = np.maximum(compute, memory)
-        shorter: Array = np.minimum(compute, memory)
-        busy = longer + (1 - structure.overlap) * shorter
-        return busy + constants.layer_s * self.launched
+        # What the longer of the two hides of the shorter counts for neither.
+        seen = 1 - structure.overlap
+        compute_s = np.where(compute >= memory, compute, seen * compute)
+        memory_s = np.where(compute >= memory, seen * memory, memory)
+        on_array = self.array_s > 0
+        start_s = constants.layer_s * self.launched
+        return np.stack([compute_s * on_array, compute_s * ~on_array, memory_s, start_s], axis=1)
 
 
-Regime = Literal["host", "small maps", "large maps"]
-"""What sets the rate: the host; or the DPU, on maps of at most LARGE_MAP_BYTES, or with larger
-ones.
+SERIAL_PORT = 2
+SERIAL_DDR = 3
+"""How many times as long a serial read takes through the port and from the DDR: 3.6 GB/s on a
+ZCU104, where AMD's profile of its layers has 3.2 to 3.7.
 """
-LARGE_MAP_BYTES = 2 << 20
+
+PARTS = ("array", "lanes", "memory", "start", "copies", "task")
+"""What the time of an image consists of: the array, the engines beside it, transfers and starts on
+the DPU, then the host's copies and its task. The prediction of each is off by a width of its own.
+"""
 
 
-def regime_of(host_bound: bool, map_bytes: float) -> Regime:
-    """The regime of a network, from its largest result."""
-    if host_bound:
-        return "host"
-    return "large maps" if map_bytes > LARGE_MAP_BYTES else "small maps"
+def shares_of(dpu_s: Array, host_s: Array, crowding: float) -> Array:
+    """Return by how much the rate follows each of PARTS, (n, 6), which adds up to 1.
+
+    A rate falls by h % where the host takes 1 % longer, and by 1 - h % where the DPU does.
+
+    Args:
+        dpu_s: time of an image by the first four parts, (n, 4).
+        host_s: time by the last two, on all cores, (n, 2).
+        crowding: exponent of `frame_rate`.
+    """
+    dpu, host = (times.sum(axis=1, keepdims=True) for times in (dpu_s, host_s))
+    follows_host = host**crowding / (host**crowding + dpu**crowding)
+    # Where the rates are those of the DPU alone the host takes no time.
+    host_shares = np.divide(host_s, host, out=np.zeros_like(host_s), where=host > 0)
+    parts = [(1 - follows_host) * dpu_s / dpu, follows_host * host_shares]
+    return np.concatenate(parts, axis=1)
 
 
 def frame_rate(dpu_s: float, host_s: float, crowding: float) -> float:
@@ -206,12 +225,48 @@ def host_work(bytes_in: float, bytes_out: float, values: float, task: Task) -> A
     return np.array([1.0, bytes_in, copied_bytes, *(values * (task == name) for name in TASKS[1:])])
 
 
+COPIES = 3
+"""Units of `host_work` that are copies: the image, its bytes in and its bytes out."""
+
+
+def host_parts_s(units: Array, constants: Constants) -> Array:
+    """Time of the host's copies and of its task on one core, (n, 2), of units (n, 7)."""
+    times = units * constants.host_s_per_unit
+    return np.stack([times[:, :COPIES].sum(axis=1), times[:, COPIES:].sum(axis=1)], axis=1)
+
+
 def placed_work(placement: Placement, task: Task) -> Array:
     """Units of the host's work for a network of a file, (7,): the task takes every value of the
-    results.
+    results, but of YOLO's maps one score for each box.
     """
     onto, back = _crossing_bytes(placement)
-    return host_work(onto, back, back, task)
+    return host_work(onto, back, back * (_scores(placement) if task == "sort" else 1), task)
+
+
+BOXES = 3
+LEAST = 6
+"""Boxes that a pixel of YOLO's maps has in versions 2 to 7, and the least numbers of a box: its
+place and size, a score, and a class.
+"""
+
+
+def _scores(placement: Placement) -> float:
+    """Return the share of the results that a sort reads.
+
+    The host skips a box whose score is low. A file with maps of one number of channels, a multiple
+    of BOXES, is taken as YOLO's; of others, which have classes apart from places, all is read.
+    """
+    back = {cut.tensor for cut in placement.cuts if not cut.onto_dpu}
+    channels = {
+        node.op.out_shape[0]
+        for node in placement.nodes
+        if node.op.out_shape is not None and not back.isdisjoint(node.op.outputs)
+    }
+    if len(channels) != 1:
+        return 1.0
+    (count,) = channels
+    boxes = count % BOXES == 0 and count >= LEAST * BOXES
+    return BOXES / count if boxes else 1.0
 
 
 def task_of(placement: Placement) -> Task:

@@ -1,5 +1,6 @@
 """What one image asks of the DPU's parts, operation by operation, counted from shapes alone."""
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -43,6 +44,7 @@ class Work:
     weight_bytes: int
     load_map_bytes: int
     store_map_bytes: int
+    serial: bool  # it loads behind the operation before, and nothing hides it
 
     @property
     def array_use(self) -> float:
@@ -75,6 +77,7 @@ def count_work(operations: Sequence[Operation], dpu: Dpu) -> tuple[Work, ...]:
                 weight_bytes=op.weight_bytes,
                 load_map_bytes=flow.load(op),
                 store_map_bytes=flow.store(op),
+                serial=flow.serial(op),
             )
             works.append(work)
     return tuple(works)
@@ -83,15 +86,23 @@ def count_work(operations: Sequence[Operation], dpu: Dpu) -> tuple[Work, ...]:
 def _array_operations(op: Operation, dpu: Dpu) -> int:
     """Input and output channels, rows and columns are filled up.
 
-    A transposed convolution runs over the zeros between its pixels.
+    A transposed convolution runs as one convolution for each phase of its stride, which gives one
+    pixel of every block of the output. No zeros are multiplied.
     """
-    if op.kind not in ("conv", "transposed"):
+    if op.kind not in ("conv", "transposed") or op.out_shape is None:
         return 0
+    strides = op.window.strides if op.kind == "transposed" else (1, 1)
+    channels, *sides = op.out_shape
+    # The phases run with one size of kernel: where the stride does not divide it, it is filled up.
+    height, width = map(groups_of, sides, strides)
+    rows, columns = map(groups_of, op.kernel, strides)
     pixels = _positions(
-        op.out_shape, dpu.whole("array", "pixel_parallel"), dpu.whole("array", "column_parallel")
+        (channels, height, width),
+        dpu.whole("array", "pixel_parallel"),
+        dpu.whole("array", "column_parallel"),
     )
-    inputs = op.kernel[0] * _row_inputs(op.channels[0], op.kernel[1], dpu)
-    return 2 * inputs * _up(op.channels[1], dpu.output_parallel) * pixels
+    inputs = math.prod(strides) * rows * _row_inputs(op.channels[0], columns, dpu)
+    return 2 * inputs * _up(channels, dpu.output_parallel) * pixels
 
 
 def _row_inputs(channels: int, columns: int, dpu: Dpu) -> int:
@@ -137,8 +148,8 @@ class _Flow:
     """Which results pass through memory: what banks cannot hold, or not for long, and what a concat
     joins.
 
-    An add or mul of maps that fit the chip is fused with the operation before it. Of larger ones it
-    is a pass of its own: two maps loaded, one stored, each operand stored by what made it.
+    An add or mul is fused with the operation before it, which stores the result. Of maps that do
+    not fit the chip the other operand is loaded, and nothing hides that.
 
     What a concat joins, and what a pixel shuffle moves, is stored pixel by pixel between what
     others store: a pixel's channels take whole bursts.
@@ -166,19 +177,18 @@ class _Flow:
         self._concats = {op.output for op in computing if op.kind == "concat"}
         self._pieces = self._piece_channels(operations)
         sums = [op for op in computing if op.kind in ("add", "mul")]
-        self._passes = {
-            op.output
-            for op in sums
-            if len(op.inputs) == 2
+        inputs = chain.from_iterable(op.inputs for op in computing if op.kind == "concat")
+        self._stored = {self._root(name) for name in inputs}
+        self._sums = {self._root(self._fused(op)): op.output for op in sums}
+
+    def serial(self, op: Operation) -> bool:
+        """Whether an operation adds or multiplies two maps that do not fit the chip."""
+        return (
+            op.kind in ("add", "mul")
+            and len(op.inputs) == 2
             and op.in_shapes[0] == op.in_shapes[1]
             and not self._fits(op.output)
-        }
-        reading = [op for op in computing if op.output in self._passes | self._concats]
-        inputs = chain.from_iterable(op.inputs for op in reading)
-        self._stored = {self._root(name) for name in inputs}
-        self._sums = {
-            self._root(self._fused(op)): op.output for op in sums if op.output not in self._passes
-        }
+        )
 
     def load(self, op: Operation) -> int:
         """Bytes read: all operands but the one that an add is fused with, and what that one has
@@ -187,9 +197,9 @@ class _Flow:
         # A concat computes nothing: its operands were stored where it joins them.
         if op.kind == "concat":
             return 0
-        # A pass of its own loads both maps, whatever made them: neither stays on the chip.
-        if op.output in self._passes:
-            return sum(map(_size, op.in_shapes))
+        # The operand was read before, or made before: neither stays on the chip.
+        if self.serial(op):
+            return _size(op.out_shape)
         here = set()
         if op.kind in ("add", "mul"):
             fused = self._root(self._fused(op))
@@ -203,7 +213,7 @@ class _Flow:
 
     def store(self, op: Operation) -> int:
         """Bytes written; a fused add's are those of the operation that it is fused with."""
-        if op.kind in UNSTARTED and op.output not in self._passes:
+        if op.kind in UNSTARTED:
             return 0
         name = self._root(op.output)
         # A sum that is fused writes in place of the operation before it.

@@ -245,6 +245,7 @@ def test_power_that_nobody_published_is_unavailable_and_so_is_what_follows() -> 
         power = dpu_power(dpu)
         figures = (power, energy(latency, power), efficiency(100, latency, power))
         assert all((figure.value is not None) == published for figure in figures)
+        assert published == ("not predictable" in power.source)
         assert all(name in figure.reason for figure in figures if not published)
 
 

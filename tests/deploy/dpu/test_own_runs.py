@@ -1,14 +1,15 @@
-"""Runs of an owner's board correct the cost model by one factor for the DPU and
-one for the host.
-"""
+"""Runs of an owner's board correct the cost model by kinship."""
 
 import json
+import math
 from pathlib import Path
 
 import pytest
 
-from beers_deploy.dpu.board import load_dpu
-from beers_deploy.dpu.cost.own_runs import SCATTER, OwnRuns, read_own_runs
+from beers_deploy.dpu.board import Dpu, load_dpu
+from beers_deploy.dpu.cost.kinship import SHARES, correction
+from beers_deploy.dpu.cost.latency import Prediction
+from beers_deploy.dpu.cost.own_runs import OwnRuns, read_own_runs
 from beers_deploy.performance.swath import predict_network
 from beers_deploy.profiles.errors import OptionError
 from tests.deploy.dpu.graphs import Sketch, integer_convbeers
@@ -19,60 +20,93 @@ RUN = '{"model": "deep.onnx", "fps": 3}'
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A network that the DPU bounds, and one that the host bounds."""
+    """A network that the DPU bounds, a wider one of the same kinds of layers, and one that the host
+    bounds.
+    """
     path = tmp_path_factory.mktemp("runs")
     integer_convbeers(path / "deep.onnx", 4, 64)
+    integer_convbeers(path / "kin.onnx", 3, 48)
     sketch = Sketch(8)
     sketch.save(path / "flat.onnx", sketch.conv("image", (1, 8, 1, 1)))
     return path
 
 
-def runs_of(folder: Path, **times_as_fast: float) -> OwnRuns:
-    """A run of each network named, so many times as fast as predicted."""
-    runs = [
-        {
-            "model": f"{name}.onnx",
-            "tile_px": 320,
-            "fps": factor * predict_network(folder / f"{name}.onnx", DPU, 320).fps,
-        }
-        for name, factor in times_as_fast.items()
-    ]
+def rate(folder: Path, name: str, dpu: Dpu = DPU, tile_px: int = 320) -> Prediction:
+    """The prediction of a network of the folder."""
+    return predict_network(folder / f"{name}.onnx", dpu, tile_px)
+
+
+def runs_of(folder: Path, factor: float, *more: dict[str, str], name: str = "deep") -> OwnRuns:
+    """A run of a network, so many times as fast as predicted, for each of the keys to add."""
+    runs = []
+    for keys in more or ({},):
+        dpu = load_dpu(keys.get("target", "vck190"), keys.get("configuration"))
+        fps = factor * rate(folder, name, dpu).fps
+        runs.append({"model": f"{name}.onnx", "tile_px": 320, "fps": fps, **keys})
     (folder / "board.json").write_text(json.dumps(runs))
-    return read_own_runs(folder / "board.json", DPU)
+    board = load_dpu("zcu102") if "target" in runs[0] else DPU
+    return read_own_runs(folder / "board.json", board)
 
 
-def test_each_part_is_corrected_by_the_runs_that_it_bounds(folder: Path) -> None:
-    """One run tells more of its network than of the board: of the logarithm, a fourth is the
-    board's.
+def test_a_run_corrects_by_kinship(folder: Path) -> None:
+    """Nearly wholly the same again, less on another configuration or of another size, less again a
+    network of the same kinds of layers, and one that the host bounds not at all.
     """
-    runs = runs_of(folder, deep=0.5, flat=2.0)
-    assert (runs.dpu_factor, runs.host_factor) == pytest.approx((0.5**0.25, 2.0**0.25))
-    for row in runs.run_rows():
-        before, after = (
-            abs(row.figures[f"{key} is off by"].value or 0) for key in ("shipped", "corrected")
-        )
-        assert after < before
+    runs = runs_of(folder, 0.5)
+    other = runs.applied(load_dpu("vck190", "C32B6"))
+    corrected = [
+        rate(folder, "deep", runs.applied(DPU)),
+        rate(folder, "deep", other),
+        rate(folder, "kin", runs.applied(DPU)),
+        rate(folder, "flat", runs.applied(DPU)),
+    ]
+    shares = [math.log(prediction.speed) / math.log(0.5) for prediction in corrected]
+    assert shares == pytest.approx([sum(SHARES), sum(SHARES[:3]), sum(SHARES[:2]), 0])
+    assert rate(folder, "deep", runs.applied(DPU), 256).speed == pytest.approx(corrected[1].speed)
+
+
+def test_what_is_corrected_is_narrower(folder: Path) -> None:
+    runs = runs_of(folder, 0.5)
+    for name, dpu in (("deep", DPU), ("deep", load_dpu("vck190", "C32B6")), ("kin", DPU)):
+        before = rate(folder, name, dpu)
+        after = rate(folder, name, runs.applied(dpu))
+        share = math.log(after.speed) / math.log(0.5)
+        assert after.width == pytest.approx(before.width * math.sqrt(1 - share**2))
+        assert after.fps == pytest.approx(before.fps * after.speed)
+        assert after.latency_s == pytest.approx(before.latency_s / after.speed)
+
+
+def test_runs_of_another_board_with_the_same_dpu_count(folder: Path) -> None:
+    """What is the board's is left out; a board with another DPU is refused."""
+    runs = runs_of(folder, 0.5, {"target": "zcu104"})
+    corrected = rate(folder, "deep", runs.applied(load_dpu("zcu102")))
+    assert math.log(corrected.speed) / math.log(0.5) == pytest.approx(sum(SHARES[1:3]))
+    (folder / "board.json").write_text('[{"model": "deep.onnx", "target": "zcu104", "fps": 3}]')
+    with pytest.raises(OptionError, match="whose DPU is not that of"):
+        read_own_runs(folder / "board.json", DPU)
 
 
 @pytest.mark.parametrize("count", [1, 3, 30])
-def test_more_runs_move_a_factor_further(folder: Path, count: int) -> None:
-    runs_of(folder, deep=0.5)
-    entry = json.loads((folder / "board.json").read_text())
-    (folder / "board.json").write_text(json.dumps(count * entry))
-    assert read_own_runs(folder / "board.json", DPU).dpu_factor == pytest.approx(
-        0.5 ** (count / (count + SCATTER))
-    )
+def test_runs_repeated_correct_further_and_never_beyond_what_they_say(count: int) -> None:
+    runs = [((1, 2, 3, 4), math.log(0.5))] * count
+    scatter = 1 - sum(SHARES)
+    factor, left = correction((1, 2, 3, 4), runs)
+    share = sum(SHARES) / (sum(SHARES) + scatter / count)
+    assert factor == pytest.approx(0.5**share)
+    assert 0 < left < 1
+    assert correction((0, 0, 0, 0), runs) == (1.0, 1.0)
 
 
-def test_a_part_without_runs_keeps_its_constants(folder: Path) -> None:
-    runs = runs_of(folder, deep=0.5)
-    assert runs.host_factor == 1.0
-    before, after = (
-        predict_network(folder / "deep.onnx", dpu, 320) for dpu in (DPU, runs.applied(DPU))
-    )
-    assert after.batch_time_s == pytest.approx(2**0.25 * before.batch_time_s)
-    assert after.host_s == pytest.approx(before.host_s)
-    assert after.width == before.width
+def test_each_run_is_compared_with_what_the_others_say_of_it(folder: Path) -> None:
+    first, second = runs_of(folder, 0.5, {}, {"configuration": "C32B6"}).run_rows()
+    for row in (first, second):
+        before, after = (
+            abs(row.figures[f"{key} is off by"].value or 0)
+            for key in ("shipped", "by the other runs")
+        )
+        assert after < before
+    (alone,) = runs_of(folder, 0.5).run_rows()
+    assert alone.figures["by the other runs"].value == alone.figures["shipped"].value
 
 
 @pytest.mark.parametrize(
@@ -96,7 +130,7 @@ def test_a_part_without_runs_keeps_its_constants(folder: Path) -> None:
         f'[{{"model": "deep.onnx", "fps": 3, "tile_px": {10**300}}}]',
         '[{"model": "deep.onnx", "fps": 1e-8, "tile_px": 320}]',
         '[{"model": "deep.onnx", "fps": 1e8, "tile_px": 320}]',
-        f"[{', '.join(1001 * [RUN])}]",
+        f"[{', '.join(101 * [RUN])}]",
     ],
 )
 def test_bad_runs_are_refused(folder: Path, text: str) -> None:

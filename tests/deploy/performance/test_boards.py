@@ -18,6 +18,7 @@ from beers_deploy.dpu.board import boards_of, load_dpu
 from beers_deploy.dpu.cost.model import TASKS
 from beers_deploy.model.raster.images import read_acquisition
 from beers_deploy.network import Network
+from beers_deploy.performance import traditional
 from beers_deploy.performance.board import Bench, Question, bench_board, boards_for
 from beers_deploy.performance.swath import Swath, predict_network
 from beers_deploy.performance.tables import frame_row, sweep_rows, within_words
@@ -94,6 +95,35 @@ def test_the_smallest_dpu_that_meets_a_time_is_named(network: Path) -> None:
     name = rows[int(np.argmin(sizes))].name
     assert f"by the prediction {name}" in words
     assert "by the whole interval" not in words
+
+
+def test_next_to_the_papers_run_stands_one_counted_alike(network: Path) -> None:
+    """Of the default configuration, also where whole tiles of all are compared."""
+    one = bench(network, dpu="C32B3").rows
+    (alike,) = [row for row in one if "as the paper counts" in row.name]
+    (same,) = [row for row in bench(network, dpu="all").rows if "as the paper counts" in row.name]
+    assert same == alike
+    others = bench(network, "zcu102,kv260").rows
+    assert not [row for row in others if "paper" in row.name]
+
+
+@pytest.mark.parametrize(("target", "warned"), [("vck190,vek280", True), ("vck190", False)])
+def test_the_first_line_warns_of_a_board_of_which_little_is_known(
+    network: Path, target: str, warned: bool
+) -> None:
+    result = bench(network, target)
+    assert ("Of vek280 little is known" in result.headings[result.rows[0].table]) is warned
+    assert "Of vck190" not in str(result.headings)
+
+
+@pytest.mark.parametrize(("others", "warned"), [(0.5, True), (0.1, False)])
+def test_the_first_line_warns_where_others_load_the_machine(
+    network: Path, monkeypatch: pytest.MonkeyPatch, others: float, warned: bool
+) -> None:
+    monkeypatch.setattr(traditional, "load_of_others", lambda *_: others)
+    result = bench(network, traditional=True)
+    heading = result.headings[result.rows[0].table]
+    assert ("other programs took 50%" in heading) is warned
 
 
 def test_a_network_that_is_not_tiled_is_predicted_by_the_frame(classifier: Path) -> None:

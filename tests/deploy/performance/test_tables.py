@@ -97,7 +97,7 @@ def test_layers_are_shown_in_detail_and_written_always(tmp_path: Path) -> None:
 
 def test_layer_rows_have_the_columns_of_vaitrace_and_sum_to_their_last(tmp_path: Path) -> None:
     rows = layer_rows(predict_network(integer_convbeers(tmp_path / "i.onnx", 2, 64), DPU, 333))
-    columns = {"work", "time", "rate", "LdFM", "LdWB", "StFM", "bandwidth", "array use", "energy"}
+    columns = {"work", "time", "rate", "LdFM", "LdWB", "StFM", "bandwidth", "array use"}
     assert all(set(row.figures) == columns for row in rows[:-1])
     assert all(word in TRAFFIC for word in columns if word[:2] in ("Ld", "St"))
     assert {row.text["bound"] for row in rows[:-1]} <= {"compute", "memory", "overhead"}

@@ -3,9 +3,11 @@ import time
 from functools import partial
 from pathlib import Path
 
+import psutil
 import pytest
 
-from beers_deploy.performance.timing import interleaved, timed
+from beers_deploy.performance.timing import interleaved, load_of_others, own_cpu_s, timed
+from beers_deploy.profiles.figures import measured
 
 counters = pytest.mark.skipif(
     sys.platform == "win32", reason="Linux's counters have names that Windows refuses"
@@ -70,3 +72,20 @@ def test_calls_run_round_by_round_until_there_are_enough_and_they_took_long_enou
         assert sum(times) >= least_s
     if least_s:
         assert min(sum(time_s for time_s, _ in timings[:-1]) for timings in series) < least_s
+
+
+@pytest.mark.parametrize(
+    ("percent", "own_cpus", "others"), [(100, 0.5, 0.5), (50, 0.5, 0), (3, 1, 0)]
+)
+def test_the_load_of_others_is_what_this_process_did_not_take(
+    percent: float, own_cpus: float, others: float
+) -> None:
+    own_s = own_cpus * (psutil.cpu_count() or 1) * 2.0
+    load = measured(percent, "%", "a test")
+    assert load_of_others(load, own_s, 2.0) == pytest.approx(others)
+
+
+def test_own_time_grows_with_work() -> None:
+    before_s = own_cpu_s()
+    sum(range(10**6))
+    assert own_cpu_s() > before_s

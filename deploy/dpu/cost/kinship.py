@@ -1,0 +1,64 @@
+"""How far the runs of an owner's board correct the prediction of another network: by kinship.
+
+ln(given / predicted) of a run is the sum of what the runs of one board have in common, the networks
+of one kind of layers, the runs of one network, and the single run. The shares of the variance in
+SHARES were chosen on the published networks, each predicted without its family
+(docs/explanation/cost-model.md). The correction of a network is its mean given the runs, and its
+interval narrows as the variance that they leave (kriging).
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from beers_deploy.dpu.board import Dpu, Levels
+from beers_deploy.dpu.cost.work import FUSED
+from beers_deploy.dpu.graph import Operation
+
+SHARES = (0.15, 0.35, 0.25, 0.2)
+"""Of the variance: of the board and what bounds the rate; of the kinds of layers; of the network;
+of the network in one size on one configuration. What is left is the scatter of repeated runs.
+"""
+
+
+def levels_of(operations: Sequence[Operation], dpu: Dpu, bound: str) -> Levels:
+    """Return what a run has in common with others, for each of SHARES.
+
+    Args:
+        operations: of the network, in order.
+        dpu: the configuration that it runs on.
+        bound: what sets its rate by the prediction, the host or the DPU.
+    """
+    computing = [op for op in operations if op.kind not in FUSED]
+    # The window of a pool over a whole map is as large as the map, whatever the network.
+    kinds = [
+        (op.kind, op.kernel if op.weight_bytes else (0, 0), op.window.strides) for op in computing
+    ]
+    network = tuple((kind, op.channels) for kind, op in zip(kinds, computing, strict=True))
+    place = (network, dpu.target.name, dpu.name, computing[0].out_shape)
+    # Levels are compared many times: their hashes stand for them.
+    return tuple(map(hash, ((dpu.target.name, bound), frozenset(kinds), network, place)))
+
+
+def correction(of: Levels, runs: Sequence[tuple[Levels, float]]) -> tuple[float, float]:
+    """Return how many times as fast as predicted a network is, and what is left of its width.
+
+    Args:
+        of: the network.
+        runs: of the owner, each with its ln(given / predicted).
+    """
+    if not runs:
+        return 1.0, 1.0
+    names = [levels for levels, _ in runs]
+    scatter = (1 - sum(SHARES)) * np.eye(len(runs))
+    covariance = scatter + [[_common(one, other) for other in names] for one in names]
+    common = np.array([_common(of, one) for one in names])
+    weights = np.linalg.solve(covariance, common)
+    ratio = float(weights @ [ratio for _, ratio in runs])
+    return math.exp(ratio), math.sqrt(1 - float(weights @ common))
+
+
+def _common(one: Levels, other: Levels) -> float:
+    same = (a == b for a, b in zip(one, other, strict=True))
+    return math.fsum(share for share, equal in zip(SHARES, same, strict=True) if equal)
