@@ -1,7 +1,7 @@
 """A network of colours and a map of noise levels, as FFDNet reads them: from samples to a board."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import onnxruntime as ort
@@ -134,7 +134,7 @@ def test_image_files_are_samples_of_a_stated_range(tmp_path: Path) -> None:
     convolution = nn.Conv2d(3, 3, 3, padding=1)
     with torch.no_grad():
         convolution.weight.normal_(0, 0.2, generator=torch.Generator().manual_seed(0))
-        convolution.bias.zero_()
+        cast(torch.Tensor, convolution.bias).zero_()
     floating = bd.Network.load(convolution, example=(1, 3, 32, 32))
     pixels = np.random.default_rng(6).integers(0, 256, (4, 32, 32, 3), np.uint8)
     pixels[:, 0, :2] = [[0], [255]]
