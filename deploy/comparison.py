@@ -70,8 +70,9 @@ class Data:
                 stand for, as in `restore`.
         """
         ranges = self.input_range
-        if int8 is not None and int8.input_ranges and self._has_pictures:
-            ranges = int8.stated_ranges
+        if int8 is not None and self._has_pictures:
+            with faults_named(int8.label):
+                ranges = int8.stated_ranges or ranges
         with faults_named(network.label):
             return samples_of(network.model, self.samples, ranges)
 
