@@ -79,8 +79,10 @@ def look(image: np.ndarray, sensor: Instrument) -> BandFaults:
 def has_faults(faults: BandFaults) -> bool:
     """Return True if any fault is reported."""
     stripes = (faults.columns, faults.rows)
-    lines = any(each.seen or each.off or each.dead for each in stripes)
-    return lines or any(pattern.seen for pattern in faults.patterns) or len(faults.pixels) > 0
+    lines = any(each.significant or each.off or each.dead for each in stripes)
+    return (
+        lines or any(pattern.significant for pattern in faults.patterns) or len(faults.pixels) > 0
+    )
 
 
 def false_alarms(scenes: Sequence[Scene], count: int, generator: np.random.Generator) -> None:
@@ -121,7 +123,7 @@ def gains(
 ) -> float:
     """Change every column's gain."""
     faulty = image * (1 + rms * generator.standard_normal(image.shape[1]))
-    return float(look_at_stored(faulty, sensor).columns.seen)
+    return float(look_at_stored(faulty, sensor).columns.significant)
 
 
 def column(

@@ -109,14 +109,14 @@ def banked_to_onnx(
         kernel_shape=[side, side],
     )
     reach, wide_reach = bank.reach(weights.kernels)
-    planes = _held(writer, "planes", bank_output, reach)
+    planes = _clip(writer, "planes", bank_output, reach)
     picked = writer.node("Conv", "picked", [bank_output, "analytic.weight"], kernel_shape=[1, 1])
-    analytic = _held(writer, "analytic", picked, wide_reach)
+    analytic = _clip(writer, "analytic", picked, wide_reach)
     deep = writer.node("Concat", "deep", [_deep(writer, variant.blocks, planes), analytic], axis=1)
     return _ended(writer, _conv(writer, "tail", deep), scale, about, tile_px)
 
 
-def _held(writer: GraphWriter, name: str, source: str, most: float) -> str:
+def _clip(writer: GraphWriter, name: str, source: str, most: float) -> str:
     """Write a Clip node that limits a tensor to [-most, most]."""
     ends = [(f"{name}.low", -most), (f"{name}.high", most)]
     limits = [writer.constant(end, np.array(value, np.float32)) for end, value in ends]

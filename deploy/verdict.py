@@ -167,10 +167,10 @@ def read_baseline(path: Path, arguments: Mapping[str, Any]) -> Baseline:
     figures: dict[str, Any] = rows[0]["figures"] if rows else {}
     mae = figures.get("MAE", {})
     if mae.get("mode") != "measured" or mae.get("unit") != SCALE or not 0 <= mae["value"] <= 1:
-        found = f"{mae.get('value')} {mae.get('unit')}, {mae.get('mode')}" if mae else "no MAE"
+        actual = f"{mae.get('value')} {mae.get('unit')}, {mae.get('mode')}" if mae else "no MAE"
         raise OptionError(
-            f"{path} must have a measured MAE from 0 to 1 {SCALE}, but it has {printable(found)}. "
-            f"{REMAKE}"
+            f"{path} must have a measured MAE from 0 to 1 {SCALE}, but it has "
+            f"{printable(actual)}. {REMAKE}"
         )
     contradiction = _contradiction(document["checks"], len(rows), mae["value"])
     if contradiction:
@@ -371,7 +371,7 @@ def file_checks(
 def junit_text(title: str, checks: Sequence[Check]) -> str:
     """Return the verdict as JUnit XML: a test case for each check."""
     faults = {
-        check.name: f"found {check.found}, allowed {check.allowed}"
+        check.name: f"found {check.actual}, allowed {check.allowed}"
         for check in checks
         if not check.passed
     }

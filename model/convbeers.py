@@ -217,7 +217,7 @@ class BankedConvBEERS(Layers):
                 they are not rounded.
         """
         filtered = each_by_its_own(image, condition.filters)
-        planes, analytic = self._held(filtered, condition.gains)
+        planes, analytic = self._clipped(filtered, condition.gains)
         inputs = pixel_unshuffle(torch.cat([image - 0.5, planes], 1), self.variant.scale)
         shallow = (self.head(inputs) + self.bias(condition.vectors)[:, :, None, None]).contiguous(
             memory_format=torch.channels_last
@@ -226,7 +226,7 @@ class BankedConvBEERS(Layers):
         restored: Tensor = image + condition.units[:, None, None, None] * (analytic + correction)
         return restored
 
-    def _held(self, filtered: Tensor, gains: Tensor) -> tuple[Tensor, Tensor]:
+    def _clipped(self, filtered: Tensor, gains: Tensor) -> tuple[Tensor, Tensor]:
         """Clip planes and analytic restoration, (N, 5, H, W) in units, to the limits of
         `Bank.reach`.
         """

@@ -236,7 +236,9 @@ def write_dataset(
             pool = stack.enter_context(
                 ProcessPoolExecutor(min(workers, MOST_PROCESSES), mp_context=spawn)
             )
-        for path, patches in stack.enter_context(closing(_made(recipe, waiting, workers, pool))):
+        for path, patches in stack.enter_context(
+            closing(_patches_by_path(recipe, waiting, workers, pool))
+        ):
             for window, patch in zip(waiting[path], patches, strict=True):
                 for role, dn in (("degraded", patch.degraded), ("reference", patch.reference)):
                     write_tiff(image_of(out, role, window.name), dn)
@@ -298,7 +300,7 @@ def _lines_left(
     return lines
 
 
-def _made(
+def _patches_by_path(
     recipe: DatasetRecipe, waiting: dict[Path, list[Window]], workers: int, pool: Executor | None
 ) -> Generator[tuple[Path, list[Patch]], None, None]:
     """Yield the patches of each part in order; two calls per worker run at any time."""

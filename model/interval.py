@@ -149,17 +149,17 @@ class PixelInterval:
         """
         try:
             record: Any = parse_json(text)
-            found = cls(
+            interval = cls(
                 exponents=Exponents(**{k: float(v) for k, v in record["exponents"].items()}),
                 quantiles={int(k): float(v) for k, v in record["quantiles"].items()},
                 acquisitions=int(record["acquisitions"]),
             )
             # A NaN or an infinite number fails each comparison too.
-            if not all(abs(value) <= MOST_EXPONENT for value in astuple(found.exponents)):
+            if not all(abs(value) <= MOST_EXPONENT for value in astuple(interval.exponents)):
                 raise ValueError(f"an exponent is not within {MOST_EXPONENT:g}")
-            if not all(0 < value <= MOST_QUANTILE for value in found.quantiles.values()):
+            if not all(0 < value <= MOST_QUANTILE for value in interval.quantiles.values()):
                 raise ValueError(f"a quantile is not between 0 and {MOST_QUANTILE:g}")
-            if not found.quantiles or not found.quantiles.keys() <= set(LEVELS):
+            if not interval.quantiles or not interval.quantiles.keys() <= set(LEVELS):
                 raise ValueError("it has other levels than this version")
         except (AttributeError, LookupError, OverflowError, TypeError, ValueError) as error:
             raise ModelError(
@@ -167,7 +167,7 @@ class PixelInterval:
                 f"({reason_of(error)}). Calibrate the network again with 'beers-deploy evaluate "
                 "--calibrate'."
             ) from error
-        return found
+        return interval
 
 
 @dataclass(frozen=True)
@@ -327,8 +327,10 @@ def fit_exponents(samples: Sequence[Sample]) -> Exponents:
     columns = root * centred(np.concatenate(terms))
     # Terms that one sensor leaves (almost) constant or proportional have no solution of their own:
     # the cutoff gives them the least exponents.
-    found, *_ = np.linalg.lstsq(columns, root[:, 0] * centred(np.concatenate(values)), rcond=1e-6)
-    return Exponents(*map(float, found))
+    solution, *_ = np.linalg.lstsq(
+        columns, root[:, 0] * centred(np.concatenate(values)), rcond=1e-6
+    )
+    return Exponents(*map(float, solution))
 
 
 def conformal_quantile(scores: Sequence[Array], level: float) -> float:

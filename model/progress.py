@@ -55,9 +55,9 @@ _sink: ContextVar[Progress] = ContextVar("progress", default=None)
 
 
 @contextmanager
-def reporting(wanted: Progress) -> Iterator[None]:
+def reporting(callback: Progress) -> Iterator[None]:
     """Report the work of this block as a caller wants; None changes nothing."""
-    token = _sink.set(_sink.get() if wanted is None else wanted)
+    token = _sink.set(_sink.get() if callback is None else callback)
     try:
         yield
     finally:

@@ -162,12 +162,12 @@ class SelfCheck:
         spectrum = np.fft.rfft2(wide) * np.fft.rfft2(kernel, wide.shape)
         blurred = np.fft.irfft2(spectrum, wide.shape)[2 * REACH_PX :, 2 * REACH_PX :]
 
-        kept = tuple(
+        inside = tuple(
             slice(placed.keep_start - placed.start, placed.keep_stop - placed.start)
             for placed in (down, across)
         )
-        counts = self._counts(raw, missing, down, across)[kept]
-        y = np.where(counts, raw[kept], 0)
+        counts = self._counts(raw, missing, down, across)[inside]
+        y = np.where(counts, raw[inside], 0)
         dark, growth, square = self.variances
         # The variance is taken at the light of H x. The noise of y is in the residual as well, so
         # that its own light would bias the quotient.
@@ -175,7 +175,7 @@ class SelfCheck:
         variance = dark + growth * light + square * light**2
         pixels = _block_sums(counts)
         residual = _block_sums(np.where(counts, (y - blurred) ** 2 / variance, 0))
-        change = _block_sums(np.where(counts, (x[kept] - blurred) ** 2 / variance, 0))
+        change = _block_sums(np.where(counts, (x[inside] - blurred) ** 2 / variance, 0))
         enough = np.where(pixels < LEAST_PX, np.nan, pixels)
         return Judged(chi2=residual / enough, sharpening=change / enough)
 

@@ -177,7 +177,7 @@ class Check:
         return self.value >= self.limit if self.bound == "at least" else self.value <= self.limit
 
     @property
-    def found(self) -> str:
+    def actual(self) -> str:
         """The value with its unit and detail, formatted for a person."""
         unit = "" if self.unit in IN_THE_NAME else f" {self.unit}"
         # A detail may hold the name of a node of another's file: it must stay on its line of a log.
@@ -189,7 +189,7 @@ class Check:
         return f"{self.bound} {self.limit:.4g}"
 
     def __str__(self) -> str:
-        return f"{self.name} {self.found}, allowed {self.allowed}"
+        return f"{self.name} {self.actual}, allowed {self.allowed}"
 
     def to_json(self) -> dict[str, object]:
         """Return the check as a dictionary that matches the results schema.
@@ -204,7 +204,7 @@ class Check:
             "bound": self.bound,
             "passed": self.passed,
             # JSON has no number for infinity and NaN: the text of the value stands here instead.
-            "detail": self.detail if math.isfinite(self.value) else self.found,
+            "detail": self.detail if math.isfinite(self.value) else self.actual,
         }
 
 

@@ -48,7 +48,7 @@ CONTEXT_SETTINGS = {"help_option_names": ["-h", "--help"]}
 
 
 @lru_cache
-def made(spelling: str) -> Any:
+def command_of(spelling: str) -> Any:
     """Return the command of Typer for a spelling; raise KeyError if there is none."""
     command = COMMANDS[SPELLINGS.get(spelling, spelling)]
     alone = typer.Typer(
@@ -69,7 +69,7 @@ class Commands(Mapping[str, Any]):
     """
 
     def __getitem__(self, spelling: str) -> Any:
-        return made(spelling)
+        return command_of(spelling)
 
     def __iter__(self) -> Iterator[str]:
         return iter((*COMMANDS, *SPELLINGS))

@@ -80,9 +80,9 @@ def _results(golden: Golden, folder: Path) -> Results:
         if path.parent.name not in golden.cases or path.name not in files.values()
     ]
     if unknown or not paths:
-        found = f"{unknown[0].parent.name}/{unknown[0].name}" if unknown else "none"
+        actual = f"{unknown[0].parent.name}/{unknown[0].name}" if unknown else "none"
         raise OptionError(
-            f"The results in {folder} must be named CASE/LAYER.npy as in {INDEX}, got {found}. "
+            f"The results in {folder} must be named CASE/LAYER.npy as in {INDEX}, got {actual}. "
             "Rename them."
         )
     outputs: dict[str, list[Written]] = {}

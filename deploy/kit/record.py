@@ -154,7 +154,7 @@ def _page(judged: Table, record: dict[str, Any]) -> Report:
             "checks",
             check.name,
             {},
-            {"found": check.found, "allowed": check.allowed, "passed": str(check.passed)},
+            {"found": check.actual, "allowed": check.allowed, "passed": str(check.passed)},
         )
         for check in judged.checks
     ]

@@ -89,17 +89,17 @@ def layers_of(
     """
     with ExitStack() as stack:
         raw = stack.enter_context(open_raster(image, trusted))
-        made = stack.enter_context(open_raster(restored))
+        result = stack.enter_context(open_raster(restored))
         facts = raw.raster
-        bands = range(3 if min(facts.bands, made.raster.bands) >= 3 else 1)
+        bands = range(3 if min(facts.bands, result.raster.bands) >= 3 else 1)
         before = read_planes(raw, bands, reduction(facts))
-        after = read_planes(made, bands, reduction(made.raster))
+        after = read_planes(result, bands, reduction(result.raster))
         others = []
         for name, path in maps.items():
             source = stack.enter_context(open_raster(path))
             others.append(_map_layer(name, source, facts))
-        notes = _notes(facts, made.raster, len(bands))
-        made_px = _pixel_px(made.raster, facts)
+        notes = _notes(facts, result.raster, len(bands))
+        made_px = _pixel_px(result.raster, facts)
     stretches = [_stretch_of(plane) for plane in before]
     legend = _ends(stretches, _unit(facts))
     layers = [
@@ -233,7 +233,7 @@ def _ends(stretches: Sequence[Stretch], unit: str) -> tuple[tuple[str, str], ...
     return (("#000", f"{blacks} {unit} or less"), ("#fff", f"{whites} {unit} or more"))
 
 
-def _notes(raw: Raster, made: Raster, bands: int) -> str:
+def _notes(raw: Raster, result: Raster, bands: int) -> str:
     """Return sentences on what is shown and how."""
     low, high = STRETCH
     stretch = (
@@ -251,9 +251,9 @@ def _notes(raw: Raster, made: Raster, bands: int) -> str:
             f"The image is reduced by {factor}: a pixel here is the mean of {factor} x {factor}, "
             "which hides noise and sharpness. Restore a crop to see them."
         )
-    if made.width_px != raw.width_px:
+    if result.width_px != raw.width_px:
         sentences.append(
-            f"The restored image is {made.width_px // raw.width_px} times as large, so there is no "
-            "difference."
+            f"The restored image is {result.width_px // raw.width_px} times as large, so there is "
+            "no difference."
         )
     return " ".join(sentences)

@@ -105,9 +105,9 @@ def in_order(given: Mapping[str, Each], raster: Raster) -> list[Each]:
     stored_names = raster.band_names
     names = stored_names or _by_number(given)
     if len(given) != raster.bands or set(names) != set(given):
-        wanted = f" ({printable(', '.join(stored_names))})" if stored_names else ""
+        names_text = f" ({printable(', '.join(stored_names))})" if stored_names else ""
         raise OptionError(
-            f"`sensor` must name a sensor for each of {raster.bands} bands{wanted}, got "
+            f"`sensor` must name a sensor for each of {raster.bands} bands{names_text}, got "
             f"{printable(', '.join(given))}. Name every band of the image; pansharpening is out of "
             "scope."
         )

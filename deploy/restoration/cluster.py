@@ -46,7 +46,7 @@ class Cluster:
         try:
             return sum(self._client.nthreads().values())
         except OSError as error:
-            raise _lost(UNCONNECTED, "Start it again") from error
+            raise _cluster_error(UNCONNECTED, "Start it again") from error
 
     def share(self, value: T) -> T:
         """Return a future that stands for a value in calls. The value is sent once, and again if
@@ -66,7 +66,7 @@ class Cluster:
             except TimeoutError:
                 seen_s = time.monotonic() if self.slots else seen_s
                 if time.monotonic() - seen_s > WORKERLESS_S:
-                    raise _lost(
+                    raise _cluster_error(
                         f"The scheduler has had no workers for {WORKERLESS_S} s.", "Start some"
                     ) from None
 
@@ -87,18 +87,18 @@ def open_cluster(scheduler: str | None) -> Iterator[Cluster | None]:
         try:
             yield Cluster(client)
         except distributed.KilledWorker as error:
-            raise _lost(
+            raise _cluster_error(
                 "Several workers died during the same call.",
                 "Give them more memory, or use smaller tiles",
             ) from error
         except CancelledError as error:
-            raise _lost(UNCONNECTED, "Start it again") from error
+            raise _cluster_error(UNCONNECTED, "Start it again") from error
 
 
 UNCONNECTED = "The connection to the scheduler of the workers was lost."
 
 
-def _lost(fault: str, remedy: str) -> MachineError:
+def _cluster_error(fault: str, remedy: str) -> MachineError:
     return MachineError(f"{fault} {remedy}, and go on with `resume`.")
 
 
@@ -115,7 +115,7 @@ def _connect(distributed: Any, address: str) -> Any:
         client.wait_for_workers(1, timeout=JOIN_S)
     except OSError as error:
         client.close()
-        raise _lost(
+        raise _cluster_error(
             f"No worker joined the scheduler within {JOIN_S} s.",
             f"Start some with 'dask worker {address}'",
         ) from error

@@ -101,7 +101,7 @@ class Tally:
         cls,
         stored: np.ndarray,
         restored: np.ndarray,
-        seen: np.ndarray | None,
+        valid: np.ndarray | None,
         known: np.ndarray | None,
     ) -> "Tally":
         """Return the tally of a part of an image.
@@ -109,7 +109,7 @@ class Tally:
         Args:
             stored: its pixels (bands, h, w), in shares of full scale.
             restored: its results (bands', h s, w s) at a scale s.
-            seen: mask of the pixels that are not missing; None if none is missing.
+            valid: mask of the pixels that are not missing; None if none is missing.
             known: mask of the results that are not missing; None if none is missing.
         """
         alike = len(stored) == len(restored)
@@ -119,12 +119,12 @@ class Tally:
         at_ends = ((restored <= 0) | (restored >= 1)) & within
         before = stored
         after = restored
-        if seen is not None and known is not None:
+        if valid is not None and known is not None:
             at_ends = at_ends & known
-            before = stored[seen]
+            before = stored[valid]
             after = restored[known]
         ends = int(at_ends.sum())
-        blank = 0 if seen is not None else _blank_px(stored)
+        blank = 0 if valid is not None else _blank_px(stored)
         counts = cls(after.size, int((before > 1).sum()), ends, network_at_ends=ends, blank=blank)
         if not alike:
             return counts

@@ -37,13 +37,13 @@ class Pattern:
         difference: between its two kinds of pixels over the level, root mean square of the sections
             without noise.
         largest: of the sections, the largest significant one.
-        seen: whether enough sections show it significantly.
+        significant: whether enough sections show it significantly.
     """
 
     name: str
     difference: float
     largest: float
-    seen: bool
+    significant: bool
 
 
 def measure_phases(pixels: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

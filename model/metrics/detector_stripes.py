@@ -82,7 +82,7 @@ class Stripes:
         spread: standard deviation of the lines' gains without noise, over the level; None if it
             cannot be determined.
         spread_error: its standard error.
-        seen: whether the spread is significant, and of independent lines.
+        significant: whether the spread is significant, and of independent lines.
         off: single deviating lines, the largest deviation first.
         dead: lines that are constant while their neighbours are not.
         grows_with_level: True for gains, False for offsets; None if the levels do not decide.
@@ -90,7 +90,7 @@ class Stripes:
 
     spread: float | None = None
     spread_error: float = 0.0
-    seen: bool = False
+    significant: bool = False
     off: tuple[Line, ...] = ()
     dead: tuple[int, ...] = ()
     grows_with_level: bool | None = None
@@ -127,7 +127,7 @@ def judge_lines(blocks: Blocks, least: float) -> Stripes:
     return Stripes(
         spread=spread,
         spread_error=spread_error,
-        seen=significant and spread is not None and spread - spread_error > least,
+        significant=significant and spread is not None and spread - spread_error > least,
         off=tuple(line for line in off if line.index not in set(dead.tolist())),
         dead=tuple(dead.tolist()),
         grows_with_level=_grows(gains, errors, level),

@@ -68,11 +68,11 @@ def raster_of(path: Path, dataset: Any) -> Raster:
                 dataset.units[band] or "",
                 dataset.scales[band],
                 dataset.offsets[band],
-                _kept(dataset.tags(band + 1)),
+                _retained_tags(dataset.tags(band + 1)),
             )
             for band in range(bands)
         ),
-        tags=_kept(tags),
+        tags=_retained_tags(tags),
     )
 
 
@@ -164,6 +164,6 @@ def _place(dataset: Any) -> Place:
     )
 
 
-def _kept(tags: dict[str, str]) -> tuple[tuple[str, str], ...]:
+def _retained_tags(tags: dict[str, str]) -> tuple[tuple[str, str], ...]:
     """Return the metadata items that are copied to a restored image."""
     return tuple((key, text) for key, text in sorted(tags.items()) if not key.startswith(UNKEPT))

@@ -83,7 +83,7 @@ def folded_signals(scene: Visited, sensors: tuple[Instrument, ...], passage: Pas
     height, width = scene.sides
     device = scene.spectrum.device
     down, across = frequencies(height, width, passage.oversampling, device)
-    ground = looked(scene.spectrum, passage.look, down, across)
+    ground = with_look(scene.spectrum, passage.look, down, across)
     # Target pixel n is sampled at the centre of its scene pixels, as
     # `model.simulator.sampling.sample` does.
     centre = (passage.oversampling - 1) / 2
@@ -108,7 +108,7 @@ def within_margin(image: Tensor, margin_px: int) -> Tensor:
     return image[margin_px : height - margin_px, margin_px : width - margin_px]
 
 
-def looked(spectrum: Tensor, look: Look, fy: Tensor, fx: Tensor) -> Tensor:
+def with_look(spectrum: Tensor, look: Look, fy: Tensor, fx: Tensor) -> Tensor:
     """Apply a look to the half spectrum of the ground; its mean changes with the light only.
 
     Args:

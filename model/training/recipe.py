@@ -163,13 +163,13 @@ def load_recipe(name: str) -> NetworkRecipe:
             f"The {where} has no stages. Add each stage of the training as a table [[stages]]."
         )
     stages = tuple(
-        _made(Stage, f"{where}: stage {number}", table) for number, table in enumerate(tables, 1)
+        _build(Stage, f"{where}: stage {number}", table) for number, table in enumerate(tables, 1)
     )
     parts: dict[str, Any] = {"stages": stages}
     for key, kind in (("looks", Looks), ("loss", LossWeights)):
         if key in raw:
-            parts[key] = _made(kind, f"{where}: {key}", raw[key])
-    recipe = _made(NetworkRecipe, where, {**raw, **parts})
+            parts[key] = _build(kind, f"{where}: {key}", raw[key])
+    recipe = _build(NetworkRecipe, where, {**raw, **parts})
     variant_named(recipe.variant)
     if stages[0].rounding and not recipe.start:
         raise ProfileError(
@@ -179,7 +179,7 @@ def load_recipe(name: str) -> NetworkRecipe:
     return recipe
 
 
-def _made(kind: type[T], where: str, raw: object) -> T:
+def _build(kind: type[T], where: str, raw: object) -> T:
     """Build a dataclass from a table, with each value checked against the type of its field."""
     if not isinstance(raw, Mapping):
         raise ProfileError(f"{where} must be a table, got {printable(repr(raw))}.")

@@ -241,7 +241,7 @@ class Trainer:
                     or self._due(schedule.validate_steps)
                     or self._full
                 ):
-                    rows += self.seen()
+                    rows += self.collected()
                 if self._due(schedule.report_steps):
                     patches = len(rows) * self.recipe.batch * self.worker.count
                     schedule.report(self.step, self._means(rows), spent.figures(patches))
@@ -252,7 +252,7 @@ class Trainer:
                 if save:
                     self.save(checkpoint)
                     saved_at = time.monotonic()
-        self.seen()
+        self.collected()
         self.save(checkpoint)
         if self.step < self.recipe.steps:
             raise KeyboardInterrupt
@@ -278,14 +278,14 @@ class Trainer:
         return dict(zip(self._take.names, np.mean(counted, 0).tolist(), strict=True))
 
     def train_step(self, batch: Batch) -> None:
-        """Take one step on a batch; `seen` reads its result later."""
+        """Take one step on a batch; `collected` reads its result later."""
         # Early on the average follows fast, or the first random weights would stay in it for long.
         step = self.step + 1
         decay = min(self.recipe.ema_decay, (1 + step) / (10 + step))
         self._unseen.append(self._take(batch, self.recipe.rate_at(self.step), 1 - decay))
         self.step = step
 
-    def seen(self) -> list[list[float]]:
+    def collected(self) -> list[list[float]]:
         """Read the results of the steps since the last call, and stop a failing run.
 
         Returns:

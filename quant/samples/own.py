@@ -200,7 +200,7 @@ def read_samples(
         raise ImageError(f"{label} contains no sample, but at least one is needed. {REMEDY}")
     stated = ranges is not None
     if ranges is None:
-        ranges = _found(label, (image for _, (image, _) in samples))
+        ranges = _ranges_of(label, (image for _, (image, _) in samples))
     # Any network preserves a constant image, so a mean over such samples would hide errors. A map
     # of noise levels is constant in each sample.
     textured = [s for s in samples if _contrast(s[1][0], ranges) >= LEAST_CONTRAST]
@@ -211,7 +211,7 @@ def read_samples(
     return OwnSamples(name, textured, ranges, stated)
 
 
-def _found(label: str, images: Iterable[np.ndarray]) -> Ranges:
+def _ranges_of(label: str, images: Iterable[np.ndarray]) -> Ranges:
     """Return the ranges that samples span; raise ImageError if no network is quantised for them."""
     ranges = ranges_of(images)
     try:

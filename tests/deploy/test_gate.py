@@ -159,7 +159,7 @@ def test_without_8_bit_results_no_limit_on_them_is_kept() -> None:
     *others, check = judge(result, Limits(saturated=0.5), shares={})
     assert len(others) == unlimited
     assert not check.passed
-    assert "none is 8-bit" in check.found
+    assert "none is 8-bit" in check.actual
 
 
 def test_options_that_do_not_go_together_are_refused(tmp_path: Path) -> None:

@@ -151,9 +151,9 @@ class Layers:
         compute = self.compute_s(constants)
         memory = self.memory_s(constants, alone=alone)
         # What the longer of the two hides of the shorter counts for neither.
-        seen = 1 - structure.overlap
-        compute_s = np.where(compute >= memory, compute, seen * compute)
-        memory_s = np.where(compute >= memory, seen * memory, memory)
+        exposed = 1 - structure.overlap
+        compute_s = np.where(compute >= memory, compute, exposed * compute)
+        memory_s = np.where(compute >= memory, exposed * memory, memory)
         on_array = self.array_s > 0
         start_s = constants.layer_s * self.launched
         return np.stack([compute_s * on_array, compute_s * ~on_array, memory_s, start_s], axis=1)

@@ -100,8 +100,8 @@ def _read(path: Path) -> Sequence[Mapping[str, object]]:
         or not 0 < len(runs) <= RUNS
         or not all(isinstance(run, dict) for run in runs)
     ):
-        found = f"a list of {len(runs)}" if isinstance(runs, list) else type(runs).__name__
-        raise OptionError(f"{path} must be a list of 1 to {RUNS} runs, got {found}. {EXAMPLE}")
+        actual = f"a list of {len(runs)}" if isinstance(runs, list) else type(runs).__name__
+        raise OptionError(f"{path} must be a list of 1 to {RUNS} runs, got {actual}. {EXAMPLE}")
     return runs
 
 

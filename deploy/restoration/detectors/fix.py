@@ -47,20 +47,22 @@ along a column, diagonal.
 """
 
 
-def faults_of(source: Source, wanted: str, name: str) -> FaultList:
+def faults_of(source: Source, source_name: str, name: str) -> FaultList:
     """Return the faults that `restore --fix-detectors` specifies.
 
     Args:
         source: the image.
-        wanted: 'found', or the file of a list; empty for none.
+        source_name: 'found', or the file of a list; empty for none.
         name: of the image, for messages.
     """
-    if not wanted:
+    if not source_name:
         return FaultList(())
     faults = (
-        find_faults(source, name) if wanted == FOUND else read_list(Path(wanted), source.raster)
+        find_faults(source, name)
+        if source_name == FOUND
+        else read_list(Path(source_name), source.raster)
     )
-    origin = "found" if wanted == FOUND else "listed"
+    origin = "found" if source_name == FOUND else "listed"
     logger.info("faulty detectors: %s %s, to be interpolated", faults.words, origin)
     return faults
 

@@ -50,7 +50,7 @@ def _of_band(band: BandFaults) -> Iterator[str]:
     for name, lines in (("columns", band.columns), ("rows", band.rows)):
         yield from _of_lines(name, lines)
     for pattern in band.patterns:
-        if pattern.seen:
+        if pattern.significant:
             yield _of_pattern(pattern)
     if len(band.pixels):
         places = [f"column {column}, row {row}" for row, column in band.pixels[:NAMED].tolist()]
@@ -73,7 +73,7 @@ def _of_lines(name: str, lines: Stripes) -> Iterator[str]:
         )
     kinds = {True: "gains", False: "offsets", None: "gains or offsets"}[lines.grows_with_level]
     remedy = ", ".join(filter(None, (EQUALIZE, EFFECTS[name])))
-    if lines.seen and lines.spread is not None:
+    if lines.significant and lines.spread is not None:
         worst = f", {one} {lines.off[0].index} by {lines.off[0].gain:+.2%}" if lines.off else ""
         yield (
             f"the {kinds} of {name} differ by {lines.spread:.2%} rms of the level{worst}; "

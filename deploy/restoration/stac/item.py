@@ -32,7 +32,7 @@ PROCESSING = "https://stac-extensions.github.io/processing/v1.2.0/schema.json"
 LEVEL = "L4"
 """The processing level that the machine-learning-model extension asks for: output of a model."""
 
-TOLD = (
+LINEAGE = (
     "consistency",
     "exposures",
     "detectors replaced",
@@ -101,8 +101,8 @@ def write_item(run: Run, path: Path, maps: Mapping[str, Path]) -> None:
 def lineage(row: Row) -> str:
     """Return a sentence on what was done to one image, by the row of its run."""
     figures = {name: f"{figure} {figure.unit}" for name, figure in row.figures.items()}
-    told = {**row.text, **figures}
-    steps = [f"{name}: {told[name]}" for name in TOLD if name in told]
+    facts = {**row.text, **figures}
+    steps = [f"{name}: {facts[name]}" for name in LINEAGE if name in facts]
     return "; ".join([f"Restored from {row.name}", *steps])
 
 

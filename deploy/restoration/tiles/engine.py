@@ -57,7 +57,7 @@ class Strip:
     above: bool = False
     left: int = 0
 
-    def kept(self, bands: slice, rows: Span, columns: Span) -> Window:
+    def inner_window(self, bands: slice, rows: Span, columns: Span) -> Window:
         """Return the window of these arrays that contains the retained part of a tile."""
         down = slice(rows.keep_start - self.top, rows.keep_stop - self.top)
         return bands, down, slice(columns.keep_start - self.left, columns.keep_stop - self.left)
@@ -160,9 +160,9 @@ class Restorer:
         if self.consistency:
             change = self._change(strip, restored, at, bands, rows, columns)
             pixels = np.clip(network_pixels + change, 0, np.float32(self.full_scale))
-        kept = strip.kept(bands, rows, columns)
-        valid_raw = None if strip.missing is None else ~strip.missing[kept]
-        raw = strip.pixels[kept].astype(np.float64) / self.full_scale
+        inner_window = strip.inner_window(bands, rows, columns)
+        valid_raw = None if strip.missing is None else ~strip.missing[inner_window]
+        raw = strip.pixels[inner_window].astype(np.float64) / self.full_scale
         valid = None if missing is None else ~missing
         tally = Tally.of(raw, self._shares(pixels), valid_raw, valid)
         if self.consistency:
@@ -229,7 +229,7 @@ class Restorer:
         """
         if strip.missing is None:
             return None
-        missing = strip.missing[strip.kept(bands, rows, columns)]
+        missing = strip.missing[strip.inner_window(bands, rows, columns)]
         tiling = self.tiling
         if tiling.channels_in != tiling.channels_out:
             missing = np.repeat(missing.any(axis=0, keepdims=True), tiling.channels_out, axis=0)
@@ -246,7 +246,9 @@ class Restorer:
             none = np.nan if self.raster.out_dtype.kind == "f" else 0
             blank = none if self.raster.nodata is None else self.raster.nodata
             return np.full(missing.shape, blank, self.raster.out_dtype)
-        stored = strip.pixels[strip.kept(bands, rows, columns)].astype(self.raster.out_dtype)
+        stored = strip.pixels[strip.inner_window(bands, rows, columns)].astype(
+            self.raster.out_dtype
+        )
         return _enlarged(stored, int(tiling.scale))
 
     def _window(self, strip: Strip, bands: slice, rows: Span, columns: Span) -> np.ndarray:

@@ -48,20 +48,22 @@ class ExposedNetwork:
     radius_px: int = 0
     offset: float = 0.0
 
-    def restore(self, window: np.ndarray, full_scale: float, kept: Kept, tiling: Tiling) -> Exposed:
+    def restore(
+        self, window: np.ndarray, full_scale: float, inner: Kept, tiling: Tiling
+    ) -> Exposed:
         """Restore a window of pixel values (bands, h, w) without missing pixels.
 
         Args:
             window: the network's input.
             full_scale: the pixel value that is 1.0 to the network.
-            kept: the part of the window that is retained.
+            inner: the part of the window that is retained.
             tiling: the network's tiling geometry.
 
         Raises:
             ModelError: the result has another shape than the network's file states.
         """
         scale = int(tiling.scale)
-        inside = (slice(None), *(slice(part.start * scale, part.stop * scale) for part in kept))
+        inside = (slice(None), *(slice(part.start * scale, part.stop * scale) for part in inner))
         if len(self.infers) == 1:
             restored = restore_window(window, self.infers[1], full_scale)
             shape = tiling.channels_out, *(side * scale for side in window.shape[1:])
@@ -72,7 +74,7 @@ class ExposedNetwork:
                 )
             return Exposed(restored[inside], 1, 0)
         image = np.asarray(window[0], np.float32)
-        choice = choose_factors(image, self.infers, self.radius_px, full_scale, self.offset)[kept]
+        choice = choose_factors(image, self.infers, self.radius_px, full_scale, self.offset)[inner]
         pixels = np.zeros((1, *choice.shape), np.float32)
         factors = np.unique(choice).tolist()
         for factor in factors:

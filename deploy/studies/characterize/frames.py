@@ -201,9 +201,9 @@ def read_raw(path: Path) -> np.ndarray:
         or pixels.min() < 0
         or pixels.max() > MAX_DN
     ):
-        found = f"{pixels.dtype} from {float(pixels.min()):.4g} to {float(pixels.max()):.4g}"
+        actual = f"{pixels.dtype} from {float(pixels.min()):.4g} to {float(pixels.max()):.4g}"
         raise ImageError(
-            f"{path} must have whole digital numbers from 0 to {MAX_DN}, but it has {found}. Give "
+            f"{path} must have whole digital numbers from 0 to {MAX_DN}, but it has {actual}. Give "
             "the raw image, because resampling, calibration and scaling change the noise."
         )
     return pixels

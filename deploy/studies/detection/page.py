@@ -100,14 +100,14 @@ def crops(compared: Sequence[Comparison]) -> list[Picture]:
     column for each method.
     """
     losses = [
-        sum(int(_lost(comparison, number).sum()) for comparison in compared)
+        sum(int(_missed_objects(comparison, number).sum()) for comparison in compared)
         for number in range(len(compared[0].scenes))
     ]
     numbers = np.argsort(-np.array(losses), kind="stable")[:PICTURES]
     return [_picture(compared, int(number)) for number in numbers]
 
 
-def _lost(comparison: Comparison, number: int) -> np.ndarray:
+def _missed_objects(comparison: Comparison, number: int) -> np.ndarray:
     """Return a mask (M,) of the objects of a scene that are found on the reference and not on
     degraded images.
     """
@@ -154,7 +154,7 @@ def _middle(comparison: Comparison, number: int) -> np.ndarray:
     are considered, if there are any.
     """
     truth = comparison.scenes[number].scene.truth
-    lost_objects = _lost(comparison, number)
+    lost_objects = _missed_objects(comparison, number)
     corners = truth.corners[lost_objects] if lost_objects.any() else truth.corners
     if not len(corners):
         return np.zeros(2)

@@ -48,17 +48,17 @@ def network_to_calibrate(methods: Mapping[str, Any], out: Path) -> tuple[str, Pa
     return name, path
 
 
-def calibrate_network(found: Evaluation, name: str, source: Path, out: Path) -> None:
+def calibrate_network(evaluation: Evaluation, name: str, source: Path, out: Path) -> None:
     """Write a copy of a network's file with the interval that fits an evaluation.
 
     Args:
-        found: the evaluation.
+        evaluation: the evaluation.
         name: of the method that is the network.
         source: the file.
         out: the copy.
     """
-    (method,) = (method for method in found.methods if method.name == name)
-    interval = interval_from_pairs(found.pairs, method.restore, found.sensors[0])
+    (method,) = (method for method in evaluation.methods if method.name == name)
+    interval = interval_from_pairs(evaluation.pairs, method.restore, evaluation.sensors[0])
     write_with_interval(source, interval, out)
     levels = ", ".join(f"{level} %" for level in interval.quantiles)
     logger.info("wrote %s: intervals of %s, of %d images", out, levels, interval.acquisitions)

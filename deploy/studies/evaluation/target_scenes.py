@@ -63,16 +63,16 @@ class Points:
 
     Attributes:
         background: radiance in W/m2/sr/um.
-        seen: the image that the degraded sensor acquires, (H, W) digital numbers.
+        acquired: the image that the degraded sensor acquires, (H, W) digital numbers.
         flat: the same without points, acquired with the same random draws.
-        wanted: the light of the points alone as the reference sensor sees it without noise, (H, W)
-            digital numbers.
+        expected: the light of the points alone as the reference sensor sees it without noise,
+            (H, W) digital numbers.
     """
 
     background: float
-    seen: np.ndarray
+    acquired: np.ndarray
     flat: np.ndarray
-    wanted: np.ndarray
+    expected: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -81,14 +81,14 @@ class Pattern:
 
     Attributes:
         name: of the figure.
-        seen: the image that the degraded sensor acquires, (H, W) digital numbers.
-        wanted: the image that the reference sensor acquires without noise, likewise.
+        acquired: the image that the degraded sensor acquires, (H, W) digital numbers.
+        expected: the image that the reference sensor acquires without noise, likewise.
         measured: True where the restored image is compared, (H, W).
     """
 
     name: str
-    seen: np.ndarray
-    wanted: np.ndarray
+    acquired: np.ndarray
+    expected: np.ndarray
     measured: np.ndarray
 
 

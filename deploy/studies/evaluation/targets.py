@@ -139,11 +139,11 @@ def flux_figures(method: Method, points: Points) -> dict[str, Figure]:
     Its noise is nearly the same at each pixel, so the difference is much more accurate than one
     with a ring around the point would be.
     """
-    light = method.restore(points.seen).astype(np.float64) - method.restore(points.flat)
+    light = method.restore(points.acquired).astype(np.float64) - method.restore(points.flat)
     values: dict[float, list[float]] = {radiance: [] for radiance in POINT_RADIANCES}
     for row, column in point_places():
         place = _aperture(row), _aperture(column)
-        flux = 100 * float(light[place].sum() / points.wanted[place].sum(dtype=np.float64))
+        flux = 100 * float(light[place].sum() / points.expected[place].sum(dtype=np.float64))
         values[point_radiance(row, column)].append(flux)
     figures = {}
     for radiance, fluxes in values.items():
@@ -167,7 +167,7 @@ def transfer_figure(method: Method, patterns: Sequence[Pattern]) -> Figure:
     """
     values: list[float] = []
     for pattern in patterns:
-        values += _transfers(method.restore(pattern.seen), pattern)
+        values += _transfers(method.restore(pattern.acquired), pattern)
     source = f"{len(values)} parts of {len(patterns)} simulated patterns, 90 % interval of the mean"
     return measured(float(np.mean(values)), OF_REFERENCE, source, interval_of_mean(values))
 
@@ -183,7 +183,7 @@ def _transfers(restored: np.ndarray, pattern: Pattern) -> list[float]:
         rows = slice(below * height // 2, (below + 1) * height // 2)
         columns = slice(right * width // 2, (right + 1) * width // 2)
         mask = pattern.measured[rows, columns]
-        truth = pattern.wanted[rows, columns][mask].astype(np.float64)
+        truth = pattern.expected[rows, columns][mask].astype(np.float64)
         # Without the mean, the slope depends only on contrast, not on the level of the image.
         truth -= truth.mean()
         slopes.append(float(truth @ restored[rows, columns][mask] / (truth @ truth)))

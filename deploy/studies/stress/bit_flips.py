@@ -226,7 +226,7 @@ def _drawn(
     bare = psnr_db(unguarded, reference, 1.0)
     clamped = _quality_db(injected, target.guards, reference)
     guarded = clamped
-    if memory.kept:
+    if memory.persistent:
         repaired = faults.corrected(injected, target.core, target.guards, rate, generator)
         guarded = _quality_db(repaired, target.guards, reference)
     blocks = _judged(target.checks[draw % len(target.pairs)], injected.image, unguarded)

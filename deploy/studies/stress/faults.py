@@ -86,10 +86,10 @@ def _narrow(op: IntConv) -> IntConv:
     )
 
 
-def _refused(found: str) -> ModelError:
+def _refused(actual: str) -> ModelError:
     return ModelError(
         "The INT8 core must have bias and shifts as the board stores them, but it has "
-        f"{found}. Make it with 'beers-deploy quantize'."
+        f"{actual}. Make it with 'beers-deploy quantize'."
     )
 
 
@@ -327,20 +327,20 @@ class Memory:
         rates: bit flips in a megabit, of 10^6, that are tried.
         times: factor of the number of draws, for memory in which few draws flip a bit. Draws
             without a flip cost nothing.
-        kept: True if it lives longer than a tile, so that scrubbing has something to compare it
-            with.
+        persistent: True if it lives longer than a tile, so that scrubbing has something to
+            compare it with.
     """
 
     inject: Callable[[IntCore, np.ndarray, float, np.random.Generator], Injected]
     rates: tuple[float, ...] = (0.1, 1.0, 10.0, 100.0, 1000.0)
     times: int = 1
-    kept: bool = False
+    persistent: bool = False
 
 
 MEMORIES = {
-    "weights": Memory(_weights, kept=True),
+    "weights": Memory(_weights, persistent=True),
     # There are too few shifts to be hit at rates that matter elsewhere.
-    "shifts": Memory(_shifts, (10.0, 100.0, 1000.0, 10_000.0), 10, kept=True),
+    "shifts": Memory(_shifts, (10.0, 100.0, 1000.0, 10_000.0), 10, persistent=True),
     "maps": Memory(_maps),
     "image": Memory(_image, times=5),
 }

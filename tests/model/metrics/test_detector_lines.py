@@ -33,7 +33,7 @@ def noisy(image: np.ndarray, generator: np.random.Generator, noise: float = 4.0)
 @given(seeds, st.integers(16, 180), st.floats(50, 3000), st.sampled_from([2.0, 4.0, 40.0]))
 def test_even_ground_has_no_lines(seed: int, width: int, level: float, noise: float) -> None:
     faults = judged(noisy(np.full((512, width), level), np.random.default_rng(seed), noise))
-    assert not faults.seen
+    assert not faults.significant
     assert not faults.off
     assert not faults.dead
 
@@ -44,7 +44,7 @@ def test_the_spread_of_the_gains_is_measured(seed: int, width: int, rms: float) 
     generator = np.random.default_rng(seed)
     gains = 1 + rms * generator.standard_normal(width)
     faults = judged(noisy(600 * gains * np.ones((512, 1)), generator))
-    assert faults.seen
+    assert faults.significant
     assert faults.spread == pytest.approx(rms, rel=0.5)
 
 
@@ -109,4 +109,4 @@ def test_gains_grow_with_the_level_and_offsets_do_not(gains: bool) -> None:
 @pytest.mark.parametrize("value", [0.0, 5.0, np.nan])
 def test_what_is_too_small_or_empty_says_nothing(shape: tuple[int, int], value: float) -> None:
     faults = judged(np.full(shape, value))
-    assert (faults.seen, faults.off, faults.dead) == (False, (), ())
+    assert (faults.significant, faults.off, faults.dead) == (False, (), ())

@@ -45,19 +45,19 @@ def test_a_pattern_is_found_with_its_size(
     size = np.linspace(-1, 1, shape[0])[:, None] * np.sqrt(3) if turns else 1.0
     image = 500 * (1 + difference / 2 * size * signs(name, shape))
     patterns = judged(image + np.random.default_rng(seed).normal(0, 4, shape))
-    assert patterns[name].seen
+    assert patterns[name].significant
     assert patterns[name].difference == pytest.approx(difference, rel=0.2, abs=0.0005)
-    assert not any(pattern.seen for other, pattern in patterns.items() if other != name)
+    assert not any(pattern.significant for other, pattern in patterns.items() if other != name)
 
 
 @settings(deadline=None, max_examples=15)
 @given(st.integers(0, 2**20), st.integers(20, 150), st.integers(20, 150))
 def test_noise_has_none(seed: int, height: int, width: int) -> None:
     image = np.random.default_rng(seed).normal(500, 20, (height, width))
-    assert not any(pattern.seen for pattern in judged(image).values())
+    assert not any(pattern.significant for pattern in judged(image).values())
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (15, 40), (40, 15), (16, 16), (64, 17)])
 @pytest.mark.parametrize("value", [0.0, 5.0, np.nan])
 def test_what_is_small_constant_or_missing_has_none(shape: tuple[int, int], value: float) -> None:
-    assert not any(pattern.seen for pattern in judged(np.full(shape, value)).values())
+    assert not any(pattern.significant for pattern in judged(np.full(shape, value)).values())

@@ -68,17 +68,17 @@ def test_no_image_has_such_a_full_scale(
 
 
 def test_no_more_is_looked_at_than_decides() -> None:
-    looked: list[float] = []
+    with_look: list[float] = []
 
     def parts() -> Iterator[Extent]:
         for value in (0.0, 0.9, 3000.0, 4000.0):
-            looked.append(value)
+            with_look.append(value)
             yield Extent(value, whole=False)
 
     assert settled_scale("x", np.dtype("float32"), parts()) == MAX_DN
-    assert looked == [0.0, 0.9, 3000.0]
+    assert with_look == [0.0, 0.9, 3000.0]
     assert settled_scale("x", np.dtype("uint16"), parts()) == MAX_DN
-    assert looked == [0.0, 0.9, 3000.0]
+    assert with_look == [0.0, 0.9, 3000.0]
 
 
 def test_floats_that_may_be_radiances_leave_it_open() -> None:

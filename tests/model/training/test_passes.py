@@ -20,9 +20,9 @@ from beers_deploy.model.training.passes import (
     Pass,
     detected,
     folded_signals,
-    looked,
     noiseless,
     prepare,
+    with_look,
 )
 from beers_deploy.profiles.effects import AntiAlias, Offset, Smear
 from beers_deploy.profiles.instrument import Instrument
@@ -82,7 +82,7 @@ def test_a_look_keeps_the_mean_times_its_light_and_the_contrast_that_it_says(
     radiance = torch.rand(36, 44, generator=torch.Generator().manual_seed(0))
     fy = torch.fft.fftfreq(36)
     fx = torch.fft.rfftfreq(44)
-    transformed = looked(torch.fft.rfft2(radiance), Look(light, contrast, softness_px), fy, fx)
+    transformed = with_look(torch.fft.rfft2(radiance), Look(light, contrast, softness_px), fy, fx)
     looked_at = torch.fft.irfft2(transformed, s=radiance.shape)
     assert float(looked_at.mean()) == pytest.approx(light * float(radiance.mean()), rel=1e-4)
     contrast_ratio = float(looked_at.std()) / (light * contrast * float(radiance.std()))
@@ -101,7 +101,7 @@ def test_softness_is_a_gaussian_of_that_width() -> None:
     point = torch.zeros(64, 64)
     point[32, 32] = 1
     frequency = torch.fft.fftfreq(64), torch.fft.rfftfreq(64)
-    soft = torch.fft.irfft2(looked(torch.fft.rfft2(point), Look(1, 1, 1.3), *frequency))
+    soft = torch.fft.irfft2(with_look(torch.fft.rfft2(point), Look(1, 1, 1.3), *frequency))
     places = torch.arange(64) - 32.0
     spread = float((soft.sum(0) * places**2).sum()) ** 0.5
     assert spread == pytest.approx(1.3, rel=1e-3)

@@ -53,11 +53,13 @@ def perfect(raw_targets: Targets) -> Targets:
     """The targets as the reference sensor sees them without noise; the background of points keeps
     its noise.
     """
-    points = [replace(target, seen=target.flat + target.wanted) for target in raw_targets.points]
+    points = [
+        replace(target, acquired=target.flat + target.expected) for target in raw_targets.points
+    ]
     return replace(
         raw_targets,
         points=points,
-        patterns=[replace(target, seen=target.wanted) for target in raw_targets.patterns],
+        patterns=[replace(target, acquired=target.expected) for target in raw_targets.patterns],
     )
 
 
@@ -119,8 +121,8 @@ def test_flux_and_contrast_of_the_raw_image_are_those_of_its_blur(raw_targets: T
 
 def test_points_and_their_flat_field_have_the_same_noise(raw_targets: Targets) -> None:
     for points in raw_targets.points:
-        far = points.wanted < 0.2
-        difference = points.seen - points.flat
+        far = points.expected < 0.2
+        difference = points.acquired - points.flat
         assert np.abs(difference[far]).max() <= 2
         assert float(points.flat.std()) > 2 * float(difference[far].std())
 
