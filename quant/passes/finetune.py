@@ -203,6 +203,9 @@ def finetune(
                 if loss < least:
                     core = candidate
                     least = loss
+                if left == steps:
+                    # What moved scales gained says nothing of the pace.
+                    before = least
                 step(
                     f"fine-tuning, step {done + steps - left} of {most}: held-out pairs lose "
                     f"{least / max(first, LEAST_ERROR):.2f} of the first"
@@ -215,7 +218,6 @@ def finetune(
                 break
             pace = slower
             trainable = TrainableCore(core)
-        before = least
     return core, done
 
 
