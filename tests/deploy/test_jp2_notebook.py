@@ -53,6 +53,8 @@ def test_its_cells_run_and_print_the_stored_outputs(
         plt.close("all")
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "raw.jp2",
+        "restored-network.json",
+        "restored-network.onnx",
         "restored.json",
         "restored.tif",
     ]

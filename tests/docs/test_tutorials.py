@@ -105,7 +105,7 @@ def test_accuracy_and_time(tmp_path: Path) -> None:
         walked("accuracy-and-time", tmp_path)
     files = {"tradeoff.html", "tradeoff.svg", "tradeoff.json"}
     assert {path.name for path in (tmp_path / "study").iterdir()} == files
-    limits = "board latency &lt;= 20 s and board power &lt;= 20 W"
+    limits = "board latency &lt;= 20 s and board power &lt;= 18 W"
     assert f"Recommended for {limits}: convbeers-half INT8, zcu104" in (
         tmp_path / "study" / "tradeoff.html"
     ).read_text(encoding="utf-8")

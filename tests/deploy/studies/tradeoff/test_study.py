@@ -82,7 +82,7 @@ def study(
         lpips=None,
         calibration=folder / "calibration",
         size=(13600, 9016),
-        budget=parse_constraints("budget", "latency<=60s,power<=20W"),
+        budget=parse_constraints("budget", "latency<=60s,power<=18W"),
         need=[],
         seed=0,
     )
@@ -160,7 +160,7 @@ def test_a_budget_in_watts_chooses_another_board(study: Tradeoff) -> None:
     """The VCK190 is faster, and takes more power than this budget allows."""
     assert study.best is not None
     assert study.best.text["board"] != "vck190"
-    reason = "vck190: no point within board power <= 20 W: the least is"
+    reason = "vck190: no point within board power <= 18 W: the least is"
     assert any(note.startswith(reason) for note in study.notes)
 
 
@@ -204,7 +204,7 @@ def test_the_command_writes_its_files_where_nothing_is_recommended(
     assert [text for text in output.splitlines() if "recommend" in text] == [line]
     assert f"wrote {out / 'tradeoff.html'}\n" in output
     assert document["verdict"] == "failed"
-    assert document["arguments"]["budget"] == "board latency <= 0.001 s, board power <= 20 W"
+    assert document["arguments"]["budget"] == "board latency <= 0.001 s, board power <= 18 W"
     assert document["arguments"]["need"] == ""
     # The paper's runs are of its own swath.
     assert not any("paper" in row["name"] for row in document["rows"])
