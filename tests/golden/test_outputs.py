@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.golden.outputs import SHIPPED, STORED, Outputs, outputs
+from tests.golden.outputs import OTHER, SHIPPED, STORED, Outputs, outputs
 
 pytestmark = pytest.mark.slow
 
@@ -37,15 +37,16 @@ def test_images_and_integers_are_those_that_were_stored(made: Outputs) -> None:
             elif "float32," in name:
                 np.testing.assert_allclose(array, wanted, rtol=0, atol=1.01, err_msg=name)
             elif "int8," in name:
-                # On some processors the search ends at other scales, 5.9 DN away in the mean
-                # (measured, by the same code on two processors).
                 assert np.nanmean(np.abs(array.astype(float) - wanted)) <= 8, name
             else:
                 difference = np.abs(array - wanted)
                 # A bias lies between two that its shift allows: one of eight may go to the other.
                 # Its image is compared above.
                 spared = difference.max() if name.endswith("biases") else 0
-                assert difference.sum() - spared <= 0.01 * np.abs(wanted).sum(), name
+                # The search for this network ends at other scales on some processors: the same code
+                # gives weights that differ by 3.3 %, biases by 4.7 %, pixels by 5.9 DN in the mean.
+                share = 0.06 if name.startswith(f"{OTHER}, ") else 0.01
+                assert difference.sum() - spared <= share * np.abs(wanted).sum(), name
 
 
 def test_figures_are_those_that_were_stored(made: Outputs) -> None:

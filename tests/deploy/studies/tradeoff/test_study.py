@@ -204,7 +204,7 @@ def test_the_command_writes_its_files_where_nothing_is_recommended(
     assert [text for text in output.splitlines() if "recommend" in text] == [line]
     assert f"wrote {out / 'tradeoff.html'}\n" in output
     assert document["verdict"] == "failed"
-    assert document["arguments"]["budget"] == "board latency <= 0.001 s, board power <= 18 W"
+    assert document["arguments"]["budget"] == "board latency <= 0.001 s, board power <= 20 W"
     assert document["arguments"]["need"] == ""
     # The paper's runs are of its own swath.
     assert not any("paper" in row["name"] for row in document["rows"])
