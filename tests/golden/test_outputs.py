@@ -6,7 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.golden.outputs import OTHER, SHIPPED, STORED, Outputs, outputs
+from tests.golden.outputs import SHIPPED, STORED, Outputs, outputs
+
+OTHER_SEARCH = STORED.with_name("outputs-other-search.npz")
 
 pytestmark = pytest.mark.slow
 
@@ -23,30 +25,37 @@ def stored(part: str) -> dict[str, Any]:
     return document[part]
 
 
+def close(name: str, array: np.ndarray, expected: np.ndarray) -> bool:
+    """Return True if an array that is fitted here is the stored one but for float sums, which
+    differ in their last bits between processors.
+    """
+    if "float32," in name:
+        return bool(np.allclose(array, expected, rtol=0, atol=1.01, equal_nan=True))
+    if "int8," in name:
+        return bool(np.nanmean(np.abs(array.astype(float) - expected)) <= 2)
+    difference = np.abs(array - expected)
+    # A bias lies between two that its shift allows: one of eight may go to the other. Its image is
+    # compared as well.
+    spared = difference.max() if name.endswith("biases") else 0
+    return bool(difference.sum() - spared <= 0.01 * np.abs(expected).sum())
+
+
 def test_images_and_integers_are_those_that_were_stored(made: Outputs) -> None:
-    with np.load(STORED.with_suffix(".npz")) as arrays:
-        assert made.arrays.keys() == set(arrays.files)
-        for name, wanted in arrays.items():
-            array = made.arrays[name]
-            assert (array.shape, array.dtype) == (wanted.shape, wanted.dtype), name
-            # Float sums differ in their last bits between processors, and so may what is fitted to
-            # them: the integers of the networks that are quantised here, and a few pixels. Shipped
-            # integers are the same everywhere.
-            if name.startswith(f"{SHIPPED}, ") and "float32," not in name:
-                np.testing.assert_array_equal(array, wanted, err_msg=name)
-            elif "float32," in name:
-                np.testing.assert_allclose(array, wanted, rtol=0, atol=1.01, err_msg=name)
-            elif "int8," in name:
-                assert np.nanmean(np.abs(array.astype(float) - wanted)) <= 8, name
-            else:
-                difference = np.abs(array - wanted)
-                # A bias lies between two that its shift allows: one of eight may go to the other.
-                # Its image is compared above.
-                spared = difference.max() if name.endswith("biases") else 0
-                # The search for this network ends at other scales on some processors: the same code
-                # gives weights that differ by 3.3 %, biases by 4.7 %, pixels by 5.9 DN in the mean.
-                share = 0.06 if name.startswith(f"{OTHER}, ") else 0.01
-                assert difference.sum() - spared <= share * np.abs(wanted).sum(), name
+    with np.load(STORED.with_suffix(".npz")) as stored_arrays:
+        arrays = dict(stored_arrays)
+    # The search for the example DnCNN ends at other scales on some processors, by the same code.
+    with np.load(OTHER_SEARCH) as stored_arrays:
+        others = dict(stored_arrays)
+    assert made.arrays.keys() == arrays.keys()
+    for name, expected in arrays.items():
+        array = made.arrays[name]
+        assert (array.shape, array.dtype) == (expected.shape, expected.dtype), name
+        # Shipped integers are the same everywhere.
+        if name.startswith(f"{SHIPPED}, ") and "float32," not in name:
+            np.testing.assert_array_equal(array, expected, err_msg=name)
+        else:
+            ends = [expected, others.get(name, expected)]
+            assert any(close(name, array, end) for end in ends), name
 
 
 def test_figures_are_those_that_were_stored(made: Outputs) -> None:

@@ -273,10 +273,10 @@ def try_method(
         board[number] = _psnr_db(sent[number].dn, pair, sensor)
         errors[number] = np.mean((image.dn - pair.degraded) ** 2, dtype=np.float64)
         for k, share in enumerate(shares):
-            with_sensor = (
-                method.with_sensor(with_noise(sensor, share * errors[number])) if share else method
-            )
-            ground[k, number] = _psnr_db(with_sensor.restore(image.dn), pair, sensor)
+            specialised = method
+            if share:
+                specialised = method.with_sensor(with_noise(sensor, share * errors[number]))
+            ground[k, number] = _psnr_db(specialised.restore(image.dn), pair, sensor)
     rates = [[image.rate for image in images] for images in (sent, raw)]
     return Trial(board, ground, np.array(rates), errors, [pair.site for pair in pairs])
 

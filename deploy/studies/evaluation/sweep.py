@@ -135,10 +135,10 @@ def run_sweep(
             edges = acquire_edges(sensor, seed) if brightness == 1 else []
             for supposed, other, method in trials[name]:
                 key = (name, supposed, method.name)
-                with_sensor = method.with_sensor(other)
-                psnr[key] = _psnr_db(with_sensor, pairs, sensor.max_dn)
+                specialised = method.with_sensor(other)
+                psnr[key] = _psnr_db(specialised, pairs, sensor.max_dn)
                 if brightness == 1 and supposed in (name, NOMINAL):
-                    mtf[key] = restored_mtf(with_sensor, edges, sensor.max_dn)
+                    mtf[key] = restored_mtf(specialised, edges, sensor.max_dn)
                 bar.advance(1, f"{name}: {method.name}")
     return Found(psnr, mtf, [pair.site for pair in pairs], seed, brightness)
 
