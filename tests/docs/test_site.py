@@ -23,7 +23,12 @@ Run = Callable[..., Any]
 
 ROOT = Path(__file__).parents[2]
 WIDTHS_PX = (1280, 390)
-ASKED = {"halo": "tiling", "KV260": "boards", "known sensor": "other-sensors", "batch handler": "glossary"}
+ASKED = {
+    "halo": "tiling",
+    "KV260": "boards",
+    "known sensor": "other-sensors",
+    "batch handler": "glossary",
+}
 """What a reader may search for, and the page that must be among the first ten found."""
 FIRST = 10
 LOOK = """
