@@ -42,6 +42,10 @@ an error of 60 dB loses 0.04 dB.
 FIT_IMAGES = 32
 FIT_PX = 48
 """The maximum number of images, and their side in pixels, on which convolutions are fitted."""
+FEWEST_FIT_IMAGES = 4
+"""Of images of a larger fixed size as few are used as have the same number of pixels, but not fewer
+than these, because each fit runs the network on all of them.
+"""
 
 
 @dataclass(frozen=True)
@@ -166,8 +170,8 @@ def _trial(
 
 def _fit_images(model: onnx.ModelProto, images: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Return some of the images, cut to FIT_PX a side if the network accepts that size."""
-    places = np.unique(np.linspace(0, len(images) - 1, FIT_IMAGES).astype(int))
     side_px = fixed_tile_px(model)
+    count = FIT_IMAGES
     if side_px is None:
         try:
             alignment_px = tiling_of(model).alignment_px
@@ -175,4 +179,7 @@ def _fit_images(model: onnx.ModelProto, images: Sequence[np.ndarray]) -> list[np
             # The operator that is to be replaced may be none that can be tiled.
             alignment_px = FIT_PX
         side_px = -(-FIT_PX // alignment_px) * alignment_px
+    else:
+        count = int(np.clip(FIT_IMAGES * FIT_PX**2 // side_px**2, FEWEST_FIT_IMAGES, FIT_IMAGES))
+    places = np.unique(np.linspace(0, len(images) - 1, count).astype(int))
     return [images[int(k)][..., :side_px, :side_px] for k in places]
