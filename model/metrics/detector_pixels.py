@@ -80,7 +80,7 @@ def _candidates(pixels: np.ndarray) -> np.ndarray:
     step = np.abs(np.diff(centres, axis=1))
     least = CANDIDATE * float(np.nanmean(step)) if np.isfinite(step).any() else 0.0
     out = np.maximum(centres - above, below - centres)
-    return np.asarray(np.argwhere((out > 0) & (out >= least)) + PATCH_PX)
+    return np.argwhere((out > 0) & (out >= least)) + PATCH_PX
 
 
 def _wrong(patches: np.ndarray, step: float) -> np.ndarray:

@@ -95,7 +95,7 @@ def plain_squares(
         return np.empty((0, 2 * HALF_PX + 1, 2 * HALF_PX + 1))
     squares = _squares(image, noise, effort)
     sound = ((squares > 0) & (squares < clipped_at)).all((1, 2))
-    return np.asarray(squares[sound & _flat(squares, noise, roughness)][: effort.fits])
+    return squares[sound & _flat(squares, noise, roughness)][: effort.fits]
 
 
 def _squares(image: np.ndarray, noise: Noise, effort: Effort) -> np.ndarray:
@@ -111,7 +111,7 @@ def _squares(image: np.ndarray, noise: Noise, effort: Effort) -> np.ndarray:
                 break
     reach = np.arange(-HALF_PX, HALF_PX + 1)
     rows, columns = (places[numbers][:, None, None] for places in (rows, columns))
-    return np.asarray(image[rows + reach[:, None], columns + reach])
+    return image[rows + reach[:, None], columns + reach]
 
 
 def _steepest(steepness: np.ndarray, effort: Effort) -> tuple[np.ndarray, np.ndarray]:
@@ -156,7 +156,7 @@ def _steepness(image: np.ndarray, noise: Noise, step_px: int) -> np.ndarray:
     down = np.abs(sum(column(step_down, k) for k in offsets)) / 5
     # A mean of 5 rows less another one has 2 / 5 of a pixel's variance.
     deviation = np.sqrt(2 / 5 * noise(column(row(0), 0)))
-    return np.asarray(np.where(down > across, 0, across / deviation))
+    return np.where(down > across, 0, across / deviation)
 
 
 def _flat(squares: np.ndarray, noise: Noise, roughness: float) -> np.ndarray:

@@ -113,7 +113,7 @@ def _responses(shape: float) -> np.ndarray:
     sums = np.fft.ifft(waves, PERIOD_PX * PER_PX, norm="forward")[:, places]
     # The response is odd around the edge: the left half is the right one, turned around.
     half = (sums * np.exp(1j * math.pi * places / (PERIOD_PX * PER_PX))).imag
-    return np.asarray(0.5 + np.concatenate([-half[:, :0:-1], half], axis=1))
+    return 0.5 + np.concatenate([-half[:, :0:-1], half], axis=1)
 
 
 def _at_gammas(gammas: np.ndarray, shape: float) -> np.ndarray:

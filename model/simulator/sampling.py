@@ -155,4 +155,4 @@ def _linear(pixels: np.ndarray) -> np.ndarray:
         np.float32
     )
     light: np.ndarray = table[pixels]
-    return np.asarray(light if light.ndim == 2 else light[..., :3].mean(axis=-1))
+    return light if light.ndim == 2 else light[..., :3].mean(axis=-1)
