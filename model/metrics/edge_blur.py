@@ -71,7 +71,7 @@ drawn towns 41 are detected instead of 47 (measured).
 
 def blurs_of(squares: np.ndarray, noise: Noise) -> list[EdgeBlur]:
     """Fit the blurs of those squares (N, S, S) that contain an edge."""
-    return [fit for fit in fit_blurs(squares, noise, FOUND) if isinstance(fit, EdgeBlur)]
+    return [fit for fit in fit_blurs(squares, noise, FOUND) if fit is not None]
 
 
 def plain_squares(
@@ -187,8 +187,6 @@ ROBUST = 1.4826
 """The ratio of the standard deviation of normal values to their median absolute deviation."""
 LONE_ERROR = 0.1
 """Assumed scatter of gamma between edges if only one edge is known."""
-SHAPED_EDGES = 40
-"""The number of edges from which the shape is determined."""
 WORST = 1e12
 """Sum of squares over noise that is used if the fit fails."""
 OTHER_SHAPES = 0.25
@@ -222,22 +220,21 @@ def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
     The shape of the curve is not fixed: each shape is weighted by how well it explains the edges.
 
     Args:
-        own: the edges across this axis, at least one.
+        own: the edges across this axis, at least two, all in regions of one size.
         others: the edges across the other axis.
     """
     # Imported here: who measures no sensor need not wait for SciPy.
     from scipy.special import stdtrit
 
     other_gamma = float(np.median([edge.gamma for edge in others])) if others else None
-    shaped = own[:SHAPED_EDGES]
     logs, errors, chi2 = (
         np.array(part)
         for part in zip(*(_of_shape(own, other_gamma, s) for s in SHAPES), strict=True)
     )
     # The best shape leaves the noise at least: less is chance.
-    scatter = np.maximum(chi2.min(0) / [edge.count for edge in shaped], 1.0)
+    scatter = np.maximum(chi2.min(0) / [edge.count for edge in own], 1.0)
     # The median and not the sum: an edge that another crosses nearby has a shape of its own.
-    weights = -len(shaped) / 2 * np.median((chi2 - chi2[0]) / scatter, axis=1)
+    weights = -len(own) / 2 * np.median((chi2 - chi2[0]) / scatter, axis=1)
     # The prior gives half of its weight to the profile's curve, because few edges cannot determine
     # another one.
     belief = np.gradient(SHAPES)
@@ -246,8 +243,7 @@ def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
     weights /= weights.sum()
     value = float(weights @ logs)
     error = math.sqrt(float(weights @ ((logs - value) ** 2 + errors**2)))
-    # A lone edge has its scatter assumed.
-    quantile = float(stdtrit(len(own) - 1 or math.inf, 0.975))
+    quantile = float(stdtrit(len(own) - 1, 0.975))
     reach = quantile * math.hypot(error, FLOOR / 2, OTHER_SHAPES * (logs[0] - value))
     low, centre, high, nearest = (
         MTF_NYQUIST_MAX * math.exp(x) for x in (value - reach, value, value + reach, logs[0])
@@ -267,8 +263,10 @@ def _of_shape(
         The logarithm of the MTF at Nyquist relative to a perfect lens, its standard error, and the
         residual of each edge.
     """
-    fits = _reshaped(edges[:SHAPED_EDGES], shape) if shape else list(edges)
-    blurs = [fit for fit in fits if isinstance(fit, EdgeBlur)] or list(edges)
+    fits: Sequence[Fit] = edges
+    if shape:
+        fits = fit_shape(np.stack([edge.pixels for edge in edges]), ANY, shape)
+    blurs = [fit for fit in fits if fit is not None] or edges
     gammas, errors = (
         np.array([getattr(edge, name) for edge in blurs]) for name in ("gamma", "error")
     )
@@ -276,17 +274,8 @@ def _of_shape(
         lean = np.array([edge.slope for edge in blurs]) ** 2
         gammas = np.sqrt(np.maximum(gammas**2 * (1 + lean) - lean * other_gamma**2, 1e-4))
     gamma, error = _centre(gammas, errors)
-    chi2 = [fit.chi2 if isinstance(fit, EdgeBlur) else WORST for fit in fits[:SHAPED_EDGES]]
+    chi2 = [fit.chi2 if fit else WORST for fit in fits]
     return -gamma / 2 - shape / 4, error / 2, np.array(chi2)
-
-
-def _reshaped(edges: Sequence[EdgeBlur], shape: float) -> list[Fit]:
-    """Fit edges again by another shape of the curve; those found by search are of one size, pointed
-    ones are not.
-    """
-    if len({edge.pixels.shape for edge in edges}) == 1:
-        return fit_shape(np.stack([edge.pixels for edge in edges]), ANY, shape)
-    return [fit_shape(edge.pixels[None], ANY, shape)[0] for edge in edges]
 
 
 def _centre(values: np.ndarray, errors: np.ndarray) -> tuple[float, float]:

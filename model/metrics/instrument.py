@@ -25,15 +25,12 @@ from beers_deploy.model.metrics.edge_curve import (
 from beers_deploy.model.metrics.edge_fit import EdgeBlur, Noise
 from beers_deploy.model.metrics.edge_search import Edge
 from beers_deploy.model.metrics.noise_blocks import Blocks, cut_blocks, join
-from beers_deploy.model.metrics.noise_line import NoiseModel, Variance, fit_noise_model
+from beers_deploy.model.metrics.noise_line import SEED, Variance
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.profiles.response import NYQUIST
 
 AXES = ("across", "along")
 """The axes relative to the track. Edges near the vertical show the blur across it."""
-SEED = 0
-"""Seed of the draws for intervals, so that one image always gives the same result."""
-
 EDGES = 20
 """The number of short edges that suffices along an axis. More would take time without improving the
 result.
@@ -66,16 +63,6 @@ def image_blocks(images: Iterable[np.ndarray], clipped_at: float, black_dn: floa
 def above_black(blocks: Blocks, black_dn: float) -> Blocks:
     """Return blocks whose means count from the black level."""
     return blocks._replace(mean=np.maximum(blocks.mean - black_dn, 0.0))
-
-
-def fit_noise(blocks: Blocks, incomplete: bool = False) -> NoiseModel | Refusal:
-    """Fit the noise line to blocks of one sensor, always by the same random draws.
-
-    Args:
-        blocks: of all its images.
-        incomplete: whether noise that is not white is accepted, and noise at one level of light.
-    """
-    return fit_noise_model(blocks, np.random.default_rng(SEED), incomplete)
 
 
 def snr(signal_dn: float, variance: Variance) -> tuple[float, tuple[float, float]]:

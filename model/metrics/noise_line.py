@@ -47,6 +47,8 @@ QUIET_PERCENT = 5.0
 """The least noise above rounding, in DN^2, of the quietest blocks; restored or resampled images
 have less.
 """
+SEED = 0
+"""Seed of the draws for intervals, so that one image always gives the same result."""
 DRAWS = 200
 PASSES = 6
 FINE_WAVES = 21
@@ -120,15 +122,13 @@ class NoiseModel:
         return Variance(value, (max(low - model * value, 0.0), high + model * value), beyond > 0)
 
 
-def fit_noise_model(
-    blocks: Blocks, generator: np.random.Generator, incomplete: bool = False
-) -> NoiseModel | Refusal:
-    """Fit the line to blocks of any number of images of one instrument, or return why there is
-    none.
+def fit_noise(blocks: Blocks, incomplete: bool = False) -> NoiseModel | Refusal:
+    """Fit the line to blocks of any number of images of one sensor, or return why there is none.
+
+    The draws of the interval are always the same.
 
     Args:
         blocks: of all images.
-        generator: for the draws of the interval.
         incomplete: whether to accept noise that is not white, and noise at only one level of light.
     """
     if blocks.mean.size < LEAST:
@@ -136,11 +136,10 @@ def fit_noise_model(
     quietest = float(np.percentile(blocks.fine, QUIET_PERCENT))
     # What was restored or resampled has less noise than a detector, at the finest detail.
     if quietest < ROUNDING + LEAST_NOISE:
-        got = (
-            f"a variance of {quietest:.2g} DN^2 at the finest detail, where rounding alone "
-            f"makes {ROUNDING:.2g}"
+        return Refusal(
+            f"a variance of {quietest:.2g} DN^2 at the finest detail, where rounding alone makes "
+            f"{ROUNDING:.2g}"
         )
-        return Refusal(got)
     quiet, fit = _choose(blocks)
     parts = np.unique(quiet.part)
     if quiet.mean.size < LEAST or parts.size < LEAST_PARTS:
@@ -149,6 +148,7 @@ def fit_noise_model(
     one_level = bright - dark < MIN_RANGE * bright
     if one_level and not incomplete:
         return Refusal(f"even areas from {dark:.4g} to {bright:.4g} DN only, too narrow for a line")
+    generator = np.random.default_rng(SEED)
     draws = np.array([_fitted(quiet, _weights(quiet.part, parts, generator)) for _ in range(DRAWS)])
     if one_level:
         fit, draws = _of_one_level(quiet, fit, draws, generator)

@@ -131,12 +131,10 @@ def disk_errors() -> Iterator[None]:
     """Raise OSError for whatever GDAL raises while it writes."""
     try:
         yield
-    except (OSError, *CODE_FAULTS) as error:
-        # RasterioIOError is an OSError, and names its cause instead of itself.
-        if error.__cause__ is None:
-            raise
-        raise OSError(" ".join(str(error.__cause__).split())) from error
     except Exception as error:
+        # RasterioIOError is an OSError, and names its cause instead of itself.
+        if isinstance(error, (OSError, *CODE_FAULTS)) and error.__cause__ is None:
+            raise
         raise OSError(" ".join(str(error.__cause__ or error).split())) from error
 
 

@@ -7,7 +7,6 @@ from beers_deploy.model.metrics.mtf_basis import (
     CORNERS,
     PARTS,
     at_distances,
-    expected_bends,
     mtf_at,
     responses,
     softened,
@@ -77,26 +76,3 @@ def test_solving_finds_a_smooth_curve_and_stays_within_what_any_curve_is(seed: i
     nothing = solve(np.zeros((PARTS, PARTS)) + 1e-6 * np.eye(PARTS), np.zeros(PARTS), truth, 0.8)
     assert nothing.min() >= 0
     assert nothing.sum() == pytest.approx(1)
-
-
-@pytest.mark.parametrize("shape", ["exponential", "gaussian", "diffraction"])
-@pytest.mark.parametrize("at_nyquist", [0.02, 0.1, 0.3])
-def test_real_optics_bend_no_more_than_expected(shape: str, at_nyquist: float) -> None:
-    optics = at_nyquist * np.pi / 2
-    frequency = CORNERS / 0.5
-    if shape == "exponential":
-        contrast = optics**frequency
-    elif shape == "gaussian":
-        contrast = optics ** (frequency**2)
-    else:
-        cut_off = np.interp(-optics, -chat(np.linspace(0, 1, 999)), np.linspace(0, 1, 999))
-        contrast = chat(np.minimum(frequency * cut_off, 1))
-    weights = weights_of(contrast)
-    bends = expected_bends(weights, 0.8) @ weights
-    assert np.abs(bends).max() < 3
-    assert np.sqrt(np.mean(bends**2)) < 1
-
-
-def chat(share: np.ndarray) -> np.ndarray:
-    """MTF of a perfect round lens at these shares of its cut-off frequency."""
-    return np.asarray(2 / np.pi * (np.arccos(share) - share * np.sqrt(1 - share**2)))

@@ -226,18 +226,6 @@ def test_what_a_scene_shows_decides(
     assert {choices[name] for name in names} == {choice}
 
 
-def test_what_is_skipped_fits_the_tolerance_together() -> None:
-    faint: dict[str, Effect] = {
-        "striping": Striping(0.3),
-        "dsnu": Dsnu(0.03),
-        "offset": Offset(0.14),
-    }
-    plan = make_plan(stages.plain_sensor(**faint), scene_stats(SCENE, 2))
-    hidden = [d for d in plan.decisions if d.choice == "cannot show"]
-    assert 1 <= len(hidden) < 3
-    assert sum(d.bound_dn or 0 for d in hidden) <= TOLERANCE_DN
-
-
 def test_a_plan_is_data() -> None:
     plan = make_plan(stages.plain_sensor(**stages.TYPICAL), scene_stats(SCENE, 2))
     assert json.loads(json.dumps(plan.to_json()))["tolerance_dn"] == TOLERANCE_DN

@@ -93,22 +93,6 @@ def test_a_table_of_the_formula_is_the_formula(contrasts: tuple[float, float], s
     np.testing.assert_allclose(mtf(fx, fy, table), mtf(fx, fy, contrasts), rtol=1e-9, atol=1e-14)
 
 
-def test_the_optics_of_one_table_are_round() -> None:
-    """The square detector apart, contrast depends on the radius alone: along a diagonal as along an
-    axis.
-    """
-    table = replace(MEASURED, along=MEASURED.across)
-    radius = np.linspace(0.01, 0.9, 40)[None]
-    zero = np.zeros((1, 1))
-    fx = 0.8 * radius
-    fy = 0.6 * radius
-    aslant = np.stack(
-        [mtf(fx[:, k : k + 1], fy[:, k : k + 1], table).ravel() for k in range(40)], 1
-    )
-    optics = mtf(radius, zero, table) / np.sinc(radius)
-    np.testing.assert_allclose(aslant / np.sinc(fx) / np.sinc(fy), optics, rtol=1e-9, atol=1e-12)
-
-
 @pytest.mark.parametrize("side", [64, 75])
 @pytest.mark.parametrize("odd", [True, False])
 def test_a_point_of_the_formula_gives_the_formulas_images(odd: bool, side: int) -> None:

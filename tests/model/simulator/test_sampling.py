@@ -92,27 +92,6 @@ def test_plain_slicing_would_shift_at_even_ratios(ratio: int) -> None:
     assert abs(centroid(sliced.astype(np.float64))[0]) == pytest.approx(0.5 / ratio, rel=0.05)
 
 
-@given(st.integers(1, 8), st.integers(3, 15), st.integers(3, 15), st.integers(0, 1000))
-def test_the_mean_radiance_is_kept(ratio: int, rows: int, columns: int, seed: int) -> None:
-    radiance = scene(rows * ratio, columns * ratio, seed)
-    transfer = transfer_function(*radiance.shape, ratio, 0.07)
-    result = sample(scene_spectrum(radiance), transfer, columns * ratio, ratio)
-    # Frequencies that alias onto the mean are whole cycles per pixel, where the detector's sinc is
-    # zero.
-    assert result.mean(dtype=np.float64) == pytest.approx(radiance.mean(dtype=np.float64), rel=1e-6)
-
-
-@given(st.integers(1, 8), st.floats(0.0, 400.0))
-def test_a_constant_stays_what_it_is(ratio: int, level: float) -> None:
-    radiance = np.full((5 * ratio, 7 * ratio), level, np.float32)
-    result = sample(
-        scene_spectrum(radiance), transfer_function(*radiance.shape, ratio, 0.07), 7 * ratio, ratio
-    )
-    np.testing.assert_allclose(
-        result, np.full((5, 7), level, np.float32), rtol=2e-6, atol=1e-5, strict=True
-    )
-
-
 def test_what_the_grid_does_not_divide_is_cropped() -> None:
     assert crop_divisible(scene(30, 31), 4).shape == (28, 28)
 
@@ -158,8 +137,3 @@ def test_what_the_new_grid_cannot_hold_is_cut_not_aliased() -> None:
     np.testing.assert_allclose(
         result, np.full((40, 40), 100.0, np.float32), rtol=0, atol=1e-3, strict=True
     )
-
-
-def test_the_mean_is_kept() -> None:
-    scene = 50 + 100 * np.random.default_rng(0).random((57, 83), np.float32)
-    assert float(resample(scene, 91, 64).mean()) == pytest.approx(float(scene.mean()), rel=1e-6)
