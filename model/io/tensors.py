@@ -188,7 +188,7 @@ def _conditioned(header: Mapping[str, object]) -> bool:
     """
     kind = header.get("kind")
     if kind not in (None, BANKED):
-        raise ValueError(f"its weights are {kind}, as another version wrote them")
+        raise ValueError(f"its kind of weights, {kind!r}, is that of another version")
     if kind and header.get("ranges") != {name: list(ends) for name, ends in RANGES.items()}:
         raise ValueError("its ranges of sensors differ from those of this version")
     return kind is not None

@@ -137,7 +137,7 @@ def fit_noise(blocks: Blocks, incomplete: bool = False) -> NoiseModel | Refusal:
     # What was restored or resampled has less noise than a detector, at the finest detail.
     if quietest < ROUNDING + LEAST_NOISE:
         return Refusal(
-            f"a variance of {quietest:.2g} DN^2 at the finest detail, where rounding alone makes "
+            f"the finest detail has a variance of {quietest:.2g} DN^2, but rounding alone adds "
             f"{ROUNDING:.2g}"
         )
     quiet, fit = _choose(blocks)
@@ -147,7 +147,9 @@ def fit_noise(blocks: Blocks, incomplete: bool = False) -> NoiseModel | Refusal:
     dark, bright = (float(v) for v in np.percentile(quiet.mean, [EDGE_PERCENT, 100 - EDGE_PERCENT]))
     one_level = bright - dark < MIN_RANGE * bright
     if one_level and not incomplete:
-        return Refusal(f"even areas from {dark:.4g} to {bright:.4g} DN only, too narrow for a line")
+        return Refusal(
+            f"the even areas are all of {dark:.4g} to {bright:.4g} DN, too narrow for a line"
+        )
     generator = np.random.default_rng(SEED)
     draws = np.array([_fitted(quiet, _weights(quiet.part, parts, generator)) for _ in range(DRAWS)])
     if one_level:

@@ -112,7 +112,7 @@ def read_acquisition(
     scale = settled_scale(str(path), pixels.dtype, [extent_of(pixels)], full_scale, max_dn, remedy)
     if low < 0 or high > scale:
         raise ImageError(
-            f"{path} has values from {low:g} to {high:g}, but its full scale is {scale:g}. "
+            f"{path} has values from {low:g} to {high:g}, but they must be 0 to {scale:g}. "
             f"{remedy_outside(low, high, RESCALE)}"
         )
     dn = np.asarray(pixels, dtype=np.float32)

@@ -9,8 +9,6 @@ from beers_deploy.model.metrics.mtf_basis import (
     at_distances,
     mtf_at,
     responses,
-    softened,
-    solve,
     weights_of,
 )
 
@@ -34,13 +32,6 @@ def test_weights_give_the_curve_at_the_corners_and_fall_between(losses: list[flo
     assert (mtf_at(fine, weights) <= np.sinc(fine) + 1e-12).all()
 
 
-@given(LOSSES, st.floats(-0.5, 4))
-def test_softening_multiplies_by_an_exponential(losses: list[float], softness_px: float) -> None:
-    optics = mtf_at(CORNERS[:-1], falling(losses))
-    softer = mtf_at(CORNERS[:-1], softened(falling(losses), softness_px))
-    assert softer == pytest.approx(optics * np.exp(-softness_px * CORNERS[:-1]), abs=1e-12)
-
-
 def edge_response(distance: np.ndarray, gamma: float) -> np.ndarray:
     """A step of 1 at 0 behind the profile's MTF: its Fourier integral as a sum."""
     step = 1 / 64
@@ -62,17 +53,3 @@ def test_the_edge_is_that_of_the_profiles_formula(gamma: float) -> None:
         edges @ weights, distance - 0.05
     )
     assert rise / 0.1 == pytest.approx(at_distances(lines @ weights, distance), abs=0.01)
-
-
-@given(st.integers(0, 2**32 - 1))
-def test_solving_finds_a_smooth_curve_and_stays_within_what_any_curve_is(seed: int) -> None:
-    generator = np.random.default_rng(seed)
-    gamma = generator.uniform(1, 8)
-    truth = weights_of(np.exp(-gamma * CORNERS))
-    looks = generator.normal(size=(60, PARTS))
-    gram = looks.T @ looks * 1e8
-    solution = solve(gram, gram @ truth, truth, 0.8)
-    assert solution == pytest.approx(truth, abs=1e-3)
-    nothing = solve(np.zeros((PARTS, PARTS)) + 1e-6 * np.eye(PARTS), np.zeros(PARTS), truth, 0.8)
-    assert nothing.min() >= 0
-    assert nothing.sum() == pytest.approx(1)

@@ -104,8 +104,8 @@ def refused(image: np.ndarray) -> str:
 
 
 def test_what_cannot_be_known_is_refused() -> None:
-    assert "rounding alone makes" in refused(np.rint(plain()))
-    assert "rounding alone makes" in refused(noisy(0.1))
+    assert "rounding alone adds" in refused(np.rint(plain()))
+    assert "rounding alone adds" in refused(noisy(0.1))
     assert "too narrow" in refused(noisy(5.0, plain(low=1000, high=1100)))
     assert "16 blocks" in refused(noisy(5.0, plain((64, 64))))
     assert "0 blocks" in refused(np.zeros((320, 320)))

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from beers_deploy.model.simulator.mtf import mtf, smear_response, transfer_function
 from beers_deploy.model.simulator.sampling import crop_divisible, resample, sample, scene_spectrum
-from beers_deploy.profiles.effects import Haze
 from beers_deploy.profiles.response import centroid
 from tests.model.simulator import stages
 
@@ -59,21 +58,6 @@ def test_fused_equals_sequential(
     transfer = transfer_function(*radiance.shape, ratio, mtf_nyquist, sigma, smear)
     fused = sample(scene_spectrum(radiance), transfer, radiance.shape[1], ratio)
     expected = one_after_the_other(radiance, ratio, mtf_nyquist, sigma, smear)
-    assert np.abs(fused - expected).max() < 5e-4
-
-
-@pytest.mark.parametrize("ratio", [1, 2, 3, 5, 8])
-def test_haze_after_sampling_equals_haze_before_the_blur(ratio: int) -> None:
-    """An affine change of the light commutes with a blur that keeps the mean: so it may wait for
-    the small grid.
-    """
-    haze = Haze(0.7, 15.0)
-    radiance = 300 * np.random.default_rng(0).random((17 * ratio, 23 * ratio), np.float32)
-    transfer = transfer_function(*radiance.shape, ratio, 0.07, 0.2, 1.5)
-    fused = stages.alone(haze, sample(scene_spectrum(radiance), transfer, radiance.shape[1], ratio))
-    expected = one_after_the_other(
-        stages.alone(haze, radiance.astype(np.float64)), ratio, 0.07, 0.2, 1.5
-    )
     assert np.abs(fused - expected).max() < 5e-4
 
 

@@ -204,16 +204,6 @@ def test_any_bits_are_restored(bits: int, camera: Tensor) -> None:
     assert after > before + 11
 
 
-def test_a_turned_sensor_gives_the_turned_filter() -> None:
-    upright, lying = (
-        replace(DEGRADED, mtf_nyquist=a, mtf_nyquist_along=b) for a, b in ((0.1, 0.05), (0.05, 0.1))
-    )
-    kernels = [Chain(sensor, REFERENCE, epsilon=3e-3).kernel() for sensor in (upright, lying)]
-    torch.testing.assert_close(kernels[0].T, kernels[1], rtol=0, atol=1e-12)
-    same = Chain(replace(DEGRADED, mtf_nyquist_along=0.07), REFERENCE, epsilon=3e-3)
-    assert torch.equal(same.kernel(), Chain(DEGRADED, REFERENCE, epsilon=3e-3).kernel())
-
-
 def test_an_unknown_quality_is_refused() -> None:
     with pytest.raises(OptionError, match="fast, standard, best"):
         restore_traditional(torch.ones(3, 3), Chain(DEGRADED, REFERENCE, "superb"))
