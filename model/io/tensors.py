@@ -68,8 +68,8 @@ def write_tensors(path: Path, tensors: Arrays, header: Mapping[str, object]) -> 
 
 
 def _sort_metadata(path: Path) -> None:
-    """Put the keys of a safetensors file's metadata in order: the library writes them in another
-    one each time.
+    """Sort the metadata of a safetensors file by key, because the library writes it in random
+    order.
     """
     content = path.read_bytes()
     # The file begins with the length of its JSON header, in 8 bytes.

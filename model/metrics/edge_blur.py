@@ -19,8 +19,8 @@ import numpy as np
 
 from beers_deploy.model.metrics.edge_fit import (
     ANY,
-    FOUND,
     HALF_PX,
+    STRICT,
     EdgeBlur,
     Fit,
     Noise,
@@ -71,7 +71,7 @@ drawn towns 41 are detected instead of 47 (measured).
 
 def blurs_of(squares: np.ndarray, noise: Noise) -> list[EdgeBlur]:
     """Fit the blurs of those squares (N, S, S) that contain an edge."""
-    return [fit for fit in fit_blurs(squares, noise, FOUND) if fit is not None]
+    return [fit for fit in fit_blurs(squares, noise, STRICT) if fit is not None]
 
 
 def plain_squares(
@@ -81,8 +81,10 @@ def plain_squares(
     effort: Effort,
     roughness: float = MAX_ROUGHNESS,
 ) -> np.ndarray:
-    """Return the squares (N, S, S), S = 2 * HALF_PX + 1, of an image that may hold a near-vertical
-    edge.
+    """Return squares (N, S, S) around the steepest places of an image, where near-vertical edges
+    may be.
+
+    S is 2 * HALF_PX + 1.
 
     Args:
         image: (H, W), finite values; transpose it for near-horizontal edges.
@@ -94,8 +96,8 @@ def plain_squares(
     if min(image.shape) <= 2 * MARGIN_PX:
         return np.empty((0, 2 * HALF_PX + 1, 2 * HALF_PX + 1))
     squares = _squares(image, noise, effort)
-    sound = ((squares > 0) & (squares < clipped_at)).all((1, 2))
-    return squares[sound & _flat(squares, noise, roughness)][: effort.fits]
+    valid = ((squares > 0) & (squares < clipped_at)).all((1, 2))
+    return squares[valid & _flat(squares, noise, roughness)][: effort.fits]
 
 
 def _squares(image: np.ndarray, noise: Noise, effort: Effort) -> np.ndarray:
@@ -178,7 +180,7 @@ def _scatter(side: np.ndarray) -> np.ndarray:
     return np.asarray(np.einsum("nij,nij->n", off, off) / ((height - 1) * width))
 
 
-MIN_FOUND = 3
+MIN_EDGES = 3
 FLOOR = 0.05
 """Least standard error of gamma: the error of the fit on edges along the grid (measured), 2.5 % of
 the MTF.

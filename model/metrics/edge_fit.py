@@ -89,7 +89,7 @@ class Limits:
     error: float = 0.6
 
 
-FOUND = Limits(30, 0.012)
+STRICT = Limits(30, 0.012)
 ANY = Limits(0, math.inf, math.inf)
 """Limits for edges found by search, among many candidates that are none, and for places that
 certainly are edges.

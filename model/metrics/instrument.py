@@ -92,8 +92,8 @@ def axis_mtfs(
 
 
 def _combined(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf | Refusal:
-    if len(own) < edge_blur.MIN_FOUND:
-        return Refusal(f"{len(own)} straight edges, {edge_blur.MIN_FOUND} are needed")
+    if len(own) < edge_blur.MIN_EDGES:
+        return Refusal(f"{len(own)} straight edges, {edge_blur.MIN_EDGES} are needed")
     return edge_blur.combine(own, others)
 
 

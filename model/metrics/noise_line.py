@@ -147,9 +147,7 @@ def fit_noise(blocks: Blocks, incomplete: bool = False) -> NoiseModel | Refusal:
     dark, bright = (float(v) for v in np.percentile(quiet.mean, [EDGE_PERCENT, 100 - EDGE_PERCENT]))
     one_level = bright - dark < MIN_RANGE * bright
     if one_level and not incomplete:
-        return Refusal(
-            f"the even areas are all of {dark:.4g} to {bright:.4g} DN, too narrow for a line"
-        )
+        return Refusal(f"all even areas have {dark:.4g} to {bright:.4g} DN, too narrow for a line")
     generator = np.random.default_rng(SEED)
     draws = np.array([_fitted(quiet, _weights(quiet.part, parts, generator)) for _ in range(DRAWS)])
     if one_level:

@@ -187,7 +187,7 @@ def _block_px(dataset: Any, tiles: list[Path]) -> int:
 
 @contextmanager
 def damage_in_a_sentence(path: Path, rows: str = "") -> Iterator[None]:
-    """Raise ImageError for whatever GDAL raises over a file, or over some rows of it."""
+    """Turn any error of GDAL about a file, or about some of its rows, into an ImageError."""
     try:
         yield
     except (BeersError, MemoryError, *CODE_FAULTS):

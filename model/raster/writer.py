@@ -128,7 +128,7 @@ def _planes(raster: Raster, pixels: Pixels) -> Iterator[tuple[int, Window, np.nd
 
 @contextmanager
 def disk_errors() -> Iterator[None]:
-    """Raise OSError for whatever GDAL raises while it writes."""
+    """Turn any error of GDAL while it writes into an OSError that states its cause."""
     try:
         yield
     except Exception as error:

@@ -86,8 +86,8 @@ def smear_moments(height: int, oversampling: int, length_px: float) -> tuple[flo
 
 
 def behind(name: str, change_dn: float, sensor: Instrument) -> float:
-    """Bound how much a change of the signal by the effect `name` may grow through the later
-    effects.
+    """Bound the change of a pixel after all later effects, if the effect `name` changes the signal
+    by `change_dn`.
 
     Blooming adds its share, PRNU its largest gain, and noise changes with the signal: |sqrt(a) -
     sqrt(b)| <= min(sqrt|a - b|, |a - b| / (2 sqrt(beta))).

@@ -29,7 +29,7 @@ def sample(
     oversampling: int,
     offset_px: tuple[float, float] = (0.0, 0.0),
 ) -> np.ndarray:
-    """Blur by `transfer` and keep every r-th point in both directions.
+    """Blur a scene by `transfer`, and sample it at the centre of each target pixel.
 
     Target pixel n covers scene pixels r*n to r*n + r - 1, so it is sampled at their centre, r*n +
     (r - 1) / 2. For even r that lies between two scene pixels: a phase ramp goes there, where

@@ -123,9 +123,9 @@ class Measurement:
             )
         if frames.hides_black:
             yield (
-                f"0 counts as dark, but the darkest pixels have {frames.darkest_dn * frames.step:g}: "
-                "state a black level of the camera as `black_level`, or the SNR in the dark is too "
-                "high"
+                f"0 counts as dark, but the darkest pixels have {frames.darkest_dn * frames.step:g}"
+                ": state a black level of the camera as `black_level`, or the SNR in the dark is "
+                "too high"
             )
         if not model.white:
             yield (

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from beers_deploy.model.metrics.edge_blur import THOROUGH, blurs_of, combine, plain_squares
-from beers_deploy.model.metrics.edge_fit import FOUND, HALF_PX, EdgeBlur, fit_blurs
+from beers_deploy.model.metrics.edge_fit import HALF_PX, STRICT, EdgeBlur, fit_blurs
 from beers_deploy.model.metrics.slanted_edge import slanted_edge
 from beers_deploy.model.simulator.mtf import Blur, gamma_from_mtf, transfer_function
 from beers_deploy.model.simulator.procedural import procedural_scene
@@ -124,7 +124,7 @@ def test_a_landscape_has_no_such_edge() -> None:
 
 def is_edge(region: np.ndarray) -> bool:
     region = region + SIGMA * np.random.default_rng(4).standard_normal(region.shape)
-    return fit_blurs(region[None], noise, FOUND) != [None]
+    return fit_blurs(region[None], noise, STRICT) != [None]
 
 
 def test_what_is_no_blurred_step_is_refused() -> None:
