@@ -269,9 +269,7 @@ def _of_shape(
     if shape:
         fits = fit_shape(np.stack([edge.pixels for edge in edges]), ANY, shape)
     blurs = [fit for fit in fits if fit is not None] or edges
-    gammas, errors = (
-        np.array([getattr(edge, name) for edge in blurs]) for name in ("gamma", "error")
-    )
+    gammas, errors = np.array([(edge.gamma, edge.error) for edge in blurs]).T
     if other_gamma is not None and not shape:
         lean = np.array([edge.slope for edge in blurs]) ** 2
         gammas = np.sqrt(np.maximum(gammas**2 * (1 + lean) - lean * other_gamma**2, 1e-4))

@@ -155,10 +155,11 @@ def fit_noise(blocks: Blocks, incomplete: bool = False) -> NoiseModel | Refusal:
     leak = float(
         fit[2] * np.maximum(quiet.structure - quiet.noise(fit), 0).mean() / quiet.fine.mean()
     )
-    alpha, beta = _unrounded(fit)
-    lines = np.array([_unrounded(draw) for draw in draws])
+    # Beta without the variance of rounding.
+    lines = np.maximum(np.vstack([fit, draws])[:, :2] - (0, ROUNDING), 0.0)
+    alpha, beta = lines[0].tolist()
     model = NoiseModel(
-        alpha, beta, lines, quiet.mean.size, (dark, bright), leak, one_level=one_level
+        alpha, beta, lines[1:], quiet.mean.size, (dark, bright), leak, one_level=one_level
     )
     return _judged(_with_colour(quiet, model), incomplete)
 
@@ -183,16 +184,12 @@ def _of_one_level(
     smooths; given too little, it produces grain. The draws range from none to all.
     """
     level = float(np.median(blocks.mean))
-
-    def split(numbers: np.ndarray, share: float) -> list[float]:
-        noise = float(numbers[0]) * level + float(numbers[1])
-        return [share * noise / max(level, ROUNDING), (1 - share) * noise, float(numbers[2])]
-
-    splits = [
-        split(draw, share)
-        for draw, share in zip(draws, generator.uniform(size=len(draws)), strict=True)
-    ]
-    return np.array(split(fit, 1.0)), np.array(splits)
+    shares = np.append(1.0, generator.uniform(size=len(draws)))
+    numbers = np.vstack([fit, draws])
+    noise = numbers[:, 0] * level + numbers[:, 1]
+    alpha = shares * noise / max(level, ROUNDING)
+    splits = np.stack([alpha, (1 - shares) * noise, numbers[:, 2]], axis=1)
+    return splits[0], splits[1:]
 
 
 def _choose(blocks: Blocks) -> tuple[Blocks, np.ndarray]:
@@ -255,13 +252,6 @@ def _weights(part: np.ndarray, parts: np.ndarray, generator: np.random.Generator
     """Draw parts with replacement, and return how often each block is drawn, (N,)."""
     counts = np.bincount(generator.integers(parts.size, size=parts.size), minlength=parts.size)
     return counts[np.searchsorted(parts, part)].astype(np.float64)
-
-
-def _unrounded(fit: np.ndarray) -> tuple[float, float]:
-    """Return alpha and beta of the instrument, with the variance of rounding
-    subtracted from beta.
-    """
-    return float(fit[0]), max(float(fit[1]) - ROUNDING, 0.0)
 
 
 def _with_colour(blocks: Blocks, model: NoiseModel) -> NoiseModel:

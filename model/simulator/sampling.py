@@ -83,12 +83,8 @@ def resample(radiance: np.ndarray, height: int, width: int) -> np.ndarray:
     of 255 and more (measured).
     """
     old_height, old_width = radiance.shape[-2:]
-    fy = np.fft.fftfreq(old_height)
-    fx = np.fft.rfftfreq(old_width)
-    ramp_y, ramp_x = (
-        _ramp(f, shift)
-        for f, shift in ((fy, (old_height / height - 1) / 2), (fx, (old_width / width - 1) / 2))
-    )
+    ramp_y = _ramp(np.fft.fftfreq(old_height), (old_height / height - 1) / 2)
+    ramp_x = _ramp(np.fft.rfftfreq(old_width), (old_width / width - 1) / 2)
     spectrum = scene_spectrum(radiance) * ramp_y[:, None] * ramp_x
     rows = min(old_height, height)
     columns = min(old_width, width)

@@ -42,13 +42,13 @@ of the reference.
 
 def wiener(image: np.ndarray, blur: np.ndarray) -> np.ndarray:
     """Apply scikit-image's Wiener filter with a Laplacian regulariser, balance 0.01."""
-    return restoration.wiener(image, blur.astype(complex), WIENER_BALANCE, clip=False)
+    return np.asarray(restoration.wiener(image, blur.astype(complex), WIENER_BALANCE, clip=False))
 
 
 def unsupervised_wiener(image: np.ndarray, blur: np.ndarray) -> np.ndarray:
     """Apply scikit-image's Wiener filter that estimates its own regularisation (seed 0)."""
     restored, _ = restoration.unsupervised_wiener(image, blur.astype(complex), clip=False, rng=0)
-    return restored
+    return np.asarray(restored)
 
 
 def richardson_lucy(image: np.ndarray, blur: np.ndarray) -> np.ndarray:
@@ -60,7 +60,9 @@ def richardson_lucy(image: np.ndarray, blur: np.ndarray) -> np.ndarray:
     psf = np.maximum(psf, 0)
     # It divides by its own blurred estimate, which goes to 0 where the image is 0.
     light = np.maximum(image, 1e-6)
-    return restoration.richardson_lucy(light, psf / psf.sum(), RICHARDSON_LUCY_STEPS, clip=False)
+    return np.asarray(
+        restoration.richardson_lucy(light, psf / psf.sum(), RICHARDSON_LUCY_STEPS, clip=False)
+    )
 
 
 def nl_means(dn: Tensor, chain: Chain) -> Tensor:

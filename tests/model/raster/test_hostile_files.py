@@ -4,7 +4,7 @@ import struct
 import tracemalloc
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -83,21 +83,6 @@ def test_a_tile_that_no_memory_holds_is_refused(tmp_path: Path) -> None:
     refused(absurd, MachineError, "strips or tiles")
 
 
-def test_a_size_that_is_no_whole_number_is_refused(tmp_path: Path) -> None:
-    path = tiff(tmp_path / "a.tif", GREY.tobytes())
-    # In a TIFF entry, type 4 is a 32-bit integer and type 11 a float.
-    integer_entry = struct.pack("<HHII", 257, 4, 1, 16)
-    float_entry = struct.pack("<HHIf", 257, 11, 1, 16.0)
-    assert integer_entry in path.read_bytes()
-    path.write_bytes(path.read_bytes().replace(integer_entry, float_entry))
-    refused(path, ImageError, "readable")
-    path = tiff(tmp_path / "b.tif", GREY.tobytes())
-    # The entry is a list of 20 values that begins at byte 8, over the file's own tags.
-    many = struct.pack("<HHII", 257, 4, 20, 8)
-    path.write_bytes(path.read_bytes().replace(integer_entry, many))
-    refused(path, ImageError, "readable")
-
-
 def test_an_image_too_long_to_be_planned_is_refused(tmp_path: Path) -> None:
     path = tiff(tmp_path / "a.tif", GREY.tobytes(), height=2**32 - 1, rows=16)
     with pytest.raises(BeersError):
@@ -105,18 +90,6 @@ def test_an_image_too_long_to_be_planned_is_refused(tmp_path: Path) -> None:
     path = tiff(tmp_path / "b.tif", GREY.tobytes(), height=2**23, width=1, rows=2**23, size=256)
     with pytest.raises(ImageError, match="pixels a side"):
         rows(path)
-
-
-def test_a_chunk_stated_longer_than_the_file_takes_no_memory(tmp_path: Path) -> None:
-    path = tmp_path / "a.png"
-    Image.fromarray(GREY).save(path)
-    content = bytearray(path.read_bytes())
-    at = content.find(b"IDAT")
-    # The length of a PNG chunk is the 4 bytes before its kind.
-    content[at - 4 : at] = struct.pack(">I", 2**31 - 1)
-    path.write_bytes(content)
-    with little_memory(), suppress(ImageError):
-        read_pixels(path)
 
 
 @pytest.mark.parametrize("side", [2_000_000, 2**31 - 1])

@@ -154,16 +154,6 @@ def test_a_full_well_gives_back_no_more_than_its_share_of_what_it_cuts_off(
     assert np.array_equal(stages.alone(FullWell(well, 0.0, length_px), image), image.clip(max=well))
 
 
-def test_defect_rates_of_zero_change_nothing_and_of_a_million_everything() -> None:
-    dn = scene(17, 23)
-    for defects, expected in (
-        (Defects(0, 0), dn),
-        (Defects(1e6, 0), np.zeros_like(dn)),
-        (Defects(0, 1e6), np.full_like(dn, 4095.0)),
-    ):
-        assert np.array_equal(stages.alone(defects, dn), expected)
-
-
 SENSOR = stages.plain_sensor()
 GAIN = SENSOR.gain_dn_per_radiance
 

@@ -22,12 +22,10 @@ from beers_deploy.model.traditional.regularisation import (
     LARGEST_EPSILON,
     LARGEST_PER_NOISE,
     derived_epsilon,
-    difference_energy,
     measure,
 )
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.instrument import Instrument
-from tests.model.simulator.stages import formula_point, with_response
 from tests.model.traditional.test_pipeline import (
     DEGRADED,
     NOISE_FREE,
@@ -160,12 +158,6 @@ def test_strips_need_an_epsilon_and_one_that_is_given_stays() -> None:
         list(restore_strips([dn], 9, chain))
     given_one = replace(chain, epsilon=0.01)
     assert given_one.fitted_to([dn]) is given_one
-
-
-def test_a_point_spread_counts_as_the_formula_it_was_made_of() -> None:
-    formula = replace(DEGRADED, mtf_nyquist=0.12, mtf_nyquist_along=0.05)
-    point = with_response(DEGRADED, formula_point(formula.mtf_axes, 2, 129, odd=True))
-    assert difference_energy(point) == pytest.approx(difference_energy(formula), rel=0.02)
 
 
 def test_the_restored_mtf_comes_near_that_of_the_reference() -> None:
