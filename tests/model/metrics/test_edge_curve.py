@@ -43,21 +43,22 @@ def drawn(
     texture: float,
 ) -> np.ndarray:
     """A region (H, W) with an edge between sloping sides, its texture some pixels wide."""
-    size = height, width = 23, 19
+    height = 23
+    width = 19
     y, x = np.mgrid[:height, :width].astype(float)
     y -= (height - 1) / 2
     x -= (width - 1) / 2
     place_px = generator.uniform(-1, 1)
     slope = generator.uniform(-0.4, 0.4)
     distance = (x - place_px - slope * y) / np.hypot(1, slope)
-    share = at_distances(responses()[0] @ weights, distance.ravel()).reshape(size)
+    share = at_distances(responses()[0] @ weights, distance.ravel()).reshape(height, width)
     left = 400 + generator.normal(0, 4) * y / height
     right = 1400 + generator.normal(0, 4) * y / height
     grain = generator.normal(size=(height + 2, width + 2))
     shifts = product(range(3), repeat=2)
     smooth = sum(grain[i : i + height, j : j + width] for i, j in shifts) / 3
     pixels = left * (1 - share) + right * share + texture * 1000 * smooth
-    return pixels + generator.normal(0, NOISE_DN, size)
+    return np.asarray(pixels + generator.normal(0, NOISE_DN, (height, width)))
 
 
 def edges_of(weights: np.ndarray, count: int, seed: int, texture: float = 0.0) -> list[Edge]:

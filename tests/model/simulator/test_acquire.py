@@ -131,7 +131,8 @@ def test_drawn_scenes_are_physical_and_repeatable() -> None:
     scene, again, other = (
         procedural_scene(700, 913, np.random.default_rng(seed)).radiance for seed in (5, 5, 6)
     )
-    assert (scene.shape, scene.dtype) == ((700, 913), np.float32)
+    assert scene.shape == (700, 913)
+    assert scene.dtype == np.float32
     assert 0 < scene.min() < 20
     assert 200 < scene.max() < 1000
     assert np.array_equal(scene, again)
