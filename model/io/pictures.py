@@ -36,7 +36,7 @@ class Stretch:
 
     def _share(self, dn: np.ndarray) -> np.ndarray:
         # An image of one value has no range to divide by.
-        return np.asarray(np.clip((dn - self.black) / max(self.white - self.black, 1e-6), 0, 1))
+        return np.clip((dn - self.black) / max(self.white - self.black, 1e-6), 0, 1)
 
 
 def stretch_of(dn: np.ndarray) -> Stretch:

@@ -68,8 +68,8 @@ def write_tensors(path: Path, tensors: Arrays, header: Mapping[str, object]) -> 
 
 
 def _sort_metadata(path: Path) -> None:
-    """Put the keys of a safetensors file's metadata in order: the library writes them in another
-    one each time.
+    """Sort the metadata of a safetensors file by key, because the library writes it in random
+    order.
     """
     content = path.read_bytes()
     # The file begins with the length of its JSON header, in 8 bytes.
@@ -188,7 +188,7 @@ def _conditioned(header: Mapping[str, object]) -> bool:
     """
     kind = header.get("kind")
     if kind not in (None, BANKED):
-        raise ValueError(f"its weights are {kind}, as another version wrote them")
+        raise ValueError(f"its kind of weights, {kind!r}, is that of another version")
     if kind and header.get("ranges") != {name: list(ends) for name, ends in RANGES.items()}:
         raise ValueError("its ranges of sensors differ from those of this version")
     return kind is not None

@@ -53,7 +53,7 @@ def percentiles(draws: np.ndarray) -> tuple[float, float]:
 
 
 def too_few(sites: int) -> str:
-    """Return a sentence on why no interval is shown for this number of sites, or "" if one is."""
+    """Return a sentence if there are too few sites for an interval, else an empty string."""
     if sites >= LEAST_SITES:
         return ""
     return (

@@ -1,5 +1,5 @@
-"""Measure the lines of one direction in the pixels of one band: their difference from their
-neighbours, and constant ones.
+"""Measure how each line of detectors in one band differs from its neighbours, and find constant
+lines.
 
 A faulty detector affects one column (pushbroom), one row or one pixel, and not its neighbours. A
 line is measured in several blocks along it: detector faults repeat in all blocks, and scenes do
@@ -105,10 +105,10 @@ def _location(values: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def constant_columns(pixels: np.ndarray) -> np.ndarray:
-    """Return True for columns of (h, w) pixels with one value, alone or in pairs, between columns
-    that vary.
+    """Return True for each column of (h, w) pixels that is constant while its neighbours vary.
 
-    NaN marks a missing pixel, which is ignored.
+    Two constant columns next to each other count as well. NaN marks a missing pixel, which is
+    ignored.
     """
     constant = np.fmax.reduce(pixels, axis=0) == np.fmin.reduce(pixels, axis=0)
     counts = np.isfinite(pixels).sum(0)

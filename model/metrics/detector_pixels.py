@@ -40,8 +40,8 @@ assumed, over the ground and in steps.
 """
 QUIET = 0.001
 """Noise over the ground that is assumed at least."""
-KNOWN = 60
-"""The least number of known pixels among the 81 around a pixel."""
+MIN_VALID = 60
+"""The minimum number of valid pixels among the 81 around a pixel."""
 
 
 def wrong_pixels(pixels: np.ndarray, step: float = 0.0) -> np.ndarray:
@@ -59,7 +59,7 @@ def wrong_pixels(pixels: np.ndarray, step: float = 0.0) -> np.ndarray:
     places = _candidates(pixels)
     windows = np.lib.stride_tricks.sliding_window_view(pixels, (size, size))
     patches = windows[places[:, 0] - PATCH_PX, places[:, 1] - PATCH_PX].astype(np.float64)
-    sufficient = np.isfinite(patches).sum((1, 2)) > KNOWN
+    sufficient = np.isfinite(patches).sum((1, 2)) > MIN_VALID
     places = places[sufficient]
     patches = patches[sufficient]
     return np.asarray(places[_wrong(patches, step)]) if len(places) else places
@@ -80,7 +80,7 @@ def _candidates(pixels: np.ndarray) -> np.ndarray:
     step = np.abs(np.diff(centres, axis=1))
     least = CANDIDATE * float(np.nanmean(step)) if np.isfinite(step).any() else 0.0
     out = np.maximum(centres - above, below - centres)
-    return np.asarray(np.argwhere((out > 0) & (out >= least)) + PATCH_PX)
+    return np.argwhere((out > 0) & (out >= least)) + PATCH_PX
 
 
 def _wrong(patches: np.ndarray, step: float) -> np.ndarray:

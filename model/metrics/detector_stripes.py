@@ -7,7 +7,6 @@ spread to them, and weights the difference by the noise and texture around.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -276,10 +275,7 @@ def _grows(gains: np.ndarray, errors: np.ndarray, level: np.ndarray) -> bool | N
     The pattern of the other blocks is fitted to each block. Over the level, gains fit all blocks
     equally, and offsets fall as 1 / level: the slope of the logarithms is 0 or -1.
     """
-    fits, fit_errors = (
-        np.array(numbers)
-        for numbers in zip(*map(partial(_fit, gains, errors), range(len(gains))), strict=True)
-    )
+    fits, fit_errors = np.array([_fit(gains, errors, number) for number in range(len(gains))]).T
     levels = np.nanmean(level, axis=1)
     use = (fits > 0) & np.isfinite(fit_errors)
     if use.sum() < 3 or np.ptp(np.log(levels[use])) < np.log(LEVELS):

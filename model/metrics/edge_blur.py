@@ -19,8 +19,8 @@ import numpy as np
 
 from beers_deploy.model.metrics.edge_fit import (
     ANY,
-    FOUND,
     HALF_PX,
+    STRICT,
     EdgeBlur,
     Fit,
     Noise,
@@ -71,7 +71,7 @@ drawn towns 41 are detected instead of 47 (measured).
 
 def blurs_of(squares: np.ndarray, noise: Noise) -> list[EdgeBlur]:
     """Fit the blurs of those squares (N, S, S) that contain an edge."""
-    return [fit for fit in fit_blurs(squares, noise, FOUND) if isinstance(fit, EdgeBlur)]
+    return [fit for fit in fit_blurs(squares, noise, STRICT) if fit is not None]
 
 
 def plain_squares(
@@ -81,8 +81,10 @@ def plain_squares(
     effort: Effort,
     roughness: float = MAX_ROUGHNESS,
 ) -> np.ndarray:
-    """Return the squares (N, S, S), S = 2 * HALF_PX + 1, of an image that may hold a near-vertical
-    edge.
+    """Return squares (N, S, S) around the steepest places of an image, where near-vertical edges
+    may be.
+
+    S is 2 * HALF_PX + 1.
 
     Args:
         image: (H, W), finite values; transpose it for near-horizontal edges.
@@ -94,8 +96,8 @@ def plain_squares(
     if min(image.shape) <= 2 * MARGIN_PX:
         return np.empty((0, 2 * HALF_PX + 1, 2 * HALF_PX + 1))
     squares = _squares(image, noise, effort)
-    sound = ((squares > 0) & (squares < clipped_at)).all((1, 2))
-    return np.asarray(squares[sound & _flat(squares, noise, roughness)][: effort.fits])
+    valid = ((squares > 0) & (squares < clipped_at)).all((1, 2))
+    return squares[valid & _flat(squares, noise, roughness)][: effort.fits]
 
 
 def _squares(image: np.ndarray, noise: Noise, effort: Effort) -> np.ndarray:
@@ -111,7 +113,7 @@ def _squares(image: np.ndarray, noise: Noise, effort: Effort) -> np.ndarray:
                 break
     reach = np.arange(-HALF_PX, HALF_PX + 1)
     rows, columns = (places[numbers][:, None, None] for places in (rows, columns))
-    return np.asarray(image[rows + reach[:, None], columns + reach])
+    return image[rows + reach[:, None], columns + reach]
 
 
 def _steepest(steepness: np.ndarray, effort: Effort) -> tuple[np.ndarray, np.ndarray]:
@@ -156,7 +158,7 @@ def _steepness(image: np.ndarray, noise: Noise, step_px: int) -> np.ndarray:
     down = np.abs(sum(column(step_down, k) for k in offsets)) / 5
     # A mean of 5 rows less another one has 2 / 5 of a pixel's variance.
     deviation = np.sqrt(2 / 5 * noise(column(row(0), 0)))
-    return np.asarray(np.where(down > across, 0, across / deviation))
+    return np.where(down > across, 0, across / deviation)
 
 
 def _flat(squares: np.ndarray, noise: Noise, roughness: float) -> np.ndarray:
@@ -178,7 +180,7 @@ def _scatter(side: np.ndarray) -> np.ndarray:
     return np.asarray(np.einsum("nij,nij->n", off, off) / ((height - 1) * width))
 
 
-MIN_FOUND = 3
+MIN_EDGES = 3
 FLOOR = 0.05
 """Least standard error of gamma: the error of the fit on edges along the grid (measured), 2.5 % of
 the MTF.
@@ -187,8 +189,6 @@ ROBUST = 1.4826
 """The ratio of the standard deviation of normal values to their median absolute deviation."""
 LONE_ERROR = 0.1
 """Assumed scatter of gamma between edges if only one edge is known."""
-SHAPED_EDGES = 40
-"""The number of edges from which the shape is determined."""
 WORST = 1e12
 """Sum of squares over noise that is used if the fit fails."""
 OTHER_SHAPES = 0.25
@@ -222,22 +222,21 @@ def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
     The shape of the curve is not fixed: each shape is weighted by how well it explains the edges.
 
     Args:
-        own: the edges across this axis, at least one.
+        own: the edges across this axis, at least two, all in regions of one size.
         others: the edges across the other axis.
     """
     # Imported here: who measures no sensor need not wait for SciPy.
     from scipy.special import stdtrit
 
     other_gamma = float(np.median([edge.gamma for edge in others])) if others else None
-    shaped = own[:SHAPED_EDGES]
     logs, errors, chi2 = (
         np.array(part)
         for part in zip(*(_of_shape(own, other_gamma, s) for s in SHAPES), strict=True)
     )
     # The best shape leaves the noise at least: less is chance.
-    scatter = np.maximum(chi2.min(0) / [edge.count for edge in shaped], 1.0)
+    scatter = np.maximum(chi2.min(0) / [edge.count for edge in own], 1.0)
     # The median and not the sum: an edge that another crosses nearby has a shape of its own.
-    weights = -len(shaped) / 2 * np.median((chi2 - chi2[0]) / scatter, axis=1)
+    weights = -len(own) / 2 * np.median((chi2 - chi2[0]) / scatter, axis=1)
     # The prior gives half of its weight to the profile's curve, because few edges cannot determine
     # another one.
     belief = np.gradient(SHAPES)
@@ -246,8 +245,7 @@ def combine(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf:
     weights /= weights.sum()
     value = float(weights @ logs)
     error = math.sqrt(float(weights @ ((logs - value) ** 2 + errors**2)))
-    # A lone edge has its scatter assumed.
-    quantile = float(stdtrit(len(own) - 1 or math.inf, 0.975))
+    quantile = float(stdtrit(len(own) - 1, 0.975))
     reach = quantile * math.hypot(error, FLOOR / 2, OTHER_SHAPES * (logs[0] - value))
     low, centre, high, nearest = (
         MTF_NYQUIST_MAX * math.exp(x) for x in (value - reach, value, value + reach, logs[0])
@@ -267,26 +265,17 @@ def _of_shape(
         The logarithm of the MTF at Nyquist relative to a perfect lens, its standard error, and the
         residual of each edge.
     """
-    fits = _reshaped(edges[:SHAPED_EDGES], shape) if shape else list(edges)
-    blurs = [fit for fit in fits if isinstance(fit, EdgeBlur)] or list(edges)
-    gammas, errors = (
-        np.array([getattr(edge, name) for edge in blurs]) for name in ("gamma", "error")
-    )
+    fits: Sequence[Fit] = edges
+    if shape:
+        fits = fit_shape(np.stack([edge.pixels for edge in edges]), ANY, shape)
+    blurs = [fit for fit in fits if fit is not None] or edges
+    gammas, errors = np.array([(edge.gamma, edge.error) for edge in blurs]).T
     if other_gamma is not None and not shape:
         lean = np.array([edge.slope for edge in blurs]) ** 2
         gammas = np.sqrt(np.maximum(gammas**2 * (1 + lean) - lean * other_gamma**2, 1e-4))
     gamma, error = _centre(gammas, errors)
-    chi2 = [fit.chi2 if isinstance(fit, EdgeBlur) else WORST for fit in fits[:SHAPED_EDGES]]
+    chi2 = [fit.chi2 if fit else WORST for fit in fits]
     return -gamma / 2 - shape / 4, error / 2, np.array(chi2)
-
-
-def _reshaped(edges: Sequence[EdgeBlur], shape: float) -> list[Fit]:
-    """Fit edges again by another shape of the curve; those found by search are of one size, pointed
-    ones are not.
-    """
-    if len({edge.pixels.shape for edge in edges}) == 1:
-        return fit_shape(np.stack([edge.pixels for edge in edges]), ANY, shape)
-    return [fit_shape(edge.pixels[None], ANY, shape)[0] for edge in edges]
 
 
 def _centre(values: np.ndarray, errors: np.ndarray) -> tuple[float, float]:

@@ -75,7 +75,7 @@ OUTLIER_RANGE_PX = 8.0
 """Priors of the softness: the scatter of steps beyond their errors, and the mean excess of other
 edges; the share of outliers, and the range of their softness.
 """
-KEPT_DEVIATIONS = 2.5
+SHARP_DEVIATIONS = 2.5
 CONTRADICTION_DEVIATIONS = 3.0
 CONTRADICTION_PX = 0.4
 """The least difference of softness that counts as a contradiction; 0.4 px is 18 % of the contrast
@@ -198,7 +198,7 @@ def _curve_of_sharpest(
         # Texture scatters the softness by more than the noise that its own error counts.
         errors = np.hypot(errors, [UNEVEN_PX * edge.unevenness for edge in fitted])
         step = sharpest(values[precise], errors[precise]) if precise.any() else 0.0
-        alike = precise & (np.abs(values - step) <= KEPT_DEVIATIONS * np.hypot(errors, SCATTER_PX))
+        alike = precise & (np.abs(values - step) <= SHARP_DEVIATIONS * np.hypot(errors, SCATTER_PX))
         sharp = [edge for edge, is_sharp in zip(fitted, alike, strict=True) if is_sharp]
     if len(sharp) < least:
         count = f"{len(sharp)} straight edge{'' if len(sharp) == 1 else 's'}"
@@ -381,8 +381,7 @@ def _missing(contrast: np.ndarray, low: np.ndarray, high: np.ndarray, edges: int
 
 
 def apart(own: MtfCurve, other: MtfCurve) -> MtfCurve:
-    """Return the curve along its own axis only, by removing the part of the other axis in inclined
-    edges.
+    """Return the curve of one axis without what inclined edges contribute of the other axis.
 
     The loss along an edge's normal is sqrt((c loss_own)^2 + (s loss_other)^2), with c and s the
     cosine and sine of its angle, as in a profile's formula (`profiles.response.MtfTable`).

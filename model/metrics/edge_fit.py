@@ -15,8 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from beers_deploy.model.metrics.refusal import Refusal
-
 HALF_PX = 8
 """Half the side of the square around a found edge, and how far from an edge pixels are fitted."""
 
@@ -71,7 +69,8 @@ class EdgeBlur:
     count: int
 
 
-Fit = EdgeBlur | Refusal
+Fit = EdgeBlur | None
+"""The blur across an edge, or None if there is no edge within the limits."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +89,7 @@ class Limits:
     error: float = 0.6
 
 
-FOUND = Limits(30, 0.012)
+STRICT = Limits(30, 0.012)
 ANY = Limits(0, math.inf, math.inf)
 """Limits for edges found by search, among many candidates that are none, and for places that
 certainly are edges.
@@ -113,7 +112,7 @@ def _responses(shape: float) -> np.ndarray:
     sums = np.fft.ifft(waves, PERIOD_PX * PER_PX, norm="forward")[:, places]
     # The response is odd around the edge: the left half is the right one, turned around.
     half = (sums * np.exp(1j * math.pi * places / (PERIOD_PX * PER_PX))).imag
-    return np.asarray(0.5 + np.concatenate([-half[:, :0:-1], half], axis=1))
+    return 0.5 + np.concatenate([-half[:, :0:-1], half], axis=1)
 
 
 def _at_gammas(gammas: np.ndarray, shape: float) -> np.ndarray:
@@ -145,18 +144,17 @@ def fit_blurs(regions: np.ndarray, noise: Noise, limits: Limits) -> list[Fit]:
         limits: the limits that an edge must keep.
 
     Returns:
-        The blur by the profile's curve; or, for an edge that no shape of the curve fits, the reason
-        why there is none.
+        The blur by the profile's curve; None where no shape of the curve fits.
     """
     # Over their noise: residuals are then in its standard deviations.
     pixels = regions / np.sqrt(noise(regions).mean((1, 2)))[:, None, None]
     results = fit_shape(pixels, limits)
-    refused = [k for k, fit in enumerate(results) if isinstance(fit, Refusal)]
+    refused = [k for k, fit in enumerate(results) if fit is None]
     steeper = set[int]()
     for shape in STEEPER:
         remaining = [k for k in refused if k not in steeper]
         fits = fit_shape(pixels[remaining], limits, shape)
-        steeper |= {k for k, fit in zip(remaining, fits, strict=True) if isinstance(fit, EdgeBlur)}
+        steeper |= {k for k, fit in zip(remaining, fits, strict=True) if fit is not None}
     # What a steeper curve fits is an edge. The profile's own curve is fitted to it all the same.
     steep = sorted(steeper)
     for k, fit in zip(steep, fit_shape(pixels[steep], ANY), strict=True):
@@ -203,7 +201,7 @@ def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fi
         shape: coefficient of the Gaussian part.
     """
     count, height, width = pixels.shape
-    fits: list[Fit] = [Refusal("no straight edge near to an axis")] * count
+    fits: list[Fit] = [None] * count
     if not count:
         return fits
     y, x = (np.arange(size) - (size - 1) / 2 for size in (height, width))
@@ -215,15 +213,15 @@ def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fi
     active = np.arange(count)
     for _ in range(PASSES):
         mask = np.abs(across - lines.place[:, None] - lines.slope[:, None] * down) <= HALF_PX
-        sizes = mask.sum(1)
-        for k in np.flatnonzero(sizes < 10 * HALF_PX):
-            fits[active[k]] = Refusal(f"{sizes[k]} pixels near the edge, {10 * HALF_PX} are needed")
-        enough = sizes >= 10 * HALF_PX
+        enough = mask.sum(1) >= 10 * HALF_PX
         lines = lines.only(enough)
         active = active[enough]
         mask = mask[enough]
         solved = _solve(lines, across, down, values[active], mask, shape)
-        gamma_change, lines = _move(lines, solved.change)
+        place, slope, softer = np.clip(solved.change, -MAX_STEP, MAX_STEP).T
+        gamma = np.clip(lines.gamma + softer, 0.0, float(GAMMAS[-1]))
+        gamma_change = np.abs(gamma - lines.gamma)
+        lines = _Lines(lines.place + place, lines.slope + slope, gamma)
         astray = (np.abs(lines.place - start[active]) > MAX_PLACE_PX) | (
             np.abs(lines.slope) > MAX_SLOPE
         )
@@ -291,13 +289,6 @@ def _solve(
     return _Solved(change, covariance[:, 4, 4], span, (residuals**2).sum(1))
 
 
-def _move(lines: _Lines, change: np.ndarray) -> tuple[np.ndarray, _Lines]:
-    """Take a bounded step; return by how much each gamma changed, and the lines."""
-    place, slope, gamma = np.clip(change, -MAX_STEP, MAX_STEP).T
-    softer = np.clip(lines.gamma + gamma, 0.0, float(GAMMAS[-1]))
-    return np.abs(softer - lines.gamma), _Lines(lines.place + place, lines.slope + slope, softer)
-
-
 def _judged(
     lines: _Lines,
     solved: _Solved,
@@ -307,7 +298,7 @@ def _judged(
     limits: Limits,
     steeper: bool,
 ) -> Fit:
-    """Return edge `k` if it is within the limits, otherwise the reason why not."""
+    """Return edge `k`, or None if it is not within the limits."""
     gamma = float(lines.gamma[k])
     chi2 = float(solved.chi2[k])
     step = float(solved.step[k])
@@ -315,10 +306,9 @@ def _judged(
     misfit = math.sqrt(max(scatter - 1, 0.0)) / max(step, 1e-9)
     # By chance less than the noise may be left, which makes no error smaller.
     error = math.sqrt(float(solved.variance[k]) * max(scatter, 1.0))
+    # Sharper than a detector's pixel, or softer than any profile: no plain edge.
     if limits is not ANY and not LEAST_GAMMA * (not steeper) <= gamma < LARGEST_GAMMA:
-        return Refusal("sharper than a detector's pixel or softer than any profile: no plain edge")
-    if misfit > limits.misfit:
-        return Refusal(f"{misfit:.1%} of the step fit no blurred edge, {limits.misfit:.1%} at most")
-    if step < limits.step_sigma or error > limits.error:
-        return Refusal(f"a step of {step:.3g} times the noise, {limits.step_sigma:g} are needed")
+        return None
+    if misfit > limits.misfit or step < limits.step_sigma or error > limits.error:
+        return None
     return EdgeBlur(gamma, error, float(lines.slope[k]), float(lines.place[k]), pixels, chi2, count)

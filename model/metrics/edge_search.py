@@ -12,7 +12,6 @@ from beers_deploy.model.metrics.edge_blur import THOROUGH, plain_squares
 from beers_deploy.model.metrics.edge_fit import (
     ANY,
     MAX_SLOPE,
-    EdgeBlur,
     Limits,
     Noise,
     centroids,
@@ -56,7 +55,7 @@ def find_edges(image: np.ndarray, noise: Noise, clipped_at: float, label: str) -
         return []
     scaled = squares / np.sqrt(noise(squares).mean((1, 2)))[:, None, None]
     fits = zip(squares, fit_shape(scaled, SEARCHED), strict=True)
-    blurs = [(fit, square) for square, fit in fits if isinstance(fit, EdgeBlur)]
+    blurs = [(fit, square) for square, fit in fits if fit is not None]
     blurs.sort(key=lambda pair: pair[0].chi2 / pair[0].count / float(np.ptp(pair[1])) ** 2)
     return [
         (EdgePixels(square, noise(square), label), EdgeLine(fit.place, fit.slope))
@@ -85,7 +84,7 @@ def edge_in(region: np.ndarray, noise: Noise, label: str) -> Edge | Refusal:
     scale = math.sqrt(float(noise(region).mean()))
     pixels = EdgePixels(region, noise(region), label)
     fit = fit_shape(region[None] / scale, ANY)[0]
-    line = EdgeLine(fit.place, fit.slope) if isinstance(fit, EdgeBlur) else centre_line(region)
+    line = EdgeLine(fit.place, fit.slope) if fit else centre_line(region)
     fitted = fit_edge(pixels, line, START, FIRST_PASSES)
     if fitted is None or abs(fitted.line.slope) > MAX_SLOPE:
         return Refusal("no straight edge near to an axis with 8 pixels on both sides")

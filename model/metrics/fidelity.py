@@ -64,8 +64,7 @@ def ssim(image: np.ndarray, reference: np.ndarray, data_range: float) -> float:
 def fidelity_db(
     dn: np.ndarray, reference: np.ndarray, degraded: np.ndarray, max_dn: int = MAX_DN
 ) -> float:
-    """Compute the PSNR over full scale without the pixels that are clipped in the input or the
-    reference.
+    """Compute the PSNR in dB over the pixels that neither the input nor the reference clips.
 
     The true values of clipped pixels are unknown. If all pixels are clipped, all are used.
 
@@ -75,9 +74,6 @@ def fidelity_db(
         degraded: those of the input of the restoration.
         max_dn: full scale.
     """
-    sound = (reference < max_dn) & (degraded < max_dn)
-    return (
-        psnr_db(dn[sound], reference[sound], max_dn)
-        if sound.any()
-        else psnr_db(dn, reference, max_dn)
-    )
+    valid = (reference < max_dn) & (degraded < max_dn)
+    valid |= not valid.any()
+    return psnr_db(dn[valid], reference[valid], max_dn)

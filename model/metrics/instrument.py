@@ -25,15 +25,12 @@ from beers_deploy.model.metrics.edge_curve import (
 from beers_deploy.model.metrics.edge_fit import EdgeBlur, Noise
 from beers_deploy.model.metrics.edge_search import Edge
 from beers_deploy.model.metrics.noise_blocks import Blocks, cut_blocks, join
-from beers_deploy.model.metrics.noise_line import NoiseModel, Variance, fit_noise_model
+from beers_deploy.model.metrics.noise_line import SEED, Variance
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.profiles.response import NYQUIST
 
 AXES = ("across", "along")
 """The axes relative to the track. Edges near the vertical show the blur across it."""
-SEED = 0
-"""Seed of the draws for intervals, so that one image always gives the same result."""
-
 EDGES = 20
 """The number of short edges that suffices along an axis. More would take time without improving the
 result.
@@ -68,16 +65,6 @@ def above_black(blocks: Blocks, black_dn: float) -> Blocks:
     return blocks._replace(mean=np.maximum(blocks.mean - black_dn, 0.0))
 
 
-def fit_noise(blocks: Blocks, incomplete: bool = False) -> NoiseModel | Refusal:
-    """Fit the noise line to blocks of one sensor, always by the same random draws.
-
-    Args:
-        blocks: of all its images.
-        incomplete: whether noise that is not white is accepted, and noise at one level of light.
-    """
-    return fit_noise_model(blocks, np.random.default_rng(SEED), incomplete)
-
-
 def snr(signal_dn: float, variance: Variance) -> tuple[float, tuple[float, float]]:
     """Return the SNR of a signal above the dark and its 95 % interval; infinite without noise."""
     # The lowest SNR belongs to the highest variance.
@@ -105,8 +92,8 @@ def axis_mtfs(
 
 
 def _combined(own: Sequence[EdgeBlur], others: Sequence[EdgeBlur]) -> AxisMtf | Refusal:
-    if len(own) < edge_blur.MIN_FOUND:
-        return Refusal(f"{len(own)} straight edges, {edge_blur.MIN_FOUND} are needed")
+    if len(own) < edge_blur.MIN_EDGES:
+        return Refusal(f"{len(own)} straight edges, {edge_blur.MIN_EDGES} are needed")
     return edge_blur.combine(own, others)
 
 

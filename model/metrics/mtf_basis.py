@@ -115,7 +115,7 @@ def expected_bends(weights: np.ndarray, bend: float) -> np.ndarray:
     padded = np.pad(weights[:-1], 2, mode="edge")
     size = np.maximum(np.convolve(padded, SMOOTHING, mode="valid"), LEAST_WEIGHT)[1:-1] * bend
     size[0] = max(size[0], FIRST_BEND)
-    return np.asarray(SECOND_DIFFERENCES / size[:, None])
+    return SECOND_DIFFERENCES / size[:, None]
 
 
 def solve(

@@ -47,9 +47,9 @@ class Blocks(NamedTuple):
     spectrum: np.ndarray
     part: np.ndarray
 
-    def only(self, chosen: np.ndarray) -> "Blocks":
-        """Return the blocks that `chosen` (bool or indices) selects."""
-        return Blocks(*(column[chosen] for column in self))
+    def only(self, mask: np.ndarray) -> "Blocks":
+        """Return the blocks where `mask` (N,) is True."""
+        return Blocks(*(column[mask] for column in self))
 
     def noise(self, fit: np.ndarray) -> np.ndarray:
         """Return the variance (N,) of the noise of each block by the line (alpha, beta, ...).
@@ -71,9 +71,9 @@ def cut_blocks(image: np.ndarray, clipped_at: float) -> Blocks:
     `clipped_at`.
     """
     pixels, part = _side_by_side(image)
-    sound = ((pixels > 0) & (pixels < clipped_at)).all((1, 2))
-    pixels = pixels[sound]
-    return _measured(pixels.mean((1, 2)), pixels, part[sound])
+    valid = ((pixels > 0) & (pixels < clipped_at)).all((1, 2))
+    pixels = pixels[valid]
+    return _measured(pixels.mean((1, 2)), pixels, part[valid])
 
 
 def cut_pair(first: np.ndarray, second: np.ndarray, clipped_at: float) -> Blocks:
@@ -91,10 +91,10 @@ def cut_pair(first: np.ndarray, second: np.ndarray, clipped_at: float) -> Blocks
     others, _ = _side_by_side(second)
     low = np.minimum(ones, others).min((1, 2))
     high = np.maximum(ones, others).max((1, 2))
-    sound = (low > 0) & (high < clipped_at)
-    ones = ones[sound]
-    others = others[sound]
-    return _measured((ones + others).mean((1, 2)) / 2, (ones - others) / math.sqrt(2), part[sound])
+    valid = (low > 0) & (high < clipped_at)
+    ones = ones[valid]
+    others = others[valid]
+    return _measured((ones + others).mean((1, 2)) / 2, (ones - others) / math.sqrt(2), part[valid])
 
 
 def _side_by_side(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -47,6 +47,8 @@ QUIET_PERCENT = 5.0
 """The least noise above rounding, in DN^2, of the quietest blocks; restored or resampled images
 have less.
 """
+SEED = 0
+"""Seed of the draws for intervals, so that one image always gives the same result."""
 DRAWS = 200
 PASSES = 6
 FINE_WAVES = 21
@@ -120,15 +122,13 @@ class NoiseModel:
         return Variance(value, (max(low - model * value, 0.0), high + model * value), beyond > 0)
 
 
-def fit_noise_model(
-    blocks: Blocks, generator: np.random.Generator, incomplete: bool = False
-) -> NoiseModel | Refusal:
-    """Fit the line to blocks of any number of images of one instrument, or return why there is
-    none.
+def fit_noise(blocks: Blocks, incomplete: bool = False) -> NoiseModel | Refusal:
+    """Fit the line to blocks of any number of images of one sensor, or return why there is none.
+
+    The draws of the interval are always the same.
 
     Args:
         blocks: of all images.
-        generator: for the draws of the interval.
         incomplete: whether to accept noise that is not white, and noise at only one level of light.
     """
     if blocks.mean.size < LEAST:
@@ -136,11 +136,10 @@ def fit_noise_model(
     quietest = float(np.percentile(blocks.fine, QUIET_PERCENT))
     # What was restored or resampled has less noise than a detector, at the finest detail.
     if quietest < ROUNDING + LEAST_NOISE:
-        got = (
-            f"a variance of {quietest:.2g} DN^2 at the finest detail, where rounding alone "
-            f"makes {ROUNDING:.2g}"
+        return Refusal(
+            f"the finest detail has a variance of {quietest:.2g} DN^2, but rounding alone adds "
+            f"{ROUNDING:.2g}"
         )
-        return Refusal(got)
     quiet, fit = _choose(blocks)
     parts = np.unique(quiet.part)
     if quiet.mean.size < LEAST or parts.size < LEAST_PARTS:
@@ -148,17 +147,19 @@ def fit_noise_model(
     dark, bright = (float(v) for v in np.percentile(quiet.mean, [EDGE_PERCENT, 100 - EDGE_PERCENT]))
     one_level = bright - dark < MIN_RANGE * bright
     if one_level and not incomplete:
-        return Refusal(f"even areas from {dark:.4g} to {bright:.4g} DN only, too narrow for a line")
+        return Refusal(f"all even areas have {dark:.4g} to {bright:.4g} DN, too narrow for a line")
+    generator = np.random.default_rng(SEED)
     draws = np.array([_fitted(quiet, _weights(quiet.part, parts, generator)) for _ in range(DRAWS)])
     if one_level:
         fit, draws = _of_one_level(quiet, fit, draws, generator)
     leak = float(
         fit[2] * np.maximum(quiet.structure - quiet.noise(fit), 0).mean() / quiet.fine.mean()
     )
-    alpha, beta = _unrounded(fit)
-    lines = np.array([_unrounded(draw) for draw in draws])
+    # Beta without the variance of rounding.
+    lines = np.maximum(np.vstack([fit, draws])[:, :2] - (0, ROUNDING), 0.0)
+    alpha, beta = lines[0].tolist()
     model = NoiseModel(
-        alpha, beta, lines, quiet.mean.size, (dark, bright), leak, one_level=one_level
+        alpha, beta, lines[1:], quiet.mean.size, (dark, bright), leak, one_level=one_level
     )
     return _judged(_with_colour(quiet, model), incomplete)
 
@@ -183,16 +184,12 @@ def _of_one_level(
     smooths; given too little, it produces grain. The draws range from none to all.
     """
     level = float(np.median(blocks.mean))
-
-    def split(numbers: np.ndarray, share: float) -> list[float]:
-        noise = float(numbers[0]) * level + float(numbers[1])
-        return [share * noise / max(level, ROUNDING), (1 - share) * noise, float(numbers[2])]
-
-    splits = [
-        split(draw, share)
-        for draw, share in zip(draws, generator.uniform(size=len(draws)), strict=True)
-    ]
-    return np.array(split(fit, 1.0)), np.array(splits)
+    shares = np.append(1.0, generator.uniform(size=len(draws)))
+    numbers = np.vstack([fit, draws])
+    noise = numbers[:, 0] * level + numbers[:, 1]
+    alpha = shares * noise / max(level, ROUNDING)
+    splits = np.stack([alpha, (1 - shares) * noise, numbers[:, 2]], axis=1)
+    return splits[0], splits[1:]
 
 
 def _choose(blocks: Blocks) -> tuple[Blocks, np.ndarray]:
@@ -255,13 +252,6 @@ def _weights(part: np.ndarray, parts: np.ndarray, generator: np.random.Generator
     """Draw parts with replacement, and return how often each block is drawn, (N,)."""
     counts = np.bincount(generator.integers(parts.size, size=parts.size), minlength=parts.size)
     return counts[np.searchsorted(parts, part)].astype(np.float64)
-
-
-def _unrounded(fit: np.ndarray) -> tuple[float, float]:
-    """Return alpha and beta of the instrument, with the variance of rounding
-    subtracted from beta.
-    """
-    return float(fit[0]), max(float(fit[1]) - ROUNDING, 0.0)
 
 
 def _with_colour(blocks: Blocks, model: NoiseModel) -> NoiseModel:

@@ -100,7 +100,7 @@ def _hamming(place: np.ndarray) -> np.ndarray:
     `place` is in pixels and may have any shape.
     """
     window = 0.54 + 0.46 * np.cos(np.pi * place / WINDOW_PX)
-    return np.asarray(np.where(np.abs(place) <= WINDOW_PX, window, 0.0))
+    return np.where(np.abs(place) <= WINDOW_PX, window, 0.0)
 
 
 SOFTNESS_PX = 0.35 * 1.2 ** np.arange(12)
@@ -178,7 +178,7 @@ def _mtf(image: np.ndarray, distance: np.ndarray, plateaus: Plateaus) -> float:
     def mean(x: np.ndarray) -> np.ndarray:
         counts, sums = (np.bincount(bins + HALF, weights, centres.size) for weights in (None, x))
         occupied = counts > 0
-        return np.asarray(np.interp(centres, centres[occupied], sums[occupied] / counts[occupied]))
+        return np.interp(centres, centres[occupied], sums[occupied] / counts[occupied])
 
     edge = mean(values)
     softness_px = min(
@@ -258,7 +258,7 @@ def _covered(distance: np.ndarray, width: float, height: float) -> np.ndarray:
     small, large = sorted((width, height))
     # An edge along the grid is a box that nothing smears: the formula would divide by 0.
     if small < 1e-9:
-        return np.asarray(np.clip(distance / large + 0.5, 0, 1))
+        return np.clip(distance / large + 0.5, 0, 1)
     ramps = [
         (sa * sb, distance + (sa * large + sb * small) / 2) for sa, sb in product((1, -1), repeat=2)
     ]

@@ -24,7 +24,7 @@ from beers_deploy.profiles.errors import ImageError, printable
 
 DARK = {"palette", "hue", "saturation", "lightness", "cyan", "magenta", "yellow", "black"}
 """GDAL's interpretations of bands whose pixels are not brighter where they are larger."""
-UNKEPT = ("STATISTICS_", "TIFFTAG_", "NITF_", "AREA_OR_POINT", "METADATATYPE")
+NOT_COPIED = ("STATISTICS_", "TIFFTAG_", "NITF_", "AREA_OR_POINT", "METADATATYPE")
 """Prefixes of metadata items that are not copied to a restored image: they describe the raw pixels
 or the raw file, or are written from other facts.
 """
@@ -166,4 +166,6 @@ def _place(dataset: Any) -> Place:
 
 def _retained_tags(tags: dict[str, str]) -> tuple[tuple[str, str], ...]:
     """Return the metadata items that are copied to a restored image."""
-    return tuple((key, text) for key, text in sorted(tags.items()) if not key.startswith(UNKEPT))
+    return tuple(
+        (key, text) for key, text in sorted(tags.items()) if not key.startswith(NOT_COPIED)
+    )

@@ -38,15 +38,15 @@ class Extent(NamedTuple):
     whole: bool
 
 
-def extent_of(pixels: np.ndarray, known: np.ndarray | bool = True) -> Extent:
+def extent_of(pixels: np.ndarray, valid: np.ndarray | bool = True) -> Extent:
     """Return the extent of pixels of any shape.
 
     Args:
         pixels: values as stored.
-        known: which of them count, bool of the same shape.
+        valid: which of them count, bool of the same shape.
     """
-    low, high = (float(extreme(pixels, where=known, initial=0)) for extreme in (np.min, np.max))
-    integers = pixels.dtype.kind != "f" or bool((np.rint(pixels) == pixels).all(where=known))
+    low, high = (float(extreme(pixels, where=valid, initial=0)) for extreme in (np.min, np.max))
+    integers = pixels.dtype.kind != "f" or bool((np.rint(pixels) == pixels).all(where=valid))
     return Extent(max(-low, high), integers)
 
 
@@ -229,7 +229,7 @@ def require_numbers(name: str, dtype: np.dtype[Any]) -> np.dtype[Any]:
 
 
 def require_small_offset(name: str, offset: float, scale: float) -> None:
-    """Raise ImageError if pixel value 0 is far from no light: value = scale x pixel + offset.
+    """Raise ImageError if no light is far from pixel value 0, by value = scale x pixel + offset.
 
     Args:
         name: of the image, for the message.

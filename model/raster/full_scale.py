@@ -57,16 +57,10 @@ def settled_scale(
             return usual
     if brightest == 0:  # All of it is black or missing.
         return usual
-    if brightest > UNIT_MAX:
-        meaning = "are not integers and may be radiances"
-        choices = f"({usual:g} for digital numbers, else your own)"
-    else:
-        meaning = "may be shares of full scale"
-        choices = f"(1 for 0..1, {usual:g} for digital numbers)"
-    advice = remedy or f"{ADVICE} {choices}."
+    advice = remedy or f"{ADVICE}: 1 for shares, {usual:g} for digital numbers, else your own."
     raise ImageError(
-        f"{name} has floats of at most {brightest:.3g}, which {meaning} instead of digital numbers "
-        f"of more than 8 bits. {advice}"
+        f"{name} has floats of at most {brightest:.3g}, which may be digital numbers, radiances or "
+        f"shares of full scale. {advice}"
     )
 
 

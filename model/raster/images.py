@@ -52,16 +52,11 @@ def read_pixels(path: Path) -> np.ndarray:
             )
         stored = source.read(0, raster.height_px)
     pixels = np.ma.getdata(stored)
-    if raster.dtype.kind == "f" and not np.isfinite(pixels).all():
-        count = int((~np.isfinite(pixels)).sum())
-        fault = f"{count} NaN or infinite pixels"
-    else:
-        count = int(raster.missing(stored).sum())
-        fault = f"{count} missing pixels by its mask, alpha or nodata value"
+    count = int((raster.missing(stored) | ~np.isfinite(pixels)).sum())
     if count:
         raise ImageError(
-            f"{path} has {fault}. Crop them off; only 'restore' accepts missing pixels, as NaN, "
-            "nodata or a mask."
+            f"{path} has {count} pixels that are NaN or infinite, or missing by its nodata value, "
+            "mask or alpha. Crop them off; only 'restore' accepts missing pixels."
         )
     return pixels[0] if raster.bands == 1 else np.moveaxis(pixels, 0, 2)
 
@@ -116,13 +111,8 @@ def read_acquisition(
     high = float(pixels.max())
     scale = settled_scale(str(path), pixels.dtype, [extent_of(pixels)], full_scale, max_dn, remedy)
     if low < 0 or high > scale:
-        allowed = (
-            f"{max_dn.bit_length()}-bit digital numbers are 0 to {max_dn}"
-            if scale == max_dn
-            else f"they must be 0 to {scale:g}"
-        )
         raise ImageError(
-            f"{path} has values from {low:g} to {high:g}, but {allowed}. "
+            f"{path} has values from {low:g} to {high:g}, but they must be 0 to {scale:g}. "
             f"{remedy_outside(low, high, RESCALE)}"
         )
     dn = np.asarray(pixels, dtype=np.float32)

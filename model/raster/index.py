@@ -126,19 +126,17 @@ def _named(index: Path, home: Path, trusted: bool) -> Iterator[Path]:
 
 def _require_pixels(index: Path, text: str, file: Path) -> None:
     """Raise ImageError if a tile does not exist, or is neither an image nor a VRT."""
-    if not text:
-        raise ImageError(f"{index} has a tile without a name. Write the index again.")
     if not file.is_file():
         raise ImageError(
-            f"{index} names the tile {printable(text)}, but there is no such file. Fetch it, or "
+            f"{index} names the tile '{printable(text)}', but there is no such file. Fetch it, or "
             "write the index again."
         )
     with file.open("rb") as stream:
         is_image = stream.read(16).startswith(MAGIC)
     if not is_image and file.suffix.lower() != ".vrt":
         raise ImageError(
-            f"{index} names the tile {printable(text)}, which is not a TIFF, JPEG 2000, NITF, PNG "
-            "or JPEG. Convert it to TIFF."
+            f"{index} names the tile '{printable(text)}', which is not a TIFF, JPEG 2000, NITF, "
+            "PNG or JPEG. Convert it to TIFF."
         )
 
 

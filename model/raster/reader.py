@@ -12,6 +12,7 @@ import os
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -187,7 +188,7 @@ def _block_px(dataset: Any, tiles: list[Path]) -> int:
 
 @contextmanager
 def damage_in_a_sentence(path: Path, rows: str = "") -> Iterator[None]:
-    """Raise ImageError for whatever GDAL raises over a file, or over some rows of it."""
+    """Turn any error of GDAL about a file, or about some of its rows, into an ImageError."""
     try:
         yield
     except (BeersError, MemoryError, *CODE_FAULTS):
@@ -212,27 +213,28 @@ def damage_in_a_sentence(path: Path, rows: str = "") -> Iterator[None]:
         ) from error
 
 
+@dataclass
 class GdalSource:
-    """An image that GDAL has opened; one thread reads at a time."""
+    """An image that GDAL has opened; one thread reads at a time.
 
-    def __init__(
-        self,
-        files: tuple[Path, ...],
-        dataset: Any,
-        raster: Raster,
-        block_px: int,
-        options: dict[str, str],
-    ) -> None:
-        self.files = files
-        self.raster = raster
-        self._dataset = dataset
-        self._block_px = block_px
-        self._options = options
+    Attributes:
+        files: the files it is read from.
+        dataset: rasterio's object.
+        raster: the facts.
+        block_px: rows of the blocks in which it is decoded.
+        options: of GDAL.
+    """
+
+    files: tuple[Path, ...]
+    dataset: Any
+    raster: Raster
+    block_px: int
+    options: dict[str, str]
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """Read rows `start` to `stop` (excluded) of every band as stored, (bands, rows, width)."""
         bands = list(range(1, self.raster.bands + 1))
-        pixels = self._read(self._dataset.read, start, stop, indexes=bands)
+        pixels = self._read(self.dataset.read, start, stop, indexes=bands)
         if not self.raster.mask_kind:
             return pixels
         hidden = self.read_mask(start, stop) == 0
@@ -241,8 +243,8 @@ class GdalSource:
     def read_mask(self, start: int, stop: int) -> np.ndarray:
         """Read the same rows of the mask or of alpha, (rows, width); 0 marks a missing pixel."""
         if self.raster.mask_kind == "alpha":
-            return self._read(self._dataset.read, start, stop, indexes=self.raster.bands + 1)
-        return self._read(self._dataset.dataset_mask, start, stop)
+            return self._read(self.dataset.read, start, stop, indexes=self.raster.bands + 1)
+        return self._read(self.dataset.dataset_mask, start, stop)
 
     def _read(
         self, read_window: Callable[..., Any], start: int, stop: int, **options: Any
@@ -250,7 +252,7 @@ class GdalSource:
         window = Window(0, start, self.raster.width_px, stop - start)
         cache = {"GDAL_CACHEMAX": self.held_bytes(stop - start)}
         rows = f"rows {start} to {stop - 1}"
-        with damage_in_a_sentence(self.files[0], rows), gdal(**self._options, **cache):
+        with damage_in_a_sentence(self.files[0], rows), gdal(**self.options, **cache):
             return np.asarray(read_window(window=window, **options))
 
     def held_bytes(self, rows_px: int) -> int:  # noqa: ARG002
@@ -261,7 +263,7 @@ class GdalSource:
         raster = self.raster
         planes = raster.bands + (raster.mask_kind == "alpha")
         row_bytes = planes * raster.width_px * raster.dtype.itemsize
-        return int(max(LEAST_CACHE_BYTES, 2 * self._block_px * row_bytes))
+        return int(max(LEAST_CACHE_BYTES, 2 * self.block_px * row_bytes))
 
 
 def _require_whole(path: Path, dataset: Any) -> None:

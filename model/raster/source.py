@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -36,17 +37,17 @@ class Source(Protocol):
         """Return the memory, in addition to the rows, for reading `rows_px` rows at a time."""
 
 
+@dataclass
 class ArraySource:
     """An image in memory: `pixels` (bands, height, width), masked or not; rows are views."""
 
-    def __init__(self, pixels: np.ndarray, raster: Raster) -> None:
-        self._pixels = pixels
-        self.raster = raster
-        self.files: tuple[Path, ...] = ()
+    pixels: np.ndarray
+    raster: Raster
+    files: tuple[Path, ...] = ()
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """Return rows `start` to `stop` (excluded) of every band, not copied."""
-        return self._pixels[:, start:stop]
+        return self.pixels[:, start:stop]
 
     def read_mask(self, start: int, stop: int) -> np.ndarray:
         """Return 255 where any band is known, 0 elsewhere, (rows, width) uint8."""

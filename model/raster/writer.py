@@ -7,6 +7,7 @@ compared with the given pixels.
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -128,15 +129,13 @@ def _planes(raster: Raster, pixels: Pixels) -> Iterator[tuple[int, Window, np.nd
 
 @contextmanager
 def disk_errors() -> Iterator[None]:
-    """Raise OSError for whatever GDAL raises while it writes."""
+    """Turn any error of GDAL while it writes into an OSError that states its cause."""
     try:
         yield
-    except (OSError, *CODE_FAULTS) as error:
-        # RasterioIOError is an OSError, and names its cause instead of itself.
-        if error.__cause__ is None:
-            raise
-        raise OSError(" ".join(str(error.__cause__).split())) from error
     except Exception as error:
+        # RasterioIOError is an OSError, and names its cause instead of itself.
+        if isinstance(error, (OSError, *CODE_FAULTS)) and error.__cause__ is None:
+            raise
         raise OSError(" ".join(str(error.__cause__ or error).split())) from error
 
 
@@ -251,19 +250,19 @@ def cog_bytes(shape: tuple[int, int, int], itemsize: int) -> int:
     return (full + 2 * overviews) * itemsize
 
 
+@dataclass
 class ArrayPixels:
     """Pixels in memory, (bands, H, W), none missing."""
 
-    def __init__(self, pixels: np.ndarray) -> None:
-        self._pixels = pixels
+    pixels: np.ndarray
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
         """Return rows `start` to `stop` (excluded) of one band, (rows, width)."""
-        return self._pixels[band, start:stop]
+        return self.pixels[band, start:stop]
 
     def read_mask(self, start: int, stop: int) -> np.ndarray:
         """Return 255 for each pixel of the same rows, (rows, width) uint8."""
-        return np.full(self._pixels[0, start:stop].shape, 255, np.uint8)
+        return np.full(self.pixels[0, start:stop].shape, 255, np.uint8)
 
 
 def write_tiff(path: Path, dn: np.ndarray) -> None:

@@ -81,10 +81,10 @@ def simulate_planned(
     Returns:
         Digital numbers (H / r - 2 margin, W / r - 2 margin).
     """
+    ratio = scene.oversampling
+    height, width = scene.radiance.shape
     if "mtf" not in plan.skipped:
         instrument = without(sensor, plan.skipped)
-        width = scene.radiance.shape[-1]
-        ratio = scene.oversampling
         return acquire(
             scene.spectrum,
             width,
@@ -96,8 +96,6 @@ def simulate_planned(
             skip=plan.skipped,
         )
     # Without any blur a target pixel is the mean of its scene pixels, which needs no transform.
-    ratio = scene.oversampling
-    height, width = scene.radiance.shape
     pixels = scene.radiance.reshape(height // ratio, ratio, width // ratio, ratio).mean((1, 3))
     return detect(crop_margin(pixels, margin_px), sensor, draw, role, plan.skipped)
 

@@ -115,7 +115,7 @@ def _coordinates() -> tuple[Pattern, Pattern]:
 def _wave(level: float, phase: Pattern, generator: np.random.Generator) -> Pattern:
     steepness = float(generator.uniform(1, 4))
     contrast = log_uniform(generator, CONTRASTS)
-    return np.asarray(level * (1 + contrast * np.clip(steepness * np.sin(phase), -1, 1)))
+    return level * (1 + contrast * np.clip(steepness * np.sin(phase), -1, 1))
 
 
 def log_uniform(generator: np.random.Generator, ends: tuple[float, float]) -> float:

@@ -72,7 +72,7 @@ def mtf(
                 f"{blur}, which is the whole response and includes the filter. Leave the filter "
                 "out."
             )
-        return np.asarray(blur.at(fx, fy))
+        return blur.at(fx, fy)
     across, along = blur if isinstance(blur, tuple) else (blur, blur)
     gamma_x, gamma_y = (gamma_from_mtf(value, antialias_sigma_px) for value in (across, along))
     radius = np.hypot(fx, fy)
@@ -103,7 +103,7 @@ def smear_response(fy: ArrayLike, length_px: float) -> NDArray[np.float64]:
 
     It is 1 for length 0.
     """
-    return np.asarray(np.sinc(length_px * np.asarray(fy, np.float64)))
+    return np.sinc(length_px * np.asarray(fy, np.float64))
 
 
 def sensor_mtf(fx: ArrayLike, fy: ArrayLike, sensor: Instrument) -> NDArray[np.inexact]:

@@ -86,8 +86,8 @@ def smear_moments(height: int, oversampling: int, length_px: float) -> tuple[flo
 
 
 def behind(name: str, change_dn: float, sensor: Instrument) -> float:
-    """Bound how much a change of the signal by the effect `name` may grow through the later
-    effects.
+    """Bound the change of a pixel after all later effects, if the effect `name` changes the signal
+    by `change_dn`.
 
     Blooming adds its share, PRNU its largest gain, and noise changes with the signal: |sqrt(a) -
     sqrt(b)| <= min(sqrt|a - b|, |a - b| / (2 sqrt(beta))).
@@ -214,37 +214,30 @@ def effect_bounds(sensor: Instrument, stats: SceneStats) -> dict[str, float]:
     low = middle - reach
     high = middle + reach
     total = ringing
-    bounds = {}
+    bounds = dict[str, float]()
+
+    def add(name: str, direct_dn: float) -> None:
+        nonlocal low, high
+        bounds[name] = behind(name, direct_dn, sensor)
+        # Later effects may meet this range, whether the effect is applied or left out.
+        low -= direct_dn / gain
+        high += direct_dn / gain
+
     if "smear" in sensor.effects:
         # The smear's kernel less a pulse sums to 0: it sees at most half its size times the span,
         # or steps times moment; the blur behind it enlarges that by its ringing.
         size, moment = smear_moments(stats.height, stats.oversampling, sensor.smear_px)
-        direct = gain * ringing * min(size * span, moment * stats.step_along)
-        bounds["smear"] = behind("smear", direct, sensor)
-        # The smear widens the range that every later effect may meet, whether it is applied or left
-        # out.
-        low = low - direct / gain
-        high = high + direct / gain
+        add("smear", gain * ringing * min(size * span, moment * stats.step_along))
         # Its kernel is a unit pulse and all that differs from it.
         total *= 1 + 2 * size
     # The blurred pixel and the plain mean of its scene pixels lie in one range: they differ by its
     # width at most.
     bounds["mtf"] = behind("mtf", gain * (1 + total) / 2 * span, sensor)
     for name, effect in pixel_effects(sensor.effects, "radiance").items():
-        direct = effect.bound_dn(sensor, low, high)
-        bounds[name] = behind(name, direct, sensor)
-        # Later effects may meet this range, whether the effect is applied or not.
-        low = low - direct / gain
-        high = high + direct / gain
-    noise = gain * NOISE_LIMIT * sensor.noise_sigma(max(high, 0.0))
-    bounds["noise"] = behind("noise", noise, sensor)
-    low = low - noise / gain
-    high = high + noise / gain
+        add(name, effect.bound_dn(sensor, low, high))
+    add("noise", gain * NOISE_LIMIT * sensor.noise_sigma(max(high, 0.0)))
     for name, effect in pixel_effects(sensor.effects, "DN").items():
-        direct = effect.bound_dn(sensor, low, high)
-        bounds[name] = behind(name, direct, sensor)
-        low = low - direct / gain
-        high = high + direct / gain
+        add(name, effect.bound_dn(sensor, low, high))
     return bounds
 
 

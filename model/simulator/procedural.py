@@ -136,22 +136,18 @@ def _street(
     draw.line([place(u0, v0), place(u1, v1)], fill=CONCRETE * 0.8, width=92)
     draw.line([place(u0, v0), place(u1, v1)], fill=ASPHALT, width=68)
     length = math.hypot(u1 - u0, v1 - v0)
-    along = ((u1 - u0) / length, (v1 - v0) / length)
+    du = (u1 - u0) / length
+    dv = (v1 - v0) / length
     for s in np.arange(20, length - 40, 80):
-        dash = [(u0 + along[0] * t, v0 + along[1] * t) for t in (s, s + 34)]
-        draw.line([place(*p) for p in dash], fill=WHITE * 0.7, width=4)
+        dash = [place(u0 + du * t, v0 + dv * t) for t in (s, s + 34)]
+        draw.line(dash, fill=WHITE * 0.7, width=4)
     for s in generator.uniform(40, max(length - 60, 41), int(length / 240)):
         side = 22 * float(generator.choice([-1, 1]))
-        u = u0 + along[0] * s - along[1] * side
-        v = v0 + along[1] * s + along[0] * side
-        car = [
-            (u - along[0] * a - along[1] * b, v - along[1] * a + along[0] * b)
-            for a, b in rectangle(20, 9)
-        ]
-        draw.polygon([shift(place(*p), 5) for p in car], fill=SHADOW)
-        draw.polygon(
-            [place(*p) for p in car], fill=float(generator.choice([18, 60, 110, 190, 280]))
-        )
+        u = u0 + du * s - dv * side
+        v = v0 + dv * s + du * side
+        car = [place(u - du * a - dv * b, v - dv * a + du * b) for a, b in rectangle(20, 9)]
+        draw.polygon([shift(point, 5) for point in car], fill=SHADOW)
+        draw.polygon(car, fill=float(generator.choice([18, 60, 110, 190, 280])))
 
 
 def _house(
@@ -165,20 +161,16 @@ def _house(
     length = generator.uniform(90, 130)
     width = generator.uniform(64, 92)
     sunlit = float(generator.uniform(60, 160))
-    roof = [(u, v), (u + length, v), (u + length, v + width), (u, v + width)]
+
+    def across(top: float, bottom: float) -> list[Point]:
+        corners = (u, top), (u + length, top), (u + length, bottom), (u, bottom)
+        return [place(*corner) for corner in corners]
+
     # The shadow is drawn first, so that the house covers its beginning.
-    draw.polygon([shift(place(*p), 22) for p in roof], fill=SHADOW)
+    draw.polygon([shift(point, 22) for point in across(v, v + width)], fill=SHADOW)
     ridge = v + width / 2
-    draw.polygon(
-        [place(*p) for p in [(u, v), (u + length, v), (u + length, ridge), (u, ridge)]], fill=sunlit
-    )
-    draw.polygon(
-        [
-            place(*p)
-            for p in [(u, ridge), (u + length, ridge), (u + length, v + width), (u, v + width)]
-        ],
-        fill=sunlit * 0.55,
-    )
+    draw.polygon(across(v, ridge), fill=sunlit)
+    draw.polygon(across(ridge, v + width), fill=sunlit * 0.55)
     for k in np.arange(8, length, 11):
         draw.line([place(u + k, v), place(u + k, v + width)], fill=sunlit * 0.8, width=2)
     x, y = place(u + 0.3 * length, v + 0.3 * width)
@@ -195,9 +187,12 @@ def _pattern(draw: ImageDraw.ImageDraw, size: tuple[int, int]) -> None:
     left = size[0] * 0.36
     top = size[1] * 0.08
     draw.rectangle((left, top, left + 2.6 * side, top + side), fill=CONCRETE)
-    edge = [(left + 0.1 * side, top + 0.1 * side), (left + 0.45 * side, top + 0.1 * side)]
+    near = left + 0.1 * side
+    far = left + 0.45 * side
     slant = 0.8 * side * math.tan(math.radians(5))
-    edge += [(left + 0.45 * side + slant, top + 0.9 * side), (left + 0.1 * side, top + 0.9 * side)]
+    upper = top + 0.1 * side
+    lower = top + 0.9 * side
+    edge = [(near, upper), (far, upper), (far + slant, lower), (near, lower)]
     draw.polygon(edge, fill=ASPHALT)
     _star(draw, left + 1.3 * side, top + 0.5 * side, 0.42 * side)
     x = left + 1.85 * side
@@ -210,11 +205,11 @@ def _pattern(draw: ImageDraw.ImageDraw, size: tuple[int, int]) -> None:
         x += 7 * bar
 
 
-def _star(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, sectors: int = 36) -> None:
-    draw.ellipse(around(x, y, radius), fill=WHITE)
-    for k in range(sectors):
-        start = 360 * k / sectors
-        draw.pieslice(around(x, y, radius), start, start + 180 / sectors, fill=ASPHALT)
+def _star(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float) -> None:
+    circle = around(x, y, radius)
+    draw.ellipse(circle, fill=WHITE)
+    for start in range(0, 360, 10):
+        draw.pieslice(circle, start, start + 5, fill=ASPHALT)
 
 
 def texture(height_px: int, width_px: int, generator: np.random.Generator) -> np.ndarray:

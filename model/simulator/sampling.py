@@ -29,7 +29,7 @@ def sample(
     oversampling: int,
     offset_px: tuple[float, float] = (0.0, 0.0),
 ) -> np.ndarray:
-    """Blur by `transfer` and keep every r-th point in both directions.
+    """Blur a scene by `transfer`, and sample it at the centre of each target pixel.
 
     Target pixel n covers scene pixels r*n to r*n + r - 1, so it is sampled at their centre, r*n +
     (r - 1) / 2. For even r that lies between two scene pixels: a phase ramp goes there, where
@@ -83,12 +83,8 @@ def resample(radiance: np.ndarray, height: int, width: int) -> np.ndarray:
     of 255 and more (measured).
     """
     old_height, old_width = radiance.shape[-2:]
-    fy = np.fft.fftfreq(old_height)
-    fx = np.fft.rfftfreq(old_width)
-    ramp_y, ramp_x = (
-        _ramp(f, shift)
-        for f, shift in ((fy, (old_height / height - 1) / 2), (fx, (old_width / width - 1) / 2))
-    )
+    ramp_y = _ramp(np.fft.fftfreq(old_height), (old_height / height - 1) / 2)
+    ramp_x = _ramp(np.fft.rfftfreq(old_width), (old_width / width - 1) / 2)
     spectrum = scene_spectrum(radiance) * ramp_y[:, None] * ramp_x
     rows = min(old_height, height)
     columns = min(old_width, width)
@@ -155,4 +151,4 @@ def _linear(pixels: np.ndarray) -> np.ndarray:
         np.float32
     )
     light: np.ndarray = table[pixels]
-    return np.asarray(light if light.ndim == 2 else light[..., :3].mean(axis=-1))
+    return light if light.ndim == 2 else light[..., :3].mean(axis=-1)

@@ -238,7 +238,7 @@ def _rows_of(matrix: Tensor, numbers: Tensor) -> Tensor:
 
 
 def similar_groups(
-    guide: Tensor, known: Tensor, places: Places, settings: PassSettings
+    guide: Tensor, valid: Tensor, places: Places, settings: PassSettings
 ) -> Iterator[tuple[Tensor, Tensor | None]]:
     """Yield groups of similar patches.
 
@@ -247,7 +247,7 @@ def similar_groups(
 
     Args:
         guide: (h, w), in which similar patches are searched.
-        known: (h, w) bool, False where a pixel is missing.
+        valid: (h, w) bool, False where a pixel is missing.
         places: rows and columns of the search windows.
         settings: of the pass.
 
@@ -258,8 +258,8 @@ def similar_groups(
     first, steps = window_numbers(
         *places, guide.shape[1] - settings.side_px + 1, settings.window_px
     )
-    if not bool(known.all()):
-        _rule_out(distances, first + steps, patch_matrix(known, settings.side_px).all(1))
+    if not bool(valid.all()):
+        _rule_out(distances, first + steps, patch_matrix(valid, settings.side_px).all(1))
     usual = settings.similar
     most = min(settings.most_similar, distances.shape[1])
     candidate, nearest = nearest_first(distances, usual, most)
@@ -277,8 +277,8 @@ def similar_groups(
 
 
 def _rule_out(distances: Tensor, numbers: Tensor, complete: Tensor) -> None:
-    """Put the patches (B, M) that hold a missing pixel, and groups around such
-    a one, out of reach.
+    """Set the distance to infinity for patches (B, M) with a missing pixel, and for groups around
+    such a patch.
     """
     distances[~complete[numbers]] = torch.inf
     distances[~complete[numbers[:, numbers.shape[1] // 2]]] = torch.inf

@@ -103,7 +103,7 @@ Up to 1e-2 costs less than 0.01 dB (measured).
 
 
 def estimate_groups(
-    noisy: Tensor, guide: Tensor, taken: Tensor | None, noise: Noise, settings: PassSettings
+    noisy: Tensor, guide: Tensor, mask: Tensor | None, noise: Noise, settings: PassSettings
 ) -> Tensor:
     """Compute the posterior mean of every patch: P - beta Sigma S^-1 (P - mean of P), with Sigma
     the covariance of the noise.
@@ -120,14 +120,14 @@ def estimate_groups(
     Args:
         noisy: (B, N, k * k) groups of patches.
         guide: the same patches of the guide image; in pass 1 `noisy` itself.
-        taken: (B, N) of 0 and 1: which patches belong to the group, None for all; estimates of the
+        mask: (B, N) of 0 and 1: which patches belong to the group, None for all; estimates of the
             others are meaningless.
         noise: that of `noisy`.
         settings: those of the pass.
     """
-    mean, centred, covariance = _moments(noisy, taken)
+    mean, centred, covariance = _moments(noisy, mask)
     if guide is not noisy:
-        covariance = _moments(guide, taken)[2]
+        covariance = _moments(guide, mask)[2]
     flat = _is_flat(mean, covariance, 0.0 if settings.clean_guide else FLAT_GAMMA * noise.sigma**2)
     shrinkage = torch.zeros_like(covariance)
     shrinkage[~flat] = _shrinkage(covariance[~flat], noise, settings)
@@ -139,9 +139,10 @@ def estimate_groups(
 
 
 def _moments(patches: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean patch (B, 1, k * k), the patches without it, and their covariance, of the taken patches.
+    """Return the mean patch (B, 1, k * k), the patches without it, and their covariance.
 
-    Divided by their number and not by one less, as published.
+    Only patches in the mask count. The covariance is divided by their number and not by one less,
+    as published.
     """
     if mask is None:
         mean = patches.mean(1, keepdim=True)

@@ -1,5 +1,6 @@
-"""Define restorations of scikit-image as baselines for tables; each aims at the reference's MTF and
-is not tuned further.
+"""Restore images by methods of scikit-image, as baselines for tables.
+
+Each aims at the reference's MTF and is not tuned further.
 
 The three deconvolutions undo the degraded MTF completely, and the result is blurred to the
 reference's. Non-local means replaces NL-Bayes in the pipeline.

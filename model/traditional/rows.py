@@ -15,20 +15,20 @@ class Rows:
 
     def __init__(self, strips: Iterable[Tensor]) -> None:
         self._strips: Iterator[Tensor] = iter(strips)
-        self._held: list[Tensor] = []
+        self._in_memory: list[Tensor] = []
         self._top = 0
 
     def window(self, rows: Tensor) -> Tensor:
         """Return the rows with the numbers (R,) as (R, W); windows must move downwards."""
         top = int(rows.min())
         bottom = int(rows.max()) + 1
-        while self._top + sum(map(len, self._held)) < bottom:
-            self._held.append(next(self._strips))
+        while self._top + sum(map(len, self._in_memory)) < bottom:
+            self._in_memory.append(next(self._strips))
         # Strips above the window are never asked for again: forgetting them bounds the memory.
-        while self._top + len(self._held[0]) <= top:
-            self._top += len(self._held.pop(0))
-        rows_held = self._held[0] if len(self._held) == 1 else torch.cat(self._held)
-        return rows_held[rows - self._top]
+        while self._top + len(self._in_memory[0]) <= top:
+            self._top += len(self._in_memory.pop(0))
+        rows_here = self._in_memory[0] if len(self._in_memory) == 1 else torch.cat(self._in_memory)
+        return rows_here[rows - self._top]
 
 
 def mirrored(start: int, stop: int, size: int) -> Tensor:
@@ -68,23 +68,23 @@ def one_thread_per_operation() -> Iterator[int]:
         torch.set_num_threads(threads)
 
 
-def fill_with_local_means(image: Tensor, known: Tensor) -> Tensor:
-    """Fill the pixels of (H, W) that are not `known` with the mean of the nearest known ones
+def fill_with_local_means(image: Tensor, valid: Tensor) -> Tensor:
+    """Fill the pixels of (H, W) that are not `valid` with the mean of the nearest valid ones
     around.
 
     It uses a pyramid: each level fills its missing pixels from the next, of half the resolution.
-    The value is 0 if no pixel is known. scikit-image's biharmonic inpainting gives other values, by
+    The value is 0 if no pixel is valid. scikit-image's biharmonic inpainting gives other values, by
     up to 117 of 255 in a striped photograph (measured).
     """
-    filled = image.where(known, 0.0)
-    if bool(known.all()) or max(image.shape) == 1:
+    filled = image.where(valid, 0.0)
+    if bool(valid.all()) or max(image.shape) == 1:
         return filled
-    # Odd sides get a row or column that counts as unknown, so that every 2 x 2 is whole.
+    # Odd sides get a row or column that counts as missing, so that every 2 x 2 is whole.
     to_even = (0, image.shape[1] % 2, 0, image.shape[0] % 2)
-    count = _sum_2x2(pad(known.to(image.dtype), to_even))
+    count = _sum_2x2(pad(valid.to(image.dtype), to_even))
     mean = _sum_2x2(pad(filled, to_even)) / count.clamp(min=1)
     coarse = fill_with_local_means(mean, count > 0).repeat_interleave(2, 0).repeat_interleave(2, 1)
-    return filled.where(known, coarse[: image.shape[0], : image.shape[1]])
+    return filled.where(valid, coarse[: image.shape[0], : image.shape[1]])
 
 
 def _sum_2x2(image: Tensor) -> Tensor:

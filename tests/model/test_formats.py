@@ -16,7 +16,6 @@ from beers_deploy.model.io.tensors import read_tensors
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.onnx_file import load_onnx
 from tests.deploy.command_line import refused
-from tests.deploy.dpu.graphs import board_convbeers, float_convbeers, integer_convbeers
 from tests.quant.simplify.networks import CASES, made
 
 LAYER = torch.nn.Conv2d(1, 1, 3)
@@ -81,12 +80,6 @@ def test_weights_in_another_format_are_named(tmp_path: Path) -> None:
     torch.save(STATE, tmp_path / "w.safetensors")
     with pytest.raises(ModelError, match=r"it is a file of PyTorch.*beers-deploy train"):
         read_tensors(tmp_path / "w.safetensors")
-
-
-@pytest.mark.parametrize("encoding", [float_convbeers, integer_convbeers, board_convbeers])
-def test_an_onnx_file_is_no_other_format(encoding: Callable[..., Path], tmp_path: Path) -> None:
-    content = encoding(tmp_path / "a.onnx", blocks=1, features=2).read_bytes()
-    assert other_format(content[:HEAD_BYTES]) is None
 
 
 @pytest.mark.parametrize("case", CASES)

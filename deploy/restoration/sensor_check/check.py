@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from beers_deploy.model.metrics.instrument import AXES, axis_mtfs, fit_noise, image_blocks
+from beers_deploy.model.metrics.instrument import AXES, axis_mtfs, image_blocks
+from beers_deploy.model.metrics.noise_line import fit_noise
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.raster.source import Source
 from beers_deploy.profiles.errors import ImageError, printable

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from beers_deploy.model.metrics.edge_blur import AxisMtf
-from beers_deploy.model.metrics.instrument import AXES, SEED, snr
+from beers_deploy.model.metrics.instrument import AXES, snr
 from beers_deploy.model.metrics.noise_blocks import ROUNDING, Blocks
-from beers_deploy.model.metrics.noise_line import NoiseModel
+from beers_deploy.model.metrics.noise_line import SEED, NoiseModel
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.profiles.figures import Figure, measured, unavailable

@@ -84,10 +84,11 @@ def measured_sensor(
         edges: boxes with one straight edge as FILE:X,Y,WIDTH,HEIGHT.
         stated: the values that the user states.
     """
+    several = images if isinstance(images, list | tuple) else [images]
     with TemporaryDirectory(prefix="beers-deploy-") as folder:
         paths = [
             _as_file(image, Path(folder) / f"image{number}.tif")
-            for number, image in enumerate(_several(images))
+            for number, image in enumerate(several)
         ]
         measurement = measure(paths, edges, stated)
         toml = profile_toml(measurement)
@@ -102,10 +103,6 @@ def measured_sensor(
             notes=tuple(measurement.notes()),
         )
         return MeasuredSensor(**vars(Sensor.load(str(profile))), table=table), toml
-
-
-def _several(images: Any) -> list[Any]:
-    return list(images) if isinstance(images, list | tuple) else [images]
 
 
 def _as_file(image: Any, path: Path) -> Path:

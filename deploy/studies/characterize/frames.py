@@ -1,5 +1,5 @@
-"""The raw frames of one camera: their files, the stored step of one digital number, and the level
-of the dark.
+"""Read the raw frames of one camera, and determine the step of a digital number, the bits and the
+level of the dark.
 """
 
 import re

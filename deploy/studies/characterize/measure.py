@@ -13,12 +13,11 @@ from beers_deploy.model.metrics.instrument import (
     AXES,
     above_black,
     axis_curves,
-    fit_noise,
     image_blocks,
     snr,
 )
 from beers_deploy.model.metrics.noise_blocks import Blocks, cut_pair, join
-from beers_deploy.model.metrics.noise_line import NoiseModel
+from beers_deploy.model.metrics.noise_line import NoiseModel, fit_noise
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.model.progress import steps
 from beers_deploy.profiles.errors import ImageError

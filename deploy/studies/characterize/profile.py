@@ -123,9 +123,9 @@ class Measurement:
             )
         if frames.hides_black:
             yield (
-                "0 counts as dark, but the darkest pixels have "
-                f"{frames.darkest_dn * frames.step:g}: if the camera "
-                "adds a black level, state it as `black_level`, or the SNR in the dark is too high"
+                f"0 counts as dark, but the darkest pixels have {frames.darkest_dn * frames.step:g}"
+                ": state a black level of the camera as `black_level`, or the SNR in the dark is "
+                "too high"
             )
         if not model.white:
             yield (
@@ -235,7 +235,9 @@ def _mtf_table(sensor: Measurement, images: str) -> dict[str, object]:
         source_axis = axis if axis in sensor.curves else other
         curve = sensor.curves[source_axis]
         source = f"{_edges(curve)} {source_axis} the track in {images}"
-        source += f", 90 % interval {_intervals(curve)}"
+        intervals = zip(curve.low, curve.high, strict=True)
+        source += ", 90 % interval "
+        source += ", ".join(f"{low:.3g} to {high:.3g}" for low, high in intervals)
         if source_axis != axis:
             source += f"; no curve {axis} the track"
         contrast = [float(f"{value:.4g}") for value in curve.contrast]
@@ -245,13 +247,6 @@ def _mtf_table(sensor: Measurement, images: str) -> dict[str, object]:
 
 def _edges(curve: MtfCurve) -> str:
     return f"{curve.edges} edge{'' if curve.edges == 1 else 's'}"
-
-
-def _intervals(curve: MtfCurve) -> str:
-    """Return the interval of each contrast as text, in the order of the table."""
-    return ", ".join(
-        f"{low:.3g} to {high:.3g}" for low, high in zip(curve.low, curve.high, strict=True)
-    )
 
 
 def _noise_table(sensor: Measurement, images: str) -> dict[str, object]:

@@ -7,11 +7,8 @@ from beers_deploy.model.metrics.mtf_basis import (
     CORNERS,
     PARTS,
     at_distances,
-    expected_bends,
     mtf_at,
     responses,
-    softened,
-    solve,
     weights_of,
 )
 
@@ -35,13 +32,6 @@ def test_weights_give_the_curve_at_the_corners_and_fall_between(losses: list[flo
     assert (mtf_at(fine, weights) <= np.sinc(fine) + 1e-12).all()
 
 
-@given(LOSSES, st.floats(-0.5, 4))
-def test_softening_multiplies_by_an_exponential(losses: list[float], softness_px: float) -> None:
-    optics = mtf_at(CORNERS[:-1], falling(losses))
-    softer = mtf_at(CORNERS[:-1], softened(falling(losses), softness_px))
-    assert softer == pytest.approx(optics * np.exp(-softness_px * CORNERS[:-1]), abs=1e-12)
-
-
 def edge_response(distance: np.ndarray, gamma: float) -> np.ndarray:
     """A step of 1 at 0 behind the profile's MTF: its Fourier integral as a sum."""
     step = 1 / 64
@@ -63,40 +53,3 @@ def test_the_edge_is_that_of_the_profiles_formula(gamma: float) -> None:
         edges @ weights, distance - 0.05
     )
     assert rise / 0.1 == pytest.approx(at_distances(lines @ weights, distance), abs=0.01)
-
-
-@given(st.integers(0, 2**32 - 1))
-def test_solving_finds_a_smooth_curve_and_stays_within_what_any_curve_is(seed: int) -> None:
-    generator = np.random.default_rng(seed)
-    gamma = generator.uniform(1, 8)
-    truth = weights_of(np.exp(-gamma * CORNERS))
-    looks = generator.normal(size=(60, PARTS))
-    gram = looks.T @ looks * 1e8
-    solution = solve(gram, gram @ truth, truth, 0.8)
-    assert solution == pytest.approx(truth, abs=1e-3)
-    nothing = solve(np.zeros((PARTS, PARTS)) + 1e-6 * np.eye(PARTS), np.zeros(PARTS), truth, 0.8)
-    assert nothing.min() >= 0
-    assert nothing.sum() == pytest.approx(1)
-
-
-@pytest.mark.parametrize("shape", ["exponential", "gaussian", "diffraction"])
-@pytest.mark.parametrize("at_nyquist", [0.02, 0.1, 0.3])
-def test_real_optics_bend_no_more_than_expected(shape: str, at_nyquist: float) -> None:
-    optics = at_nyquist * np.pi / 2
-    frequency = CORNERS / 0.5
-    if shape == "exponential":
-        contrast = optics**frequency
-    elif shape == "gaussian":
-        contrast = optics ** (frequency**2)
-    else:
-        cut_off = np.interp(-optics, -chat(np.linspace(0, 1, 999)), np.linspace(0, 1, 999))
-        contrast = chat(np.minimum(frequency * cut_off, 1))
-    weights = weights_of(contrast)
-    bends = expected_bends(weights, 0.8) @ weights
-    assert np.abs(bends).max() < 3
-    assert np.sqrt(np.mean(bends**2)) < 1
-
-
-def chat(share: np.ndarray) -> np.ndarray:
-    """MTF of a perfect round lens at these shares of its cut-off frequency."""
-    return np.asarray(2 / np.pi * (np.arccos(share) - share * np.sqrt(1 - share**2)))

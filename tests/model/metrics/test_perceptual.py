@@ -12,14 +12,11 @@ from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d, pad
 
 from beers_deploy.model.metrics.perceptual import (
-    BACKBONES,
-    MIN_NORM,
     PUBLISHED,
     WEIGHTS_VARIABLE,
     Backbone,
     Dists,
     Lpips,
-    _unit,
     find_backbone,
     not_found,
 )
@@ -27,8 +24,6 @@ from beers_deploy.profiles.errors import ImageError, ModelError
 
 Weights = dict[str, np.ndarray]
 Maps = list[Tensor]
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_STD = (0.229, 0.224, 0.225)
 STEMS = {"squeeze": "squeezenet1_1", "vgg": "vgg16"}
 
 
@@ -142,9 +137,9 @@ def plain_dists(image: np.ndarray, reference: np.ndarray) -> float:
     weights = made_up("vgg")
     published = load_file(PUBLISHED / "dists.safetensors")
     alpha, beta = (published[name].astype(np.float64) for name in ("alpha", "beta"))
-    mean, std = (
-        torch.tensor(x, dtype=torch.float64)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD)
-    )
+    mean, std = torch.tensor([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]], dtype=torch.float64)[
+        ..., None, None
+    ]
     colours = [torch.from_numpy(np.stack([a] * 3))[None] for a in (image, reference)]
     stages = [[c, *vgg_maps((c - mean) / std, weights, hanning_pooled)] for c in colours]
     channels = list[tuple[np.ndarray, np.ndarray]]()
@@ -165,14 +160,12 @@ def plain_dists(image: np.ndarray, reference: np.ndarray) -> float:
     [("squeeze", (64, 64)), ("squeeze", (67, 53)), ("vgg", (37, 32)), ("dists", (37, 32))],
 )
 def test_agrees_with_a_plain_computation(name: str, sides: tuple[int, int], folder: Path) -> None:
-    image, reference = pair(*sides)
+    images = pair(*sides)
     metric = load(name, folder)
-    planes = [a[0, 0].double().numpy() for a in (image, reference)]
+    planes = [a[0, 0].double().numpy() for a in images]
     plain = plain_dists(*planes) if name == "dists" else plain_lpips(name, *planes)
-    assert float(metric(image, reference)) == pytest.approx(plain, rel=1e-5)
-    assert float(metric.double()(image.double(), reference.double())) == pytest.approx(
-        plain, rel=1e-7
-    )
+    assert float(metric(*images)) == pytest.approx(plain, rel=1e-5)
+    assert float(metric.double()(*(a.double() for a in images))) == pytest.approx(plain, rel=1e-7)
 
 
 def test_identical_images_are_0_with_no_gradient(metric: Lpips | Dists) -> None:
@@ -208,28 +201,17 @@ def test_the_gradient_is_that_of_the_value(folder: Path) -> None:
         assert float((at.grad * step).sum()) == pytest.approx(change, rel=1e-3)
 
 
-def gradient_at(features: Tensor, unit: Callable[[Tensor], Tensor]) -> Tensor:
-    at = features.clone().requires_grad_()
-    return torch.autograd.grad((unit(at) - 0.5).square().sum(), at)[0]
-
-
-@pytest.mark.parametrize("size", [0.0, 1e-30, 1e-12, 1e-6, 1e-3, 1.0])
-def test_features_of_any_size_have_a_bounded_gradient(size: float) -> None:
-    assert float(gradient_at(torch.full((1, 4, 2, 2), size), _unit).abs().max()) <= 2 / MIN_NORM
-
-
 def test_the_packages_own_arithmetic_fails_on_features_that_are_all_zero() -> None:
-    def naive(features: Tensor) -> Tensor:
-        return features / (features.square().sum(1, keepdim=True).sqrt() + 1e-10)
-
-    assert gradient_at(torch.zeros(1, 4, 2, 2), naive).isnan().all()
-    features = torch.from_numpy(np.random.default_rng(0).standard_normal((2, 8, 5, 5)))
-    assert torch.allclose(_unit(features), naive(features), rtol=1e-8)
+    features = torch.zeros(1, 4, 2, 2, requires_grad=True)
+    unit = features / (features.square().sum(1, keepdim=True).sqrt() + 1e-10)
+    (gradient,) = torch.autograd.grad((unit - 0.5).square().sum(), features)
+    assert gradient.isnan().all()
 
 
-def test_dead_features_keep_the_gradient_finite(metric: Lpips | Dists) -> None:
+@pytest.mark.parametrize("size", [0.0, 1e-12, 1e-4])
+def test_dead_features_keep_the_gradient_finite(size: float, metric: Lpips | Dists) -> None:
     for parameter in metric.backbone.parameters():
-        parameter.data.zero_()
+        parameter.data.mul_(size)
     image, reference = pair(40, 40)
     image.requires_grad_()
     value = metric(image, reference)
@@ -249,11 +231,10 @@ def test_the_smallest_image(network: str, smallest: int, folder: Path) -> None:
 
 def test_images_of_different_shapes_are_refused(metric: Lpips | Dists) -> None:
     image, reference = pair(40, 40)
-    for wrong in (image[0], image[..., 1:], image.expand(-1, 3, -1, -1)):
+    colour = image.expand(-1, 3, -1, -1)
+    for wrong in ((image[0], image[0]), (image[..., 1:], reference), (colour, colour)):
         with pytest.raises(ImageError, match="of one shape"):
-            metric(
-                wrong, wrong if wrong.shape == image[0].shape or wrong.shape[1] == 3 else reference
-            )
+            metric(*wrong)
 
 
 @pytest.mark.parametrize(
@@ -295,16 +276,9 @@ def test_npz_loads_like_safetensors_at_half_precision_and_with_other_entries(
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            {"features.3.squeeze.bias": None},
-            "has no tensor named features.3.squeeze.bias",
-        ),
-        (
-            {"features.0.weight": np.zeros((64, 3, 7, 7))},
-            r"features.0.weight of the shape \(64, 3, 3, 3\), got \(64, 3, 7",
-        ),
-        ({"features.0.bias": np.full(64, np.nan)}, "NaN or infinity in features.0.bias"),
-        ({"features.0.bias": np.full(64, 1e300)}, "NaN or infinity in features.0.bias"),
+        ({"features.3.squeeze.bias": None}, "no tensor named features.3.squeeze.bias"),
+        ({"features.0.weight": np.zeros((64, 3, 7, 7))}, r"\(64, 3, 3, 3\), got \(64, 3, 7"),
+        ({"features.0.bias": np.full(64, 1e300)}, "infinity in features.0.bias"),
         ({"features.0.bias": np.zeros(64, np.int8)}, "floating-point numbers"),
     ],
 )
@@ -355,12 +329,7 @@ def test_where_a_backbone_is_looked_for(
         assert find_backbone("vgg", tmp_path) is None
     # The environment variable names the file of VGG16, not that of SqueezeNet.
     assert find_backbone("squeeze") is None
-    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "nowhere"))
-    assert [find_backbone(network) for network in BACKBONES] == [None] * 2
-    for network, stem in STEMS.items():
-        assert not_found(network).startswith(
-            f"weights not found: no {stem}*.safetensors or {stem}*.npz"
-        )
+    assert "squeezenet1_1*.safetensors or squeezenet1_1*.npz" in not_found("squeeze")
 
 
 # The tests below need the real SqueezeNet next to the repository.

@@ -9,7 +9,7 @@ from affine import Affine
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beers_deploy.model.raster.facts import Place, Raster, usable_nodata
+from beers_deploy.model.raster.facts import Place, usable_nodata
 
 NUMBER = st.floats(-1e3, 1e3).map(lambda number: round(number, 3))
 SIZE = st.floats(0.1, 1e3)
@@ -65,9 +65,3 @@ def test_a_nodata_value_is_one_that_a_pixel_can_have(value: float, kind: str) ->
 def _values(dtype: np.dtype[Any]) -> range:
     limits = np.iinfo(dtype)
     return range(limits.min, limits.max + 1)
-
-
-def test_a_restored_image_has_the_type_of_its_pixels() -> None:
-    kinds = ("uint8", "int16", "uint16", "uint32", "float64")
-    out = [Raster(1, 9, 9, np.dtype(kind)).out_dtype.name for kind in kinds]
-    assert out == ["uint8", "int16", "uint16", "uint32", "float32"]

@@ -1,6 +1,6 @@
 """Whose pixels are 12-bit digital numbers, and whose nobody can know."""
 
-from collections.abc import Iterator
+from itertools import product
 
 import numpy as np
 import pytest
@@ -17,32 +17,33 @@ def settled(kind: str, *largest: float, requested: float | None = None) -> float
     )
 
 
-@pytest.mark.parametrize("kind", ["uint16", "int16", "uint32", "int32"])
-def test_integers_of_more_than_8_bits_are_12_bit_digital_numbers(kind: str) -> None:
+@pytest.mark.parametrize(
+    ("kind", "largest"),
+    [
+        *product(["uint16", "int16", "uint32"], [[0], [4095], [60_000]]),
+        *product(["float16", "float32", "float64"], [[], [0], [0, 1, 2.5], [4095]]),
+    ],
+)
+def test_deep_integers_and_floats_beyond_any_share_are_12_bit_digital_numbers(
+    kind: str, largest: list[float]
+) -> None:
     # Values above the scale are not refused here, but where pixels are read.
-    for brightest in (0, 1, 255, 4095, 60000):
-        assert settled(kind, brightest) == MAX_DN
+    assert settled(kind, *largest) == MAX_DN
 
 
-@pytest.mark.parametrize("kind", ["float16", "float32", "float64"])
-def test_floats_beyond_any_share_are_digital_numbers(kind: str) -> None:
-    assert settled(kind, 0.0, 1.0, 2.5) == MAX_DN
-    assert settled(kind, 4095) == MAX_DN
-    for brightest in (1e-6, 0.5, 1.0, UNIT_MAX):
-        with pytest.raises(
-            ImageError, match=r"x\.tif has floats of at most .*shares of full scale.*`full_scale`"
-        ):
-            settled(kind, 0.0, brightest)
-
-
-@pytest.mark.parametrize("kind", ["uint8", "int8"])
-def test_8_bit_pixels_leave_it_open(kind: str) -> None:
-    with pytest.raises(ImageError, match=r"x\.tif has 8-bit pixels.*`full_scale` \(255 for"):
-        settled(kind, 200)
-
-
-def test_black_says_nothing() -> None:
-    assert settled("float32") == settled("float32", 0.0, 0.0) == MAX_DN
+@pytest.mark.parametrize(
+    ("kind", "largest", "words"),
+    [
+        *(("float32", value, "shares of full scale") for value in (1e-6, 0.5, 1, UNIT_MAX)),
+        ("uint8", 200, r"\(255 for"),
+        ("int8", 100, "8-bit pixels"),
+    ],
+)
+def test_shares_and_8_bit_pixels_leave_it_open(kind: str, largest: float, words: str) -> None:
+    with pytest.raises(ImageError, match=words) as caught:
+        settled(kind, 0, largest)
+    assert str(caught.value).startswith("x.tif has ")
+    assert "`full_scale`" in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -68,32 +69,19 @@ def test_no_image_has_such_a_full_scale(
 
 
 def test_no_more_is_looked_at_than_decides() -> None:
-    with_look: list[float] = []
-
-    def parts() -> Iterator[Extent]:
-        for value in (0.0, 0.9, 3000.0, 4000.0):
-            with_look.append(value)
-            yield Extent(value, whole=False)
-
-    assert settled_scale("x", np.dtype("float32"), parts()) == MAX_DN
-    assert with_look == [0.0, 0.9, 3000.0]
-    assert settled_scale("x", np.dtype("uint16"), parts()) == MAX_DN
-    assert with_look == [0.0, 0.9, 3000.0]
+    parts = (Extent(value, whole=False) for value in (0.0, 0.9, 3000.0, 4000.0, 5000.0))
+    assert settled_scale("x", np.dtype("float32"), parts) == MAX_DN
+    assert settled_scale("x", np.dtype("uint16"), parts) == MAX_DN
+    assert next(parts).largest == 4000
 
 
 def test_floats_that_may_be_radiances_leave_it_open() -> None:
     digital = np.random.default_rng(0).integers(0, 1700, (40, 40)).astype(np.float32)
-    for pixels, open_ in (
-        (digital, False),
-        (digital / 10.2375, True),
-        (digital * 2.1, False),
-        (digital / 4.0, True),
-    ):
-        if open_:
-            with pytest.raises(ImageError, match=r"radiances.*full_scale"):
-                settled_scale("x", pixels.dtype, [extent_of(pixels)])
-        else:
-            assert settled_scale("x", pixels.dtype, [extent_of(pixels)]) == MAX_DN
+    for pixels in (digital, digital * 2.1):
+        assert settled_scale("x", pixels.dtype, [extent_of(pixels)]) == MAX_DN
+    for pixels in (digital / 10.2375, digital / 4):
+        with pytest.raises(ImageError, match=r"radiances.*full_scale"):
+            settled_scale("x", pixels.dtype, [extent_of(pixels)])
 
 
 def test_who_has_no_such_option_says_what_else_to_do() -> None:

@@ -22,66 +22,39 @@ def test_every_kind_of_file_reads_as_stored(tmp_path: Path) -> None:
     grey = rng.integers(0, 4096, (13, 21)).astype(np.uint16)
     colour = rng.integers(0, 256, (13, 21, 3)).astype(np.uint8)
     tifffile.imwrite(tmp_path / "grey.tif", grey)
-    tifffile.imwrite(tmp_path / "tiled.tif", grey, tile=(16, 16), compression="zlib")
-    tifffile.imwrite(
-        tmp_path / "planar.tif",
-        np.moveaxis(colour, 2, 0),
-        photometric="rgb",
-        planarconfig="separate",
-    )
     tifffile.imwrite(tmp_path / "float.tif", grey.astype(np.float32))
-    Image.fromarray(colour).save(tmp_path / "colour.png")
-    Image.fromarray(grey).save(tmp_path / "grey16.png")
-    for name, expected in (
-        ("grey.tif", grey),
-        ("tiled.tif", grey),
-        ("grey16.png", grey),
-        ("float.tif", grey),
-    ):
-        np.testing.assert_array_equal(read_pixels(tmp_path / name), expected)
-    for name in ("planar.tif", "colour.png"):
-        np.testing.assert_array_equal(read_pixels(tmp_path / name), colour)
-    assert len(list_images(tmp_path)) == 6
-    assert {image_size_px(path) for path in list_images(tmp_path)} == {(13, 21)}
+    tifffile.imwrite(tmp_path / "planar.tif", np.moveaxis(colour, 2, 0), photometric="rgb")
+    for name, pixels in (("colour.png", colour), ("grey16.png", grey)):
+        Image.fromarray(pixels).save(tmp_path / name)
+    for path in list_images(tmp_path):
+        is_colour = path.stem in ("planar", "colour")
+        np.testing.assert_array_equal(read_pixels(path), colour if is_colour else grey)
+        assert image_size_px(path) == (13, 21)
+    assert len(list_images(tmp_path)) == 5
 
 
-def test_the_size_of_what_is_no_image_is_refused(tmp_path: Path) -> None:
-    for name, kind in (("a.png", "PNG"), ("a.tif", "TIFF"), ("a.jpg", "JPEG")):
-        (tmp_path / name).write_bytes(b"neither")
-        with pytest.raises(ImageError, match=f"a readable {kind}"):
-            image_size_px(tmp_path / name)
-    with pytest.raises(ImageError, match="no such file"):
-        image_size_px(tmp_path / "none.png")
+def radiance_of(path: Path, pixels: np.ndarray) -> np.ndarray:
+    if path.suffix == ".tif":
+        tifffile.imwrite(path, pixels)
+    else:
+        Image.fromarray(pixels).save(path)
+    return read_scene(path, SENSOR).radiance
 
 
 def test_scenes_become_radiance(tmp_path: Path) -> None:
-    ends = np.array([[[0, 0, 0], [255, 255, 255], [188, 188, 188]]], np.uint8).repeat(4, axis=0)
-    Image.fromarray(ends).save(tmp_path / "ends.png")
-    radiance = read_scene(tmp_path / "ends.png", SENSOR).radiance[0]
-    np.testing.assert_allclose(
-        radiance[:2], np.array([0, 400], np.float32), rtol=1.3e-6, atol=1e-5, strict=True
-    )
-    # The sRGB value 188 is half the light of 255.
-    assert float(radiance[2]) == pytest.approx(200, rel=0.02)
-    tifffile.imwrite(tmp_path / "dn.tif", np.full((5, 7), 2048, np.uint16))
-    assert float(read_scene(tmp_path / "dn.tif", SENSOR).radiance[0, 0]) == pytest.approx(
-        2048 / 10.2375
-    )
-    tifffile.imwrite(tmp_path / "radiance.tif", np.full((5, 7), 33.5, np.float32))
-    assert float(read_scene(tmp_path / "radiance.tif", SENSOR).radiance[0, 0]) == 33.5
-
-
-def test_photographs_of_one_or_three_bands_are_linearised(tmp_path: Path) -> None:
+    """White is full scale, the sRGB value 188 half of its light, and bands weigh evenly."""
+    colours = [[0, 0, 0], [255, 255, 255], [188, 188, 188], [255, 0, 0], [0, 255, 0], [0, 0, 255]]
+    pixels = np.array([colours], np.uint8)
+    radiance = radiance_of(tmp_path / "colour.png", pixels)
+    assert radiance.dtype == np.float32
+    assert radiance[0] == pytest.approx([0, 400, 200, *3 * [400 / 3]], rel=0.02)
+    assert radiance[0, 3:] == pytest.approx(400 / 3, rel=1e-6)
     grey = np.full((16, 24), 188, np.uint8)
-    for name, pixels in (
-        ("grey.png", grey),
-        ("grey.jpg", grey),
-        ("colour.jpg", np.dstack([grey] * 3)),
-    ):
-        Image.fromarray(pixels).save(tmp_path / name)
-        radiance = read_scene(tmp_path / name, SENSOR).radiance
-        assert radiance.shape == (16, 24)
-        assert float(radiance.mean()) == pytest.approx(200, rel=0.03)
+    for name in ("grey.png", "grey.jpg"):
+        assert radiance_of(tmp_path / name, grey) == pytest.approx(radiance[0, 2], rel=0.01)
+    for number, expected in ((np.uint16(2048), 2048 / 10.2375), (np.float32(33.5), 33.5)):
+        stored = np.full((5, 7), number)
+        assert radiance_of(tmp_path / "mono.tif", stored) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("pixels", [np.zeros((5, 7, 3), np.uint16), np.zeros((5, 7), np.int16)])
@@ -91,16 +64,6 @@ def test_pixels_of_an_unclear_meaning_are_refused(pixels: np.ndarray, tmp_path: 
     )
     with pytest.raises(ImageError, match=rf"odd\.tif.*{pixels.dtype}"):
         read_scene(tmp_path / "odd.tif", SENSOR)
-
-
-def test_bands_weigh_evenly(tmp_path: Path) -> None:
-    for band in range(3):
-        pixels = np.zeros((4, 4, 3), np.uint8)
-        pixels[..., band] = 255
-        Image.fromarray(pixels).save(tmp_path / "one.png")
-        assert float(read_scene(tmp_path / "one.png", SENSOR).radiance[0, 0]) == pytest.approx(
-            400 / 3, rel=1e-6
-        )
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".png", ".jpg"])
@@ -119,12 +82,11 @@ def test_damaged_files_are_one_sentence(suffix: str, content: bytes, tmp_path: P
 def test_a_truncated_file_is_refused(name: str, tmp_path: Path) -> None:
     pixels = np.random.default_rng(0).integers(0, 256, (90, 90)).astype(np.uint8)
     Image.fromarray(pixels).save(tmp_path / name)
-    assert read_pixels(tmp_path / name).shape == (90, 90)
+    assert image_size_px(tmp_path / name) == (90, 90)
     content = (tmp_path / name).read_bytes()
     (tmp_path / name).write_bytes(content[: len(content) // 2])
-    with pytest.raises(ImageError, match="cut") as caught:
+    with pytest.raises(ImageError, match="cut"):
         read_pixels(tmp_path / name)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["none.tif", "none.png", "none/none.tif"])
@@ -142,7 +104,7 @@ def test_nan_is_counted(tmp_path: Path) -> None:
     pixels[2, 3] = np.nan
     pixels[4, 1] = np.inf
     tifffile.imwrite(tmp_path / "nan.tif", pixels)
-    with pytest.raises(ImageError, match="2 NaN or infinite"):
+    with pytest.raises(ImageError, match="2 pixels that are NaN or infinite"):
         read_pixels(tmp_path / "nan.tif")
 
 

@@ -49,8 +49,8 @@ def test_what_an_index_names_is_found_once_each(tmp_path: Path) -> None:
 
 BOMB = '<!DOCTYPE a [<!ENTITY a "aa"><!ENTITY b "&a;&a;">]>'
 REFUSED = {
-    "missing": (vrt(naming("no.tif")), "the tile no.tif, but there is no such file"),
-    "no name": (vrt(naming("")), "a tile without a name"),
+    "missing": (vrt(naming("no.tif")), "the tile 'no.tif', but there is no such file"),
+    "no name": (vrt(naming("")), "the tile '', but there is no such file"),
     "a name too long": (vrt(naming("9" * 5000)), "not a path: 999"),
     "above": (vrt(naming("../outside.tif")), "outside its own folder"),
     "absolute": (vrt(naming("/etc/passwd")), "/etc/passwd"),
@@ -63,8 +63,8 @@ REFUSED = {
         vrt('<SimpleSource SourceFilename="/vsicurl/http://a"/>'),
         "/vsicurl/http://a",
     ),
-    "no image": (vrt(naming("notes.txt")), "notes.txt, which is not a TIFF"),
-    "a service": (vrt(naming("service.xml")), "service.xml, which is not a TIFF"),
+    "no image": (vrt(naming("notes.txt")), "notes.txt', which is not a TIFF"),
+    "a service": (vrt(naming("service.xml")), "service.xml', which is not a TIFF"),
     "bomb": (BOMB + vrt("<Description>&b;</Description>"), "a document type"),
     "no XML": ("<VRTDataset", "plain XML"),
     "unknown letters": (

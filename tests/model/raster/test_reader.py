@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 import rasterio
 import tifffile
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from PIL import Image
 
 from beers_deploy.model.raster.reader import LEAST_CACHE_BYTES, open_raster
@@ -85,23 +83,6 @@ def test_one_page_of_several_has_to_be_named(tmp_path: Path) -> None:
     refused(tmp_path / "pages.tif", ImageError, "one image, got 3.*GTIFF_DIR:1:")
 
 
-@settings(max_examples=30)
-@given(st.lists(st.integers(1, 25), min_size=1, max_size=12), st.integers(0, 12))
-def test_rows_that_overlap_are_those_of_the_image(
-    tmp_path_factory: pytest.TempPathFactory, heights: list[int], overlap: int
-) -> None:
-    path = tmp_path_factory.getbasetemp() / "overlap.tif"
-    pixels = pixels_of("uint16")
-    tifffile.imwrite(path, pixels, tile=(16, 16), compression="zlib")
-    with open_raster(path) as source:
-        top = 0
-        for height in heights:
-            bottom = min(top + height, HEIGHT)
-            rows = source.read(max(top - overlap, 0), bottom)
-            np.testing.assert_array_equal(rows[0], pixels[max(top - overlap, 0) : bottom])
-            top = bottom % HEIGHT
-
-
 def test_tiles_never_written_hold_the_nodata_value(tmp_path: Path) -> None:
     tile = np.full((16, 16), 9, np.uint16)
     nodata = [(42113, "s", 0, "7", True)]
@@ -125,25 +106,13 @@ def test_damage_is_one_sentence(tmp_path: Path) -> None:
     tifffile.imwrite(intact, pixels_of("uint16"), tile=(16, 16), compression="zlib")
     content = intact.read_bytes()
     (tmp_path / "short.tif").write_bytes(content[: len(content) * 2 // 3])
-    refused(tmp_path / "short.tif", ImageError, "cut short|readable")
+    refused(tmp_path / "short.tif", ImageError, "cut short")
     with tifffile.TiffFile(intact) as file:
         offset = file.pages.first.dataoffsets[9]
     (tmp_path / "tile.tif").write_bytes(content[:offset] + b"\xff" * 40 + content[offset + 40 :])
     refused(tmp_path / "tile.tif", ImageError, "rows 0 to 60")
     tifffile.imwrite(tmp_path / "complex.tif", np.ones((9, 9), np.complex64))
     refused(tmp_path / "complex.tif", ImageError, "complex64")
-
-
-def test_a_codec_that_gdal_lacks_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "a.tif"
-    tifffile.imwrite(path, pixels_of("uint16"))
-    content = bytearray(path.read_bytes())
-    with tifffile.TiffFile(path) as file:
-        offset = file.pages.first.tags["Compression"].valueoffset
-    # 34712 is JPEG 2000 inside a TIFF, which libtiff does not have.
-    content[offset : offset + 2] = (34712).to_bytes(2, "little")
-    path.write_bytes(content)
-    refused(path, ImageError, "missing codec JP2000.*deflate, LZW or ZSTD")
 
 
 def test_statistics_of_the_raw_pixels_are_not_kept(tmp_path: Path) -> None:

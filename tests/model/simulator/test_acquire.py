@@ -83,33 +83,28 @@ def test_the_same_draw_gives_the_same_pixels_and_another_does_not() -> None:
     assert not np.array_equal(first, other)
 
 
-def test_margin_and_ratio_give_the_size() -> None:
-    pair = simulate_pair(
-        np.full((503, 471), 80.0, np.float32), DEGRADED, REFERENCE, 5, Draw(0), margin_px=16
-    )
-    assert pair.degraded.shape == pair.reference.shape == (100 - 32, 94 - 32)
-
-
 def test_the_margin_keeps_the_wrapped_border_out() -> None:
     """A bright strip at the left edge wraps into the right one; within the margin it must have
     faded.
     """
     dark, strip = (np.full((600, 600), 50.0, np.float32) for _ in range(2))
     strip[:, :5] = 400.0
-    inside = [
-        simulate_pair(s, QUIET, QUIET, 5, Draw(0)).degraded[:, -1].mean() for s in (dark, strip)
-    ]
-    edge = [
-        simulate_pair(s, QUIET, QUIET, 5, Draw(0), margin_px=0).degraded[:, -1].mean()
-        for s in (dark, strip)
-    ]
-    assert abs(inside[1] - inside[0]) < 5
-    assert abs(edge[1] - edge[0]) > 100
+
+    def leak(margin_px: int) -> float:
+        pair = (simulate_pair(s, QUIET, QUIET, 5, Draw(0), margin_px) for s in (dark, strip))
+        before, after = (one.degraded[:, -1].mean() for one in pair)
+        return abs(float(after - before))
+
+    assert leak(MARGIN_PX) < 5
+    assert leak(0) > 100
 
 
 def test_a_scene_within_its_margin_is_refused() -> None:
+    scene = np.full((335, 471), 80.0, np.float32)
+    pair = simulate_pair(scene, DEGRADED, REFERENCE, 5, Draw(0))
+    assert pair.degraded.shape == pair.reference.shape == (67 - 64, 94 - 64)
     with pytest.raises(ImageError, match="64 target pixels"):
-        simulate_pair(np.zeros((300, 900), np.float32), DEGRADED, REFERENCE, 5, Draw(0))
+        simulate_pair(scene[:324], DEGRADED, REFERENCE, 5, Draw(0))
 
 
 @pytest.mark.parametrize(("height", "width"), [(96, 96), (95, 100), (5, 7)])
@@ -133,17 +128,15 @@ def test_padding_shifts_nothing() -> None:
 
 
 def test_drawn_scenes_are_physical_and_repeatable() -> None:
-    scene = procedural_scene(700, 913, np.random.default_rng(5))
-    assert scene.radiance.shape == (700, 913)
-    assert scene.radiance.dtype == np.float32
-    assert 0 < scene.radiance.min() < 20
-    assert 200 < scene.radiance.max() < 1000
-    assert np.array_equal(
-        scene.radiance, procedural_scene(700, 913, np.random.default_rng(5)).radiance
+    scene, again, other = (
+        procedural_scene(700, 913, np.random.default_rng(seed)).radiance for seed in (5, 5, 6)
     )
-    assert not np.array_equal(
-        scene.radiance, procedural_scene(700, 913, np.random.default_rng(6)).radiance
-    )
+    assert scene.shape == (700, 913)
+    assert scene.dtype == np.float32
+    assert 0 < scene.min() < 20
+    assert 200 < scene.max() < 1000
+    assert np.array_equal(scene, again)
+    assert not np.array_equal(scene, other)
 
 
 # The tests below need real images next to the repository.
@@ -155,12 +148,6 @@ def radiance(request: pytest.FixtureRequest, shared_data: Path) -> np.ndarray:
     return read_scene(list_images(shared_data / request.param)[0], REFERENCE).radiance[:700, :610]
 
 
-def test_a_real_scene_is_radiance_of_a_day(radiance: np.ndarray) -> None:
-    assert radiance.dtype == np.float32
-    assert 0 <= float(radiance.min()) < float(radiance.max()) <= 400.001
-    assert 5 < float(radiance.mean()) < 300
-
-
 def test_a_real_pair_is_whole_numbers_of_the_same_ground(radiance: np.ndarray) -> None:
     pair = simulate_pair(radiance, DEGRADED, REFERENCE, 3, Draw(0), margin_px=16)
     ground = pixel_means(radiance, 3)[16:-16, 16:-16] * 10.2375
@@ -170,17 +157,3 @@ def test_a_real_pair_is_whole_numbers_of_the_same_ground(radiance: np.ndarray) -
         assert float(image.mean()) == pytest.approx(float(ground.mean()), rel=0.02)
     closeness = [psnr_db(image, ground, 4095) for image in (pair.degraded, pair.reference)]
     assert closeness[0] + 3 < closeness[1]
-
-
-def test_the_blur_takes_detail_from_a_real_scene(radiance: np.ndarray) -> None:
-    """Contrast between neighbours falls; the negative control is the pair of one sensor with
-    itself.
-    """
-    detail = []
-    for sensor in (DEGRADED, REFERENCE):
-        pair = simulate_pair(radiance, sensor, REFERENCE, 3, Draw(0), margin_px=16)
-        detail.append(
-            float(np.diff(pair.degraded, axis=1).std() / np.diff(pair.reference, axis=1).std())
-        )
-    assert detail[0] < 0.8
-    assert detail[1] == pytest.approx(1, rel=0.02)

@@ -17,7 +17,6 @@ from beers_deploy.model.simulator.plan import (
     Plan,
     effect_bounds,
     make_plan,
-    ringing_of,
     scene_stats,
 )
 from beers_deploy.model.simulator.sampling import crop_divisible
@@ -150,19 +149,6 @@ def test_the_plan_keeps_within_its_tolerance(
     assert np.abs(products[0] - products[1]).max() <= 1
 
 
-def test_a_table_that_rings_is_bounded_by_its_own_ringing() -> None:
-    """Not by that of the formula of the same contrast at Nyquist, which hardly rings."""
-    radiance = np.zeros((90, 90), np.float32)
-    radiance[20:70, 15:60] = 200.0
-    plain = stages.plain_sensor()
-    sensor = stages.with_response(plain, RESPONSES[0])
-    stats = scene_stats(radiance, 3)
-    assert (
-        change(radiance, sensor, 3, "mtf", 0) <= effect_bounds(sensor, stats)["mtf"] + ROUNDING_DN
-    )
-    assert ringing_of(sensor, stats) > 1.1 * ringing_of(replace(sensor, response=None), stats)
-
-
 STRONG: dict[str, Effect] = {
     "smear": Smear(2.0),
     "veil": Haze(0.5, 20.0),
@@ -192,14 +178,6 @@ def test_a_quarter_of_any_bound_would_be_caught(name: str) -> None:
     assert bound / 4 + ROUNDING_DN < error <= bound + ROUNDING_DN
 
 
-def test_the_bound_of_defects_holds_where_the_signal_is_above_full_scale() -> None:
-    """A dead pixel loses all of the signal, also what the converter would have cut off."""
-    radiance = np.full((60, 75), 760.0, np.float32)
-    sensor = stages.plain_sensor(defects=Defects(50_000, 50_000))
-    bound = effect_bounds(sensor, scene_stats(radiance, 3))["defects"]
-    assert change(radiance, sensor, 3, "defects", 0) <= bound + ROUNDING_DN
-
-
 SCENE = draw_scene("noise", 60, 80, 100, 0.5, 0)
 FLAT = np.full((60, 80), 50.0, np.float32)
 BLURRED = stages.plain_sensor(smear=Smear(2.0), antialias=AntiAlias(0.1))
@@ -224,18 +202,6 @@ def test_what_a_scene_shows_decides(
 ) -> None:
     choices = {d.effect: d.choice for d in make_plan(sensor, scene_stats(radiance, 2)).decisions}
     assert {choices[name] for name in names} == {choice}
-
-
-def test_what_is_skipped_fits_the_tolerance_together() -> None:
-    faint: dict[str, Effect] = {
-        "striping": Striping(0.3),
-        "dsnu": Dsnu(0.03),
-        "offset": Offset(0.14),
-    }
-    plan = make_plan(stages.plain_sensor(**faint), scene_stats(SCENE, 2))
-    hidden = [d for d in plan.decisions if d.choice == "cannot show"]
-    assert 1 <= len(hidden) < 3
-    assert sum(d.bound_dn or 0 for d in hidden) <= TOLERANCE_DN
 
 
 def test_a_plan_is_data() -> None:

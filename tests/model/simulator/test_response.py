@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from beers_deploy.model.metrics.slanted_edge import edge_mtf, slanted_edge
-from beers_deploy.model.simulator.acquire import acquire
-from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.mtf import mtf, sensor_transfer, transfer_function
 from beers_deploy.model.simulator.sampling import sample, scene_spectrum
 from beers_deploy.profiles.effects import AntiAlias, Smear
@@ -93,22 +91,6 @@ def test_a_table_of_the_formula_is_the_formula(contrasts: tuple[float, float], s
     np.testing.assert_allclose(mtf(fx, fy, table), mtf(fx, fy, contrasts), rtol=1e-9, atol=1e-14)
 
 
-def test_the_optics_of_one_table_are_round() -> None:
-    """The square detector apart, contrast depends on the radius alone: along a diagonal as along an
-    axis.
-    """
-    table = replace(MEASURED, along=MEASURED.across)
-    radius = np.linspace(0.01, 0.9, 40)[None]
-    zero = np.zeros((1, 1))
-    fx = 0.8 * radius
-    fy = 0.6 * radius
-    aslant = np.stack(
-        [mtf(fx[:, k : k + 1], fy[:, k : k + 1], table).ravel() for k in range(40)], 1
-    )
-    optics = mtf(radius, zero, table) / np.sinc(radius)
-    np.testing.assert_allclose(aslant / np.sinc(fx) / np.sinc(fy), optics, rtol=1e-9, atol=1e-12)
-
-
 @pytest.mark.parametrize("side", [64, 75])
 @pytest.mark.parametrize("odd", [True, False])
 def test_a_point_of_the_formula_gives_the_formulas_images(odd: bool, side: int) -> None:
@@ -150,22 +132,3 @@ def test_smear_comes_on_top_and_the_filter_is_part_of_it(name: str) -> None:
             sensor_transfer(30, 36, 3, sensor)
         smeared = replace(sensor, effects={"smear": Smear(1.5)})
         assert np.array_equal(sensor_transfer(30, 36, 3, smeared), transfer)
-
-
-@pytest.mark.parametrize("bits", [8, 10, 14])
-@pytest.mark.parametrize("name", ["numbers", "table", "lopsided"])
-def test_any_bits_digitise_the_same_radiance(name: str, bits: int) -> None:
-    """Full scale is 400 W/m2/sr/um for all: what 8 and 14 bits see differs by their rounding."""
-    blur, _ = BLURS[name]
-    plain = replace(stages.plain_sensor(), alpha=0.0, beta=0.0)
-    sensor = plain if isinstance(blur, tuple) else stages.with_response(plain, blur)
-    own = replace(sensor, bits=bits, gain_dn_per_radiance=(2**bits - 1) / 400)
-    radiance = 50 + 250 * np.random.default_rng(1).random((120, 100), np.float32)
-    spectrum = scene_spectrum(radiance)
-    expected = sample(spectrum, sensor_transfer(120, 100, 2, sensor), 100, 2)
-    actual = acquire(spectrum, 100, own, 2, Draw(0), "degraded", margin_px=0)
-    assert (
-        np.abs(actual / own.gain_dn_per_radiance - expected).max()
-        <= 0.501 / own.gain_dn_per_radiance
-    )
-    assert 0.5 * 2**bits < float(actual.max()) <= 2**bits - 1

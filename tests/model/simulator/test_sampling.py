@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from beers_deploy.model.simulator.mtf import mtf, smear_response, transfer_function
 from beers_deploy.model.simulator.sampling import crop_divisible, resample, sample, scene_spectrum
-from beers_deploy.profiles.effects import Haze
 from beers_deploy.profiles.response import centroid
 from tests.model.simulator import stages
 
@@ -62,21 +61,6 @@ def test_fused_equals_sequential(
     assert np.abs(fused - expected).max() < 5e-4
 
 
-@pytest.mark.parametrize("ratio", [1, 2, 3, 5, 8])
-def test_haze_after_sampling_equals_haze_before_the_blur(ratio: int) -> None:
-    """An affine change of the light commutes with a blur that keeps the mean: so it may wait for
-    the small grid.
-    """
-    haze = Haze(0.7, 15.0)
-    radiance = 300 * np.random.default_rng(0).random((17 * ratio, 23 * ratio), np.float32)
-    transfer = transfer_function(*radiance.shape, ratio, 0.07, 0.2, 1.5)
-    fused = stages.alone(haze, sample(scene_spectrum(radiance), transfer, radiance.shape[1], ratio))
-    expected = one_after_the_other(
-        stages.alone(haze, radiance.astype(np.float64)), ratio, 0.07, 0.2, 1.5
-    )
-    assert np.abs(fused - expected).max() < 5e-4
-
-
 @pytest.mark.parametrize("smear", [0.0, 0.7, 2.0])
 @pytest.mark.parametrize("ratio", RATIOS)
 def test_nothing_is_shifted(ratio: int, smear: float) -> None:
@@ -90,27 +74,6 @@ def test_nothing_is_shifted(ratio: int, smear: float) -> None:
 def test_plain_slicing_would_shift_at_even_ratios(ratio: int) -> None:
     sliced = stages.blob(32 * ratio, 3.0 * ratio)[ratio // 2 :: ratio, ratio // 2 :: ratio]
     assert abs(centroid(sliced.astype(np.float64))[0]) == pytest.approx(0.5 / ratio, rel=0.05)
-
-
-@given(st.integers(1, 8), st.integers(3, 15), st.integers(3, 15), st.integers(0, 1000))
-def test_the_mean_radiance_is_kept(ratio: int, rows: int, columns: int, seed: int) -> None:
-    radiance = scene(rows * ratio, columns * ratio, seed)
-    transfer = transfer_function(*radiance.shape, ratio, 0.07)
-    result = sample(scene_spectrum(radiance), transfer, columns * ratio, ratio)
-    # Frequencies that alias onto the mean are whole cycles per pixel, where the detector's sinc is
-    # zero.
-    assert result.mean(dtype=np.float64) == pytest.approx(radiance.mean(dtype=np.float64), rel=1e-6)
-
-
-@given(st.integers(1, 8), st.floats(0.0, 400.0))
-def test_a_constant_stays_what_it_is(ratio: int, level: float) -> None:
-    radiance = np.full((5 * ratio, 7 * ratio), level, np.float32)
-    result = sample(
-        scene_spectrum(radiance), transfer_function(*radiance.shape, ratio, 0.07), 7 * ratio, ratio
-    )
-    np.testing.assert_allclose(
-        result, np.full((5, 7), level, np.float32), rtol=2e-6, atol=1e-5, strict=True
-    )
 
 
 def test_what_the_grid_does_not_divide_is_cropped() -> None:
@@ -158,8 +121,3 @@ def test_what_the_new_grid_cannot_hold_is_cut_not_aliased() -> None:
     np.testing.assert_allclose(
         result, np.full((40, 40), 100.0, np.float32), rtol=0, atol=1e-3, strict=True
     )
-
-
-def test_the_mean_is_kept() -> None:
-    scene = 50 + 100 * np.random.default_rng(0).random((57, 83), np.float32)
-    assert float(resample(scene, 91, 64).mean()) == pytest.approx(float(scene.mean()), rel=1e-6)

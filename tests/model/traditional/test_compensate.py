@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from beers_deploy.model.simulator.mtf import mtf, transfer_function
+from beers_deploy.model.simulator.mtf import Blur, mtf, transfer_function
 from beers_deploy.model.simulator.sampling import sample, scene_spectrum
 from beers_deploy.model.traditional import compensate as module
 from beers_deploy.model.traditional.compensate import (
@@ -40,22 +40,15 @@ def test_gain_is_one_at_dc_and_finite_everywhere(
     assert (gain >= 0).all()
 
 
-def test_without_regularisation_it_is_the_ratio_of_the_mtfs() -> None:
-    gain = compensation_gain(26, 34, 0.07, 0.25, epsilon=0)
-    assert float(gain[0, 17]) == pytest.approx(0.25 / 0.07)
-
-
-def test_without_regularisation_a_point_spread_is_undone_whole() -> None:
-    """What it shifted and turned lies straight again: gain times blur is the
-    target, phase and all.
+@pytest.mark.parametrize("blur_from", [0.07, lopsided_point()])
+def test_without_regularisation_a_blur_is_undone_whole(blur_from: Blur) -> None:
+    """What a point spread shifted and turned lies straight again: gain times blur is the target,
+    phase and all.
     """
     fx = np.fft.rfftfreq(34)[None]
     fy = np.fft.fftfreq(26)[:, None]
-    blur = mtf(fx, fy, lopsided_point())
-    target = mtf(fx, fy, 0.25)
-    undone = compensation_gain(26, 34, lopsided_point(), 0.25, epsilon=0) * blur
-    assert np.abs(blur.imag).max() > 0.02
-    np.testing.assert_allclose(undone, target, rtol=1e-9, atol=1e-12)
+    undone = compensation_gain(26, 34, blur_from, 0.25, epsilon=0) * mtf(fx, fy, blur_from)
+    np.testing.assert_allclose(undone, mtf(fx, fy, 0.25), rtol=1e-9, atol=1e-12)
 
 
 def test_regularisation_holds_the_noise_of_a_weak_mtf_down() -> None:
@@ -63,19 +56,15 @@ def test_regularisation_holds_the_noise_of_a_weak_mtf_down() -> None:
     assert float(compensation_gain(26, 34, 0.03, 0.25, EPSILON).max()) < 5
 
 
-@pytest.mark.parametrize("value", [0.0, 1.0, 4095.0])
-def test_a_constant_image_is_unchanged(value: float) -> None:
-    image = torch.full((13, 21), value)
-    torch.testing.assert_close(compensate(image, 0.07, 0.25, EPSILON), image, rtol=1e-6, atol=1e-6)
-
-
+@pytest.mark.parametrize("mtf_from", [0.07, 1.001e-4])
 @pytest.mark.parametrize("shape", [(128, 128), (61, 75), (400, 31), (1, 3)])
-def test_the_mean_is_preserved(shape: tuple[int, int]) -> None:
+def test_the_mean_is_preserved(shape: tuple[int, int], mtf_from: float) -> None:
     """A symmetric filter on a mirrored image: the mean of the crop is that of a period, whatever
     the size.
     """
     image = texture(*shape)
-    restored = compensate(image, 0.07, 0.25, EPSILON)
+    restored = compensate(image, mtf_from, 0.25, EPSILON)
+    assert restored.shape == shape
     assert float(restored.double().mean() / image.double().mean()) == pytest.approx(1, abs=1e-6)
 
 
@@ -127,20 +116,13 @@ def test_missing_pixels_reach_no_further_than_the_filter() -> None:
 
 
 def test_holes_are_filled_from_around() -> None:
-    image = torch.arange(63.0)[None].expand(37, -1)
+    image = torch.arange(63.0).expand(37, -1)
     valid = torch.ones_like(image, dtype=torch.bool)
     valid[5:20, 30:40] = False
     filled = fill_with_local_means(image, valid)
     assert torch.equal(filled[valid], image[valid])
     torch.testing.assert_close(filled, image, rtol=0, atol=10)
     assert torch.equal(fill_with_local_means(image, ~valid & False), torch.zeros_like(image))
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (3, 200), (61, 75)])
-def test_any_shape_comes_back_finite(shape: tuple[int, int]) -> None:
-    restored = compensate(texture(*shape), 1.001e-4, 0.63, EPSILON)
-    assert restored.shape == shape
-    assert bool(torch.isfinite(restored).all())
 
 
 def test_it_carries_one_blur_into_the_other() -> None:

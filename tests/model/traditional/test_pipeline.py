@@ -12,8 +12,6 @@ from torch import Tensor
 
 from beers_deploy.model.simulator.acquire import simulate_pair
 from beers_deploy.model.simulator.detector import Draw
-from beers_deploy.model.simulator.mtf import transfer_function
-from beers_deploy.model.simulator.sampling import sample, scene_spectrum
 from beers_deploy.model.traditional import pipeline
 from beers_deploy.model.traditional.noise import Noise, coloured_by, with_rounding_noise
 from beers_deploy.model.traditional.peers import PEERS
@@ -23,7 +21,6 @@ from beers_deploy.model.traditional.pipeline import (
     restore_strips,
     restore_traditional,
 )
-from beers_deploy.model.traditional.rows import mirrored
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.instrument import Instrument, noise_from_snr
 from beers_deploy.profiles.response import PointSpread
@@ -69,12 +66,22 @@ def restored_db(pair: Seen, chain: Chain) -> float:
     return psnr_db(restore_traditional(pair.degraded, chain), pair.reference)
 
 
-def test_the_chain_gains_many_decibels_over_the_degraded_image(pair: Seen) -> None:
-    restored = restore_traditional(pair.degraded, Chain(DEGRADED, REFERENCE))
+ALPHA, BETA = noise_from_snr(25, 15, 100, 50)
+NOISY = replace(DEGRADED, mtf_nyquist=0.03, alpha=ALPHA, beta=BETA)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize(("sensor", "gain_db"), [(DEGRADED, 12.9), (NOISY, 9.6)])
+def test_the_chain_gains_as_many_decibels_as_were_measured(
+    sensor: Instrument, gain_db: float, order: Order, camera: Tensor
+) -> None:
+    """Denoising first gains 13.09 and 9.78 dB, deconvolving first 13.35 and 10.10 dB."""
+    pair = seen_by(camera, sensor)
+    restored = restore_traditional(pair.degraded, Chain(sensor, REFERENCE, order=order))
     assert restored.shape == pair.degraded.shape
     assert restored.dtype == torch.float32
-    assert psnr_db(restored, pair.reference) > psnr_db(pair.degraded, pair.reference) + 12
-    assert float(restored.mean() / pair.degraded.mean()) == pytest.approx(1, abs=2e-3)
+    assert psnr_db(restored, pair.reference) > psnr_db(pair.degraded, pair.reference) + gain_db
+    assert float(restored.mean() / pair.degraded.mean()) == pytest.approx(1, abs=5e-3)
 
 
 def test_each_half_of_the_chain_is_needed(pair: Seen) -> None:
@@ -82,49 +89,6 @@ def test_each_half_of_the_chain_is_needed(pair: Seen) -> None:
     # A reference with the sensor's own MTF leaves nothing to sharpen, so this chain only denoises.
     assert restored_db(pair, Chain(DEGRADED, replace(REFERENCE, mtf_nyquist=0.07))) < full_chain - 3
     assert psnr_db(compensate(pair.degraded, 0.07, 0.25, 3e-3), pair.reference) < full_chain - 3
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("mtf", "snr", "floor_db"), [(0.07, (50, 110), 46.5), (0.03, (15, 50), 41.0)]
-)
-def test_both_orders_reach_the_measured_quality(
-    mtf: float, snr: tuple[float, float], floor_db: float, camera: Tensor
-) -> None:
-    """10 to 210 W/m2/sr/um, mirrored borders, 16 pixels inside, over 250: degraded 37.56 and 33.73
-    dB.
-    """
-    alpha, beta = noise_from_snr(25, snr[0], 100, snr[1])
-    sensor = replace(DEGRADED, mtf_nyquist=mtf, alpha=alpha, beta=beta)
-    dn, truth = blurred_pair(10 + camera.double() * (200 / 255), sensor)
-    inside = slice(16, -16), slice(16, -16)
-
-    def level_db(restored: Tensor) -> float:
-        error = (restored.double() / sensor.gain_dn_per_radiance - truth)[inside].square().mean()
-        return float(10 * torch.log10(250**2 / error))
-
-    first, second = (
-        level_db(restore_traditional(dn, Chain(sensor, REFERENCE, order=order))) for order in ORDERS
-    )
-    assert level_db(dn) < first - 7
-    assert first >= floor_db
-    assert second >= first - 0.1
-
-
-def blurred_pair(radiance: Tensor, sensor: Instrument) -> tuple[Tensor, Tensor]:
-    """Digital numbers through the sensor, and the radiance at 25 % MTF without noise."""
-    rows = mirrored(-64, radiance.shape[0] + 64, radiance.shape[0])
-    wide = radiance[rows][:, rows].numpy()
-    size = wide.shape[0]
-    inside = slice(64, -64)
-    dim, sharp = (
-        sample(scene_spectrum(wide), transfer_function(size, size, 1, mtf), size, 1)[inside, inside]
-        for mtf in (sensor.mtf_nyquist, 0.25)
-    )
-    normal = np.random.default_rng(0).standard_normal(dim.shape)
-    noisy = dim + normal * np.sqrt(sensor.alpha * dim.clip(0) + sensor.beta)
-    dn = np.rint(noisy * sensor.gain_dn_per_radiance).clip(0, sensor.max_dn)
-    return torch.from_numpy(dn).float(), torch.from_numpy(sharp)
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -168,12 +132,6 @@ def test_the_gain_of_each_sensor_is_its_own(pair: Seen) -> None:
 def test_a_black_and_a_saturated_image(level: float, sensor: Instrument) -> None:
     restored = restore_traditional(torch.full((13, 21), level), Chain(sensor, REFERENCE))
     torch.testing.assert_close(restored, torch.full((13, 21), level), rtol=0, atol=0.05)
-
-
-def test_the_result_stays_within_the_converter() -> None:
-    checkerboard = torch.from_numpy(np.indices((29, 31)).sum(0) % 2 * 4095).float()
-    restored = restore_traditional(checkerboard, Chain(DEGRADED, REFERENCE, "fast"))
-    assert 0 <= float(restored.min()) <= float(restored.max()) <= 4095
 
 
 def test_rounding_counts_as_noise() -> None:
@@ -247,16 +205,6 @@ def test_any_bits_are_restored(bits: int, camera: Tensor) -> None:
         for dn in (pair.degraded, restored)
     )
     assert after > before + 11
-
-
-def test_a_turned_sensor_gives_the_turned_filter() -> None:
-    upright, lying = (
-        replace(DEGRADED, mtf_nyquist=a, mtf_nyquist_along=b) for a, b in ((0.1, 0.05), (0.05, 0.1))
-    )
-    kernels = [Chain(sensor, REFERENCE, epsilon=3e-3).kernel() for sensor in (upright, lying)]
-    torch.testing.assert_close(kernels[0].T, kernels[1], rtol=0, atol=1e-12)
-    same = Chain(replace(DEGRADED, mtf_nyquist_along=0.07), REFERENCE, epsilon=3e-3)
-    assert torch.equal(same.kernel(), Chain(DEGRADED, REFERENCE, epsilon=3e-3).kernel())
 
 
 def test_an_unknown_quality_is_refused() -> None:

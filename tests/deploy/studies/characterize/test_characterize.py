@@ -12,11 +12,10 @@ from beers_deploy.model.simulator.acquire import acquire
 from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import scene_spectrum
-from beers_deploy.profiles.errors import BeersError, OptionError
+from beers_deploy.profiles.errors import BeersError
 from beers_deploy.profiles.instrument import Instrument, noise_from_snr
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.characterize import Stated, measure, profile_toml
-from beers_deploy.studies.characterize.frames import Frames, cut_box
 from tests.deploy.command_line import done, refused
 from tests.deploy.documents import valid
 
@@ -66,21 +65,16 @@ def test_the_profile_is_that_of_the_sensor(raw: tuple[Path, Path], tmp_path: Pat
     sensor = profile.nominal()
     assert sensor.response is not None
     none = np.zeros((1, 1))
-    for table, truth in (
-        (sensor.response.at(FREQUENCIES[None], none)[0], transfer(FREQUENCIES, SENSOR.mtf_axes[0])),
-        (
-            sensor.response.at(none, FREQUENCIES[:, None])[:, 0],
-            transfer(FREQUENCIES, SENSOR.mtf_axes[1]),
-        ),
-    ):
-        assert table == pytest.approx(truth, rel=0.12)
+    across = sensor.response.at(FREQUENCIES[None], none).ravel()
+    along = sensor.response.at(none, FREQUENCIES[:, None]).ravel()
+    for table, mtf in zip((across, along), SENSOR.mtf_axes, strict=True):
+        assert table == pytest.approx(transfer(FREQUENCIES, mtf), rel=0.12)
     for radiance, snr in zip((25, 100), SNRS, strict=True):
         assert radiance / sensor.noise_sigma(radiance) == pytest.approx(snr, rel=0.1)
     assert (sensor.bits, sensor.gain_dn_per_radiance, profile.gsd_m.low) == (12, GAIN, 0.7)
-    assert {profile.mtf_nyquist.status, profile.snr_pair[0].status} == {"measured"}
-    assert {profile.gain_dn_per_radiance.status, profile.bits.status, profile.gsd_m.status} == {
-        "stated"
-    }
+    measured = profile.mtf_nyquist, profile.snr_pair[0]
+    stated = profile.gain_dn_per_radiance, profile.bits, profile.gsd_m
+    assert [c.status for c in (*measured, *stated)] == ["measured"] * 2 + ["stated"] * 3
     done("characterize", *raw, *options, "--out", tmp_path / "again.toml")
     assert (tmp_path / "again.toml").read_bytes() == out.read_bytes()
     by_name = valid(figures)["rows"][0]["figures"]
@@ -161,11 +155,8 @@ def test_steps_and_a_black_level_change_nothing_but_the_units(
     for path in raw:
         tifffile.imwrite(folder / path.name, ((tifffile.imread(path) + 200) * 8).astype(np.uint16))
     result = measure([folder], stated=Stated(bits=15, black_level=1600, mtf=(0.1, 0.1)))
-    assert (result.frames.step, result.frames.bits, result.frames.stored_full_scale) == (
-        8,
-        12,
-        32760,
-    )
+    frames = result.frames
+    assert (frames.step, frames.bits, frames.stored_full_scale) == (8, 12, 32760)
     for one, other in zip(result.snrs, plain.snrs, strict=True):
         assert one.value == pytest.approx(other.value, rel=0.02)
     assert tomllib.loads(profile_toml(result))["offset"]["offset_dn"]["value"] == 200
@@ -195,31 +186,18 @@ def test_pairs_of_one_scene_give_the_noise_alone(tmp_path: Path) -> None:
     ("box", "words"),
     [
         ("board.tif", "FILE:X,Y,WIDTH,HEIGHT"),
-        ("board.tif:1,2,3", "FILE:X,Y,WIDTH,HEIGHT"),
         ("board.tif:1,2,-3,4", "FILE:X,Y,WIDTH,HEIGHT"),
-        ("other.tif:1,2,30,40", "'other.tif', which is not one of the `images`"),
-    ],
-)
-def test_a_box_written_wrongly_is_refused(box: str, words: str) -> None:
-    with pytest.raises(OptionError, match=words):
-        cut_box(box, Frames((Path("board.tif"),), 1, 12, True, 0.0, 0.0))
-
-
-@pytest.mark.parametrize(
-    ("box", "words"),
-    [
-        ("0,0,9999,20", "or more inside"),
-        ("9,9,0,0", "or more inside"),
-        ("2,2,30,40", "one straight edge"),
+        ("other.tif:1,2,30,40", "'other.tif', which is not one of the IMAGES"),
+        ("{}:0,0,9999,20", "or more inside"),
+        ("{}:9,9,0,0", "or more inside"),
+        ("{}:2,2,30,40", "one straight edge"),
     ],
 )
 def test_a_box_that_holds_no_edge_is_refused(
     raw: tuple[Path, Path], tmp_path: Path, box: str, words: str
 ) -> None:
-    edge = "--edge", f"{raw[0]}:{box}"
-    assert words in refused(
-        "characterize", *raw, "--bits", 12, *edge, "--out", tmp_path / "mine.toml"
-    )
+    options = "--bits", 12, "--edge", box.format(raw[0]), "--out", tmp_path / "mine.toml"
+    assert words in refused("characterize", *raw, *options)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -231,39 +209,31 @@ def tiff(folder: Path, pixels: np.ndarray) -> Path:
 
 
 FLAT = np.random.default_rng(0).normal(1000, 20, (200, 200))
-WRONG: dict[str, tuple[np.ndarray, tuple[str, ...], str]] = {
-    "8-bit": (np.clip(FLAT / 8, 0, 255).astype(np.uint8), (), "or are stored in 8 bits"),
-    "bands": (np.full((64, 64, 3), 7, np.uint16), ("--bits", "12"), "one band"),
-    "fractions": (FLAT.astype(np.float32), ("--bits", "12"), "whole digital numbers"),
-    "negative": (FLAT.astype(np.int16) - 2000, ("--bits", "12"), "from 0 to 65535"),
-    "wide": (FLAT.astype(np.uint32) * 70, ("--bits", "16"), "from 0 to 65535"),
-    "all missing": (np.full((200, 200), np.nan, np.float32), ("--bits", "12"), "unclipped"),
-    "steps": (FLAT.astype(np.uint16) * 16 + 3, ("--bits", "16"), "Divide them by 16"),
-    "black": (
-        FLAT.astype(np.uint16),
-        ("--bits", "12", "--black-level", "1500"),
-        "--black-level must be at least 0 and below the median",
-    ),
-    "mtf": (FLAT.astype(np.uint16), ("--bits", "12", "--mtf", "7"), "Write 0.07 for 7 %"),
-    "three contrasts": (
-        FLAT.astype(np.uint16),
-        ("--bits", "12", "--mtf", "0.1,0.1,0.1"),
-        "one or two ratios",
-    ),
-    "open bits": (FLAT.astype(np.uint16), (), "--bits is missing"),
-    "wrong bits": (FLAT.astype(np.uint16), ("--bits", "8"), "up to 255"),
-    "gain": (FLAT.astype(np.uint16), ("--bits", "12", "--gain", "0"), "above 0"),
-    "no noise": (np.full((200, 200), 1000, np.uint16), ("--bits", "12"), "noise"),
-    "nodata": (np.zeros((200, 200), np.uint16), ("--bits", "12"), "unclipped"),
+RAW = FLAT.astype(np.uint16)
+WRONG: dict[str, tuple[np.ndarray, str, str]] = {
+    "8-bit": ((FLAT / 8).astype(np.uint8), "", "or are stored in 8 bits"),
+    "bands": (np.full((64, 64, 3), 7, np.uint16), "--bits 12", "one band"),
+    "fractions": (FLAT.astype(np.float32), "--bits 12", "whole digital numbers"),
+    "negative": (FLAT.astype(np.int16) - 2000, "--bits 12", "from 0 to 65535"),
+    "wide": (FLAT.astype(np.uint32) * 70, "--bits 16", "from 0 to 65535"),
+    "all missing": (np.full((200, 200), np.nan, np.float32), "--bits 12", "unclipped"),
+    "steps": (RAW * 16 + 3, "--bits 16", "Divide them by 16"),
+    "black": (RAW, "--bits 12 --black-level 1500", "--black-level must be at least 0"),
+    "mtf": (RAW, "--bits 12 --mtf 7", "Write 0.07 for 7 %"),
+    "three contrasts": (RAW, "--bits 12 --mtf 0.1,0.1,0.1", "one or two ratios"),
+    "open bits": (RAW, "", "--bits is missing"),
+    "wrong bits": (RAW, "--bits 8", "up to 255"),
+    "gain": (RAW, "--bits 12 --gain 0", "above 0"),
+    "no noise": (np.full_like(RAW, 1000), "--bits 12", "noise"),
+    "nodata": (np.zeros_like(RAW), "--bits 12", "unclipped"),
 }
 
 
 @pytest.mark.parametrize("case", WRONG)
 def test_wrong_input_is_one_sentence(case: str, tmp_path: Path) -> None:
     pixels, options, words = WRONG[case]
-    image = tiff(tmp_path, pixels)
     outputs = "--out", tmp_path / "mine.toml", "--json", tmp_path / "mine.json"
-    message = refused("characterize", image, *options, *outputs)
+    message = refused("characterize", tiff(tmp_path, pixels), *options.split(), *outputs)
     assert [p.name for p in tmp_path.iterdir()] == ["raw.tif"]
     assert words in message
     assert message.startswith("beers-deploy: ")
