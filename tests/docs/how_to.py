@@ -19,7 +19,7 @@ from tests.docs.test_commands_in_pages import NAME, context_of
 from tests.docs.walk import ROOT
 
 PAGES = sorted((ROOT / "docs" / "how-to").glob("*.md"))
-PROGRAMS = {NAME, "python", "python3", "pip", "pytest", "rio", "apt-get", "xdputil"}
+PROGRAMS = {NAME, "python", "python3", "pip", "pytest", "rio", "xdputil"}
 SHELLS = {"console", "bash", "sh"}
 FENCE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?:^ {4}\S.*\n?)+", re.MULTILINE)
@@ -28,8 +28,6 @@ Sitting = tuple[str, ...]
 
 LEFT_OUT = {
     "pip install 'beers-deploy[notebook]'": "fetches from a registry",
-    "apt-get install gdal-bin python3-qgis": "changes the system",
-    "pytest tests/deploy/restoration/test_other_readers.py": "is a part of the suite",
     "xdputil query": "is a program of the board",
     "xdputil benchmark core.xmodel 3": "is a program of the board",
     "beers-deploy golden results --compare kit/golden": "compares what a board wrote",
