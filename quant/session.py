@@ -71,7 +71,7 @@ def open_session(
     with contradictions(name):
         network = filled(network) if optimise else network
         if exact and is_quantized(network):
-            network, _ = made_exact(network)
+            network = made_exact(network)
     try:
         return ort.InferenceSession(
             network.SerializeToString(), options, providers=["CPUExecutionProvider"]

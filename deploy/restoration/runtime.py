@@ -72,7 +72,7 @@ def open_openvino(model: onnx.ModelProto, threads: int, at_once: int = 1) -> tup
         "ENABLE_CPU_PINNING": False,
     }
     options |= {"INFERENCE_NUM_THREADS": str(threads)} if threads else {}
-    exact = model if not is_quantized(model) or _adds_exactly(core) else made_exact(model)[0]
+    exact = model if not is_quantized(model) or _adds_exactly(core) else made_exact(model)
     content = saturating_adds(exact).SerializeToString()
 
     @lru_cache(maxsize=2)

@@ -23,9 +23,7 @@ from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.kernels import (
     FEWEST_OUTPUTS,
-    INT16_MAX,
-    INT16_MIN,
-    Way,
+    INT16,
     cannot_saturate,
     filled,
     made_exact,
@@ -178,10 +176,10 @@ def test_what_is_proven_holds_for_the_worst_activations(
     pairs = line.reshape(3, -1, 2)
     worst = [largest * np.where(sign * pairs > 0, pairs, 0).sum(-1) for sign in (1, -1)]
     if cannot_saturate("QLinearConv", weight, largest):
-        assert worst[0].max() <= INT16_MAX
-        assert worst[1].min() >= INT16_MIN
+        assert worst[0].max() <= INT16.max
+        assert worst[1].min() >= INT16.min
     elif inputs % 2 == 0:
-        assert worst[0].max() > INT16_MAX or worst[1].min() < INT16_MIN
+        assert worst[0].max() > INT16.max or worst[1].min() < INT16.min
 
 
 @pytest.mark.parametrize(
@@ -225,10 +223,16 @@ def test_behind_a_relu_no_weights_saturate(path: Path) -> None:
     """What keeps INT8 faster than float32: a third of the convolutions, the largest, keep the fast
     kernels.
     """
-    ways = made_exact(load_onnx(path))[1]
-    behind = {way for name, way in ways.items() if name.endswith(".second")}
-    assert behind == {Way.signed}
-    assert sum(way == Way.signed for way in ways.values()) >= len(ways) / 3
+    kinds = weight_types(made_exact(load_onnx(path)))
+    assert {kind for name, kind in kinds.items() if name.endswith(".second")} == {TensorProto.INT8}
+    assert list(kinds.values()).count(TensorProto.INT8) >= len(kinds) / 3
+
+
+def weight_types(model: onnx.ModelProto) -> dict[str, int]:
+    """Return the type of the weights of each integer convolution by its name."""
+    types = {tensor.name: tensor.data_type for tensor in model.graph.initializer}
+    nodes = [node for node in model.graph.node if node.op_type == "QLinearConv"]
+    return {node.name: types[node.input[3]] for node in nodes}
 
 
 def test_a_relu_that_somebody_else_looks_at_is_left_alone() -> None:
@@ -295,7 +299,8 @@ def test_files_of_other_makers_give_the_same_numbers_in_these_ways(
         tmp_path / "float.onnx", tmp_path / "theirs.onnx", Calibration(noise), **options
     )
     theirs = load_onnx(tmp_path / "theirs.onnx")
-    assert set(made_exact(theirs)[1].values()) & {Way.unsigned, Way.converted}
+    exact = made_exact(theirs)
+    assert exact.graph.node != theirs.graph.node
     image = np.random.default_rng(1).integers(0, 2, (1, 1, 31, 45)).astype(np.float32)
     ways = run(open_session(theirs, 1, exact=True), image)
     if form is QuantFormat.QOperator:
