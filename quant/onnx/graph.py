@@ -210,6 +210,31 @@ class OnnxGraph:
         self.constants[name] = value.astype(dtype)
         return name
 
+    def convolution(
+        self,
+        source: str,
+        output: str,
+        name: str,
+        weight: np.ndarray,
+        bias: np.ndarray | None = None,
+        **attributes: Any,
+    ) -> Node:
+        """Return a convolution, and store its weights.
+
+        Args:
+            source: the tensor that it reads.
+            output: the tensor that it writes.
+            name: of the node.
+            weight: (O, I / groups, kh, kw), stored as float32.
+            bias: (O,), stored as float32; None for none.
+            attributes: of the node, besides the size of its kernel.
+        """
+        inputs = [source, self.add_constant(f"{name}.weight", weight)]
+        if bias is not None:
+            inputs.append(self.add_constant(f"{name}.bias", bias))
+        attributes = {"kernel_shape": list(weight.shape[2:]), **attributes}
+        return Node.new("Conv", inputs, output, name, **attributes)
+
     def value(self, node: Node, place: int) -> np.ndarray | None:
         """Return the constant that a node reads; None if it reads none there."""
         return self.constants.get(node.inputs[place]) if place < len(node.inputs) else None

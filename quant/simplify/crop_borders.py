@@ -39,11 +39,6 @@ def convolve_crop(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | 
     kernel = [3 if px else 1 for px in border_px.values()]
     weight = np.zeros((size[1], 1, *kernel))
     weight[:, :, kernel[0] // 2, kernel[1] // 2] = 1
-    name = node.proto.name or node.outputs[0]
-    attributes = {
-        "kernel_shape": kernel,
-        "dilations": [px or 1 for px in border_px.values()],
-        "group": size[1],
-    }
-    inputs = [node.inputs[0], graph.add_constant(f"{name}.weight", weight)]
-    return [Node.new("Conv", inputs, node.outputs[0], name, **attributes)]
+    attributes = {"dilations": [px or 1 for px in border_px.values()], "group": size[1]}
+    result = node.outputs[0]
+    return [graph.convolution(node.inputs[0], result, node.name, weight, **attributes)]

@@ -196,12 +196,8 @@ def _with_written_maps(
         names[name] = f"{node.outputs[0]}.constant_{number}"
         # With weights of zero the result is the bias alone, in the size of the map that is read.
         weight = np.zeros((value.shape[1], before[1], 1, 1))
-        inputs = [
-            source,
-            graph.add_constant(f"{names[name]}.weight", weight),
-            graph.add_constant(f"{names[name]}.bias", value[0, :, 0, 0]),
-        ]
-        nodes.append(Node.new("Conv", inputs, names[name], names[name], kernel_shape=[1, 1]))
+        bias = value[0, :, 0, 0]
+        nodes.append(graph.convolution(source, names[name], names[name], weight, bias))
     node.inputs = tuple(names.get(name, name) for name in node.inputs)
     return [*nodes, node]
 

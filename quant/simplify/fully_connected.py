@@ -88,11 +88,8 @@ class ConnectByConvolutions:
             return None
         weight = weight * np.float32(attribute("alpha", 1.0))
         offset = np.broadcast_to(bias.reshape(-1) * attribute("beta", 1.0), len(weight))
-        name = node.proto.name or node.outputs[0]
-        numbers = {"weight": weight.reshape(-1, *size), "bias": offset}
-        names = [graph.add_constant(f"{name}.{role}", value) for role, value in numbers.items()]
-        kernel = list(size[1:])
-        conv = Node.new("Conv", [source, *names], node.outputs[0], name, kernel_shape=kernel)
+        kernel = weight.reshape(-1, *size)
+        conv = graph.convolution(source, node.outputs[0], node.name, kernel, offset)
         return self._flat(conv, (len(weight), 1, 1))
 
     def _flat(self, image: Node, size: Map) -> list[Node]:

@@ -104,18 +104,18 @@ def _divide(
     # The channels of a group read others of their group, which the part need not have.
     if groups != 1 and not is_depthwise:
         return _select(graph, source, len(weight), channels, name)
-    inputs = [before.inputs[0], graph.add_constant(f"{divided_name}.weight", weight[channels])]
     bias = graph.value(before, 2)
-    if bias is not None:
-        inputs.append(graph.add_constant(f"{divided_name}.bias", bias[channels]))
-    attributes = dict(before.attributes)
+    bias = bias if bias is None else bias[channels]
+    attributes = {**before.attributes}
+    source = before.inputs[0]
     nodes: list[Node] = []
     if groups != 1:
         # A depthwise kernel reads the channel that it writes, so the map in front has parts too.
-        inputs[0] = f"{name}.before"
+        nodes = _part_of(graph, source, shapes, channels, f"{name}.before")
+        source = f"{name}.before"
         attributes["group"] = len(channels)
-        nodes = _part_of(graph, before.inputs[0], shapes, channels, inputs[0])
-    return [*nodes, Node.new("Conv", inputs, name, divided_name, **attributes)]
+    conv = graph.convolution(source, name, divided_name, weight[channels], bias, **attributes)
+    return [*nodes, conv]
 
 
 def _part_of(
@@ -147,7 +147,5 @@ def _select(
         channels: the numbers of those that are selected, (C,).
         name: of the part.
     """
-    node_name = f"{name}.Conv"
-    weight = np.eye(width, dtype=np.float32)[channels][..., None, None]
-    constant = graph.add_constant(f"{node_name}.weight", weight)
-    return [Node.new("Conv", [source, constant], name, node_name, kernel_shape=[1, 1])]
+    weight = np.eye(width)[channels][..., None, None]
+    return [graph.convolution(source, name, f"{name}.Conv", weight)]

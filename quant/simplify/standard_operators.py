@@ -16,6 +16,12 @@ def float_shapes(graph: OnnxGraph) -> Shapes:
     }
 
 
+def channels_in(shapes: Shapes, name: str) -> int:
+    """Return the number of channels of a map (N, C, H, W); 0 if it is not known."""
+    sizes = shapes.get(name, ())
+    return sizes[1] if len(sizes) == 4 else 0
+
+
 def split_sums(_: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a Sum of several tensors by Adds, one after the other."""
     if node.op_type != "Sum" or len(node.inputs) < 2:
