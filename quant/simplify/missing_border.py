@@ -72,21 +72,17 @@ def _is_padded(node: onnx.NodeProto) -> bool:
 
 def _missing_px(model: onnx.ModelProto) -> int:
     """Return how many pixels of a border are missing at each side; 0 for none (1)."""
-    results = []
-    for size in SIZES_PX:
-        sides = _result_size(model, size)
-        if not sides:
-            return 0
-        results.append(sides)
-    borders = set()
-    for axis in (0, 1):
-        growth = (results[1][axis] - results[0][axis]) / (SIZES_PX[1][axis] - SIZES_PX[0][axis])
-        if growth < 1:
-            return 0
-        borders.add((SIZES_PX[0][axis] - results[0][axis] / growth) / 2)
-    border_px = borders.pop()
-    is_whole = border_px == int(border_px)
-    return int(border_px) if is_whole and not borders and 0 < border_px <= MOST_PX else 0
+    results = [_result_size(model, size) for size in SIZES_PX]
+    if not all(results):
+        return 0
+    small, large = np.array(results)
+    sides, larger_sides = np.array(SIZES_PX)
+    growth = (large - small) / (larger_sides - sides)
+    if growth.min() < 1:
+        return 0
+    borders = (sides - small / growth) / 2
+    border_px = int(borders[0])
+    return border_px if (borders == border_px).all() and 0 < border_px <= MOST_PX else 0
 
 
 def _result_size(model: onnx.ModelProto, size: tuple[int, int]) -> tuple[int, ...]:
