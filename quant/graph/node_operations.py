@@ -82,26 +82,22 @@ def _read_conv(node: Node, graph: OnnxGraph) -> Op:
 def _read_transposed_conv(node: Node, graph: OnnxGraph) -> Op:
     """Read a transposed convolution that enlarges rows and columns by the same factor."""
     weight, bias = _weights(node, graph)
-    attributes = node.attributes
-    strides = attributes.get("strides", [1, 1])
+    attribute = node.attributes.get
+    strides = list(attribute("strides", [1, 1]))
     # AMD's tools leave a transposed convolution with output padding to the processor.
-    plain = int(attributes.get("group", 1)) == 1 and not any(node.output_padding)
-    require(plain, node, "must have one group and no output padding")
-    even = (
-        set(attributes.get("dilations", [1])) == {1}
+    is_plain = (
+        attribute("group", 1) == 1
+        and not any(node.output_padding)
+        and set(attribute("dilations", [1])) == {1}
         and len(set(strides)) == 1
-        and "output_shape" not in attributes
+        and attribute("output_shape") is None
+        and attribute("auto_pad", "NOTSET") == "NOTSET"
     )
     require(
-        even,
+        is_plain,
         node,
-        "must have one stride for rows and columns, no dilation and no output_shape, got "
-        f"strides {list(strides)}",
-    )
-    require(
-        attributes.get("auto_pad", "NOTSET") == "NOTSET",
-        node,
-        "must state its pads instead of auto_pad",
+        "must have one group, no dilation, no output padding or output_shape, no auto_pad, and one "
+        f"stride for rows and columns, got strides {strides}",
     )
     _, window = _window(node, weight.shape[2:])
     return Conv(

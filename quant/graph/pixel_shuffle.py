@@ -6,11 +6,12 @@ determined on an image of numbered pixels.
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 import onnx
-from onnx import TypeProto, helper
+from onnx import TypeProto
 
 from beers_deploy.quant.graph.operations import Shuffle
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
@@ -88,10 +89,10 @@ def _shuffle(chain: list[Node], sizes: tuple[int, ...], graph: OnnxGraph) -> Nod
         mode = _order(image, result, block, up) if block > 1 else ""
         kind = "DepthToSpace" if up else "SpaceToDepth"
         # Messages name the first node of the chain, and files that we write the last one.
-        ends = [chain[0].inputs[0]], [chain[-1].outputs[0]]
-        proto = helper.make_node(kind, *ends, chain[-1].name, blocksize=block)
+        last = chain[-1]
+        node = Node.new(kind, chain[0].inputs[:1], last.outputs[0], last.name, blocksize=block)
         attributes = {"blocksize": block, "mode": mode}
-        return Node(kind, chain[0].name, tuple(ends[0]), tuple(ends[1]), attributes, proto)
+        return replace(node, name=chain[0].name, attributes=attributes)
     return None
 
 
