@@ -9,6 +9,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from numpy.typing import ArrayLike
 from torch import nn
 
 from beers_deploy.dpu.reading import network_of
@@ -64,7 +65,12 @@ def test_a_shuffle_of_an_old_opset_is_one(tmp_path: Path) -> None:
     assert tiling_of(model).scale == 2
 
 
-NUMBERS = {"at": [2], "flat": [1, 1, 1, -1], "square": [1, 1, 12, -1], "unit": 0.5}
+NUMBERS: dict[str, ArrayLike] = {
+    "at": [2],
+    "flat": [1, 1, 1, -1],
+    "square": [1, 1, 12, -1],
+    "unit": 0.5,
+}
 NUMBERS["zero"] = np.int8(0)
 OTHER_MOVES = [
     "restored = Transpose<perm=[0,1,3,2]>(image)",
