@@ -69,7 +69,7 @@ zero point of that result.
 """
 
 
-def made_exact(model: onnx.ModelProto) -> onnx.ModelProto:
+def with_exact_sums(model: onnx.ModelProto) -> onnx.ModelProto:
     """Return the model with the same results on kernels that saturate.
 
     Args:
@@ -272,9 +272,9 @@ FIRST_OPSET = 11
 """The first opset in which Pad and Slice have their positions as inputs."""
 
 
-def filled(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Return the model with the same results, its integer convolutions no narrower than suits
-    onnxruntime.
+def with_wide_convolutions(model: onnx.ModelProto) -> onnx.ModelProto:
+    """Return the model with channels of zeros added to narrow integer convolutions, which
+    onnxruntime computes faster.
 
     Args:
         model: any network; not changed.

@@ -79,13 +79,13 @@ dB: it has to break every limit.
 
 
 def limits_of(
-    given: "Limits | Mapping[str, float] | str | os.PathLike[str] | None",
+    source: "Limits | Mapping[str, float] | str | os.PathLike[str] | None",
     max_mae: float | None = None,
 ) -> Limits:
     """Read the limits of a TOML file or a mapping; limits that are missing have their defaults.
 
     Args:
-        given: limits, a mapping or a TOML file such as `mae = 0.0007`; the defaults if None.
+        source: limits, a mapping or a TOML file such as `mae = 0.0007`; the defaults if None.
         max_mae: overrides the limit of the MAE.
 
     Raises:
@@ -93,20 +93,20 @@ def limits_of(
     """
     where = "`limits`"
     values: Mapping[str, object]
-    if isinstance(given, str | os.PathLike):
-        where = str(given)
+    if isinstance(source, str | os.PathLike):
+        where = str(source)
         try:
-            values = read_toml_text(Path(given))
+            values = read_toml_text(Path(source))
         except (OSError, ValueError) as error:
-            reason = unreadable(Path(given)) or printable(str(error))
+            reason = unreadable(Path(source)) or printable(str(error))
             raise OptionError(
                 f"The limits cannot be read from {where}: {reason}. Give a TOML file with lines "
                 "such as mae = 0.0007."
             ) from error
-    elif isinstance(given, Mapping):
-        values = given
+    elif isinstance(source, Mapping):
+        values = source
     else:
-        values = vars(given or Limits())
+        values = vars(source or Limits())
     if not values:
         raise OptionError(
             f"{where} must set at least one of {', '.join(BREAKABLE)}, for example mae = 0.0007."
@@ -133,8 +133,8 @@ def _require_breakable(where: str, name: str, value: object) -> None:
             f"{key} ({low:g} to {high:g})" for key, (low, high) in BREAKABLE.items()
         )
         raise OptionError(
-            f"{where}: {printable(f'{name} = {value!r}')} is not a limit that a broken network "
-            f"exceeds. Give numbers in these ranges: {allowed}."
+            f"{printable(f'{name} = {value!r}')} in {where} is not a limit. These are the limits, "
+            f"with the values that a broken network exceeds: {allowed}."
         )
 
 

@@ -66,8 +66,8 @@ def check_content(model: onnx.ModelProto, where: str) -> None:
 
 @contextmanager
 def contradictions(where: str) -> Iterator[None]:
-    """Raise ModelError for whatever a graph leads to whose nodes lack inputs or have impossible
-    sizes.
+    """Turn the errors that a malformed graph causes, by missing inputs or impossible sizes, into
+    ModelError.
 
     Args:
         where: name of the network for the message, such as "a.onnx" or "the float network".

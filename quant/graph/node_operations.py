@@ -125,7 +125,7 @@ def _read_concat(node: Node, graph: OnnxGraph) -> Op:
 
 def _read_max_pool(node: Node, _: OnnxGraph) -> Op:
     plain = len(node.outputs) == 1 and not node.attributes.get("ceil_mode", 0)
-    require(plain, node, "must pool without indices and ceil_mode")
+    require(plain, node, "must have one output and ceil_mode 0")
     return MaxPool(node.name, node.inputs[0], node.outputs[0], *_window(node))
 
 
@@ -133,7 +133,7 @@ def _read_average_pool(node: Node, _: OnnxGraph) -> Op:
     kernel, window = _window(node)
     zeros = bool(node.attributes.get("count_include_pad", 0)) or not any(window.pads)
     plain = zeros and not node.attributes.get("ceil_mode", 0)
-    require(plain, node, "must count its padding and have no ceil_mode")
+    require(plain, node, "must have count_include_pad 1 and ceil_mode 0")
     return AveragePool(node.name, node.inputs[0], node.outputs[0], kernel, window)
 
 

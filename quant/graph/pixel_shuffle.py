@@ -37,10 +37,11 @@ VALUES = 1 << 22
 
 
 def with_shuffles(model: onnx.ModelProto) -> OnnxGraph:
-    """Return the graph of a model, each pixel shuffle being one node whichever way it is spelled.
+    """Return the graph of a model in which each pixel shuffle is one node.
 
-    A spelled-out one becomes DepthToSpace or SpaceToDepth. Its `mode`, also of SpaceToDepth, is the
-    order of the channels: one of `ORDERS`, empty for any other.
+    One that the file writes as Reshape and Transpose becomes DepthToSpace or SpaceToDepth. Its
+    `mode`, also of SpaceToDepth, is the order of the channels: one of `ORDERS`, empty for any
+    other.
     """
     graph = OnnxGraph(model)
     chains = _chains(graph)

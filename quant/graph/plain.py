@@ -44,7 +44,9 @@ def _is_plain(op: Op) -> bool:
 
 
 def image_channels(graph: Graph) -> int:
-    """Return the channels of the image as such operations read it: S^2, the pixels of a place."""
+    """Return the number of channels in which operations read the image: S^2 for blocks of S x S
+    pixels.
+    """
     return next(
         int(op.weight.shape[1]) for op in graph if isinstance(op, Conv) and op.input == IMAGE
     )

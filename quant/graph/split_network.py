@@ -27,6 +27,7 @@ from beers_deploy.quant.graph.operations import (
     Shuffle,
 )
 from beers_deploy.quant.onnx.window import Pair
+from beers_deploy.quant.untrusted import times
 
 REMEDY = (
     "See docs/reference/any-network.md for the operators that 'quantize' accepts; 'check' names "
@@ -153,7 +154,10 @@ def _without_shuffles(graph: Graph) -> tuple[Graph, tuple[Shuffle, ...]]:
 
 def _ended(graph: Graph, name: str) -> Graph:
     if name == IMAGE or not any(op.output == name for op in graph):
-        raise unsupported(f"No operation of the network computes its correction, {name!r}.")
+        raise unsupported(
+            "The network must compute its result by at least one operation other than pixel "
+            f"shuffles, but none writes {name!r}."
+        )
     return tuple(renamed(op, {name: CORRECTION}) for op in graph)
 
 
@@ -173,8 +177,8 @@ def renamed(op: Op, names: Mapping[str, str]) -> Op:
 
 
 def named_apart(ops: Sequence[Op], ends: Mapping[str, str]) -> Graph:
-    """Return operations with the names `ends` for their ends, and without clashes with names of
-    this project.
+    """Rename tensors as `ends` states, and put "net." in front of names that this project's own
+    files use.
     """
     # A network may call its own tensors "planes" or "restored", which our files use for others.
     names = {op.output: f"net.{op.output}" for op in ops if _is_ours(op.output)} | dict(ends)
@@ -241,8 +245,11 @@ def _input_size(op: Op, sizes: Mapping[str, Pair]) -> Pair:
     # Squeeze and excite: a factor for each channel, of one pixel, times a map.
     is_gate = isinstance(op, Mul) and (1, 1) in input_sizes
     if not is_gate and len(set(input_sizes)) > 1:
-        unequal = " and ".join(f"{rows} x {columns}" for rows, columns in input_sizes)
-        raise unsupported(f"{op.name} needs tensors of one size, but they have {unequal}.")
+        unequal = " and ".join(map(times, input_sizes))
+        raise unsupported(
+            f"{op.name} needs tensors of one size, but for an image of {times(sizes[IMAGE])} they "
+            f"have {unequal} pixels."
+        )
     return max(input_sizes)
 
 

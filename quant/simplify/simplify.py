@@ -110,7 +110,7 @@ def simplify(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     network = deepcopy(model)
     _widen(network)
-    network = channels_first(network)
+    channels_first(network)
     weights = {tensor.name for tensor in network.graph.initializer}
     inputs = [value for value in network.graph.input if value.name not in weights]
     outputs = list(network.graph.output)

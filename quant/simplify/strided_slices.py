@@ -94,6 +94,5 @@ def _order(graph: OnnxGraph, node: Node, channels: int, block: int) -> np.ndarra
     if result.shape != unshuffled.shape:
         return None
     # Each channel is known by its first pixel.
-    firsts = unshuffled[0, :, 0, 0].tolist()
-    order = np.array([firsts.index(n) if n in firsts else 0 for n in result[0, :, 0, 0].tolist()])
+    order = (result[0, :, :1, 0] == unshuffled[0, :, 0, 0]).argmax(1)
     return order if np.array_equal(unshuffled[:, order], result) else None

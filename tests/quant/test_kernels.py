@@ -27,8 +27,8 @@ from beers_deploy.quant.kernels import (
     FEWEST_OUTPUTS,
     INT16,
     cannot_saturate,
-    filled,
-    made_exact,
+    with_exact_sums,
+    with_wide_convolutions,
 )
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session, run
@@ -197,7 +197,7 @@ def test_behind_a_relu_no_weights_saturate(path: Path) -> None:
     """What keeps INT8 faster than float32: a third of the convolutions, the largest, keep the fast
     kernels.
     """
-    kinds = weight_types(made_exact(load_onnx(path)))
+    kinds = weight_types(with_exact_sums(load_onnx(path)))
     assert {kind for name, kind in kinds.items() if name.endswith(".second")} == {TensorProto.INT8}
     assert list(kinds.values()).count(TensorProto.INT8) >= len(kinds) / 3
 
@@ -273,7 +273,7 @@ def test_files_of_other_makers_give_the_same_numbers_in_these_ways(
         tmp_path / "float.onnx", tmp_path / "theirs.onnx", Calibration(noise), **options
     )
     theirs = load_onnx(tmp_path / "theirs.onnx")
-    exact = made_exact(theirs)
+    exact = with_exact_sums(theirs)
     assert exact.graph.node != theirs.graph.node
     image = np.random.default_rng(1).integers(0, 2, (1, 1, 31, 45)).astype(np.float32)
     ways = run(open_session(theirs, 1, exact=True), image)
@@ -298,7 +298,7 @@ def as_written(model: onnx.ModelProto, image: np.ndarray) -> np.ndarray:
 def test_no_convolution_stays_narrow_and_the_numbers_are_the_same(path: Path) -> None:
     model = load_onnx(path)
     generator = np.random.default_rng(0)
-    wider = filled(model)
+    wider = with_wide_convolutions(model)
     onnx.checker.check_model(wider)
     for old, new in zip(shapes_of_weights(model), shapes_of_weights(wider), strict=True):
         assert new[0] == max(old[0], FEWEST_OUTPUTS)
@@ -322,5 +322,6 @@ def test_one_output_is_filled_where_a_stored_zero_is_a_weight_of_zero(
     model = convolution(np.array([[[[1]], [[-2]]]], np.int8), np.uint8, middle=middle)
     model.opset_import[0].version = opset
     image = np.random.default_rng(0).integers(0, 256, (1, 2, 3, 5)).astype(np.uint8)
-    assert shapes_of_weights(filled(model)) == [shape]
-    assert np.array_equal(as_written(filled(model), image), as_written(model, image))
+    wider = with_wide_convolutions(model)
+    assert shapes_of_weights(wider) == [shape]
+    assert np.array_equal(as_written(wider, image), as_written(model, image))
