@@ -123,7 +123,8 @@ def _computed(
         # Whatever the reference raises of a node that contradicts itself means: not known.
         with np.errstate(all="ignore"), suppress(Exception):
             feeds = dict(zip(node.input, values, strict=True))
-            result = np.asarray(ReferenceEvaluator(node, opsets={"": opset}).run(None, feeds)[0])
+            evaluator = ReferenceEvaluator(node, opsets={"": opset})
+            result = np.asarray(next(iter(evaluator.run(None, feeds))))
             if result.dtype.kind in "biuf" and result.size <= LIST_VALUES:
                 return {node.output[0]: result}
     if node.op_type not in KEEPING | FILLING:

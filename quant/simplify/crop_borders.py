@@ -40,6 +40,9 @@ def convolve_crop(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | 
     kernel = [3 if px else 1 for px in border_px.values()]
     weight = np.zeros((size[1], 1, *kernel))
     weight[:, :, kernel[0] // 2, kernel[1] // 2] = 1
-    attributes = {"dilations": [px or 1 for px in border_px.values()], "group": size[1]}
+    dilations = [px or 1 for px in border_px.values()]
+    source = node.inputs[0]
     result = node.outputs[0]
-    return [graph.convolution(node.inputs[0], result, node.name, weight, **attributes)]
+    return [
+        graph.convolution(source, result, node.name, weight, dilations=dilations, group=size[1])
+    ]
