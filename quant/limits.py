@@ -127,8 +127,10 @@ def _require_breakable(where: str, name: str, value: object) -> None:
     """
     low, high = BREAKABLE.get(name, (math.inf, -math.inf))
     # Python's bool is an int, so that `mae = true` would pass as 1.
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not low <= value <= high:
+    is_limit = (
+        isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high
+    )
+    if not is_limit:
         allowed = ", ".join(
             f"{key} ({low:g} to {high:g})" for key, (low, high) in BREAKABLE.items()
         )

@@ -96,7 +96,7 @@ def window_attributes(window: Window, groups: int = 1) -> dict[str, Any]:
     return attributes
 
 
-ATTRIBUTES: dict[Activation, dict[str, float]] = {
+ATTRIBUTES: dict[Activation, dict[str, Any]] = {
     Activation.leaky_relu: {"alpha": LEAKY_SLOPE},
     # ONNX's own default is an alpha of 0.2.
     Activation.hard_sigmoid: {"alpha": 1 / 6, "beta": 0.5},
