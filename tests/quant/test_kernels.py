@@ -97,8 +97,8 @@ def by_definition(model: onnx.ModelProto, image: np.ndarray) -> np.ndarray:
     middle = values["weight_middle"].astype(np.int64).ravel()[0]
     weight = values["weight"].astype(np.int64) - middle
     # Sums of these integers are exact in float64.
-    numbers = (torch.from_numpy(array.astype(np.float64)) for array in (shifted, weight))
-    sums = conv2d(*numbers, groups=groups).numpy()
+    pixels, taps = (torch.from_numpy(array.astype(np.float64)) for array in (shifted, weight))
+    sums = conv2d(pixels, taps, groups=groups).numpy()
     scale = values["weight_unit"].astype(np.float64).reshape(-1, 1, 1) / float(
         values["result_unit"]
     )

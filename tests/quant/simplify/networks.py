@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from functools import cache
 from itertools import chain
+from typing import Any
 
 import numpy as np
 import onnx
@@ -61,7 +62,7 @@ def single(value: ArrayLike) -> np.ndarray:
 
 
 def parsed(
-    nodes: str, ends: str, opset: int = OPSET, constants: Mapping[str, ArrayLike] | None = None
+    nodes: str, ends: str, opset: int = OPSET, constants: Mapping[str, Any] | None = None
 ) -> onnx.ModelProto:
     """Return a network from ONNX's own text format.
 
@@ -90,7 +91,7 @@ def made(
     opset: int = OPSET,
     kind: str = "float",
     ends: str = "",
-    **constants: ArrayLike,
+    **constants: Any,
 ) -> onnx.ModelProto:
     """Return a network from `x` (N, 4, H, W) to `y`, with the constants of `values` and others.
 

@@ -1,6 +1,7 @@
 """Both ends of a network: channels last, as in TensorFlow, missing borders, and strided slices."""
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import onnx
@@ -78,7 +79,7 @@ def test_layers_with_and_without_padding_together_are_refused() -> None:
 
 def test_slices_side_by_side_are_a_pixel_unshuffle() -> None:
     """YOLO's Focus layer has the columns of a block before its rows."""
-    starts = {"a": [0, 0], "b": [1, 0], "c": [0, 1], "d": [1, 1]}
+    starts: dict[str, Any] = {"a": [0, 0], "b": [1, 0], "c": [0, 1], "d": [1, 1]}
     cuts = [f"cut_{name} = Slice(x, {name}, far, axes, by_two)" for name in starts]
     joined = f"j = Concat<axis=1>({', '.join(f'cut_{name}' for name in starts)})"
     weight = np.random.default_rng(0).normal(0, 1, (3, 4 * CHANNELS, 3, 3))

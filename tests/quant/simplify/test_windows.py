@@ -1,5 +1,7 @@
 """Large kernels and crops become windows that every target computes, and stay what they were."""
 
+from typing import Any
+
 import numpy as np
 import onnx
 from hypothesis import assume, given, settings
@@ -114,7 +116,7 @@ def test_a_crop_is_a_convolution_that_reads_one_pixel(
     assume(cut)
     weight = drawn(np.random.default_rng(0), CHANNELS, CHANNELS, 3, 3)
     places = np.array(list(cut.values()))
-    constants = {"w": weight, "starts": places, "stops": -places, "axes": list(cut)}
+    constants: dict[str, Any] = {"w": weight, "starts": places, "stops": -places, "axes": list(cut)}
     nodes = f"s = Slice(x, starts, stops, axes) y = Conv<pads={[pad] * 4}>(s, w)"
     model = made(nodes, ends=ENDS, **constants)
     short = simplify(model, "a.onnx")
@@ -131,7 +133,7 @@ def test_a_u_net_without_padding_crops_its_skip_and_gets_a_mirrored_border() -> 
     """
     generator = np.random.default_rng(0)
     sides = {"w": 3, "halved": 2, "double": 4}
-    constants = {
+    constants: dict[str, Any] = {
         name: drawn(generator, CHANNELS, CHANNELS, side, side, deviation=0.3)
         for name, side in sides.items()
     }
