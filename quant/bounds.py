@@ -106,20 +106,17 @@ def _padded(ends: Range) -> Range:
 def _conv(core: IntCore, op: IntConv, source: Range) -> Accumulated:
     low, high = _padded(source)
     weight = op.weight.astype(np.int64)
-    up = np.maximum(weight, 0).sum((2, 3))
-    down = np.minimum(weight, 0).sum((2, 3))
     product_bits = op.weight_frac_bits + core.frac_bits[op.input]
     bias = op.bias.astype(np.int64) << (product_bits - op.bias_frac_bits)
     # A sum is largest where each positive weight reads its channel's high end and each negative
     # one the low end.
-    if op.groups == 1:
-        least = up @ low + down @ high + bias
-        most = up @ high + down @ low + bias
-    else:  # depthwise: each channel its own
-        up = up[:, 0]
-        down = down[:, 0]
-        least = up * low + down * high + bias
-        most = up * high + down * low + bias
+    shape = (op.groups, -1, weight.shape[1])
+    up = np.maximum(weight, 0).sum((2, 3)).reshape(shape)
+    down = np.minimum(weight, 0).sum((2, 3)).reshape(shape)
+    low = low.reshape(op.groups, -1, 1)
+    high = high.reshape(op.groups, -1, 1)
+    least = (up @ low + down @ high).ravel() + bias
+    most = (up @ high + down @ low).ravel() + bias
     (least, finer), (most, _) = (
         activated(end, op.activation, product_bits) for end in (least, most)
     )

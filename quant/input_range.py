@@ -139,7 +139,7 @@ def ranges_of_result(result: np.ndarray, image: np.ndarray, ranges: Ranges) -> R
 
 
 def share_within(values: np.ndarray, low: float, high: float) -> float:
-    """Return the share of the values that lie between two."""
+    """Return the share of the values from `low` to `high`."""
     return float(((values >= low) & (values <= high)).mean())
 
 

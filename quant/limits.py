@@ -5,7 +5,7 @@ and the check of each.
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,75 +79,65 @@ dB: it has to break every limit.
 
 
 def limits_of(
-    given: "Limits | Mapping[str, float] | str | os.PathLike[str] | None",
+    source: "Limits | Mapping[str, float] | str | os.PathLike[str] | None",
     max_mae: float | None = None,
 ) -> Limits:
     """Read the limits of a TOML file or a mapping; limits that are missing have their defaults.
 
     Args:
-        given: limits, a mapping or a TOML file such as `mae = 0.0007`; the defaults if None.
+        source: limits, a mapping or a TOML file such as `mae = 0.0007`; the defaults if None.
         max_mae: overrides the limit of the MAE.
 
     Raises:
         OptionError: no limits, unknown ones, or some that no network breaks.
     """
-    limits: Limits
     where = "`limits`"
-    if isinstance(given, str | os.PathLike):
-        where = str(given)
+    values: Mapping[str, object]
+    if isinstance(source, str | os.PathLike):
+        where = str(source)
         try:
-            raw = read_toml_text(Path(given))
+            values = read_toml_text(Path(source))
         except (OSError, ValueError) as error:
-            reason = unreadable(Path(given)) or printable(str(error))
+            reason = unreadable(Path(source)) or printable(str(error))
             raise OptionError(
                 f"The limits cannot be read from {where}: {reason}. Give a TOML file with lines "
                 "such as mae = 0.0007."
             ) from error
-        limits = _named(where, raw)
-    elif isinstance(given, Mapping):
-        limits = _named(where, given)
+    elif isinstance(source, Mapping):
+        values = source
     else:
-        limits = given or Limits()
-    _require_breakable(where, limits)
-    if max_mae is not None:
-        limits = replace(limits, mae=max_mae)
-        _require_breakable("`max_mae`", limits)
-    return limits
-
-
-def _require_breakable(where: str, limits: Limits) -> None:
-    """Raise OptionError if no network would break a limit: a gate that cannot fail is none."""
-    for name, (low, high) in BREAKABLE.items():
-        value = getattr(limits, name)
-        if value is not None and not low <= value <= high:
-            raise OptionError(
-                f"{where}: the limit {name} must be between {low:g} and {high:g}, got {value:g}. "
-                "Set a limit that a broken network would not meet."
-            )
-
-
-def _named(where: str, raw: Mapping[str, object]) -> Limits:
-    names = [field.name for field in fields(Limits)]
-    if not raw:
+        values = vars(source or Limits())
+    if not values:
         raise OptionError(
-            f"{where} must set at least one of {', '.join(names)}, for example mae = 0.0007."
+            f"{where} must set at least one of {', '.join(BREAKABLE)}, for example mae = 0.0007."
         )
-    for name, value in raw.items():
-        if name not in names or not _is_limit(value):
-            raise OptionError(
-                f"{where} must have numbers of 0 or more named {', '.join(names)}, got "
-                f"{printable(f'{name} = {value!r}')}. Correct that line."
-            )
-    values: dict[str, Any] = dict(raw)
-    return Limits(**values)
+    numbers: dict[str, Any] = {**values}
+    for name, value in numbers.items():
+        if value is not None or name not in BREAKABLE:
+            _require_breakable(where, name, value)
+    if max_mae is not None:
+        _require_breakable("`max_mae`", "mae", max_mae)
+        numbers["mae"] = max_mae
+    return Limits(**numbers)
 
 
-def _is_limit(value: object) -> bool:
-    """Return True for a number from 0 on that has no more digits than are compared with others."""
+def _require_breakable(where: str, name: str, value: object) -> None:
+    """Raise OptionError unless a value is a limit that a broken network exceeds: a gate that cannot
+    fail is none.
+    """
+    low, high = BREAKABLE.get(name, (math.inf, -math.inf))
     # Python's bool is an int, so that `mae = true` would pass as 1.
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return value >= 0 and (isinstance(value, float) or value < 1 << 64)
+    is_limit = (
+        isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high
+    )
+    if not is_limit:
+        allowed = ", ".join(
+            f"{key} ({low:g} to {high:g})" for key, (low, high) in BREAKABLE.items()
+        )
+        raise OptionError(
+            f"{printable(f'{name} = {value!r}')} in {where} is not a limit. These are the limits, "
+            f"with the values that a broken network exceeds: {allowed}."
+        )
 
 
 AT_LEAST = "PSNR float-INT8"

@@ -280,8 +280,8 @@ def fixed_tile_px(model: onnx.ModelProto) -> int | None:
     if len(model.graph.input) != 1 or len(sizes) != 4 or sizes[2] != sizes[3]:
         raise ModelError(
             "The network must have one input (N, C, H, W), with H equal to W if they are fixed, "
-            f"got {len(model.graph.input)} of the sizes {sizes}. Export it with "
-            "'beers-deploy export'."
+            f"but it has {len(model.graph.input)}, the first of the sizes {sizes} (0 is free). "
+            "Export it with 'beers-deploy export'."
         )
     return sizes[2] or None
 

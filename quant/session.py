@@ -28,7 +28,7 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.graph.writer import graph_to_onnx
 from beers_deploy.quant.host_part import ONE_CHANNEL, HostPart
-from beers_deploy.quant.kernels import filled, made_exact
+from beers_deploy.quant.kernels import with_exact_sums, with_wide_convolutions
 from beers_deploy.quant.onnx_file import any_size, fixed_tile_px, is_quantized, load_onnx
 from beers_deploy.quant.untrusted import contradictions, times
 
@@ -69,9 +69,9 @@ def open_session(
     if exact is None:
         exact = is_quantized(network) and not int8_adds_exactly()
     with contradictions(name):
-        network = filled(network) if optimise else network
+        network = with_wide_convolutions(network) if optimise else network
         if exact and is_quantized(network):
-            network, _ = made_exact(network)
+            network = with_exact_sums(network)
     try:
         return ort.InferenceSession(
             network.SerializeToString(), options, providers=["CPUExecutionProvider"]
@@ -92,14 +92,14 @@ def open_any_size(model: onnx.ModelProto, optimise: bool = True) -> ort.Inferenc
 
 
 def run(session: ort.InferenceSession, image: np.ndarray) -> np.ndarray:
-    """Restore (N, 1, H, W) float32 in [0, 1] to the same shape.
+    """Return the restored image (N, 1, H, W) for an image of that shape, float32 in [0, 1].
 
     Raises:
         ModelError: a model that does not run on this image, or that returns another shape.
     """
     restored = tensors_of(session, None, image)[0]
     if restored.shape != image.shape:
-        raise _unfit(f"its result has {times(restored.shape)}")
+        raise _unfit(f"{times(image.shape)} values give {times(restored.shape)}")
     return restored
 
 
@@ -186,7 +186,7 @@ def tensor_values(
 def values_of(
     graph: Graph, names: list[str], images: Iterable[np.ndarray], host_part: HostPart = ONE_CHANNEL
 ) -> Iterator[list[np.ndarray]]:
-    """Yield the same of a plane-reading float graph, for every tile of every image."""
+    """Yield the named tensors of a float graph that reads planes, for every tile of every image."""
     session = open_session(graph_to_onnx(graph, names, host_part.planes))
     for image in images:
         yield from tensor_values(session, names, image, halo_of(graph), host_part)

@@ -66,8 +66,8 @@ def check_content(model: onnx.ModelProto, where: str) -> None:
 
 @contextmanager
 def contradictions(where: str) -> Iterator[None]:
-    """Raise ModelError for whatever a graph leads to whose nodes lack inputs or have impossible
-    sizes.
+    """Turn the errors that a malformed graph causes, by missing inputs or impossible sizes, into
+    ModelError.
 
     Args:
         where: name of the network for the message, such as "a.onnx" or "the float network".
@@ -176,12 +176,8 @@ def _check_place_and_type(tensor: TensorProto, where: str) -> None:
             f"{printable(repr(place))}. Save the network as one self-contained ONNX file."
         )
     if tensor.data_type not in VALUE_BYTES:
-        type_numbers = TensorProto.DataType.values()
-        kind = (
-            TensorProto.DataType.Name(tensor.data_type)
-            if tensor.data_type in type_numbers
-            else f"{tensor.data_type}"
-        )
+        names = {number: name for name, number in TensorProto.DataType.items()}
+        kind = names.get(tensor.data_type, tensor.data_type)
         raise ModelError(
             f"{printable(repr(tensor.name))} in {where} has the type {kind}, but weights must be "
             "plain numbers. Convert them."

@@ -17,7 +17,7 @@ from onnx import helper, numpy_helper
 
 from beers_deploy.model.processor import asked, require_cores
 from beers_deploy.profiles.errors import ModelError, optional, reason_of
-from beers_deploy.quant.kernels import made_exact
+from beers_deploy.quant.kernels import with_exact_sums
 from beers_deploy.quant.onnx_file import is_quantized, parse_onnx
 from beers_deploy.quant.session import open_session, tensors_of
 from beers_deploy.restoration.cluster import Cluster
@@ -72,7 +72,7 @@ def open_openvino(model: onnx.ModelProto, threads: int, at_once: int = 1) -> tup
         "ENABLE_CPU_PINNING": False,
     }
     options |= {"INFERENCE_NUM_THREADS": str(threads)} if threads else {}
-    exact = model if not is_quantized(model) or _adds_exactly(core) else made_exact(model)[0]
+    exact = model if not is_quantized(model) or _adds_exactly(core) else with_exact_sums(model)
     content = saturating_adds(exact).SerializeToString()
 
     @lru_cache(maxsize=2)

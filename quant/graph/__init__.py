@@ -36,7 +36,7 @@ from beers_deploy.quant.graph.operations import (
     tied,
     ties_scales,
 )
-from beers_deploy.quant.graph.plain import correction_graph, image_channels, plain_network
+from beers_deploy.quant.graph.plain import correction_graph, image_channels
 from beers_deploy.quant.graph.reader import read_network, refusal
 from beers_deploy.quant.graph.split_network import (
     SplitNetwork,
@@ -75,7 +75,6 @@ __all__ = [
     "fold_full_scale",
     "graph_to_onnx",
     "image_channels",
-    "plain_network",
     "read_network",
     "read_planes",
     "refusal",

@@ -40,7 +40,7 @@ def shrinking(graph: OnnxGraph, node: Node) -> list[Node]:
     pool = nodes[0]
     weight = graph.value(writer, 1)
     # The pads and strides that `aligned` writes fit these kernels and strides only.
-    is_known = (
+    is_attention = (
         writer.op_type == "Conv"
         and weight is not None
         and weight.shape[2:] == (3, 3)
@@ -50,7 +50,7 @@ def shrinking(graph: OnnxGraph, node: Node) -> list[Node]:
         and not any([*writer.attributes.get("pads", []), *pool.attributes.get("pads", [])])
         and Resizing.of(node, graph).mode == "linear"
     )
-    return [writer, *nodes] if is_known else []
+    return [writer, *nodes] if is_attention else []
 
 
 def _writer(graph: OnnxGraph, name: str) -> Node | None:

@@ -82,26 +82,22 @@ def _read_conv(node: Node, graph: OnnxGraph) -> Op:
 def _read_transposed_conv(node: Node, graph: OnnxGraph) -> Op:
     """Read a transposed convolution that enlarges rows and columns by the same factor."""
     weight, bias = _weights(node, graph)
-    attributes = node.attributes
-    strides = attributes.get("strides", [1, 1])
+    attribute = node.attributes.get
+    strides = list(attribute("strides", [1, 1]))
     # AMD's tools leave a transposed convolution with output padding to the processor.
-    plain = int(attributes.get("group", 1)) == 1 and not any(node.output_padding)
-    require(plain, node, "must have one group and no output padding")
-    even = (
-        set(attributes.get("dilations", [1])) == {1}
+    is_plain = (
+        attribute("group", 1) == 1
+        and not any(node.output_padding)
+        and set(attribute("dilations", [1])) == {1}
         and len(set(strides)) == 1
-        and "output_shape" not in attributes
+        and attribute("output_shape") is None
+        and attribute("auto_pad", "NOTSET") == "NOTSET"
     )
     require(
-        even,
+        is_plain,
         node,
-        "must have one stride for rows and columns, no dilation and no output_shape, got "
-        f"strides {list(strides)}",
-    )
-    require(
-        attributes.get("auto_pad", "NOTSET") == "NOTSET",
-        node,
-        "must state its pads instead of auto_pad",
+        "must have one group, no dilation, no output padding or output_shape, no auto_pad, and one "
+        f"stride for rows and columns, got strides {strides}",
     )
     _, window = _window(node, weight.shape[2:])
     return Conv(
@@ -129,7 +125,7 @@ def _read_concat(node: Node, graph: OnnxGraph) -> Op:
 
 def _read_max_pool(node: Node, _: OnnxGraph) -> Op:
     plain = len(node.outputs) == 1 and not node.attributes.get("ceil_mode", 0)
-    require(plain, node, "must pool without indices and ceil_mode")
+    require(plain, node, "must have one output and ceil_mode 0")
     return MaxPool(node.name, node.inputs[0], node.outputs[0], *_window(node))
 
 
@@ -137,7 +133,7 @@ def _read_average_pool(node: Node, _: OnnxGraph) -> Op:
     kernel, window = _window(node)
     zeros = bool(node.attributes.get("count_include_pad", 0)) or not any(window.pads)
     plain = zeros and not node.attributes.get("ceil_mode", 0)
-    require(plain, node, "must count its padding and have no ceil_mode")
+    require(plain, node, "must have count_include_pad 1 and ceil_mode 0")
     return AveragePool(node.name, node.inputs[0], node.outputs[0], kernel, window)
 
 

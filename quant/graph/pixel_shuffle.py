@@ -6,11 +6,12 @@ determined on an image of numbered pixels.
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 import onnx
-from onnx import TypeProto, helper
+from onnx import TypeProto
 
 from beers_deploy.quant.graph.operations import Shuffle
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
@@ -36,10 +37,11 @@ VALUES = 1 << 22
 
 
 def with_shuffles(model: onnx.ModelProto) -> OnnxGraph:
-    """Return the graph of a model, each pixel shuffle being one node whichever way it is spelled.
+    """Return the graph of a model in which each pixel shuffle is one node.
 
-    A spelled-out one becomes DepthToSpace or SpaceToDepth. Its `mode`, also of SpaceToDepth, is the
-    order of the channels: one of `ORDERS`, empty for any other.
+    One that the file writes as Reshape and Transpose becomes DepthToSpace or SpaceToDepth. Its
+    `mode`, also of SpaceToDepth, is the order of the channels: one of `ORDERS`, empty for any
+    other.
     """
     graph = OnnxGraph(model)
     chains = _chains(graph)
@@ -88,10 +90,10 @@ def _shuffle(chain: list[Node], sizes: tuple[int, ...], graph: OnnxGraph) -> Nod
         mode = _order(image, result, block, up) if block > 1 else ""
         kind = "DepthToSpace" if up else "SpaceToDepth"
         # Messages name the first node of the chain, and files that we write the last one.
-        ends = [chain[0].inputs[0]], [chain[-1].outputs[0]]
-        proto = helper.make_node(kind, *ends, chain[-1].name, blocksize=block)
+        last = chain[-1]
+        node = Node.new(kind, chain[0].inputs[:1], last.outputs[0], last.name, blocksize=block)
         attributes = {"blocksize": block, "mode": mode}
-        return Node(kind, chain[0].name, tuple(ends[0]), tuple(ends[1]), attributes, proto)
+        return replace(node, name=chain[0].name, attributes=attributes)
     return None
 
 

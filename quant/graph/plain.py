@@ -9,8 +9,9 @@ from beers_deploy.quant.graph.reader import read_network
 from beers_deploy.quant.graph.split_network import SplitNetwork, unsupported
 
 
-def plain_network(model: onnx.ModelProto) -> SplitNetwork:
-    """Read a network of ConvBEERS' kind.
+def correction_graph(model: onnx.ModelProto) -> Graph:
+    """Read a network of ConvBEERS' kind: from `image` (N, S^2, H / S, W / S) to `correction` of
+    that shape.
 
     It adds a correction to an image of one channel. The correction is computed by same-size
     convolutions of stride 1, ReLU and adds. It may run at full resolution, or at a lower one with
@@ -32,7 +33,7 @@ def plain_network(model: onnx.ModelProto) -> SplitNetwork:
                 "The network may have only same-size convolutions of stride 1, ReLU and adds, but "
                 f"it has {op.name}."
             )
-    return network
+    return network.graph
 
 
 def _is_plain(op: Op) -> bool:
@@ -42,13 +43,10 @@ def _is_plain(op: Op) -> bool:
     return isinstance(op, Add) and op.activation is Activation.none
 
 
-def correction_graph(model: onnx.ModelProto) -> Graph:
-    """Return its operations, from `image` (N, S^2, H / S, W / S) to `correction` of that shape."""
-    return plain_network(model).graph
-
-
 def image_channels(graph: Graph) -> int:
-    """Return the channels of the image as such operations read it: S^2, the pixels of a place."""
+    """Return the number of channels in which operations read the image: S^2 for blocks of S x S
+    pixels.
+    """
     return next(
         int(op.weight.shape[1]) for op in graph if isinstance(op, Conv) and op.input == IMAGE
     )

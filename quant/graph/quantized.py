@@ -96,7 +96,7 @@ class Integers:
         self._int8 = {name for name, kind in graph.types.items() if kind in BYTES}
         self._wide: set[str] = set()
         # Int8 tensors seen as float, and the int8 tensor that each of them is.
-        self._seen: dict[str, str] = {}
+        self._dequantised: dict[str, str] = {}
         # Notation, and the tensor that it stands for.
         self._same: dict[str, str] = {}
         # The writer's format first, then whatever contradicts it.
@@ -141,7 +141,7 @@ class Integers:
         """Return the tensors of the network that a node reads."""
         names = [name for name in self._operands(node) if name]
         if self.is_integer(node) and node.op_type != "QuantizeLinear":
-            names = [self._seen.get(name, name) for name in names]
+            names = [self._dequantised.get(name, name) for name in names]
         return tuple(name for name in map(self.resolve, names) if name not in self._constants)
 
     def operand(self, node: Node) -> np.ndarray | None:
@@ -208,7 +208,7 @@ class Integers:
         source = node.inputs[0] if node.inputs else ""
         result = node.outputs[0]
         if node.op_type == "DequantizeLinear":
-            aliases = self._seen if self.constant(source) is None else self._same
+            aliases = self._dequantised if self.constant(source) is None else self._same
             # At once, because each reader would walk a chain of aliases again.
             aliases[result] = self.resolve(source)
         elif node.op_type == "QuantizeLinear" and source in self._wide:
@@ -222,7 +222,7 @@ class Integers:
         elif (
             node.op_type != "Cast"
             and result in self._becomes
-            and self._reads(node, self._wide, self._seen)
+            and self._reads(node, self._wide, self._dequantised)
         ):
             self._wide.update(node.outputs)
 

@@ -31,7 +31,7 @@ from beers_deploy.quant.graph.split_network import (
     REMEDY,
     AdaptableError,
     SplitNetwork,
-    add_channels,
+    channels_of,
     check_network,
     check_result_size,
     cut,
@@ -114,8 +114,6 @@ class _Reader:
         self.image, *_ = self.source.inputs
         self.ops: list[Op] = []
         self._places: dict[str, int] = {}  # where the operation that writes a tensor stands
-        self._widths: dict[str, int] = {}  # channels of what the first operations write
-        self._measured = 0  # how many operations `_widths` covers
         self.limits: tuple[float, ...] = ()
         self.border_px = self._take_mirror()
 
@@ -242,14 +240,6 @@ class _Reader:
         self._places[op.output] = len(self.ops)
         self.ops.append(op)
 
-    def _channels_of(self, tensor: str) -> int:
-        """Return the number of channels of an operation's result."""
-        if not self._measured:
-            self._widths[self.image] = self.channels()
-        add_channels(self._widths, self.ops[self._measured :])
-        self._measured = len(self.ops)
-        return self._widths[tensor]
-
     def _arithmetic(self, node: Node) -> None:
         """Append a sum, difference or product of two tensors, or of one with constants."""
         if any(self.source.value(node, place) is not None for place in (0, 1)):
@@ -272,7 +262,7 @@ class _Reader:
                 f"{node} must have a constant of one number for each channel, got {times(shape)}."
             )
         source, affine = match
-        channels = self._channels_of(source)
+        channels = channels_of(self.ops, {self.image: self.channels()})[source]
         require(
             affine.channels in (1, channels),
             node,
@@ -303,8 +293,6 @@ class _Reader:
             (output,) = node.outputs
             self.ops[place] = replace(producer, output=output, activation=activation)
             self._places[output] = self._places.pop(source)
-            if source in self._widths:
-                self._widths[output] = self._widths[source]
         else:
             self._append(Pointwise(node.name, source, node.outputs[0], activation))
 

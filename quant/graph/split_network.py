@@ -27,6 +27,7 @@ from beers_deploy.quant.graph.operations import (
     Shuffle,
 )
 from beers_deploy.quant.onnx.window import Pair
+from beers_deploy.quant.untrusted import times
 
 REMEDY = (
     "See docs/reference/any-network.md for the operators that 'quantize' accepts; 'check' names "
@@ -153,7 +154,10 @@ def _without_shuffles(graph: Graph) -> tuple[Graph, tuple[Shuffle, ...]]:
 
 def _ended(graph: Graph, name: str) -> Graph:
     if name == IMAGE or not any(op.output == name for op in graph):
-        raise unsupported(f"No operation of the network computes its correction, {name!r}.")
+        raise unsupported(
+            "The network must compute its result by at least one operation other than pixel "
+            f"shuffles, but none writes {name!r}."
+        )
     return tuple(renamed(op, {name: CORRECTION}) for op in graph)
 
 
@@ -173,8 +177,8 @@ def renamed(op: Op, names: Mapping[str, str]) -> Op:
 
 
 def named_apart(ops: Sequence[Op], ends: Mapping[str, str]) -> Graph:
-    """Return operations with the names `ends` for their ends, and without clashes with names of
-    this project.
+    """Rename tensors as `ends` states, and put "net." in front of names that this project's own
+    files use.
     """
     # A network may call its own tensors "planes" or "restored", which our files use for others.
     names = {op.output: f"net.{op.output}" for op in ops if _is_ours(op.output)} | dict(ends)
@@ -218,16 +222,21 @@ def sized(graph: Graph, size: Pair) -> Graph:
     """Return the graph for images of one size (rows, columns), with the windows of global pooling
     set.
     """
+    sizes = _sizes(graph, size)
+    return tuple(
+        replace(op, kernel=sizes[op.input])
+        if isinstance(op, AveragePool) and op.kernel is None
+        else op
+        for op in graph
+    )
+
+
+def _sizes(graph: Graph, size: Pair) -> dict[str, Pair]:
+    """Return the size of every tensor for images of one size."""
     sizes = {IMAGE: size}
-    ops = list[Op]()
     for op in graph:
-        input_size = _input_size(op, sizes)
-        # Global pooling is a window of the whole map, whose size is known from here on.
-        if isinstance(op, AveragePool) and op.kernel is None:
-            op = replace(op, kernel=input_size)
-        sizes[op.output] = _size(op, input_size)
-        ops.append(op)
-    return tuple(ops)
+        sizes[op.output] = _size(op, _input_size(op, sizes))
+    return sizes
 
 
 def _input_size(op: Op, sizes: Mapping[str, Pair]) -> Pair:
@@ -236,8 +245,11 @@ def _input_size(op: Op, sizes: Mapping[str, Pair]) -> Pair:
     # Squeeze and excite: a factor for each channel, of one pixel, times a map.
     is_gate = isinstance(op, Mul) and (1, 1) in input_sizes
     if not is_gate and len(set(input_sizes)) > 1:
-        unequal = " and ".join(f"{rows} x {columns}" for rows, columns in input_sizes)
-        raise unsupported(f"{op.name} needs tensors of one size, but they have {unequal}.")
+        unequal = " and ".join(map(times, input_sizes))
+        raise unsupported(
+            f"{op.name} needs tensors of one size, but for an image of {times(sizes[IMAGE])} they "
+            f"have {unequal} pixels."
+        )
     return max(input_sizes)
 
 
@@ -253,7 +265,8 @@ def check_result_size(graph: Graph, border_px: int) -> None:
         border_px: by which the image is mirrored.
     """
     once, twice = (
-        _size_of_result(graph, side_px + 2 * border_px) for side_px in (WHOLE_PX, 2 * WHOLE_PX)
+        _sizes(graph, (side_px + 2 * border_px,) * 2)[CORRECTION]
+        for side_px in (WHOLE_PX, 2 * WHOLE_PX)
     )
     extra = [2 * one - two for one, two in zip(once, twice, strict=True)]
     if any(extra):
@@ -262,13 +275,6 @@ def check_result_size(graph: Graph, border_px: int) -> None:
             f"rows and {extra[1]:+d} columns, because some layers lack padding.",
             "Pad every convolution, or none: then the image is mirrored beyond its borders.",
         )
-
-
-def _size_of_result(graph: Graph, side_px: int) -> Pair:
-    sizes = {IMAGE: (side_px, side_px)}
-    for op in graph:
-        sizes[op.output] = _size(op, _input_size(op, sizes))
-    return sizes[CORRECTION]
 
 
 def _size(op: Op, size: Pair) -> Pair:
@@ -286,20 +292,20 @@ def _size(op: Op, size: Pair) -> Pair:
     return size
 
 
-def channels_of(graph: Graph, given: Mapping[str, int]) -> dict[str, int]:
-    """Compute the channels of every tensor from those of the given ones."""
-    widths = dict(given)
-    add_channels(widths, graph)
-    return widths
+def channels_of(graph: Iterable[Op], sources: Mapping[str, int]) -> dict[str, int]:
+    """Return the number of channels of every tensor.
 
-
-def add_channels(widths: dict[str, int], ops: Iterable[Op]) -> None:
-    """Add the numbers of channels of operations' results to those of their inputs."""
-    for op in ops:
+    Args:
+        graph: operations in order.
+        sources: the number of channels of the tensors that they read but do not write.
+    """
+    widths = dict(sources)
+    for op in graph:
         unwritten = [name for name in op.inputs if name not in widths]
         if unwritten:
             raise unsupported(f"{op.name} reads {unwritten[0]!r} before it is computed.")
         widths[op.output] = _width(op, [widths[name] for name in op.inputs])
+    return widths
 
 
 def _width(op: Op, widths: list[int]) -> int:

@@ -96,19 +96,22 @@ def window_attributes(window: Window, groups: int = 1) -> dict[str, Any]:
     return attributes
 
 
+ATTRIBUTES: dict[Activation, dict[str, Any]] = {
+    Activation.leaky_relu: {"alpha": LEAKY_SLOPE},
+    # ONNX's own default is an alpha of 0.2.
+    Activation.hard_sigmoid: {"alpha": 1 / 6, "beta": 0.5},
+}
+"""The attributes of an activation, if they are not ONNX's defaults."""
+
+
 def _activation(
     w: GraphWriter, activation: Activation, source: str, output: str, name: str
 ) -> None:
     if activation is Activation.relu6:
         limits = [w.constant(f"limit_{value}", np.array(value, np.float32)) for value in (0, 6)]
         w.node("Clip", output, [source, *limits], name)
-    elif activation is Activation.leaky_relu:
-        w.node("LeakyRelu", output, [source], name, alpha=LEAKY_SLOPE)
-    elif activation is Activation.hard_sigmoid:
-        # ONNX's own default is an alpha of 0.2.
-        w.node("HardSigmoid", output, [source], name, alpha=1 / 6, beta=0.5)
     else:
-        w.node(activation.value, output, [source], name)
+        w.node(activation.value, output, [source], name, **ATTRIBUTES.get(activation, {}))
 
 
 def _pool(w: GraphWriter, op: MaxPool | AveragePool, feeds: list[str], output: str) -> None:

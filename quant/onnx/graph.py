@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 import onnx
-from onnx import NodeProto, TypeProto, helper, numpy_helper, shape_inference
+from numpy.typing import DTypeLike
+from onnx import NodeProto, TensorProto, TypeProto, helper, numpy_helper, shape_inference
 
 from beers_deploy.quant.domains import Functions, functions_of, operator_name
 from beers_deploy.quant.onnx.window import Pair, Window
@@ -203,11 +204,36 @@ class OnnxGraph:
         self.writers[name] = writer
         writer.outputs = tuple(name if output == result else output for output in writer.outputs)
 
-    def add_constant(self, name: str, value: np.ndarray) -> str:
-        """Store a constant as float32 under a name that is free, and return the name."""
+    def add_constant(self, name: str, value: np.ndarray, dtype: DTypeLike = np.float32) -> str:
+        """Store a constant of this type under a name that is free, and return the name."""
         name = free_name(name, self._name_counts)
-        self.constants[name] = value.astype(np.float32)
+        self.constants[name] = value.astype(dtype)
         return name
+
+    def convolution(
+        self,
+        source: str,
+        output: str,
+        name: str,
+        weight: np.ndarray,
+        bias: np.ndarray | None = None,
+        **attributes: Any,
+    ) -> Node:
+        """Return a convolution, and store its weights.
+
+        Args:
+            source: the tensor that it reads.
+            output: the tensor that it writes.
+            name: of the node.
+            weight: (O, I / groups, kh, kw), stored as float32.
+            bias: (O,), stored as float32; None for none.
+            attributes: of the node, besides the size of its kernel.
+        """
+        inputs = [source, self.add_constant(f"{name}.weight", weight)]
+        if bias is not None:
+            inputs.append(self.add_constant(f"{name}.bias", bias))
+        attributes = {"kernel_shape": list(weight.shape[2:]), **attributes}
+        return Node.new("Conv", inputs, output, name, **attributes)
 
     def value(self, node: Node, place: int) -> np.ndarray | None:
         """Return the constant that a node reads; None if it reads none there."""
@@ -232,9 +258,13 @@ def constants(model: onnx.ModelProto) -> dict[str, np.ndarray]:
     arrays = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
     functions = functions_of(model)
     for node in model.graph.node:
-        values = [a.t for a in node.attribute if a.name == "value"]
-        if operator_name(node, functions) == "Constant" and values:
-            arrays[node.output[0]] = numpy_helper.to_array(values[0])
+        if operator_name(node, functions) == "Constant" and node.attribute:
+            value = helper.get_attribute_value(node.attribute[0])
+            if isinstance(value, TensorProto):
+                value = numpy_helper.to_array(value)
+            # Exporters may store numbers as such: value_float, value_ints.
+            kind = np.float32 if "float" in node.attribute[0].name else None
+            arrays[node.output[0]] = np.asarray(value, kind)
     return arrays
 
 

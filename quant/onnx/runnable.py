@@ -4,14 +4,16 @@
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
+from contextlib import suppress
 
 import numpy as np
 import onnx
-from onnx import AttributeProto, NodeProto, TensorProto, numpy_helper
+from onnx import AttributeProto, NodeProto
 
 from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.quant.domains import INLINE, MICROSOFT, STANDARD, foreign_remedy, opset_of
+from beers_deploy.quant.onnx.graph import constants
 from beers_deploy.quant.untrusted import RANK, check_size, times
 
 WINDOW_PX = 1024
@@ -27,7 +29,6 @@ FACTORS = {"Pad": (1,), "Resize": (2,), "Tile": (1,), "Upsample": (1,)}
 """Operators with an input that states the enlargement, and that input."""
 KEEPING = {
     "Cast",
-    "Constant",
     "DequantizeLinear",
     "Identity",
     "Neg",
@@ -59,132 +60,79 @@ def check_runnable(model: onnx.ModelProto, where: str) -> None:
         raise ModelError(
             f"{where} has sparse weights, which are not supported. Export it without them."
         )
-    constants = _Constants(model, where)
     # What follows from the image is sized by it; what follows from constants alone may have any
     # size.
-    of_image = {value.name for value in model.graph.input} - set(constants.values)
+    arrays = constants(model)
+    of_image = {value.name for value in model.graph.input} - arrays.keys()
+    filled_values = 0
     for node in model.graph.node:
         _check_operator(node, where)
         _check_windows(node, where)
-        _check_growth(node, constants.values, of_image, where)
+        _check_growth(node, arrays, of_image, where)
         if of_image.intersection(node.input):
             of_image.update(node.output)
-        else:
-            constants.follow(node)
+        elif node.op_type != "Constant":
+            if node.op_type in FILLING:
+                filled_values += _filled(node, arrays, where)
+                check_size("all filled constants", [filled_values], where)
+            arrays |= _computed(node, arrays, opset_of(model), where)
 
 
-class _Constants:
-    """Results that are computed from constants alone: their values if they are a short list, and
-    their total size.
+def _filled(node: NodeProto, arrays: Mapping[str, np.ndarray], where: str) -> int:
+    """Return the number of values to which a node fills a constant.
+
+    Raises ModelError if the file does not state the size, or if it is too large.
     """
-
-    def __init__(self, model: onnx.ModelProto, where: str) -> None:
-        self.values = {tensor.name: tensor for tensor in model.graph.initializer}
-        self._arrays: dict[str, np.ndarray] = {}
-        self._made = 0
-        self._where = where
-        self._opset = opset_of(model)
-
-    def follow(self, node: NodeProto) -> None:
-        """Note a node that reads no image."""
-        stored = (
-            [a.t for a in node.attribute if a.name == "value"] if node.op_type == "Constant" else []
-        )
-        if stored:
-            self.values[node.output[0]] = stored[0]
-            return
-        arrays = [self._array(name) for name in node.input]
-        self._check_filled(node, arrays)
-        result = _computed(node, arrays, self._opset)
-        if result is not None:
-            self.values[node.output[0]] = numpy_helper.from_array(result, node.output[0])
-        elif node.op_type not in KEEPING | FILLING:
-            raise ModelError(
-                f"{printable(named(node))} in {self._where} reads constants only, but only "
-                "operators on the image are supported here. Fold its constants."
-            )
-
-    def _array(self, name: str) -> np.ndarray | None:
-        """Return a constant as an array if it is a short list, otherwise None."""
-        tensor = self.values.get(name)
-        if (
-            name not in self._arrays
-            and tensor is not None
-            and math.prod(tensor.dims) <= LIST_VALUES
-        ):
-            self._arrays[name] = numpy_helper.to_array(tensor)
-        return self._arrays.get(name)
-
-    def _check_filled(self, node: NodeProto, arrays: list[np.ndarray | None]) -> None:
-        """Raise ModelError if a node fills weights to a size that the file does not state, or that
-        is too large.
-        """
-        if node.op_type not in FILLING:
-            return
-        source = self.values.get(node.input[0])
-        if not arrays or arrays[-1] is None or source is None:
-            raise _computed_size(node, self._where)
-        sizes = [int(size) for size in arrays[-1].ravel()[: RANK + 1]]
-        # One size or factor each, or fewer sizes for Expand, whose source then is as large.
-        if node.op_type != "ConstantOfShape":
-            dims = [1] * (len(sizes) - len(source.dims)) + list(source.dims)
-            if len(dims) == len(sizes):
-                sizes = [abs(size) * dim for size, dim in zip(sizes, dims, strict=True)]
-        check_size(named(node), sizes, self._where)
-        self._made += math.prod(max(size, 0) for size in sizes)
-        check_size("all filled constants", [self._made], self._where)
+    source = arrays.get(node.input[0])
+    sizes = arrays.get(node.input[-1])
+    if source is None or sizes is None:
+        raise _computed_size(node, where)
+    sides = [int(size) for size in sizes.ravel()[: RANK + 1]]
+    # One size or factor each, or fewer sizes for Expand, whose source then is as large.
+    if node.op_type != "ConstantOfShape":
+        dims = [1] * (len(sides) - source.ndim) + list(source.shape)
+        if len(dims) == len(sides):
+            sides = [abs(side) * dim for side, dim in zip(sides, dims, strict=True)]
+    check_size(named(node), sides, where)
+    return math.prod(max(side, 0) for side in sides)
 
 
 LIST_VALUES = 4096
 """The maximum number of values of one list; a runtime computes with such lists in a moment."""
 
-COMPUTED = {
-    "Add",
-    "Cast",
-    "Concat",
-    "ConstantOfShape",
-    "Div",
-    "Expand",
-    "Gather",
-    "Identity",
-    "Mul",
-    "Neg",
-    "Reshape",
-    "Shape",
-    "Slice",
-    "Sqrt",
-    "Squeeze",
-    "Sub",
-    "Tile",
-    "Transpose",
-    "Unsqueeze",
-}
+COMPUTED = KEEPING | FILLING | {"Add", "Concat", "Div", "Gather", "Mul", "Shape", "Slice", "Sub"}
+"""Operators whose results are computed if they are short lists of numbers."""
 
 
 def _computed(
-    node: NodeProto, values: Sequence[np.ndarray | None], opset: int
-) -> np.ndarray | None:
-    """Compute the result of a node from short lists; None if it is no short list of numbers, or is
-    not supported.
+    node: NodeProto, arrays: Mapping[str, np.ndarray], opset: int, where: str
+) -> dict[str, np.ndarray]:
+    """Compute the result of a node from short lists; empty if it is no short list of numbers.
 
     Exporters leave a dozen nodes to state four sizes. onnx's reference in Python computes them
     before a runtime opens the file. The resulting sizes are therefore checked like those that a
-    file states. The caller has bounded the results of ConstantOfShape.
+    file states. The caller has bounded the results of ConstantOfShape. Raises ModelError for a
+    node whose result might be of any size.
     """
-    short = all(value is not None and value.size <= LIST_VALUES for value in values)
-    if node.op_type not in COMPUTED or not short:
-        return None
-    # Importing it takes half a second, which only files that compute sizes should cost.
-    from onnx.reference import ReferenceEvaluator
+    values = [arrays.get(name) for name in node.input]
+    is_short = all(value is not None and value.size <= LIST_VALUES for value in values)
+    if node.op_type in COMPUTED and is_short:
+        # Importing it takes half a second, which only files that compute sizes should cost.
+        from onnx.reference import ReferenceEvaluator
 
-    try:
-        with np.errstate(all="ignore"):
+        # Whatever the reference raises of a node that contradicts itself means: not known.
+        with np.errstate(all="ignore"), suppress(Exception):
             feeds = dict(zip(node.input, values, strict=True))
-            result = next(iter(ReferenceEvaluator(node, opsets={"": opset}).run(None, feeds)))
-    except Exception:  # noqa: BLE001 - whatever the reference raises of a node that is none means: not known
-        return None
-    array = np.asarray(result)
-    return array if array.dtype.kind in "biuf" and array.size <= LIST_VALUES else None
+            evaluator = ReferenceEvaluator(node, opsets={"": opset})
+            result = np.asarray(next(iter(evaluator.run(None, feeds))))
+            if result.dtype.kind in "biuf" and result.size <= LIST_VALUES:
+                return {node.output[0]: result}
+    if node.op_type not in KEEPING | FILLING:
+        raise ModelError(
+            f"{printable(named(node))} in {where} reads constants only, but only operators on the "
+            "image are supported here. Fold its constants."
+        )
+    return {}
 
 
 def named(node: NodeProto) -> str:
@@ -233,7 +181,7 @@ def _check_windows(node: NodeProto, where: str) -> None:
 
 
 def _check_growth(
-    node: NodeProto, constants: dict[str, TensorProto], of_image: set[str], where: str
+    node: NodeProto, arrays: Mapping[str, np.ndarray], of_image: set[str], where: str
 ) -> None:
     """Raise ModelError if a node may enlarge too much.
 
@@ -244,13 +192,10 @@ def _check_growth(
         for name in (node.input[i] for i in places.get(node.op_type, ()) if i < len(node.input)):
             if not name or name in of_image:
                 continue
-            if name not in constants:
+            if name not in arrays:
                 raise _computed_size(node, where)
             # At most one more than any list of sizes has.
-            values = [
-                float(value)
-                for value in numpy_helper.to_array(constants[name]).ravel()[: 2 * RANK + 1]
-            ]
+            values = [float(value) for value in arrays[name].ravel()[: 2 * RANK + 1]]
             if absolute:
                 check_size(named(node), values, where)
             elif not max(map(abs, values), default=0) <= WINDOW_PX:

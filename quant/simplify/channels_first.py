@@ -13,14 +13,11 @@ TO_FIRST = [0, 3, 1, 2]
 TO_LAST = [0, 2, 3, 1]
 
 
-def channels_first(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Return the network with the channels of image and result first.
+def channels_first(model: onnx.ModelProto) -> None:
+    """Put the channels of image and result first, in place, if the image is transposed so.
 
     Args:
-        model: a float network; not changed.
-
-    Returns:
-        A network of (N, C, H, W), the given one if its image is not transposed first.
+        model: a float network.
     """
     graph = OnnxGraph(model)
     images = [name for name in graph.inputs if _is_transposed(graph.readers[name], TO_FIRST)]
@@ -30,10 +27,7 @@ def channels_first(model: onnx.ModelProto) -> onnx.ModelProto:
         if name in graph.writers and _is_transposed([graph.writers[name]], TO_LAST)
     ]
     if not images:
-        return model
-    network = onnx.ModelProto()
-    network.CopyFrom(model)
-    graph = OnnxGraph(network)
+        return
 
     def without(_: OnnxGraph, node: Node) -> list[Node] | None:
         is_end = node.inputs[0] in images or node.outputs[0] in results
@@ -43,15 +37,11 @@ def channels_first(model: onnx.ModelProto) -> onnx.ModelProto:
 
     graph.rewrite(without)
     graph.save()
-    values = [
-        *(value for value in network.graph.input if value.name in images),
-        *(value for value in network.graph.output if value.name in results),
-    ]
-    for value in values:
-        dims = value.type.tensor_type.shape.dim
-        channels = dims.pop()
-        dims.insert(1, channels)
-    return network
+    for value in (*model.graph.input, *model.graph.output):
+        if value.name in (*images, *results):
+            dims = value.type.tensor_type.shape.dim
+            channels = dims.pop()
+            dims.insert(1, channels)
 
 
 def _is_transposed(nodes: list[Node], order: list[int]) -> bool:

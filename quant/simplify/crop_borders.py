@@ -8,7 +8,7 @@ the first and the last reach the border that is cut, and the one in the middle h
 import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
-from beers_deploy.quant.simplify.standard_operators import Shapes
+from beers_deploy.quant.simplify.standard_operators import Shapes, slices_of
 
 
 def convolve_crop(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | None:
@@ -26,24 +26,23 @@ def convolve_crop(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] | 
     size = shapes.get(node.inputs[0], ()) if node.op_type == "Slice" else ()
     if len(size) != 4 or size[1] < 1:
         return None
-    starts, ends, axes, steps = (graph.numbers(node, place, "") for place in range(1, 5))
-    if not (starts and ends and axes) or set(steps or [1]) != {1}:
-        return None
     border_px = {2: 0, 3: 0}
-    for axis, start, end in zip(axes, starts, ends, strict=True):
+    cuts = slices_of(graph, node)
+    for axis, cut in cuts.items():
         # A window without padding cuts as much at either side, so both cuts must be equal.
-        if axis % 4 not in border_px or start <= 0 or end not in (-start, size[axis] - start):
+        is_crop = cut.step == 1 and cut.stop in (-cut.start, size[axis] - cut.start)
+        if axis not in border_px or cut.start <= 0 or not is_crop:
             return None
-        border_px[axis % 4] = start
+        border_px[axis] = cut.start
+    if not cuts:
+        return None
     # Dilated by the border, a kernel of three shortens the map by the border on either side.
     kernel = [3 if px else 1 for px in border_px.values()]
     weight = np.zeros((size[1], 1, *kernel))
     weight[:, :, kernel[0] // 2, kernel[1] // 2] = 1
-    name = node.proto.name or node.outputs[0]
-    attributes = {
-        "kernel_shape": kernel,
-        "dilations": [px or 1 for px in border_px.values()],
-        "group": size[1],
-    }
-    inputs = [node.inputs[0], graph.add_constant(f"{name}.weight", weight)]
-    return [Node.new("Conv", inputs, node.outputs[0], name, **attributes)]
+    dilations = [px or 1 for px in border_px.values()]
+    source = node.inputs[0]
+    result = node.outputs[0]
+    return [
+        graph.convolution(source, result, node.name, weight, dilations=dilations, group=size[1])
+    ]

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
-from beers_deploy.quant.simplify.standard_operators import Shapes
+from beers_deploy.quant.simplify.standard_operators import Shapes, channels_in
 
 NORMALISATION = "BatchNormalization"
 
@@ -56,14 +56,12 @@ def negate_by_convolution(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[
     Returns:
         The convolution and the Add, None if the node is no Sub of two maps of known channels.
     """
-    constants = [name for name in node.inputs if name in graph.constants]
-    size = shapes.get(node.inputs[1], ()) if node.op_type == "Sub" and not constants else ()
-    if len(size) != 4 or size[1] < 1:
+    channels = channels_in(shapes, node.inputs[1]) if node.op_type == "Sub" else 0
+    if not channels or not graph.constants.keys().isdisjoint(node.inputs):
         return None
     name = f"{node.outputs[0]}.negated"
-    attributes = {"kernel_shape": [1, 1], "group": size[1]}
-    negation = Node.new("Conv", [node.inputs[1]], name, name, **attributes)
-    _set_weights(graph, negation, np.full((size[1], 1, 1, 1), -1.0), np.zeros(size[1]))
+    weight = np.full((channels, 1, 1, 1), -1.0)
+    negation = graph.convolution(node.inputs[1], name, name, weight, group=channels)
     return [negation, Node.new("Add", [node.inputs[0], name], node.outputs[0], node.proto.name)]
 
 
@@ -94,8 +92,7 @@ def fold_in_front(graph: OnnxGraph, shapes: Shapes) -> None:
             continue
         source, affine = match
         # One channel times many constants would be many channels.
-        size = shapes.get(source, ())
-        if affine.channels != 1 and (len(size) != 4 or size[1] != affine.channels):
+        if affine.channels not in (1, channels_in(shapes, source)):
             continue
         if all(_may_take_in(graph, reader, result, affine) for reader in behind):
             for reader in behind:
@@ -116,11 +113,10 @@ def convolve_normalisation(shapes: Shapes, graph: OnnxGraph, node: Node) -> list
     if replacement is not None or match is None or len(shapes.get(node.inputs[0], ())) != 4:
         return replacement
     source, affine = match
-    attributes = {"kernel_shape": [1, 1], "group": affine.channels}
-    name = node.proto.name or node.outputs[0]
-    conv = Node.new("Conv", [source], node.outputs[0], name, **attributes)
-    _set_weights(graph, conv, affine.scale.reshape(-1, 1, 1, 1), affine.shift)
-    return [conv]
+    weight = affine.scale.reshape(-1, 1, 1, 1)
+    result = node.outputs[0]
+    group = affine.channels
+    return [graph.convolution(source, result, node.name, weight, affine.shift, group=group)]
 
 
 def affine_of(graph: OnnxGraph, node: Node) -> tuple[str, Affine] | None:

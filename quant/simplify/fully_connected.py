@@ -51,7 +51,7 @@ class ConnectByConvolutions:
             graph.n_reads(name) == 1 and graph.n_reads(source) <= 1 and source in graph.writers
         )
         maps = [1, *size], [0, *size], [-1, *size]
-        if is_private and node.op_type == "Reshape" and _integers(graph, node) in maps:
+        if is_private and node.op_type == "Reshape" and graph.numbers(node, 1, "") in maps:
             graph.rename(source, node.outputs[0])
             return []
         return None
@@ -63,7 +63,7 @@ class ConnectByConvolutions:
             return False
         if node.op_type == "Flatten":
             return node.attributes.get("axis", 1) in (1, -3)
-        operand = _integers(graph, node)
+        operand = graph.numbers(node, 1, "") or []
         if node.op_type == "Squeeze" and operand:
             return {axis % 4 for axis in operand} == {2, 3}
         if node.op_type != "Reshape" or len(operand) != 2 or node.attributes.get("allowzero", 0):
@@ -88,11 +88,8 @@ class ConnectByConvolutions:
             return None
         weight = weight * np.float32(attribute("alpha", 1.0))
         offset = np.broadcast_to(bias.reshape(-1) * attribute("beta", 1.0), len(weight))
-        name = node.proto.name or node.outputs[0]
-        numbers = {"weight": weight.reshape(-1, *size), "bias": offset}
-        names = [graph.add_constant(f"{name}.{role}", value) for role, value in numbers.items()]
-        kernel = list(size[1:])
-        conv = Node.new("Conv", [source, *names], node.outputs[0], name, kernel_shape=kernel)
+        kernel = weight.reshape(-1, *size)
+        conv = graph.convolution(source, node.outputs[0], node.name, kernel, offset)
         return self._flat(conv, (len(weight), 1, 1))
 
     def _flat(self, image: Node, size: Map) -> list[Node]:
@@ -101,9 +98,3 @@ class ConnectByConvolutions:
         image.outputs = (f"{name}.map",)
         self._maps[name] = image.outputs[0], size
         return [image, Node.new("Flatten", image.outputs, name, f"{name}.flat")]
-
-
-def _integers(graph: OnnxGraph, node: Node) -> list[int]:
-    """Return the constant integers that a node of two inputs reads; empty if it has none."""
-    value = graph.value(node, 1) if len(node.inputs) == 2 else None
-    return [] if value is None else [int(number) for number in value.ravel()]

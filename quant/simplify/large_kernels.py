@@ -70,11 +70,8 @@ def split_large_kernel(graph: OnnxGraph, node: Node) -> list[Node] | None:
             "pads": part_pads,
             "dilations": [step * dilations[0], dilations[1]],
         }
-        part_name = f"{name}.rows_{first}"
-        constant = graph.add_constant(f"{part_name}.weight", kernel)
-        parts.append(
-            Node.new("Conv", [node.inputs[0], constant], part_name, part_name, **attributes)
-        )
+        part = f"{name}.rows_{first}"
+        parts.append(graph.convolution(node.inputs[0], part, part, kernel, **attributes))
     # 2.
     # The bias is added once, by the convolution that sums, so the parts have none.
     joined = Node.new(

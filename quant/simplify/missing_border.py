@@ -9,11 +9,13 @@ A network that pools over the whole image is not changed: a larger image would c
 so the result inside its border too.
 """
 
+from copy import deepcopy
+
 import numpy as np
 import onnx
-from onnx import helper, numpy_helper, shape_inference
+from onnx import shape_inference
 
-from beers_deploy.quant.onnx.graph import sizes_of
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
 
 WINDOWS = {"AveragePool", "Conv", "ConvTranspose", "MaxPool", "Pad"}
 WHOLE_IMAGE = "Global", "Reduce"
@@ -41,25 +43,22 @@ def with_missing_border(model: onnx.ModelProto) -> onnx.ModelProto:
     border_px = 0 if is_padded or reads_all else _missing_px(model)
     if not border_px:
         return model
-    network = onnx.ModelProto()
-    network.CopyFrom(model)
-    graph = network.graph
+    network = deepcopy(model)
     # The sizes that a file of a fixed size states are those without the border.
-    graph.ClearField("value_info")
-    for dim in graph.output[0].type.tensor_type.shape.dim[2:]:
+    network.graph.ClearField("value_info")
+    for dim in network.graph.output[0].type.tensor_type.shape.dim[2:]:
         dim.Clear()
-    image = graph.input[0].name
-    mirrored = f"{image}.mirrored"
     # 2.
-    for node in graph.node:
-        names = [mirrored if name == image else name for name in node.input]
-        del node.input[:]
-        node.input.extend(names)
+    graph = OnnxGraph(network)
+    image = network.graph.input[0].name
+    mirrored = f"{image}.mirrored"
+    for node in graph.readers[image]:
+        node.inputs = tuple(mirrored if name == image else name for name in node.inputs)
     amounts = np.array([0, 0, border_px, border_px] * 2)
-    pads = numpy_helper.from_array(amounts, f"{mirrored}.pads")
-    graph.initializer.append(pads)
-    pad = helper.make_node("Pad", [image, pads.name], [mirrored], mirrored, mode="reflect")
-    graph.node.insert(0, pad)
+    pads = graph.add_constant(f"{mirrored}.pads", amounts, np.int64)
+    pad = Node.new("Pad", [image, pads], mirrored, mirrored, mode="reflect")
+    graph.set_nodes([pad, *graph.nodes])
+    graph.save()
     return network
 
 
@@ -72,21 +71,17 @@ def _is_padded(node: onnx.NodeProto) -> bool:
 
 def _missing_px(model: onnx.ModelProto) -> int:
     """Return how many pixels of a border are missing at each side; 0 for none (1)."""
-    results = []
-    for size in SIZES_PX:
-        sides = _result_size(model, size)
-        if not sides:
-            return 0
-        results.append(sides)
-    borders = set()
-    for axis in (0, 1):
-        growth = (results[1][axis] - results[0][axis]) / (SIZES_PX[1][axis] - SIZES_PX[0][axis])
-        if growth < 1:
-            return 0
-        borders.add((SIZES_PX[0][axis] - results[0][axis] / growth) / 2)
-    border_px = borders.pop()
-    is_whole = border_px == int(border_px)
-    return int(border_px) if is_whole and not borders and 0 < border_px <= MOST_PX else 0
+    results = [_result_size(model, size) for size in SIZES_PX]
+    if not all(results):
+        return 0
+    small, large = np.array(results)
+    sides, larger_sides = np.array(SIZES_PX)
+    growth = (large - small) / (larger_sides - sides)
+    if growth.min() < 1:
+        return 0
+    borders = (sides - small / growth) / 2
+    border_px = int(borders[0])
+    return border_px if (borders == border_px).all() and 0 < border_px <= MOST_PX else 0
 
 
 def _result_size(model: onnx.ModelProto, size: tuple[int, int]) -> tuple[int, ...]:
@@ -98,8 +93,7 @@ def _result_size(model: onnx.ModelProto, size: tuple[int, int]) -> tuple[int, ..
     """
     if len(model.graph.input) != 1 or len(model.graph.output) != 1:
         return ()
-    network = onnx.ModelProto()
-    network.CopyFrom(model)
+    network = deepcopy(model)
     network.graph.ClearField("value_info")
     dims = network.graph.input[0].type.tensor_type.shape.dim
     if len(dims) != 4:

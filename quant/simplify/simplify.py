@@ -49,7 +49,6 @@ from beers_deploy.quant.simplify.channels_first import channels_first
 from beers_deploy.quant.simplify.crop_borders import convolve_crop
 from beers_deploy.quant.simplify.fold_affine import (
     add_negated,
-    affine_of,
     convolve_normalisation,
     fold_behind,
     fold_in_front,
@@ -96,10 +95,6 @@ slices into a Gather, and prevent pixel shuffles from being recognised.
 HALVES = (TensorProto.FLOAT16, TensorProto.BFLOAT16)
 
 
-NEEDS_SHAPES = {"Cast", "Gemm", "ReduceMean", "Slice", "Softmax", "Split", "Sub"}
-"""Operators that may be rewritten if shapes are known."""
-
-
 def simplify(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     """Simplify a float network as described in the module.
 
@@ -115,7 +110,7 @@ def simplify(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
 def _simplified(model: onnx.ModelProto, where: str) -> onnx.ModelProto:
     network = deepcopy(model)
     _widen(network)
-    network = channels_first(network)
+    channels_first(network)
     weights = {tensor.name for tensor in network.graph.initializer}
     inputs = [value for value in network.graph.input if value.name not in weights]
     outputs = list(network.graph.output)
@@ -148,8 +143,6 @@ def _run_passes(model: onnx.ModelProto) -> None:
     ):
         graph.rewrite(rewriting)
     graph.save()
-    if not any(node.op_type in NEEDS_SHAPES or affine_of(graph, node) for node in graph.nodes):
-        return
     shapes = float_shapes(graph)
     fold_in_front(graph, shapes)
     for with_shapes in (

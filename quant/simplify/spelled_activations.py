@@ -34,10 +34,8 @@ def join_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
         high = _scalar(graph, node, 2) if has_limit else np.inf
         if low == 0 and high is not None and high > UNLIMITED:
             source = node.inputs[0]
-    elif node.op_type == "Max" and len(node.inputs) == 2:
-        for place in (0, 1):
-            if _scalar(graph, node, 1 - place) == 0:
-                source = node.inputs[place]
+    else:
+        source = _other_operand(graph, node, "Max", 0)
     if source is None:
         return None
     return [Node.new("Relu", [source], node.outputs[0], node.name)]
@@ -89,12 +87,7 @@ def _sixth_of(graph: OnnxGraph, node: Node) -> str | None:
     """Return the tensor of which a node computes a sixth."""
     if node.op_type == "Div" and _scalar(graph, node, 1) == 6:
         return node.inputs[0]
-    if node.op_type == "Mul":
-        for place in (0, 1):
-            factor = _scalar(graph, node, 1 - place)
-            if factor is not None and np.isclose(factor, 1 / 6, rtol=1e-6):
-                return node.inputs[place]
-    return None
+    return _other_operand(graph, node, "Mul", 1 / 6)
 
 
 def _shifted_and_clipped(graph: OnnxGraph, name: str) -> str | None:
@@ -105,10 +98,23 @@ def _shifted_and_clipped(graph: OnnxGraph, name: str) -> str | None:
     shift = graph.writers.get(clip.inputs[0])
     if (_scalar(graph, clip, 1), _scalar(graph, clip, 2)) != (0, 6) or shift is None:
         return None
-    if shift.op_type == "Add":
+    return _other_operand(graph, shift, "Add", 3)
+
+
+def _other_operand(graph: OnnxGraph, node: Node, kind: str, number: float) -> str | None:
+    """Return the tensor that a node of this operator combines with a constant number.
+
+    Args:
+        graph: that the node belongs to.
+        node: any node.
+        kind: an operator of two operands in any order.
+        number: the constant, up to the rounding of float32.
+    """
+    if node.op_type == kind and len(node.inputs) == 2:
         for place in (0, 1):
-            if _scalar(graph, shift, 1 - place) == 3:
-                return shift.inputs[place]
+            constant = _scalar(graph, node, 1 - place)
+            if constant is not None and np.isclose(constant, number, rtol=1e-6, atol=0):
+                return node.inputs[place]
     return None
 
 

@@ -9,13 +9,11 @@
 All of it is exact. The divided nodes remain, and are removed if nothing reads them.
 """
 
-from functools import partial
-
 import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.fold_affine import is_convolution
-from beers_deploy.quant.simplify.standard_operators import Shapes
+from beers_deploy.quant.simplify.standard_operators import Shapes, channels_in, slices_of
 
 POINTWISE = {"HardSigmoid", "HardSwish", "LeakyRelu", "Relu", "Sigmoid", "Tanh"}
 CHANNEL_AXIS = (1, -3)
@@ -37,13 +35,10 @@ def split_channels(shapes: Shapes, graph: OnnxGraph, node: Node) -> list[Node] |
     parts = _parts(graph, node, shapes)
     source = node.inputs[0] if parts else ""
     only_parts = all(_parts(graph, reader, shapes) for reader in graph.readers[source])
-    if source in graph.outputs or not only_parts:
-        compute = partial(_select, graph, source, shapes.get(source, (0, 0))[1])
-    else:
-        compute = partial(_divide, graph, source, shapes)
+    divides = source not in graph.outputs and only_parts
     nodes: list[Node] = []
     for name, channels in parts:
-        nodes += compute(channels, name)
+        nodes += _compute(graph, source, shapes, channels, name, divides)
     return nodes or None
 
 
@@ -55,29 +50,22 @@ def _parts(graph: OnnxGraph, node: Node, shapes: Shapes) -> list[Part]:
         node: any node.
         shapes: of each float tensor.
     """
-    source = shapes.get(node.inputs[0], ()) if node.inputs else ()
-    if len(source) != 4 or source[1] < 1:
+    numbers = np.arange(channels_in(shapes, node.inputs[0]) if node.inputs else 0)
+    if not len(numbers):
         return []
-    numbers = np.arange(source[1])
     if node.op_type == "Split" and node.attributes.get("axis", 0) in CHANNEL_AXIS:
-        sizes = [shapes.get(name, ()) for name in node.outputs]
-        if not all(len(size) == 4 and size[1] > 0 for size in sizes):
+        widths = [channels_in(shapes, name) for name in node.outputs]
+        if not all(widths):
             return []
-        ends = np.cumsum([size[1] for size in sizes])
-        return list(zip(node.outputs, np.split(numbers, ends[:-1]), strict=True))
-    if node.op_type == "Slice":
-        starts, stops, axes, steps = (graph.numbers(node, place, "") for place in range(1, 5))
-        if starts and stops and axes and len(axes) == 1 and axes[0] in CHANNEL_AXIS:
-            step = steps[0] if steps else 1
-            return [(node.outputs[0], numbers[starts[0] : stops[0] : step])]
-    return []
+        return list(zip(node.outputs, np.split(numbers, np.cumsum(widths[:-1])), strict=True))
+    cuts = slices_of(graph, node) if node.op_type == "Slice" else {}
+    return [(node.outputs[0], numbers[cuts[1]])] if cuts.keys() == {1} else []
 
 
-def _divide(
-    graph: OnnxGraph, source: str, shapes: Shapes, channels: np.ndarray, name: str
+def _compute(
+    graph: OnnxGraph, source: str, shapes: Shapes, channels: np.ndarray, name: str, divides: bool
 ) -> list[Node]:
-    """Return the operations that compute some channels of a map that is never needed as a whole
-    (2).
+    """Return the operations that compute some channels of a map.
 
     Args:
         graph: its constants are extended by the weights of the part.
@@ -85,69 +73,43 @@ def _divide(
         shapes: of each float tensor.
         channels: the numbers of the channels, (C,).
         name: of the part.
+        divides: whether the map is never needed as a whole (2), or the channels are selected (3).
     """
-    before = graph.writers.get(source)
-    divided_name = f"{name}.{before.op_type}" if before else ""
-    # An activation works on each value by itself, so it is repeated behind the part.
-    if before is not None and before.op_type in POINTWISE:
-        inner = f"{name}.before"
+    before = graph.writers.get(source) if divides else None
+    inner = f"{name}.before"
+    in_front: list[Node] = []
+    is_pointwise = before is not None and before.op_type in POINTWISE
+    groups = _groups(graph, before)
+    if before is not None and (is_pointwise or groups > 1):
+        # An activation works on each value by itself, and a depthwise kernel on each channel, so
+        # that the map in front has parts too.
+        reads_once = graph.n_reads(before.inputs[0]) == 1
+        in_front = _compute(graph, before.inputs[0], shapes, channels, inner, reads_once)
+    if before is not None and is_pointwise:
         behind = Node.of(before.written())
-        behind.proto.name = divided_name
+        behind.proto.name = f"{name}.{before.op_type}"
         behind.inputs = (inner,)
         behind.outputs = (name,)
-        return [*_part_of(graph, before.inputs[0], shapes, channels, inner), behind]
-    if before is None or before.op_type != "Conv" or not is_convolution(graph, before):
-        return _select(graph, source, shapes[source][1], channels, name)
-    weight = graph.constants[before.inputs[1]]
-    groups = before.attributes.get("group", 1)
-    is_depthwise = groups == len(weight) and weight.shape[1] == 1
+        return [*in_front, behind]
+    if before is not None and groups:
+        weight = graph.constants[before.inputs[1]][channels]
+        bias = graph.value(before, 2)
+        bias = bias if bias is None else bias[channels]
+        attributes = {**before.attributes, "group": len(channels) if groups > 1 else 1}
+        front = inner if in_front else before.inputs[0]
+        conv = graph.convolution(front, name, f"{name}.Conv", weight, bias, **attributes)
+        return [*in_front, conv]
+    weight = np.eye(shapes[source][1])[channels][..., None, None]
+    return [graph.convolution(source, name, f"{name}.Conv", weight)]
+
+
+def _groups(graph: OnnxGraph, node: Node | None) -> int:
+    """Return the groups of a convolution whose channels can be computed separately, 0 for another
+    node.
+    """
+    if node is None or node.op_type != "Conv" or not is_convolution(graph, node):
+        return 0
+    outputs, inputs = graph.constants[node.inputs[1]].shape[:2]
+    groups = int(node.attributes.get("group", 1))
     # The channels of a group read others of their group, which the part need not have.
-    if groups != 1 and not is_depthwise:
-        return _select(graph, source, len(weight), channels, name)
-    inputs = [before.inputs[0], graph.add_constant(f"{divided_name}.weight", weight[channels])]
-    bias = graph.value(before, 2)
-    if bias is not None:
-        inputs.append(graph.add_constant(f"{divided_name}.bias", bias[channels]))
-    attributes = dict(before.attributes)
-    nodes: list[Node] = []
-    if groups != 1:
-        # A depthwise kernel reads the channel that it writes, so the map in front has parts too.
-        inputs[0] = f"{name}.before"
-        attributes["group"] = len(channels)
-        nodes = _part_of(graph, before.inputs[0], shapes, channels, inputs[0])
-    return [*nodes, Node.new("Conv", inputs, name, divided_name, **attributes)]
-
-
-def _part_of(
-    graph: OnnxGraph, source: str, shapes: Shapes, channels: np.ndarray, name: str
-) -> list[Node]:
-    """Return the operations that compute some channels of a map that one node reads, or several.
-
-    Args:
-        graph: its constants are extended.
-        source: the map.
-        shapes: of each float tensor.
-        channels: the numbers of the channels, (C,).
-        name: of the part.
-    """
-    if graph.n_reads(source) == 1:
-        return _divide(graph, source, shapes, channels, name)
-    return _select(graph, source, shapes[source][1], channels, name)
-
-
-def _select(
-    graph: OnnxGraph, source: str, width: int, channels: np.ndarray, name: str
-) -> list[Node]:
-    """Return a convolution of one pixel that selects channels (3).
-
-    Args:
-        graph: its constants are extended.
-        source: the map.
-        width: channels of the map.
-        channels: the numbers of those that are selected, (C,).
-        name: of the part.
-    """
-    node_name = f"{name}.Conv"
-    weight = np.eye(width, dtype=np.float32)[channels][..., None, None]
-    constant = graph.add_constant(f"{node_name}.weight", weight)
-    return [Node.new("Conv", [source, constant], name, node_name, kernel_shape=[1, 1])]
+    return groups if groups == 1 or (groups == outputs and inputs == 1) else 0

@@ -16,6 +16,24 @@ def float_shapes(graph: OnnxGraph) -> Shapes:
     }
 
 
+def channels_in(shapes: Shapes, name: str) -> int:
+    """Return the number of channels of a map (N, C, H, W); 0 if it is not known."""
+    sizes = shapes.get(name, ())
+    return sizes[1] if len(sizes) == 4 else 0
+
+
+def slices_of(graph: OnnxGraph, node: Node) -> dict[int, slice]:
+    """Return what a Slice of a tensor of four axes cuts, by axis; empty if other nodes compute
+    it.
+    """
+    starts, stops, axes, steps = (graph.numbers(node, place, "") for place in range(1, 5))
+    if not (starts and stops and axes) or steps is None:
+        return {}
+    steps = steps or [1] * len(axes)
+    cuts = map(slice, starts, stops, steps)
+    return {axis % 4: cut for axis, cut in zip(axes, cuts, strict=True)}
+
+
 def split_sums(_: OnnxGraph, node: Node) -> list[Node] | None:
     """Replace a Sum of several tensors by Adds, one after the other."""
     if node.op_type != "Sum" or len(node.inputs) < 2:

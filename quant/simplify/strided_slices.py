@@ -11,7 +11,7 @@ import numpy as np
 
 from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 from beers_deploy.quant.simplify.fold_affine import is_convolution
-from beers_deploy.quant.simplify.standard_operators import Shapes
+from beers_deploy.quant.simplify.standard_operators import Shapes, slices_of
 
 BLOCKS = (2, 3, 4)
 
@@ -82,15 +82,8 @@ def _order(graph: OnnxGraph, node: Node, channels: int, block: int) -> np.ndarra
     for name in node.inputs:
         part = image
         for each in _origin(graph, name)[1]:
-            starts, stops, axes, steps = (graph.numbers(each, k, "") for k in range(1, 5))
-            if not (starts and stops and axes) or steps is None:
-                return None
-            places = [slice(None)] * 4
-            for axis, start, stop, by in zip(
-                axes, starts, stops, steps or [1] * len(axes), strict=True
-            ):
-                places[axis] = slice(start, stop, by)
-            part = part[tuple(places)]
+            cuts = slices_of(graph, each)
+            part = part[tuple(cuts.get(axis, slice(None)) for axis in range(4))]
         parts.append(part)
     # ONNX's SpaceToDepth has the place in the block before the channel.
     blocks = image.reshape(channels, 4, block, 6, block).transpose(2, 4, 0, 1, 3)
@@ -101,6 +94,5 @@ def _order(graph: OnnxGraph, node: Node, channels: int, block: int) -> np.ndarra
     if result.shape != unshuffled.shape:
         return None
     # Each channel is known by its first pixel.
-    firsts = unshuffled[0, :, 0, 0].tolist()
-    order = np.array([firsts.index(n) if n in firsts else 0 for n in result[0, :, 0, 0].tolist()])
+    order = (result[0, :, :1, 0] == unshuffled[0, :, 0, 0]).argmax(1)
     return order if np.array_equal(unshuffled[:, order], result) else None

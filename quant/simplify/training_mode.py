@@ -5,13 +5,11 @@ Such a network returns another result for each run or for each tile. It is rejec
 nodes are folded.
 """
 
-import numpy as np
 import onnx
-from onnx import NodeProto
 
 from beers_deploy.profiles.errors import ModelError, printable
-from beers_deploy.quant.domains import STANDARD, opset_of
-from beers_deploy.quant.onnx.graph import attributes_of, constants
+from beers_deploy.quant.domains import opset_of
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph
 
 IS_TEST_UNTIL = 6
 """The last opset whose operators state by `is_test` whether they are in inference mode; without it
@@ -31,46 +29,29 @@ def require_inference(model: onnx.ModelProto, where: str) -> None:
         ModelError: a Dropout or a BatchNormalization in training mode, or in a mode that the file
             leaves open.
     """
+    graph = OnnxGraph(model)
     opset = opset_of(model)
-    values = constants(model)
-    for node in model.graph.node:
-        if (
-            node.domain in STANDARD
-            and node.op_type in TRAINED
-            and TRAINED[node.op_type](node, opset, values)
-        ):
-            name = printable(repr(node.name or node.output[0]))
+    for node in graph.nodes:
+        if _is_in_training(graph, node, opset):
             raise ModelError(
-                f"{node.op_type} {name} in {where} is in training mode, so that the result is not "
-                "a function of the image alone. Call model.eval() before you export the network, "
-                "or give the exporter its mode for inference."
+                f"{node.op_type} {printable(repr(node.name))} in {where} is in training mode, so "
+                "that the result is not a function of the image alone. Call model.eval() before "
+                "you export the network, or give the exporter its mode for inference."
             )
 
 
-def _drops(node: NodeProto, opset: int, values: dict[str, np.ndarray]) -> bool:
-    """Return True if a Dropout draws: its mode is a third input, and a mode that is computed may be
-    any.
-    """
+def _is_in_training(graph: OnnxGraph, node: Node, opset: int) -> bool:
+    """Return True if a Dropout draws, or a BatchNormalization adapts to the image."""
+    if node.op_type not in ("BatchNormalization", "Dropout"):
+        return False
     if opset <= IS_TEST_UNTIL:
-        return not attributes_of(node).get("is_test", 0)
-    if len(node.input) <= DROPOUT_MODE_INPUT or not node.input[DROPOUT_MODE_INPUT]:
+        return not node.attributes.get("is_test", 0)
+    if node.op_type == "BatchNormalization":
+        # Further results are the running mean and variance, which only training computes. From
+        # opset 14 on an attribute states it as well.
+        return bool(node.attributes.get("training_mode", 0)) or any(node.outputs[1:])
+    if not any(node.inputs[DROPOUT_MODE_INPUT:]):
         return False
     # A mode that is computed could be anything when the network runs.
-    mode = values.get(node.input[DROPOUT_MODE_INPUT])
+    mode = graph.value(node, DROPOUT_MODE_INPUT)
     return mode is None or bool(mode.any())
-
-
-def _adapts(node: NodeProto, opset: int, _: dict[str, np.ndarray]) -> bool:
-    """Return True if a BatchNormalization computes mean and variance from the image, and returns
-    them as further results.
-
-    From opset 14 on an attribute states it as well.
-    """
-    attributes = attributes_of(node)
-    if opset <= IS_TEST_UNTIL:
-        return not attributes.get("is_test", 0)
-    # Further results are the running mean and variance, which only training computes.
-    return bool(attributes.get("training_mode", 0)) or any(node.output[1:])
-
-
-TRAINED = {"Dropout": _drops, "BatchNormalization": _adapts}

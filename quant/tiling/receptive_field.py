@@ -26,9 +26,10 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import onnx
+from onnx import TypeProto
 
 from beers_deploy.quant.graph.pixel_shuffle import MOVES, with_shuffles
-from beers_deploy.quant.onnx.graph import Node, OnnxGraph
+from beers_deploy.quant.onnx.graph import Node, OnnxGraph, sizes_of
 from beers_deploy.quant.onnx_file import faults_named, fixed_tile_px
 from beers_deploy.quant.tiling.axis_maps import AXIS_MAPS, AxisMap, AxisNode, not_tileable
 from beers_deploy.quant.untrusted import contradictions
@@ -84,7 +85,7 @@ def tiling_of(model: onnx.ModelProto, where: str = "") -> Tiling:
     with faults_named(where), contradictions(where or "the network"):
         graph = with_shuffles(model)
         rows, columns = (_Walk(graph, axis) for axis in (0, 1))
-        channels_in, channels_out = _channels(graph, model)
+        channels_in, channels_out = _channels(graph)
         fixed_px = fixed_tile_px(model)
         alignment_px = math.lcm(rows.alignment_px, columns.alignment_px)
         radius_px = max(rows.radius_px, columns.radius_px)
@@ -106,35 +107,24 @@ def tiling_of(model: onnx.ModelProto, where: str = "") -> Tiling:
         )
 
 
-def _channels(graph: OnnxGraph, model: onnx.ModelProto) -> tuple[int, int]:
-    if len(graph.inputs) != 1 or len(graph.outputs) != 1:
+def _channels(graph: OnnxGraph) -> tuple[int, int]:
+    """Return the number of channels of the image and of the result."""
+    sizes = next(iter(graph.inputs.values()), [])
+    is_image = len(sizes) == 4 and sizes[0] <= 1 and sizes[1] > 0
+    if len(graph.inputs) != 1 or len(graph.outputs) != 1 or not is_image:
         raise not_tileable(
-            f"it must have one input and one output, but it has {len(graph.inputs)} and "
-            f"{len(graph.outputs)}"
+            "it must have one output and one input (N, C, H, W), with N of 1 or free and C stated, "
+            f"but it has {len(graph.outputs)} outputs, and the sizes of its inputs are "
+            f"{list(graph.inputs.values())} (0 is free)"
         )
-    (sizes,) = graph.inputs.values()
-    if sizes and sizes[0] > 1:
-        raise not_tileable(
-            f"it must accept one image at a time, but it is fixed to batches of {sizes[0]}"
-        )
-    if len(sizes) != 4 or not sizes[1]:
-        raise not_tileable(
-            "its input must be an image (N, C, H, W) of a stated number of channels, but the file "
-            "states none"
-        )
-    channels_out = _channel_count(model.graph.output[0])
-    if not channels_out:
-        info = onnx.shape_inference.infer_shapes(model).graph
-        channels_out = _channel_count(info.output[0])
+    (result,) = graph.outputs
+    result_sizes = graph.result_sizes[result]
+    if len(result_sizes) != 4 or not result_sizes[1]:
+        result_sizes = sizes_of(graph.tensor_types().get(result, TypeProto.Tensor()))
     # Where neither file nor inference states it, as with a runtime's own operators, the output is
     # judged when it is computed.
-    return sizes[1], channels_out or sizes[1]
-
-
-def _channel_count(value: onnx.ValueInfoProto) -> int:
-    """Return the number of channels; 0 if it is not stated, or if the tensor is no image."""
-    sizes = value.type.tensor_type.shape.dim
-    return sizes[1].dim_value if len(sizes) == 4 else 0
+    stated = result_sizes[1] if len(result_sizes) == 4 else 0
+    return sizes[1], stated or sizes[1]
 
 
 PERIOD = 1024

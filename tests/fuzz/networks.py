@@ -59,7 +59,7 @@ def exported_seeds(_: Path) -> list[bytes]:
         made(sizes),
         made(scaled, 9),
         made(sizes, 20),
-        made(idle, kind=onnx.TensorProto.FLOAT16),
+        made(idle, kind="float16"),
     ]
     return [network.SerializeToString() for network in networks]
 

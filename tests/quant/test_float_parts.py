@@ -1,39 +1,48 @@
 """A file that hides a float network around an integer core does not pass as INT8."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
 import pytest
+from numpy.typing import ArrayLike
 from onnxruntime.quantization import quantize_static
 
 from beers_deploy.quant.float_parts import float_layers_check, float_note
-from beers_deploy.quant.onnx_file import GraphWriter, image_info, load_onnx, make_model, save_onnx
+from beers_deploy.quant.onnx_file import load_onnx, save_onnx
 from beers_deploy.quant.structure import structure_checks
 from tests.quant.quick import Calibration
+from tests.quant.simplify.networks import parsed
 from tests.shipped import shipped_pair
+
+HIDDEN = {
+    "in front": "y = Conv(x, w)",
+    "behind": "y = Conv(dq, w)",
+    "a product of matrices": "y = MatMul(x, m)",
+}
+CONSTANTS: dict[str, ArrayLike] = {
+    "unit": 2.0**-7,
+    "zero": np.int8(0),
+    "w": np.full((1, 1, 1, 1), 0.5),
+    "m": np.eye(8),
+    "none": 0.0,
+}
 
 
 def decoy(hidden: str) -> onnx.ModelProto:
-    """A float layer; and beside it a quantised one whose result counts for nothing."""
-    w = GraphWriter()
-    unit = w.constant("unit", np.array(2.0**-7, np.float32))
-    zero = w.constant("zero", np.array(0, np.int8))
-    w.node("QuantizeLinear", "q", ["x", unit, zero])
-    w.node("DequantizeLinear", "dq", ["q", unit, zero])
-    weight = w.constant("w", np.full((1, 1, 1, 1), 0.5, np.float32))
-    if hidden == "conv":
-        w.node("Conv", "y", ["x", weight])
-    elif hidden == "behind":
-        w.node("Conv", "y", ["dq", weight])
-    else:
-        w.node("MatMul", "y", ["x", w.constant("m", np.eye(8, dtype=np.float32))])
-    w.node("Mul", "nothing", ["dq", w.constant("none", np.array(0, np.float32))])
-    w.node("Add", "z", ["y", "nothing"])
-    return make_model(w.graph("g", [image_info("x", 1, 8)], [image_info("z", 1, 8)]), {})
+    """Return a float layer, next to a quantised one whose result has no effect."""
+    nodes = f"""
+        q = QuantizeLinear(x, unit, zero)
+        dq = DequantizeLinear(q, unit, zero)
+        {HIDDEN[hidden]}
+        nothing = Mul(dq, none)
+        z = Add(y, nothing)
+    """
+    return parsed(nodes, "float[1,1,8,8] x => float[1,1,8,8] z", constants=CONSTANTS)
 
 
-@pytest.mark.parametrize("hidden", ["conv", "behind", "matmul"])
+@pytest.mark.parametrize("hidden", HIDDEN)
 def test_a_float_layer_is_counted(hidden: str) -> None:
     check = float_layers_check(decoy(hidden))
     assert (check.value, check.passed) == (1, False)
@@ -48,35 +57,33 @@ def test_a_file_of_ours_has_none(name: str) -> None:
     assert float_note(model) == []
 
 
-def written(path: Path) -> Path:
-    """A small float network."""
-    w = GraphWriter()
-    generator = np.random.default_rng(0)
-    first = w.constant("first", generator.normal(0, 0.2, (4, 1, 3, 3)).astype(np.float32))
-    second = w.constant("second", generator.normal(0, 0.2, (1, 4, 3, 3)).astype(np.float32))
-    w.node("Conv", "a", ["image", first], pads=[1, 1, 1, 1])
-    w.node("Relu", "b", ["a"])
-    w.node("Conv", "y", ["b", second], pads=[1, 1, 1, 1])
-    save_onnx(
-        make_model(w.graph("g", [image_info("image", 1, None)], [image_info("y", 1, None)]), {}),
-        path,
-    )
-    return path
-
-
 @pytest.mark.parametrize("per_channel", [False, True])
-def test_a_file_of_another_quantizer_has_none(per_channel: bool, tmp_path: Path) -> None:
-    model = written(tmp_path / "float.onnx")
-    noise = list(np.random.default_rng(0).random((2, 1, 1, 32, 32), np.float32))
-    quantize_static(model, tmp_path / "free.onnx", Calibration(noise), per_channel=per_channel)
-    assert float_layers_check(load_onnx(tmp_path / "free.onnx")).passed
+def test_a_file_of_another_quantizer_has_none(
+    per_channel: bool, float_onnx: onnx.ModelProto, tmp_path: Path
+) -> None:
+    free = quantized_freely(float_onnx, tmp_path, per_channel=per_channel)
+    assert float_layers_check(free).passed
 
 
-def test_one_layer_left_in_float_is_told(tmp_path: Path) -> None:
-    model = written(tmp_path / "float.onnx")
-    noise = list(np.random.default_rng(0).random((2, 1, 1, 32, 32), np.float32))
-    first = next(node.name for node in load_onnx(model).graph.node if node.op_type == "Conv")
-    path = tmp_path / "partly.onnx"
-    quantize_static(model, path, Calibration(noise), nodes_to_exclude=[first])
-    checks = {check.name: check for check in structure_checks(load_onnx(model), load_onnx(path))}
+def test_one_float_layer_is_reported(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    shapes = {"first": (4, 1, 3, 3), "second": (1, 4, 3, 3)}
+    model = parsed(
+        """[kept] a = Conv<pads=[1,1,1,1]>(image, first)
+        b = Relu(a)
+        y = Conv<pads=[1,1,1,1]>(b, second)""",
+        "float[N,1,H,W] image => float[N,1,H,W] y",
+        constants={name: generator.normal(0, 0.2, shape) for name, shape in shapes.items()},
+    )
+    partly = quantized_freely(model, tmp_path, nodes_to_exclude=["kept"])
+    checks = {check.name: check for check in structure_checks(model, partly)}
     assert not checks["layers computed in float"].passed
+
+
+def quantized_freely(model: onnx.ModelProto, folder: Path, **options: Any) -> onnx.ModelProto:
+    """Return a network as onnxruntime quantises it."""
+    save_onnx(model, folder / "float.onnx")
+    noise = list(np.random.default_rng(0).random((2, 1, 1, 32, 32), np.float32))
+    path = folder / "free.onnx"
+    quantize_static(folder / "float.onnx", path, Calibration(noise), **options)
+    return load_onnx(path)

@@ -12,10 +12,12 @@ import numpy as np
 import onnx
 import onnxruntime as ort
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
+from torch.nn.functional import conv2d
 
 from beers_deploy.model.processor import int8_adds_exactly
 from beers_deploy.profiles.errors import ModelError
@@ -23,12 +25,10 @@ from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.kernels import (
     FEWEST_OUTPUTS,
-    INT16_MAX,
-    INT16_MIN,
-    Way,
+    INT16,
     cannot_saturate,
-    filled,
-    made_exact,
+    with_exact_sums,
+    with_wide_convolutions,
 )
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session, run
@@ -90,23 +90,15 @@ def convolution(
 
 
 def by_definition(model: onnx.ModelProto, image: np.ndarray) -> np.ndarray:
-    """What such a convolution is, tap by tap in int64: no padding, half to even."""
+    """Compute such a convolution in float64, without padding, half to even."""
     values = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
     groups = model.graph.node[0].attribute[0].i
     shifted = image.astype(np.int64) - int(values["middle"])
-    weight = (
-        values["weight"].astype(np.int64)
-        - values["weight_middle"].astype(np.int64).reshape(-1, *([1] * 3))[:1]
-    )
-    per_group = weight.shape[1]
-    kernel = weight.shape[2]
-    height, width = (side - kernel + 1 for side in image.shape[2:])
-    sums = np.zeros((len(image), len(weight), height, width), np.int64)
-    for o in range(len(weight)):
-        first = o // (len(weight) // groups) * per_group
-        for dy, dx in np.ndindex(kernel, kernel):
-            window = shifted[:, first : first + per_group, dy : dy + height, dx : dx + width]
-            sums[:, o] += np.einsum("nchw,c->nhw", window, weight[o, :, dy, dx])
+    middle = values["weight_middle"].astype(np.int64).ravel()[0]
+    weight = values["weight"].astype(np.int64) - middle
+    # Sums of these integers are exact in float64.
+    pixels, taps = (torch.from_numpy(array.astype(np.float64)) for array in (shifted, weight))
+    sums = conv2d(pixels, taps, groups=groups).numpy()
     scale = values["weight_unit"].astype(np.float64).reshape(-1, 1, 1) / float(
         values["result_unit"]
     )
@@ -178,30 +170,10 @@ def test_what_is_proven_holds_for_the_worst_activations(
     pairs = line.reshape(3, -1, 2)
     worst = [largest * np.where(sign * pairs > 0, pairs, 0).sum(-1) for sign in (1, -1)]
     if cannot_saturate("QLinearConv", weight, largest):
-        assert worst[0].max() <= INT16_MAX
-        assert worst[1].min() >= INT16_MIN
+        assert worst[0].max() <= INT16.max
+        assert worst[1].min() >= INT16.min
     elif inputs % 2 == 0:
-        assert worst[0].max() > INT16_MAX or worst[1].min() < INT16_MIN
-
-
-@pytest.mark.parametrize(
-    ("pair", "largest", "proven"),
-    [
-        # 2 x 64 x 255 = 32 640 fits int16, which ends at 32 767.
-        ((64, 64), 255, True),
-        # (64 + 65) x 255 = 32 895 does not.
-        ((64, 65), 255, False),
-        # Weights of opposite signs do not add up.
-        ((127, -128), 255, True),
-        ((-64, -65), 255, False),
-        # Behind a ReLU activations end at 127, and 2 x 127 x 127 = 32 258 fits.
-        ((127, 127), 127, True),
-        ((-128, -128), 127, True),
-    ],
-)
-def test_the_limit_is_that_of_int16(pair: tuple[int, int], largest: int, proven: bool) -> None:
-    weight = np.array(pair, np.int8).reshape(1, 2, 1, 1)
-    assert cannot_saturate("QLinearConv", weight, largest) == proven
+        assert worst[0].max() > INT16.max or worst[1].min() < INT16.min
 
 
 SMALL = [shipped_pair(name)[1] for name in ("convbeers-xs", "convbeers-s")]
@@ -225,10 +197,16 @@ def test_behind_a_relu_no_weights_saturate(path: Path) -> None:
     """What keeps INT8 faster than float32: a third of the convolutions, the largest, keep the fast
     kernels.
     """
-    ways = made_exact(load_onnx(path))[1]
-    behind = {way for name, way in ways.items() if name.endswith(".second")}
-    assert behind == {Way.signed}
-    assert sum(way == Way.signed for way in ways.values()) >= len(ways) / 3
+    kinds = weight_types(with_exact_sums(load_onnx(path)))
+    assert {kind for name, kind in kinds.items() if name.endswith(".second")} == {TensorProto.INT8}
+    assert list(kinds.values()).count(TensorProto.INT8) >= len(kinds) / 3
+
+
+def weight_types(model: onnx.ModelProto) -> dict[str, int]:
+    """Return the type of the weights of each integer convolution by its name."""
+    types = {tensor.name: tensor.data_type for tensor in model.graph.initializer}
+    nodes = [node for node in model.graph.node if node.op_type == "QLinearConv"]
+    return {node.name: types[node.input[3]] for node in nodes}
 
 
 def test_a_relu_that_somebody_else_looks_at_is_left_alone() -> None:
@@ -295,7 +273,8 @@ def test_files_of_other_makers_give_the_same_numbers_in_these_ways(
         tmp_path / "float.onnx", tmp_path / "theirs.onnx", Calibration(noise), **options
     )
     theirs = load_onnx(tmp_path / "theirs.onnx")
-    assert set(made_exact(theirs)[1].values()) & {Way.unsigned, Way.converted}
+    exact = with_exact_sums(theirs)
+    assert exact.graph.node != theirs.graph.node
     image = np.random.default_rng(1).integers(0, 2, (1, 1, 31, 45)).astype(np.float32)
     ways = run(open_session(theirs, 1, exact=True), image)
     if form is QuantFormat.QOperator:
@@ -319,7 +298,7 @@ def as_written(model: onnx.ModelProto, image: np.ndarray) -> np.ndarray:
 def test_no_convolution_stays_narrow_and_the_numbers_are_the_same(path: Path) -> None:
     model = load_onnx(path)
     generator = np.random.default_rng(0)
-    wider = filled(model)
+    wider = with_wide_convolutions(model)
     onnx.checker.check_model(wider)
     for old, new in zip(shapes_of_weights(model), shapes_of_weights(wider), strict=True):
         assert new[0] == max(old[0], FEWEST_OUTPUTS)
@@ -343,5 +322,6 @@ def test_one_output_is_filled_where_a_stored_zero_is_a_weight_of_zero(
     model = convolution(np.array([[[[1]], [[-2]]]], np.int8), np.uint8, middle=middle)
     model.opset_import[0].version = opset
     image = np.random.default_rng(0).integers(0, 256, (1, 2, 3, 5)).astype(np.uint8)
-    assert shapes_of_weights(filled(model)) == [shape]
-    assert np.array_equal(as_written(filled(model), image), as_written(model, image))
+    wider = with_wide_convolutions(model)
+    assert shapes_of_weights(wider) == [shape]
+    assert np.array_equal(as_written(wider, image), as_written(model, image))

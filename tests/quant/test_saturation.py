@@ -5,37 +5,38 @@ from collections.abc import Callable
 import numpy as np
 import onnx
 import pytest
-from onnx import helper, numpy_helper
 
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import CORRECTION
 from beers_deploy.quant.integer.reference import run_core
-from beers_deploy.quant.onnx_file import image_info, load_onnx, make_model
+from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.structure import rounded_tensors, saturated_shares
+from tests.quant.simplify.networks import parsed
 from tests.shipped import shipped_pair
 
 IMAGE = np.random.default_rng(3).random((2, 1, 37, 43), dtype=np.float32)
 Lost = Callable[[np.ndarray], np.ndarray]
-RESTORED = image_info("restored", 1, None)
+ENDS = "float[N,1,H,W] image => float[N,1,H,W] restored"
 
 
-def qdq(scale: float, zero_point: np.ndarray | None, relu: bool = False) -> onnx.ModelProto:
-    """The image, rounded to 8 bits and back."""
-    stored = [numpy_helper.from_array(np.array(scale, np.float32), "scale")]
-    names = ["scale"]
-    if zero_point is not None:
-        stored.append(numpy_helper.from_array(zero_point, "zero"))
-        names.append("zero")
-    nodes = [helper.make_node("QuantizeLinear", ["image", *names], ["whole"])]
-    nodes += [helper.make_node("Max", ["whole", "zero"], ["positive"])] if relu else []
-    nodes += [
-        helper.make_node(
-            "DequantizeLinear", ["positive" if relu else "whole", *names], ["restored"]
-        )
-    ]
-    return make_model(
-        helper.make_graph(nodes, "qdq", [image_info("image", 1, None)], [RESTORED], stored), {}
-    )
+QDQ = "whole = QuantizeLinear(image, {0}) restored = DequantizeLinear(whole, {0})"
+RELU = """whole = QuantizeLinear(image, {0})
+    positive = Max(whole, zero)
+    restored = DequantizeLinear(positive, {0})"""
+TWICE = """whole = QuantizeLinear(image, {0})
+    float = DequantizeLinear(whole, {0})
+    positive = Relu(float)
+    again = QuantizeLinear(positive, {0})
+    restored = DequantizeLinear(again, {0})"""
+
+
+def rounded(nodes: str, scale: float, zero_point: np.ndarray | None) -> onnx.ModelProto:
+    """Return a network that rounds the image to 8 bits and back."""
+    names = "scale" if zero_point is None else "scale, zero"
+    constants = {"scale": np.float32(scale), "zero": zero_point}
+    if zero_point is None:
+        constants.pop("zero")
+    return parsed(nodes.format(names), ENDS, constants=constants)
 
 
 @pytest.mark.parametrize(
@@ -52,29 +53,22 @@ def qdq(scale: float, zero_point: np.ndarray | None, relu: bool = False) -> onnx
 def test_shares_are_those_of_the_values(
     zero_point: np.ndarray | None, relu: bool, expected_lost: Lost
 ) -> None:
+    nodes = RELU if relu else QDQ
     scale = 1 / 400
     signed = (IMAGE - 0.5) * 2
-    shares = saturated_shares(qdq(scale, zero_point, relu), [signed[:1], signed[1:]])
+    shares = saturated_shares(rounded(nodes, scale, zero_point), [signed[:1], signed[1:]])
     assert shares == {
         "whole": pytest.approx(expected_lost(signed / np.float32(scale)).mean(), abs=1e-3)
     }
     assert shares["whole"] > 0.1
-    assert saturated_shares(qdq(1 / 120, zero_point, relu), [IMAGE]) == {"whole": 0.0}
+    assert saturated_shares(rounded(nodes, 1 / 120, zero_point), [IMAGE]) == {"whole": 0.0}
 
 
 def test_a_relu_between_two_roundings_reads_the_first() -> None:
     """QuantizeLinear, DequantizeLinear, Relu, QuantizeLinear: what is below
     zero was to be cut off.
     """
-    model = qdq(1 / 400, np.array(0, np.int8))
-    model.graph.node[1].output[0] = "float"
-    model.graph.node.extend(
-        [
-            helper.make_node("Relu", ["float"], ["positive"]),
-            helper.make_node("QuantizeLinear", ["positive", "scale", "zero"], ["again"]),
-            helper.make_node("DequantizeLinear", ["again", "scale", "zero"], ["restored"]),
-        ]
-    )
+    model = rounded(TWICE, 1 / 400, np.array(0, np.int8))
     signed = (IMAGE - 0.5) * 2
     shares = saturated_shares(model, [signed])
     lost_share = float((signed * 400 >= 126.5).mean())
@@ -99,11 +93,7 @@ def test_the_shipped_file_saturates_as_the_integer_reference_says() -> None:
     assert max(plain.values()) > 0.001
 
 
-def test_a_scale_that_fits_saturates_nothing_and_a_float_network_has_nothing_to_saturate() -> None:
-    assert saturated_shares(qdq(1 / 120, np.array(0, np.int8)), [IMAGE]) == {"whole": 0.0}
-    node = helper.make_node("Relu", ["image"], ["restored"])
-    model = make_model(
-        helper.make_graph([node], "float", [image_info("image", 1, None)], [RESTORED]), {}
-    )
+def test_a_float_network_has_nothing_to_saturate() -> None:
+    model = parsed("restored = Relu(image)", ENDS)
     assert rounded_tensors(model) == []
     assert saturated_shares(model, [IMAGE]) == {}

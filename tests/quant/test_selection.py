@@ -11,7 +11,7 @@ from beers_deploy.quant.passes.selection import ALL, Passes
 from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.session import open_session, result_of
 from tests.quant.quick import patches_of
-from tests.quant.test_odd_networks import Sketch, dead_channels
+from tests.quant.test_odd_networks import VALID
 
 pytestmark = pytest.mark.slow
 
@@ -34,7 +34,7 @@ def results(float_onnx: onnx.ModelProto) -> Results:
     patches = patches_of([waves(phase) for phase in range(3)])
 
     def of_passes(passes: Passes) -> list[np.ndarray]:
-        networks = (float_onnx, dead_channels(Sketch()))
+        networks = (float_onnx, VALID["dead channels"])
         files = [quantize_model(network, patches, {}, passes=passes).host for network in networks]
         return [result_of(open_session(file), waves(0)) for file in files]
 

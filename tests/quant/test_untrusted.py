@@ -15,12 +15,12 @@ from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.reading import network_of, read_network
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.quant.onnx_file import any_size, load_onnx, parse_onnx
+from beers_deploy.quant.onnx_file import load_onnx, parse_onnx
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from beers_deploy.quant.untrusted import FILE_BYTES
 from tests.deploy.dpu.graphs import Sketch, board_convbeers, float_convbeers, integer_convbeers
-from tests.quant.simplify.networks import node
+from tests.quant.simplify.networks import parsed
 
 Change = Callable[[onnx.ModelProto], object]
 IMAGE = np.full((1, 1, 12, 14), 0.25, np.float32)
@@ -87,16 +87,12 @@ def typed(kind: int) -> Change:
     ("change", "words"),
     [
         (stating(10**6, 10**6, 10**6), "1000000 x 1000000 x 1000000"),
-        (stating(2**62, 4), "4.61168601843e+18 x 4 values, but the file holds 36"),
         (stating(-4, 1, 3, 3), "each 0 or more"),
         (stating(4, 1, 3, 4), "holds 36"),
         (stating(*[1] * 17), "at most 16 dimensions"),
-        (stating(0), "holds 36"),
         (sized(1, 1, 2**40, 2**40), "values"),
         (sized(1, 1, -5, 640), "-5"),
-        (sized(2**62, 2**62, 2**62, 2**62), "values"),
         (typed(TensorProto.STRING), "STRING"),
-        (typed(TensorProto.COMPLEX64), "COMPLEX64"),
         (typed(TensorProto.INT4), "INT4"),
         (typed(0), "UNDEFINED"),
         (typed(12345), "12345"),
@@ -113,111 +109,68 @@ def test_what_a_file_states_but_does_not_hold_is_refused(
         assert words in refusal(model, to_run)
 
 
-def constant(name: str, *values: float, kind: type = np.int64) -> onnx.NodeProto:
-    return helper.make_node(
-        "Constant", [], [name], value=numpy_helper.from_array(np.array(values, kind))
-    )
+def constant(name: str, *values: int) -> str:
+    """Return a node of ONNX's text format that holds integers."""
+    numbers = ", ".join(map(str, values))
+    return f"{name} = Constant<value = int64[{len(values)}] {{{numbers}}}>() "
 
 
-def ends(*names: str, kind: int = TensorProto.BOOL) -> list[onnx.ValueInfoProto]:
-    return [helper.make_tensor_value_info(name, kind, []) for name in names]
+FILLED = "a = ConstantOfShape(n) "
+LOOP = "body (int64 i, bool go) => (bool again) { again = Identity(go) }"
+LARGE = "s = Constant<value = float[4] {1, 1, 1000000, 1000000}>() "
+REFUSED = [
+    ("y = ai.foreign.Evil(image)", "Evil y of 'ai.foreign'"),
+    ("y = com.microsoft.FusedConv(image)", "FusedConv"),
+    (f"y = Loop<body = {LOOP}>(, )", "Loop y in untrusted.onnx contains a graph"),
+    (constant("n", 2**20, 2**20) + FILLED, "values"),
+    (
+        constant("n", 2**27 + 1) + FILLED + "b = ConstantOfShape(n)",
+        "'all filled constants' in untrusted.onnx has the size 268435458",
+    ),
+    (constant("n", 5000) + FILLED + "b = ConstantOfShape(a)", "a size that other nodes compute"),
+    (
+        constant("n", 3000) + FILLED + "b = Concat<axis=0>(a, a) c = Add(b, b)",
+        "Concat b in untrusted.onnx reads constants only",
+    ),
+    (constant("n", 9, 9) + "y = CumSum(n, n)", "reads constants only"),
+    (
+        constant("n", 9) + constant("r", 2**20, 2**10) + "y = Expand(n, r)",
+        "1048576 x 1024, but a tensor may have at most",
+    ),
+    (
+        constant("n", *range(9)) + constant("r", 999) + "b = Tile(n, r) y = Tile(b, r)",
+        "a size that other nodes compute",
+    ),
+    (
+        constant("n", 9, 9) + constant("i", 7) + "y = Gather(n, i)",
+        "Gather y in untrusted.onnx reads constants only",
+    ),
+    ("y = RandomNormal<shape=[1048576,1048576]>()", "values"),
+    (constant("n", 1, 1, 2**20, 2**20) + "y = Expand(image, n)", "Expand"),
+    (
+        constant("n", 1, 1, 2000, 1) + "y = Tile(image, n)",
+        "Tile y in untrusted.onnx enlarges by",
+    ),
+    (LARGE + "y = Resize(image, , s)", "enlarges by 1 x 1 x 1000000 x 1000000"),
+    (constant("a", 1, 1, 9, 9) + "b = Neg(a) y = Expand(image, b)", "-9"),
+    (constant("a", 1, 1, 2**14, 2**14) + "b = Mul(a, a) y = Expand(image, b)", "268435456"),
+    (
+        constant("n", 5000) + FILLED + "y = Expand(image, a)",
+        "Expand y in untrusted.onnx has a size that other nodes compute",
+    ),
+    (
+        "y = MaxPool<kernel_shape=[3,3], pads=[1073741824,0,0,0]>(image)",
+        "has pads of 1073741824",
+    ),
+    ("y = DepthToSpace<blocksize=1048576>(image)", "has blocksize of 1048576"),
+]
 
 
-INPUTS = [*ends("i", kind=TensorProto.INT64), *ends("cond")]
-LOOP = helper.make_graph([node("Identity", "cond", to="again")], "body", INPUTS, ends("again"))
-SIZE_5000 = constant("n", 5000)
-SIZE_3000 = constant("n", 3000)
-
-
-def filled(to: str, by: str = "n") -> onnx.NodeProto:
-    return node("ConstantOfShape", by, to=to)
-
-
-@pytest.mark.parametrize(
-    ("nodes", "words"),
-    [
-        ([node("Evil", "image", domain="ai.foreign")], "Evil y of 'ai.foreign'"),
-        ([node("FusedConv", "image", domain="com.microsoft")], "FusedConv"),
-        ([node("LinearRegressor", "image", domain="ai.onnx.ml")], "LinearRegressor"),
-        (
-            [helper.make_node("Loop", ["", ""], [], body=LOOP)],
-            "Loop in untrusted.onnx contains a graph",
-        ),
-        ([constant("n", 2**20, 2**20), filled("y")], "values"),
-        (
-            [constant("n", 2**27 + 1), filled("a"), filled("b")],
-            "'all filled constants' in untrusted.onnx has the size 268435458",
-        ),
-        ([SIZE_5000, filled("a"), filled("b", by="a")], "a size that other nodes compute"),
-        (
-            [
-                SIZE_3000,
-                filled("a"),
-                node("Concat", "a", "a", to="b", axis=0),
-                node("Add", "b", "b", to="c"),
-            ],
-            "Concat b in untrusted.onnx reads constants only",
-        ),
-        ([constant("n", 9, 9), node("CumSum", "n", "n")], "reads constants only"),
-        (
-            [constant("n", 9), constant("r", 2**20, 2**10), node("Expand", "n", "r")],
-            "1048576 x 1024, but a tensor may have at most",
-        ),
-        (
-            [constant("n", 9), constant("r", 2**14, 2**13), *[node("Expand", "n", "r")] * 3],
-            "'all filled constants' in untrusted.onnx has the size 402653184",
-        ),
-        (
-            [
-                constant("n", *range(9)),
-                constant("r", 999),
-                node("Tile", "n", "r", to="b"),
-                node("Tile", "b", "r"),
-            ],
-            "a size that other nodes compute",
-        ),
-        (
-            [constant("n", 9, 9), constant("i", 7), node("Gather", "n", "i")],
-            "Gather y in untrusted.onnx reads constants only",
-        ),
-        ([node("RandomNormal", shape=[2**20, 2**20])], "values"),
-        ([constant("n", 1, 1, 2**20, 2**20), node("Expand", "image", "n")], "Expand"),
-        (
-            [constant("n", 1, 1, 2000, 1), node("Tile", "image", "n")],
-            "Tile y in untrusted.onnx enlarges by",
-        ),
-        ([constant("n", *[9**9] * 8), node("Pad", "image", "n")], "enlarges by"),
-        (
-            [constant("s", 1, 1, 1e6, 1e6, kind=np.float32), node("Resize", "image", "", "s")],
-            "enlarges by 1 x 1 x 1000000 x 1000000",
-        ),
-        ([constant("a", 1, 1, 9, 9), node("Neg", "a", to="b"), node("Expand", "image", "b")], "-9"),
-        (
-            [
-                constant("a", 1, 1, 2**14, 2**14),
-                node("Mul", "a", "a", to="b"),
-                node("Expand", "image", "b"),
-            ],
-            "268435456",
-        ),
-        (
-            [SIZE_5000, filled("a"), node("Expand", "image", "a")],
-            "Expand y in untrusted.onnx has a size that other nodes compute",
-        ),
-        (
-            [node("MaxPool", "image", kernel_shape=[3, 3], pads=[2**30] * 4)],
-            "has pads of 1073741824",
-        ),
-        ([node("DepthToSpace", "image", blocksize=2**20)], "has blocksize of 1048576"),
-    ],
-)
+@pytest.mark.parametrize(("nodes", "words"), REFUSED)
 def test_what_a_runtime_would_do_for_an_untrusted_file_is_refused(
-    nodes: list[onnx.NodeProto], words: str, model: onnx.ModelProto
+    nodes: str, words: str, model: onnx.ModelProto
 ) -> None:
-    model.graph.node.extend(nodes)
-    model.opset_import.extend(
-        helper.make_opsetid(domain, 1) for domain in {n.domain for n in nodes if n.domain}
-    )
+    model.graph.node.extend(parsed(nodes, "float[1] image => float[1] y").graph.node)
     # ONNX's own checker would refuse some of these first, with other words.
     with patch("onnx.checker.check_model"):
         assert words in refusal(model)
@@ -277,12 +230,6 @@ def test_every_truncation_of_a_file_is_refused_or_sound(model: onnx.ModelProto) 
     assert refused >= len(content) // 37 - 5
 
 
-def test_a_network_whose_output_is_no_image_keeps_its_size(model: onnx.ModelProto) -> None:
-    sized(1, 1, 16, 16)(model)
-    del model.graph.output[0].type.tensor_type.shape.dim[3]
-    assert any_size(model) is model
-
-
 def test_a_network_that_fails_on_an_image_is_one_sentence(tmp_path: Path) -> None:
     sketch = Sketch(1)
     sketch.node("Add", "image", sketch.constant(np.zeros((1, 1, 5, 5), np.float32)))
@@ -305,15 +252,6 @@ def test_weights_without_sizes_are_one_sentence(tmp_path: Path) -> None:
     tensor.CopyFrom(numpy_helper.from_array(np.array(1, np.int8), weight))
     with pytest.raises(ModelError):
         open_session(parse_onnx(model.SerializeToString(), "flat.onnx"), 1)
-
-
-def test_an_unknown_operator_of_two_tensors_hides_the_shape(tmp_path: Path) -> None:
-    sketch = Sketch(1)
-    scale = sketch.constant(np.array(0.5, np.float32))
-    unknown = sketch.node("QLinearMystery", "image", scale, "image", domain="com.microsoft")
-    assert (
-        read_network(sketch.save(tmp_path / "a.onnx", unknown), 32).operations[0].out_shape is None
-    )
 
 
 def test_a_long_chain_of_activations_is_followed_in_a_moment(tmp_path: Path) -> None:

@@ -1,16 +1,16 @@
 """Both ends of a network: channels last, as in TensorFlow, missing borders, and strided slices."""
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import onnx
 import pytest
-from onnx import TensorProto, helper
 
 from beers_deploy.quant.graph import read_network, refusal
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.simplify import simplify
-from tests.quant.simplify.networks import CHANNELS, conv, made, node
+from tests.quant.simplify.networks import CHANNELS, CONV, SAME, made
 
 IMAGE = np.random.default_rng(4).uniform(0, 1, (1, CHANNELS, 18, 23)).astype(np.float32)
 
@@ -27,26 +27,18 @@ def sized(model: onnx.ModelProto, rows: int, columns: int) -> onnx.ModelProto:
 
 def test_a_network_of_channels_last_becomes_one_of_channels_first() -> None:
     """TensorFlow's exporters leave a Transpose at either end."""
-    first = [0, 3, 1, 2]
-    last = [0, 2, 3, 1]
-    nodes = [
-        node("Transpose", "x", to="t", perm=first),
-        conv("t", "c"),
-        node("Transpose", "c", perm=last),
-    ]
-    model = made(nodes)
-    sizes = [
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", "H", "W", CHANNELS])
-        for name in ("x", "y")
-    ]
-    model.graph.input[0].CopyFrom(sizes[0])
-    model.graph.output[0].CopyFrom(sizes[1])
+    sizes = f"[N,H,W,{CHANNELS}]"
+    model = made(
+        f"t = Transpose<perm=[0,3,1,2]>(x) c = {SAME}(t, w) y = Transpose<perm=[0,2,3,1]>(c)",
+        ends=f"float{sizes} x => float{sizes} y",
+    )
     short = simplify(model, "a.onnx")
     assert [n.op_type for n in short.graph.node] == ["Conv"]
     assert short.graph.input[0].type.tensor_type.shape.dim[1].dim_value == CHANNELS
     onnx.checker.check_model(short, full_check=True)
-    before = result_of(open_session(model), IMAGE.transpose(last)).transpose(first)
-    np.testing.assert_allclose(result_of(open_session(short), IMAGE), before, rtol=1e-5)
+    before = result_of(open_session(model), np.moveaxis(IMAGE, 1, 3))
+    after = result_of(open_session(short), IMAGE)
+    np.testing.assert_allclose(np.moveaxis(after, 1, 3), before, rtol=1e-5)
 
 
 @pytest.mark.parametrize("layers", [1, 2, 5])
@@ -54,7 +46,7 @@ def test_a_network_of_channels_last_becomes_one_of_channels_first() -> None:
 def test_the_image_of_a_network_without_padding_is_mirrored(layers: int, is_fixed: bool) -> None:
     """Inside the border it computes what it computed before, at a fixed size as at any."""
     tensors = ["x", *(f"c{k}" for k in range(1, layers)), "y"]
-    model = made([conv(a, b, pad_px=0) for a, b in pairwise(tensors)])
+    model = made(" ".join(f"{to} = Conv({source}, w)" for source, to in pairwise(tensors)))
     if is_fixed:
         model = sized(model, *IMAGE.shape[2:])
     short = simplify(model, "a.onnx")
@@ -68,11 +60,7 @@ def test_the_image_of_a_network_without_padding_is_mirrored(layers: int, is_fixe
 
 def test_a_network_that_pools_over_the_image_gets_no_border() -> None:
     """A larger image would change the mean, and with it the result inside the border."""
-    nodes = [
-        conv("x", "c", pad_px=0),
-        node("GlobalAveragePool", "c", to="pooled"),
-        node("Mul", "c", "pooled"),
-    ]
+    nodes = "c = Conv(x, w) pooled = GlobalAveragePool(c) y = Mul(c, pooled)"
     model = sized(made(nodes), *IMAGE.shape[2:])
     short = simplify(model, "a.onnx")
     assert "Pad" not in {n.op_type for n in short.graph.node}
@@ -82,7 +70,7 @@ def test_a_network_that_pools_over_the_image_gets_no_border() -> None:
 
 def test_layers_with_and_without_padding_together_are_refused() -> None:
     """Zeros that a layer pads with would lie beyond a mirrored border."""
-    model = made([conv(), conv("c", "y", pad_px=0)])
+    model = made(f"{CONV} y = Conv(c, w)")
     short = simplify(model, "a.onnx")
     assert [n.op_type for n in short.graph.node] == ["Conv", "Conv"]
     reason = refusal(short)
@@ -91,18 +79,17 @@ def test_layers_with_and_without_padding_together_are_refused() -> None:
 
 def test_slices_side_by_side_are_a_pixel_unshuffle() -> None:
     """YOLO's Focus layer has the columns of a block before its rows."""
-    starts = {"0 0": [0, 0], "1 0": [1, 0], "0 1": [0, 1], "1 1": [1, 1]}
-    constants = {"ends": [999, 999], "rows and columns": [2, 3], "by two": [2, 2], **starts}
-    slices = [
-        node("Slice", "x", name, "ends", "rows and columns", "by two", to=f"s{name}")
-        for name in starts
-    ]
-    joined = node("Concat", *(f"s{name}" for name in starts), to="j", axis=1)
-    model = made([*slices, joined, conv("j", "y", "focus")])
-    weight = np.random.default_rng(0).normal(0, 1, (3, 4 * CHANNELS, 3, 3)).astype(np.float32)
-    tensors = {name: np.array(numbers) for name, numbers in constants.items()} | {"focus": weight}
-    for name, value in tensors.items():
-        model.graph.initializer.append(onnx.numpy_helper.from_array(value, name))
+    starts: dict[str, Any] = {"a": [0, 0], "b": [1, 0], "c": [0, 1], "d": [1, 1]}
+    cuts = [f"cut_{name} = Slice(x, {name}, far, axes, by_two)" for name in starts]
+    joined = f"j = Concat<axis=1>({', '.join(f'cut_{name}' for name in starts)})"
+    weight = np.random.default_rng(0).normal(0, 1, (3, 4 * CHANNELS, 3, 3))
+    model = made(
+        f"{' '.join(cuts)} {joined} y = {SAME}(j, focus)",
+        far=[999, 999],
+        by_two=[2, 2],
+        focus=weight,
+        **starts,
+    )
     short = simplify(model, "a.onnx")
     assert [n.op_type for n in short.graph.node] == ["SpaceToDepth", "Conv"]
     assert len(read_network(short).front) == 1

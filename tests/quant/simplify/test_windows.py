@@ -6,31 +6,21 @@ import numpy as np
 import onnx
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from onnx import TensorProto, helper, numpy_helper
 
 from beers_deploy.quant.graph import read_network, refusal
 from beers_deploy.quant.onnx.graph import OnnxGraph
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.large_kernels import LARGE_POSITIONS, MOST_POSITIONS
 from beers_deploy.quant.simplify.simplify import simplify
+from tests.quant.simplify.networks import made
 
 CHANNELS = 3
-OPSET = 17
+ENDS = f"float[N,{CHANNELS},H,W] x => float[N,C,h,w] y"
 
 
 def drawn(generator: np.random.Generator, *shape: int, deviation: float = 1) -> np.ndarray:
     """Draw normally distributed float32 weights of a shape."""
     return generator.normal(0, deviation, shape).astype(np.float32)
-
-
-def network(nodes: list[onnx.NodeProto], **constants: np.ndarray) -> onnx.ModelProto:
-    """Return a network of `CHANNELS` channels from `x` to `y`, for images of any size."""
-    initializers = [numpy_helper.from_array(value, name) for name, value in constants.items()]
-    image = helper.make_tensor_value_info("x", TensorProto.FLOAT, ["N", CHANNELS, "H", "W"])
-    result = helper.make_tensor_value_info("y", TensorProto.FLOAT, ["N", "C", "h", "w"])
-    graph = helper.make_graph(nodes, "g", [image], [result], initializers)
-    opset = helper.make_opsetid("", OPSET)
-    return helper.make_model(graph, opset_imports=[opset], ir_version=8)
 
 
 def assert_same(model: onnx.ModelProto, short: onnx.ModelProto, rows: int, columns: int) -> None:
@@ -74,9 +64,8 @@ def test_a_large_kernel_is_several_small_ones_and_their_sum(
     generator = np.random.default_rng(kernel)
     weight = drawn(generator, outputs, CHANNELS, *kernel)
     bias = drawn(generator, outputs)
-    windows: dict[str, Any] = {"pads": pads, "strides": strides, "dilations": dilations}
-    node = helper.make_node("Conv", ["x", "w", "b"], ["y"], "large", kernel_shape=kernel, **windows)
-    model = network([node], w=weight, b=bias)
+    window = f"pads={pads}, strides={list(strides)}, dilations={list(dilations)}"
+    model = made(f"y = Conv<{window}>(x, w, b)", ends=ENDS, w=weight, b=bias)
     short = simplify(model, "a.onnx")
     graph = OnnxGraph(short)
     convs = [node for node in graph.nodes if node.op_type == "Conv"]
@@ -103,9 +92,7 @@ def test_srresnets_kernels_of_9_x_9_are_two_and_a_sum() -> None:
     The last one keeps the name of the layer and has its ReLU, so that reports name what users know.
     """
     weight = drawn(np.random.default_rng(0), CHANNELS, CHANNELS, 9, 9)
-    conv = helper.make_node("Conv", ["x", "w"], ["c"], "head", pads=[4] * 4)
-    relu = helper.make_node("Relu", ["c"], ["y"])
-    model = network([conv, relu], w=weight)
+    model = made("[head] c = Conv<pads=[4,4,4,4]>(x, w) y = Relu(c)", ends=ENDS, w=weight)
     short = simplify(model, "a.onnx")
     names = [op.name for op in read_network(short).graph]
     assert names == ["head.rows_0", "head.rows_1", "head.rows", "head"]
@@ -128,11 +115,10 @@ def test_a_crop_is_a_convolution_that_reads_one_pixel(
     cut = {axis: px for axis, px in zip((2, 3), border, strict=True) if px}
     assume(cut)
     weight = drawn(np.random.default_rng(0), CHANNELS, CHANNELS, 3, 3)
-    crop = helper.make_node("Slice", ["x", "starts", "ends", "axes"], ["s"], "crop")
-    conv = helper.make_node("Conv", ["s", "w"], ["y"], "conv", pads=[pad] * 4)
-    axes = np.array(list(cut))
     places = np.array(list(cut.values()))
-    model = network([crop, conv], w=weight, starts=places, ends=-places, axes=axes)
+    constants: dict[str, Any] = {"w": weight, "starts": places, "stops": -places, "axes": list(cut)}
+    nodes = f"s = Slice(x, starts, stops, axes) y = Conv<pads={[pad] * 4}>(s, w)"
+    model = made(nodes, ends=ENDS, **constants)
     short = simplify(model, "a.onnx")
     kinds = [node.op_type for node in short.graph.node]
     assert "Slice" not in kinds
@@ -146,26 +132,23 @@ def test_a_u_net_without_padding_crops_its_skip_and_gets_a_mirrored_border() -> 
     Published ones, such as waifu2x's, are of this kind. Inside of the border nothing changes.
     """
     generator = np.random.default_rng(0)
-    sides = {"w": 3, "half": 2, "double": 4}
-    constants = {
+    sides = {"w": 3, "halved": 2, "double": 4}
+    constants: dict[str, Any] = {
         name: drawn(generator, CHANNELS, CHANNELS, side, side, deviation=0.3)
         for name, side in sides.items()
     }
-    constants["four"] = np.array([4, 4])
-    constants["less"] = -constants["four"]
-    constants["axes"] = np.array([2, 3])
-    nodes = [
-        helper.make_node("Conv", ["x", "w"], ["a"], "a"),
-        helper.make_node("Conv", ["a", "half"], ["b"], "b", strides=[2, 2]),
-        helper.make_node("Conv", ["b", "w"], ["c"], "c"),
-        helper.make_node(
-            "ConvTranspose", ["c", "double"], ["d"], "d", strides=[2, 2], pads=[3] * 4
-        ),
-        helper.make_node("Slice", ["a", "four", "less", "axes"], ["s"], "s"),
-        helper.make_node("Add", ["s", "d"], ["e"], "e"),
-        helper.make_node("Conv", ["e", "w"], ["y"], "y"),
-    ]
-    model = network(nodes, **constants)
+    constants["begin"] = np.array([4, 4])
+    constants["stop"] = -constants["begin"]
+    nodes = """
+        a = Conv(x, w)
+        less = Conv<strides=[2,2]>(a, halved)
+        c = Conv(less, w)
+        d = ConvTranspose<strides=[2,2], pads=[3,3,3,3]>(c, double)
+        s = Slice(a, begin, stop, axes)
+        e = Add(s, d)
+        y = Conv(e, w)
+    """
+    model = made(nodes, ends=ENDS, **constants)
     short = simplify(model, "a.onnx")
     assert refusal(short) == ""
     assert read_network(short).border_px == 6

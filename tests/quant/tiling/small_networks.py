@@ -3,31 +3,44 @@ enlargements, joins.
 """
 
 import math
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
 import numpy as np
 import onnx
 import torch
-from onnx import TensorProto, helper, numpy_helper
+from numpy.typing import ArrayLike
+from onnx import helper, numpy_helper
 
 from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.convbeers import ConvBEERS, initialise
 from beers_deploy.model.variants import Variant
-from beers_deploy.quant.domains import MICROSOFT
 from beers_deploy.quant.onnx_file import any_size, image_info, make_model
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from tests.quant.quick import patches_of, quickly
+from tests.quant.simplify.networks import parsed
 
 
-def constant(name: str, *shape: int) -> onnx.TensorProto:
-    """Random weights, such that values keep their size from layer to layer."""
-    values = np.random.default_rng(list(name.encode())).normal(size=shape)
-    return numpy_helper.from_array(
-        (values / math.sqrt(math.prod(shape[1:]))).astype(np.float32), name
-    )
+def weights(**shapes: tuple[int, ...]) -> dict[str, ArrayLike]:
+    """Return random weights, such that values keep their size from layer to layer."""
+    return {
+        name: np.random.default_rng(list(name.encode())).normal(size=shape)
+        / math.sqrt(math.prod(shape[1:]))
+        for name, shape in shapes.items()
+    }
+
+
+def network(
+    nodes: str, constants: Mapping[str, ArrayLike], bands: tuple[int, int] = (1, 1)
+) -> onnx.ModelProto:
+    """Return a network from `image` to `restored`, from ONNX's text format."""
+    ends = f"float[N,{bands[0]},H,W] image => float[N,{bands[1]},P,Q] restored"
+    model = parsed(nodes, ends, constants=constants)
+    onnx.checker.check_model(model)
+    return model
 
 
 def whole(name: str, *values: int) -> onnx.TensorProto:
@@ -86,147 +99,118 @@ class Row:
         return graph(self.nodes, *self.weights, bands=bands)
 
 
+SAME = "Conv<pads=[1,1,1,1]>"
+
+
 def float_unet() -> onnx.ModelProto:
     """Convolution, pool, convolution, transposed convolution, beside the first, convolution."""
-    row = Row().add("Conv", constant("first", 2, 1, 3, 3), pads=[1] * 4)
-    first = row.tensor
-    row.add("MaxPool", kernel_shape=[2, 2], strides=[2, 2]).add(
-        "Conv", constant("middle", 2, 2, 3, 3), pads=[1] * 4
-    )
-    row.add("ConvTranspose", constant("up", 2, 2, 2, 2), strides=[2, 2]).add(
-        "Concat", first, axis=1
-    )
-    return row.add("Conv", constant("last", 1, 4, 3, 3), pads=[1] * 4).model()
-
-
-UNIT = ["unit", "zero"]
-
-
-def int8_conv(source: str, weight: str, result: str, stride: int = 1) -> onnx.NodeProto:
-    feeds = [source, *UNIT, weight, "fine", "none", *UNIT]
-    return helper.make_node(
-        "QLinearConv", feeds, [result], name=result, pads=[1] * 4, strides=[stride] * 2
-    )
-
-
-def int8_graph(
-    nodes: list[onnx.NodeProto], unit: float, **weights: tuple[int, ...]
-) -> onnx.ModelProto:
-    """A network in whole numbers: `unit` is what 1 stands for, `weights` are
-    the shapes of those.
+    nodes = f"""
+        a = {SAME}(image, first)
+        half = MaxPool<kernel_shape=[2,2], strides=[2,2]>(a)
+        b = {SAME}(half, middle)
+        c = ConvTranspose<strides=[2,2]>(b, up)
+        both = Concat<axis=1>(c, a)
+        restored = {SAME}(both, last)
     """
-    numbers = {
-        "unit": np.float32(unit),
-        "coarse": np.float32(16),
-        "fine": np.float32(2**-6),
+    shapes = {"first": (2, 1, 3, 3), "middle": (2, 2, 3, 3), "up": (2, 2, 2, 2)}
+    return network(nodes, weights(**shapes, last=(1, 4, 3, 3)))
+
+
+CONV = "QLinearConv<pads=[1,1,1,1], strides=[{0},{0}]>({1}, unit, zero, {2}, fine, no, unit, zero)"
+"""An integer convolution of stride, tensor and weights."""
+CORNER = 'coordinate_transformation_mode="asymmetric"'
+
+
+def int8_network(nodes: str, unit: float, **shapes: tuple[int, ...]) -> onnx.ModelProto:
+    """Return a network on integers, of which one represents `unit`."""
+    numbers: dict[str, ArrayLike] = {
+        "unit": unit,
+        "coarse": 16.0,
+        "fine": 2**-6,
         "zero": np.uint8(128),
-        "none": np.int8(0),
-        "four": np.array([1, 1, 4, 4], np.float32),
+        "no": np.int8(0),
+        "four": [1.0, 1.0, 4.0, 4.0],
         "table": np.random.default_rng(3).permutation(256).astype(np.uint8),
     }
-    for name, shape in weights.items():
-        numbers[name] = (
-            np.random.default_rng(list(name.encode())).integers(-60, 61, shape).astype(np.int8)
-        )
-    return graph(
-        nodes,
-        *(numpy_helper.from_array(np.asarray(value), name) for name, value in numbers.items()),
-    )
+    for name, shape in shapes.items():
+        generator = np.random.default_rng(list(name.encode()))
+        numbers[name] = generator.integers(-60, 61, shape).astype(np.int8)
+    return network(nodes, numbers)
 
 
 def int8_unet() -> onnx.ModelProto:
-    """In whole numbers, with the activations that an INT8 file may have, on a lattice of 4."""
-    nodes = [
-        helper.make_node("QuantizeLinear", ["image", "coarse", "zero"], ["q"]),
-        int8_conv("q", "first", "a"),
-        helper.make_node(
-            "QLinearLeakyRelu", ["a", *UNIT, *UNIT], ["leaky"], domain=MICROSOFT, alpha=0.1
-        ),
-        int8_conv("leaky", "down", "half", 2),
-        helper.make_node("Cast", ["half"], ["places"], to=TensorProto.INT32),
-        helper.make_node("Gather", ["table", "places"], ["bent"]),
-        helper.make_node(
-            "QLinearAveragePool",
-            ["bent", *UNIT, *UNIT],
-            ["mean"],
-            domain=MICROSOFT,
-            kernel_shape=[2, 2],
-            strides=[2, 2],
-        ),
-        helper.make_node(
-            "Resize", ["mean", "", "four"], ["wide"], coordinate_transformation_mode="asymmetric"
-        ),
-        helper.make_node(
-            "QLinearMul", ["wide", *UNIT, "leaky", *UNIT, *UNIT], ["gated"], domain=MICROSOFT
-        ),
-        helper.make_node(
-            "QLinearConcat", [*UNIT, "gated", *UNIT, "q", *UNIT], ["both"], domain=MICROSOFT, axis=1
-        ),
-        int8_conv("both", "last", "end"),
-        helper.make_node("DequantizeLinear", ["end", *UNIT], ["restored"]),
-    ]
-    return int8_graph(nodes, 0.5, first=(2, 1, 3, 3), down=(2, 2, 3, 3), last=(1, 3, 3, 3))
+    """On integers, with the activations that an INT8 file may have, on a lattice of 4."""
+    unit = "unit, zero"
+    nodes = f"""
+        q = QuantizeLinear(image, coarse, zero)
+        a = {CONV.format(1, "q", "first")}
+        leaky = com.microsoft.QLinearLeakyRelu<alpha=0.1>(a, {unit}, {unit})
+        half = {CONV.format(2, "leaky", "down")}
+        places = Cast<to=6>(half)
+        bent = Gather(table, places)
+        mean = com.microsoft.QLinearAveragePool<kernel_shape=[2,2], strides=[2,2]>(
+            bent, {unit}, {unit}
+        )
+        wide = Resize<{CORNER}>(mean, , four)
+        gated = com.microsoft.QLinearMul(wide, {unit}, leaky, {unit}, {unit})
+        both = com.microsoft.QLinearConcat<axis=1>({unit}, gated, {unit}, q, {unit})
+        end = {CONV.format(1, "both", "last")}
+        restored = DequantizeLinear(end, {unit})
+    """
+    return int8_network(nodes, 0.5, first=(2, 1, 3, 3), down=(2, 2, 3, 3), last=(1, 3, 3, 3))
 
 
 def espcn() -> onnx.ModelProto:
     """Twice the size by a pixel shuffle."""
-    row = Row().add("Conv", constant("in", 8, 1, 5, 5), pads=[2] * 4).add("Relu")
-    return (
-        row.add("Conv", constant("out", 4, 8, 3, 3), pads=[1] * 4)
-        .add("DepthToSpace", blocksize=2, mode="CRD")
-        .model()
-    )
+    nodes = f"""
+        a = Conv<pads=[2,2,2,2]>(image, in)
+        b = Relu(a)
+        c = {SAME}(b, out)
+        restored = DepthToSpace<blocksize=2, mode="CRD">(c)
+    """
+    return network(nodes, weights(**{"in": (8, 1, 5, 5), "out": (4, 8, 3, 3)}))
 
 
 def four_bands(bands_out: int = 4) -> onnx.ModelProto:
     """Bands that are restored together, or made into others."""
-    row = Row().add("Conv", constant("in", 8, 4, 3, 3), pads=[1] * 4).add("Relu")
-    return row.add("Conv", constant("out", bands_out, 8, 3, 3), pads=[1] * 4).model((4, bands_out))
+    nodes = f"a = {SAME}(image, in) b = Relu(a) restored = {SAME}(b, out)"
+    shapes = {"in": (8, 4, 3, 3), "out": (bands_out, 8, 3, 3)}
+    return network(nodes, weights(**shapes), (4, bands_out))
 
 
 def ffdnet() -> onnx.ModelProto:
     """Half the size inside, by a pixel unshuffle in front and a shuffle behind."""
-    row = (
-        Row().add("SpaceToDepth", blocksize=2).add("Conv", constant("in", 8, 4, 3, 3), pads=[1] * 4)
-    )
-    row.add("Clip", real(0), real(6)).add(
-        "Conv", constant("out", 4, 8, 3, 3), pads=[2] * 4, dilations=[2, 2]
-    )
-    return row.add("DepthToSpace", blocksize=2).model()
+    nodes = f"""
+        places = SpaceToDepth<blocksize=2>(image)
+        a = {SAME}(places, in)
+        b = Clip(a, low, high)
+        c = Conv<pads=[2,2,2,2], dilations=[2,2]>(b, out)
+        restored = DepthToSpace<blocksize=2>(c)
+    """
+    constants = weights(**{"in": (8, 4, 3, 3), "out": (4, 8, 3, 3)})
+    return network(nodes, {**constants, "low": 0.0, "high": 6.0})
 
 
 def plain_int8_unet() -> onnx.ModelProto:
-    """In whole numbers and operators of ONNX itself, on a lattice of 8."""
-
-    def conv(source: str, weight: str, result: str, stride: int = 1) -> list[onnx.NodeProto]:
-        relu = helper.make_node("Max", [f"{result}.sum", "zero"], [result])
-        return [int8_conv(source, weight, f"{result}.sum", stride), relu]
-
-    nodes = [
-        helper.make_node("QuantizeLinear", ["image", *UNIT], ["q"]),
-        *conv("q", "first", "a"),
-        helper.make_node("MaxPool", ["a"], ["half"], kernel_shape=[2, 2], strides=[2, 2]),
-        *conv("half", "second", "b", 2),
-        *conv("b", "third", "c", 2),
-        helper.make_node("DepthToSpace", ["c"], ["larger"], blocksize=2),
-        helper.make_node(
-            "Resize",
-            ["larger", "", "four"],
-            ["wide"],
-            coordinate_transformation_mode="asymmetric",
-            nearest_mode="floor",
-        ),
-        helper.make_node("Concat", ["wide", "a"], ["both"], axis=1),
-        *conv("both", "last", "end"),
-        helper.make_node("DequantizeLinear", ["end", *UNIT], ["restored"]),
-    ]
-    weights = {
-        "first": (2, 1, 3, 3),
-        "second": (4, 2, 3, 3),
-        "third": (8, 4, 3, 3),
-        "last": (1, 4, 3, 3),
-    }
-    return int8_graph(nodes, 2**-7, **weights)
+    """On integers and operators of ONNX itself, on a lattice of 8."""
+    nodes = f"""
+        q = QuantizeLinear(image, unit, zero)
+        a_sum = {CONV.format(1, "q", "first")}
+        a = Max(a_sum, zero)
+        half = MaxPool<kernel_shape=[2,2], strides=[2,2]>(a)
+        b_sum = {CONV.format(2, "half", "second")}
+        b = Max(b_sum, zero)
+        c_sum = {CONV.format(2, "b", "third")}
+        c = Max(c_sum, zero)
+        larger = DepthToSpace<blocksize=2>(c)
+        wide = Resize<{CORNER}, nearest_mode="floor">(larger, , four)
+        both = Concat<axis=1>(wide, a)
+        end_sum = {CONV.format(1, "both", "last")}
+        end = Max(end_sum, zero)
+        restored = DequantizeLinear(end, unit, zero)
+    """
+    shapes = {"first": (2, 1, 3, 3), "second": (4, 2, 3, 3), "third": (8, 4, 3, 3)}
+    return int8_network(nodes, 2**-7, **shapes, last=(1, 4, 3, 3))
 
 
 def half_resolution() -> onnx.ModelProto:

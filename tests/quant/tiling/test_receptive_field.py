@@ -3,220 +3,187 @@ elsewhere.
 """
 
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 import onnx
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from onnx import TensorProto, helper
+from onnx import numpy_helper
 
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.quant.tiling.receptive_field import Tiling, tiling_of
+from tests.quant.simplify.networks import parsed
 from tests.quant.tiling.random_networks import networks
 from tests.quant.tiling.small_networks import (
-    Row,
     check_tiles,
-    constant,
     float_unet,
-    graph,
     int8_unet,
-    real,
     taps,
-    whole,
 )
 
-
-def one(kind: str, *others: onnx.TensorProto | str, **attributes: Any) -> onnx.ModelProto:
-    return Row().add(kind, *others, **attributes).model()
-
-
-def conv(rows: int = 3, columns: int = 3, **attributes: Any) -> onnx.ModelProto:
-    return one("Conv", taps("w", 1, 1, rows, columns), **attributes)
-
-
-def transposed(side: int, stride: int, **attributes: Any) -> onnx.ModelProto:
-    return one("ConvTranspose", taps("w", 1, 1, side, side), strides=[stride] * 2, **attributes)
-
-
-def resized(mode: str, where: str, factor: float, **attributes: Any) -> onnx.ModelProto:
-    scales = real(1, 1, factor, factor)
-    return one("Resize", "", scales, mode=mode, coordinate_transformation_mode=where, **attributes)
-
-
-def looking(pads: list[int]) -> Row:
-    """A window that looks further to one side."""
-    return Row().add("Conv", taps("w", 1, 1, 3, 3), pads=pads)
-
-
-def pad(before: int, behind: int) -> onnx.TensorProto:
-    return whole("pads", 0, 0, before, before, 0, 0, behind, behind)
-
-
-def cut(begin: tuple[int, int], end: int, step: int = 1) -> list[onnx.TensorProto]:
-    return [
-        whole("from", *begin),
-        whole("to", end, end),
-        whole("axes", 2, 3),
-        whole("steps", step, step),
-    ]
-
-
 FAR = 1 << 62
-EXACT = {
-    "3 x 3": (conv(pads=[1] * 4), Tiling(1)),
-    "5 x 3": (conv(5, 3, pads=[2, 1, 2, 1]), Tiling(2)),
-    "dilated": (conv(pads=[4] * 4, dilations=[4, 4]), Tiling(4)),
-    "one-sided": (conv(pads=[2, 0, 0, 2]), Tiling(2)),
-    "same": (conv(4, 4, auto_pad="SAME_UPPER"), Tiling(2)),
-    "same, strided": (
-        conv(4, 4, auto_pad="SAME_LOWER", strides=[3, 3]),
-        Tiling(3, 3, Fraction(1, 3)),
-    ),
-    "pool": (one("MaxPool", kernel_shape=[5, 5], pads=[2] * 4), Tiling(2)),
-    "mean": (one("AveragePool", kernel_shape=[3, 3], pads=[1] * 4), Tiling(1)),
-    "gain": (one("Mul", taps("gain", 1, 1, 1)), Tiling(0)),
-    "padded before": (
-        Row().add("Pad", pad(3, 3), mode="edge").add("Conv", taps("w", 1, 1, 7, 7)).model(),
-        Tiling(3),
-    ),
-    "looks ahead, mirrored and moved": (
-        looking([0, 0, 2, 2])
-        .add("Pad", pad(1, 0), mode="reflect")
-        .add("Slice", *cut((0, 0), -1))
-        .model(),
-        # Mirrored padding needs as many pixels as it mirrors.
-        Tiling(3, min_side_px=2),
-    ),
-    "looks back, copied and moved": (
-        looking([2, 2, 0, 0])
-        .add("Pad", pad(0, 1), mode="edge")
-        .add("Slice", *cut((1, 1), FAR))
-        .model(),
-        Tiling(2),
-    ),
-    "strided pool": (
-        one("MaxPool", kernel_shape=[2, 2], strides=[2, 2]),
-        Tiling(0, 2, Fraction(1, 2)),
-    ),
-    "strided": (conv(pads=[1] * 4, strides=[2, 2]), Tiling(2, 2, Fraction(1, 2))),
-    "odd pool": (
-        one("MaxPool", kernel_shape=[3, 3], strides=[3, 3], ceil_mode=1),
-        Tiling(0, 3, Fraction(1, 3)),
-    ),
-    "transposed": (transposed(4, 2, pads=[1] * 4), Tiling(1, 1, Fraction(2))),
-    "transposed with gaps": (transposed(2, 3, output_padding=[1, 1]), Tiling(0, 1, Fraction(3))),
-    "shuffle": (
-        Row().add("DepthToSpace", blocksize=2).model((4, 1)),
-        Tiling(0, 1, Fraction(2), 4, 1),
-    ),
-    "unshuffle": (
-        Row().add("SpaceToDepth", blocksize=2).model((1, 4)),
-        Tiling(0, 2, Fraction(1, 2), 1, 4),
-    ),
-    "nearest": (
-        resized("nearest", "asymmetric", 3, nearest_mode="floor"),
-        Tiling(0, 1, Fraction(3)),
-    ),
-    "nearest, half": (resized("nearest", "half_pixel", 2), Tiling(0, 1, Fraction(2))),
-    "linear": (resized("linear", "half_pixel", 2), Tiling(1, 1, Fraction(2))),
-    "linear down": (resized("linear", "half_pixel", 0.5), Tiling(0, 2, Fraction(1, 2))),
-    "transposed with a dilation, then windows": (
-        Row()
-        .add(
-            "ConvTranspose", taps("far", 1, 1, 2, 2), strides=[2, 2], dilations=[3, 3], pads=[1] * 4
-        )
-        .add("MaxPool", kernel_shape=[2, 2], pads=[0, 0, 1, 1])
-        .model(),
-        Tiling(1, 1, Fraction(2)),
-    ),
-    "every second": (one("Slice", *cut((1, 0), FAR, 2)), Tiling(0, 2, Fraction(1, 2))),
-    "float U-Net": (float_unet(), Tiling(6, 2)),
-    "INT8 U-Net": (int8_unet(), Tiling(8, 4)),
+SHAPES = {"w2": (2, 2), "w3": (3, 3), "w4": (4, 4), "w7": (7, 7), "w53": (5, 3)}
+CONSTANTS = {
+    **{name: numpy_helper.to_array(taps(name, 1, 1, *shape)) for name, shape in SHAPES.items()},
+    "gain": [[[3.0]]],
+    "map": np.arange(1600.0).reshape(1, 1, 40, 40),
+    "ramp": np.arange(40.0),
+    "around": [0, 0, 3, 3, 0, 0, 3, 3],
+    "before": [0, 0, 1, 1, 0, 0, 0, 0],
+    "behind": [0, 0, 0, 0, 0, 0, 1, 1],
+    "axes": [2, 3],
+    "zeros": [0, 0],
+    "ones": [1, 1],
+    "ones_back": [-1, -1],
+    "two_one": [1, 0],
+    "twos": [2, 2],
+    "far": [FAR, FAR],
+    "forties": [40, 40],
+    "sizes": [1, 1, 40, 40],
+    "half": [1.0, 1.0, 0.5, 0.5],
+    "more": [1.0, 1.0, 1.5, 1.5],
+    "double": [1.0, 1.0, 2.0, 2.0],
+    "triple": [1.0, 1.0, 3.0, 3.0],
+    "scale": [0.5],
+    "bias": [0.5],
 }
 
 
-@pytest.mark.parametrize("name", EXACT)
-def test_tiled_is_whole_and_no_smaller_halo_does(name: str) -> None:
-    model, tiling = EXACT[name]
+def model_of(nodes: str, bands: tuple[int, int] = (1, 1)) -> onnx.ModelProto:
+    """Return a network from `image` to `restored`."""
+    ends = f"float[N,{bands[0]},H,W] image => float[N,{bands[1]},P,Q] restored"
+    return parsed(f"{nodes}", ends, constants=CONSTANTS)
+
+
+HALF_PIXEL = 'coordinate_transformation_mode="half_pixel"'
+CORNER = 'coordinate_transformation_mode="asymmetric"'
+EXACT = {
+    "restored = Conv<pads=[1,1,1,1]>(image, w3)": Tiling(1),
+    "restored = Conv<pads=[2,1,2,1]>(image, w53)": Tiling(2),
+    "restored = Conv<pads=[4,4,4,4], dilations=[4,4]>(image, w3)": Tiling(4),
+    "restored = Conv<pads=[2,0,0,2]>(image, w3)": Tiling(2),
+    'restored = Conv<auto_pad="SAME_UPPER">(image, w4)': Tiling(2),
+    'restored = Conv<auto_pad="SAME_LOWER", strides=[3,3]>(image, w4)': Tiling(
+        3, 3, Fraction(1, 3)
+    ),
+    "restored = MaxPool<kernel_shape=[5,5], pads=[2,2,2,2]>(image)": Tiling(2),
+    "restored = AveragePool<kernel_shape=[3,3], pads=[1,1,1,1]>(image)": Tiling(1),
+    "restored = Mul(image, gain)": Tiling(0),
+    'p = Pad<mode="edge">(image, around) restored = Conv(p, w7)': Tiling(3),
+    # Mirrored padding needs as many pixels as it mirrors.
+    """c = Conv<pads=[0,0,2,2]>(image, w3)
+    p = Pad<mode="reflect">(c, before)
+    restored = Slice(p, zeros, ones_back, axes)""": Tiling(3, min_side_px=2),
+    """c = Conv<pads=[2,2,0,0]>(image, w3)
+    p = Pad<mode="edge">(c, behind)
+    restored = Slice(p, ones, far, axes)""": Tiling(2),
+    "restored = MaxPool<kernel_shape=[2,2], strides=[2,2]>(image)": Tiling(0, 2, Fraction(1, 2)),
+    "restored = Conv<pads=[1,1,1,1], strides=[2,2]>(image, w3)": Tiling(2, 2, Fraction(1, 2)),
+    "restored = MaxPool<kernel_shape=[3,3], strides=[3,3], ceil_mode=1>(image)": Tiling(
+        0, 3, Fraction(1, 3)
+    ),
+    "restored = ConvTranspose<strides=[2,2], pads=[1,1,1,1]>(image, w4)": Tiling(1, 1, Fraction(2)),
+    "restored = ConvTranspose<strides=[3,3], output_padding=[1,1]>(image, w2)": Tiling(
+        0, 1, Fraction(3)
+    ),
+    f'restored = Resize<{CORNER}, nearest_mode="floor">(image, , triple)': Tiling(
+        0, 1, Fraction(3)
+    ),
+    f"restored = Resize<{HALF_PIXEL}>(image, , double)": Tiling(0, 1, Fraction(2)),
+    f'restored = Resize<mode="linear", {HALF_PIXEL}>(image, , double)': Tiling(1, 1, Fraction(2)),
+    f'restored = Resize<mode="linear", {HALF_PIXEL}>(image, , half)': Tiling(0, 2, Fraction(1, 2)),
+    """c = ConvTranspose<strides=[2,2], dilations=[3,3], pads=[1,1,1,1]>(image, w2)
+    restored = MaxPool<kernel_shape=[2,2], pads=[0,0,1,1]>(c)""": Tiling(1, 1, Fraction(2)),
+    "restored = Slice(image, two_one, far, axes, twos)": Tiling(0, 2, Fraction(1, 2)),
+}
+OTHERS = {
+    "float U-Net": (float_unet(), Tiling(6, 2)),
+    "INT8 U-Net": (int8_unet(), Tiling(8, 4)),
+    "shuffle": (
+        model_of("restored = DepthToSpace<blocksize=2>(image)", (4, 1)),
+        Tiling(0, 1, Fraction(2), 4, 1),
+    ),
+    "unshuffle": (
+        model_of("restored = SpaceToDepth<blocksize=2>(image)", (1, 4)),
+        Tiling(0, 2, Fraction(1, 2), 1, 4),
+    ),
+}
+
+
+@pytest.mark.parametrize("nodes", EXACT)
+def test_tiled_is_whole_and_no_smaller_halo_does(nodes: str) -> None:
+    check_halo(model_of(nodes), EXACT[nodes], (1, 3))
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_tiled_is_whole_of_larger_networks_and_shuffles(name: str) -> None:
+    check_halo(*OTHERS[name], (2, 5))
+
+
+def check_halo(model: onnx.ModelProto, tiling: Tiling, cells: tuple[int, ...]) -> None:
+    """Check the tiling of a network, and that a shorter halo gives another result."""
     assert tiling_of(model) == tiling
-    cells = (2, 5) if "U-Net" in name else (1, 3)
     check_any(model, (25, 38), cells)
     if tiling.halo_px:
         with pytest.raises(AssertionError, match="Mismatched"):
             check_any(model, (25, 38), cells, short_px=tiling.alignment_px)
 
 
-HEAD = helper.make_node("GlobalAveragePool", ["image"], ["restored"], name="head/pool")
-ELSEWHERE = {
-    "but GlobalAveragePool head/pool reads the whole image": graph([HEAD]),
-    "InstanceNormalization restored reads the whole image": one(
-        "InstanceNormalization", constant("scale", 1), constant("bias", 1)
+HALVES = "strides=[64,64], kernel_shape=[2,2]"
+REFUSED = {
+    "but GlobalAveragePool head/pool reads the whole image": (
+        '["head/pool"] restored = GlobalAveragePool(image)'
     ),
-    "ReduceMean restored reads the whole image": one("ReduceMean", axes=[2, 3]),
-    "DynamicQuantizeLinear q reads the whole image": graph(
-        [
-            helper.make_node("DynamicQuantizeLinear", ["image"], ["q", "s", "z"]),
-            helper.make_node("DequantizeLinear", ["q", "s", "z"], ["restored"]),
-        ]
+    "InstanceNormalization restored reads the whole image": (
+        "restored = InstanceNormalization(image, scale, bias)"
     ),
-    "Flatten restored is fully connected": one("Flatten"),
-    "Softmax restored does not work along the channels": one("Softmax", axis=3),
-    "Concat restored does not work along the channels": one("Concat", "image", axis=2),
-    "Concat restored combines tensors of different sizes": Row()
-    .add("MaxPool", kernel_shape=[2, 2], strides=[2, 2])
-    .add("Concat", "image", axis=1)
-    .model((1, 2)),
-    "Resize restored resizes by 1 x 1 x 1.5 x 1.5": resized("nearest", "asymmetric", 1.5),
-    "Resize restored resizes by 3 with weights whose rounding depends on the position": resized(
-        "linear", "half_pixel", 3
+    "ReduceMean restored reads the whole image": "restored = ReduceMean<axes=[2,3]>(image)",
+    "DynamicQuantizeLinear q reads the whole image": (
+        "q, s, z = DynamicQuantizeLinear(image) restored = DequantizeLinear(q, s, z)"
     ),
-    "Resize restored uses the coordinates align_corners, which depend on the size": resized(
-        "linear", "align_corners", 2
+    "Flatten restored is fully connected": "restored = Flatten(image)",
+    "Softmax restored does not work along the channels": "restored = Softmax<axis=3>(image)",
+    "Concat restored does not work along the channels": "restored = Concat<axis=2>(image, image)",
+    "Concat restored combines tensors of different sizes": (
+        "p = MaxPool<kernel_shape=[2,2], strides=[2,2]>(image) restored = Concat<axis=1>(p, image)"
     ),
-    "Resize restored resizes to a fixed size": one("Resize", "", "", whole("sizes", 1, 1, 40, 40)),
-    "Slice restored cuts at a fixed position": one("Slice", *cut((0, 0), 40)),
-    "Add restored has a constant that differs from pixel to pixel": one(
-        "Add", constant("map", 1, 1, 40, 40)
+    "Resize restored resizes by 1 x 1 x 1.5 x 1.5": f"restored = Resize<{CORNER}>(image, , more)",
+    "Resize restored resizes by 3 with weights whose rounding depends on the position": (
+        f'restored = Resize<mode="linear", {HALF_PIXEL}>(image, , triple)'
     ),
-    "Mul restored has a constant that differs": one("Mul", constant("ramp", 40)),
-    "MaxPool max returns positions as well": graph(
-        [
-            helper.make_node(
-                "MaxPool", ["image"], ["max", "places"], kernel_shape=[3, 3], pads=[1] * 4
-            ),
-            helper.make_node("Cast", ["places"], ["restored"], to=TensorProto.FLOAT),
-        ]
+    "Resize restored uses the coordinates align_corners, which depend on the size": (
+        'restored = Resize<mode="linear", coordinate_transformation_mode="align_corners">'
+        "(image, , double)"
     ),
-    "MaxPool restored has no positive stride": one(
-        "MaxPool", kernel_shape=[2, 2], strides=[-2, -2]
+    "Resize restored resizes to a fixed size": "restored = Resize(image, , , sizes)",
+    "Slice restored cuts at a fixed position": "restored = Slice(image, zeros, forties, axes)",
+    "Add restored has a constant that differs from pixel to pixel": "restored = Add(image, map)",
+    "Mul restored has a constant that differs": "restored = Mul(image, ramp)",
+    "MaxPool max returns positions as well": (
+        "max, at = MaxPool<kernel_shape=[3,3], pads=[1,1,1,1]>(image) restored = Cast<to=1>(at)"
     ),
-    "but it has -2 pixels a side": conv(),
-    "scale rows and columns by one factor, but the factors are 1/2 and 1": one(
-        "MaxPool", kernel_shape=[2, 1], strides=[2, 1]
+    "MaxPool restored has no positive stride": (
+        "restored = MaxPool<kernel_shape=[2,2], strides=[-2,-2]>(image)"
     ),
-    "its period is 4096 pixels": Row()
-    .add("MaxPool", kernel_shape=[2, 2], strides=[64, 64])
-    .add("MaxPool", kernel_shape=[2, 2], strides=[64, 64])
-    .model(),
+    "but it has -2 pixels a side": "restored = Conv(image, w3)",
+    "scale rows and columns by one factor, but the factors are 1/2 and 1": (
+        "restored = MaxPool<kernel_shape=[2,1], strides=[2,1]>(image)"
+    ),
+    "its period is 4096 pixels": f"p = MaxPool<{HALVES}>(image) restored = MaxPool<{HALVES}>(p)",
 }
 
 
-@pytest.mark.parametrize("sentence", ELSEWHERE)
+@pytest.mark.parametrize("sentence", REFUSED)
 def test_what_depends_on_the_place_or_the_whole_image_is_refused(sentence: str) -> None:
     with pytest.raises(ModelError, match=sentence):
-        tiling_of(ELSEWHERE[sentence])
+        tiling_of(model_of(REFUSED[sentence]))
 
 
 def test_constants_in_the_graph_are_followed() -> None:
-    weight = helper.make_node("Constant", [], ["w"], value=constant("w", 1, 1, 7, 7))
-    assert (
-        tiling_of(
-            graph([weight, helper.make_node("Conv", ["image", "w"], ["restored"], pads=[3] * 4)])
-        ).halo_px
-        == 3
-    )
+    """The weights are those of a node, not an initializer."""
+    weight = "w = Constant<value = float[1,1,3,1] {1, 1, 1}>()"
+    assert tiling_of(model_of(f"{weight} restored = Conv<pads=[1,0,1,0]>(image, w)")).halo_px == 1
 
 
 def check_any(

@@ -9,7 +9,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from onnx import helper, numpy_helper
+from numpy.typing import ArrayLike
 from torch import nn
 
 from beers_deploy.dpu.reading import network_of
@@ -18,17 +18,17 @@ from beers_deploy.quant.graph import read_network
 from beers_deploy.quant.graph.pixel_shuffle import with_shuffles
 from beers_deploy.quant.simplify.simplify import simplify
 from beers_deploy.quant.tiling.receptive_field import Tiling, tiling_of
-from tests.quant.tiling.small_networks import graph, whole
+from tests.quant.tiling.small_networks import network
 
 
-def exported(network: nn.Module, any_size: bool, folder: Path, opset: int = 17) -> onnx.ModelProto:
+def exported(module: nn.Module, any_size: bool, folder: Path, opset: int = 17) -> onnx.ModelProto:
     """As torch's own exporter leaves it."""
     path = folder / "network.onnx"
     axes = {2: "H", 3: "W"}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.onnx.export(
-            network,
+            module,
             (torch.zeros(1, 1, 70, 70),),
             path,
             dynamo=False,
@@ -44,10 +44,10 @@ def exported(network: nn.Module, any_size: bool, folder: Path, opset: int = 17) 
 @pytest.mark.parametrize("size", [2, 5])
 def test_what_torch_makes_of_an_unshuffle_is_one(size: int, any_size: bool, tmp_path: Path) -> None:
     count = size * size
-    network = nn.Sequential(
+    module = nn.Sequential(
         nn.PixelUnshuffle(size), nn.Conv2d(count, count, 3, padding=1), nn.PixelShuffle(size)
     )
-    model = exported(network, any_size, tmp_path)
+    model = exported(module, any_size, tmp_path)
     assert "Transpose" in {node.op_type for node in model.graph.node}
     assert tiling_of(model) == Tiling(size, size, fixed_px=None if any_size else 70)
     front = read_network(simplify(model, "exported")).front
@@ -65,55 +65,45 @@ def test_a_shuffle_of_an_old_opset_is_one(tmp_path: Path) -> None:
     assert tiling_of(model).scale == 2
 
 
-def moves(*nodes: onnx.NodeProto) -> onnx.ModelProto:
-    sizes = {"at": [2], "flat": [1, 1, 1, -1], "square": [1, 1, 12, -1]}
-    return graph(list(nodes), *(whole(name, *values) for name, values in sizes.items()))
-
-
-MORE = helper.make_node("Unsqueeze", ["image", "at"], ["more"])
-LEFT = {
-    "turned": moves(
-        helper.make_node("Transpose", ["image"], ["restored"], name="turn", perm=[0, 1, 3, 2])
-    ),
-    "flat": moves(
-        helper.make_node("Reshape", ["image", "flat"], ["line"], name="flatten"),
-        helper.make_node("Reshape", ["line", "square"], ["restored"]),
-    ),
-    "read in the middle": moves(
-        MORE,
-        helper.make_node("Squeeze", ["more", "at"], ["less"]),
-        helper.make_node("ReduceSum", ["more", "at"], ["other"]),
-        helper.make_node("Add", ["less", "other"], ["restored"]),
-    ),
+NUMBERS: dict[str, ArrayLike] = {
+    "at": [2],
+    "flat": [1, 1, 1, -1],
+    "square": [1, 1, 12, -1],
+    "unit": 0.5,
 }
+NUMBERS["zero"] = np.int8(0)
+OTHER_MOVES = [
+    "restored = Transpose<perm=[0,1,3,2]>(image)",
+    "line = Reshape(image, flat) restored = Reshape(line, square)",
+    """more = Unsqueeze(image, at)
+    less = Squeeze(more, at)
+    other = ReduceSum(more, at)
+    restored = Add(less, other)""",
+]
 
 
-@pytest.mark.parametrize("name", LEFT)
-def test_whatever_else_moves_pixels_is_left(name: str) -> None:
-    assert [node.proto for node in with_shuffles(LEFT[name]).nodes] == list(LEFT[name].graph.node)
+@pytest.mark.parametrize("nodes", OTHER_MOVES)
+def test_whatever_else_moves_pixels_is_not_changed(nodes: str) -> None:
+    model = network(nodes, NUMBERS)
+    assert [node.proto for node in with_shuffles(model).nodes] == list(model.graph.node)
     with pytest.raises(ModelError, match=" moves pixels"):
-        tiling_of(LEFT[name])
+        tiling_of(model)
 
 
-def test_a_row_that_leads_back_is_a_shuffle_of_one() -> None:
-    assert tiling_of(
-        moves(MORE, helper.make_node("Squeeze", ["more", "at"], ["restored"]))
-    ) == Tiling(0)
+def test_moves_that_lead_back_are_a_shuffle_of_one() -> None:
+    model = network("more = Unsqueeze(image, at) restored = Squeeze(more, at)", NUMBERS)
+    assert tiling_of(model) == Tiling(0)
 
 
 def test_moves_between_integers_are_of_integers() -> None:
-    unit = ["unit", "zero"]
-    nodes = [
-        helper.make_node("QuantizeLinear", ["image", *unit], ["int8"]),
-        helper.make_node("DequantizeLinear", ["int8", *unit], ["seen"]),
-        helper.make_node("Unsqueeze", ["seen", "at"], ["more"]),
-        helper.make_node("Squeeze", ["more", "at"], ["less"]),
-        helper.make_node("QuantizeLinear", ["less", *unit], ["moved"]),
-        helper.make_node("DequantizeLinear", ["moved", *unit], ["restored"]),
-    ]
-    values = {"unit": np.float32(0.5), "zero": np.int8(0), "at": np.array([2])}
-    model = graph(
-        nodes, *(numpy_helper.from_array(np.asarray(value), name) for name, value in values.items())
-    )
-    kinds = [(op.kind, op.integer) for op in network_of(model, 8).operations]
+    nodes = """
+        int8 = QuantizeLinear(image, unit, zero)
+        seen = DequantizeLinear(int8, unit, zero)
+        more = Unsqueeze(seen, at)
+        less = Squeeze(more, at)
+        moved = QuantizeLinear(less, unit, zero)
+        restored = DequantizeLinear(moved, unit, zero)
+    """
+    operations = network_of(network(nodes, NUMBERS), 8).operations
+    kinds = [(op.kind, op.integer) for op in operations]
     assert kinds == [("quantize", True), ("pixel shuffle", True), ("dequantize", False)]
