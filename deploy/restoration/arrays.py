@@ -43,25 +43,18 @@ def restore_array(
         load: returns the pipeline that restores it.
         level: of the interval whose half-widths are returned too; None for none.
     """
-    results = _restored_and_width(image, reading, load, level)
-    return results[0] if level is None else tuple(results)
-
-
-def _restored_and_width(
-    image: Any, reading: Reading, load: Callable[[], Pipeline], level: Level | None
-) -> list[Any]:
-    """Return the restored array, and with a level its half-widths, of the kind of the image."""
     # Arrays of xarray and torch are recognised by their attributes, so that neither is imported.
     if hasattr(image, "coords") and hasattr(image, "dims"):
-        return _restore_labelled(image, reading, load, level)
-    if hasattr(image, "detach"):
+        results = _restore_labelled(image, reading, load, level)
+    elif hasattr(image, "detach"):
         torch = import_module("torch")
-        results = _restore(image.detach().cpu().numpy(), reading, load, level)
-        return [torch.from_numpy(pixels).to(image.device) for pixels in results]
-    results = _restore(image, reading, load, level)
-    if np.ma.isMaskedArray(image):
-        return [_masked_like(image, pixels) for pixels in results]
-    return results
+        arrays = _restore(image.detach().cpu().numpy(), reading, load, level)
+        results = [torch.from_numpy(pixels).to(image.device) for pixels in arrays]
+    else:
+        results = _restore(image, reading, load, level)
+        if np.ma.isMaskedArray(image):
+            results = [_masked_like(image, pixels) for pixels in results]
+    return results[0] if level is None else tuple(results)
 
 
 def _restore_labelled(

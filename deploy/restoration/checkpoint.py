@@ -179,8 +179,8 @@ class Checkpoint:
             self._finished.append(
                 FinishedRow(rows_px, row.pixels.nbytes, digest.hexdigest(), row.tally)
             )
-            self.rows = self.rows + rows_px
-            self.tally = self.tally + row.tally
+            self.rows += rows_px
+            self.tally += row.tally
             self._write_journal()
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
@@ -206,14 +206,9 @@ class Checkpoint:
         try:
             yield
         except OSError as error:
-            advice = (
-                f"go on with `resume` from row {self.rows} of {self.shape[1]}"
-                if self.rows
-                else "run it again: no row is left to `resume` from"
-            )
             raise MachineError(
-                f"{self.out} cannot be written: {error.strerror or error}. Correct that, and "
-                f"{advice}."
+                f"{self.out} cannot be written: {error.strerror or error}. Correct that, and go on "
+                f"with `resume` from row {self.rows} of {self.shape[1]}."
             ) from error
 
     def _left(self) -> list[FinishedRow]:

@@ -196,8 +196,7 @@ class Plan:
     @property
     def sentence(self) -> str:
         """How the image is cut, in one sentence for the user."""
-        bands = f", each of {self.bands} bands by itself" if self.groups > 1 else ""
-        bands = f", {self.bands} bands together" if self.tiling.channels_in > 1 else bands
+        bands = f", {self.bands} bands" if self.bands > 1 else ""
         larger = f", {self.scale} times as large" if self.scale > 1 else ""
         rows_px, columns_px = self.tile_shape
         tiles = "1 tile" if self.tiles == 1 else f"{self.tiles} tiles"

@@ -24,7 +24,7 @@ from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.cluster import Cluster
 from beers_deploy.restoration.detectors.words import warn_of_detectors
 from beers_deploy.restoration.figures import plan_figures, seam_figures
-from beers_deploy.restoration.memory import check_memory, is_bulky, rows_bytes
+from beers_deploy.restoration.memory import check_memory, rows_bytes
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Plan, Span, Tiles, plan_for
 from beers_deploy.restoration.radiometry import FullScale, Reading, full_scale_of
@@ -168,8 +168,7 @@ class NetworkRestoration(Restoration):
     def memory_bytes(self) -> int:
         """Return the peak memory: what the process uses now, plus the rows to come."""
         needed = rows_bytes(self.source, self.plan, begun=True)
-        bulky = is_bulky(self.source, self.plan)
-        return check_memory(needed, self.reading.memory_bytes, bulky)
+        return check_memory(needed, self.reading.memory_bytes)
 
     def figures(self, tally: Tally) -> dict[str, Figure]:
         """Return the figures of a run."""
@@ -206,7 +205,7 @@ class NetworkPipeline:
         require_alike(networks)
         plan = plan_for(networks[0], raster.shape, self.tiles)
         logger.info(plan.sentence)
-        check_memory(rows_bytes(source, plan), reading.memory_bytes, is_bulky(source, plan))
+        check_memory(rows_bytes(source, plan), reading.memory_bytes)
         extents = (raster.extent(source.read(row.keep_start, row.keep_stop)) for row in plan.rows)
         scale = full_scale_of(name, raster, extents, reading.full_scale, reading.sensor_bits)
         check, check_s = check_sensor(source, networks, reading, scale.value, name)

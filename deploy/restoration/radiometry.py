@@ -96,7 +96,13 @@ def full_scale_of(
     """
     if asked is not None:
         settled_scale(name, raster.dtype, extents, asked)
-        require_room(raster, asked)
+        kind = raster.out_dtype
+        # A float output holds any full scale.
+        if kind.kind != "f" and asked > np.iinfo(kind).max:
+            raise OptionError(
+                f"`full_scale` must be at most {np.iinfo(kind).max} for {kind} pixels, got "
+                f"{asked:g}. Convert the image to uint16."
+            )
         return FullScale(asked, "asked for")
     if raster.bits is not None:
         return FullScale(2**raster.bits - 1, f"{raster.bits} bits, as the file states")
@@ -112,14 +118,3 @@ def full_scale_of(
         else usual
     )
     return FullScale(value, f"{bits} bits, of the sensor")
-
-
-def require_room(raster: Raster, full_scale: float) -> None:
-    """Raise OptionError if the output's type cannot hold pixels up to full scale."""
-    kind = raster.out_dtype
-    # A float output holds any full scale.
-    if kind.kind != "f" and full_scale > np.iinfo(kind).max:
-        raise OptionError(
-            f"`full_scale` must be at most {np.iinfo(kind).max} for {kind} pixels, got "
-            f"{full_scale:g}. Convert the image to uint16."
-        )

@@ -171,7 +171,7 @@ class TraditionalPipeline:
             + BYTES_PER_COLUMN * raster.width_px * raster.bands
             + source.held_bytes(STRIP_PX)
         )
-        check_memory(needed, reading.memory_bytes, bulky=False)
+        check_memory(needed, reading.memory_bytes)
         rows = strips(raster.height_px, STRIP_PX)
         extents = (raster.extent(source.read(*strip)) for strip in rows)
         scale = full_scale_of(name, raster, extents, reading.full_scale, reading.sensor_bits)

@@ -8,7 +8,7 @@ from beers_deploy.model.metrics.detector_phases import COLOUR, Pattern
 from beers_deploy.model.metrics.detector_stripes import Stripes
 from beers_deploy.model.raster.source import Source
 from beers_deploy.profiles.figures import Figure, measured, unavailable
-from beers_deploy.restoration.detectors.fault_list import FOUND
+from beers_deploy.restoration.detectors.fault_list import FOUND, counted
 from beers_deploy.restoration.detectors.look import BandFaults, look_at_detectors
 
 logger = logging.getLogger(__name__)
@@ -55,7 +55,7 @@ def _of_band(band: BandFaults) -> Iterator[str]:
     if len(band.pixels):
         places = [f"column {column}, row {row}" for row, column in band.pixels[:NAMED].tolist()]
         yield (
-            f"{_count(len(band.pixels), 'pixel')} of {band.looked_px}, isolated as no light can "
+            f"{counted(len(band.pixels), 'pixel')} of {band.looked_px}, isolated as no light can "
             "be: hot, dead or "
             f"hit by a particle ({_some(places, len(band.pixels))}); restoration sharpens that; "
             f"{FIX} such pixels"
@@ -67,7 +67,7 @@ def _of_lines(name: str, lines: Stripes) -> Iterator[str]:
     if lines.dead:
         places = [str(line) for line in lines.dead[:NAMED]]
         yield (
-            f"{_count(len(lines.dead), f'dead {one}')}, constant where the others vary "
+            f"{counted(len(lines.dead), f'dead {one}')}, constant where the others vary "
             f"({one} {_some(places, len(lines.dead))}); restoration sharpens that; {FIX} such "
             f"{name}"
         )
@@ -83,7 +83,7 @@ def _of_lines(name: str, lines: Stripes) -> Iterator[str]:
         places = [f"{one} {line.index} by {line.gain:+.2%}" for line in lines.off[:NAMED]]
         verb = "is" if len(lines.off) == 1 else "are"
         yield (
-            f"{_count(len(lines.off), one)} {verb} off in gain or offset "
+            f"{counted(len(lines.off), one)} {verb} off in gain or offset "
             f"({_some(places, len(lines.off))}); "
             f"{SHARPENS}: {EQUALIZE}, or list them for `fix_detectors`"
         )
@@ -99,10 +99,6 @@ def _of_pattern(pattern: Pattern) -> str:
             f"{message}, as of a mosaic of colour filters: split the image into its colours first"
         )
     return f"{message}; {SHARPENS}: {EQUALIZE}, channel by channel"
-
-
-def _count(number: int, name: str) -> str:
-    return f"{number} {name}{'s' if number > 1 else ''}"
 
 
 def _some(places: Sequence[str], count: int) -> str:

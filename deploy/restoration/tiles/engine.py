@@ -19,7 +19,6 @@ from beers_deploy.profiles.errors import ImageError
 from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.restoration.plan import Span
-from beers_deploy.restoration.radiometry import require_room
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
 from beers_deploy.restoration.tiles.missing import fill_from_nearest
 
@@ -86,9 +85,6 @@ class Restorer:
     name: str = NAME
     clips: bool = False
     consistency: tuple[Consistency | None, ...] = ()
-
-    def __post_init__(self) -> None:
-        require_room(self.raster, self.full_scale)
 
     @property
     def reach_px(self) -> int:
