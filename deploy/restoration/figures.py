@@ -1,10 +1,12 @@
 """Figures of a restoration: how the image is cut, and the error of seams if there are any."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from beers_deploy.model.raster.source import Source
 from beers_deploy.profiles.figures import Figure, measured, predicted, unavailable
-from beers_deploy.restoration.plan import Plan, Span
+from beers_deploy.restoration.plan import Plan, Span, TilePlace
 from beers_deploy.restoration.tiles.engine import Restorer
 
 
@@ -37,9 +39,11 @@ def seam_figures(source: Source, plan: Plan, restorer: Restorer) -> dict[str, Fi
         _widened(span, plan.radius_px, end_px)
         for span, end_px in zip((rows, columns), ends_px, strict=True)
     ]
-    strip = restorer.read(source, min(rows.start, wide[0].start), max(rows.stop, wide[0].stop))
+    # A last tile that was moved inward may begin before the wider window.
+    top = min(rows.start, wide[0].start)
+    strip = restorer.read(source, replace(rows, start=top, stop=max(rows.stop, wide[0].stop)))
     cheap, exact = (
-        restorer.tile(strip, 0, *spans).pixels.astype(np.float64)
+        restorer.tile(strip, TilePlace(0, *spans)).pixels.astype(np.float64)
         for spans in ((rows, columns), wide)
     )
     error = np.abs(np.nan_to_num(cheap) - np.nan_to_num(exact))

@@ -10,6 +10,8 @@ extended there by copies of its last row and column.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
 
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import ModelError, OptionError, printable
@@ -54,6 +56,14 @@ class Span:
     stop: int
     keep_start: int
     keep_stop: int
+
+
+class TilePlace(NamedTuple):
+    """The place of a tile: the group of bands, and its rows and columns."""
+
+    group: int
+    rows: Span
+    columns: Span
 
 
 def plan_side(
@@ -160,6 +170,11 @@ class Plan:
     def tile_shape(self) -> tuple[int, int]:
         """The number of rows and columns of pixels of every tile."""
         return self.rows[0].stop - self.rows[0].start, self.columns[0].stop - self.columns[0].start
+
+    def places(self, row: Span) -> list[TilePlace]:
+        """Return the tiles of one row of tiles, in the order in which they are restored."""
+        across = product(range(self.groups), self.columns)
+        return [TilePlace(group, row, column) for group, column in across]
 
     @property
     def row_tiles(self) -> int:

@@ -155,15 +155,13 @@ class NetworkRestoration(Restoration):
 
     def ticks(self, done_px: int) -> int:
         """Return the number of tiles to run."""
-        rows = rows_to_run(self.plan, self.restorer, self._rows_left(done_px))
+        rows = rows_to_run(self.restorer, self._rows_left(done_px))
         return len(rows) * self.plan.row_tiles
 
     def rows(self, done_px: int, tick: Tick) -> Generator[RestoredRow, None, None]:
         """Restore rows of tiles from row `done_px` of the restored image on."""
         rows = self._rows_left(done_px)
-        return restore_rows(
-            self.source, self.plan, self.restorer, rows, lambda: tick(1), self.at_once
-        )
+        return restore_rows(self.source, self.restorer, rows, lambda: tick(1), self.at_once)
 
     def memory_bytes(self) -> int:
         """Return the peak memory: what the process uses now, plus the rows to come."""
@@ -216,7 +214,7 @@ class NetworkPipeline:
         )
         # Values above an assumed full scale show that the assumption is wrong, so they are refused.
         clips = not scale.assumed
-        restorer = Restorer(raster, exposed, scale.value, plan.tiling, name, clips, steps)
+        restorer = Restorer(raster, exposed, scale.value, plan, name, clips, steps)
         others = [exposures_of(network, self.around) for network in networks]
         identity = {
             "model": [network.sha256 for network in networks],

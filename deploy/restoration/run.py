@@ -130,7 +130,7 @@ def restore_file(
     time_s = time.perf_counter() - started - work.check_s - self_check_s
     _warn_of_clipping(work, checkpoint)
     if blocks.doubt:
-        logger.warning(f"the result {blocks.doubt}")  # noqa: G004 - it names options
+        logger.warning(f"the result {blocks.doubt}")
     self_check = {**blocks.figures, "self-check": measured(self_check_s, "s", SELF_CHECKED)}
     more = {**(self_check if blocks.bands else {}), **interval}
     row = _row(image.name, work, checkpoint, done_px, time_s, faults, more)
