@@ -13,7 +13,6 @@ import rasterio
 import tifffile
 from numpy.testing import assert_array_equal
 from onnx import numpy_helper
-from PIL import Image
 from rasterio.enums import ColorInterp, MaskFlags
 
 from beers_deploy.profiles.errors import ImageError, OptionError
@@ -129,16 +128,6 @@ def test_alpha_is_copied(
     expected = by_nodata(tmp_path, pixels, model)
     for band in result[:-1]:
         assert_array_equal(band, np.where(HIDDEN, pixels, expected))
-
-
-@pytest.mark.parametrize("mode", ["LA", "RGBA"])
-def test_alpha_of_a_png_is_no_light(mode: str, model: Path, tmp_path: Path) -> None:
-    planes = np.random.default_rng(0).integers(1, 255, (31, 29, len(mode))).astype(np.uint8)
-    planes[3:9, 4:20, -1] = 0
-    Image.fromarray(planes, mode).save(tmp_path / "in.png")
-    result, _ = restored(tmp_path / "in.png", model, full_scale=255)
-    assert_array_equal(result[-1], planes[..., -1])
-    assert_array_equal(result[0, 3:9, 4:20], planes[3:9, 4:20, 0])
 
 
 def two_pages(path: Path, pixels: np.ndarray) -> None:
