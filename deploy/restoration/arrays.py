@@ -22,7 +22,7 @@ from beers_deploy.model.raster.facts import (
 )
 from beers_deploy.model.raster.source import ArraySource
 from beers_deploy.profiles.errors import ImageError, OptionError
-from beers_deploy.restoration.interval.half_widths import HalfWidths, half_widths_of
+from beers_deploy.restoration.interval import HalfWidths, half_widths_of
 from beers_deploy.restoration.prepare import NetworkPipeline, Pipeline
 from beers_deploy.restoration.radiometry import Reading
 from beers_deploy.restoration.tiles.engine import NAME

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import ModelError, OptionError, printable
+from beers_deploy.profiles.figures import Figure, predicted
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.quant.tiling.receptive_field import Tiling
 
@@ -193,6 +194,15 @@ class Plan:
             c.stop - c.start for c in self.columns
         )
         return window_px / (self.height_px * self.width_px)
+
+    @property
+    def figures(self) -> dict[str, Figure]:
+        """The figures of how an image is cut. They are known in advance, not measured."""
+        numbers = {"tiles": self.tiles, "work factor": self.work_factor}
+        source = "arithmetic on the plan of tiles"
+        return {
+            key: predicted(number, "1", (number, number), source) for key, number in numbers.items()
+        }
 
     @property
     def strip_rows_px(self) -> int:

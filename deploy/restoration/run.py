@@ -33,8 +33,12 @@ from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.cluster import open_cluster
 from beers_deploy.restoration.detectors.fault_list import FOUND, FaultList, list_beside
 from beers_deploy.restoration.detectors.fix import faults_of, fixed
-from beers_deploy.restoration.interval.file import interval_beside, write_half_widths
-from beers_deploy.restoration.interval.half_widths import HalfWidths, half_widths_of
+from beers_deploy.restoration.interval import (
+    HalfWidths,
+    half_widths_of,
+    interval_beside,
+    write_half_widths,
+)
 from beers_deploy.restoration.memory import peak_memory
 from beers_deploy.restoration.output import Output, require_tiff_name, what_was_done, write_output
 from beers_deploy.restoration.prepare import Pipeline, Restoration
@@ -212,7 +216,6 @@ def _checkpoint(output: Output, work: Restoration, faults: FaultList) -> Checkpo
     job = {
         # Another version of the program or of the runtime may compute other bits.
         "program": version("beers-deploy"),
-        "method": work.method,
         "image": fingerprint(work.source.files),
         "raster": repr(raster),
         "sensors": repr(sensors),

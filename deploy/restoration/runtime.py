@@ -237,9 +237,9 @@ def _opened(packed: Packed) -> Infer:
     return open_runtime(packed.runtime, network, packed.threads)[0]
 
 
-def infer_on(cluster: Cluster, packed: Packed) -> Infer:
+def infer_on(cluster: Cluster, engine: Engine, model: onnx.ModelProto) -> Infer:
     """Return a network that the workers of a cluster run. Each call sends a tile and waits for its
     result.
     """
-    shared = cluster.share(packed)
+    shared = cluster.share(engine.packed(model))
     return lambda image: cluster.result(cluster.pool.submit(Packed.__call__, shared, image))

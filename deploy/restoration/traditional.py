@@ -183,12 +183,11 @@ class TraditionalPipeline:
             source=source,
             name=name,
             reading=reading,
-            method="traditional",
             scale=scale,
             check=check,
             check_s=check_s,
             out_shape=raster.shape,
-            identity={"quality": self.quality},
+            identity={"method": "traditional", "quality": self.quality},
             how=f"{torch.get_num_threads()} threads",
             text={
                 "method": "traditional",

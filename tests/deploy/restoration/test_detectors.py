@@ -15,8 +15,7 @@ from beers_deploy.model.raster.source import ArraySource
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.restoration.detectors.fault_list import Fault, FaultList, read_list
 from beers_deploy.restoration.detectors.fix import REACH_PX, FixedSource, find_faults
-from beers_deploy.restoration.detectors.look import LOOKED_PX, look_at_detectors
-from beers_deploy.restoration.detectors.words import sentences
+from beers_deploy.restoration.detectors.look import LOOKED_PX, look_at_detectors, sentences
 from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import done
 from tests.deploy.restoration.runs import stopped_after

@@ -32,9 +32,7 @@ def test_polynomials_bits_and_gains_of_a_dimap_are_kept(
         assert [after.tags(band)["RADIANCE_BIAS"] for band in (1, 2)] == ["0.0", "0.1"]
 
 
-def test_control_points_names_and_gains_of_a_vrt_are_kept(
-    model: Path, tmp_path: Path
-) -> None:
+def test_control_points_names_and_gains_of_a_vrt_are_kept(model: Path, tmp_path: Path) -> None:
     points = "".join(
         f'<GCP Id="{k}" Pixel="{17 * k}" Line="{9 * k * k}" X="{k / 3!r}" Y="{45 - k / 7!r}" '
         'Z="0"/>'

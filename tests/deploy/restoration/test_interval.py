@@ -20,7 +20,7 @@ from beers_deploy.network_files import int8_for_sensor
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import metadata
-from beers_deploy.restoration.interval.half_widths import interval_of
+from beers_deploy.restoration.interval import interval_of
 from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import stopped_after
 from tests.model.networks import plain
