@@ -70,17 +70,6 @@ def test_alpha_in_a_jpeg_2000_and_a_mask_next_to_one_are_missing_pixels(tmp_path
             np.testing.assert_array_equal(source.raster.missing(rows)[0], hidden[20:60])
 
 
-def not_restored(image: Path, out: Path, model: Path, error: type[BeersError], *words: str) -> None:
-    """Expect an error of one line with these words, and nothing written."""
-    before = sorted(out.parent.iterdir())
-    with pytest.raises(error) as caught:
-        restore(image, out, network=model, tile=64)
-    for word in words:
-        assert word in str(caught.value)
-    assert "\n" not in str(caught.value)
-    assert sorted(out.parent.iterdir()) == before
-
-
 @pytest.mark.parametrize("share", [0.0, 0.05, 0.5, 0.95])
 def test_a_truncated_jpeg_2000_is_an_error_of_one_line(
     share: float, model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
@@ -88,16 +77,10 @@ def test_a_truncated_jpeg_2000_is_an_error_of_one_line(
     image = images.write_jp2(tmp_path / "a.jp2", images.digital_numbers())
     content = image.read_bytes()
     image.write_bytes(content[: int(share * len(content)) + 50])
-    not_restored(image, tmp_path / "out.tif", model, ImageError, "a.jp2", "whole image")
+    with pytest.raises(ImageError, match=r"^.*a\.jp2.*whole image.*$"):
+        restore(image, tmp_path / "out.tif", network=model, tile=64)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.jp2"]
     assert capfd.readouterr().err == ""
-
-
-def test_an_unreadable_format_is_an_error_of_one_line(model: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out.tif"
-    (tmp_path / "a.xml").write_text("<WMS_Service/>")
-    not_restored(tmp_path / "a.xml", out, model, ImageError, "DIMAP")
-    images.write(tmp_path / "c.img", np.ones((1, 9, 9), np.complex64), "HFA")
-    not_restored(tmp_path / "c.img", out, model, ImageError, "complex64")
 
 
 def test_a_tile_is_no_output(model: Path, tmp_path: Path) -> None:

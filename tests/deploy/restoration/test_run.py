@@ -2,7 +2,6 @@
 
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -161,23 +160,10 @@ def test_invalid_options_are_refused(
 
 
 def test_a_budget_that_does_not_suffice_is_refused_before_the_run(
-    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    model: Path, tmp_path: Path
 ) -> None:
-    refused(tmp_path, noise(40, 40), MachineError, "1.00 kB", network=model, memory=1e-6)
-    # What a process of many tests holds moves by more than the rows of the image.
-    memory = SimpleNamespace(memory_info=lambda: SimpleNamespace(rss=100_000_000))
-    monkeypatch.setattr("beers_deploy.restoration.memory.psutil.Process", lambda: memory)
-    # One strip of 1000 rows needs 6 MB, the tiles of an image in strips of 10 rows far less.
-    options: dict[str, Any] = {"network": model, "tile": 64, "memory": 0.108, "overwrite": True}
-    for rows in (10, 1000):
-        tifffile.imwrite(
-            tmp_path / "in.tif", noise(1000, 3000), compression="zlib", rowsperstrip=rows
-        )
-        if rows == 10:
-            restore(tmp_path / "in.tif", tmp_path / "out.tif", **options)
-            continue
-        with pytest.raises(MachineError, match="TILED=YES"):
-            restore(tmp_path / "in.tif", tmp_path / "out.tif", **options)
+    words = "1.00 kB", "smaller `tile`", "TILED=YES"
+    refused(tmp_path, noise(40, 40), MachineError, *words, network=model, memory=1e-6)
 
 
 def test_a_tile_without_known_pixels_costs_no_inference(
