@@ -59,18 +59,18 @@ def sensitivity_page(
 
 def worst_picture(number: int, patches: Patches, sessions: Sessions, white_dn: float) -> Picture:
     """Draw one patch as given, in float and in INT8, and the absolute difference."""
-    degraded = patches.degraded[number]
-    given, in_float, in_int8 = (
+    patch = patches.degraded[number]
+    degraded, in_float, in_int8 = (
         np.clip(to_shares(image, patches.ranges), 0, 1)[0, 0] * MAX_DN
-        for image in (degraded, *(result_of(session, degraded) for session in sessions))
+        for image in (patch, *(result_of(session, patch) for session in sessions))
     )
     # A network may enlarge the image, which is shown at the size of the results.
     places = (
         np.arange(after) * before // after
-        for before, after in zip(given.shape, in_float.shape, strict=True)
+        for before, after in zip(degraded.shape, in_float.shape, strict=True)
     )
-    given = given[np.ix_(*places)]
-    images = {"degraded": given, "float": in_float, "INT8": in_int8}
+    degraded = degraded[np.ix_(*places)]
+    images = {"degraded": degraded, "float": in_float, "INT8": in_int8}
     difference = np.abs(in_int8 - in_float)
     cells = [*strip_row(images.values(), stretch_of(in_float)), *error_row([difference], white_dn)]
     caption = (

@@ -77,7 +77,7 @@ def _restore_labelled(
     bands = next((dim for dim in image.dims if dim in BAND_DIMS), None)
     ordered = image if bands is None or image.ndim != 3 else image.transpose(bands, ...)
     if image.ndim == 3 and bands is None and ordered.shape[-1] <= FEW < min(ordered.shape[:-1]):
-        raise _bands_last(ordered.shape, "name the dimension of the bands 'band'.")
+        raise _bands_last(ordered.shape, "Name the dimension of the bands 'band'")
     reading = replace(reading, full_scale=full_scale, nodata=nodata)
     labelled = [
         _labelled(ordered, pixels) for pixels in _restore(ordered.data, reading, load, level)
@@ -194,13 +194,14 @@ def _bands_first(image: Any) -> Any:
             "`nodata`."
         )
     if len(shape) == 3 and shape[2] <= FEW < min(shape[:2]):
-        raise _bands_last(shape, "numpy.moveaxis(image, -1, 0) puts them first.")
+        raise _bands_last(shape, "Put them first with numpy.moveaxis(image, -1, 0)")
     return image if len(shape) == 3 else image[None]
 
 
 def _bands_last(shape: tuple[int, ...], remedy: str) -> ImageError:
     return ImageError(
-        f"`image` must be (bands, H, W), but its shape {tuple(shape)} ends in bands: {remedy}"
+        f"`image` must be (bands, H, W), but the bands are last in its shape {tuple(shape)}. "
+        f"{remedy}."
     )
 
 

@@ -77,10 +77,10 @@ class HalfWidths:
         top = max(start - CONTEXT_PX, 0)
         bottom = min(stop + CONTEXT_PX, raster.height_px)
         pixels = self.restored(band, top, bottom)
-        known = np.ones(pixels.shape, bool)
+        valid = np.ones(pixels.shape, bool)
         if raster.may_miss:
-            known = ~raster.missing(self.source.read(top, bottom))[band]
-        return self.bands[band].of(pixels, known)[start - top : stop - top]
+            valid = ~raster.missing(self.source.read(top, bottom))[band]
+        return self.bands[band].of(pixels, valid)[start - top : stop - top]
 
 
 def half_widths_of(work: Restoration, level: Level) -> tuple[HalfWidth, ...]:

@@ -1,9 +1,9 @@
-"""One image file restored into another: what `restore` does with a file.
+"""Restore an image file into another one, as `restore` does with files.
 
-open -> faulty detectors -> make ready -> rows that a checkpoint lacks -> the TIFF -> figures
+open -> faulty detectors -> prepare -> rows that a checkpoint lacks -> the TIFF -> figures
 
-One row is written while the next is made. Whatever stops a run, the output is the old one or the
-new one; finished rows stay in the checkpoint where a later run can go on.
+One row is written while the next is computed. Whatever stops a run, the output is the old one or
+the new one. Finished rows stay in the checkpoint if a later run can continue from them.
 """
 
 import logging
@@ -66,12 +66,13 @@ MANY = 0.05
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Run(Table):
-    """One file restored into another.
+    """The figures of one file that was restored into another.
 
     Attributes:
-        path: of the restored image.
-        time_s: from opening the image to the finished file.
-        networks: that restored its bands, in their order; none of the traditional pipeline.
+        path: the path of the restored image.
+        time_s: the seconds from opening the image to the finished file.
+        networks: the networks that restored the bands, in the order of the bands; empty for the
+            traditional pipeline.
     """
 
     path: Path
@@ -88,8 +89,9 @@ def restore_file(
         image: a file that `model.raster.reader.open_raster` opens, of any size.
         output: the TIFF, of the type `Raster.out_dtype`, in the scale of the image; larger by the
             network's factor where it has one, and in its place on Earth.
-        reading: how its pixels are understood.
-        load: returns what restores it; called once the image and the output are accepted.
+        reading: how its pixels are interpreted.
+        load: returns the pipeline that restores it. It is called once the image and the output are
+            accepted.
     """
     out = output.path
     widths = None if output.interval is None else interval_beside(out)
@@ -112,7 +114,7 @@ def restore_file(
         bands = () if output.interval is None else half_widths_of(work, output.interval)
         checkpoint = _checkpoint(output, work, faults)
         done_px = checkpoint.rows
-        with _kept_for_resuming(checkpoint, bool(work.row_ends)):
+        with _rows_for_resuming(checkpoint, bool(work.row_ends)):
             _finish_rows(checkpoint, work)
             self_check_started = time.perf_counter()
             blocks = check_result(work.source, checkpoint.read, checks)
@@ -238,13 +240,13 @@ def _checkpoint(output: Output, work: Restoration, faults: FaultList) -> Checkpo
 def require_unchanged(
     source: Source, name: str, before: Sequence[tuple[int, int, int]], digest: object
 ) -> None:
-    """Refuse an image, `name` in messages, that was replaced while its rows were read.
+    """Raise ImageError if an image was replaced while its rows were read.
 
     Args:
         source: the image.
-        name: of the image.
-        before: its files' stamps before the first row was read.
-        digest: its fingerprint then.
+        name: its name, for the message.
+        before: the stamps of its files before the first row was read.
+        digest: its fingerprint at that time.
     """
     # A file that was only touched or copied back is the same image: its content decides.
     if stamps(source.files) != before and fingerprint(source.files) != digest:
@@ -254,7 +256,7 @@ def require_unchanged(
 
 
 def _finish_rows(checkpoint: Checkpoint, work: Restoration) -> None:
-    """Restore the rows that a checkpoint lacks, and keep each in it while the next is made."""
+    """Restore the rows that a checkpoint lacks, and store each while the next is computed."""
     total = work.ticks(checkpoint.rows)
     steady = min(work.steady_ticks, total)
     with steps("restoring", total) as bar, held_back() as interrupt:
@@ -285,8 +287,8 @@ def _finish_rows(checkpoint: Checkpoint, work: Restoration) -> None:
 
 
 @contextmanager
-def _kept_for_resuming(checkpoint: Checkpoint, resumable: bool) -> Iterator[None]:
-    """Keep finished rows through a stop or a full disk, if a later run can go on from them."""
+def _rows_for_resuming(checkpoint: Checkpoint, resumable: bool) -> Iterator[None]:
+    """Delete the finished rows after an error, unless a later run can continue from them."""
     try:
         yield
     except KeyboardInterrupt:
@@ -309,7 +311,7 @@ def _kept_for_resuming(checkpoint: Checkpoint, resumable: bool) -> Iterator[None
 
 
 def _write_behind(restored: Iterable[RestoredRow], checkpoint: Checkpoint) -> None:
-    """Keep rows, each while the next is made; never more than one waits."""
+    """Store each row while the next is computed. At most one row waits."""
     with ThreadPoolExecutor(1) as writer:
         writing: Future[None] | None = None
         for row in restored:

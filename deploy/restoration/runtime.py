@@ -227,11 +227,11 @@ class Packed:
         return infer(image)
 
 
-NETWORKS_KEPT = 32
+NETWORKS_IN_MEMORY = 32
 _opening = Lock()
 
 
-@lru_cache(maxsize=NETWORKS_KEPT)
+@lru_cache(maxsize=NETWORKS_IN_MEMORY)
 def _opened(packed: Packed) -> Infer:
     network = parse_onnx(packed.content, "network")
     return open_runtime(packed.runtime, network, packed.threads)[0]

@@ -121,14 +121,14 @@ class TraditionalRestoration(Restoration):
         restored = np.nan_to_num(dn) / factors[:, None, None]
         pixels = as_stored(raster, restored, full_scale)
         raw = np.ma.getdata(self.source.read(top, stop))
-        known = ~missing if missing.any() else None
-        if known is not None:
+        valid = ~missing if missing.any() else None
+        if valid is not None:
             pixels = np.where(missing, raw.astype(raster.out_dtype), pixels)
         tally = Tally.of(
             np.nan_to_num(raw.astype(np.float64)) / full_scale,
             restored.astype(np.float64) / full_scale,
-            known,
-            known,
+            valid,
+            valid,
         )
         return RestoredRow(Span(top, stop, top, stop), pixels, tally)
 

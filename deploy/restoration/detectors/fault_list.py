@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from beers_deploy.model.raster.facts import Raster
-from beers_deploy.profiles.errors import OptionError, reason_of
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.toml import unreadable
 
 FOUND = "found"
 HEADER = ("column", "row", "band")
@@ -121,8 +122,8 @@ def read_list(path: Path, raster: Raster) -> FaultList:
     lines = list[str]()
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = f"cannot be read as text: {reason_of(error)}"
+    except (OSError, UnicodeDecodeError):
+        reason = f"cannot be read: {unreadable(path) or 'it is not a text file'}"
     faults = [
         _fault(path, number, line, raster)
         for number, line in enumerate(lines, 1)
@@ -147,8 +148,8 @@ def _fault(path: Path, number: int, line: str, raster: Raster) -> Fault:
     column, row, band = (-1 if cell == ALL else int(cell or 0) for cell in match.groups())
     if column >= raster.width_px or row >= raster.height_px or band > raster.bands:
         raise OptionError(
-            f"Line {number} of {path} ({line.strip()}) lies outside the image of "
-            f"{raster.width_px} columns, {raster.height_px} rows and {raster.bands} bands. Count "
-            "columns and rows from 0, and bands from 1."
+            f"Line {number} of {path} ({line.strip()}) lies outside the image, which has "
+            f"{raster.width_px} columns, {raster.height_px} rows and "
+            f"{counted(raster.bands, 'band')}. Count columns and rows from 0, and bands from 1."
         )
     return Fault(column, row, band)

@@ -77,7 +77,7 @@ def look_at_detectors(source: Source, full_scale: float = np.inf) -> tuple[BandF
         full_scale: the pixel value at and above which a pixel is not a measurement.
     """
     raster = source.raster
-    measurements = [_Found(step) for step in value_steps(source)]
+    measurements = [_Measurements(step) for step in value_steps(source)]
     for top, stop in _strips(raster.height_px, raster.width_px, raster.bands):
         start = max(top - MARGIN_PX, 0)
         end = min(stop + MARGIN_PX, raster.height_px)
@@ -122,7 +122,7 @@ def _strips(height_px: int, width_px: int, bands: int) -> Iterator[tuple[int, in
         yield even, even + side_px
 
 
-class _Found:
+class _Measurements:
     """The measurements in the strips of one band."""
 
     def __init__(self, step: float) -> None:

@@ -14,7 +14,7 @@ from beers_deploy.quant.untrusted import times
 from beers_deploy.restoration.plan import Plan
 from beers_deploy.restoration.runtime import Infer
 
-Kept = tuple[slice, slice]
+Inner = tuple[slice, slice]
 """The rows and columns of a window that are retained."""
 
 
@@ -48,7 +48,7 @@ class ExposedNetwork:
     offset: float = 0.0
 
     def restore(
-        self, window: np.ndarray, full_scale: float, inner: Kept, tiling: Tiling
+        self, window: np.ndarray, full_scale: float, inner: Inner, tiling: Tiling
     ) -> Exposed:
         """Restore a window of pixel values (bands, h, w) without missing pixels.
 
