@@ -102,7 +102,10 @@ def _restore(
     image: Any, reading: Reading, load: Callable[[], Pipeline], level: Level | None
 ) -> list[Any]:
     bands = _bands_first(image)
-    raster = _raster(bands, reading.nodata)
+    dtype = require_numbers(NAME, bands.dtype)
+    value = None if reading.nodata is None else float(reading.nodata)
+    mask_kind: MaskKind = "mask" if np.ma.isMaskedArray(bands) else ""
+    raster = Raster(*bands.shape, dtype, usable_nodata(value, dtype), mask_kind=mask_kind)
     if not hasattr(image, "__dask_graph__"):
         results = _restore_now(bands, raster, reading, load(), level)
     elif np.ma.isMaskedArray(getattr(image, "_meta", None)):
@@ -203,12 +206,3 @@ def _bands_last(shape: tuple[int, ...], remedy: str) -> ImageError:
         f"`image` must be (bands, H, W), but the bands are last in its shape {tuple(shape)}. "
         f"{remedy}."
     )
-
-
-def _raster(bands: Any, nodata: float | None) -> Raster:
-    count, height_px, width_px = bands.shape
-    dtype = require_numbers(NAME, bands.dtype)
-    value = None if nodata is None else float(nodata)
-    mask_kind: MaskKind = "mask" if np.ma.isMaskedArray(bands) else ""
-    nodata = usable_nodata(value, dtype)
-    return Raster(count, height_px, width_px, dtype, nodata, mask_kind=mask_kind)

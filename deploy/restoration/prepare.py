@@ -20,7 +20,6 @@ import onnx
 from beers_deploy.model.raster.source import Source
 from beers_deploy.network import Network
 from beers_deploy.profiles.figures import Figure, measured, unavailable
-from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.cluster import Cluster
 from beers_deploy.restoration.detectors.look import warn_of_detectors
@@ -342,11 +341,10 @@ def check_sensor(
         The check, and the seconds that it took.
     """
     started = time.perf_counter()
-    check = SensorCheck()
     warn_of_detectors(source, full_scale)
-    if any(sensor.name != BLIND for sensor in reading.sensors.values()):
-        check = checked_sensor(source, reading.sensors, full_scale, name, reading.strict)
-    elif not reading.force:
+    check = checked_sensor(source, reading.sensors, full_scale, name, reading.strict)
+    # A check without figures had no sensor to compare with.
+    if not check.figures and not reading.force:
         models = [network.model for network in networks]
         if sentence := restored_already(source, models, full_scale):
             logger.warning(sentence)

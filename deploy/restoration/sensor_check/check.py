@@ -56,26 +56,6 @@ class SensorCheck:
         words = "; ".join(self.warnings) or ("agrees" if is_measured else "not measurable")
         return {"sensor check": words} if self.figures else {}
 
-    def report(self, name: str, sensor: str, strict: bool) -> None:
-        """Log a warning for each contradiction.
-
-        Args:
-            name: of the image, for messages.
-            sensor: its profile's name.
-            strict: if True, a contradiction is an error instead.
-
-        Raises:
-            ImageError: there is a contradiction, and `strict` is True.
-        """
-        if self.warnings and strict:
-            raise ImageError(
-                f"{name} contradicts the sensor {sensor}: {printable('; '.join(self.warnings))}. "
-                "Name the image's own sensor, measure it with 'characterize', or leave `strict` "
-                "out."
-            )
-        for warning in self.warnings:
-            logger.warning("look at the sensor: %s", warning)
-
 
 def checked_sensor(
     source: Source,
@@ -92,13 +72,22 @@ def checked_sensor(
         full_scale: the pixel value that is the sensors' largest digital number.
         name: of the image, for messages.
         strict: if True, a contradiction is an error instead of a warning.
+
+    Raises:
+        ImageError: there is a contradiction, and `strict` is True.
     """
     if all(sensor.name == BLIND for sensor in sensors.values()):
         return SensorCheck()
     ordered = in_order(sensors, source.raster)
     check = check_source(source, ordered, full_scale)
-    names = " and ".join(dict.fromkeys(sensor.name for sensor in ordered))
-    check.report(name, names, strict)
+    if check.warnings and strict:
+        names = " and ".join(dict.fromkeys(sensor.name for sensor in ordered))
+        raise ImageError(
+            f"{name} contradicts the sensor {names}: {printable('; '.join(check.warnings))}. Name "
+            "the image's own sensor, measure it with 'characterize', or omit `strict`."
+        )
+    for warning in check.warnings:
+        logger.warning("look at the sensor: %s", warning)
     return check
 
 
