@@ -5,6 +5,7 @@ network has run on the tiles that the consistency step reaches.
 """
 
 from importlib import import_module
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -65,7 +66,7 @@ def restore_lazily(bands: Any, raster: Raster, pipeline: NetworkPipeline, readin
     def of_group(place: TilePlace) -> Any:
         return shared[place.group % len(shared)]
 
-    places = [place for row in plan.rows for place in plan.places(row)]
+    places = list(chain.from_iterable(map(plan.places, plan.rows)))
     strips = {place: read(place) for place in places}
     restored = {place: delayed(_tile)(of_group(place), strips[place], place) for place in places}
 

@@ -171,24 +171,19 @@ def test_a_scheduler_whose_workers_left_is_one_sentence(monkeypatch: pytest.Monk
         call(local.scheduler_address, time.sleep, 60, meanwhile=lambda: local.scale(0))
 
 
-def test_nobody_at_the_address_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nobody_at_the_address_and_no_workers_are_one_sentence(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(cluster, "ANSWER_S", 0.5)
-    for address in ("tcp://127.0.0.1:1", "foo://a:1"):
-        with (
-            pytest.raises(MachineError, match=f"{address} does not answer: .*tcp://host:8786"),
-            open_cluster(address),
-        ):
-            pass
-
-
-def test_a_scheduler_without_workers_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "JOIN_S", 0.5)
-    with (
-        local_cluster(0) as local,
-        pytest.raises(MachineError, match="dask worker"),
-        open_cluster(local.scheduler_address),
-    ):
-        pass
+    with local_cluster(0) as local:
+        for address, words in (
+            ("tcp://127.0.0.1:1", "127.0.0.1:1 does not answer: .*tcp://host:8786"),
+            ("foo://a:1", "foo://a:1 does not answer: .*tcp://host:8786"),
+            (local.scheduler_address, "dask worker"),
+        ):
+            with pytest.raises(MachineError, match=words), open_cluster(address):
+                pass
 
 
 def test_a_worker_of_another_version_is_refused() -> None:
