@@ -105,7 +105,9 @@ def _restore(
     dtype = require_numbers(NAME, bands.dtype)
     value = None if reading.nodata is None else float(reading.nodata)
     mask_kind: MaskKind = "mask" if np.ma.isMaskedArray(bands) else ""
-    raster = Raster(*bands.shape, dtype, usable_nodata(value, dtype), mask_kind=mask_kind)
+    count, height_px, width_px = bands.shape
+    nodata = usable_nodata(value, dtype)
+    raster = Raster(count, height_px, width_px, dtype, nodata, mask_kind=mask_kind)
     if not hasattr(image, "__dask_graph__"):
         results = _restore_now(bands, raster, reading, load(), level)
     elif np.ma.isMaskedArray(getattr(image, "_meta", None)):

@@ -190,7 +190,8 @@ class Checkpoint:
             return []
         # A damaged journal may lack a key, or hold a value of another type.
         with suppress(ValueError, LookupError, TypeError, AttributeError, OSError):
-            content: dict[str, Any] = dict(read_json(path))
+            document: Any = read_json(path)
+            content: dict[str, Any] = dict(document)
             is_whole = content.pop("sha256") == _digest(content)
             finished = [
                 FinishedRow(**row | {"tally": Tally(**row["tally"])}) for row in content["finished"]

@@ -52,8 +52,8 @@ def require_tiff_name(path: Path) -> None:
     """
     if path.suffix.lower() not in OUT_SUFFIXES:
         raise OptionError(
-            f"The output {path.name} must have the name of a TIFF, such as {path.stem}.tif. Rename "
-            "it; other programs convert a TIFF to other formats."
+            f"The output must have the name of a TIFF, such as restored.tif, got {path.name}. "
+            "Rename it; other programs convert a TIFF to the format that you need."
         )
     for ending in (".msk", ".aux.xml"):
         sidecar = path.with_name(f"{path.name}{ending}")

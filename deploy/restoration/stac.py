@@ -43,14 +43,13 @@ LINEAGE = (
     "self-check outside",
     "self-check not decidable",
 )
-"""What the lineage reports of a run, where it has it."""
+"""The facts of a run that the lineage reports if the run has them."""
 
 MAPS = {
     "self-check": "Agreement of the restored with the raw image, block by block",
     "interval": "Interval of each restored pixel",
 }
 """Titles of the rasters that may be written with an image."""
-
 
 NAME = re.compile(r"[a-zA-Z][a-zA-Z0-9_.\-\s]+[a-zA-Z0-9]")
 """What the extension accepts as the name of a model."""

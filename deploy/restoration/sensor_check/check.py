@@ -31,7 +31,6 @@ logger = logging.getLogger(__name__)
 ABOVE = 0.001
 """A larger share of pixels above full scale does not occur in an image of the sensor."""
 
-
 WINDOW_PX = 512
 ACROSS = 4
 """The side of a window, and the largest number of windows along each axis."""
@@ -55,6 +54,26 @@ class SensorCheck:
         is_measured = any(figure.value is not None for figure in self.figures.values())
         words = "; ".join(self.warnings) or ("agrees" if is_measured else "not measurable")
         return {"sensor check": words} if self.figures else {}
+
+    def report(self, name: str, sensor: str, strict: bool) -> None:
+        """Log a warning for each contradiction.
+
+        Args:
+            name: of the image, for messages.
+            sensor: its profile's name.
+            strict: if True, a contradiction is an error instead.
+
+        Raises:
+            ImageError: there is a contradiction, and `strict` is True.
+        """
+        if self.warnings and strict:
+            raise ImageError(
+                f"{name} contradicts the sensor {sensor}: {printable('; '.join(self.warnings))}. "
+                "Name the image's own sensor, measure it with 'characterize', or leave `strict` "
+                "out."
+            )
+        for warning in self.warnings:
+            logger.warning("look at the sensor: %s", warning)
 
 
 def checked_sensor(
@@ -80,14 +99,8 @@ def checked_sensor(
         return SensorCheck()
     ordered = in_order(sensors, source.raster)
     check = check_source(source, ordered, full_scale)
-    if check.warnings and strict:
-        names = " and ".join(dict.fromkeys(sensor.name for sensor in ordered))
-        raise ImageError(
-            f"{name} contradicts the sensor {names}: {printable('; '.join(check.warnings))}. Name "
-            "the image's own sensor, measure it with 'characterize', or omit `strict`."
-        )
-    for warning in check.warnings:
-        logger.warning("look at the sensor: %s", warning)
+    names = " and ".join(dict.fromkeys(sensor.name for sensor in ordered))
+    check.report(name, names, strict)
     return check
 
 
