@@ -36,7 +36,8 @@ def by_file(
 
 def whole_image(model: Path, pixels: np.ndarray) -> np.ndarray:
     """Return the result without any tiling, float32."""
-    return restore_window(pixels[None], partial(run, open_session(load_onnx(model))), 4095)[0]
+    infer = partial(run, open_session(load_onnx(model)))
+    return np.asarray(restore_window(pixels[None], infer, 4095)[0])
 
 
 @pytest.mark.parametrize("dtype", [np.uint16, np.float32])
