@@ -44,7 +44,7 @@ from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import load_onnx, metadata, save_onnx
 from beers_deploy.quant.sensor_bank.conditioned import WEIGHTS
-from beers_deploy.restoration.interval.half_widths import interval_of
+from beers_deploy.restoration.interval import interval_of
 from beers_deploy.restoration.steps import BOTH
 from beers_deploy.studies.evaluation.calibrate import write_with_interval
 from beers_deploy.studies.evaluation.methods import network_restore, profile_of

@@ -63,25 +63,23 @@ class Conditioned:
         return int8_for_sensor(load_onnx(shipped), sensor)
 
 
-def conditioned(given: Path) -> Conditioned | None:
+def conditioned(path: Path) -> Conditioned | None:
     """Return the conditioned network for a name or a file, or None for any other file."""
-    if _is_shipped(given):
-        name = given.name.removesuffix(INT8)
+    if _is_shipped(path):
+        name = path.name.removesuffix(INT8)
         return Conditioned(name, shipped_weights(name))
     return (
-        Conditioned(given.stem, given)
-        if given.suffix == ".safetensors" and is_conditioned(given)
+        Conditioned(path.stem, path)
+        if path.suffix == ".safetensors" and is_conditioned(path)
         else None
     )
 
 
-def weights_file(given: Path) -> Path:
+def weights_file(path: Path) -> Path:
     """Return the path of a file, or of the shipped network of that name. Nothing is read."""
-    if not _is_shipped(given):
-        return given
-    return (
-        SHIPPED / f"{given.name}.onnx" if given.name.endswith(INT8) else shipped_weights(given.name)
-    )
+    if not _is_shipped(path):
+        return path
+    return SHIPPED / f"{path.name}.onnx" if path.name.endswith(INT8) else shipped_weights(path.name)
 
 
 def _is_shipped(path: Path) -> bool:
@@ -93,12 +91,12 @@ def _is_shipped(path: Path) -> bool:
     return is_name and not path.exists()
 
 
-def require_known(given: Path) -> Path:
+def require_known(path: Path) -> Path:
     """Return a path that may be a file or a shipped name. Raise an error for any other."""
-    if given.suffix or given.exists() or _is_shipped(given):
-        return given
+    if path.suffix or path.exists() or _is_shipped(path):
+        return path
     raise ModelError(
-        f"{given} is neither a file nor a shipped network ({', '.join(shipped_names())}, each also "
+        f"{path} is neither a file nor a shipped network ({', '.join(shipped_names())}, each also "
         f"with {INT8}). Correct the name or the path."
     )
 

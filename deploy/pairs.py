@@ -21,6 +21,7 @@ from beers_deploy.profiles.reference import require_same_units
 from beers_deploy.profiles.sensor import Sensor
 
 if TYPE_CHECKING:
+    from beers_deploy.model.simulator.detector import Draw
     from beers_deploy.model.simulator.sampling import Scene
 
 
@@ -135,7 +136,7 @@ def simulated_pair(
     aim = reference.in_units_of(degraded)
     require_same_units(degraded, aim)
     draw = Draw(seed)
-    radiance = _scene(scene, aim.nominal(), size_px, ratio, seed).radiance * radiance_scale
+    radiance = _scene(scene, aim.nominal(), size_px, ratio, draw).radiance * radiance_scale
     # Each sensor has a generator of its own: leaving one draw out does not change the others.
     instrument, aim_instrument = (
         profile.draw(draw.generator(f"sensor-{role}"))
@@ -152,17 +153,16 @@ def _scene(
     sensor: Instrument,
     size_px: int,
     ratio: int,
-    seed: int,
+    draw: "Draw",
 ) -> "Scene":
     from beers_deploy.model.simulator.acquire import MARGIN_PX
-    from beers_deploy.model.simulator.detector import Draw
     from beers_deploy.model.simulator.procedural import procedural_scene
     from beers_deploy.model.simulator.sampling import read_scene, scene_of
 
     if scene is None:
         # The Fourier transform of the blur wraps around. The margin excludes the opposite border.
         side_px = (size_px + 2 * MARGIN_PX) * ratio
-        return procedural_scene(side_px, side_px, Draw(seed).generator("drawn scene"))
+        return procedural_scene(side_px, side_px, draw.generator("drawn scene"))
     if isinstance(scene, str | os.PathLike):
         return read_scene(Path(scene), sensor)
     return scene_of("scene", np.asarray(scene), sensor)

@@ -21,8 +21,7 @@ from beers_deploy.performance.swath import predict_network, swath_latency
 from beers_deploy.profiles.errors import BeersError, ImageError
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted, unavailable
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.restoration.detectors.words import warn_of_detectors
-from beers_deploy.restoration.figures import plan_figures
+from beers_deploy.restoration.detectors.look import warn_of_detectors
 from beers_deploy.restoration.plan import Plan, plan_for
 from beers_deploy.restoration.prepare import NetworkPipeline
 from beers_deploy.restoration.radiometry import FullScale, Reading, full_scale_of
@@ -63,7 +62,7 @@ def preview_row(
         "width": measured(raster.width_px, "px", HEADER),
         "height": measured(raster.height_px, "px", HEADER),
         "bands": measured(raster.bands, "1", HEADER),
-        **plan_figures(plan),
+        **plan.figures,
         "time here": time_here(network, plan, pipeline.engine),
         f"time on {target.name}": time_on_board(network, plan, target),
         **check.figures,

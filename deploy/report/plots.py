@@ -342,10 +342,9 @@ def bins(spread: "Spread") -> tuple[np.ndarray, np.ndarray, int]:
     that contain every error.
     """
     farthest = int(np.abs(np.flatnonzero(spread.counts) - MAX_DN).max())
-    wide = 1
-    while 2 * (reach := -(-max(farthest - wide // 2, 0) // wide)) + 1 > MOST_BARS:
-        # The width stays odd, so that zero lies in the middle of a bin.
-        wide += 2
+    # The width is odd, so that zero lies in the middle of a bin.
+    wide = math.ceil((2 * farthest + 1) / MOST_BARS) | 1
+    reach = -(-max(farthest - wide // 2, 0) // wide)
     half = reach * wide + wide // 2
     middle = MAX_DN + wide
     padded = np.pad(spread.counts, wide)

@@ -1,6 +1,11 @@
-"""The page that shows the INT8 error by size, by patch and by layer."""
+"""The page that shows the INT8 error by size, by patch and by layer.
 
-from collections.abc import Sequence
+The errors of layers are also written as node data of Google's Model Explorer, which colours nodes
+by a value.
+"""
+
+import json
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import onnxruntime as ort
@@ -54,18 +59,18 @@ def sensitivity_page(
 
 def worst_picture(number: int, patches: Patches, sessions: Sessions, white_dn: float) -> Picture:
     """Draw one patch as given, in float and in INT8, and the absolute difference."""
-    degraded = patches.degraded[number]
-    given, in_float, in_int8 = (
+    patch = patches.degraded[number]
+    degraded, in_float, in_int8 = (
         np.clip(to_shares(image, patches.ranges), 0, 1)[0, 0] * MAX_DN
-        for image in (degraded, *(result_of(session, degraded) for session in sessions))
+        for image in (patch, *(result_of(session, patch) for session in sessions))
     )
     # A network may enlarge the image, which is shown at the size of the results.
     places = (
         np.arange(after) * before // after
-        for before, after in zip(given.shape, in_float.shape, strict=True)
+        for before, after in zip(degraded.shape, in_float.shape, strict=True)
     )
-    given = given[np.ix_(*places)]
-    images = {"degraded": given, "float": in_float, "INT8": in_int8}
+    degraded = degraded[np.ix_(*places)]
+    images = {"degraded": degraded, "float": in_float, "INT8": in_int8}
     difference = np.abs(in_int8 - in_float)
     cells = [*strip_row(images.values(), stretch_of(in_float)), *error_row([difference], white_dn)]
     caption = (
@@ -109,3 +114,24 @@ NOTES = (
         "rounds ties to even."
     ),
 )
+
+SHARE = "share of squared error"
+GRADIENT = [{"stop": 0, "bgColor": "#ffffff"}, {"stop": 1, "bgColor": "#d73027"}]
+"""Colours from the smallest value to the largest."""
+
+
+def node_data(layers: Iterable[Row]) -> str:
+    """Return the share of the squared error of each node as JSON of one graph.
+
+    The nodes in the float network, the host's file and the board's file have the layers' names, so
+    the same JSON colours all three.
+
+    Args:
+        layers: rows with a single layer in int8; other rows are left out.
+
+    Returns:
+        JSON text as Model Explorer reads it, with the shares in percent by the node's name.
+    """
+    shares = {row.name: row.figures[SHARE].value for row in layers if SHARE in row.figures}
+    results = {name: {"value": share} for name, share in shares.items()}
+    return json.dumps({"name": f"{SHARE}, %", "results": results, "gradient": GRADIENT}, indent=1)

@@ -135,12 +135,12 @@ def read_planes(source: Source, bands: Sequence[int], factor: int) -> Planes:
         stored = source.read(start, stop)[list(bands)]
         # Blocks at the right and at the bottom may have fewer pixels.
         beyond = ((0, 0), (0, (start - stop) % factor), (0, -raster.width_px % factor))
-        known = np.ma.array(
+        pixels = np.ma.array(
             np.pad(np.ma.getdata(stored), beyond),
             np.float32,
             mask=np.pad(raster.missing(stored), beyond, constant_values=True),
         )
-        blocks = known.reshape(len(bands), known.shape[1] // factor, factor, -1, factor)
+        blocks = pixels.reshape(len(bands), pixels.shape[1] // factor, factor, -1, factor)
         parts.append(blocks.mean(axis=(2, 4)).filled(np.nan).astype(np.float32))
     return np.concatenate(parts, axis=1)
 
@@ -149,8 +149,8 @@ def _sample(plane: Planes) -> Planes:
     """Return the known pixels of a plane on a coarse grid, or one zero if there are none."""
     step = -(-max(plane.shape) // SAMPLE_PX)
     sample = plane[::step, ::step]
-    known = sample[np.isfinite(sample)]
-    return known if known.size else np.zeros(1, np.float32)
+    values = sample[np.isfinite(sample)]
+    return values if values.size else np.zeros(1, np.float32)
 
 
 def _stretch_of(plane: Planes) -> Stretch:

@@ -13,7 +13,6 @@
     traditional  the same for the traditional pipeline: `TraditionalPipeline`
     tiles        the one tile loop, for files, arrays and Dask
     outcome      a comparison of the result with the image
-    figures      the figures of a run
     checkpoint   the finished rows on the disk and their journal, from which a later run continues
     output       from the finished rows to the TIFF, plain or cloud-optimised
     interval     the half-widths of the result, from its finished rows

@@ -22,7 +22,7 @@ from beers_deploy.model.raster.facts import (
 )
 from beers_deploy.model.raster.source import ArraySource
 from beers_deploy.profiles.errors import ImageError, OptionError
-from beers_deploy.restoration.interval.half_widths import HalfWidths, half_widths_of
+from beers_deploy.restoration.interval import HalfWidths, half_widths_of
 from beers_deploy.restoration.prepare import NetworkPipeline, Pipeline
 from beers_deploy.restoration.radiometry import Reading
 from beers_deploy.restoration.tiles.engine import NAME
@@ -43,25 +43,18 @@ def restore_array(
         load: returns the pipeline that restores it.
         level: of the interval whose half-widths are returned too; None for none.
     """
-    results = _restored_and_width(image, reading, load, level)
-    return results[0] if level is None else tuple(results)
-
-
-def _restored_and_width(
-    image: Any, reading: Reading, load: Callable[[], Pipeline], level: Level | None
-) -> list[Any]:
-    """Return the restored array, and with a level its half-widths, of the kind of the image."""
     # Arrays of xarray and torch are recognised by their attributes, so that neither is imported.
     if hasattr(image, "coords") and hasattr(image, "dims"):
-        return _restore_labelled(image, reading, load, level)
-    if hasattr(image, "detach"):
+        results = _restore_labelled(image, reading, load, level)
+    elif hasattr(image, "detach"):
         torch = import_module("torch")
-        results = _restore(image.detach().cpu().numpy(), reading, load, level)
-        return [torch.from_numpy(pixels).to(image.device) for pixels in results]
-    results = _restore(image, reading, load, level)
-    if np.ma.isMaskedArray(image):
-        return [_masked_like(image, pixels) for pixels in results]
-    return results
+        arrays = _restore(image.detach().cpu().numpy(), reading, load, level)
+        results = [torch.from_numpy(pixels).to(image.device) for pixels in arrays]
+    else:
+        results = _restore(image, reading, load, level)
+        if np.ma.isMaskedArray(image):
+            results = [_masked_like(image, pixels) for pixels in results]
+    return results[0] if level is None else tuple(results)
 
 
 def _restore_labelled(
@@ -84,7 +77,7 @@ def _restore_labelled(
     bands = next((dim for dim in image.dims if dim in BAND_DIMS), None)
     ordered = image if bands is None or image.ndim != 3 else image.transpose(bands, ...)
     if image.ndim == 3 and bands is None and ordered.shape[-1] <= FEW < min(ordered.shape[:-1]):
-        raise _bands_last(ordered.shape, "name the dimension of the bands 'band'.")
+        raise _bands_last(ordered.shape, "Name the dimension of the bands 'band'")
     reading = replace(reading, full_scale=full_scale, nodata=nodata)
     labelled = [
         _labelled(ordered, pixels) for pixels in _restore(ordered.data, reading, load, level)
@@ -109,7 +102,12 @@ def _restore(
     image: Any, reading: Reading, load: Callable[[], Pipeline], level: Level | None
 ) -> list[Any]:
     bands = _bands_first(image)
-    raster = _raster(bands, reading.nodata)
+    dtype = require_numbers(NAME, bands.dtype)
+    value = None if reading.nodata is None else float(reading.nodata)
+    mask_kind: MaskKind = "mask" if np.ma.isMaskedArray(bands) else ""
+    count, height_px, width_px = bands.shape
+    nodata = usable_nodata(value, dtype)
+    raster = Raster(count, height_px, width_px, dtype, nodata, mask_kind=mask_kind)
     if not hasattr(image, "__dask_graph__"):
         results = _restore_now(bands, raster, reading, load(), level)
     elif np.ma.isMaskedArray(getattr(image, "_meta", None)):
@@ -201,20 +199,12 @@ def _bands_first(image: Any) -> Any:
             "`nodata`."
         )
     if len(shape) == 3 and shape[2] <= FEW < min(shape[:2]):
-        raise _bands_last(shape, "numpy.moveaxis(image, -1, 0) puts them first.")
+        raise _bands_last(shape, "Put them first with numpy.moveaxis(image, -1, 0)")
     return image if len(shape) == 3 else image[None]
 
 
 def _bands_last(shape: tuple[int, ...], remedy: str) -> ImageError:
     return ImageError(
-        f"`image` must be (bands, H, W), but its shape {tuple(shape)} ends in bands: {remedy}"
+        f"`image` must be (bands, H, W), but the bands are last in its shape {tuple(shape)}. "
+        f"{remedy}."
     )
-
-
-def _raster(bands: Any, nodata: float | None) -> Raster:
-    count, height_px, width_px = bands.shape
-    dtype = require_numbers(NAME, bands.dtype)
-    value = None if nodata is None else float(nodata)
-    mask_kind: MaskKind = "mask" if np.ma.isMaskedArray(bands) else ""
-    nodata = usable_nodata(value, dtype)
-    return Raster(count, height_px, width_px, dtype, nodata, mask_kind=mask_kind)

@@ -6,7 +6,7 @@ the end of their names, or used in the order given.
 
 import logging
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -96,35 +96,31 @@ def _log_network(network: Network, sensors: Mapping[str, Sensor]) -> None:
         logger.info("network: %s, conditioned on %s", network.name, names)
 
 
-def in_order(given: Mapping[str, Each], raster: Raster) -> list[Each]:
-    """Return the given items in the order of the image's bands. An item for all bands is returned
+def in_order(items: Mapping[str, Each], raster: Raster) -> list[Each]:
+    """Return items by band in the order of the image's bands. An item for all bands is returned
     alone.
     """
-    if "" in given:
-        return [given[""]]
+    if "" in items:
+        return [items[""]]
     stored_names = raster.band_names
-    names = stored_names or _by_number(given)
-    if len(given) != raster.bands or set(names) != set(given):
+    names = stored_names or _by_number(items)
+    if len(items) != raster.bands or set(names) != set(items):
         names_text = f" ({printable(', '.join(stored_names))})" if stored_names else ""
         raise OptionError(
             f"`sensor` must name a sensor for each of {raster.bands} bands{names_text}, got "
-            f"{printable(', '.join(given))}. Name every band of the image; pansharpening is out of "
+            f"{printable(', '.join(items))}. Name every band of the image; pansharpening is out of "
             "scope."
         )
-    return [given[name] for name in names]
+    return [items[name] for name in names]
 
 
-def _by_number(names: Iterable[str]) -> tuple[str, ...]:
+def _by_number(names: Collection[str]) -> Collection[str]:
     """Sort names that end in a number, such as B2, by that number. Leave other names in the given
     order.
     """
-    matches = {name: re.fullmatch(r"\D*(\d{1,6})", name) for name in names}
-    ordinals = {name: int(match[1]) for name, match in matches.items() if match}
-    return tuple(
-        sorted(ordinals, key=lambda name: ordinals[name])
-        if len(ordinals) == len(matches)
-        else matches
-    )
+    if all(re.fullmatch(r"\D*\d{1,6}", name) for name in names):
+        return sorted(names, key=lambda name: int(re.sub(r"\D", "", name)))
+    return names
 
 
 def require_alike(networks: Sequence[Network]) -> None:

@@ -64,34 +64,6 @@ def journal_text(job: Mapping[str, object], finished: Sequence[FinishedRow]) -> 
     return json.dumps(content | {"sha256": _digest(content)})
 
 
-def read_journal(path: Path, job: Mapping[str, object]) -> list[FinishedRow]:
-    """Read the finished rows of a journal.
-
-    Args:
-        path: the path of the journal.
-        job: the job that it must belong to.
-
-    Raises:
-        ValueError: the journal is damaged, or belongs to another job.
-        LookupError: the journal lacks one of its keys.
-        TypeError: a value has another type.
-        OSError: the journal cannot be read.
-    """
-    document: Any = read_json(path)
-    content: dict[str, Any] = dict(document)
-    # `resume` trusts nothing that it finds on the disk: a journal has a digest of its own.
-    if content.pop("sha256") != _digest(content):
-        raise ValueError("damaged")
-    if content["job"] != job:
-        raise ValueError("another job")
-    finished = [
-        FinishedRow(**row | {"tally": Tally(**row["tally"])}) for row in content["finished"]
-    ]
-    if not all(map(_possible, finished)):
-        raise ValueError("impossible counts")
-    return finished
-
-
 def _possible(row: FinishedRow) -> bool:
     """Return True if counts are integers, and no count or sum is negative."""
     tally = zip(astuple(row.tally), astuple(Tally()), strict=True)
@@ -179,8 +151,8 @@ class Checkpoint:
             self._finished.append(
                 FinishedRow(rows_px, row.pixels.nbytes, digest.hexdigest(), row.tally)
             )
-            self.rows = self.rows + rows_px
-            self.tally = self.tally + row.tally
+            self.rows += rows_px
+            self.tally += row.tally
             self._write_journal()
 
     def read(self, band: int, start: int, stop: int) -> np.ndarray:
@@ -206,14 +178,9 @@ class Checkpoint:
         try:
             yield
         except OSError as error:
-            advice = (
-                f"go on with `resume` from row {self.rows} of {self.shape[1]}"
-                if self.rows
-                else "run it again: no row is left to `resume` from"
-            )
             raise MachineError(
-                f"{self.out} cannot be written: {error.strerror or error}. Correct that, and "
-                f"{advice}."
+                f"{self.out} cannot be written: {error.strerror or error}. Correct that, and go on "
+                f"with `resume` from row {self.rows} of {self.shape[1]}."
             ) from error
 
     def _left(self) -> list[FinishedRow]:
@@ -221,11 +188,18 @@ class Checkpoint:
         path = self.folder / "journal.json"
         if not path.is_file():
             return []
+        # A damaged journal may lack a key, or hold a value of another type.
         with suppress(ValueError, LookupError, TypeError, AttributeError, OSError):
-            finished = read_journal(path, self.job)
+            document: Any = read_json(path)
+            content: dict[str, Any] = dict(document)
+            is_whole = content.pop("sha256") == _digest(content)
+            finished = [
+                FinishedRow(**row | {"tally": Tally(**row["tally"])}) for row in content["finished"]
+            ]
             ends = list(accumulate(row.rows_px for row in finished))
             planned = not self._row_ends or ends == self._row_ends[: len(ends)]
-            if planned and max(ends, default=0) <= self.shape[1]:
+            inside = max(ends, default=0) <= self.shape[1] and all(map(_possible, finished))
+            if is_whole and content["job"] == self.job and planned and inside:
                 return finished
         raise OptionError(
             "`resume` needs the image, the model and the options of the run that was stopped, but "

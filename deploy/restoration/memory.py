@@ -9,7 +9,7 @@ import psutil
 
 from beers_deploy.model.raster.source import Source
 from beers_deploy.profiles.errors import MachineError, sizes
-from beers_deploy.profiles.figures import Figure, measured, unavailable
+from beers_deploy.profiles.figures import Figure, measured
 from beers_deploy.restoration.plan import Plan
 
 STATUS = Path("/proc/self/status")
@@ -39,14 +39,15 @@ def rows_bytes(source: Source, plan: Plan, begun: bool = False) -> int:
     return 2 * strip_bytes + flags + restored + source_bytes
 
 
-def check_memory(rows: int, budget_bytes: int | None, bulky: bool) -> int:
-    """Return the process's peak memory in bytes: what it uses now, plus the rows to come. Raise
-    MachineError if that exceeds the budget.
+def check_memory(rows: int, budget_bytes: int | None) -> int:
+    """Return the process's peak memory in bytes: what it uses now, plus the rows to come.
 
     Args:
         rows: bytes that rows of the image will need.
         budget_bytes: None allows all free memory.
-        bulky: True if most of them are due to large strips of the image.
+
+    Raises:
+        MachineError: the peak exceeds the budget.
     """
     resident_bytes = psutil.Process().memory_info().rss
     # What this process holds already is not part of what is free.
@@ -54,48 +55,29 @@ def check_memory(rows: int, budget_bytes: int | None, bulky: bool) -> int:
     if resident_bytes + rows <= allowed_bytes:
         return resident_bytes + rows
     limit, before, rows_size = sizes(allowed_bytes, resident_bytes, rows)
-    smaller = (
-        "Rewrite the image in tiles (gdal_translate -co TILED=YES)"
-        if bulky
-        else "Use a smaller `tile`"
-    )
-    remedy = (
-        f"{smaller}, or allow more memory"
-        if resident_bytes < allowed_bytes
-        else f"Allow more memory than {before}"
-    )
     raise MachineError(
         f"The run may use {limit} of memory, but the process already uses {before}, and rows of "
-        f"the image need {rows_size}. {remedy}."
+        f"the image need {rows_size} more. Allow more memory than both together, use a smaller "
+        "`tile`, or rewrite an image of large strips in tiles (gdal_translate -co TILED=YES)."
     )
-
-
-def is_bulky(source: Source, plan: Plan) -> bool:
-    """Return True if most of the memory is needed for the image's own strips or tiles."""
-    return source.held_bytes(1) > rows_bytes(source, plan) / 2
 
 
 def peak_memory() -> Figure:
-    """Return the peak resident memory of this process since it started, in GB; unavailable if the
-    system does not count it.
-    """
-    peak = _peak_bytes()
-    if peak is None:
-        return unavailable("GB", "this system counts no peak memory")
-    return measured(peak / 1e9, "GB", "resident memory of this process, highest since it began")
+    """Return the peak resident memory of this process since it started, in GB."""
+    source = "resident memory of this process, highest since it began"
+    return measured(_peak_bytes() / 1e9, "GB", source)
 
 
-def _peak_bytes() -> int | None:
+def _peak_bytes() -> int:
     if sys.platform == "win32":
         return int(psutil.Process().memory_info().peak_wset)
     # On Linux, getrusage's count begins with the memory of the process's parent.
     with suppress(OSError, StopIteration):
         lines = STATUS.read_text(encoding="utf-8").splitlines()
         return 1024 * int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
-    try:
-        import resource
-    except ImportError:
-        return None
+    # Every system but Windows has this module.
+    import resource
+
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     # macOS counts bytes, the others KiB.
     return peak if sys.platform == "darwin" else 1024 * peak

@@ -26,7 +26,7 @@ Restore = Callable[[np.ndarray], np.ndarray]
 def network_method(
     model: onnx.ModelProto,
     max_dn: int,
-    brighter: Mapping[int, onnx.ModelProto] | None = None,
+    brighter: Mapping[int, onnx.ModelProto],
     sensor: Instrument | None = None,
     reference: Instrument | None = None,
     plan_of: Callable[[tuple[int, ...]], Plan] | None = None,
@@ -37,7 +37,7 @@ def network_method(
     Args:
         model: the network.
         max_dn: the largest digital number.
-        brighter: the same network for sensors of higher gain, by factor; none omits exposure.
+        brighter: the same network for sensors of higher gain, by factor; empty to omit exposure.
         sensor: the sensor that acquired the images; None omits the consistency step.
         reference: the sensor that the restoration aims at; needed with `sensor`.
         plan_of: returns the tiles of an image (H, W); the default ones, or those that the network
@@ -45,11 +45,10 @@ def network_method(
     """
     infer, _ = open_runtime("onnxruntime", model, threads=0)
     tiling = tiling_of(model)
-    others = {} if brighter is None else brighter
     # Bright images ask for no factor above 1.
     at_first_call = {
         factor: AtFirstCall(partial(open_runtime, "onnxruntime", other, 0))
-        for factor, other in others.items()
+        for factor, other in brighter.items()
     }
     offset = sensor.offset_dn if sensor else 0.0
     network = ExposedNetwork({1: infer, **at_first_call}, tiling.halo_px, offset)

@@ -30,7 +30,7 @@ MANY_BLANK = 0.01
 """A warning reports a larger share of the image in squares of `BLANK_PX` a side that are exactly 0,
 if no pixel is stated to be missing. Noise leaves no such square, even around 0.
 """
-MEAN_KEPT = 0.015
+MEAN_SHARE = 0.015
 LEAST_MOVE = 0.0003
 SCATTER = 2.0
 DARK_MOVE = RANGES["sigma_dark"][1] / 2
@@ -194,7 +194,7 @@ class Tally:
         # A border of zeros changes the mean of a small image, hence the standard error.
         scatter = SCATTER * self.spreads[0] / math.sqrt(count)
         # No pixel is stored below 0, which raises the mean of a dark and noisy image.
-        return MEAN_KEPT * self.means[0] + LEAST_MOVE + scatter + DARK_MOVE * self.dark / count
+        return MEAN_SHARE * self.means[0] + LEAST_MOVE + scatter + DARK_MOVE * self.dark / count
 
     @property
     def spreads(self) -> tuple[float, float]:
@@ -285,9 +285,9 @@ class Tally:
             impossible or self.clipped > MANY_AT_ENDS * max(self.compared, 1)
         ):
             raise ImageError(
-                f"{name} is not restored plausibly: {printable('; '.join(self.doubts))}. Check "
-                "`full_scale` and, with 'gate', the network, or write the result all the same with "
-                "`force`."
+                f"The restoration of {name} is not plausible: "
+                f"{printable('; '.join(self.doubts))}. Check `full_scale`, check the network with "
+                "'gate', or write the result all the same with `force`."
             )
 
 

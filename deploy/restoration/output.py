@@ -25,16 +25,16 @@ OUT_SUFFIXES = TIFF_SUFFIXES | {".btf", ".tf8"}
 
 @dataclass(frozen=True)
 class Output:
-    """What is written.
+    """The files that a run writes.
 
     Attributes:
-        path: of the TIFF.
-        compression: of the TIFF.
-        cog: whether it is a Cloud-Optimised GeoTIFF.
-        resume: whether a stopped run goes on.
-        self_check: where the map of the self-check is written; None for nowhere.
-        interval: the level of the half-widths that are written next to the TIFF; None for none.
-        others: further files that will be written, which must be no input either.
+        path: the path of the TIFF.
+        compression: the compression of the TIFF.
+        cog: True for a Cloud-Optimised GeoTIFF.
+        resume: True to continue a run that was stopped.
+        self_check: the path of the map of the self-check; None writes no map.
+        interval: the level of the half-widths that are written next to the TIFF; None writes none.
+        others: further files that will be written, none of which may be an input.
     """
 
     path: Path
@@ -47,7 +47,9 @@ class Output:
 
 
 def require_tiff_name(path: Path) -> None:
-    """Refuse a name under which no program would look for a TIFF."""
+    """Raise OptionError if the output's name is not that of a TIFF, or if a sidecar of that name
+    exists.
+    """
     if path.suffix.lower() not in OUT_SUFFIXES:
         raise OptionError(
             f"The output must have the name of a TIFF, such as restored.tif, got {path.name}. "
@@ -63,8 +65,8 @@ def require_tiff_name(path: Path) -> None:
 
 
 def what_was_done(networks: Sequence[Network], scale: FullScale) -> dict[str, str]:
-    """Return the run as an image's metadata: tool, networks in the order of the bands, their
-    sensors and full scale.
+    """Return the metadata that records a run in its output: this tool, the networks in the order of
+    the bands, their sensors, and the full scale.
     """
     about = {
         RESTORED_BY: f"beers-deploy {version('beers-deploy')}",

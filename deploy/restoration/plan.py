@@ -10,9 +10,12 @@ extended there by copies of its last row and column.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
 
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import ModelError, OptionError, printable
+from beers_deploy.profiles.figures import Figure, predicted
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.quant.tiling.receptive_field import Tiling
 
@@ -54,6 +57,14 @@ class Span:
     stop: int
     keep_start: int
     keep_stop: int
+
+
+class TilePlace(NamedTuple):
+    """The place of a tile: the group of bands, and its rows and columns."""
+
+    group: int
+    rows: Span
+    columns: Span
 
 
 def plan_side(
@@ -161,6 +172,11 @@ class Plan:
         """The number of rows and columns of pixels of every tile."""
         return self.rows[0].stop - self.rows[0].start, self.columns[0].stop - self.columns[0].start
 
+    def places(self, row: Span) -> list[TilePlace]:
+        """Return the tiles of one row of tiles, in the order in which they are restored."""
+        across = product(range(self.groups), self.columns)
+        return [TilePlace(group, row, column) for group, column in across]
+
     @property
     def row_tiles(self) -> int:
         """The number of tiles in one row of tiles, over all groups of bands."""
@@ -180,6 +196,15 @@ class Plan:
         return window_px / (self.height_px * self.width_px)
 
     @property
+    def figures(self) -> dict[str, Figure]:
+        """The figures of how an image is cut. They are known in advance, not measured."""
+        numbers = {"tiles": self.tiles, "work factor": self.work_factor}
+        source = "arithmetic on the plan of tiles"
+        return {
+            key: predicted(number, "1", (number, number), source) for key, number in numbers.items()
+        }
+
+    @property
     def strip_rows_px(self) -> int:
         """The largest number of rows that are read at once: those of a tile, and those from which
         missing pixels are filled.
@@ -196,8 +221,7 @@ class Plan:
     @property
     def sentence(self) -> str:
         """How the image is cut, in one sentence for the user."""
-        bands = f", each of {self.bands} bands by itself" if self.groups > 1 else ""
-        bands = f", {self.bands} bands together" if self.tiling.channels_in > 1 else bands
+        bands = f", {self.bands} bands" if self.bands > 1 else ""
         larger = f", {self.scale} times as large" if self.scale > 1 else ""
         rows_px, columns_px = self.tile_shape
         tiles = "1 tile" if self.tiles == 1 else f"{self.tiles} tiles"

@@ -9,24 +9,23 @@ import logging
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 from typing import Protocol
 
+import numpy as np
 import onnx
 
 from beers_deploy.model.raster.source import Source
 from beers_deploy.network import Network
-from beers_deploy.profiles.figures import Figure
-from beers_deploy.profiles.shipped import BLIND
+from beers_deploy.profiles.figures import Figure, measured, unavailable
 from beers_deploy.restoration.bands import in_order, require_alike
 from beers_deploy.restoration.cluster import Cluster
-from beers_deploy.restoration.detectors.words import warn_of_detectors
-from beers_deploy.restoration.figures import plan_figures, seam_figures
-from beers_deploy.restoration.memory import check_memory, is_bulky, rows_bytes
+from beers_deploy.restoration.detectors.look import warn_of_detectors
+from beers_deploy.restoration.memory import check_memory, rows_bytes
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.plan import Plan, Span, Tiles, plan_for
+from beers_deploy.restoration.plan import Plan, Span, TilePlace, Tiles, plan_for
 from beers_deploy.restoration.radiometry import FullScale, Reading, full_scale_of
 from beers_deploy.restoration.runtime import (
     AtFirstCall,
@@ -64,7 +63,6 @@ class Restoration(ABC):
         source: the image.
         name: of the image, for messages.
         reading: how its pixels are interpreted.
-        method: 'network' or 'traditional'.
         networks: the networks that restore its bands; empty for the traditional pipeline.
         scale: the pixel value that is full scale.
         check: the result of checking the image's sensor.
@@ -82,7 +80,6 @@ class Restoration(ABC):
     source: Source
     name: str
     reading: Reading
-    method: str
     networks: Sequence[Network] = ()
     scale: FullScale
     check: SensorCheck
@@ -155,25 +152,22 @@ class NetworkRestoration(Restoration):
 
     def ticks(self, done_px: int) -> int:
         """Return the number of tiles to run."""
-        rows = rows_to_run(self.plan, self.restorer, self._rows_left(done_px))
+        rows = rows_to_run(self.restorer, self._rows_left(done_px))
         return len(rows) * self.plan.row_tiles
 
     def rows(self, done_px: int, tick: Tick) -> Generator[RestoredRow, None, None]:
         """Restore rows of tiles from row `done_px` of the restored image on."""
         rows = self._rows_left(done_px)
-        return restore_rows(
-            self.source, self.plan, self.restorer, rows, lambda: tick(1), self.at_once
-        )
+        return restore_rows(self.source, self.restorer, rows, lambda: tick(1), self.at_once)
 
     def memory_bytes(self) -> int:
         """Return the peak memory: what the process uses now, plus the rows to come."""
         needed = rows_bytes(self.source, self.plan, begun=True)
-        bulky = is_bulky(self.source, self.plan)
-        return check_memory(needed, self.reading.memory_bytes, bulky)
+        return check_memory(needed, self.reading.memory_bytes)
 
     def figures(self, tally: Tally) -> dict[str, Figure]:
         """Return the figures of a run."""
-        figures = {**plan_figures(self.plan), **self.seams, **tally.figures}
+        figures = {**self.plan.figures, **self.seams, **tally.figures}
         if any(len(network.infers) > 1 for network in self.restorer.networks):
             figures |= tally.exposure_figures
         if self.restorer.consistency:
@@ -206,7 +200,7 @@ class NetworkPipeline:
         require_alike(networks)
         plan = plan_for(networks[0], raster.shape, self.tiles)
         logger.info(plan.sentence)
-        check_memory(rows_bytes(source, plan), reading.memory_bytes, is_bulky(source, plan))
+        check_memory(rows_bytes(source, plan), reading.memory_bytes)
         extents = (raster.extent(source.read(row.keep_start, row.keep_stop)) for row in plan.rows)
         scale = full_scale_of(name, raster, extents, reading.full_scale, reading.sensor_bits)
         check, check_s = check_sensor(source, networks, reading, scale.value, name)
@@ -217,9 +211,10 @@ class NetworkPipeline:
         )
         # Values above an assumed full scale show that the assumption is wrong, so they are refused.
         clips = not scale.assumed
-        restorer = Restorer(raster, exposed, scale.value, plan.tiling, name, clips, steps)
+        restorer = Restorer(raster, exposed, scale.value, plan, name, clips, steps)
         others = [exposures_of(network, self.around) for network in networks]
         identity = {
+            "method": "network",
             "model": [network.sha256 for network in networks],
             "exposures": [[other.sha256 for other in each.values()] for each in others],
             "factors": [sorted(each) for each in others],
@@ -239,7 +234,6 @@ class NetworkPipeline:
             source=source,
             name=name,
             reading=reading,
-            method="network",
             networks=networks,
             scale=scale,
             check=check,
@@ -270,22 +264,65 @@ def _opener(
     at_once = tiles_at_once(threads, plan.tiles)
     first_model = networks[0].model
     first, runtime = open_runtime(engine.runtime, first_model, threads, at_once)
-    if cluster is None:
+    if cluster is not None:
+        # Two rows of tiles are in work: two tiles for each of the cluster's calls keep it busy.
+        at_once = max(min(2 * cluster.slots, 2 * plan.row_tiles), 1)
+        return partial(infer_on, cluster, engine), at_once, runtime
 
-        def open_here(model: onnx.ModelProto) -> Infer:
-            if model is first_model:
-                return first
-            return AtFirstCall(partial(open_runtime, engine.runtime, model, threads, at_once))
+    def open_here(model: onnx.ModelProto) -> Infer:
+        if model is first_model:
+            return first
+        return AtFirstCall(partial(open_runtime, engine.runtime, model, threads, at_once))
 
-        return open_here, at_once, runtime
-    workers = cluster
+    return open_here, at_once, runtime
 
-    def open_there(model: onnx.ModelProto) -> Infer:
-        return infer_on(workers, engine.packed(model))
 
-    # Two rows of tiles are in work: two tiles for each of the cluster's calls keep it busy.
-    at_once = max(min(2 * cluster.slots, 2 * plan.row_tiles), 1)
-    return open_there, at_once, runtime
+def seam_figures(source: Source, plan: Plan, restorer: Restorer) -> dict[str, Figure]:
+    """Measure the error of seams on a tile in the middle, in digital numbers, if the halo leaves
+    seams.
+
+    The same retained pixels are restored twice: from the tile's own window, and from one with the
+    whole radius around it.
+    """
+    keys = "seam error max", "seam error mean"
+    if plan.halo_px >= plan.radius_px or len(plan.rows) == len(plan.columns) == 1:
+        return {}
+    if plan.tiling.fixed_px is not None:
+        reason = "the network is fixed to one tile size: no wider window to compare with"
+        return dict.fromkeys(keys, unavailable("DN", reason))
+    rows = plan.rows[len(plan.rows) // 2]
+    columns = plan.columns[len(plan.columns) // 2]
+    ends_px = plan.rows[-1].stop, plan.columns[-1].stop
+    wide = [
+        _widened(span, plan.radius_px, end_px)
+        for span, end_px in zip((rows, columns), ends_px, strict=True)
+    ]
+    # A last tile that was moved inward may begin before the wider window.
+    top = min(rows.start, wide[0].start)
+    strip = restorer.read(source, replace(rows, start=top, stop=max(rows.stop, wide[0].stop)))
+    cheap, exact = (
+        restorer.tile(strip, TilePlace(0, *spans)).pixels.astype(np.float64)
+        for spans in ((rows, columns), wide)
+    )
+    error = np.abs(np.nan_to_num(cheap) - np.nan_to_num(exact))
+    how = f"the tile in the middle with a halo of {plan.halo_px} px against {plan.radius_px} px"
+    return {
+        key: measured(float(value), "DN", how)
+        for key, value in zip(keys, (error.max(), error.mean()), strict=True)
+    }
+
+
+def _widened(span: Span, radius_px: int, size_px: int) -> Span:
+    """Return a span of the same retained pixels with the whole radius around them, as far as the
+    image and its extension reach.
+
+    The retained part ends on the network's lattice or with the image. In the second case the span
+    that is read ends with the extension.
+    """
+    start = max(span.keep_start - radius_px, 0)
+    stop = min(span.keep_stop + radius_px, size_px)
+    stop = size_px if span.stop == size_px else stop
+    return Span(start, stop, span.keep_start, span.keep_stop)
 
 
 def check_sensor(
@@ -304,11 +341,10 @@ def check_sensor(
         The check, and the seconds that it took.
     """
     started = time.perf_counter()
-    check = SensorCheck()
     warn_of_detectors(source, full_scale)
-    if any(sensor.name != BLIND for sensor in reading.sensors.values()):
-        check = checked_sensor(source, reading.sensors, full_scale, name, reading.strict)
-    elif not reading.force:
+    check = checked_sensor(source, reading.sensors, full_scale, name, reading.strict)
+    # A check without figures had no sensor to compare with.
+    if not check.figures and not reading.force:
         models = [network.model for network in networks]
         if sentence := restored_already(source, models, full_scale):
             logger.warning(sentence)

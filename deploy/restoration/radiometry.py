@@ -78,7 +78,7 @@ def full_scale_of(
     name: str,
     raster: Raster,
     extents: Iterable[Extent],
-    asked: float | None = None,
+    requested: float | None = None,
     bits: int | None = None,
 ) -> FullScale:
     """Return the full scale of an image: the user's, that of its file, of the sensor, or 12 bits.
@@ -87,17 +87,23 @@ def full_scale_of(
         name: the name of the image, for messages.
         raster: the description of its file.
         extents: as for `model.raster.full_scale.settled_scale`, drawn for floats only.
-        asked: the full scale that the user gives, or None.
+        requested: the full scale that the user gives, or None.
         bits: bits per pixel of the sensor, if the user names its profile.
 
     Raises:
         OptionError: a full scale that is not positive, or that the output's type cannot hold.
         ImageError: pixels that contradict an assumed full scale.
     """
-    if asked is not None:
-        settled_scale(name, raster.dtype, extents, asked)
-        require_room(raster, asked)
-        return FullScale(asked, "asked for")
+    if requested is not None:
+        settled_scale(name, raster.dtype, extents, requested)
+        kind = raster.out_dtype
+        # A float output holds any full scale.
+        if kind.kind != "f" and requested > np.iinfo(kind).max:
+            raise OptionError(
+                f"`full_scale` must be at most {np.iinfo(kind).max} for {kind} pixels, got "
+                f"{requested:g}. Convert the image to uint16."
+            )
+        return FullScale(requested, "asked for")
     if raster.bits is not None:
         return FullScale(2**raster.bits - 1, f"{raster.bits} bits, as the file states")
     # A full scale that the type of the pixels cannot hold is not that of the image.
@@ -112,14 +118,3 @@ def full_scale_of(
         else usual
     )
     return FullScale(value, f"{bits} bits, of the sensor")
-
-
-def require_room(raster: Raster, full_scale: float) -> None:
-    """Raise OptionError if the output's type cannot hold pixels up to full scale."""
-    kind = raster.out_dtype
-    # A float output holds any full scale.
-    if kind.kind != "f" and full_scale > np.iinfo(kind).max:
-        raise OptionError(
-            f"`full_scale` must be at most {np.iinfo(kind).max} for {kind} pixels, got "
-            f"{full_scale:g}. Convert the image to uint16."
-        )

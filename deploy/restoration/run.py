@@ -1,9 +1,9 @@
-"""One image file restored into another: what `restore` does with a file.
+"""Restore an image file into another one, as `restore` does with files.
 
-open -> faulty detectors -> make ready -> rows that a checkpoint lacks -> the TIFF -> figures
+open -> faulty detectors -> prepare -> rows that a checkpoint lacks -> the TIFF -> figures
 
-One row is written while the next is made. Whatever stops a run, the output is the old one or the
-new one; finished rows stay in the checkpoint where a later run can go on.
+One row is written while the next is computed. Whatever stops a run, the output is the old one or
+the new one. Finished rows stay in the checkpoint if a later run can continue from them.
 """
 
 import logging
@@ -11,13 +11,13 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from math import prod
 from pathlib import Path
 
 from beers_deploy.model.interval import HalfWidth
-from beers_deploy.model.io.files import require_writable
+from beers_deploy.model.io.files import require_writable, write_text
 from beers_deploy.model.io.lock import only_run
 from beers_deploy.model.progress import held_back, steps
 from beers_deploy.model.raster.facts import require_raw
@@ -25,27 +25,25 @@ from beers_deploy.model.raster.reader import open_raster, require_image_file
 from beers_deploy.model.raster.source import Source, fingerprint, stamps
 from beers_deploy.model.raster.writer import cog_bytes, require_codec
 from beers_deploy.network import Network
-from beers_deploy.profiles.errors import BeersError, ImageError, MachineError
+from beers_deploy.profiles.errors import BeersError, ImageError, MachineError, OptionError
 from beers_deploy.profiles.figures import Figure, Row, measured
 from beers_deploy.profiles.sensor_numbers import numbers_of
 from beers_deploy.restoration.bands import in_order
 from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.cluster import open_cluster
-from beers_deploy.restoration.detectors.fault_list import FOUND, FaultList, list_beside, write_list
+from beers_deploy.restoration.detectors.fault_list import FOUND, FaultList, list_beside
 from beers_deploy.restoration.detectors.fix import faults_of, fixed
-from beers_deploy.restoration.interval.file import interval_beside, write_half_widths
-from beers_deploy.restoration.interval.half_widths import HalfWidths, half_widths_of
+from beers_deploy.restoration.interval import (
+    HalfWidths,
+    half_widths_of,
+    interval_beside,
+    write_half_widths,
+)
 from beers_deploy.restoration.memory import peak_memory
 from beers_deploy.restoration.output import Output, require_tiff_name, what_was_done, write_output
 from beers_deploy.restoration.prepare import Pipeline, Restoration
 from beers_deploy.restoration.radiometry import Reading
-from beers_deploy.restoration.self_check import (
-    BlockMap,
-    check_result,
-    checks_of,
-    require_checkable,
-    write_map,
-)
+from beers_deploy.restoration.self_check import check_result, checks_of, write_map
 from beers_deploy.restoration.tiles.rows import RestoredRow
 from beers_deploy.results import Input, Table
 
@@ -56,6 +54,7 @@ CHECKED = (
     "of detectors: "
     "no part of time and throughput"
 )
+SELF_CHECKED = "the self-check of all blocks: no part of time and throughput"
 ALPHA = (
     "band {band} is alpha, by the file's header: it is copied, and pixels where it is 0 are "
     "missing. If it holds light, such as near infrared, write the file without alpha "
@@ -67,12 +66,13 @@ MANY = 0.05
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Run(Table):
-    """One file restored into another.
+    """The figures of one file that was restored into another.
 
     Attributes:
-        path: of the restored image.
-        time_s: from opening the image to the finished file.
-        networks: that restored its bands, in their order; none of the traditional pipeline.
+        path: the path of the restored image.
+        time_s: the seconds from opening the image to the finished file.
+        networks: the networks that restored the bands, in the order of the bands; empty for the
+            traditional pipeline.
     """
 
     path: Path
@@ -89,10 +89,12 @@ def restore_file(
         image: a file that `model.raster.reader.open_raster` opens, of any size.
         output: the TIFF, of the type `Raster.out_dtype`, in the scale of the image; larger by the
             network's factor where it has one, and in its place on Earth.
-        reading: how its pixels are understood.
-        load: returns what restores it; called once the image and the output are accepted.
+        reading: how its pixels are interpreted.
+        load: returns the pipeline that restores it. It is called once the image and the output are
+            accepted.
     """
     out = output.path
+    widths = None if output.interval is None else interval_beside(out)
     with ExitStack() as stack:
         stored = stack.enter_context(begun(image, output, reading))
         pipeline = load()
@@ -104,11 +106,15 @@ def restore_file(
         faults = faults_of(stored, reading.fix_detectors, str(image))
         work = pipeline.prepare(fixed(stored, faults), reading, str(image), cluster)
         checks = checks_of(reading.sensors, stored.raster, work.out_shape, work.scale.value)
-        require_checkable(output.self_check, checks)
+        if output.self_check is not None and not checks:
+            raise OptionError(
+                "`self_check` needs a known sensor, and a network that returns one pixel of the "
+                "same band for each pixel. Name the sensor with `sensor`, or omit `self_check`."
+            )
         bands = () if output.interval is None else half_widths_of(work, output.interval)
         checkpoint = _checkpoint(output, work, faults)
         done_px = checkpoint.rows
-        with _kept_for_resuming(checkpoint, bool(work.row_ends)):
+        with _rows_for_resuming(checkpoint, bool(work.row_ends)):
             _finish_rows(checkpoint, work)
             self_check_started = time.perf_counter()
             blocks = check_result(work.source, checkpoint.read, checks)
@@ -118,24 +124,30 @@ def restore_file(
                 blocks.require(str(image))
         # All rows are finished: a stop now would save nothing.
         with held_back():
-            interval = _write_interval(output, work, checkpoint, bands)
+            interval = _write_interval(widths, output, work, checkpoint, bands)
             about = what_was_done(work.networks, work.scale)
             write_output(checkpoint, work.source, output, about)
-            write_list(faults, list_beside(out, reading.fix_detectors))
+            listed = list_beside(out, reading.fix_detectors) if faults.faults else None
+            if listed is not None:
+                write_text(listed, faults.text)
             if output.self_check is not None:
                 write_map(output.self_check, blocks, stored.raster)
     # The two checks are no part of a restoration, and their times are figures of their own.
     time_s = time.perf_counter() - started - work.check_s - self_check_s
     _warn_of_clipping(work, checkpoint)
     if blocks.doubt:
-        logger.warning("the result fails the self-check: %s", blocks.doubt)
-    row = _row(image.name, work, checkpoint, done_px, time_s, faults)
-    more = {**_self_check_figures(blocks, self_check_s), **interval}
-    row = replace(row, figures={**row.figures, **more})
-    listed = reading.fix_detectors not in ("", FOUND)
+        logger.warning(f"the result {blocks.doubt}")
+    self_check = {**blocks.figures, "self-check": measured(self_check_s, "s", SELF_CHECKED)}
+    more = {**(self_check if blocks.bands else {}), **interval}
+    row = _row(image.name, work, checkpoint, done_px, time_s, faults, more)
+    inputs: list[Input | Path] = [*_inputs(work), image]
+    if reading.fix_detectors not in ("", FOUND):
+        inputs.append(Path(reading.fix_detectors))
+    # Files that the user names are not listed; those next to the output have names of ours.
+    written = " and ".join(str(path) for path in (out, widths, listed) if path is not None)
     return Run(
-        title=f"wrote {out}",
-        inputs=(*_inputs(work), image, *([Path(reading.fix_detectors)] if listed else [])),
+        title=f"wrote {written}",
+        inputs=tuple(inputs),
         rows=(row,),
         headings={"restore": ""},
         details=DETAILS,
@@ -149,26 +161,20 @@ DETAILS = frozenset({"runtime", "sensor check", "self-check", "interval", "work 
 """Figures and words for a closer look."""
 
 
-def _self_check_figures(blocks: BlockMap, time_s: float) -> dict[str, Figure]:
-    """Return the figures of the self-check; none where no band has one."""
-    if not blocks.bands:
-        return {}
-    source = "the self-check of all blocks: no part of time and throughput"
-    return {**blocks.figures, "self-check": measured(time_s, "s", source)}
-
-
 def _write_interval(
-    output: Output, work: Restoration, checkpoint: Checkpoint, bands: tuple[HalfWidth, ...]
+    path: Path | None,
+    output: Output,
+    work: Restoration,
+    checkpoint: Checkpoint,
+    bands: tuple[HalfWidth, ...],
 ) -> dict[str, Figure]:
-    """Write the half-widths next to the output if they are asked for; return the figures of it."""
-    if output.interval is None:
+    """Write the half-widths to a file if they are requested, and return the figure of the time."""
+    if path is None or output.interval is None:
         return {}
     started = time.perf_counter()
-    path = interval_beside(output.path)
     widths = HalfWidths(work.source, checkpoint.read, bands)
     with checkpoint.disk():
         write_half_widths(path, widths, output.interval, output.compression)
-    logger.info("wrote %s: half-widths of the %d %% interval", path, output.interval)
     source = f"half-widths of the {output.interval} % interval: computed, written and compared"
     return {"interval": measured(time.perf_counter() - started, "s", source)}
 
@@ -212,7 +218,6 @@ def _checkpoint(output: Output, work: Restoration, faults: FaultList) -> Checkpo
     job = {
         # Another version of the program or of the runtime may compute other bits.
         "program": version("beers-deploy"),
-        "method": work.method,
         "image": fingerprint(work.source.files),
         "raster": repr(raster),
         "sensors": repr(sensors),
@@ -235,13 +240,13 @@ def _checkpoint(output: Output, work: Restoration, faults: FaultList) -> Checkpo
 def require_unchanged(
     source: Source, name: str, before: Sequence[tuple[int, int, int]], digest: object
 ) -> None:
-    """Refuse an image, `name` in messages, that was replaced while its rows were read.
+    """Raise ImageError if an image was replaced while its rows were read.
 
     Args:
         source: the image.
-        name: of the image.
-        before: its files' stamps before the first row was read.
-        digest: its fingerprint then.
+        name: its name, for the message.
+        before: the stamps of its files before the first row was read.
+        digest: its fingerprint at that time.
     """
     # A file that was only touched or copied back is the same image: its content decides.
     if stamps(source.files) != before and fingerprint(source.files) != digest:
@@ -251,7 +256,7 @@ def require_unchanged(
 
 
 def _finish_rows(checkpoint: Checkpoint, work: Restoration) -> None:
-    """Restore the rows that a checkpoint lacks, and keep each in it while the next is made."""
+    """Restore the rows that a checkpoint lacks, and store each while the next is computed."""
     total = work.ticks(checkpoint.rows)
     steady = min(work.steady_ticks, total)
     with steps("restoring", total) as bar, held_back() as interrupt:
@@ -282,8 +287,8 @@ def _finish_rows(checkpoint: Checkpoint, work: Restoration) -> None:
 
 
 @contextmanager
-def _kept_for_resuming(checkpoint: Checkpoint, resumable: bool) -> Iterator[None]:
-    """Keep finished rows through a stop or a full disk, if a later run can go on from them."""
+def _rows_for_resuming(checkpoint: Checkpoint, resumable: bool) -> Iterator[None]:
+    """Delete the finished rows after an error, unless a later run can continue from them."""
     try:
         yield
     except KeyboardInterrupt:
@@ -306,7 +311,7 @@ def _kept_for_resuming(checkpoint: Checkpoint, resumable: bool) -> Iterator[None
 
 
 def _write_behind(restored: Iterable[RestoredRow], checkpoint: Checkpoint) -> None:
-    """Keep rows, each while the next is made; never more than one waits."""
+    """Store each row while the next is computed. At most one row waits."""
     with ThreadPoolExecutor(1) as writer:
         writing: Future[None] | None = None
         for row in restored:
@@ -335,8 +340,9 @@ def _row(
     done_px: int,
     time_s: float,
     faults: FaultList,
+    more: dict[str, Figure],
 ) -> Row:
-    """Return the figures of one run, of which `done_px` rows were finished before."""
+    """Return the figures of one run, of which `done_px` rows were finished before, and `more`."""
     raster = work.source.raster
     left = 1 - done_px / checkpoint.shape[1]
     useful_px = prod(raster.shape) * left
@@ -350,6 +356,7 @@ def _row(
         "sensor check": measured(work.check_s, "s", CHECKED),
         **work.check.figures,
         **work.figures(checkpoint.tally),
+        **more,
     }
     replaced = {"detectors replaced": faults.words} if faults.faults else {}
     text = {**work.scale.text, **work.check.text, **replaced, **work.text}

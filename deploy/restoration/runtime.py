@@ -227,19 +227,19 @@ class Packed:
         return infer(image)
 
 
-NETWORKS_KEPT = 32
+NETWORKS_IN_MEMORY = 32
 _opening = Lock()
 
 
-@lru_cache(maxsize=NETWORKS_KEPT)
+@lru_cache(maxsize=NETWORKS_IN_MEMORY)
 def _opened(packed: Packed) -> Infer:
     network = parse_onnx(packed.content, "network")
     return open_runtime(packed.runtime, network, packed.threads)[0]
 
 
-def infer_on(cluster: Cluster, packed: Packed) -> Infer:
+def infer_on(cluster: Cluster, engine: Engine, model: onnx.ModelProto) -> Infer:
     """Return a network that the workers of a cluster run. Each call sends a tile and waits for its
     result.
     """
-    shared = cluster.share(packed)
+    shared = cluster.share(engine.packed(model))
     return lambda image: cluster.result(cluster.pool.submit(Packed.__call__, shared, image))

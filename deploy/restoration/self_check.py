@@ -27,7 +27,7 @@ from beers_deploy.model.self_check import (
     Judged,
     SelfCheck,
 )
-from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.figures import Figure, measured
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND
@@ -56,23 +56,20 @@ class BlockMap:
 
     bands: Mapping[int, Judged]
 
-    def _count(self, flags: Callable[[Judged], np.ndarray]) -> int:
-        return sum(int(np.count_nonzero(flags(judged))) for judged in self.bands.values())
-
     @property
     def known(self) -> int:
         """The number of blocks with enough pixels."""
-        return self._count(lambda judged: np.isfinite(judged.chi2))
+        return sum(int(np.isfinite(judged.chi2).sum()) for judged in self.bands.values())
 
     @property
     def decidable(self) -> int:
         """The number of blocks that would show a wrong restoration."""
-        return self._count(lambda judged: judged.decidable)
+        return sum(int(judged.decidable.sum()) for judged in self.bands.values())
 
     @property
     def outside(self) -> int:
         """The number of blocks whose residual is more than noise."""
-        return self._count(lambda judged: judged.outside)
+        return sum(int(judged.outside.sum()) for judged in self.bands.values())
 
     @property
     def figures(self) -> dict[str, Figure]:
@@ -90,14 +87,16 @@ class BlockMap:
 
     @property
     def doubt(self) -> str:
-        """A sentence for a result that contradicts its raw image; empty if it does not."""
+        """The second part of a sentence on a result that contradicts its raw image; empty if it
+        does not.
+        """
         if self.outside <= MANY_OUTSIDE * self.decidable:
             return ""
         return (
-            f"{self.outside} of {self.decidable} blocks of the result contradict the raw image: "
-            f"blurred as the sensor blurs, they differ from it by more than {MOST_CHI2:g} times "
-            "the noise. Check that the network was made for this sensor, that its file is intact, "
-            "and that `sensor` is the one that acquired the image."
+            f"fails the self-check: {self.outside} of {self.decidable} blocks contradict the raw "
+            "image, because they differ from it, blurred as the sensor blurs, by more than "
+            f"{MOST_CHI2:g} times the noise. Check that the network was made for this sensor, that "
+            "its file is intact, and that `sensor` is the one that acquired the image."
         )
 
     def require(self, name: str) -> None:
@@ -107,7 +106,7 @@ class BlockMap:
             name: of the image, for the message.
         """
         if self.doubt:
-            raise ImageError(f"{name} fails the self-check: {self.doubt}")
+            raise ImageError(f"The restoration of {name} {self.doubt}")
 
 
 def checks_of(
@@ -133,15 +132,6 @@ def checks_of(
     ]
     checks = ((band, built[band % len(built)]) for band in range(raster.bands))
     return {band: check for band, check in checks if check is not None}
-
-
-def require_checkable(path: Path | None, checks: Mapping[int, SelfCheck]) -> None:
-    """Raise OptionError if a map is requested and there is no self-check."""
-    if path is not None and not checks:
-        raise OptionError(
-            "`self_check` needs a known sensor, and a network that gives one pixel of the same "
-            "band for each pixel. Name the sensor with `sensor`, or leave `self_check` out."
-        )
 
 
 def check_result(source: Source, read: ReadRows, checks: Mapping[int, SelfCheck]) -> BlockMap:

@@ -7,6 +7,7 @@ each pixel.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import onnx
@@ -16,11 +17,7 @@ from beers_deploy.model.raster.facts import Raster
 from beers_deploy.network import Network
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND
-from beers_deploy.quant.input_range import (
-    Ranges,
-    from_shares,
-    to_shares,
-)
+from beers_deploy.quant.input_range import Ranges, from_shares, to_shares
 from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.restoration.bands import in_order
 from beers_deploy.restoration.runtime import Infer
@@ -57,28 +54,11 @@ def exposures_of(network: Network, around: Around) -> Mapping[int, Network]:
     return network.exposures if around.exposure else {}
 
 
-@dataclass(frozen=True)
-class InRange:
-    """Adapts a network that reads and returns images of other ranges to [0, 1].
-
-    Attributes:
-        infer: the network.
-        ranges: of its channels.
+def in_ranges(infer: Infer, ranges: Ranges, image: np.ndarray) -> np.ndarray:
+    """Run a network whose channels have other ranges on an image in [0, 1], and return its result
+    in [0, 1] likewise.
     """
-
-    infer: Infer
-    ranges: Ranges
-
-    def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Run the network on an image in shares of its ranges.
-
-        Args:
-            image: in [0, 1] of the ranges, of the shape that `infer` accepts.
-
-        Returns:
-            The result, also in shares of the ranges.
-        """
-        return to_shares(self.infer(from_shares(image, self.ranges)), self.ranges)
+    return to_shares(infer(from_shares(image, ranges)), ranges)
 
 
 def exposed_networks(
@@ -112,7 +92,7 @@ def exposed_networks(
         if network.profile is not None and others:
             offset = offset_of(network.profile, full_scale)
         infer = opened(network.model)
-        infers = {1: InRange(infer, ranges) if ranges else infer, **infers}
+        infers = {1: partial(in_ranges, infer, ranges) if ranges else infer, **infers}
         built.append(ExposedNetwork(infers, tiling.halo_px, offset))
     return tuple(built)
 

@@ -121,14 +121,14 @@ class TraditionalRestoration(Restoration):
         restored = np.nan_to_num(dn) / factors[:, None, None]
         pixels = as_stored(raster, restored, full_scale)
         raw = np.ma.getdata(self.source.read(top, stop))
-        known = ~missing if missing.any() else None
-        if known is not None:
+        valid = ~missing if missing.any() else None
+        if valid is not None:
             pixels = np.where(missing, raw.astype(raster.out_dtype), pixels)
         tally = Tally.of(
             np.nan_to_num(raw.astype(np.float64)) / full_scale,
             restored.astype(np.float64) / full_scale,
-            known,
-            known,
+            valid,
+            valid,
         )
         return RestoredRow(Span(top, stop, top, stop), pixels, tally)
 
@@ -171,7 +171,7 @@ class TraditionalPipeline:
             + BYTES_PER_COLUMN * raster.width_px * raster.bands
             + source.held_bytes(STRIP_PX)
         )
-        check_memory(needed, reading.memory_bytes, bulky=False)
+        check_memory(needed, reading.memory_bytes)
         rows = strips(raster.height_px, STRIP_PX)
         extents = (raster.extent(source.read(*strip)) for strip in rows)
         scale = full_scale_of(name, raster, extents, reading.full_scale, reading.sensor_bits)
@@ -183,12 +183,11 @@ class TraditionalPipeline:
             source=source,
             name=name,
             reading=reading,
-            method="traditional",
             scale=scale,
             check=check,
             check_s=check_s,
             out_shape=raster.shape,
-            identity={"quality": self.quality},
+            identity={"method": "traditional", "quality": self.quality},
             how=f"{torch.get_num_threads()} threads",
             text={
                 "method": "traditional",

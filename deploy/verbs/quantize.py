@@ -253,8 +253,8 @@ def _judged(network: "Network", held_out: "Patches", pages: list[Path]) -> "tupl
     from beers_deploy.quant.price import price_rows
     from beers_deploy.quant.sensitivity import losses
     from beers_deploy.quantization import differences_of, sensitivity_report
-    from beers_deploy.report.node_data import node_data
     from beers_deploy.report.page import write_report
+    from beers_deploy.report.sensitivity_page import node_data
 
     assert network.quantized is not None  # noqa: S101 - it was quantised here
     differences = differences_of(network, held_out)

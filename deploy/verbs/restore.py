@@ -244,9 +244,9 @@ def _output(
         how: the other fields of `Output`.
     """
     from beers_deploy.restoration.detectors.fault_list import list_beside
-    from beers_deploy.restoration.interval.file import interval_beside
+    from beers_deploy.restoration.interval import interval_beside
     from beers_deploy.restoration.output import Output
-    from beers_deploy.restoration.stac.network import network_paths
+    from beers_deploy.restoration.stac import network_paths
 
     if out is None:
         raise OptionError(
@@ -279,8 +279,8 @@ def _write_documents(
 ) -> None:
     """Write the STAC item and the view of a run, where they are asked for."""
     from beers_deploy.report.view import write_view
-    from beers_deploy.restoration.interval.file import interval_beside
-    from beers_deploy.restoration.stac.item import write_item
+    from beers_deploy.restoration.interval import interval_beside
+    from beers_deploy.restoration.stac import write_item
 
     # Rasters over the same place as the output, by the name of their layer and asset.
     widths = None if output.interval is None else interval_beside(output.path)

@@ -6,22 +6,29 @@ row of `*` stands for the whole column, and a column of `*` for the whole row.
 """
 
 import hashlib
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.model.io.files import write_text
 from beers_deploy.model.raster.facts import Raster
-from beers_deploy.profiles.errors import OptionError, printable
+from beers_deploy.profiles.errors import OptionError
+from beers_deploy.profiles.toml import unreadable
 
-LINES = "Write lines 'column,row', counted from 0, with '*' as the row for a whole column."
 FOUND = "found"
 HEADER = ("column", "row", "band")
 ALL = "*"
-DIGITS = 9
-"""The largest number of digits in a number, because no image is larger."""
+NO_FAULT = re.compile(r"\s*|#.*|\s*column\s*,\s*row\s*(,\s*band\s*)?")
+"""Lines of a list that are skipped: empty ones, comments and the header."""
+FAULT = re.compile(
+    r"(?!\s*\*\s*,\s*\*)\s*(\d{1,9}|\*)\s*,\s*(\d{1,9}|\*)\s*(?:,\s*0*([1-9]\d{0,8})\s*)?",
+    re.ASCII,
+)
+"""A line with a fault: column and row, not both '*', and perhaps a band. No image has more than 9
+digits.
+"""
 
 
 @dataclass(frozen=True, order=True)
@@ -68,9 +75,7 @@ class FaultList:
         columns = sum(fault.row < 0 for fault in self.faults)
         rows = sum(fault.column < 0 for fault in self.faults)
         counts = {"pixel": len(self.faults) - columns - rows, "column": columns, "row": rows}
-        words = [
-            f"{count} {name}{'s' if count > 1 else ''}" for name, count in counts.items() if count
-        ]
+        words = [counted(count, name) for name, count in counts.items() if count]
         return ", ".join(words) or "none"
 
     def mask(self, raster: Raster, start: int, stop: int) -> np.ndarray:
@@ -94,17 +99,16 @@ class FaultList:
         return np.array(places, np.int64).reshape(-1, 3)
 
 
+def counted(count: int, name: str) -> str:
+    """Return a number and the name of what is counted, in the plural if there are several."""
+    return f"{count} {name}{'s' if count > 1 else ''}"
+
+
 def list_beside(out: Path, source: str) -> Path | None:
     """Return the path of the list of found faults next to the restored image, or None if no faults
     are searched for.
     """
     return out.with_name(f"{out.stem}.detectors.csv") if source == FOUND else None
-
-
-def write_list(faults: FaultList, path: Path | None) -> None:
-    """Write the faults that were found, if any, unless the path is None."""
-    if path is not None and faults.faults:
-        write_text(path, faults.text)
 
 
 def read_list(path: Path, raster: Raster) -> FaultList:
@@ -114,62 +118,38 @@ def read_list(path: Path, raster: Raster) -> FaultList:
         path: the path of the file.
         raster: of the image.
     """
+    reason = "lists none"
+    lines = list[str]()
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except OSError as error:
-        raise OptionError(
-            f"`fix_detectors` must be '{FOUND}' or a list of faulty detectors, but {path} cannot "
-            f"be read: {error.strerror or error}. {LINES}"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise OptionError(
-            f"`fix_detectors` must be '{FOUND}' or a list of faulty detectors, but {path} is not "
-            f"a text file. {LINES}"
-        ) from error
-    faults = []
-    for number, line in enumerate(lines, 1):
-        cells = tuple(cell.strip() for cell in line.split(","))
-        # Files of all bands have no column for the band, and so a shorter header.
-        if not any(cells) or line.startswith("#") or cells in (HEADER, HEADER[:2]):
-            continue
-        faults.append(_fault(path, number, line, raster))
+    except (OSError, UnicodeDecodeError):
+        reason = f"cannot be read: {unreadable(path) or 'it is not a text file'}"
+    faults = [
+        _fault(path, number, line, raster)
+        for number, line in enumerate(lines, 1)
+        if not NO_FAULT.fullmatch(line)
+    ]
     if not faults:
         raise OptionError(
-            f"`fix_detectors` must be '{FOUND}' or a list of faulty detectors, but {path} lists "
-            f"none. {LINES}"
+            f"`fix_detectors` must be '{FOUND}' or a list of faulty detectors, but {path} {reason}."
+            " Write lines 'column,row', counted from 0, with '*' as the row for a whole column."
         )
     return FaultList(tuple(sorted(set(faults))))
 
 
 def _fault(path: Path, number: int, line: str, raster: Raster) -> Fault:
     """Return the fault of one line, the `number`-th of the file."""
-    sizes = raster.width_px, raster.height_px, raster.bands + 1
-    numbers = [_number(cell.strip()) for cell in line.split(",")]
-    # Bands count from 1, and no band may be '*': a line without a band holds for all.
-    if (
-        len(numbers) not in (2, 3)
-        or None in numbers
-        or numbers[:2] == [-1, -1]
-        or numbers[2:] in ([-1], [0])
-    ):
+    match = FAULT.fullmatch(line)
+    if match is None:
         raise OptionError(
             f"Line {number} of {path} must be column,row or column,row,band, got {line[:40]!r}. "
             "Correct or delete the line."
         )
-    placed = [value for value in numbers if value is not None]
-    # A line without a band has two numbers for the three sizes.
-    if any(value >= size for value, size in zip(placed, sizes, strict=False)):
+    column, row, band = (-1 if cell == ALL else int(cell or 0) for cell in match.groups())
+    if column >= raster.width_px or row >= raster.height_px or band > raster.bands:
         raise OptionError(
-            f"Line {number} of {path} ({printable(line.strip())}) lies outside the image of "
-            f"{raster.width_px} columns, {raster.height_px} rows and {raster.bands} bands. Count "
-            "columns and rows from 0."
+            f"Line {number} of {path} ({line.strip()}) lies outside the image, which has "
+            f"{raster.width_px} columns, {raster.height_px} rows and "
+            f"{counted(raster.bands, 'band')}. Count columns and rows from 0, and bands from 1."
         )
-    return Fault(*placed)
-
-
-def _number(cell: str) -> int | None:
-    """Return the number in a cell, -1 for `*`, or None for anything else."""
-    if cell == ALL:
-        return -1
-    # `isdecimal` alone accepts the digits of every script.
-    return int(cell) if cell.isascii() and cell.isdecimal() and len(cell) <= DIGITS else None
+    return Fault(column, row, band)

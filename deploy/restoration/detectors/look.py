@@ -7,18 +7,29 @@ span the whole width and are spread evenly from top to bottom. In a large image 
 `LOOKED_PX` pixels of all bands together.
 """
 
-from collections.abc import Iterator
+import logging
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from beers_deploy.model.metrics.detector_lines import Blocks, join_blocks, measure_lines
-from beers_deploy.model.metrics.detector_phases import Pattern, judge_phases, measure_phases
+from beers_deploy.model.metrics.detector_phases import (
+    COLOUR,
+    Pattern,
+    judge_phases,
+    measure_phases,
+)
 from beers_deploy.model.metrics.detector_pixels import wrong_pixels
 from beers_deploy.model.metrics.detector_stripes import Stripes, judge_lines
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.source import Source
+from beers_deploy.profiles.figures import Figure, measured, unavailable
+from beers_deploy.restoration.detectors.fault_list import FOUND, counted
+
+logger = logging.getLogger(__name__)
 
 LOOKED_PX = 1 << 23
 """The number of pixels, over all bands, that are checked. This takes one to two seconds on one core
@@ -66,7 +77,7 @@ def look_at_detectors(source: Source, full_scale: float = np.inf) -> tuple[BandF
         full_scale: the pixel value at and above which a pixel is not a measurement.
     """
     raster = source.raster
-    measurements = [_Found(step) for step in value_steps(source)]
+    measurements = [_Measurements(step) for step in value_steps(source)]
     for top, stop in _strips(raster.height_px, raster.width_px, raster.bands):
         start = max(top - MARGIN_PX, 0)
         end = min(stop + MARGIN_PX, raster.height_px)
@@ -111,7 +122,7 @@ def _strips(height_px: int, width_px: int, bands: int) -> Iterator[tuple[int, in
         yield even, even + side_px
 
 
-class _Found:
+class _Measurements:
     """The measurements in the strips of one band."""
 
     def __init__(self, step: float) -> None:
@@ -167,3 +178,126 @@ def _sections(width_px: int) -> list[slice]:
     # First columns are even, so that all sections share the phase of a pattern of two pixels.
     ends = [width_px * number // count // 2 * 2 for number in range(count)] + [width_px]
     return [slice(left, right) for left, right in pairwise(ends)]
+
+
+SHARPENS = "restoration about doubles it"
+EQUALIZE = "equalize the image first"
+TRAIN = "or train with the effects prnu and dsnu in the sensor's profile"
+FIX = f"`fix_detectors` {FOUND} replaces"
+ERRORS = 2.0
+"""The number of standard errors in an interval of 95 %."""
+NAMED = 3
+"""The largest number of places that a sentence names."""
+
+
+def warn_of_detectors(source: Source, full_scale: float) -> Mapping[str, Figure]:
+    """Detect faults of detectors, log a warning for each kind, and return the figures.
+
+    Args:
+        source: the image.
+        full_scale: the pixel value at and above which a pixel is not a measurement.
+    """
+    bands = look_at_detectors(source, full_scale)
+    for sentence in sentences(bands):
+        logger.warning(sentence)
+    return figures(bands)
+
+
+def sentences(bands: Sequence[BandFaults]) -> list[str]:
+    """Return a sentence for each kind of fault in each band."""
+    messages = []
+    for number, band in enumerate(bands, 1):
+        where = f"band {number}: " if len(bands) > 1 else ""
+        messages += [f"look at the detectors: {where}{words}" for words in _of_band(band)]
+    return messages
+
+
+def _of_band(band: BandFaults) -> Iterator[str]:
+    yield from _of_lines("column", band.columns)
+    yield from _of_lines("row", band.rows)
+    for pattern in band.patterns:
+        if pattern.significant:
+            yield _of_pattern(pattern)
+    if len(band.pixels):
+        places = [f"column {column}, row {row}" for row, column in band.pixels.tolist()]
+        yield (
+            f"{counted(len(places), 'pixel')} of {band.looked_px}, isolated as no light can be: "
+            f"hot, dead or hit by a particle ({_some(places)}); restoration sharpens that; {FIX} "
+            "such pixels"
+        )
+
+
+def _of_lines(one: str, lines: Stripes) -> Iterator[str]:
+    if lines.dead:
+        places = [f"{one} {line}" for line in lines.dead]
+        yield (
+            f"{counted(len(places), f'dead {one}')}, constant where the others vary "
+            f"({_some(places)}); restoration sharpens that; {FIX} such {one}s"
+        )
+    places = [f"{one} {line.index} by {line.gain:+.2%}" for line in lines.off]
+    if lines.significant and lines.spread is not None:
+        yield (
+            f"the gains or offsets of {one}s differ by {lines.spread:.2%} rms of the level; "
+            f"{SHARPENS}: {EQUALIZE}, {TRAIN}"
+        )
+    elif places:
+        verb = "is" if len(places) == 1 else "are"
+        yield (
+            f"{counted(len(places), one)} {verb} off in gain or offset ({_some(places)}); "
+            f"{SHARPENS}: {EQUALIZE}, or list them for `fix_detectors`"
+        )
+
+
+def _of_pattern(pattern: Pattern) -> str:
+    shape = "a checkerboard" if pattern.name == "checkerboard" else pattern.name
+    size = f"{pattern.difference:.2%} rms of the level, {pattern.largest:.2%} at most"
+    message = f"a fixed pattern of two pixels, {shape}: {size}"
+
+    if pattern.largest > COLOUR:
+        return (
+            f"{message}, as of a mosaic of colour filters: split the image into its colours first"
+        )
+    return f"{message}; {SHARPENS}: {EQUALIZE}, channel by channel"
+
+
+def _some(places: Sequence[str]) -> str:
+    """Return the first places as text, with a note if there are more of them."""
+    more = f" and {len(places) - NAMED} more" if len(places) > NAMED else ""
+    return f"{', '.join(places[:NAMED])}{more}"
+
+
+def figures(bands: Sequence[BandFaults]) -> Mapping[str, Figure]:
+    """Return the figures of each band for a row of results."""
+    result = dict[str, Figure]()
+    for number, band in enumerate(bands, 1):
+        where = f"band {number}: " if len(bands) > 1 else ""
+        result |= {f"{where}{name}": figure for name, figure in _figures(band).items()}
+    return result
+
+
+def _figures(band: BandFaults) -> dict[str, Figure]:
+    how = f"{band.looked_px} pixels in strips of the image"
+    lines = {"columns": band.columns, "rows": band.rows}
+    rms = f"rms over the level, without noise, {how}"
+    pattern = max((pattern.difference for pattern in band.patterns), default=math.nan)
+    return {
+        **{f"{name} differ by": _spread(stripes, rms) for name, stripes in lines.items()},
+        "2 x 2 pattern": measured(100 * pattern, "%", f"the strongest of three, {rms}"),
+        "lines off": measured(
+            sum(len(stripes.off) for stripes in lines.values()),
+            "1",
+            f"single columns and rows, {how}",
+        ),
+        "dead lines": measured(
+            sum(len(stripes.dead) for stripes in lines.values()), "1", f"columns and rows, {how}"
+        ),
+        "wrong pixels": measured(len(band.pixels), "1", f"single ones, {how}"),
+    }
+
+
+def _spread(lines: Stripes, how: str) -> Figure:
+    if lines.spread is None:
+        return unavailable("%", "too few lines or blocks along them")
+    # A spread is never negative, although its interval may reach below 0.
+    low, high = (max(lines.spread + sign * ERRORS * lines.spread_error, 0) for sign in (-1, 1))
+    return measured(100 * lines.spread, "%", how, (100 * low, 100 * high))

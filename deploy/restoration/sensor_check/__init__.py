@@ -1,7 +1,7 @@
 """Compare an image with the sensor that is named for it, by its own pixels alone.
 
-- `windows`: windows spread over the image
-- `check`: their noise and blur compared with the profile, and the warnings of `restore`
+- `check`: noise and blur of windows spread over the image compared with the profile, and the
+  warnings of `restore`
 - `comparison`: the two comparisons, each with its decision and its sentence
 - `raw`: without a named sensor, the warning that the image looks restored already
 """

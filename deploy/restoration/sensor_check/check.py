@@ -5,7 +5,7 @@ compared with those in the profile (`comparison`).
 """
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,12 +26,15 @@ from beers_deploy.restoration.sensor_check.comparison import (
     compare_noise,
     mtf_name,
 )
-from beers_deploy.restoration.sensor_check.windows import band_windows, integer_step
 
 logger = logging.getLogger(__name__)
 
 ABOVE = 0.001
 """A larger share of pixels above full scale does not occur in an image of the sensor."""
+
+WINDOW_PX = 512
+ACROSS = 4
+"""The side of a window, and the largest number of windows along each axis."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,9 @@ def checked_sensor(
         full_scale: the pixel value that is the sensors' largest digital number.
         name: of the image, for messages.
         strict: if True, a contradiction is an error instead of a warning.
+
+    Raises:
+        ImageError: there is a contradiction, and `strict` is True.
     """
     if all(sensor.name == BLIND for sensor in sensors.values()):
         return SensorCheck()
@@ -153,3 +159,39 @@ def check_windows(windows: Sequence[np.ndarray], sensor: Sensor, full_scale: flo
         figures[mtf_name(axis)], contradiction = compare_blur(axis, blur, stated)
         warnings += contradiction
     return SensorCheck(figures, tuple(warnings))
+
+
+def band_windows(source: Source) -> list[list[np.ndarray]]:
+    """Return windows (h, w) of each band, spread evenly over an image; missing pixels are 0."""
+    return [list(windows) for windows in zip(*_windows(source), strict=True)]
+
+
+def integer_step(windows: Sequence[np.ndarray]) -> int | None:
+    """Return the largest integer that divides all pixels, or None if they are not integers."""
+    if any(window.dtype.kind == "f" for window in windows) and not all(
+        (np.isfinite(window) & (window == np.rint(window))).all() for window in windows
+    ):
+        return None
+    divisors = [np.gcd.reduce(window.astype(np.int64), axis=None) for window in windows]
+    # The divisor of an image of zeros alone is 0.
+    return max(int(np.gcd.reduce(divisors)), 1)
+
+
+def _windows(source: Source) -> Iterator[np.ndarray]:
+    """Yield windows (bands, h, w) spread evenly over an image, 0 where pixels are missing."""
+    raster = source.raster
+    for down in _spread(raster.height_px):
+        rows = source.read(down.start, down.stop)
+        values = np.ma.getdata(rows)
+        if raster.may_miss:
+            values = np.where(raster.missing(rows), 0, values)
+        for across in _spread(raster.width_px):
+            yield values[:, :, across]
+
+
+def _spread(size_px: int) -> list[slice]:
+    """Return windows along a side, evenly spaced from end to end without overlap."""
+    count = min(ACROSS, -(-size_px // WINDOW_PX))
+    side_px = min(WINDOW_PX, size_px // count)
+    starts = np.linspace(0, size_px - side_px, count)
+    return [slice(int(start), int(start) + side_px) for start in starts]

@@ -16,8 +16,8 @@ from beers_deploy.model.metrics.noise_blocks import ROUNDING
 from beers_deploy.model.metrics.noise_line import LEAST
 from beers_deploy.model.raster.source import Source
 from beers_deploy.quant.onnx_file import metadata
+from beers_deploy.restoration.sensor_check.check import band_windows, integer_step
 from beers_deploy.restoration.sensor_check.comparison import QUIET_PERCENT
-from beers_deploy.restoration.sensor_check.windows import band_windows, integer_step
 
 FAR_BELOW = 0.4
 """A share of the variance of the quietest sensor, in a tenth of the blocks. An image with less is

@@ -16,12 +16,9 @@ from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.full_scale import remedy_outside
 from beers_deploy.model.raster.source import Source
 from beers_deploy.profiles.errors import ImageError
-from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.plan import Span
-from beers_deploy.restoration.radiometry import require_room
+from beers_deploy.restoration.plan import Plan, Span, TilePlace
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
-from beers_deploy.restoration.tiles.missing import fill_from_nearest
 
 NAME = "The image"
 """The name of an image that has no file, in messages."""
@@ -57,11 +54,6 @@ class Strip:
     above: bool = False
     left: int = 0
 
-    def inner_window(self, bands: slice, rows: Span, columns: Span) -> Window:
-        """Return the window of these arrays that contains the retained part of a tile."""
-        down = slice(rows.keep_start - self.top, rows.keep_stop - self.top)
-        return bands, down, slice(columns.keep_start - self.left, columns.keep_stop - self.left)
-
 
 @dataclass(frozen=True)
 class Restorer:
@@ -71,8 +63,8 @@ class Restorer:
         raster: the description of the image.
         networks: the network at its exposures; one for all groups of bands, or one for each.
         full_scale: the pixel value that is 1.0 to the network.
-        tiling: the network's tiling geometry. Missing pixels are filled from no farther away than
-            its halo. Pixels beyond that, filled or not, do not influence a known pixel.
+        plan: how the image is cut. Missing pixels are filled from no farther away than the halo of
+            its tiling geometry. Pixels beyond that, filled or not, do not influence a known pixel.
         name: of the image, for messages.
         clips: if True, values above full scale are clipped and counted; else they are an error.
         consistency: the consistency step, one for all bands or one for each; empty if it is
@@ -82,13 +74,10 @@ class Restorer:
     raster: Raster
     networks: tuple[ExposedNetwork, ...]
     full_scale: float
-    tiling: Tiling
+    plan: Plan
     name: str = NAME
     clips: bool = False
     consistency: tuple[Consistency | None, ...] = ()
-
-    def __post_init__(self) -> None:
-        require_room(self.raster, self.full_scale)
 
     @property
     def reach_px(self) -> int:
@@ -98,31 +87,27 @@ class Restorer:
     @property
     def margin_px(self) -> int:
         """The number of raw pixels that are read around the windows of tiles."""
-        fill_px = self.raster.fill_margin_px(self.tiling.halo_px)
+        fill_px = self.raster.fill_margin_px(self.plan.radius_px)
         return max(fill_px, RAW_REACH_PX if self.consistency else 0)
 
-    def read(self, source: Source, start: int, stop: int) -> Strip:
-        """Read the strip that tiles from row `start` to `stop` (excluded) need."""
-        start = max(start - self.margin_px, 0)
-        stop = min(stop + self.margin_px, self.raster.height_px)
+    def read(self, source: Source, rows: Span) -> Strip:
+        """Read the strip that the tiles of one row need."""
+        start = max(rows.start - self.margin_px, 0)
+        stop = min(rows.stop + self.margin_px, self.raster.height_px)
         return checked_strip(
             self.raster, start, source.read(start, stop), self.full_scale, self.name, self.clips
         )
 
-    def tile(self, strip: Strip, group: int, rows: Span, columns: Span) -> Tile:
-        """Run the network of one group of bands on the tile that reads `rows` and `columns`.
-
-        A tile of missing pixels is not run.
-        """
-        bands = self._bands(group)
-        missing = self._missing(strip, bands, rows, columns)
+    def tile(self, strip: Strip, place: TilePlace) -> Tile:
+        """Run the network on one tile. A tile of missing pixels is not run."""
+        missing = self._missing(strip, place)
         if missing is not None and missing.all():
             # The network would restore nothing but what fills missing pixels.
             return Tile(np.full(missing.shape, np.nan, np.float32), Tally())
-        network = self.networks[group % len(self.networks)]
-        window = self._window(strip, bands, rows, columns)
-        inner = _within(rows), _within(columns)
-        restored = network.restore(window, self.full_scale, inner, self.tiling)
+        network = self.networks[place.group % len(self.networks)]
+        inner = _within(place.rows), _within(place.columns)
+        window = self._window(strip, place)
+        restored = network.restore(window, self.full_scale, inner, self.plan.tiling)
         tally = Tally(tiles=1, runs=restored.runs, brightened=restored.brightened)
         pixels = restored.pixels
         if missing is not None:
@@ -130,13 +115,7 @@ class Restorer:
         return Tile(pixels, tally)
 
     def finish(
-        self,
-        strip: Strip,
-        restored: np.ndarray,
-        at: tuple[int, int],
-        group: int,
-        rows: Span,
-        columns: Span,
+        self, strip: Strip, restored: np.ndarray, at: tuple[int, int], place: TilePlace
     ) -> Tile:
         """Apply the consistency step and store the retained pixels of a tile.
 
@@ -145,54 +124,47 @@ class Restorer:
             restored: the result of `tile`, (bands, h, w), with `reach_px` pixels around the
                 retained ones.
             at: row and column in the image of its first pixel.
-            group: the group of bands.
-            rows: the rows of the tile, of which the retained ones are stored.
-            columns: likewise.
+            place: the tile, whose retained pixels are stored.
         """
-        scale = int(self.tiling.scale)
-        bands = self._bands(group)
-        down = slice((rows.keep_start - at[0]) * scale, (rows.keep_stop - at[0]) * scale)
-        across = slice((columns.keep_start - at[1]) * scale, (columns.keep_stop - at[1]) * scale)
-        missing = self._missing(strip, bands, rows, columns)
+        missing = self._missing(strip, place)
+        window = self._retained(strip, place)
+        raw = strip.pixels[window]
         if missing is not None and missing.all():
-            return Tile(self._unrestored(strip, missing, bands, rows, columns), Tally())
-        network_pixels = pixels = restored[:, down, across]
-        if self.consistency:
-            change = self._change(strip, restored, at, bands, rows, columns)
-            pixels = np.clip(network_pixels + change, 0, np.float32(self.full_scale))
-        inner_window = strip.inner_window(bands, rows, columns)
-        valid_raw = None if strip.missing is None else ~strip.missing[inner_window]
-        raw = strip.pixels[inner_window].astype(np.float64) / self.full_scale
+            return Tile(self._unrestored(raw, missing), Tally())
+        down, across = (
+            slice(
+                (span.keep_start - start) * self.plan.scale,
+                (span.keep_stop - start) * self.plan.scale,
+            )
+            for span, start in zip(place[1:], at, strict=True)
+        )
+        valid_raw = None if strip.missing is None else ~strip.missing[window]
         valid = None if missing is None else ~missing
-        tally = Tally.of(raw, self._shares(pixels), valid_raw, valid)
+        raw_shares = raw.astype(np.float64) / self.full_scale
+
+        def tally_of(pixels: np.ndarray) -> Tally:
+            shares = np.nan_to_num(pixels).astype(np.float64) / self.full_scale
+            return Tally.of(raw_shares, shares, valid_raw, valid)
+
+        pixels = network_pixels = restored[:, down, across]
+        tally = tally_of(network_pixels)
         if self.consistency:
-            squared = float(
-                np.nansum(np.square((pixels - network_pixels) / self.full_scale), dtype=np.float64)
-            )
-            tally = tally.changed_from(
-                Tally.of(raw, self._shares(network_pixels), valid_raw, valid), squared
-            )
+            change = self._change(strip, restored, at, place)
+            pixels = np.clip(network_pixels + change, 0, np.float32(self.full_scale))
+            squares = np.square((pixels - network_pixels) / self.full_scale)
+            squared = float(np.nansum(squares, dtype=np.float64))
+            tally = tally_of(pixels).changed_from(tally, squared)
         result = as_stored(self.raster, np.nan_to_num(pixels), self.full_scale)
         if missing is not None:
-            result = np.where(
-                missing, self._unrestored(strip, missing, bands, rows, columns), result
-            )
+            result = np.where(missing, self._unrestored(raw, missing), result)
         return Tile(result, tally)
 
-    def _shares(self, pixels: np.ndarray) -> np.ndarray:
-        """Return pixels in shares of full scale, with missing ones 0."""
-        return np.asarray(np.nan_to_num(pixels).astype(np.float64) / self.full_scale)
-
     def _change(
-        self,
-        strip: Strip,
-        restored: np.ndarray,
-        at: tuple[int, int],
-        bands: slice,
-        rows: Span,
-        columns: Span,
+        self, strip: Strip, restored: np.ndarray, at: tuple[int, int], place: TilePlace
     ) -> np.ndarray:
         """Return the correction of the consistency step for the retained pixels, (bands, h, w)."""
+        _, rows, columns = place
+        bands = self._bands(place)
         top = max(rows.keep_start - RAW_REACH_PX, 0)
         left = max(columns.keep_start - RAW_REACH_PX, 0)
         down = slice(top - strip.top, rows.keep_stop + RAW_REACH_PX - strip.top)
@@ -205,22 +177,26 @@ class Restorer:
             Placed(self.raster.height_px, at[0], rows.keep_start, rows.keep_stop),
             Placed(self.raster.width_px, at[1], columns.keep_start, columns.keep_stop),
         )
-        steps = [
-            self.consistency[band % len(self.consistency)]
-            for band in range(bands.start, bands.stop)
-        ]
-        change = np.zeros(
-            (len(steps), *(placed.keep_stop - placed.keep_start for placed in sides)), np.float32
-        )
-        for number, step in enumerate(steps):
+        shape = len(raw), rows.keep_stop - rows.keep_start, columns.keep_stop - columns.keep_start
+        change = np.zeros(shape, np.float32)
+        for number, result in enumerate(change):
+            step = self.consistency[(bands.start + number) % len(self.consistency)]
             if step is not None:
-                change[number] = step.correction(raw[number], restored[number], *sides, (top, left))
+                result[:] = step.correction(raw[number], restored[number], *sides, (top, left))
         return change
 
-    def _bands(self, group: int) -> slice:
-        return slice(group * self.tiling.channels_in, (group + 1) * self.tiling.channels_in)
+    def _bands(self, place: TilePlace) -> slice:
+        count = self.plan.tiling.channels_in
+        return slice(place.group * count, (place.group + 1) * count)
 
-    def _missing(self, strip: Strip, bands: slice, rows: Span, columns: Span) -> np.ndarray | None:
+    def _retained(self, strip: Strip, place: TilePlace) -> Window:
+        """Return the window of a strip's arrays that contains the retained part of a tile."""
+        down = slice(place.rows.keep_start - strip.top, place.rows.keep_stop - strip.top)
+        columns = place.columns
+        across = slice(columns.keep_start - strip.left, columns.keep_stop - strip.left)
+        return self._bands(place), down, across
+
+    def _missing(self, strip: Strip, place: TilePlace) -> np.ndarray | None:
         """Return a mask of the retained pixels that are missing, of the restored shape, or None if
         there are none.
 
@@ -229,71 +205,52 @@ class Restorer:
         """
         if strip.missing is None:
             return None
-        missing = strip.missing[strip.inner_window(bands, rows, columns)]
-        tiling = self.tiling
+        missing = strip.missing[self._retained(strip, place)]
+        tiling = self.plan.tiling
         if tiling.channels_in != tiling.channels_out:
             missing = np.repeat(missing.any(axis=0, keepdims=True), tiling.channels_out, axis=0)
-        return _enlarged(missing, int(tiling.scale))
+        return _enlarged(missing, self.plan.scale)
 
-    def _unrestored(
-        self, strip: Strip, missing: np.ndarray, bands: slice, rows: Span, columns: Span
-    ) -> np.ndarray:
+    def _unrestored(self, raw: np.ndarray, missing: np.ndarray) -> np.ndarray:
         """Return the values that missing pixels are stored as: unchanged, or the nodata value if
         bands do not correspond.
         """
-        tiling = self.tiling
-        if tiling.channels_in != tiling.channels_out:
-            none = np.nan if self.raster.out_dtype.kind == "f" else 0
-            blank = none if self.raster.nodata is None else self.raster.nodata
-            return np.full(missing.shape, blank, self.raster.out_dtype)
-        stored = strip.pixels[strip.inner_window(bands, rows, columns)].astype(
-            self.raster.out_dtype
-        )
-        return _enlarged(stored, int(tiling.scale))
+        kind = self.raster.out_dtype
+        if self.plan.tiling.channels_in == self.plan.tiling.channels_out:
+            return _enlarged(raw.astype(kind), self.plan.scale)
+        none = np.nan if kind.kind == "f" else 0
+        blank = none if self.raster.nodata is None else self.raster.nodata
+        return np.full(missing.shape, blank, kind)
 
-    def _window(self, strip: Strip, bands: slice, rows: Span, columns: Span) -> np.ndarray:
+    def _window(self, strip: Strip, place: TilePlace) -> np.ndarray:
         """Return the network's input for a tile, (bands, h, w), with missing pixels filled,
         extended to the lattice.
         """
-        if strip.missing is None:
-            down = slice(rows.start - strip.top, rows.stop - strip.top)
-            window = strip.pixels[
-                bands, down, columns.start - strip.left : columns.stop - strip.left
-            ]
-        else:
-            window = self._filled(strip, strip.missing, bands, rows, columns)
+        _, rows, columns = place
+        reach_px = 0 if strip.missing is None else self.plan.radius_px
+        # A slice stops at the last pixel by itself, but a negative start would count from the
+        # end.
+        top = max(rows.start - reach_px - strip.top, 0)
+        left = max(columns.start - reach_px - strip.left, 0)
+        down = slice(top, rows.stop + reach_px - strip.top)
+        across = slice(left, columns.stop + reach_px - strip.left)
+        around = self._bands(place), down, across
+        window = strip.pixels[around]
+        if strip.missing is not None:
+            planes = zip(window, strip.missing[around], strict=True)
+            window = np.stack([fill_from_nearest(*plane, reach_px) for plane in planes])
+        above = rows.start - strip.top - top
+        aside = columns.start - strip.left - left
+        height = rows.stop - rows.start
+        width = columns.stop - columns.start
+        window = window[:, above : above + height, aside : aside + width]
         if strip.above:
             window = np.minimum(window, window.dtype.type(self.full_scale))
-        lack = (
-            rows.stop - rows.start - window.shape[1],
-            columns.stop - columns.start - window.shape[2],
-        )
+        lack = height - window.shape[1], width - window.shape[2]
         if not any(lack):
             return window
         # An image that is no multiple of the lattice is extended by its last row and column.
         return np.pad(window, ((0, 0), (0, lack[0]), (0, lack[1])), mode="edge")
-
-    def _filled(
-        self, strip: Strip, flags: np.ndarray, bands: slice, rows: Span, columns: Span
-    ) -> np.ndarray:
-        """Return a window with its missing pixels filled, as far as the image reaches."""
-        radius_px = self.tiling.halo_px
-        # A slice stops at the last pixel by itself, but a negative start would count from the
-        # end.
-        left = max(columns.start - strip.left - radius_px, 0)
-        right = columns.stop - strip.left + radius_px
-        top = max(rows.start - radius_px, 0) - strip.top
-        bottom = rows.stop + radius_px - strip.top
-        around = (bands, slice(max(top, 0), bottom), slice(left, right))
-        planes = zip(strip.pixels[around], flags[around], strict=True)
-        filled = np.stack(
-            [fill_from_nearest(pixels, missing, radius_px) for pixels, missing in planes]
-        )
-        above = rows.start - strip.top - max(top, 0)
-        aside = columns.start - strip.left - left
-        return filled[
-            :, above : above + rows.stop - rows.start, aside : aside + columns.stop - columns.start
-        ]
 
 
 def _enlarged(planes: np.ndarray, scale: int) -> np.ndarray:
@@ -355,3 +312,33 @@ def _beside(raster: Raster, nodata: float, full_scale: float) -> float:
         return nodata + 1 if nodata + 1 <= full_scale else nodata - 1
     towards = full_scale if nodata < full_scale else 0
     return float(np.nextafter(np.float32(nodata), np.float32(towards)))
+
+
+def fill_from_nearest(pixels: np.ndarray, missing: np.ndarray, reach_px: int) -> np.ndarray:
+    """Return (h, w) pixels where each `missing` one is a copy of a known one at most `reach_px`
+    rows and columns away.
+
+    A missing pixel gets the nearest known pixel of the row, then the nearest filled one of the
+    column, or 0 if there is none in reach. A filled pixel therefore depends on nothing farther
+    away, and a window gives exactly the same result as the whole image.
+    """
+    filled, missing = _along_rows(pixels, missing, reach_px)
+    filled, missing = _along_rows(filled.T, missing.T, reach_px)
+    return np.asarray(np.where(missing, 0, filled).T)
+
+
+def _along_rows(
+    pixels: np.ndarray, missing: np.ndarray, reach_px: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the filled pixels, and a mask of those without a known pixel in reach. Of two at the
+    same distance the left one is used.
+    """
+    width = pixels.shape[1]
+    # Without a known pixel on one side, its place is out of reach from every pixel.
+    far = width + reach_px + 1
+    here = np.arange(width)
+    left = np.maximum.accumulate(np.where(missing, -far, here), axis=1)
+    right = np.minimum.accumulate(np.where(missing, 2 * far, here)[:, ::-1], axis=1)[:, ::-1]
+    nearest = np.where(here - left <= right - here, left, right)
+    out_of_reach = np.abs(nearest - here) > reach_px
+    return np.take_along_axis(pixels, np.where(out_of_reach, here, nearest), axis=1), out_of_reach

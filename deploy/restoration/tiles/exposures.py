@@ -9,13 +9,12 @@ import numpy as np
 
 from beers_deploy.model.exposure import choose_factors
 from beers_deploy.profiles.errors import ImageError, ModelError
-from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.tiling.receptive_field import Tiling
 from beers_deploy.quant.untrusted import times
 from beers_deploy.restoration.plan import Plan
 from beers_deploy.restoration.runtime import Infer
 
-Kept = tuple[slice, slice]
+Inner = tuple[slice, slice]
 """The rows and columns of a window that are retained."""
 
 
@@ -49,7 +48,7 @@ class ExposedNetwork:
     offset: float = 0.0
 
     def restore(
-        self, window: np.ndarray, full_scale: float, inner: Kept, tiling: Tiling
+        self, window: np.ndarray, full_scale: float, inner: Inner, tiling: Tiling
     ) -> Exposed:
         """Restore a window of pixel values (bands, h, w) without missing pixels.
 
@@ -118,20 +117,18 @@ def tiles_by_factor(
     return counts
 
 
-def restore_window(dn: np.ndarray, infer: Infer, full_scale: float = MAX_DN) -> np.ndarray:
+def restore_window(dn: np.ndarray, infer: Infer, full_scale: float) -> np.ndarray:
     """Run a network on a window of pixel values, and return float32 in 0..full_scale, not rounded.
 
     Args:
-        dn: (h, w) or (bands, h, w).
+        dn: (bands, h, w).
         infer: the network.
         full_scale: the pixel value that is 1.0 to it.
 
     Returns:
-        An array with the same number of axes. Its bands and sizes are those of the network's
-        result.
+        The bands and sizes of the network's result.
     """
-    bands = dn[None] if dn.ndim == 2 else dn
-    image = np.ascontiguousarray(bands, dtype=np.float32)[None] / np.float32(full_scale)
+    image = np.ascontiguousarray(dn, dtype=np.float32)[None] / np.float32(full_scale)
     # Values that overflow are refused below.
     with np.errstate(over="ignore"):
         restored = infer(image)[0] * np.float32(full_scale)
@@ -139,5 +136,4 @@ def restore_window(dn: np.ndarray, infer: Infer, full_scale: float = MAX_DN) -> 
         raise ImageError(
             "The network returned NaN or infinite pixels for a tile. Check the model with 'gate'."
         )
-    restored = np.clip(restored, 0, np.float32(full_scale))
-    return np.asarray(restored[0] if dn.ndim == 2 else restored)
+    return np.asarray(np.clip(restored, 0, np.float32(full_scale)))

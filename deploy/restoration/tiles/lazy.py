@@ -4,16 +4,15 @@ A tile is two tasks. One runs the network on its window. The other stores its pi
 network has run on the tiles that the consistency step reaches.
 """
 
-from functools import partial
 from importlib import import_module
-from itertools import product
+from itertools import chain
 from typing import Any
 
 import numpy as np
 
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.restoration.bands import in_order, require_alike
-from beers_deploy.restoration.plan import Plan, Span, plan_for
+from beers_deploy.restoration.plan import Span, TilePlace, plan_for
 from beers_deploy.restoration.prepare import NetworkPipeline
 from beers_deploy.restoration.radiometry import Reading, full_scale_of
 from beers_deploy.restoration.steps import consistency_steps, exposed_networks
@@ -46,38 +45,48 @@ def restore_lazily(bands: Any, raster: Raster, pipeline: NetworkPipeline, readin
             raster,
             exposed[band : band + 1],
             full_scale,
-            plan.tiling,
+            plan,
             consistency=steps if len(networks) < 2 else steps[band : band + 1],
         )
         for band in range(len(networks))
     ]
+    shared = [delayed(restorer) for restorer in restorers]
     reach_px = restorers[0].reach_px
     margin_px = restorers[0].margin_px
-    shared = [delayed(restorer) for restorer in restorers]
-    tile = delayed(partial(restore_tile, reading))
-    finish = delayed(partial(finish_tile, reading))
-    groups = range(plan.groups)
-    windows = {
-        place: _read(bands, plan, margin_px, *place)
-        for place in product(groups, plan.rows, plan.columns)
-    }
-    restored = {
-        place: tile(shared[place[0] % len(shared)], *windows[place], *place[1:])
-        for place in windows
-    }
+    count = plan.tiling.channels_in
 
-    def block(group: int, row: Span, column: Span) -> Any:
+    def read(place: TilePlace) -> Any:
+        """Return the lazy strip of a tile, which both of its tasks share."""
+        rows, columns = (
+            slice(max(span.start - margin_px, 0), span.stop + margin_px) for span in place[1:]
+        )
+        pixels = bands[place.group * count : (place.group + 1) * count, rows, columns]
+        return delayed(_strip)(reading, of_group(place), pixels, rows.start, columns.start)
+
+    def of_group(place: TilePlace) -> Any:
+        return shared[place.group % len(shared)]
+
+    places = list(chain.from_iterable(map(plan.places, plan.rows)))
+    strips = {place: read(place) for place in places}
+    restored = {place: delayed(_tile)(of_group(place), strips[place], place) for place in places}
+
+    def block(place: TilePlace) -> Any:
+        group, row, column = place
         down = [tile for tile in plan.rows if _near(tile, row, reach_px)]
         across = [tile for tile in plan.columns if _near(tile, column, reach_px)]
-        around = [[restored[group, down_tile, tile] for tile in across] for down_tile in down]
+        around = [
+            [restored[TilePlace(group, down_tile, tile)] for tile in across] for down_tile in down
+        ]
         at = down[0].keep_start, across[0].keep_start
-        window = windows[group, row, column]
-        finished = finish(shared[group % len(shared)], *window, around, at, row, column)
+        finished = delayed(_finish)(of_group(place), strips[place], around, at, place)
         sides = ((span.keep_stop - span.keep_start) * plan.scale for span in (row, column))
         return da.from_delayed(finished, (plan.tiling.channels_out, *sides), raster.out_dtype)
 
     return da.block(
-        [[[block(g, row, column) for column in plan.columns] for row in plan.rows] for g in groups]
+        [
+            [[block(TilePlace(g, row, column)) for column in plan.columns] for row in plan.rows]
+            for g in range(plan.groups)
+        ]
     )
 
 
@@ -91,62 +100,29 @@ def _near(other: Span, span: Span, reach_px: int) -> bool:
     )
 
 
-def _read(
-    bands: Any, plan: Plan, margin_px: int, group: int, row: Span, column: Span
-) -> tuple[Any, int, int]:
-    """Return the input of a tile: a lazy window (bands, h, w), and the row and column of its first
-    pixel.
-    """
-    rows, columns = (
-        slice(max(span.start - margin_px, 0), span.stop + margin_px) for span in (row, column)
-    )
-    count = plan.tiling.channels_in
-    pixels = bands[group * count : (group + 1) * count, rows, columns]
-    # Both tasks of the tile share this one, so that chunks are read once.
-    return import_module("dask").delayed(pixels), rows.start, columns.start
+def _tile(restorer: Restorer, strip: Strip, place: TilePlace) -> np.ndarray:
+    """Return the retained pixels (bands, h, w) float32 of a tile as the network returned them."""
+    # The strip and the restorer are those of this group of bands alone.
+    return restorer.tile(strip, place._replace(group=0)).pixels
 
 
-def restore_tile(
-    reading: Reading,
+def _finish(
     restorer: Restorer,
-    window: np.ndarray,
-    top: int,
-    left: int,
-    row: Span,
-    column: Span,
-) -> np.ndarray:
-    """Run the network on one tile. Return its retained pixels (bands, h, w) float32, given a window
-    that begins at (top, left).
-    """
-    return restorer.tile(_strip(reading, restorer, window, top, left), 0, row, column).pixels
-
-
-def finish_tile(
-    reading: Reading,
-    restorer: Restorer,
-    window: np.ndarray,
-    top: int,
-    left: int,
+    strip: Strip,
     around: list[list[np.ndarray]],
     at: tuple[int, int],
-    row: Span,
-    column: Span,
+    place: TilePlace,
 ) -> np.ndarray:
     """Store the retained pixels (bands, h, w) of one tile.
 
     Args:
-        reading: how its pixels are interpreted.
         restorer: of its band.
-        window: raw pixels, as of `restore_tile`.
-        top: row of its first pixel.
-        left: its column.
-        around: the results of `restore_tile` for the tiles within reach, in rows.
+        strip: its raw pixels.
+        around: the results of `_tile` for the tiles within reach, in rows.
         at: row and column of the first pixel of these.
-        row: rows of the tile.
-        column: its columns.
+        place: the tile.
     """
-    strip = _strip(reading, restorer, window, top, left)
-    return restorer.finish(strip, np.block(around), at, 0, row, column).pixels
+    return restorer.finish(strip, np.block(around), at, place._replace(group=0)).pixels
 
 
 def _strip(reading: Reading, restorer: Restorer, window: np.ndarray, top: int, left: int) -> Strip:

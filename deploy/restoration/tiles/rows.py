@@ -12,7 +12,8 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from itertools import product
+from functools import partial
+from itertools import zip_longest
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +25,7 @@ from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.untrusted import times
 from beers_deploy.restoration.outcome import Tally
-from beers_deploy.restoration.plan import Plan, Span
+from beers_deploy.restoration.plan import Plan, Span, TilePlace
 from beers_deploy.restoration.runtime import Infer
 from beers_deploy.restoration.tiles.engine import Restorer, Strip, Tile
 from beers_deploy.restoration.tiles.exposures import ExposedNetwork
@@ -93,7 +94,6 @@ class HeldRows:
 
 def restore_rows(
     source: Source,
-    plan: Plan,
     restorer: Restorer,
     rows: Sequence[Span],
     tick: Callable[[], None],
@@ -107,16 +107,17 @@ def restore_rows(
     """
     if not rows:
         return
+    plan = restorer.plan
     reach_px = restorer.reach_px
     first = rows[0].keep_start
-    network_rows = rows_to_run(plan, restorer, rows)
+    network_rows = rows_to_run(restorer, rows)
     # One thread reads, because a source keeps the segments that it decoded for the next rows.
     with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(at_once) as pool:
         try:
             waiting = deque[NetworkRow]()
             scale = plan.scale
             buffer = HeldRows(network_rows[0].keep_start * scale)
-            for row in _network_rows(source, plan, restorer, network_rows, (reader, pool), tick):
+            for row in _network_rows(source, restorer, network_rows, (reader, pool), tick):
                 buffer.parts.append(row.pixels)
                 if first <= row.span.keep_start < rows[-1].keep_stop:
                     waiting.append(row)
@@ -125,25 +126,24 @@ def restore_rows(
                 ):
                     done_px = waiting[0].span.keep_stop
                     # A variable for the row would hold it in memory while the next is computed.
-                    yield _finished(waiting.popleft(), buffer, plan, restorer, pool)
+                    yield _finished(waiting.popleft(), buffer, restorer, pool)
                     buffer.forget_above((done_px - reach_px) * scale)
         finally:
             # Otherwise the tiles of two rows would still be restored after an error.
             pool.shutdown(cancel_futures=True)
 
 
-def rows_to_run(plan: Plan, restorer: Restorer, rows: Sequence[Span]) -> list[Span]:
+def rows_to_run(restorer: Restorer, rows: Sequence[Span]) -> list[Span]:
     """Return the rows of tiles that the network must run on to finish `rows`."""
     if not rows:
         return []
     start = rows[0].keep_start - restorer.reach_px
     stop = rows[-1].keep_stop + restorer.reach_px
-    return [row for row in plan.rows if row.keep_stop > start and row.keep_start < stop]
+    return [row for row in restorer.plan.rows if row.keep_stop > start and row.keep_start < stop]
 
 
 def _network_rows(
     source: Source,
-    plan: Plan,
     restorer: Restorer,
     rows: Sequence[Span],
     pools: tuple[Executor, Executor],
@@ -154,84 +154,61 @@ def _network_rows(
     A row is started before the previous one is finished, so that no thread waits.
     """
     reader, pool = pools
-    coming = [reader.submit(restorer.read, source, row.start, row.stop) for row in rows[:1]]
-    begun: deque[tuple[Span, Strip, Iterator[Tile]]] = deque()
-    for number, row in enumerate(rows):
-        strip = coming.pop().result()
+    plan = restorer.plan
+
+    def finished(row: Span, strip: Strip, tiles: Iterable[Tile]) -> NetworkRow:
+        rows_px = (row.keep_stop - row.keep_start) * plan.scale
+        pixels = np.empty((plan.out_shape[0], rows_px, plan.out_shape[2]), np.float32)
+        return NetworkRow(row, strip, pixels, _gathered(tiles, pixels, plan, row, tick))
+
+    coming = reader.submit(restorer.read, source, rows[0])
+    begun = deque[tuple[Span, Strip, Iterator[Tile]]]()
+    for row, following in zip_longest(rows, rows[1:]):
+        strip = coming.result()
         # The next strip is read while the network runs on this one.
-        following = rows[number + 1 : number + 2]
-        coming += [
-            reader.submit(restorer.read, source, span.start, span.stop) for span in following
-        ]
-        begun.append((row, strip, _tiles(strip, row, plan, restorer, pool)))
+        if following:
+            coming = reader.submit(restorer.read, source, following)
+        begun.append((row, strip, pool.map(partial(restorer.tile, strip), plan.places(row))))
         if len(begun) > 1:
-            yield _network_row(*begun.popleft(), plan, tick)
-    while begun:
-        yield _network_row(*begun.popleft(), plan, tick)
+            yield finished(*begun.popleft())
+    yield finished(*begun.popleft())
 
 
-def _tiles(
-    strip: Strip, row: Span, plan: Plan, restorer: Restorer, pool: Executor
-) -> Iterator[Tile]:
-    """Return an iterator over the tiles of one row, in the order of `places`."""
-    # Within the caller's loop, the lambda would use the strip and the row of the next iteration.
-    return pool.map(lambda place: restorer.tile(strip, place[0], row, place[1]), places(plan))
-
-
-def _network_row(
-    row: Span, strip: Strip, tiles: Iterable[Tile], plan: Plan, tick: Callable[[], None]
-) -> NetworkRow:
-    pixels = np.empty(
-        (plan.out_shape[0], (row.keep_stop - row.keep_start) * plan.scale, plan.out_shape[2]),
-        np.float32,
-    )
-    return NetworkRow(row, strip, pixels, _gathered(tiles, pixels, plan, tick))
-
-
-def _finished(
-    row: NetworkRow, buffer: HeldRows, plan: Plan, restorer: Restorer, pool: Executor
-) -> RestoredRow:
+def _finished(row: NetworkRow, buffer: HeldRows, restorer: Restorer, pool: Executor) -> RestoredRow:
     """Finish a row of tiles, tile by tile, once all that they need is available."""
+    plan = restorer.plan
     count = plan.tiling.channels_out
     reach_px = restorer.reach_px
     scale = plan.scale
     top = max(row.span.keep_start - reach_px, 0)
     rows = slice(top * scale, (row.span.keep_stop + reach_px) * scale)
 
-    def finish(place: tuple[int, Span]) -> Tile:
-        group, columns = place
-        bands = slice(group * count, (group + 1) * count)
-        left = max(columns.keep_start - reach_px, 0)
-        across = slice(left * scale, (columns.keep_stop + reach_px) * scale)
-        around = buffer.window(bands, rows, across)
-        return restorer.finish(row.strip, around, (top, left), group, row.span, columns)
+    def finish(place: TilePlace) -> Tile:
+        bands = slice(place.group * count, (place.group + 1) * count)
+        left = max(place.columns.keep_start - reach_px, 0)
+        across = slice(left * scale, (place.columns.keep_stop + reach_px) * scale)
+        return restorer.finish(row.strip, buffer.window(bands, rows, across), (top, left), place)
 
     pixels = np.empty(row.pixels.shape, restorer.raster.out_dtype)
-    tally = row.tally + _gathered(pool.map(finish, places(plan)), pixels, plan, lambda: None)
+    tiles = pool.map(finish, plan.places(row.span))
+    tally = row.tally + _gathered(tiles, pixels, plan, row.span, lambda: None)
     return RestoredRow(row.span, pixels, tally)
 
 
 def _gathered(
-    tiles: Iterable[Tile], pixels: np.ndarray, plan: Plan, tick: Callable[[], None]
+    tiles: Iterable[Tile], pixels: np.ndarray, plan: Plan, row: Span, tick: Callable[[], None]
 ) -> Tally:
     """Put the tiles of a row into `pixels` (bands, rows, width), and return their joint
     statistics.
     """
     tally = Tally()
     count = plan.tiling.channels_out
-    for (group, columns), tile in zip(places(plan), tiles, strict=True):
+    for (group, _, columns), tile in zip(plan.places(row), tiles, strict=True):
         across = slice(columns.keep_start * plan.scale, columns.keep_stop * plan.scale)
         pixels[group * count : (group + 1) * count, :, across] = tile.pixels
         tally += tile.tally
         tick()
     return tally
-
-
-def places(plan: Plan) -> list[tuple[int, Span]]:
-    """Return the group of bands and the columns of every tile in a row of tiles, in the order in
-    which they are restored.
-    """
-    return list(product(range(plan.groups), plan.columns))
 
 
 def gathered(
@@ -279,8 +256,8 @@ def restore_floats(
     _, height_px, width_px = pixels.shape
     raster = Raster(1, height_px, width_px, pixels.dtype)
     exposed = network if isinstance(network, ExposedNetwork) else ExposedNetwork({1: network})
-    restorer = Restorer(raster, (exposed,), float(max_dn), plan.tiling, consistency=consistency)
-    rows = restore_rows(ArraySource(pixels, raster), plan, restorer, plan.rows, lambda: None)
+    restorer = Restorer(raster, (exposed,), float(max_dn), plan, consistency=consistency)
+    rows = restore_rows(ArraySource(pixels, raster), restorer, plan.rows, lambda: None)
     restored, _ = gathered(rows, plan.out_shape, raster.out_dtype)
     return np.asarray(restored[0])
 

@@ -32,8 +32,7 @@ from beers_deploy.profiles.figures import Row, by_table
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.report.page import Picture, Report, Section, write_report
 from beers_deploy.restoration.method import Restore
-from beers_deploy.restoration.sensor_check.check import check_windows
-from beers_deploy.restoration.sensor_check.windows import WINDOW_PX
+from beers_deploy.restoration.sensor_check.check import WINDOW_PX, check_windows
 from beers_deploy.restoration.steps import Around
 from beers_deploy.results import Input, Table
 from beers_deploy.studies.evaluation import compression, scores, target_scenes, targets

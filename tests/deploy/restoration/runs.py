@@ -5,6 +5,7 @@ import sys
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 import rasterio
 import tifffile
 
+import beers_deploy as bd
 from beers_deploy.profiles.figures import Row
 from beers_deploy.restoration.tiles.engine import Restorer, Tile
 from beers_deploy.verbs.restore import restore
@@ -39,6 +41,35 @@ def restored(
     with warnings.catch_warnings(action="ignore"), rasterio.open(folder / "out.tif") as file:
         pixels = file.read()
     return pixels if len(pixels) > 1 else pixels[0], row
+
+
+NAME = "pleiades-degraded"
+TRANSFORM = rasterio.Affine(0.5, 0.1, 500000, 0.05, -0.5, 4600000)
+NODATA = 65535
+
+
+def two_bands(path: Path) -> np.ndarray:
+    """Write two bands of one image (150, 214) at a place on Earth, and return the first band. In
+    the second one the first 64 x 64 pixels are missing.
+    """
+    band = pair_of_bands().degraded[:150]
+    second = band.copy()
+    second[:64, :64] = NODATA
+    with rasterio.open(
+        path, "w", driver="GTiff", width=214, height=150, count=2, dtype="uint16",
+        crs="EPSG:32631", transform=TRANSFORM, nodata=NODATA,
+    ) as file:  # fmt: skip
+        file.write(np.stack([band, second]))
+        file.descriptions = ("blue", "red")
+    return band
+
+
+@cache
+def pair_of_bands() -> bd.Pair:
+    """Return a drawn scene of 214 x 214 pixels as `NAME` acquires it."""
+    pair = bd.simulate(sensor=NAME, size=214, seed=3)
+    assert isinstance(pair, bd.Pair)
+    return pair
 
 
 def begin(image: Path, out: Path, *options: object) -> subprocess.Popen[str]:

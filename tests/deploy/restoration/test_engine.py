@@ -29,10 +29,10 @@ def running(infer: Infer, at_once: int, tick: Callable[[], None] = lambda: None)
     pixels = np.random.default_rng(0).integers(0, 4096, SHAPE).astype(np.uint16)
     raster = Raster(*SHAPE, pixels.dtype, None)
     plan: Plan = make_plan(raster.shape, TILE_PX, RADIUS_PX, Tiling(RADIUS_PX))
-    restorer = Restorer(raster, (ExposedNetwork({1: infer}),), 4095.0, Tiling(RADIUS_PX))
+    restorer = Restorer(raster, (ExposedNetwork({1: infer}),), 4095.0, plan)
     result = np.empty(SHAPE, np.uint16)
     source = ArraySource(pixels, raster)
-    for row, pixels_out, tally in restore_rows(source, plan, restorer, plan.rows, tick, at_once):
+    for row, pixels_out, tally in restore_rows(source, restorer, plan.rows, tick, at_once):
         assert (tally.known, tally.clipped) == (pixels_out.size, 0)
         result[:, row.keep_start : row.keep_stop] = pixels_out
     return result

@@ -8,7 +8,6 @@ import rasterio
 from numpy.testing import assert_allclose
 
 from beers_deploy.model.raster.reader import open_raster
-from beers_deploy.model.raster.source import fingerprint
 from beers_deploy.profiles.errors import BeersError, ImageError
 from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import refused
@@ -33,27 +32,21 @@ def test_polynomials_bits_and_gains_of_a_dimap_are_kept(
         assert [after.tags(band)["RADIANCE_BIAS"] for band in (1, 2)] == ["0.0", "0.1"]
 
 
-def test_names_and_gains_of_the_bands_of_a_vrt_are_kept(model: Path, tmp_path: Path) -> None:
-    more = "<Description>B0</Description><Offset>-0.5</Offset><Scale>0.25</Scale>"
-    image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers(), more)
-    restore(image, tmp_path / "out.tif", network=model)
-    with rasterio.open(tmp_path / "out.tif") as after:
-        assert after.descriptions == ("B0", "B0")
-        assert (after.scales, after.offsets) == ((0.25, 0.25), (-0.5, -0.5))
-
-
-def test_ground_control_points_of_a_vrt_are_kept(model: Path, tmp_path: Path) -> None:
+def test_control_points_names_and_gains_of_a_vrt_are_kept(model: Path, tmp_path: Path) -> None:
     points = "".join(
         f'<GCP Id="{k}" Pixel="{17 * k}" Line="{9 * k * k}" X="{k / 3!r}" Y="{45 - k / 7!r}" '
         'Z="0"/>'
         for k in range(5)
     )
-    image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers())
+    more = "<Description>B0</Description><Offset>-0.5</Offset><Scale>0.25</Scale>"
+    image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers(), more)
     text = image.read_text()
     place = text[text.index("<SRS>") : text.index("</GeoTransform>") + len("</GeoTransform>")]
     image.write_text(text.replace(place, f'<GCPList Projection="EPSG:4326">{points}</GCPList>'))
     restore(image, tmp_path / "out.tif", network=model)
     with rasterio.open(image) as before, rasterio.open(tmp_path / "out.tif") as after:
+        assert after.descriptions == ("B0", "B0")
+        assert (after.scales, after.offsets) == ((0.25, 0.25), (-0.5, -0.5))
         assert before.gcps[1] == after.gcps[1] == rasterio.CRS.from_epsg(4326)
         points_of = [[(p.col, p.row, p.x, p.y) for p in file.gcps[0]] for file in (before, after)]
     assert len(points_of[0]) == 5
@@ -77,17 +70,6 @@ def test_alpha_in_a_jpeg_2000_and_a_mask_next_to_one_are_missing_pixels(tmp_path
             np.testing.assert_array_equal(source.raster.missing(rows)[0], hidden[20:60])
 
 
-def not_restored(image: Path, out: Path, model: Path, error: type[BeersError], *words: str) -> None:
-    """Expect an error of one line with these words, and nothing written."""
-    before = sorted(out.parent.iterdir())
-    with pytest.raises(error) as caught:
-        restore(image, out, network=model, tile=64)
-    for word in words:
-        assert word in str(caught.value)
-    assert "\n" not in str(caught.value)
-    assert sorted(out.parent.iterdir()) == before
-
-
 @pytest.mark.parametrize("share", [0.0, 0.05, 0.5, 0.95])
 def test_a_truncated_jpeg_2000_is_an_error_of_one_line(
     share: float, model: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
@@ -95,16 +77,10 @@ def test_a_truncated_jpeg_2000_is_an_error_of_one_line(
     image = images.write_jp2(tmp_path / "a.jp2", images.digital_numbers())
     content = image.read_bytes()
     image.write_bytes(content[: int(share * len(content)) + 50])
-    not_restored(image, tmp_path / "out.tif", model, ImageError, "a.jp2", "whole image")
+    with pytest.raises(ImageError, match=r"^.*a\.jp2.*whole image.*$"):
+        restore(image, tmp_path / "out.tif", network=model, tile=64)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.jp2"]
     assert capfd.readouterr().err == ""
-
-
-def test_an_unreadable_format_is_an_error_of_one_line(model: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out.tif"
-    (tmp_path / "a.xml").write_text("<WMS_Service/>")
-    not_restored(tmp_path / "a.xml", out, model, ImageError, "DIMAP")
-    images.write(tmp_path / "c.img", np.ones((1, 9, 9), np.complex64), "HFA")
-    not_restored(tmp_path / "c.img", out, model, ImageError, "complex64")
 
 
 def test_a_tile_is_no_output(model: Path, tmp_path: Path) -> None:
@@ -117,13 +93,3 @@ def test_a_tile_is_no_output(model: Path, tmp_path: Path) -> None:
     for words in (out, "--dry-run"):
         assert tile.name in refused(f"restore {image} {words} --json {tile}")
         assert tile.read_bytes() == before
-
-
-def test_a_changed_tile_makes_another_image(tmp_path: Path) -> None:
-    image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers())
-    with open_raster(image) as source:
-        before = fingerprint(source.files)
-    images.write_jp2(
-        tmp_path / "R64C80.jp2", np.zeros((2, images.HEIGHT - 64, images.WIDTH - 80), np.uint16)
-    )
-    assert fingerprint(source.files) != before

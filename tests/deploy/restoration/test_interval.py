@@ -20,47 +20,28 @@ from beers_deploy.network_files import int8_for_sensor
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.onnx_file import metadata
-from beers_deploy.restoration.interval.half_widths import interval_of
+from beers_deploy.restoration.interval import interval_of
 from beers_deploy.verbs.restore import restore
-from tests.deploy.restoration.runs import stopped_after
+from tests.deploy.restoration.runs import NAME, TRANSFORM, pair_of_bands, stopped_after, two_bands
 from tests.model.networks import plain
 
-NAME = "pleiades-degraded"
 NETWORK = "convbeers-xs-int8"
-HEIGHT = 150
-WIDTH = 214
-NODATA = 65535
-TRANSFORM = rasterio.Affine(0.5, 0.1, 500000, 0.05, -0.5, 4600000)
+OPTIONS: dict[str, Any] = {"network": NETWORK, "sensor": NAME, "interval": 90}
 
 
 @pytest.fixture(scope="module")
-def pair() -> bd.Pair:
-    made = bd.simulate(sensor=NAME, size=WIDTH, seed=3)
-    assert isinstance(made, bd.Pair)
-    return made
-
-
-@pytest.fixture(scope="module")
-def image(pair: bd.Pair, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two bands of a drawn scene, the second with missing pixels, at a place on Earth."""
-    band = pair.degraded[:HEIGHT]
-    second = band.copy()
-    second[40:70, 30:90] = NODATA
+def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("image") / "raw.tif"
-    with rasterio.open(
-        path, "w", driver="GTiff", width=WIDTH, height=HEIGHT, count=2, dtype="uint16",
-        crs="EPSG:32631", transform=TRANSFORM, nodata=NODATA,
-    ) as file:  # fmt: skip
-        file.write(np.stack([band, second]))
-        file.descriptions = ("blue", "red")
+    two_bands(path)
     return path
 
 
 def run(image: Path, out: Path, **options: Any) -> bytes:
     """Restore an image with half-widths, and return the bytes of their file."""
-    given = {"network": NETWORK, "sensor": NAME, "interval": 90, "progress": False, **options}
-    restore(image, out, overwrite=True, **given)
-    return out.with_name(f"{out.stem}-interval.tif").read_bytes()
+    table = restore(image, out, overwrite=True, progress=False, **{**OPTIONS, **options})
+    half_widths = out.with_name(f"{out.stem}-interval.tif")
+    assert table.title == f"wrote {out} and {half_widths}"
+    return half_widths.read_bytes()
 
 
 def test_the_file_lies_over_the_image_and_has_a_plane_for_each_band(
@@ -77,7 +58,7 @@ def test_the_file_lies_over_the_image_and_has_a_plane_for_each_band(
     assert blue.dtype == np.float32
     assert (blue > 0).all()
     missing = np.zeros(blue.shape, bool)
-    missing[40:70, 30:90] = True
+    missing[:64, :64] = True
     assert_array_equal(np.isnan(red), missing)
     # Far from the missing pixels both bands are nearly the same image.
     assert_allclose(red[:, 150:], blue[:, 150:], rtol=0.05)
@@ -88,9 +69,8 @@ def test_tiles_stops_and_memory_change_no_byte(image: Path, tmp_path: Path) -> N
     assert run(image, tmp_path / "tiles.tif", tile=64) == whole
     assert run(image, tmp_path / "little.tif", tile=512, memory=3.0) == whole
     out = tmp_path / "stopped.tif"
-    options: dict[str, Any] = {"network": NETWORK, "sensor": NAME, "tile": 64, "interval": 90}
     with stopped_after(9):
-        restore(image, out, **options)
+        restore(image, out, tile=64, **OPTIONS)
     assert not (tmp_path / "stopped-interval.tif").exists()
     assert run(image, out, tile=64, resume=True) == whole
     # Negative control: another level has other half-widths.
@@ -110,43 +90,41 @@ def test_bands_have_the_half_widths_of_their_own_sensors(image: Path, tmp_path: 
     assert np.nanmean(red) > 1.2 * np.nanmean(blue)
 
 
-def test_an_array_comes_with_the_half_widths_of_the_file(
-    pair: bd.Pair, image: Path, tmp_path: Path
-) -> None:
+def test_an_array_comes_with_the_half_widths_of_the_file(image: Path, tmp_path: Path) -> None:
     run(image, tmp_path / "out.tif")
     with rasterio.open(tmp_path / "out-interval.tif") as file:
-        wanted = file.read(1)
-    band = pair.degraded[:HEIGHT]
-    options: dict[str, Any] = {"network": NETWORK, "sensor": NAME, "interval": 90}
-    restored, half = bd.restore(band, **options)
-    assert_array_equal(half, wanted)
+        of_file = file.read(1)
+    band = pair_of_bands().degraded[:150]
+    restored, half = bd.restore(band, **OPTIONS)
+    assert_array_equal(half, of_file)
     assert_array_equal(restored, bd.restore(band, network=NETWORK, sensor=NAME))
     assert half.shape == restored.shape
-    _, of_torch = bd.restore(torch.from_numpy(band.astype(np.float32)), **options)
+    _, of_torch = bd.restore(torch.from_numpy(band.astype(np.float32)), **OPTIONS)
     assert isinstance(of_torch, torch.Tensor)
     # Floats are not rounded, and their deviations differ by less than rounding makes.
     assert of_torch.numpy() == pytest.approx(half, rel=0.2)
     hidden = np.zeros(band.shape, bool)
     hidden[:5] = True
-    masked, masked_half = bd.restore(np.ma.array(band, mask=hidden), **options)
+    masked, masked_half = bd.restore(np.ma.array(band, mask=hidden), **OPTIONS)
     for each in (masked, masked_half):
         assert_array_equal(np.ma.getmaskarray(each), hidden)
 
 
-def test_an_xarray_keeps_its_labels_and_dask_is_refused(pair: bd.Pair) -> None:
+def test_an_xarray_keeps_its_labels_and_dask_is_refused() -> None:
     xarray = pytest.importorskip("xarray", reason="xarray is not installed")
     dask = pytest.importorskip("dask.array", reason="dask is not installed")
-    options: dict[str, Any] = {"network": NETWORK, "sensor": NAME, "interval": 90}
+    pair = pair_of_bands()
     image = xarray.DataArray(pair.degraded[:40, :50], {"y": range(40)}, ("y", "x"))
-    restored, half = bd.restore(image, **options)
+    restored, half = bd.restore(image, **OPTIONS)
     assert half.dims == restored.dims == ("y", "x")
     assert_array_equal(half.y, image.y)
     with pytest.raises(OptionError, match="Compute the Dask array"):
-        bd.restore(dask.from_array(pair.degraded), **options)
+        bd.restore(dask.from_array(pair.degraded), **OPTIONS)
 
 
-def test_most_errors_of_a_drawn_scene_lie_within_the_interval(pair: bd.Pair) -> None:
+def test_most_errors_of_a_drawn_scene_lie_within_the_interval() -> None:
     """Drawn scenes are no photographs, so only the order of levels and a wide range are asked."""
+    pair = pair_of_bands()
     shares = []
     for level in (50, 90):
         restored, half = bd.restore(
@@ -177,9 +155,8 @@ def test_what_has_no_interval_is_refused_before_a_file_is_written(
 
 def without_interval(model: Any) -> Any:
     """A network without the interval in its metadata."""
-    kept = [item for item in model.metadata_props if item.key != "interval"]
-    del model.metadata_props[:]
-    model.metadata_props.extend(kept)
+    (item,) = (item for item in model.metadata_props if item.key == "interval")
+    model.metadata_props.remove(item)
     return model
 
 
@@ -208,7 +185,7 @@ def test_an_older_file_of_half_widths_is_not_replaced(image: Path, tmp_path: Pat
     older = tmp_path / "out-interval.tif"
     older.write_bytes(b"older")
     with pytest.raises(OptionError, match=r"out-interval\.tif exists already"):
-        restore(image, tmp_path / "out.tif", network=NETWORK, sensor=NAME, interval=90)
+        restore(image, tmp_path / "out.tif", **OPTIONS)
     assert older.read_bytes() == b"older"
 
 
@@ -216,9 +193,9 @@ def test_an_older_file_of_half_widths_is_not_replaced(image: Path, tmp_path: Pat
 def test_shipped_networks_have_an_interval_that_another_sensor_keeps(name: str) -> None:
     """Float and INT8 have their own; it goes where a file is conditioned on another sensor."""
     levels = [50, 68, 80, 90, 95, 99]
-    found = [interval_of(bd.Network.load(each, sensor=NAME)) for each in (name, f"{name}-int8")]
-    assert [list(interval.quantiles) for interval in found] == [levels, levels]
-    assert found[0] != found[1]
+    own = [interval_of(bd.Network.load(each, sensor=NAME)) for each in (name, f"{name}-int8")]
+    assert [list(interval.quantiles) for interval in own] == [levels, levels]
+    assert own[0] != own[1]
     model = bd.Network.load(f"{name}-int8", sensor=NAME).model
     other = int8_for_sensor(model, Sensor.load("dior-medium"))
     assert metadata(other)["interval"] == metadata(model)["interval"]

@@ -1,6 +1,5 @@
 """Two runs never write one output at once, and a killed run blocks no other."""
 
-import errno
 import subprocess
 import sys
 import threading
@@ -74,19 +73,6 @@ def test_a_disk_without_locks_locks_nothing_and_is_left_clean(
     with only_run(tmp_path / "out"), only_run(tmp_path / "out"):
         pass
     assert not folder.exists()
-
-
-def test_a_folder_that_never_comes_is_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Such as a drive that is not there: no run that just ended took it along."""
-
-    def missing(self: Path, *_: object, **__: object) -> None:
-        raise FileNotFoundError(errno.ENOENT, "no such drive", str(self))
-
-    monkeypatch.setattr(Path, "mkdir", missing)
-    with pytest.raises(MachineError, match="no such drive"), only_run(tmp_path / "out"):
-        pass
 
 
 def test_new_folders_above_go_with_it_unless_something_was_written_there(tmp_path: Path) -> None:

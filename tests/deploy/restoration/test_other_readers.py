@@ -1,7 +1,6 @@
 """The restored COG as other programs read it: gdalinfo and QGIS, both of the system."""
 
 import json
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -63,15 +62,6 @@ for out in sys.argv[4:]:
     runs.append([done, feedback.textLog()])
 print(json.dumps({"runs": runs}))
 """
-FOOTPRINT = """
-layer = QgsVectorLayer(sys.argv[1], "footprint", "ogr")
-box = layer.extent()
-said = {
-    "box": [box.xMinimum(), box.yMinimum(), box.xMaximum(), box.yMaximum()],
-    "crs": layer.crs().authid(),
-}
-print(json.dumps(said | {"features": layer.featureCount()}))
-"""
 
 
 def answer(*command: str | Path) -> dict[str, Any]:
@@ -84,14 +74,6 @@ def answer(*command: str | Path) -> dict[str, Any]:
 
 
 @pytest.fixture
-def gdalinfo() -> str:
-    """Return the path of the program."""
-    if (path := shutil.which("gdalinfo")) is None:
-        pytest.skip("no gdalinfo: apt-get install gdal-bin")
-    return path
-
-
-@pytest.fixture
 def qgis() -> Path:
     """Return the path of a Python that has QGIS."""
     if (
@@ -100,19 +82,6 @@ def qgis() -> Path:
     ):
         pytest.skip("no QGIS: apt-get install python3-qgis")
     return PYTHON
-
-
-def test_gdalinfo_finds_bands_nodata_and_overviews(
-    gdalinfo: str, model: Path, tmp_path: Path
-) -> None:
-    restore_with_a_hole(tmp_path, model)
-    bands = answer(gdalinfo, "-json", tmp_path / "out.tif")["bands"]
-    assert [band["description"] for band in bands] == ["B0", "B1"]
-    assert [band["scale"] for band in bands] == [0.1, 0.2]
-    assert [band["noDataValue"] for band in bands] == [0, 0]
-    assert [[overview["size"] for overview in band["overviews"]] for band in bands] == [
-        [[354, 375]]
-    ] * 2
 
 
 def restore_with_a_hole(folder: Path, model: Path) -> np.ndarray:
@@ -166,14 +135,3 @@ def test_qgis_s_toolbox_restores(qgis: Path, tmp_path: Path) -> None:
     with rasterio.open(outs[0]) as ours, rasterio.open(tmp_path / "expected.tif") as theirs:
         np.testing.assert_array_equal(ours.read(), theirs.read())
         assert ours.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
-
-
-def test_qgis_draws_the_footprint_of_a_stac_item(qgis: Path, model: Path, tmp_path: Path) -> None:
-    pytest.importorskip("pystac")
-    image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
-    restore(image, tmp_path / "out.tif", network=model, cog=True, stac=tmp_path / "out.json")
-    layer = answer(qgis, "-c", IN_QGIS.replace("{}", FOOTPRINT), tmp_path / "out.json")
-    assert (layer["features"], layer["crs"]) == (1, "EPSG:4326")
-    assert layer["box"] == pytest.approx(
-        json.loads((tmp_path / "out.json").read_text())["bbox"], rel=0, abs=1e-9
-    )

@@ -36,7 +36,9 @@ def test_three_percent_of_an_ordinary_scene_are_doubted_and_one_is_not(
     in daylight.
     """
     image = mean * (1 + contrast * np.random.default_rng(seed).uniform(-1, 1, (200, 200)))
-    assert doubts_the_mean(tally(image, (1 + share) * image))
+    brighter = tally(image, (1 + share) * image)
+    assert doubts_the_mean(brighter)
+    assert brighter.figures["mean moved"].value == pytest.approx(100 * share * image.mean())
     assert not doubts_the_mean(tally(image, (1 + share / 3) * image))
 
 

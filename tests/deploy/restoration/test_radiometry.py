@@ -14,7 +14,7 @@ import pytest
 import tifffile
 from numpy.testing import assert_array_equal
 
-from beers_deploy.model.raster.facts import Extent, Raster
+from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.reader import open_raster
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Row
@@ -71,13 +71,6 @@ def test_8_bit_pixels_need_it_stated_and_cannot_be_of_more() -> None:
     assert scale(replace(eight, bits=6)).value == 63
     with pytest.raises(OptionError, match="at most 255 for uint8"):
         scale(eight, option=4095)
-
-
-def test_floats_of_digital_numbers_have_the_sensor_s_full_scale_and_shares_none() -> None:
-    floats = Raster(1, 9, 9, np.dtype(np.float32))
-    assert full_scale_of("x", floats, [Extent(900.0, whole=False)], bits=10).value == 1023
-    with pytest.raises(ImageError, match="full_scale"):
-        full_scale_of("x", floats, [Extent(0.9, whole=False)], bits=10)
 
 
 @pytest.mark.parametrize("bits", [10, 14])

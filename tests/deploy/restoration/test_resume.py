@@ -10,7 +10,6 @@ import signal
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -132,15 +131,6 @@ def test_a_full_disk_is_an_error_of_one_line_and_loses_no_finished_row(
     assert out.read_bytes() == b"old"
     restore(image, out, **options, resume=True)
     assert out.read_bytes() == expected
-
-
-def test_a_swath_that_the_disk_cannot_hold_is_refused_first(
-    image: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
-    with pytest.raises(MachineError, match="free"):
-        restore(image, tmp_path / "out.tif", network=model, tile=TILE_PX)
-    assert [p.name for p in tmp_path.iterdir()] == ["in.tif"]
 
 
 @pytest.mark.parametrize("name", ["a.jp2", "a.vrt", "DIM.XML"])

@@ -17,29 +17,13 @@ from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.verbs.restore import restore
-
-NAME = "pleiades-degraded"
-HEIGHT = 150
-WIDTH = 214
-NODATA = 65535
-TRANSFORM = rasterio.Affine(0.5, 0.1, 500000, 0.05, -0.5, 4600000)
+from tests.deploy.restoration.runs import NAME, TRANSFORM, two_bands
 
 
 @pytest.fixture(scope="module")
 def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two bands of a drawn scene, the second with missing pixels, at a place on Earth."""
-    pair = bd.simulate(sensor=NAME, size=WIDTH, seed=3)
-    assert isinstance(pair, bd.Pair)
-    band = pair.degraded[:HEIGHT]
-    second = band.copy()
-    second[:BLOCK_PX, :BLOCK_PX] = NODATA
     path = tmp_path_factory.mktemp("image") / "raw.tif"
-    with rasterio.open(
-        path, "w", driver="GTiff", width=WIDTH, height=HEIGHT, count=2, dtype="uint16",
-        crs="EPSG:32631", transform=TRANSFORM, nodata=NODATA,
-    ) as file:  # fmt: skip
-        file.write(np.stack([band, second]))
-        file.descriptions = ("blue", "red")
+    two_bands(path)
     return path
 
 
@@ -104,8 +88,9 @@ def test_a_network_for_another_sensor_is_found(
         row = run(image, out, network=other_network)
     assert (row.figures["self-check outside"].value or 0) > 50
     assert "the result fails the self-check" in caplog.text
+    assert "`sensor` is the one" in caplog.text
     strict = tmp_path / "strict.tif"
-    with pytest.raises(ImageError, match=r"fails the self-check: .* contradict the raw image"):
+    with pytest.raises(ImageError, match=r"of .* fails the self-check: .* contradict the raw"):
         run(image, strict, network=other_network, strict=True, self_check=tmp_path / "map.tif")
     assert sorted(file.name for file in tmp_path.iterdir()) == ["out.tif"]
 
@@ -137,12 +122,13 @@ def test_ground_control_points_move_to_the_blocks(image: Path, tmp_path: Path) -
     """Ground control points of the image are those of the map, in its blocks instead of pixels."""
     with rasterio.open(image) as file:
         pixels = file.read(1)
+    height, width = pixels.shape
     points = [
         GroundControlPoint(row, column, x=column / 2, y=-row / 2, z=3.0)
-        for row, column in ((0, 0), (0, WIDTH), (HEIGHT, 0))
+        for row, column in ((0, 0), (0, width), (height, 0))
     ]
     with rasterio.open(
-        tmp_path / "raw.tif", "w", driver="GTiff", width=WIDTH, height=HEIGHT, count=1,
+        tmp_path / "raw.tif", "w", driver="GTiff", width=width, height=height, count=1,
         dtype="uint16", gcps=points, crs="EPSG:32631",
     ) as file:  # fmt: skip
         file.write(pixels, 1)

@@ -1,6 +1,5 @@
 """An image is compared with its sensor: a wrong sensor leads to a warning, or to an error."""
 
-import logging
 import re
 import time
 from pathlib import Path
@@ -125,18 +124,6 @@ def test_commands_warn_and_strict_refuses(raw: np.ndarray, tmp_path: Path) -> No
         assert "contradicts the sensor wrong" in refused(*words, "--sensor", profile, "--strict")
     refused("restore", image, out, "--method", "traditional", "--sensor", profile, "--strict")
     assert not out.exists()
-
-
-def test_the_library_logs_a_warning_and_strict_refuses(
-    raw: np.ndarray, caplog: pytest.LogCaptureFixture
-) -> None:
-    noisy = SENSOR.replace(snr_0=25, snr_1=55)
-    bd.restore(raw, network="convbeers-xs-int8", sensor=noisy)
-    (record,) = caplog.records
-    assert record.levelno == logging.WARNING
-    assert record.getMessage().startswith("look at the sensor: noise at")
-    with pytest.raises(ValueError, match="contradicts the sensor"):
-        bd.restore(raw, network="convbeers-xs-int8", sensor=noisy, strict=True)
 
 
 def test_pairs_are_compared_with_the_sensor_before_an_evaluation(tmp_path: Path) -> None:

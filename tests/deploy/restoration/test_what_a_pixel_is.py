@@ -13,7 +13,6 @@ import rasterio
 import tifffile
 from numpy.testing import assert_array_equal
 from onnx import numpy_helper
-from PIL import Image
 from rasterio.enums import ColorInterp, MaskFlags
 
 from beers_deploy.profiles.errors import ImageError, OptionError
@@ -131,16 +130,6 @@ def test_alpha_is_copied(
         assert_array_equal(band, np.where(HIDDEN, pixels, expected))
 
 
-@pytest.mark.parametrize("mode", ["LA", "RGBA"])
-def test_alpha_of_a_png_is_no_light(mode: str, model: Path, tmp_path: Path) -> None:
-    planes = np.random.default_rng(0).integers(1, 255, (31, 29, len(mode))).astype(np.uint8)
-    planes[3:9, 4:20, -1] = 0
-    Image.fromarray(planes, mode).save(tmp_path / "in.png")
-    result, _ = restored(tmp_path / "in.png", model, full_scale=255)
-    assert_array_equal(result[-1], planes[..., -1])
-    assert_array_equal(result[0, 3:9, 4:20], planes[3:9, 4:20, 0])
-
-
 def two_pages(path: Path, pixels: np.ndarray) -> None:
     with tifffile.TiffWriter(path) as file:
         file.write(pixels)
@@ -239,16 +228,3 @@ def test_a_result_that_no_restoration_has_is_refused(
         restored(tmp_path / "in.tif", scaled(*how), sensor=sensor)
     assert [path.name for path in tmp_path.iterdir()] == ["in.tif"]
     restored(tmp_path / "in.tif", scaled(*how), force=True, sensor=sensor)
-
-
-def test_a_small_departure_is_reported(
-    scaled: Callable[[float, float], Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    tifffile.imwrite(tmp_path / "in.tif", np.full((61, 83), 1500, np.uint16) + (noise(61, 83) >> 6))
-    shifts = []
-    for offset in (0.0, 0.05):
-        out = tmp_path / f"{offset}.tif"
-        (row,) = restore(tmp_path / "in.tif", out, network=scaled(1.0, offset))
-        shifts.append(row.figures["mean moved"].value or 0.0)
-    assert shifts[1] - shifts[0] == pytest.approx(5, abs=0.1)
-    assert any("the mean went from" in message for message in caplog.messages)

@@ -12,7 +12,7 @@ from beers_deploy.model.interval import BORDER_PX
 from beers_deploy.model.io.tensors import read_tensors
 from beers_deploy.model.shipped import shipped_weights
 from beers_deploy.profiles.errors import ImageError, OptionError
-from beers_deploy.restoration.interval.half_widths import interval_of
+from beers_deploy.restoration.interval import interval_of
 from beers_deploy.studies.evaluation.calibrate import (
     interval_from_pairs,
     network_to_calibrate,

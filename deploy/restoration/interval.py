@@ -1,30 +1,31 @@
-"""The half-widths of a restored image, computed from its finished rows.
+"""The half-widths of a restored image, computed from its finished rows, and their file.
 
 `model.interval` has the formula. A half-width depends on restored pixels within CONTEXT_PX and on
 nothing else, so the rows that are asked for, tiles and a resumed run change no byte.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from beers_deploy.model.interval import CONTEXT_PX, HalfWidth, PixelInterval
+from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.levels import INTERVAL, Level
+from beers_deploy.model.raster.compression import Compression
+from beers_deploy.model.raster.facts import BandInfo, Raster
 from beers_deploy.model.raster.source import Source, strips
+from beers_deploy.model.raster.writer import write_raster
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import ModelError, OptionError
-from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.restoration.bands import in_order
 from beers_deploy.restoration.prepare import Restoration
+from beers_deploy.restoration.self_check import ReadRows
 
 ROWS_PX = 32
 """Rows that are computed at a time, so that all intermediate arrays stay small."""
-
-ReadRows = Callable[[int, int, int], np.ndarray]
-"""Return restored rows (rows, width) as stored, given the band, the first row and the end."""
 
 
 def interval_of(network: Network) -> PixelInterval:
@@ -76,10 +77,10 @@ class HalfWidths:
         top = max(start - CONTEXT_PX, 0)
         bottom = min(stop + CONTEXT_PX, raster.height_px)
         pixels = self.restored(band, top, bottom)
-        known = np.ones(pixels.shape, bool)
+        valid = np.ones(pixels.shape, bool)
         if raster.may_miss:
-            known = ~raster.missing(self.source.read(top, bottom))[band]
-        return self.bands[band].of(pixels, known)[start - top : stop - top]
+            valid = ~raster.missing(self.source.read(top, bottom))[band]
+        return self.bands[band].of(pixels, valid)[start - top : stop - top]
 
 
 def half_widths_of(work: Restoration, level: Level) -> tuple[HalfWidth, ...]:
@@ -100,20 +101,50 @@ def half_widths_of(work: Restoration, level: Level) -> tuple[HalfWidth, ...]:
             "`interval` needs a network that gives one pixel of the same band for each pixel. "
             "Leave `interval` out."
         )
-    require_known(work.reading.sensors)
+    sensors = work.reading.sensors
+    if not sensors or any(sensor.name == BLIND for sensor in sensors.values()):
+        raise OptionError(
+            "`interval` needs the sensor of every band, whose noise is its unit. Name it with "
+            "`sensor`, or omit `interval`."
+        )
     # The networks of several bands are one file, conditioned on their sensors.
     interval = interval_of(work.networks[0])
     built = [
         interval.for_sensor(sensor.nominal(), work.scale.value, level)
-        for sensor in in_order(work.reading.sensors, raster)
+        for sensor in in_order(sensors, raster)
     ]
     return tuple(built[band % len(built)] for band in range(raster.bands))
 
 
-def require_known(sensors: Mapping[str, Sensor]) -> None:
-    """Raise OptionError if the sensor of any band is unknown."""
-    if not sensors or any(sensor.name == BLIND for sensor in sensors.values()):
-        raise OptionError(
-            "`interval` needs the sensor of every band, whose noise is its unit. Name it with "
-            "`sensor`, or leave `interval` out."
+def interval_beside(out: Path) -> Path:
+    """Return the path of the file of half-widths of a restored image."""
+    return out.with_name(f"{out.stem}-interval.tif")
+
+
+def write_half_widths(
+    path: Path, widths: HalfWidths, level: Level, compression: Compression
+) -> None:
+    """Write half-widths as a GeoTIFF of float32 with one plane for each band, NaN where a pixel is
+    missing, in the units and at the place of the restored image.
+    """
+    raster = widths.source.raster
+    infos = raster.band_info or (BandInfo(),) * raster.bands
+    named = tuple(
+        replace(
+            info,
+            name=f"{info.name or f'band {band}'}: half-width",
+            # An offset shifts values, and a half-width is a difference of two.
+            offset=0.0,
+            tags=(("level_percent", str(level)),),
         )
+        for band, info in enumerate(infos, 1)
+    )
+    facts = Raster(
+        *raster.shape,
+        np.dtype(np.float32),
+        nodata=float("nan"),
+        place=raster.place,
+        band_info=named,
+    )
+    with whole_file(path) as temporary:
+        write_raster(temporary, facts, widths, compression, "beers-deploy")
