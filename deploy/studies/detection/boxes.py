@@ -178,10 +178,6 @@ class Letterbox:
         padded = np.pad(fitted.astype(np.float32), self._border, constant_values=PADDING)
         return np.ascontiguousarray(padded.transpose(2, 0, 1))
 
-    def to_input(self, corners: np.ndarray) -> np.ndarray:
-        """Convert (N, 4) corners from px of the image to px of the input."""
-        return np.asarray(corners * self._gain + self._shift)
-
     def to_image(self, corners: np.ndarray) -> np.ndarray:
         """Convert (N, 4) corners from px of the input to px of the image."""
         return np.asarray((corners - self._shift) / self._gain)

@@ -115,8 +115,11 @@ def run_evaluation(plan: Plan) -> Evaluation:
     instruments = scores.Instruments(distances, nominal.max_dn, nominal.offset_dn)
     remarks = list[str]()
     sensor_rows = list[Row]()
+    loaded = list[NamedPair]()
     if plan.given is not None:
-        loaded = [_named(number, pair) for number, pair in enumerate(plan.given)]
+        for number, pair in enumerate(plan.given):
+            images = (image.astype(np.float32) for image in pair)
+            loaded.append(NamedPair(f"pair{number}", *images, noise_free=pair.clean))
     elif plan.folder is not None:
         loaded = read_pairs(plan.folder, nominal.max_dn, read_pairs_recipe(plan.folder))
         sensor_rows = [_sensor_row(loaded, sensors[0], str(plan.folder), plan.strict)]
@@ -182,14 +185,10 @@ def _compared(
 def _in_order(rows: Iterable[Row]) -> list[Row]:
     """Return the rows by table: means, targets, sites, images; with the sites' means among them."""
     tables = by_table(rows)
-    means: list[Row] = []
-    images: list[Row] = []
-    for name, table in tables.items():
-        if name.startswith("mean"):
-            means += table
-        if name.startswith("images"):
-            images += table
-    return [*means, *tables[targets.TARGETS], *scores.site_rows(tables["images"]), *images]
+    means = [table for name, table in tables.items() if name.startswith("mean")]
+    images = [table for name, table in tables.items() if name.startswith("images")]
+    sites = scores.site_rows(tables["images"])
+    return [*chain(*means, tables[targets.TARGETS], sites, *images)]
 
 
 def _sensor_row(pairs: Sequence[NamedPair], sensor: Sensor, name: str, strict: bool) -> Row:
@@ -218,11 +217,6 @@ def _inputs(plan: Plan) -> Iterator[Path | Input]:
     if plan.folder:
         folders = [plan.folder / "degraded", plan.folder / "reference"]
     yield from chain.from_iterable(map(list_images, folders))
-
-
-def _named(number: int, pair: Pair) -> NamedPair:
-    degraded, reference = (image.astype(np.float32) for image in pair)
-    return NamedPair(f"pair{number}", degraded, reference, noise_free=pair.clean)
 
 
 def _method(

@@ -2,7 +2,6 @@
 why it has none.
 """
 
-import math
 from collections.abc import Sequence
 
 from beers_deploy.profiles.figures import Row
@@ -71,36 +70,14 @@ def _sentence(row: Row) -> str:
 
 
 def why_not(points: Sequence[Measured], constraints: Sequence[Constraint], cost: str) -> str:
-    """Return a sentence on the constraint that no point of a board complies with, and the closest
+    """Return a sentence on the limits that no point of a board complies with, and the closest
     point.
     """
     here = placed(points, cost)
     if not here:
         return f"no point has both a PSNR and a {cost}"
-    out_of_reach = [
-        constraint
-        for constraint in constraints
-        if all(constraint.violation(point) for point in here)
-    ]
-    if out_of_reach:
-        return "; ".join(_missed(constraint, here) for constraint in out_of_reach)
-    return (
-        f"no point keeps {' and '.join(map(str, constraints))} at once{nearest(here, constraints)}"
-    )
-
-
-def _missed(constraint: Constraint, points: Sequence[Measured]) -> str:
-    comparable = [point for point in points if not math.isnan(point.value(constraint.key))]
-    if not comparable:
-        figure = points[0].figures.get(constraint.key)
-        return f"no point has the figure {constraint.key}{f': {figure.reason}' if figure else ''}"
-    closest = min(comparable, key=constraint.violation)
-    extreme = "least" if constraint.at_most else "most"
-    extreme_value = closest.value(constraint.key)
-    return (
-        f"no point within {constraint}: the {extreme} is {constraint.in_words(extreme_value)} "
-        f"({closest.name})"
-    )
+    limits = " and ".join(map(str, constraints))
+    return f"no point keeps {limits}{nearest(here, constraints)}"
 
 
 def _compared(point: Measured, recommended: Measured | None, cost: str, compare: Comparison) -> str:

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 
 from beers_deploy.dpu.board import Dpu, dpu_of
@@ -102,7 +102,7 @@ class Point:
 
 
 def network_variants(
-    given: Iterable[NetworkLike],
+    networks: Iterable[NetworkLike],
     sensor: Sensor,
     make_int8: Callable[[Network], Network],
 ) -> list[Variant]:
@@ -110,16 +110,15 @@ def network_variants(
     profile, and INT8 files are used as they are.
 
     Args:
-        given: shipped names, ONNX and safetensors files, or networks in memory.
+        networks: shipped names, ONNX and safetensors files, or networks in memory.
         sensor: the sensor that acquires the images.
         make_int8: quantises a float network.
     """
-    variants: list[Variant] = []
-    for network in given:
-        variants += _variants(network, sensor, make_int8)
-    variant_names = [variant.name for variant in variants]
-    if len(set(variant_names)) < len(variant_names):
-        twice = max(variant_names, key=variant_names.count)
+    each = (_variants(network, sensor, make_int8) for network in networks)
+    variants = list(chain.from_iterable(each))
+    names = [variant.name for variant in variants]
+    if len(set(names)) < len(names):
+        twice = max(names, key=names.count)
         raise OptionError(
             f"The names of the networks in `network` must differ, but two are named {twice!r}. "
             "Rename one file."
@@ -128,28 +127,23 @@ def network_variants(
 
 
 def _variants(
-    given: NetworkLike,
-    sensor: Sensor,
-    make_int8: Callable[[Network], Network],
+    source: NetworkLike, sensor: Sensor, make_int8: Callable[[Network], Network]
 ) -> Iterator[Variant]:
-    is_shipped = given in shipped_names()
-    if (
-        isinstance(given, str)
-        and not is_shipped
-        and Path(given).suffix not in (".onnx", ".safetensors")
-    ):
+    is_shipped = source in shipped_names()
+    is_file = not isinstance(source, str) or Path(source).suffix in (".onnx", ".safetensors")
+    if not is_shipped and not is_file:
         raise OptionError(
             f"`network` must be a shipped network ({', '.join(shipped_names())}), or an ONNX or "
-            f"safetensors file, but it is {printable(repr(given))}."
+            f"safetensors file, but it is {printable(repr(source))}."
         )
-    network = Network.load(given, sensor=sensor)
+    network = Network.load(source, sensor=sensor)
     _require_tiles(network.label, network.tiling)
     if network.precision == "int8":
         yield Variant(network.name, INT8, network)
         return
     yield Variant(network.name, FLOAT, network)
     if is_shipped:
-        yield Variant(network.name, INT8, Network.load(given, sensor=sensor, int8=True))
+        yield Variant(network.name, INT8, Network.load(source, sensor=sensor, int8=True))
         return
     try:
         int8 = make_int8(network)
@@ -184,12 +178,13 @@ def points_of(
         boards: targets with a DPU.
         whole: the swath.
     """
-    chains = [Variant(f"traditional-{quality}") for quality in QUALITIES]
-    points: list[Point] = []
-    for variant in networks:
-        points += network_points(variant, boards, whole)
-    points += [Point(chain, board) for chain, board in product(chains, boards)]
-    return [*points, *(Point(Variant(peer)) for peer in PEERS)]
+    of_networks = (network_points(variant, boards, whole) for variant in networks)
+    traditional = [Variant(f"traditional-{quality}") for quality in QUALITIES]
+    return [
+        *chain.from_iterable(of_networks),
+        *(Point(variant, board) for variant, board in product(traditional, boards)),
+        *(Point(Variant(peer)) for peer in PEERS),
+    ]
 
 
 def network_points(variant: Variant, boards: Sequence[TargetProfile], whole: Swath) -> list[Point]:

@@ -112,14 +112,6 @@ def test_the_four_photographs_are_read_with_their_boxes(shared_data: Path) -> No
     assert labelled.notes == []
 
 
-def test_an_image_without_its_file_is_refused(tmp_path: Path) -> None:
-    image(voc(tmp_path) / "00003.png")
-    refused(
-        tmp_path,
-        r"a file of labels for every image, but 1 of 3 are missing, the first 00003\.xml",
-    )
-
-
 def test_boxes_outside_or_without_area_are_left_out_and_told(tmp_path: Path) -> None:
     image(tmp_path / "a.png")
     text(
@@ -141,23 +133,17 @@ def test_labels_of_an_image_of_another_size_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
-        (
-            lambda folder: image(folder / "a.png"),
-            "no labels for the images in .* VOC .* as `labels`",
-        ),
+        (lambda folder: image(folder / "a.png"), "but it has 0 .json files"),
         (
             lambda folder: text(image(folder / "a.png").with_name("b.xml"), xml([])),
-            "1 of 1 are missing, the first a.xml",
+            "1 of 1 are missing, the first 'a.xml'",
         ),
         (
             lambda folder: text(image(folder / "a.png").with_name("a.xml"), xml([])),
             "none on 1 images",
         ),
         (lambda folder: folder, "there is no image in it"),
-        (
-            lambda folder: text(text(coco(folder) / "b.json", "{}"), "{}"),
-            "has 2 JSON files, .* as `labels`",
-        ),
+        (lambda folder: text(text(coco(folder) / "b.json", "{}"), "{}"), "it has 2 .json files"),
     ],
 )
 def test_a_folder_without_labelled_images_is_refused(
@@ -168,25 +154,12 @@ def test_a_folder_without_labelled_images_is_refused(
         read_labelled(tmp_path)
 
 
-def test_a_missing_folder_or_file_of_labels_is_refused(tmp_path: Path) -> None:
-    folder = voc(tmp_path)
-    for labels, sentence in (
-        (tmp_path / "none", "none does not exist"),
-        (folder / "00001.xml", "00001.xml is another file"),
-    ):
-        with pytest.raises(OptionError, match=sentence):
-            read_labelled(folder, labels)
-
-
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
         ('<!DOCTYPE a [<!ENTITY b "c">]>' + SHIP, "a document type"),
         (SHIP.replace("<xmin>3</xmin>", ""), "xmin, .* of a 'ship', but it has 'none 4 12 9'"),
-        (SHIP.replace("<xmax>12", "<xmax>nan"), "of a 'ship', but it has '3 4 nan 9'"),
         (SHIP.replace("<name>ship</name>", "<name> </name>"), "an object without a name"),
-        (SHIP.replace("<width>60", "<width>six"), "numbers as size"),
-        (SHIP[:-20], "is not plain XML"),
         ("<kml></kml>", "Pascal VOC, an 'annotation', but it is <kml>"),
         ('<?xml version="1.0" encoding="klingon"?>' + SHIP, "is not plain XML: .*klingon"),
     ],
@@ -209,14 +182,9 @@ def test_a_huge_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
     ("damage", "sentence"),
     [
         ({"images": None}, "TypeError: 'NoneType'"),
-        ({"annotations": [5]}, "TypeError: 'int'"),
         (
             {"annotations": [{"image_id": 9, "category_id": 7, "bbox": [0, 0, 1, 1]}]},
             "KeyError: 9",
-        ),
-        (
-            {"annotations": [{"image_id": [], "category_id": 7, "bbox": [0, 0, 1, 1]}]},
-            "TypeError: ",
         ),
         ({"categories": [{"id": 7, "name": 5}]}, "TypeError: "),
         (

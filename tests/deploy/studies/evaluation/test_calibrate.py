@@ -21,7 +21,6 @@ from beers_deploy.studies.evaluation.calibrate import (
 from beers_deploy.studies.evaluation.pairs import NamedPair
 from beers_deploy.verbs.evaluate import evaluate
 from beers_deploy.verbs.restore import restore
-from tests.deploy.command_line import refused
 from tests.deploy.studies.evaluation.small_pairs import DEGRADED, few_targets, write_pairs
 
 SITES = "abcdef"
@@ -107,7 +106,3 @@ def test_weights_keep_every_number(tmp_path: Path) -> None:
 def test_one_file_of_a_network_is_calibrated(methods: list[str], out: str, words: str) -> None:
     with pytest.raises(OptionError, match=words):
         network_to_calibrate(dict(zip(methods, methods, strict=True)), Path(out))
-
-
-def test_the_command_refuses_it_without_a_file() -> None:
-    refused("evaluate --methods convbeers-xs --calibrate out.onnx", "one file of a network")
