@@ -83,9 +83,8 @@ def coco(folder: Path) -> Path:
         images.append({"id": number, "file_name": name, **size})
         for kind, x1, y1, x2, y2 in objects:
             box = {"image_id": number, "bbox": [x1, y1, x2 - x1, y2 - y1], "iscrowd": 0}
-            annotations.append(
-                {**box, "id": len(annotations), "category_id": 7 + names.index(kind)}
-            )
+            category = {"id": len(annotations), "category_id": 7 + names.index(kind)}
+            annotations.append({**box, **category})
     categories = [{"id": 7 + i, "name": name} for i, name in enumerate(names)]
     content = {"images": images, "annotations": annotations, "categories": categories}
     text(folder / "labels.json", json.dumps(content))

@@ -35,15 +35,16 @@ Pairs = list[tuple[Boxes, Boxes]]
 """What is labelled on each image, and what was found."""
 
 
-def drawn(rng: np.random.Generator, count: int, ties: bool = False) -> Pairs:
+def drawn(rng: np.random.Generator, images: int, ties: bool = False) -> Pairs:
     """Objects of all sizes: some found well, some badly or as another class, and false ones beside.
 
     With `ties` scores are of ten values; else no two are alike.
     """
     pairs = []
-    for _ in range(count):
+    for _ in range(images):
         truth = boxes(rng, int(rng.integers(0, 7)))
-        repeats = rng.integers(0, len(truth), int(rng.integers(0, 12))) if len(truth) else []
+        count = int(rng.integers(0, 12)) if len(truth) else 0
+        repeats = rng.integers(0, max(len(truth), 1), count)
         near = truth.corners[repeats] + rng.normal(0, 1.5, (len(repeats), 4))
         near[:, 2:] = np.maximum(near[:, 2:], near[:, :2] + 1)
         # A fifth of the labels are drawn again.

@@ -16,7 +16,6 @@ from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.method import Restore
 from beers_deploy.studies.evaluation import sweep as module
-from beers_deploy.studies.evaluation import target_scenes
 from beers_deploy.studies.evaluation.methods import BLIND, Method
 from beers_deploy.studies.evaluation.sweep import (
     NOMINAL_KNOWN,
@@ -29,10 +28,9 @@ from beers_deploy.studies.evaluation.sweep import (
 )
 from tests.deploy.command_line import done
 from tests.deploy.documents import valid
+from tests.deploy.studies.evaluation.small_pairs import DEGRADED, REFERENCE, few_targets
 
-PROFILE = Sensor.load("pleiades-degraded")
-REFERENCE = Sensor.load("pleiades-reference")
-NOMINAL = PROFILE.nominal()
+NOMINAL = DEGRADED.nominal()
 DRIFTED = replace(NOMINAL, mtf_nyquist=0.03)
 DIM = replace(NOMINAL, gain_dn_per_radiance=0.7 * NOMINAL.gain_dn_per_radiance)
 
@@ -41,11 +39,11 @@ WRONGLY = "sweep, sensor known wrongly", "sweep, lost by a sensor known wrongly"
 
 
 def test_what_is_supposed_wrongly_is_another_sensor_than_the_one_of_a_condition() -> None:
-    sensors = conditions(NOMINAL, PROFILE)
+    sensors = conditions(NOMINAL, DEGRADED)
     assert len(sensors) == 16
-    for truth, supposed in suppositions(NOMINAL, PROFILE).items():
+    for truth, supposed in suppositions(NOMINAL, DEGRADED).items():
         assert sensors[truth] not in supposed.values()
-    more, less = suppositions(NOMINAL, PROFILE)["nominal"].values()
+    more, less = suppositions(NOMINAL, DEGRADED)["nominal"].values()
     for radiance in (25, 100):
         sigma = NOMINAL.noise_sigma(radiance)
         assert (
@@ -65,11 +63,7 @@ def half(dn: np.ndarray) -> np.ndarray:
 def quick() -> Iterator[None]:
     """Three conditions, on targets that are small and seen once."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(target_scenes, "REPEATS", 1)
-        patch.setattr(target_scenes, "ANGLES_DEG", (5.0, 8.0))
-        patch.setattr(target_scenes, "SIDE_PX", 100)
-        patch.setattr(target_scenes, "POINTS_A_SIDE", 3)
-        patch.setattr(target_scenes, "BAR_CONTRASTS", (0.1,))
+        few_targets(patch)
         patch.setattr(module, "conditions", few)
         yield
 
@@ -89,7 +83,7 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Swept:
     folder = tmp_path_factory.mktemp("scenes")
     scene = procedural_scene(500, 560, np.random.default_rng(5))
     tifffile.imwrite(folder / "scene.tif", scene.radiance)
-    rows = run_sweep([Method("half", half, BLIND), able], folder, PROFILE, REFERENCE, 0).rows
+    rows = run_sweep([Method("half", half, BLIND), able], folder, DEGRADED, REFERENCE, 0).rows
     return {
         table: {row.name: row for row in rows} for table, rows in by_table(rows).items()
     }, specialised
@@ -105,7 +99,7 @@ def psnr(swept: Swept, condition: str) -> Callable[[str], float]:
 
 def test_a_network_that_can_know_the_sensor_knows_that_of_each_condition(swept: Swept) -> None:
     """Then those that are supposed in its place; it never restores as it does by itself."""
-    supposed_for = suppositions(NOMINAL, PROFILE)
+    supposed_for = suppositions(NOMINAL, DEGRADED)
     supposed = [list(supposed_for[name].values()) for name in ("nominal", "MTF 3%")]
     assert swept[1] == [NOMINAL, *supposed[0], DRIFTED, *supposed[1], DIM]
     at = psnr(swept, "nominal")
@@ -113,19 +107,15 @@ def test_a_network_that_can_know_the_sensor_knows_that_of_each_condition(swept: 
 
 
 def test_the_truth_pays_where_the_sensor_has_drifted(swept: Swept) -> None:
-    nominal = psnr(swept, "nominal")
-    drifted = psnr(swept, "MTF 3%")
-    assert nominal(TRUTH_KNOWN) == nominal(NOMINAL_KNOWN)
-    assert drifted(TRUTH_KNOWN) > drifted(NOMINAL_KNOWN) + 1
-    assert nominal("half") < nominal("degraded") - 5
-
-
-def test_another_gain_is_told_to_the_chains_and_kept(swept: Swept) -> None:
     """The reference has the gain of the input, so brightness is no error of a method that knows no
     gains.
     """
     nominal = psnr(swept, "nominal")
+    drifted = psnr(swept, "MTF 3%")
     dim = psnr(swept, "dim")
+    assert nominal(TRUTH_KNOWN) == nominal(NOMINAL_KNOWN)
+    assert drifted(TRUTH_KNOWN) > drifted(NOMINAL_KNOWN) + 1
+    assert nominal("half") < nominal("degraded") - 5
     assert dim(NOMINAL_KNOWN) == dim(TRUTH_KNOWN)
     assert dim("degraded") == pytest.approx(nominal("degraded") + 3.1, abs=0.5)
 
@@ -161,7 +151,7 @@ def synthetic_sweep() -> SweepResult:
     return SweepResult(psnr, dict.fromkeys(psnr, unavailable("%", "no edges here")), SITES, 0)
 
 
-def test_the_interval_of_a_gain_is_that_of_differences_on_the_same_images() -> None:
+def test_gains_and_losses_are_those_of_differences_on_the_same_images() -> None:
     tables = by_table(synthetic_sweep().rows)
     noisy, clean = (
         tables[f"sweep, PSNR{end}"][0].figures["net"].value or 0
@@ -173,24 +163,12 @@ def test_the_interval_of_a_gain_is_that_of_differences_on_the_same_images() -> N
     assert nominal.interval == pytest.approx((0.75, 0.75))
     assert blurred.interval is not None
     assert 0.1 <= blurred.interval[0] < (blurred.value or 0) < blurred.interval[1] <= 0.5
-
-
-def test_over_all_conditions_mean_and_least_gain_are_named() -> None:
-    (row,) = by_table(synthetic_sweep().rows)["sweep, gain over the pipeline, all conditions"]
+    (row,) = tables["sweep, gain over the pipeline, all conditions"]
     assert row.name == "net"
     assert row.figures["mean of 2 conditions"].value == pytest.approx((0.75 + 0.3) / 2)
     assert row.figures["least"].value == pytest.approx(0.3)
     assert row.text == {"least at": "MTF 3%"}
-
-
-def test_tables_of_another_brightness_have_it_in_their_names_and_no_mtf() -> None:
-    tables = list(by_table(replace(synthetic_sweep(), brightness=0.25).rows))
-    bright = [name for name in by_table(synthetic_sweep().rows) if "MTF" not in name]
-    assert tables == [f"{name}, radiance x 0.25" for name in bright]
-
-
-def test_what_a_wrongly_known_sensor_costs_is_on_the_same_images() -> None:
-    (row,) = by_table(synthetic_sweep().rows)["sweep, lost by a sensor known wrongly"]
+    (row,) = tables["sweep, lost by a sensor known wrongly"]
     assert row.name == "MTF 3%, supposed MTF 7%"
     assert row.figures["net"].value == pytest.approx(1.3)
     assert row.figures["net"].interval is not None
@@ -214,4 +192,7 @@ def test_the_command_sweeps_the_networks_alone_at_each_brightness(tmp_path: Path
     )
     assert list(bright) == list(dim) == ["nominal", "MTF 3%", "dim"]
     assert set(bright["nominal"]) >= {NOMINAL_KNOWN, TRUTH_KNOWN, "convbeers-xs"}
+    swept = {row["table"] for row in valid(document)["rows"] if row["table"].startswith("sweep")}
+    assert "sweep, MTF at Nyquist" in swept
+    assert "sweep, MTF at Nyquist, radiance x 0.1" not in swept
     assert dim["nominal"]["degraded"]["value"] > bright["nominal"]["degraded"]["value"] + 5
