@@ -203,10 +203,10 @@ def judgement(name: str, image: Acquired, interval: PixelInterval) -> Judgement:
     result = restored(name, image)
     inner = (slice(BORDER_PX, -BORDER_PX),) * 2
     error = np.abs(result.astype(np.float64) - image.truth)[inner]
-    known = np.ones(result.shape, bool)
+    mask = np.ones(result.shape, bool)
     scale = image.sensor.max_dn
     widths = [
-        interval.for_sensor(image.sensor, scale, level).of(result, known)[inner] for level in LEVELS
+        interval.for_sensor(image.sensor, scale, level).of(result, mask)[inner] for level in LEVELS
     ]
     counts = (image.raw < scale)[inner]
     scores = np.stack([error[counts] / width[counts] for width in widths])

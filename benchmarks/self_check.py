@@ -69,8 +69,8 @@ def flat(parts: list[Judged]) -> Judged:
         np.concatenate([getattr(part, name).ravel() for part in parts])
         for name in ("chi2", "sharpening")
     )
-    known = np.isfinite(chi2)
-    return Judged(chi2[known], sharpening[known])
+    finite = np.isfinite(chi2)
+    return Judged(chi2[finite], sharpening[finite])
 
 
 def by_class(blocks: Judged) -> str:

@@ -30,7 +30,7 @@ START = Constants(0.8, 40, 0.55, 6e-6, 5e-5, 0.4e9, 0.8e9, 0.3e9, 30e6, 60e6, 1.
 """Where the fit begins: the right orders of magnitude; a pixel of an image takes the host a clock
 cycle.
 """
-SPREAD = np.array([0.3, 1, 0.2, 1, 1, 0.7, 0.7, 0.7, 1, 1, 0.5])
+DEVIATION = np.array([0.3, 1, 0.2, 1, 1, 0.7, 0.7, 0.7, 1, 1, 0.5])
 """How far each logarithm may lie from its start, a standard deviation: shares less than times and
 rates. Few networks tell what the VCK190's memory reaches, and they differ by 1.7: the other boards'
 0.5 to 0.65 count too.
@@ -234,7 +234,7 @@ def _descend(cases: Cases, logs: Array) -> tuple[Array, float]:
 def _cost(cases: Cases, logs: Array) -> float:
     # With the soft L1 loss a rate far off counts linearly.
     soft = 2 * (np.sqrt(1 + (cases.residuals(from_logs(logs)) / SOFT) ** 2) - 1)
-    return float(cases.weights @ soft + np.sum(((logs - logs_of(START)) / SPREAD) ** 2))
+    return float(cases.weights @ soft + np.sum(((logs - logs_of(START)) / DEVIATION) ** 2))
 
 
 def _slope(cases: Cases, logs: Array) -> tuple[Array, Array]:
@@ -243,5 +243,5 @@ def _slope(cases: Cases, logs: Array) -> tuple[Array, Array]:
     stepped = [cases.residuals(from_logs(logs + STEP * unit)) for unit in np.eye(len(logs))]
     slopes = (np.stack(stepped, axis=1) - residuals[:, None]) / STEP
     weights = cases.weights / np.sqrt(1 + (residuals / SOFT) ** 2) / SOFT**2
-    normal = slopes.T @ (weights[:, None] * slopes) + np.diag(1 / SPREAD**2)
-    return normal, -(slopes.T @ (weights * residuals) + (logs - logs_of(START)) / SPREAD**2)
+    normal = slopes.T @ (weights[:, None] * slopes) + np.diag(1 / DEVIATION**2)
+    return normal, -(slopes.T @ (weights * residuals) + (logs - logs_of(START)) / DEVIATION**2)

@@ -132,11 +132,8 @@ def network_case(
     input_size = sum(math.prod(shape) for shape in net.inputs.values())
     weight_bytes = sum(written(name).read_bytes.values())
     output_size = sum(sizes[result] for result in net.outputs)
-    host = (
-        host_work(input_size, output_size, weight_bytes, entry.host)
-        if entry.host
-        else host_work(0, 0, 0, "copy")
-    )
+    sizes_read = (input_size, output_size, weight_bytes) if entry.host else (0, 0, 0)
+    host = host_work(*sizes_read, entry.host or "copy")
     layers = Layers.of(count_work(net.operations, dpu), dpu)
     cores = dpu.whole("cpu", "cores")
     largest = largest_map_bytes(net.operations)

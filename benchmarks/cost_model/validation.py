@@ -2,7 +2,7 @@
 follow.
 
 Networks of one family resemble one another, so a family is left out as a whole. What is chosen and
-what is judged are kept apart by two rounds (nested cross-validation): for each family left out,
+what is judged are selected apart by two rounds (nested cross-validation): for each family left out,
 `crowding` is chosen, and the width of the interval made, from errors on others of the families that
 remain. Boards of one processor share `crowding`. `nested` is what the errors of the documents and
 the widths of [cost] come from.
@@ -50,7 +50,7 @@ that part alone.
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What was found of a network on a configuration, its family left out.
+    """The errors of a network on a configuration, its family left out.
 
     Attributes:
         network: its name.
@@ -245,7 +245,9 @@ def pair_width(board: str) -> float:
             fit(cases.only(names != name), near=trial.near)
         )
     on_dpu = ~hosts_of(cases.shares(trial.near))
-    outcomes = [(row, e) for row, e, kept in zip(cases.rows, errors, on_dpu, strict=True) if kept]
+    outcomes = [
+        (row, e) for row, e, selected in zip(cases.rows, errors, on_dpu, strict=True) if selected
+    ]
     distances = [
         abs(x - y)
         for (a, x), (b, y) in combinations(outcomes, 2)
@@ -330,7 +332,7 @@ def corrected(owner: str, board: str) -> dict[str, Corrected]:
 
     All of them are predicted without their families.
     """
-    found = defaultdict(list)
+    by_kin = defaultdict(list)
     theirs, ours = (
         [(row, _levels(row, name)) for row in nested(name).rows] for name in (owner, board)
     )
@@ -339,9 +341,9 @@ def corrected(owner: str, board: str) -> dict[str, Corrected]:
             factor, left = correction(of, [(levels, -run.error)])
             shift = np.log(factor)
             held = np.all(np.abs(row.rates + shift) <= left * row.width)
-            found[_kin(run, row, levels, of)].append((row.error, row.error + shift, held))
+            by_kin[_kin(run, row, levels, of)].append((row.error, row.error + shift, held))
     kinds = {}
-    for kin, outcomes in sorted(found.items()):
+    for kin, outcomes in sorted(by_kin.items()):
         before, after, held = np.array(outcomes, float).T
         off_before, off_after = (float(np.abs(np.expm1(e)).mean()) for e in (before, after))
         kinds[kin] = Corrected(len(outcomes), off_before, off_after, float(held.mean()))

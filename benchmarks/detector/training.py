@@ -52,7 +52,7 @@ OVERSAMPLING = 3
 """Scene pixels per pixel of a drawn picture along each axis."""
 STREAM = 0x64726177
 """Seed word that separates the training scenes from those that a study draws, for any seed."""
-SPREAD = 0.54
+ALPHA = 0.54
 """TTFNet's alpha: half the width of a bump divided by half the width of the object."""
 MIN_SIGMA = 0.35
 """The smallest sigma in cells. An object smaller than a cell is trained in one cell."""
@@ -116,7 +116,7 @@ def _bump(corners: np.ndarray, height: int, width: int) -> tuple[tuple[slice, sl
     cells. The Gaussian is 1 in the cell that holds the centre.
     """
     middle = (corners[:2] + corners[2:]) / 2
-    half = SPREAD * (corners[2:] - corners[:2]) / 2
+    half = ALPHA * (corners[2:] - corners[:2]) / 2
     column, row = (int(v) for v in np.clip(np.floor(middle), 0, (width - 1, height - 1)))
     reach_x, reach_y = (int(v) for v in np.floor(half))
     rows = slice(max(row - reach_y, 0), row + reach_y + 1)

@@ -19,7 +19,7 @@ from beers_deploy.studies.evaluation.methods import DEGRADED
 CROP_PX = 88
 ZOOM = 3
 PICTURES = 4
-FOUND = "#2fd39b"
+HIT = "#2fd39b"
 MISSED = "#ff5a36"
 FALSE = "#ffd21f"
 """The colours of boxes: found, missed and false."""
@@ -156,7 +156,7 @@ def _cell(comparison: Comparison, row: str, number: int, middle: np.ndarray) -> 
     layers = (
         (truth.corners[~matched & ~truth.ignored], MISSED),
         (boxes.corners[~hits & ~ignored], FALSE),
-        (boxes.corners[hits], FOUND),
+        (boxes.corners[hits], HIT),
     )
     for corners, colour in layers:
         for x1, y1, x2, y2 in (corners / ratio - np.tile(corner, 2)) * ZOOM:

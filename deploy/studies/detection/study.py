@@ -214,7 +214,7 @@ def acquired(
 
 def labelled_scenes(
     names: Sequence[str],
-    given: Mapping[str, str],
+    mapping: Mapping[str, str],
     images: Path,
     labels: Path | None = None,
     split: str | None = None,
@@ -224,13 +224,13 @@ def labelled_scenes(
 
     Args:
         names: of the classes that the detector knows.
-        given: the detector's names by labelled ones, where letters do not match.
+        mapping: the detector's names by labelled ones, where letters do not match.
         images: as `read_labelled` accepts it.
         labels: their path, if not next to the pictures.
         split: the part of a tree.
     """
     labelled = read_labelled(images, labels, split)
-    numbers = class_numbers(labelled.names, names, given)
+    numbers = class_numbers(labelled.names, names, mapping)
     scenes = [_of_file(path, truth.renamed(numbers)) for path, truth in labelled.images]
     return scenes, [*labelled.notes, *left_out(labelled.names, numbers)]
 

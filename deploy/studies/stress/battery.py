@@ -127,13 +127,13 @@ def _excess(measure: Measure) -> float:
     return math.inf if math.isnan(measure.value) else measure.value - measure.allowed
 
 
-def chosen(names: str | Sequence[str] | None, known: Iterable[str], option: str) -> list[str]:
-    """Return names from a list, or from text with commas; all if None.
+def chosen(names: str | Sequence[str] | None, available: Iterable[str], option: str) -> list[str]:
+    """Return the names of a list, or of text with commas; all that are available if None.
 
     Raises:
-        OptionError: a name is unknown.
+        OptionError: a name is not available.
     """
-    every = list(known)
+    every = list(available)
     if names is None:
         return every
     parts = names.split(",") if isinstance(names, str) else names
@@ -141,8 +141,8 @@ def chosen(names: str | Sequence[str] | None, known: Iterable[str], option: str)
     for name in selection:
         if name not in every:
             raise OptionError(
-                f"`{option}` must be some of {', '.join(every)}, separated by commas, but it has "
-                f"{printable(repr(name))}."
+                f"`{option}` has no {printable(repr(name))}. Give some of {', '.join(every)}, "
+                "separated by commas."
             )
     return selection
 

@@ -67,7 +67,7 @@ NEAR_PX = 16
 """Marks at most this far apart share a label."""
 PALE = 0.45
 MARKERS = ("o", "s", "D", "^", "v", "P", "X")
-CHAINS = "traditional pipelines"
+PIPELINES = "traditional pipelines"
 LIBRARIES = "other libraries"
 HOST = "this machine"
 LEGEND_COLUMNS = 2
@@ -245,7 +245,7 @@ def series(study: Tradeoff) -> Iterator[Series]:
 def _kind(point: Measured) -> str:
     if point.point is not None and point.point.variant.network is not None:
         return point.text["method"]
-    return LIBRARIES if point.text["method"] in PEERS else CHAINS
+    return LIBRARIES if point.text["method"] in PEERS else PIPELINES
 
 
 def _scatter(axes: "Axes", group: Series, study: Tradeoff) -> None:

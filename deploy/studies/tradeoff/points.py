@@ -273,7 +273,7 @@ UNITS: dict[str, str] = {
     "board efficiency": "px/s/W",
 }
 """The figures of a point on its board, with their units."""
-CHAIN = "traditional-standard"
+STANDARD = "traditional-standard"
 """The pipeline whose time on a board's processor a target states."""
 
 
@@ -285,7 +285,7 @@ def board_figures(
     Args:
         point: a network on a DPU, or a traditional pipeline on the board's processor.
         whole: the swath.
-        slower: the time of a pipeline relative to CHAIN, measured on this machine.
+        slower: the time of a pipeline relative to STANDARD, measured on this machine.
         runs: the mean number of runs of the network on a tile of the measured images.
     """
     if point.dpu is not None:
@@ -300,7 +300,7 @@ def board_figures(
         if latency.value is not None and latency.interval is not None:
             # A board's file states the standard chain alone: others are scaled by their times here.
             low_s, high_s = (end * slower for end in latency.interval)
-            source = f"{latency.source}; times of the chains here: {slower:.2f} of {CHAIN}"
+            source = f"{latency.source}; times of the chains here: {slower:.2f} of {STANDARD}"
             latency = predicted(latency.value * slower, "s", (low_s, high_s), source)
     else:
         latency = unavailable(

@@ -41,7 +41,7 @@ from beers_deploy.studies.tradeoff.measure import (
 )
 from beers_deploy.studies.tradeoff.page import Tradeoff
 from beers_deploy.studies.tradeoff.points import (
-    CHAIN,
+    STANDARD,
     Point,
     Variant,
     board_figures,
@@ -283,7 +283,7 @@ def _measured(
     for point, result in zip(points, results, strict=True):
         here_s = medians_s[point.variant]
         # If the chain itself was not timed, the board's stated time is used as it is.
-        slower = here_s / medians_s.get(Variant(CHAIN), here_s)
+        slower = here_s / medians_s.get(Variant(STANDARD), here_s)
         runs = benchmark.runs(point) if point.dpu is not None else 1.0
         figures = host[point.variant] | board_figures(point, swath, slower, runs)
         if point.dpu is not None:

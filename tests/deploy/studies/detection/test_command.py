@@ -94,13 +94,21 @@ def test_what_cannot_be_is_one_sentence(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     voc(tmp_path / "ships")
-    given = ["evaluate", "--detector", str(DETECTOR), "--images", "ships", "--out", "detection"]
+    command = [
+        "evaluate",
+        "--detector",
+        str(DETECTOR),
+        "--images",
+        "ships",
+        "--out",
+        "detection",
+    ]
     for name, value in zip(arguments[::2], [*arguments[1::2], None], strict=False):
-        if name in given:
-            given[given.index(name) + 1] = str(value)
+        if name in command:
+            command[command.index(name) + 1] = str(value)
         else:
-            given += [name] if value is None else [name, value]
-    message = refused(*given)
+            command += [name] if value is None else [name, value]
+    message = refused(*command)
     assert message.count("beers-deploy: ") == 1
     assert words in message.split("beers-deploy: ")[1]
     assert not (tmp_path / "detection" / "report.html").exists()

@@ -40,7 +40,7 @@ def scene(seed: int = 0, height: int = 128, width: int = 101, top: int = 4095) -
     return np.asarray(np.rint(top * np.clip(noisy, 0, 1)), np.float32)
 
 
-def seen(name: str, seed: int) -> NamedPair:
+def pair_of(name: str, seed: int) -> NamedPair:
     """Return a pair whose reference without noise is the degraded image less 10 DN."""
     dn = scene(seed)
     return NamedPair(name, dn, dn, noise_free=np.maximum(dn - 10, 0))
@@ -93,7 +93,7 @@ def trial_of(method: Method, pairs: list[NamedPair]) -> Trial:
 
 
 def test_on_board_is_compressed_after_and_on_the_ground_before_restoration() -> None:
-    one = seen("a", 0)
+    one = pair_of("a", 0)
     trial = trial_of(Method("half", half, "blind"), [one])
 
     def inner_db(dn: np.ndarray) -> float:
@@ -108,27 +108,27 @@ def test_on_board_is_compressed_after_and_on_the_ground_before_restoration() -> 
     assert trial.board_db[0] != trial.ground_db[0, 0]
 
 
-def telling(given: list[Instrument]) -> Method:
-    """Return a method that records the sensors it is given, and restores as well with each."""
+def telling(sensors: list[Instrument]) -> Method:
+    """Return a method that records the sensors it is sensors, and restores as well with each."""
 
     def specialise(sensor: Instrument) -> Restore:
-        given.append(sensor)
+        sensors.append(sensor)
         return lambda dn: dn
 
     return Method("telling", lambda dn: dn, "known", specialise)
 
 
 def test_the_noise_of_the_profile_grows_by_shares_of_the_measured_error() -> None:
-    given: list[Instrument] = []
-    pairs = [seen("a", 0), seen("b", 1)]
-    trial = trial_of(telling(given), pairs)
+    sensors: list[Instrument] = []
+    pairs = [pair_of("a", 0), pair_of("b", 1)]
+    trial = trial_of(telling(sensors), pairs)
     expected = []
     for item in pairs:
         error = rms_dn(decompressed(item.degraded, RATE, 12).dn, item.degraded) ** 2
         expected += [share * error for share in SHARES[1:]]
     gain = SENSOR.gain_dn_per_radiance
-    assert [gain**2 * (sensor.beta - SENSOR.beta) for sensor in given] == pytest.approx(expected)
-    assert {(sensor.alpha, sensor.mtf_axes) for sensor in given} == {
+    assert [gain**2 * (sensor.beta - SENSOR.beta) for sensor in sensors] == pytest.approx(expected)
+    assert {(sensor.alpha, sensor.mtf_axes) for sensor in sensors} == {
         (SENSOR.alpha, SENSOR.mtf_axes)
     }
     assert trial.error_dn2 * SHARES[-1] == pytest.approx(expected[2::3])
@@ -170,7 +170,7 @@ def test_the_interval_of_the_gain_is_that_of_differences_on_the_same_images() ->
 
 def test_there_is_a_row_for_each_method_and_rate_but_the_input() -> None:
     methods = [IDENTITY, Method("half", half, "blind")]
-    rows = run_compression(methods, [seen("a", 0)], SENSOR, [1.0, 2.5], 0)
+    rows = run_compression(methods, [pair_of("a", 0)], SENSOR, [1.0, 2.5], 0)
     assert [(row.table, row.name) for row in rows] == [
         (GAIN, "half, 1 bit/px"),
         (GAIN, "half, 2.5 bit/px"),
@@ -178,7 +178,7 @@ def test_there_is_a_row_for_each_method_and_rate_but_the_input() -> None:
     ]
     rates = [rows[2].figures[key].value or 0 for key in ("restored", "raw")]
     assert 0 < rates[0] < rates[1] < 12
-    assert run_compression(methods, [seen("a", 0)], SENSOR, [], 0) == []
+    assert run_compression(methods, [pair_of("a", 0)], SENSOR, [], 0) == []
 
 
 @pytest.mark.parametrize("rate", [0.0, 12.5, float("nan")])

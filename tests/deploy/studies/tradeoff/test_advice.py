@@ -30,7 +30,7 @@ from beers_deploy.studies.tradeoff.front import (
     significant,
     verdict,
 )
-from tests.deploy.studies.tradeoff.made import COMPARE, DPU, family, made
+from tests.deploy.studies.tradeoff.synthetic import COMPARE, DPU, family, synthetic
 
 COST = "board latency"
 PLACES = st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9)), min_size=1, max_size=12)
@@ -66,8 +66,8 @@ def test_what_lacks_a_figure_or_was_published_is_not_on_the_front() -> None:
 
 
 def test_differences_are_paired_and_reach_less_far_than_the_sites_differ() -> None:
-    small = made("small", 45.0, 2.0)
-    medium = made("medium", 45.5, 4.0)
+    small = synthetic("small", 45.0, 2.0)
+    medium = synthetic("medium", 45.5, 4.0)
     difference = COMPARE.difference(medium, small)
     assert difference.interval is not None
     assert difference.value == pytest.approx(0.5)
@@ -78,17 +78,17 @@ def test_differences_are_paired_and_reach_less_far_than_the_sites_differ() -> No
 
 
 def test_the_same_pictures_do_not_differ_on_however_few_sites() -> None:
-    one = made("one", 45.0, 2.0)
-    other = replace(made("one", 45.0, 2.0), name="other")
+    one = synthetic("one", 45.0, 2.0)
+    other = replace(synthetic("one", 45.0, 2.0), name="other")
     difference = Comparison(("a",) * 6, 0).difference(one, other)
     assert (difference.value, difference.interval) == (0.0, (0.0, 0.0))
 
 
 def test_below_five_sites_values_decide_beyond_a_margin() -> None:
     few = Comparison(("a", "a", "b", "b", "c", "c"), 0)
-    base = made("one", 45.0, 2.0)
-    better = made("better", 45.2, 3.0)
-    alike = made("alike", 45.02, 3.0)
+    base = synthetic("one", 45.0, 2.0)
+    better = synthetic("better", 45.2, 3.0)
+    alike = synthetic("alike", 45.02, 3.0)
     difference = few.difference(better, base)
     assert difference.interval is None
     assert verdict(difference) == TOO_FEW
@@ -100,7 +100,7 @@ def test_a_ratio_of_latencies_on_a_board_has_the_width_of_pairs() -> None:
     cost = {**DPU.target.tables["cost"], "pair_width": Constant(0.2, "inferred", "a test")}
     target = replace(DPU.target, tables={**DPU.target.tables, "cost": cost})
     dpu = replace(DPU, target=target)
-    points = [made("small", 45.0, 2.0), made("large", 45.5, 6.0)]
+    points = [synthetic("small", 45.0, 2.0), synthetic("large", 45.5, 6.0)]
     cheap, costly = (
         replace(item, point=replace(item.point, board=target, dpu=dpu) if item.point else None)
         for item in points
@@ -109,7 +109,7 @@ def test_a_ratio_of_latencies_on_a_board_has_the_width_of_pairs() -> None:
     assert ratio.value == pytest.approx(3)
     assert ratio.interval == pytest.approx((3 / math.exp(0.2), 3 * math.exp(0.2)))
     # Points that differ in the halo alone differ by their number of tiles, which is exact.
-    one, other = (made(name, 45.0, 2.0, method="net") for name in ("one", "other"))
+    one, other = (synthetic(name, 45.0, 2.0, method="net") for name in ("one", "other"))
     assert cost_ratio(other, one, COST).interval == (1, 1)
     assert cost_ratio(other, one, "host p50").mode == "measured"
 

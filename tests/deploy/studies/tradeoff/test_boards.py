@@ -13,7 +13,7 @@ from beers_deploy.studies.tradeoff.advice import Question, parse_constraints
 from beers_deploy.studies.tradeoff.front import Measured
 from beers_deploy.studies.tradeoff.page import Tradeoff
 from beers_deploy.studies.tradeoff.run import weigh
-from tests.deploy.studies.tradeoff.made import COMPARE, made
+from tests.deploy.studies.tradeoff.synthetic import COMPARE, synthetic
 
 BOARDS = ("fast", "frugal", "slow")
 POWER_W = {"fast": 30.0, "frugal": 12.0, "slow": 20.0}
@@ -38,7 +38,7 @@ def on_boards(costs: dict[str, float], psnr_db: dict[str, float]) -> list[Measur
     points = []
     for board, factor in costs.items():
         for name, quality_db in psnr_db.items():
-            point = made(
+            point = synthetic(
                 name,
                 quality_db,
                 factor * (1 + quality_db - 44),
@@ -80,7 +80,7 @@ def test_the_order_of_the_boards_changes_nothing(
     """
     candidates = [
         replace(
-            made("net", psnr_db, cost_s, board=board, power_w=POWER_W[board]),
+            synthetic("net", psnr_db, cost_s, board=board, power_w=POWER_W[board]),
             name=f"{board} {psnr_db} {cost_s}",
         )
         for board, psnr_db, cost_s in points
@@ -156,7 +156,7 @@ def test_what_a_board_lacks_or_refuses_is_said_with_its_reason() -> None:
     assert (
         "no point has every figure asked for, such as board power" in rows["slow"].text["verdict"]
     )
-    odd = made("odd", 45.0, 1.0)
+    odd = synthetic("odd", 45.0, 1.0)
     assert odd.point is not None
     misfit = replace(
         odd,

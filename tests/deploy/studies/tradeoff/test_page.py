@@ -23,7 +23,7 @@ from beers_deploy.studies.tradeoff.page import (
 )
 from beers_deploy.studies.tradeoff.run import weigh
 from tests.deploy.browser import seen
-from tests.deploy.studies.tradeoff.made import COMPARE, family, made
+from tests.deploy.studies.tradeoff.synthetic import COMPARE, family, synthetic
 
 SVG = "{http://www.w3.org/2000/svg}"
 BOARDS = ("vck190",)
@@ -52,7 +52,7 @@ def page() -> str:
 
 def test_of_several_boards_a_network_keeps_its_colour_and_a_board_its_marker() -> None:
     points = [
-        replace(made(name, 45.0, cost, board=board), name=f"{name} {board}")
+        replace(synthetic(name, 45.0, cost, board=board), name=f"{name} {board}")
         for cost, (name, board) in enumerate(product(("one", "other"), ("vck190", "zcu104")), 1)
     ]
     lines = list(series(study(points, boards=("vck190", "zcu104"))))
@@ -65,7 +65,7 @@ def test_of_several_boards_a_network_keeps_its_colour_and_a_board_its_marker() -
 
 @pytest.mark.parametrize("most_s", [9.9, 2_813.0, 4_200_000.0])
 def test_every_label_lies_within_the_picture(most_s: float) -> None:
-    points = [*family(), made("a network with a rather long name", 44.0, most_s)]
+    points = [*family(), synthetic("a network with a rather long name", 44.0, most_s)]
     with look():
         figure = figure_of(study(points, "latency<=9s"))
         # Both extents are in inches.

@@ -44,7 +44,7 @@ from beers_deploy.studies.tradeoff.points import (
 )
 from beers_deploy.studies.tradeoff.run import require_quantizable
 from tests.deploy.dpu.graphs import integer_convbeers
-from tests.deploy.studies.tradeoff.made import DPU
+from tests.deploy.studies.tradeoff.synthetic import DPU
 from tests.model.networks import plain
 
 WHOLE = Swath(13600, 9016)
