@@ -201,8 +201,6 @@ def main() -> None:
     if arguments.aidge_python is not None:
         columns["Aidge, board's file"] = partial(Vectors.by_aidge, python=arguments.aidge_python)
     columns["onnxruntime, board's file"] = Vectors.by_onnxruntime_board
-    columns["onnxruntime, host's file"] = Vectors.by_onnxruntime_host
-    columns["integer core, ties to even"] = Vectors.half_even
     print(f"| network | integers | {' | '.join(columns)} |")
     print("|---" * (2 + len(columns)) + "|")
     for name in arguments.files or [f"{name}{INT8}" for name in shipped_names()]:

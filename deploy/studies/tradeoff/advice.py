@@ -1,4 +1,6 @@
-"""Choose a point by limits such as `latency<=20s`, and recommend it in one line."""
+"""Choose a point by limits such as `latency<=20s`, recommend it in one line, and compare the best
+point of each board with it.
+"""
 
 import math
 import re
@@ -6,14 +8,16 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from beers_deploy.profiles.errors import OptionError, printable
-from beers_deploy.profiles.figures import Figure
+from beers_deploy.profiles.figures import Figure, Row
 from beers_deploy.studies.tradeoff.front import (
+    BOARDS,
     COSTS,
     LATENCY,
     PSNR,
     Comparison,
     Measured,
     ends,
+    figures_to_compare,
     placed,
     significant,
     verdict,
@@ -211,7 +215,9 @@ def nearest(points: Sequence[Measured], constraints: Sequence[Constraint]) -> st
     """Return the point with the smallest violation and its figures, as the end of a sentence."""
     comparable = [point for point in points if math.isfinite(_violation(point, constraints))]
     if not comparable:
-        absent = [each.key for each in constraints if points and each.violation(points[0])]
+        absent = [
+            each.key for each in constraints if points and math.isinf(each.violation(points[0]))
+        ]
         return f": no point has every figure asked for{f', such as {absent[0]}' if absent else ''}"
     least = min(comparable, key=lambda point: _violation(point, constraints))
     return f"; nearest is {_words(least, [constraint.key for constraint in constraints])}"
@@ -224,3 +230,56 @@ def _words(point: Measured, keys: Sequence[str]) -> str:
         figure = point.figures[key]
         parts.append(f"{key} {with_unit(str(figure), figure.unit)} ({figure.mode})")
     return f"{point.name}: {', '.join(parts)}"
+
+
+def board_rows(
+    points: Sequence[Measured], boards: Sequence[str], recommended: Measured | None, asked: Question
+) -> list[Row]:
+    """Return a row for each board: the figures of its best point, and how it compares with the
+    recommended one; or the reason why it has none.
+
+    Args:
+        points: of all boards.
+        boards: names, in the order of the rows.
+        recommended: None if there is none.
+        asked: budget and need.
+    """
+    cost = asked.cost(points)
+    limits = f" keeps {' and '.join(map(str, asked.constraints))}" if asked.constraints else ""
+    rows: list[Row] = []
+    for board in boards:
+        here = [point for point in points if point.text.get("board") == board]
+        candidates = within(here, asked.constraints, cost)
+        if not candidates:
+            reasons = [f"no point{limits}{nearest(placed(here, cost), asked.constraints)}"]
+            reasons += [
+                f"{point.name} does not fit its DPU: {point.point.reason}"
+                for point in points
+                if point.point is not None and point.point.refused_by == board
+            ]
+            rows.append(Row(BOARDS, board, {}, {"point": "none", "verdict": "; ".join(reasons)}))
+            continue
+        best, _ = choose(candidates, asked)
+        words = "within the limits"
+        if recommended is not None and recommended.text.get("board") == board:
+            best = recommended
+            words = "this is the recommended point"
+        elif recommended is not None:
+            difference = asked.compare.difference(best, recommended)
+            ratio = best.value(cost) / recommended.value(cost)
+            quality = f"PSNR {difference} dB against" if difference.value else "the PSNR of"
+            words = f"{quality} the recommended point, for {ratio:.3g} times its {cost}"
+        text = {"point": best.name, "verdict": words}
+        rows.append(Row(BOARDS, board, figures_to_compare(best, cost), text))
+    return rows
+
+
+def board_lines(rows: Sequence[Row]) -> list[str]:
+    """Return the rows of boards as sentences: those of several boards, or that of a single one if
+    it has no point.
+    """
+    return [
+        f"{row.name}: {row.text['point'] + ': ' if row.figures else ''}{row.text['verdict']}"
+        for row in rows
+        if len(rows) > 1 or not row.figures
+    ]

@@ -31,7 +31,6 @@ from beers_deploy.results import Input, Table, input_of
 from beers_deploy.studies.evaluation.methods import Method, method_named, method_of
 from beers_deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes
 from beers_deploy.studies.tradeoff import advice
-from beers_deploy.studies.tradeoff.boards import board_rows, lines
 from beers_deploy.studies.tradeoff.front import Comparison, Measured, front_rows, pareto_front
 from beers_deploy.studies.tradeoff.measure import (
     Benchmark,
@@ -232,7 +231,7 @@ def weigh(
     best, line = advice.recommend(points, asked)
     front = pareto_front(advice.affordable(points, asked.constraints, cost), cost)
     numbered = front_rows(front, cost, asked.compare)
-    by_board = board_rows(points, boards, best, asked)
+    by_board = advice.board_rows(points, boards, best, asked)
     name = best.name if best else "none"
     figures = best.figures if best else {}
     every = (Row("points", point.name, point.figures, point.text) for point in points)
@@ -243,7 +242,7 @@ def weigh(
         title="what accuracy costs in time",
         rows=rows,
         checks=(fits,),
-        notes=(line, *lines(by_board), *remarks),
+        notes=(line, *advice.board_lines(by_board), *remarks),
         details=frozenset({"recommended", "boards", "points"}),
         points=points,
         front=front,
