@@ -172,11 +172,11 @@ def battery_table(
     """
     results = run_battery(subject, cases, stages, seed, side_px)
     layers = layer_rows(subject)
-    failed = [result for result in results if result.failed]
-    failures = "; ".join(
+    failed = [
         f"{result.case.name}, {result.stage}: {result.verdict.removeprefix('FAILED: ')}"
-        for result in failed
-    )
+        for result in results
+        if result.failed
+    ]
     # A sum that might overflow is a failure, even if no case makes it overflow.
     overflowing = [row.name for row in layers if row.text["can it overflow int32"] != "no"]
     reasons = dict.fromkeys(result.reason for result in results if result.reason)
@@ -191,7 +191,7 @@ def battery_table(
             *finding_rows(results),
         ),
         checks=(
-            Check("failures", len(failed), 0, "result", detail=failures),
+            Check("failures", len(failed), 0, "result", detail="; ".join(failed)),
             Check(
                 "sums that might overflow",
                 len(overflowing),

@@ -137,7 +137,15 @@ def _variants(
             f"safetensors file, but it is {printable(repr(source))}."
         )
     network = Network.load(source, sensor=sensor)
-    _require_tiles(network.label, network.tiling)
+    tiling = network.tiling
+    plain = replace(tiling, alignment_px=1, min_side_px=1, fixed_px=None) == Tiling(tiling.halo_px)
+    if tiling.fixed_px is not None or not plain or HALO_STEP_PX % tiling.alignment_px:
+        fixed = ", fixed to one tile size" if tiling.fixed_px is not None else ""
+        raise OptionError(
+            f"`network` must restore one band in tiles of any multiple of {HALO_STEP_PX} px, but "
+            f"{network.label} is a network {tiling.words}{fixed}. Export it with free sizes, or "
+            "bench it by itself."
+        )
     if network.precision == "int8":
         yield Variant(network.name, INT8, network)
         return
@@ -151,20 +159,6 @@ def _variants(
         logger.warning("%s is compared in float32 alone: %s", network.label, error)
         return
     yield Variant(network.name, INT8, int8)
-
-
-def _require_tiles(name: str, tiling: Tiling) -> None:
-    """Raise OptionError if a network does not restore one band in tiles of any multiple of the
-    halo's steps.
-    """
-    plain = replace(tiling, alignment_px=1, min_side_px=1, fixed_px=None) == Tiling(tiling.halo_px)
-    if tiling.fixed_px is not None or not plain or HALO_STEP_PX % tiling.alignment_px:
-        fixed = ", fixed to one tile size" if tiling.fixed_px is not None else ""
-        raise OptionError(
-            f"`network` must restore one band in tiles of any multiple of {HALO_STEP_PX} px, but "
-            f"{name} is a network {tiling.words}{fixed}. Export it with free sizes, or bench it "
-            "by itself."
-        )
 
 
 def points_of(
