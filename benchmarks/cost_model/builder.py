@@ -28,22 +28,20 @@ class Tensor:
 
     @property
     def channels(self) -> int:
-        """The C of its shape."""
+        """The number of channels."""
         return self.shape[0]
 
 
 @dataclass(frozen=True)
 class Written:
-    """A network that was written down, and how many bytes of which results the host reads for one
-    image.
-    """
+    """A network, and the number of bytes of each result that the host reads for one image."""
 
     network: SizedGraph
     read_bytes: Mapping[str, int]
 
 
 class Builder:
-    """A network under construction."""
+    """Builds a network, operation by operation."""
 
     def __init__(self, height: int, width: int, channels: int = 3) -> None:
         self.image = Tensor("image", (channels, height, width))
@@ -61,15 +59,15 @@ class Builder:
         g: int = 1,
         valid: int = 0,
     ) -> Tensor:
-        """A convolution.
+        """Append a convolution.
 
         Args:
-            x: what it reads.
+            x: the input.
             channels: of its result.
             kernel: its size in pixels.
             stride: in pixels.
             d: dilation.
-            g: groups of channels that do not see one another.
+            g: the number of groups of channels.
             valid: pads nothing if 1; otherwise the result has size / stride, rounded up.
         """
         sides, window, size = _slide(x.shape, kernel, stride, valid, d)
@@ -80,14 +78,14 @@ class Builder:
     def depthwise(
         self, x: Tensor, kernel: Size = 3, stride: Size = 1, *, d: int = 1, m: int = 1
     ) -> Tensor:
-        """Each channel by itself, or into `m` channels; `d` is the dilation."""
+        """Append a depthwise convolution into `m` times the channels; `d` is the dilation."""
         sides, window, size = _slide(x.shape, kernel, stride, 0, d)
         channels = x.channels * m
         weights = channels * math.prod(sides)
         return self._append("Conv", "depthwise", (x,), (channels, *size), sides, window, weights)
 
     def transposed(self, x: Tensor, channels: int, kernel: int, stride: int) -> Tensor:
-        """A transposed convolution that enlarges by its stride."""
+        """Append a transposed convolution that enlarges by its stride."""
         cut = max(kernel - stride, 0)
         pads = (cut // 2, cut // 2, cut - cut // 2, cut - cut // 2)
         window = Window((stride, stride), pads)
@@ -107,8 +105,8 @@ class Builder:
         ceil: int = 0,
         op_type: str = "MaxPool",
     ) -> Tensor:
-        """The largest value of a window, or its mean; `ceil` counts windows that only begin inside
-        a bare image.
+        """Append a pooling by maximum or mean. With `ceil`, windows that only begin inside the
+        image count too.
         """
         # Pad behind the image by as much as a stride may lose.
         behind = [(side - 1) * ceil for side in _pair(stride)]
@@ -119,25 +117,25 @@ class Builder:
         return self._append(op_type, "pool", (x,), (x.channels, *size), sides, window)
 
     def global_mean(self, x: Tensor) -> Tensor:
-        """The mean of each channel."""
+        """Append the mean of each channel."""
         shape = (x.channels, 1, 1)
         return self._append("GlobalAveragePool", "pool", (x,), shape, x.shape[1:])
 
     def add(self, x: Tensor, *others: Tensor) -> Tensor:
-        """The sum of results of one shape."""
+        """Append sums of results of one shape."""
         for other in others:
             _require_same(x.shape, other.shape)
             x = self._append("Add", "add", (x, other), x.shape)
         return x
 
     def mul(self, x: Tensor, other: Tensor) -> Tensor:
-        """The product of two results of one shape, or of each channel with a number of its own."""
+        """Append the product of two results of one shape, or of each channel with a number."""
         per_channel = other.shape[1:] == (1, 1)
         _require_same(x.shape, (other.channels, *x.shape[1:]) if per_channel else other.shape)
         return self._append("Mul", "mul", (x, other), x.shape)
 
     def concat(self, x: Tensor, *others: Tensor) -> Tensor:
-        """Channels of several results one behind the other."""
+        """Append a concatenation of channels."""
         for other in others:
             _require_same(x.shape[1:], other.shape[1:])
         channels = x.channels + sum(other.channels for other in others)
@@ -149,7 +147,7 @@ class Builder:
         return self._append("Slice", "other", (x,), (count, *x.shape[1:]))
 
     def resize(self, x: Tensor, to: int | Tensor = 2, *, linear: bool = False) -> Tensor:
-        """Larger by a whole factor, or as large as another result: nearest
+        """Append a resize by an integer factor, or to the size of another result: nearest
         neighbour, or bilinear.
         """
         height, width = (
@@ -162,17 +160,17 @@ class Builder:
         )
 
     def shuffle(self, x: Tensor, block: int = 2) -> Tensor:
-        """Channels become blocks of pixels (pixel shuffle)."""
+        """Append a pixel shuffle: channels become blocks of pixels."""
         shape = (x.channels // block**2, x.shape[1] * block, x.shape[2] * block)
         return self._append("DepthToSpace", "pixel shuffle", (x,), shape)
 
     def unshuffle(self, x: Tensor, block: int = 2) -> Tensor:
-        """Blocks of pixels become channels (the `reorg` of YOLOv2, the Focus of YOLOX)."""
+        """Append the inverse of a pixel shuffle (`reorg` of YOLOv2, Focus of YOLOX)."""
         shape = (x.channels * block**2, x.shape[1] // block, x.shape[2] // block)
         return self._append("SpaceToDepth", "pixel shuffle", (x,), shape)
 
     def activation(self, x: Tensor, op_type: str) -> Tensor:
-        """One that no convolution takes in."""
+        """Append an activation that is not fused into a convolution."""
         return self._append(op_type, "activation", (x,), x.shape)
 
     def out(self, x: Tensor, channels: int | None = None) -> Tensor:
@@ -183,7 +181,7 @@ class Builder:
         return x
 
     def written(self, last: Tensor) -> Written:
-        """What was written down; `last` is the result if there was no other."""
+        """Return the network; `last` is its output if `out` was never called."""
         if not self._read_bytes:
             self.out(last)
         names = tuple(self._read_bytes)

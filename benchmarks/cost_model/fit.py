@@ -54,17 +54,17 @@ much damping, or the one with this number: along a kink steps grow ever smaller.
 
 
 def logs_of(constants: Constants) -> Array:
-    """Natural logarithms, (11,): what the fit moves."""
+    """Return the natural logarithms of the constants, (11,), which are fitted."""
     return np.asarray(np.log([getattr(constants, name) for name in NAMES]))
 
 
 def from_logs(logs: Array) -> Constants:
-    """The inverse of `logs_of`."""
+    """Return the constants of their natural logarithms, (11,)."""
     return Constants(*np.exp(logs).tolist())
 
 
 def rounded(constants: Constants) -> Constants:
-    """Four significant digits: what a profile stores."""
+    """Return the constants with four significant digits, as a profile stores them."""
     return Constants(*(float(f"{getattr(constants, name):.3e}") for name in NAMES))
 
 
@@ -88,7 +88,7 @@ class Cases:
 
     @cached_property
     def layers(self) -> Layers:
-        """All layers, one network behind the other."""
+        """The layers of all networks, concatenated."""
         parts = [row.layers for row in self.rows]
         return Layers(
             *(
@@ -135,7 +135,7 @@ class Cases:
         return np.concatenate([weights, ALONE * weights * ~np.isnan(self.observed_single)])
 
     def times(self, constants: Constants) -> Times:
-        """What an image takes."""
+        """Return the seconds of an image in each case."""
         handlers, cores = (
             of_layers[self._starts] for of_layers in (self.layers.handlers, self.layers.cores)
         )
@@ -145,12 +145,12 @@ class Cases:
         return Times(shared / (handlers * cores), alone / handlers, host_s)
 
     def _core_s(self, constants: Constants, *, alone: bool) -> Array:
-        """Time of one batch on every core, or on one core alone (n,)."""
+        """Return the time of one batch on every core, or on one core alone, (n,)."""
         times = self.layers.time_s(constants, self.structure, alone=alone)
         return np.add.reduceat(times, self._starts)
 
     def shares(self, constants: Constants) -> Array:
-        """By how much each case's rate follows each of PARTS, (n, 6)."""
+        """Return the share of each of PARTS in the rate of each case, (n, 6)."""
         layers = self.layers
         parts_s = layers.parts_s(constants, self.structure)
         images = (layers.handlers * layers.cores)[self._starts]
@@ -161,7 +161,7 @@ class Cases:
         )
 
     def predicted(self, times: Times) -> Array:
-        """ln(FPS) with several threads, (n,)."""
+        """Return ln(FPS) with several threads, (n,)."""
         dpu = np.log(times.dpu_s)
         host = np.log(times.host_s / self.host_cores)
         q = self.structure.crowding
@@ -176,7 +176,7 @@ class Cases:
         return np.concatenate([self.predicted(times) - self.observed, np.nan_to_num(single)])
 
     def errors(self, constants: Constants) -> Array:
-        """ln(predicted / observed) of FPS with several threads, (n,)."""
+        """Return ln(predicted / observed) of FPS with several threads, (n,)."""
         return self.residuals(constants)[: len(self.rows)]
 
     def rate_errors(self, errors: Array) -> list[Array]:
@@ -187,7 +187,7 @@ class Cases:
         return [centre - np.log(row.fps) for centre, row in zip(centres, self.rows, strict=True)]
 
     def only(self, keep: Sequence[bool] | NDArray[np.bool_]) -> "Cases":
-        """The rows where `keep` (n,) is true."""
+        """Return the cases where `keep` (n,) is True."""
         return Cases(
             tuple(row for row, selected in zip(self.rows, keep, strict=True) if selected),
             self.structure,
@@ -195,9 +195,7 @@ class Cases:
 
 
 def fit(cases: Cases, near: Constants | None = None) -> Constants:
-    """The constants that come nearest to the rates; `near` is where to begin,
-    if not around START.
-    """
+    """Return the constants that fit the rates best. The fit begins at `near`, or around START."""
     # The cost has kinks where one part of a layer outruns another, so the nearest minimum need not
     # be the lowest.
     begins = [logs_of(near)] if near else [logs_of(START) + shift for shift in SHIFTS]
@@ -206,7 +204,7 @@ def fit(cases: Cases, near: Constants | None = None) -> Constants:
 
 
 def _descend(cases: Cases, logs: Array) -> tuple[Array, float]:
-    """Where damped steps end, and its cost."""
+    """Return the minimum that damped steps reach, and its cost."""
     damping = 1e-3
     cost = _cost(cases, logs)
     normal, downhill = _slope(cases, logs)
@@ -238,7 +236,7 @@ def _cost(cases: Cases, logs: Array) -> float:
 
 
 def _slope(cases: Cases, logs: Array) -> tuple[Array, Array]:
-    """The normal matrix (11, 11) and minus half the gradient (11,)."""
+    """Return the normal matrix (11, 11) and minus half the gradient (11,)."""
     residuals = cases.residuals(from_logs(logs))
     stepped = [cases.residuals(from_logs(logs + STEP * unit)) for unit in np.eye(len(logs))]
     slopes = (np.stack(stepped, axis=1) - residuals[:, None]) / STEP
