@@ -257,7 +257,7 @@ def class_names(names: Any) -> tuple[str, ...]:
 
 def parse_classes(text: str) -> dict[str, str]:
     """Parse LABELLED=DETECTOR,... and return the detector's class for each labelled class."""
-    pairs = [tuple(map(str.strip, entry.split("="))) for entry in text.split(",")]
+    pairs = [[part.strip() for part in entry.split("=")] for entry in text.split(",")]
     valid = all(len(pair) == 2 and all(map(letters, pair)) for pair in pairs)
     if not valid or len({letters(pair[0]) for pair in pairs}) < len(pairs):
         raise OptionError(

@@ -118,8 +118,8 @@ def run_evaluation(plan: Plan) -> Evaluation:
     loaded = list[NamedPair]()
     if plan.given is not None:
         for number, pair in enumerate(plan.given):
-            images = (image.astype(np.float32) for image in pair)
-            loaded.append(NamedPair(f"pair{number}", *images, noise_free=pair.clean))
+            degraded, reference = (image.astype(np.float32) for image in pair)
+            loaded.append(NamedPair(f"pair{number}", degraded, reference, noise_free=pair.clean))
     elif plan.folder is not None:
         loaded = read_pairs(plan.folder, nominal.max_dn, read_pairs_recipe(plan.folder))
         sensor_rows = [_sensor_row(loaded, sensors[0], str(plan.folder), plan.strict)]

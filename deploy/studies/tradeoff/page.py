@@ -252,15 +252,10 @@ def _scatter(axes: "Axes", group: Series, study: Tradeoff) -> None:
     # The front's marks come last, so that they lie on top.
     points = sorted(group.points, key=lambda point: point in study.front)
     large = [point in study.front for point in points]
-    axes.scatter(
-        *_places(points, study.cost),
-        s=np.where(large, FRONT_PX2, OTHERS_PX2),
-        alpha=np.where(large, 1.0, PALE),
-        c=group.colour,
-        marker=group.marker,
-        zorder=2,
-        linewidths=0,
-    )
+    style: dict[str, Any] = {"alpha": np.where(large, 1.0, PALE), "marker": group.marker}
+    sizes = np.where(large, FRONT_PX2, OTHERS_PX2)
+    x, y = _places(points, study.cost)
+    axes.scatter(x, y, sizes, group.colour, linewidths=0, zorder=2, **style)
 
 
 def _places(points: Sequence[Measured], cost: str) -> tuple[list[float], list[float]]:

@@ -194,9 +194,9 @@ def preview(study: Study) -> Table:
     seams = Counter(point.variant for point in points if point.halo_px is not None)
     low_s = high_s = 0.0
     for variant, samples in zip(methods, times, strict=True):
-        factor = (1 + 2 * seams[variant]) * crops
-        low_s += factor * min(samples)[0]
-        high_s += factor * max(samples)[0]
+        times_s = [(1 + 2 * seams[variant]) * crops * time_s for time_s, _ in samples]
+        low_s += min(times_s)
+        high_s += max(times_s)
     counts = {"point": len(points), "method": len(methods), "image": len(benchmark.pairs)}
     figures = {
         f"{unit}s": measured_figure(count, unit, "the plan of the study")
