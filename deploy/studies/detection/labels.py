@@ -103,11 +103,12 @@ def _read_each(images: Sequence[Path], where: Path) -> list[_File]:
 
 
 def _require_all(absent: Sequence[str], count: int, folder: Path) -> None:
+    """Raise OptionError if files are absent."""
     if absent:
         raise OptionError(
-            f"{folder} must have a file of labels for every image, and every image of a split, but "
-            f"{len(absent)} of {count} are missing, the first {printable(repr(absent[0]))}. Add "
-            "them, with no object where nothing is labelled."
+            f"{len(absent)} of {count} files are missing in {folder}, the first "
+            f"{printable(repr(absent[0]))}. Add them: an image without objects needs a file of "
+            "labels too."
         )
 
 
