@@ -47,7 +47,7 @@ kinks, and the nearest low point need not be the lowest.
 """
 ENOUGH = 1e-5
 STUCK = 1e5
-MOST = 200
+MAX_STEPS = 200
 """A step that gains less than this share of the cost is the last, and so is one that needs this
 much damping, or the one with this number: along a kink steps grow ever smaller.
 """
@@ -208,7 +208,7 @@ def _descend(cases: Cases, logs: Array) -> tuple[Array, float]:
     damping = 1e-3
     cost = _cost(cases, logs)
     normal, downhill = _slope(cases, logs)
-    for _ in range(MOST):
+    for _ in range(MAX_STEPS):
         there = logs + np.linalg.solve(normal + damping * np.diag(np.diag(normal)), downhill)
         # No array does more than its peak, so the logarithm of the efficiency ends at 0.
         there[PEAK] = min(there[PEAK], 0.0)

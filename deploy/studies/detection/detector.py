@@ -30,9 +30,9 @@ from beers_deploy.profiles.errors import (
 from beers_deploy.quant.onnx.graph import constants
 from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata
 from beers_deploy.quant.session import open_session
-from beers_deploy.studies.detection.boxes import MOST, Boxes, Letterbox, suppress
+from beers_deploy.studies.detection.boxes import MAX_BOXES, Boxes, Letterbox, suppress
 
-LEAST_SCORE = 1e-3
+MIN_SCORE = 1e-3
 """Detections below this score are dropped, as Ultralytics validates: average precision needs the
 doubtful ones.
 """
@@ -213,7 +213,7 @@ def _flag(model: onnx.ModelProto) -> str:
 
 def _raw(output: np.ndarray) -> Boxes:
     """Return every pair of an anchor and a class with a sufficient score, in px of the input."""
-    classes, anchors = np.nonzero(output[4:] > LEAST_SCORE)
+    classes, anchors = np.nonzero(output[4:] > MIN_SCORE)
     middle = output[:2, anchors].T.astype(np.float64)
     half = output[2:4, anchors].T.astype(np.float64) / 2
     corners = np.hstack([middle - half, middle + half])
@@ -224,13 +224,13 @@ def _final(output: np.ndarray, classes: int) -> Boxes:
     """Return the rows with a sufficient score, best first. The other rows pad the list with
     zeros.
     """
-    rows = output[output[:, 4] > LEAST_SCORE]
+    rows = output[output[:, 4] > MIN_SCORE]
     if not np.isin(rows[:, 5], np.arange(classes)).all():
         raise ModelError(
             f"The detector returns classes other than 0 to {classes - 1} in its sixth column. "
             f"{REMEDY}"
         )
-    rows = rows[np.argsort(-rows[:, 4], kind="stable")[:MOST]]
+    rows = rows[np.argsort(-rows[:, 4], kind="stable")[:MAX_BOXES]]
     return Boxes.of(rows[:, :4], rows[:, 5], rows[:, 4])
 
 
