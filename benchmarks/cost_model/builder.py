@@ -177,7 +177,8 @@ class Builder:
         """Make a result one of the network's; the host reads `channels` of it,
         all if not stated.
         """
-        self._read_bytes[x.name] = (channels or x.channels) * x.shape[1] * x.shape[2]
+        channels_read = x.channels if channels is None else channels
+        self._read_bytes[x.name] = channels_read * x.shape[1] * x.shape[2]
         return x
 
     def written(self, last: Tensor) -> Written:
