@@ -1,7 +1,7 @@
 """Measure what each accuracy pass of the quantiser gains, in dB: the loss with all passes, and how
 much larger it is when one is left out.
 
-    python -m benchmarks.ablation --images aerial-train/ --held-out aerial-test/ --keep networks/
+    python -m benchmarks.ablation --images aerial-train/ --held-out aerial-test/
 
 The small networks are those of `benchmarks.small_networks`, trained briefly. Shipped networks are
 quantised over their range of sensors and evaluated on `pleiades-degraded`. The script prints a
@@ -11,6 +11,8 @@ Markdown table. The samples it evaluates on were seen by neither training nor ca
 import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import onnx
 
@@ -25,7 +27,7 @@ from beers_deploy.quant.samples.own import samples_of
 from beers_deploy.quant.samples.simulated import unseen_patches
 from beers_deploy.quant.session import open_any_size
 from beers_deploy.quantization import family_model
-from benchmarks.small_networks import NETWORKS, Small, folder_of, names_in, options, prepared
+from benchmarks.small_networks import NETWORKS, Small, names_in, options, prepared
 
 Loss = Callable[[Passes], float]
 """Quantise a network with these passes and return its mean loss of PSNR in dB."""
@@ -94,10 +96,10 @@ def main() -> None:
     arguments = options(__doc__).parse_args()
     print(f"| network | all | {' | '.join(field.name for field in fields(Passes))} |")
     print("|---" * (len(fields(Passes)) + 2) + "|")
-    with folder_of(arguments) as folder:
+    with TemporaryDirectory() as temporary:
         for name in names_in(arguments, *shipped_names()):
             if name in NETWORKS:
-                cells = row(small(prepared(name, arguments, folder)))
+                cells = row(small(prepared(name, arguments, Path(temporary))))
             else:
                 cells = row(shipped(name, arguments), behind_bank=True)
             print(f"| {name} | {' | '.join(cells)} |", flush=True)

@@ -9,26 +9,57 @@ MTF curve that differs from the formula's.
 """
 
 import argparse
+import math
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 import beers_deploy as bd
+from beers_deploy.model.curves import draw_table
+from beers_deploy.model.family import LEAST_ALONG, SensorFamily
 from beers_deploy.model.metrics.slanted_edge import slanted_edge
+from beers_deploy.model.raster.images import list_images
+from beers_deploy.model.simulator.acquire import acquire_padded, fitting_oversampling
+from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.mtf import sensor_mtf
+from beers_deploy.model.simulator.sampling import crop_divisible, read_scene
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.figures import Figure
 from beers_deploy.profiles.instrument import Instrument
+from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.characterize.profile import SHOWN_CPX
-from benchmarks.acquisitions import RATIO, acquired, draw_sensor, photographs
 
+LIKE = Sensor.load("pleiades-degraded").nominal()
+RATIO = 4
+"""Scene pixels per sensor pixel along each axis."""
+MIN_SIDE_PX = 140
+MTF_RANGE = (0.02, 0.12)
 SCENES = 12
 TARGET_PX = 120
 LEAN_DEG = 7.0
 DARK = 30.0
 BRIGHT = 160.0
+
+
+def draw_sensor(generator: np.random.Generator, other_curve: bool) -> Instrument:
+    """Draw a sensor with the noise that networks are trained for and an MTF of 2 to 12 %."""
+    across = math.exp(generator.uniform(*np.log(MTF_RANGE)))
+    along = max(across * LEAST_ALONG ** float(generator.uniform() ** 2), MTF_RANGE[0])
+    sensor = SensorFamily(LIKE).draw(generator)
+    response = None
+    if other_curve:
+        response = draw_table(across, along, generator)
+        across, along = response.at_nyquist
+    return replace(sensor, response=response, mtf_nyquist=across, mtf_nyquist_along=along)
+
+
+def acquired(radiance: np.ndarray, sensor: Instrument, number: int) -> np.ndarray:
+    """Return the digital numbers (h, w) of an acquisition of a scene (H, W) by a sensor."""
+    scene = np.ascontiguousarray(crop_divisible(radiance, RATIO), np.float32)
+    return to_uint16(acquire_padded(scene, sensor, RATIO, Draw(number), "degraded"))
 
 
 def with_checkerboard(radiance: np.ndarray) -> np.ndarray:
@@ -73,13 +104,14 @@ def main() -> None:
     parser.add_argument("--sensors", type=int, default=20)
     parser.add_argument("--seed", type=int, default=22)
     arguments = parser.parse_args()
-    scenes = photographs([arguments.images])
+    photographs = [read_scene(path, LIKE).radiance for path in list_images(arguments.images)]
+    scenes = [each for each in photographs if fitting_oversampling(each, (RATIO,), MIN_SIDE_PX)]
     generator = np.random.default_rng(arguments.seed)
     errors = defaultdict[str, list[float]](list)
     inside = defaultdict[str, list[bool]](list)
     for number in range(arguments.sensors):
         sensor = draw_sensor(generator, other_curve=number % 2 == 1)
-        radiances = [scenes[k].radiance for k in generator.permutation(len(scenes))[:SCENES]]
+        radiances = [scenes[k] for k in generator.permutation(len(scenes))[:SCENES]]
         images = [acquired(scene, sensor, 100 * number + k) for k, scene in enumerate(radiances)]
         largest = max(range(len(images)), key=lambda k: min(radiances[k].shape))
         board = with_checkerboard(radiances[largest])

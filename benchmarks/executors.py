@@ -142,8 +142,9 @@ class Vectors:
         pictures = np.concatenate([images[case] for case in cases if case in images])
         return cls(network.model, golden.core, tile_px, planes.astype(np.int8), result, pictures)
 
+    @property
     def board_feed(self) -> np.ndarray:
-        """Return the planes as the board's file reads them, in float32."""
+        """The planes as the board's file reads them, in float32."""
         return self.planes * np.float32(self.core.scale(PLANES))
 
     def integers(self, result: np.ndarray) -> np.ndarray:
@@ -158,12 +159,12 @@ class Vectors:
     def by_aidge(self, python: Path) -> np.ndarray:
         """Return the result of Aidge for the board's file."""
         board = board_model(self.core, {}, self.tile_px)
-        return self.integers(run_aidge(python, board, self.board_feed()))
+        return self.integers(run_aidge(python, board, self.board_feed))
 
     def by_onnxruntime_board(self) -> np.ndarray:
         """Return the result of onnxruntime for the board's file."""
         session = open_session(board_model(self.core, {}))
-        return self.integers(session.run(None, {PLANES: self.board_feed()})[0])
+        return self.integers(session.run(None, {PLANES: self.board_feed})[0])
 
     def by_onnxruntime_host(self) -> np.ndarray:
         """Return the result of onnxruntime for the host's file, for the cases with an image."""
@@ -182,23 +183,6 @@ class Vectors:
         return float((result != self.result[: len(result)]).mean())
 
 
-Executor = Callable[[Vectors], np.ndarray]
-
-
-def executors(aidge: Path | None, compilers: Sequence[str]) -> dict[str, Executor]:
-    """Return the executors that are available, by name."""
-    found: dict[str, Executor] = {}
-    for compiler in compilers:
-        command = [*shlex.split(compiler), "-O2"]
-        found[f"C99, {compiler}"] = partial(Vectors.by_c, compiler=command)
-    if aidge is not None:
-        found["Aidge, board's file"] = partial(Vectors.by_aidge, python=aidge)
-    found["onnxruntime, board's file"] = Vectors.by_onnxruntime_board
-    found["onnxruntime, host's file"] = Vectors.by_onnxruntime_host
-    found["integer core, ties to even"] = Vectors.half_even
-    return found
-
-
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(
@@ -210,7 +194,13 @@ def main() -> None:
     parser.add_argument("--compiler", nargs="*", default=compilers, help="C compilers")
     parser.add_argument("--tile", type=int, default=TILE_PX, help="side of the tile in pixels")
     arguments = parser.parse_args()
-    columns = executors(arguments.aidge_python, arguments.compiler)
+    columns: dict[str, Callable[[Vectors], np.ndarray]] = {}
+    for compiler in arguments.compiler:
+        command = [*shlex.split(compiler), "-O2"]
+        columns[f"C99, {compiler}"] = partial(Vectors.by_c, compiler=command)
+    if arguments.aidge_python is not None:
+        columns["Aidge, board's file"] = partial(Vectors.by_aidge, python=arguments.aidge_python)
+    columns["onnxruntime, board's file"] = Vectors.by_onnxruntime_board
     print(f"| network | integers | {' | '.join(columns)} |")
     print("|---" * (2 + len(columns)) + "|")
     for name in arguments.files or [f"{name}{INT8}" for name in shipped_names()]:

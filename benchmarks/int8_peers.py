@@ -19,6 +19,7 @@ import subprocess
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -28,7 +29,6 @@ from benchmarks.small_networks import (
     NETWORKS,
     Drawn,
     Small,
-    folder_of,
     names_in,
     options,
     prepared,
@@ -71,7 +71,8 @@ def main() -> None:
     parser.add_argument("--tuned", action="store_true", help="fine-tune as well; minutes a network")
     parser.add_argument("--quark-python", type=Path, help="interpreter that has AMD Quark")
     arguments = parser.parse_args()
-    with folder_of(arguments) as folder:
+    with TemporaryDirectory() as temporary:
+        folder = Path(temporary)
         for number, name in enumerate(names_in(arguments)):
             network = prepared(name, arguments, folder)
             ways: dict[str, Quantize] = {"ours": ours}

@@ -21,13 +21,11 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-from onnx import numpy_helper
 from scipy.stats import spearmanr
 
 from beers_deploy.model.family import SensorFamily
 from beers_deploy.model.interval import BORDER_PX, PixelInterval, Sample, calibrated
 from beers_deploy.model.io.files import sha256
-from beers_deploy.model.io.tensors import read_tensors
 from beers_deploy.model.levels import LEVELS, Level
 from beers_deploy.model.raster.images import list_images, site_of
 from beers_deploy.model.shipped import INT8, SHIPPED, shipped_names, shipped_weights
@@ -54,7 +52,12 @@ REFERENCE = Sensor.load("pleiades-reference").nominal()
 FAMILY = SensorFamily(LIKE.nominal(), other_curves=0.3)
 RECIPES = SHIPPED.parent / "recipes"
 
-LEAST_PX = 2 * BORDER_PX + 64
+FITTED = 4
+HELD_OUT = 20
+"""Acquisitions of a place that networks were trained on, and of one that was held out of that."""
+CROP_PX = 160
+"""The side of the window of a scene that is acquired, in pixels of the sensor."""
+MIN_SIDE_PX = 2 * BORDER_PX + 64
 OVERSAMPLINGS = (4, 2)
 BLOCK_PX = 16
 JUDGED = {
@@ -115,7 +118,7 @@ def acquired(
     generator = np.random.default_rng(seed)
     sensor = draw_sensor(generator)
     scene = read_scene(path, REFERENCE).radiance * np.float32(radiance)
-    ratio = fitting_oversampling(scene, OVERSAMPLINGS, LEAST_PX)
+    ratio = fitting_oversampling(scene, OVERSAMPLINGS, MIN_SIDE_PX)
     if ratio is None:
         return None
     if crop_px is not None:
@@ -136,41 +139,24 @@ def restored(name: str, image: Acquired) -> np.ndarray:
     return network_restore(network, profile, REFERENCE, BOTH)(image.raw)
 
 
-@dataclass(frozen=True)
-class Amount:
-    """How much is acquired, each time by another sensor.
-
-    Attributes:
-        fitted: acquisitions of a place that networks were trained on.
-        held_out: acquisitions of a place that was held out of the training.
-        crop_px: side of the window of the scene, in pixels of the sensor.
-    """
-
-    fitted: int = 4
-    held_out: int = 20
-    crop_px: int = 160
-
-
-def training_images(
-    folders: Iterable[Path], amount: Amount
-) -> tuple[list[Acquired], list[Acquired]]:
+def training_images(folders: Iterable[Path]) -> tuple[list[Acquired], list[Acquired]]:
     """Acquire places that networks were trained on, and places that were held out of that."""
     recipe = tomllib.loads((RECIPES / "convbeers-s.toml").read_text(encoding="utf-8"))
     parts: tuple[list[Acquired], list[Acquired]] = ([], [])
     for number, (site, paths) in enumerate(by_site(folders).items()):
         is_held_out = site in recipe["held_out"]
-        count = amount.held_out if is_held_out else amount.fitted
+        count = HELD_OUT if is_held_out else FITTED
         for k in range(count):
             path = paths[k * len(paths) // count]
-            image = acquired(path, FAMILY.draw, (number, k), amount.crop_px)
+            image = acquired(path, FAMILY.draw, (number, k), CROP_PX)
             if image is not None:
                 parts[is_held_out].append(image)
     return parts
 
 
-def calibrate(names: Iterable[str], folders: Iterable[Path], amount: Amount) -> None:
+def calibrate(names: Iterable[str], folders: Iterable[Path]) -> None:
     """Write the intervals of shipped networks, in float32 and INT8."""
-    fitted, held_out = training_images(folders, amount)
+    fitted, held_out = training_images(folders)
     print(f"{len(fitted)} acquisitions fitted, {len(held_out)} held out", flush=True)
     for name in names:
         intervals = {}
@@ -182,48 +168,18 @@ def calibrate(names: Iterable[str], folders: Iterable[Path], amount: Amount) -> 
             intervals[each] = calibrated(*samples)
             print(each, intervals[each].to_json(), flush=True)
         weights = shipped_weights(name)
-        write_weights(weights, intervals[name])
-        write_int8(SHIPPED / f"{name}{INT8}.onnx", intervals[f"{name}{INT8}"], weights)
-
-
-def write_weights(path: Path, interval: PixelInterval) -> None:
-    """Write an interval into weights, and check that no weight changed."""
-    before, _ = read_tensors(path)
-    write_with_interval(path, interval, path)
-    after, _ = read_tensors(path)
-    require_equal(path, before, after)
-
-
-def write_int8(path: Path, interval: PixelInterval, weights: Path) -> None:
-    """Write an interval into an INT8 file and the digest of its weights, which have one too; check
-    that no integer changed.
-    """
-    before = arrays_of(load_onnx(path))
-    write_with_interval(path, interval, path)
-    model = load_onnx(path)
-    onnx.helper.set_model_props(model, {**metadata(model), WEIGHTS: sha256(weights)})
-    save_onnx(model, path)
-    require_equal(path, before, arrays_of(load_onnx(path)))
-
-
-def arrays_of(model: onnx.ModelProto) -> dict[str, np.ndarray]:
-    """Return all constants of a network by name."""
-    return {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
-
-
-def require_equal(path: Path, before: dict[str, np.ndarray], after: dict[str, np.ndarray]) -> None:
-    """Stop if any number of a network changed."""
-    same = before.keys() == after.keys() and all(
-        before[name].tobytes() == after[name].tobytes() for name in before
-    )
-    if not same:
-        raise SystemExit(f"{path} holds other numbers than before")
-    print(f"{path.name}: {len(after)} arrays as before", flush=True)
+        write_with_interval(weights, intervals[name], weights)
+        int8 = SHIPPED / f"{name}{INT8}.onnx"
+        write_with_interval(int8, intervals[int8.stem], int8)
+        # The INT8 file states the digest of the weights, which have an interval now.
+        model = load_onnx(int8)
+        onnx.helper.set_model_props(model, {**metadata(model), WEIGHTS: sha256(weights)})
+        save_onnx(model, int8)
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """What was found of one acquisition, without its border and saturated pixels.
+    """The errors and intervals of one acquisition, without its border and saturated pixels.
 
     Attributes:
         site: the place.
@@ -247,10 +203,10 @@ def judgement(name: str, image: Acquired, interval: PixelInterval) -> Judgement:
     result = restored(name, image)
     inner = (slice(BORDER_PX, -BORDER_PX),) * 2
     error = np.abs(result.astype(np.float64) - image.truth)[inner]
-    known = np.ones(result.shape, bool)
+    mask = np.ones(result.shape, bool)
     scale = image.sensor.max_dn
     widths = [
-        interval.for_sensor(image.sensor, scale, level).of(result, known)[inner] for level in LEVELS
+        interval.for_sensor(image.sensor, scale, level).of(result, mask)[inner] for level in LEVELS
     ]
     counts = (image.raw < scale)[inner]
     scores = np.stack([error[counts] / width[counts] for width in widths])
@@ -271,28 +227,28 @@ def judgements(
 ) -> list[Judgement]:
     """Judge a network on all images of some folders, each acquired by a draw of a profile."""
     interval = interval_of(Network.load(name, sensor=LIKE))
-    found = []
+    results = []
     for number, path in enumerate(p for paths in by_site(folders).values() for p in paths):
         image = acquired(path, sensor.draw, (number,), radiance=radiance)
         if image is not None and (image.raw < image.sensor.max_dn).any():
-            found.append(judgement(name, image, interval))
-    return found
+            results.append(judgement(name, image, interval))
+    return results
 
 
-def place_coverage(found: Sequence[Judgement], level: Level = 90) -> dict[str, float]:
+def place_coverage(images: Sequence[Judgement], level: Level = 90) -> dict[str, float]:
     """Return the mean coverage of the images of each place."""
     sites = dict[str, list[float]]()
-    for each in found:
+    for each in images:
         sites.setdefault(each.site, []).append(each.coverage(level))
     return {site: float(np.mean(values)) for site, values in sites.items()}
 
 
-def line(name: str, found: Sequence[Judgement]) -> str:
+def line(name: str, images: Sequence[Judgement]) -> str:
     """Return the row of a table: coverage over places, and the rank correlation of blocks."""
-    places = list(place_coverage(found).values())
-    blocks = np.concatenate([each.blocks for each in found], axis=1)
+    places = list(place_coverage(images).values())
+    blocks = np.concatenate([each.blocks for each in images], axis=1)
     rank = spearmanr(*blocks).statistic
-    width = np.mean([each.blocks[0].mean() for each in found])
+    width = np.mean([each.blocks[0].mean() for each in images])
     return (
         f"| {name} | {np.mean(places):.1%} | {min(places):.1%} | {max(places):.1%} | {rank:.3f} "
         f"| {width:.1f} |"
@@ -301,18 +257,18 @@ def line(name: str, found: Sequence[Judgement]) -> str:
 
 def tables(name: str, folders: Sequence[Path], plot: Path | None) -> Iterator[str]:
     """Yield the lines of the tables of one network; draw its reliability."""
-    found = {each: judgements(name, folders, sensor) for each, sensor in JUDGED.items()}
+    by_sensor = {each: judgements(name, folders, sensor) for each, sensor in JUDGED.items()}
     yield "| sensor | mean of places | lowest | highest | rank correlation | half-width, DN |"
-    yield from (line(each, judged) for each, judged in found.items())
-    yield "| level | " + " | ".join(found) + " |"
+    yield from (line(each, judged) for each, judged in by_sensor.items())
+    yield "| level | " + " | ".join(by_sensor) + " |"
     for level in LEVELS:
-        means = [np.mean(list(place_coverage(j, level).values())) for j in found.values()]
+        means = [np.mean(list(place_coverage(j, level).values())) for j in by_sensor.values()]
         yield f"| {level} % | " + " | ".join(f"{mean:.1%}" for mean in means) + " |"
-    yield "| place | " + " | ".join(found) + " |"
-    places = [place_coverage(judged) for judged in found.values()]
+    yield "| place | " + " | ".join(by_sensor) + " |"
+    places = [place_coverage(judged) for judged in by_sensor.values()]
     for site in places[0]:
         yield f"| {site} | " + " | ".join(f"{place[site]:.1%}" for place in places) + " |"
-    nominal = found["pleiades-degraded"]
+    nominal = by_sensor["pleiades-degraded"]
     yield "| brightness | pixels | coverage |"
     brightness = np.concatenate([each.brightness for each in nominal])
     within = np.concatenate([each.scores[LEVELS.index(90)] <= 1 for each in nominal])
@@ -324,15 +280,15 @@ def tables(name: str, folders: Sequence[Path], plot: Path | None) -> Iterator[st
         dimmed = judgements(name, folders, LIKE, radiance)
         yield line(f"pleiades-degraded, radiance x {radiance:g}", dimmed)
     if plot is not None:
-        draw(found, plot)
+        draw(by_sensor, plot)
 
 
-def draw(found: dict[str, list[Judgement]], plot: Path) -> None:
+def draw(by_sensor: dict[str, list[Judgement]], plot: Path) -> None:
     """Draw coverage over level for each sensor: the mean of places, and the range of them."""
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(2, 3, figsize=(9, 6), sharex=True, sharey=True)
-    for axis, (name, judged) in zip(axes.flat, found.items(), strict=True):
+    for axis, (name, judged) in zip(axes.flat, by_sensor.items(), strict=True):
         places = np.array([list(place_coverage(judged, level).values()) for level in LEVELS])
         axis.plot([45, 100], [45, 100], color="0.6", linewidth=1)
         axis.fill_between(
@@ -357,13 +313,9 @@ def main() -> None:
     parser.add_argument("names", nargs="*")
     parser.add_argument("--images", type=Path, nargs="+", required=True)
     parser.add_argument("--plot", type=Path)
-    parser.add_argument("--fitted", type=int, default=Amount.fitted)
-    parser.add_argument("--held-out", type=int, default=Amount.held_out)
-    parser.add_argument("--crop", type=int, default=Amount.crop_px)
     arguments = parser.parse_args()
     if arguments.task == "calibrate":
-        amount = Amount(arguments.fitted, arguments.held_out, arguments.crop)
-        calibrate(arguments.names or shipped_names(), arguments.images, amount)
+        calibrate(arguments.names or shipped_names(), arguments.images)
         return
     first, *others = arguments.names or [f"{shipped_names()[0]}{INT8}"]
     for text in tables(first, arguments.images, arguments.plot):

@@ -69,8 +69,8 @@ def flat(parts: list[Judged]) -> Judged:
         np.concatenate([getattr(part, name).ravel() for part in parts])
         for name in ("chi2", "sharpening")
     )
-    known = np.isfinite(chi2)
-    return Judged(chi2[known], sharpening[known])
+    finite = np.isfinite(chi2)
+    return Judged(chi2[finite], sharpening[finite])
 
 
 def by_class(blocks: Judged) -> str:
@@ -135,10 +135,8 @@ def flips(images: Path, name: str, count: int, seed: int) -> str:
     core = read_core(network.model)
     pairs = pairs_at(images, sensor, 1.0, seed)
     sound = network_method(network.model, PEAK_DN, {}, sensor, reference)
-    costly = 0
-    found = 0
-    costly_flips = 0
-    found_flips = 0
+    # A row for each flip: the blocks that it costs too much, and those of them that are found.
+    counts = np.zeros((count, 2), int)
     before: dict[int, np.ndarray] = {}
     for draw in range(count):
         generator = np.random.default_rng([seed, draw])
@@ -154,14 +152,12 @@ def flips(images: Path, name: str, count: int, seed: int) -> str:
         rows, columns = loss_db.shape
         whole = np.s_[:rows, :columns]
         hurt = (loss_db > COSTLY_DB) & blocks.decidable[whole] & np.isfinite(blocks.chi2[whole])
-        costly += int(np.count_nonzero(hurt))
-        found += int(np.count_nonzero(hurt & blocks.outside[whole]))
-        if hurt.any():
-            costly_flips += 1
-            found_flips += bool((hurt & blocks.outside[whole]).any())
+        counts[draw] = hurt.sum(), (hurt & blocks.outside[whole]).sum()
+    costly, detected = counts.sum(0)
+    costly_flips, detected_flips = (counts > 0).sum(0)
     return (
         f"{name}: {count} flips, {costly_flips} cost a decidable block more than {COSTLY_DB:g} dB, "
-        f"{found_flips} of them found; {found} of {costly} such blocks"
+        f"{detected_flips} of them found; {detected} of {costly} such blocks"
     )
 
 

@@ -7,12 +7,10 @@ quantise.
 import argparse
 import re
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -314,27 +312,16 @@ def options(text: str | None) -> argparse.ArgumentParser:
     parser.add_argument("--steps", type=int, default=1500, help="of the training")
     parser.add_argument("--batches", type=int, default=8, help="of eight samples each")
     parser.add_argument("--only", default="", help="networks whose names this expression matches")
-    parser.add_argument("--keep", type=Path, help="folder in which the trained networks stay")
     return parser
 
 
-@contextmanager
-def folder_of(arguments: argparse.Namespace) -> Iterator[Path]:
-    """Yield the folder of --keep, or a temporary one."""
-    with TemporaryDirectory() as temporary:
-        folder = (arguments.keep or Path(temporary)).resolve()
-        folder.mkdir(parents=True, exist_ok=True)
-        yield folder
-
-
 def prepared(name: str, arguments: argparse.Namespace, folder: Path) -> Small:
-    """Train a network unless the folder contains it, and draw its samples."""
+    """Train a network, save it in a folder, and draw its samples."""
     kind, _ = NETWORKS[name]
     path = folder / f"{slug(name)}.onnx"
-    if not path.exists():
-        # ESPCN doubles the size, so its images have half the side of its references.
-        side_px = SIDE_PX // (2 if kind == "espcn" else 1)
-        save(trained(name, arguments.images, arguments.steps), side_px, path)
+    # ESPCN doubles the size, so its images have half the side of its references.
+    side_px = SIDE_PX // (2 if kind == "espcn" else 1)
+    save(trained(name, arguments.images, arguments.steps), side_px, path)
     return Small(
         path,
         Drawn.of(kind, arguments.images, 5, arguments.batches),

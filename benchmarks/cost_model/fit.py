@@ -30,7 +30,7 @@ START = Constants(0.8, 40, 0.55, 6e-6, 5e-5, 0.4e9, 0.8e9, 0.3e9, 30e6, 60e6, 1.
 """Where the fit begins: the right orders of magnitude; a pixel of an image takes the host a clock
 cycle.
 """
-SPREAD = np.array([0.3, 1, 0.2, 1, 1, 0.7, 0.7, 0.7, 1, 1, 0.5])
+DEVIATION = np.array([0.3, 1, 0.2, 1, 1, 0.7, 0.7, 0.7, 1, 1, 0.5])
 """How far each logarithm may lie from its start, a standard deviation: shares less than times and
 rates. Few networks tell what the VCK190's memory reaches, and they differ by 1.7: the other boards'
 0.5 to 0.65 count too.
@@ -47,24 +47,24 @@ kinks, and the nearest low point need not be the lowest.
 """
 ENOUGH = 1e-5
 STUCK = 1e5
-MOST = 200
+MAX_STEPS = 200
 """A step that gains less than this share of the cost is the last, and so is one that needs this
 much damping, or the one with this number: along a kink steps grow ever smaller.
 """
 
 
 def logs_of(constants: Constants) -> Array:
-    """Natural logarithms, (11,): what the fit moves."""
+    """Return the natural logarithms of the constants, (11,), which are fitted."""
     return np.asarray(np.log([getattr(constants, name) for name in NAMES]))
 
 
 def from_logs(logs: Array) -> Constants:
-    """The inverse of `logs_of`."""
+    """Return the constants of their natural logarithms, (11,)."""
     return Constants(*np.exp(logs).tolist())
 
 
 def rounded(constants: Constants) -> Constants:
-    """Four significant digits: what a profile stores."""
+    """Return the constants with four significant digits, as a profile stores them."""
     return Constants(*(float(f"{getattr(constants, name):.3e}") for name in NAMES))
 
 
@@ -88,7 +88,7 @@ class Cases:
 
     @cached_property
     def layers(self) -> Layers:
-        """All layers, one network behind the other."""
+        """The layers of all networks, concatenated."""
         parts = [row.layers for row in self.rows]
         return Layers(
             *(
@@ -135,7 +135,7 @@ class Cases:
         return np.concatenate([weights, ALONE * weights * ~np.isnan(self.observed_single)])
 
     def times(self, constants: Constants) -> Times:
-        """What an image takes."""
+        """Return the seconds of an image in each case."""
         handlers, cores = (
             of_layers[self._starts] for of_layers in (self.layers.handlers, self.layers.cores)
         )
@@ -145,12 +145,12 @@ class Cases:
         return Times(shared / (handlers * cores), alone / handlers, host_s)
 
     def _core_s(self, constants: Constants, *, alone: bool) -> Array:
-        """Time of one batch on every core, or on one core alone (n,)."""
+        """Return the time of one batch on every core, or on one core alone, (n,)."""
         times = self.layers.time_s(constants, self.structure, alone=alone)
         return np.add.reduceat(times, self._starts)
 
     def shares(self, constants: Constants) -> Array:
-        """By how much each case's rate follows each of PARTS, (n, 6)."""
+        """Return the share of each of PARTS in the rate of each case, (n, 6)."""
         layers = self.layers
         parts_s = layers.parts_s(constants, self.structure)
         images = (layers.handlers * layers.cores)[self._starts]
@@ -161,7 +161,7 @@ class Cases:
         )
 
     def predicted(self, times: Times) -> Array:
-        """ln(FPS) with several threads, (n,)."""
+        """Return ln(FPS) with several threads, (n,)."""
         dpu = np.log(times.dpu_s)
         host = np.log(times.host_s / self.host_cores)
         q = self.structure.crowding
@@ -176,7 +176,7 @@ class Cases:
         return np.concatenate([self.predicted(times) - self.observed, np.nan_to_num(single)])
 
     def errors(self, constants: Constants) -> Array:
-        """ln(predicted / observed) of FPS with several threads, (n,)."""
+        """Return ln(predicted / observed) of FPS with several threads, (n,)."""
         return self.residuals(constants)[: len(self.rows)]
 
     def rate_errors(self, errors: Array) -> list[Array]:
@@ -187,7 +187,7 @@ class Cases:
         return [centre - np.log(row.fps) for centre, row in zip(centres, self.rows, strict=True)]
 
     def only(self, keep: Sequence[bool] | NDArray[np.bool_]) -> "Cases":
-        """The rows where `keep` (n,) is true."""
+        """Return the cases where `keep` (n,) is True."""
         return Cases(
             tuple(row for row, selected in zip(self.rows, keep, strict=True) if selected),
             self.structure,
@@ -195,9 +195,7 @@ class Cases:
 
 
 def fit(cases: Cases, near: Constants | None = None) -> Constants:
-    """The constants that come nearest to the rates; `near` is where to begin,
-    if not around START.
-    """
+    """Return the constants that fit the rates best. The fit begins at `near`, or around START."""
     # The cost has kinks where one part of a layer outruns another, so the nearest minimum need not
     # be the lowest.
     begins = [logs_of(near)] if near else [logs_of(START) + shift for shift in SHIFTS]
@@ -206,11 +204,11 @@ def fit(cases: Cases, near: Constants | None = None) -> Constants:
 
 
 def _descend(cases: Cases, logs: Array) -> tuple[Array, float]:
-    """Where damped steps end, and its cost."""
+    """Return the minimum that damped steps reach, and its cost."""
     damping = 1e-3
     cost = _cost(cases, logs)
     normal, downhill = _slope(cases, logs)
-    for _ in range(MOST):
+    for _ in range(MAX_STEPS):
         there = logs + np.linalg.solve(normal + damping * np.diag(np.diag(normal)), downhill)
         # No array does more than its peak, so the logarithm of the efficiency ends at 0.
         there[PEAK] = min(there[PEAK], 0.0)
@@ -234,14 +232,14 @@ def _descend(cases: Cases, logs: Array) -> tuple[Array, float]:
 def _cost(cases: Cases, logs: Array) -> float:
     # With the soft L1 loss a rate far off counts linearly.
     soft = 2 * (np.sqrt(1 + (cases.residuals(from_logs(logs)) / SOFT) ** 2) - 1)
-    return float(cases.weights @ soft + np.sum(((logs - logs_of(START)) / SPREAD) ** 2))
+    return float(cases.weights @ soft + np.sum(((logs - logs_of(START)) / DEVIATION) ** 2))
 
 
 def _slope(cases: Cases, logs: Array) -> tuple[Array, Array]:
-    """The normal matrix (11, 11) and minus half the gradient (11,)."""
+    """Return the normal matrix (11, 11) and minus half the gradient (11,)."""
     residuals = cases.residuals(from_logs(logs))
     stepped = [cases.residuals(from_logs(logs + STEP * unit)) for unit in np.eye(len(logs))]
     slopes = (np.stack(stepped, axis=1) - residuals[:, None]) / STEP
     weights = cases.weights / np.sqrt(1 + (residuals / SOFT) ** 2) / SOFT**2
-    normal = slopes.T @ (weights[:, None] * slopes) + np.diag(1 / SPREAD**2)
-    return normal, -(slopes.T @ (weights * residuals) + (logs - logs_of(START)) / SPREAD**2)
+    normal = slopes.T @ (weights[:, None] * slopes) + np.diag(1 / DEVIATION**2)
+    return normal, -(slopes.T @ (weights * residuals) + (logs - logs_of(START)) / DEVIATION**2)

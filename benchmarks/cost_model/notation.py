@@ -85,7 +85,7 @@ KINDS = {
     "classifiers": "classifiers",
     "inceptions": "classifiers",
 }
-"""What the networks of a file do."""
+"""The kind of the networks of each file."""
 SIZE = re.compile(r"\b(\d+)x(\d+)\b")
 FLAG = re.compile(r"\b(valid|ceil)\b")
 HEADER = ("family", "host", "gop", "source", "image")
@@ -141,7 +141,7 @@ class Library:
         return builder.written(self._run(builder, entry.lines, {"x": builder.image}))
 
     def _run(self, builder: Builder, lines: Sequence[str], names: dict[str, Any]) -> Tensor:
-        """Take the steps of some lines, and return their last x."""
+        """Append the steps of some lines, and return their last x."""
         result: Tensor
         for line in lines:
             name, equals, steps = line.partition(" = ")
@@ -171,7 +171,7 @@ class Library:
 
 
 def _value(text: str, names: Mapping[str, Any]) -> Any:
-    """Evaluate a number, a size or a kept result: expressions of Python, but for 1x7 and `/`."""
+    """Evaluate a number, a size or a stored result: expressions of Python, but for 1x7 and `/`."""
     python = SIZE.sub(r"(\1, \2)", text).replace("/", "//")
     return eval(python, {}, dict(names))  # noqa: S307 - files of this folder
 

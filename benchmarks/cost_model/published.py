@@ -70,13 +70,13 @@ class Case:
 
 @cache
 def written(name: str) -> Written:
-    """One of NETWORKS, written down once."""
+    """Return the layers of one of NETWORKS."""
     return LIBRARY.write(name)
 
 
 @cache
 def published_rates() -> list[dict[str, str]]:
-    """The rows of `published.csv`."""
+    """Return the rows of `published.csv`."""
     with (ZOO / "published.csv").open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
 
@@ -90,14 +90,14 @@ rates are in no fit.
 
 @cache
 def boards() -> tuple[str, ...]:
-    """Boards with published rates."""
+    """Return the names of the boards with published rates."""
     return tuple(dict.fromkeys(rate["board"] for rate in published_rates()))
 
 
 @cache
 def host_cores(board: str) -> int:
-    """Cores of a board's processor: four Cortex-A53 of the Zynq boards, two Cortex-A72 of the
-    Versal boards.
+    """Return the number of cores of a board's processor: four Cortex-A53 of the Zynq boards, two
+    Cortex-A72 of the Versal boards.
     """
     return load_dpu(board).whole("cpu", "cores")
 
@@ -125,18 +125,15 @@ def published_cases(board: str) -> tuple[Case, ...]:
 def network_case(
     name: str, dpu: Dpu, fps: tuple[float, ...], fps_single: tuple[float, ...] = ()
 ) -> Case:
-    """One of NETWORKS on a configuration, with its rates."""
+    """Return one of NETWORKS on a configuration, with its rates."""
     net = written(name).network
     entry = NETWORKS[name]
     sizes = {op.output: op.out_bytes for op in net.operations}
     input_size = sum(math.prod(shape) for shape in net.inputs.values())
     weight_bytes = sum(written(name).read_bytes.values())
     output_size = sum(sizes[result] for result in net.outputs)
-    host = (
-        host_work(input_size, output_size, weight_bytes, entry.host)
-        if entry.host
-        else host_work(0, 0, 0, "copy")
-    )
+    sizes_read = (input_size, output_size, weight_bytes) if entry.host else (0, 0, 0)
+    host = host_work(*sizes_read, entry.host or "copy")
     layers = Layers.of(count_work(net.operations, dpu), dpu)
     cores = dpu.whole("cpu", "cores")
     largest = largest_map_bytes(net.operations)

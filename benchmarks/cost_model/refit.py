@@ -43,7 +43,7 @@ FITTED = (
 
 
 def with_cost(profile: str, board: str) -> str:
-    """The profile's text with its [cost] fitted anew."""
+    """Return the text of a profile with a new [cost]."""
     lines = [HEADER]
     lines += [
         f'{key} = {{ value = {value}, status = "{status}", source = "{source}" }}'
@@ -56,7 +56,7 @@ def with_cost(profile: str, board: str) -> str:
 
 
 def cost_table(board: str) -> Iterator[tuple[str, str, str, str]]:
-    """Key, value, status and source of each constant of a board's [cost]."""
+    """Yield key, value, status and source of each constant of a board's [cost]."""
     validation = nested(board)
     source = FITTED.format(rows=len(validation.cases.rows))
     for key, value in asdict(rounded(fit(validation.cases))).items():
@@ -108,7 +108,7 @@ def cost_table(board: str) -> Iterator[tuple[str, str, str, str]]:
 
 
 def fitted_ranges(validation: Nested) -> dict[str, tuple[float, float]]:
-    """Ranges of the networks that the DPU bounds: the others tell nothing of it."""
+    """Return the ranges of the networks whose rate the DPU sets."""
     bound = {row.network for row in validation.rows if not row.on_host}
     maps = [row.map_bytes for row in validation.cases.rows if row.network in bound]
     works = [sum(op.operations for op in written(name).network.operations) for name in bound]
@@ -116,7 +116,9 @@ def fitted_ranges(validation: Nested) -> dict[str, tuple[float, float]]:
 
 
 def accuracy() -> Iterator[tuple[object, ...]]:
-    """A row a board: errors of networks whose family was left out, and what the intervals held."""
+    """Yield a row for each board: errors of networks whose family was left out, and the coverage
+    of the intervals.
+    """
     errors = "median", "mean", "largest", "Spearman"
     held = "rates inside", "families", "width", "settled", "right"
     yield "board", "networks", "families", "rates", *errors, *held
@@ -144,7 +146,7 @@ def accuracy() -> Iterator[tuple[object, ...]]:
 
 
 def by_kind() -> Iterator[tuple[object, ...]]:
-    """A row a board and kind of network: errors of networks whose family was left out."""
+    """Yield a row for each board and kind of network: errors with the family left out."""
     yield (
         "board",
         "kind",
@@ -180,7 +182,7 @@ def by_kind() -> Iterator[tuple[object, ...]]:
 
 
 def by_kinship() -> Iterator[tuple[object, ...]]:
-    """A row a kind of kinship: what one run of an owner gains, on its board and across boards."""
+    """Yield a row for each kinship: the gain by one run, on its own board and across boards."""
     yield "run on", "predicted on", "kinship", "pairs", "without", "with", "inside"
     zynq = [board for board in boards() if host_cores(board) == host_cores("zcu102")]
     for owner, board in [*((name, name) for name in boards()), *permutations(zynq, 2)]:
@@ -198,7 +200,7 @@ def _percent(share: float) -> str:
 
 
 def table(rows: Iterable[Iterable[object]]) -> str:
-    """A Markdown table, its head first."""
+    """Return a table in Markdown from its head and its rows."""
     head, *lines = [list(map(str, row)) for row in rows]
     return (
         "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *lines)) + "\n"

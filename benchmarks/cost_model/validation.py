@@ -2,7 +2,7 @@
 follow.
 
 Networks of one family resemble one another, so a family is left out as a whole. What is chosen and
-what is judged are kept apart by two rounds (nested cross-validation): for each family left out,
+what is judged are selected apart by two rounds (nested cross-validation): for each family left out,
 `crowding` is chosen, and the width of the interval made, from errors on others of the families that
 remain. Boards of one processor share `crowding`. `nested` is what the errors of the documents and
 the widths of [cost] come from.
@@ -27,7 +27,7 @@ from benchmarks.cost_model.fit import Cases, fit
 from benchmarks.cost_model.published import boards, host_cores, published_cases, written
 
 CROWDINGS = (2.0, 4.0)
-"""What the cross-validation chooses from."""
+"""The values among which the cross-validation chooses."""
 OVERLAP = {"DPUCZDX8G": 1.0, "DPUCVDX8G": 0.5, "DPUCV2DX8G": 0.5}
 """By DPU.
 
@@ -50,7 +50,7 @@ that part alone.
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What was found of a network on a configuration, its family left out.
+    """The errors of a network on a configuration, its family left out.
 
     Attributes:
         network: its name.
@@ -72,7 +72,7 @@ class LeftOut:
 
     @property
     def held(self) -> float:
-        """Share of the published rates inside the interval."""
+        """The share of the published rates inside the interval."""
         return float(np.mean(np.abs(self.rates) <= self.width))
 
 
@@ -102,8 +102,8 @@ def nested(board: str) -> Nested:
 
 @cache
 def chosen(board: str, left_out: str = "") -> float:
-    """The crowding of least mean error over the boards of a board's processor, all families but
-    one.
+    """Return the crowding of least mean error, over the boards of a board's processor and all
+    families but one.
 
     Args:
         board: its name.
@@ -134,7 +134,7 @@ class Trial:
         self._fits: dict[frozenset[str], Constants] = {}
 
     def fit_without(self, unseen: Iterable[str]) -> Constants:
-        """The constants that the other families give."""
+        """Return the constants that are fitted to the other families."""
         key = frozenset(unseen) & frozenset(self.names)
         if key not in self._fits:
             self._fits[key] = fit(
@@ -143,7 +143,7 @@ class Trial:
         return self._fits[key]
 
     def left_out(self, name: str) -> list[LeftOut]:
-        """A family, predicted without it, in intervals whose widths were made without it."""
+        """Predict a family with constants and interval widths that do not depend on it."""
         widths = widths_of(*self.inner(name))
         tested = self.cases.only(self.cases.families == name)
         constants = self.fit_without({name})
@@ -176,13 +176,13 @@ class Trial:
         return errors, training, shares
 
     def score(self, left_out: str) -> float:
-        """Mean over families of the mean error, all but one."""
+        """Return the mean over the other families of their mean error."""
         errors, training, _ = self.inner(left_out)
         return family_mean(np.abs(errors), training.families)
 
 
 def widths_of(errors: Array, cases: Cases, shares: Array) -> Array:
-    """Widths of PARTS, (6,), that SHARE of the families lie inside with every rate of all networks.
+    """Return the widths of PARTS, (6,), that hold every rate of SHARE of the families.
 
     What counts of a case is its rate that lies farthest off. The typical errors of the parts, none
     below 0, are those whose means, weighed by the shares, come nearest to these by least squares; a
@@ -203,12 +203,12 @@ def widths_of(errors: Array, cases: Cases, shares: Array) -> Array:
 
 
 def hosts_of(shares: Array) -> NDArray[np.bool_]:
-    """Where the host sets the rate, (n,)."""
+    """Return True where the host sets the rate, (n,)."""
     return np.asarray(shares[:, PARTS.index("copies") :].sum(axis=1) > 0.5)
 
 
 def family_mean(sizes: Array, families: NDArray[np.str_]) -> float:
-    """Mean over families of the mean."""
+    """Return the mean over families of their means."""
     return float(np.mean([sizes[families == name].mean() for name in dict.fromkeys(families)]))
 
 
@@ -245,7 +245,9 @@ def pair_width(board: str) -> float:
             fit(cases.only(names != name), near=trial.near)
         )
     on_dpu = ~hosts_of(cases.shares(trial.near))
-    outcomes = [(row, e) for row, e, kept in zip(cases.rows, errors, on_dpu, strict=True) if kept]
+    outcomes = [
+        (row, e) for row, e, selected in zip(cases.rows, errors, on_dpu, strict=True) if selected
+    ]
     distances = [
         abs(x - y)
         for (a, x), (b, y) in combinations(outcomes, 2)
@@ -330,7 +332,7 @@ def corrected(owner: str, board: str) -> dict[str, Corrected]:
 
     All of them are predicted without their families.
     """
-    found = defaultdict(list)
+    by_kin = defaultdict(list)
     theirs, ours = (
         [(row, _levels(row, name)) for row in nested(name).rows] for name in (owner, board)
     )
@@ -339,9 +341,9 @@ def corrected(owner: str, board: str) -> dict[str, Corrected]:
             factor, left = correction(of, [(levels, -run.error)])
             shift = np.log(factor)
             held = np.all(np.abs(row.rates + shift) <= left * row.width)
-            found[_kin(run, row, levels, of)].append((row.error, row.error + shift, held))
+            by_kin[_kin(run, row, levels, of)].append((row.error, row.error + shift, held))
     kinds = {}
-    for kin, outcomes in sorted(found.items()):
+    for kin, outcomes in sorted(by_kin.items()):
         before, after, held = np.array(outcomes, float).T
         off_before, off_after = (float(np.abs(np.expm1(e)).mean()) for e in (before, after))
         kinds[kin] = Corrected(len(outcomes), off_before, off_after, float(held.mean()))
@@ -362,6 +364,6 @@ def _kin(run: LeftOut, row: LeftOut, levels: Levels, of: Levels) -> str:
 
 
 def rank_correlation(validation: Nested) -> float:
-    """Spearman's: does the model put networks in the right order."""
+    """Return Spearman's rank correlation of predicted and published rates."""
     errors = np.array([row.error for row in validation.rows])
     return float(spearmanr(validation.cases.observed, validation.cases.observed + errors).statistic)

@@ -12,7 +12,7 @@ box and the probability of each class. The detector is anchor-free, like CenterN
 import io
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import onnx
@@ -25,8 +25,6 @@ DETECTOR = Path(__file__).with_name("detector.onnx")
 
 STRIDE_PX = 4
 """Side of a cell in input pixels."""
-MULTIPLE_PX = 8
-"""The sides of an input are multiples of this."""
 PRIOR = 0.02
 """The initial probability of each class (focal loss, Lin et al., 2017, arXiv 1708.02002)."""
 
@@ -102,7 +100,7 @@ def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
 
 
 def detector_to_onnx(
-    network: DetectorNetwork, names: Sequence[str], side_px: int, about: Mapping[str, str]
+    network: DetectorNetwork, names: Sequence[str], side_px: int, recipe: str
 ) -> onnx.ModelProto:
     """Export a detector to ONNX: `images` (1, 3, S, S), RGB in [0, 1], to `output0` (1, 4 +
     classes, S * S / 16).
@@ -116,7 +114,7 @@ def detector_to_onnx(
         network: the trained network.
         names: the names of the classes, in the network's order.
         side_px: S, a multiple of 8.
-        about: further metadata.
+        recipe: the settings of the training.
     """
     buffer = io.BytesIO()
     image = torch.zeros(1, 3, side_px, side_px)
@@ -135,13 +133,14 @@ def detector_to_onnx(
     model: onnx.ModelProto = onnx.ModelProto.FromString(buffer.getvalue())
     metadata = {
         "task": "detect",
-        "stride": MULTIPLE_PX,
+        "stride": 8,
         "batch": 1,
         "imgsz": [side_px, side_px],
         "channels": 3,
         "names": dict(enumerate(names)),
+        "description": "vehicles, ships, aircraft and tanks of drawn scenes",
+        "license": "Apache-2.0",
+        "recipe": recipe,
     }
-    onnx.helper.set_model_props(
-        model, {**{key: str(value) for key, value in metadata.items()}, **about}
-    )
+    onnx.helper.set_model_props(model, {key: str(value) for key, value in metadata.items()})
     return model

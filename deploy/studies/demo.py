@@ -120,13 +120,13 @@ def bench_tables(model: Network, dn: np.ndarray, sensors: tuple[Sensor, Sensor])
     """
     dpu = load_dpu(DEFAULT_TARGET)
     halo_px = model.tiling.halo_px
-    chain = measure_chain(dn, *sensors)
+    pipeline = measure_chain(dn, *sensors)
     rows = []
     for width, height in ((dn.shape[1], dn.shape[0]), SWATH_PX):
         swath = Swath(width, height, TILE_PX, halo_px, consistency=True)
         prediction = predict_network(model, dpu, step_px=swath.step_px)
         network = tables.predicted_rows(VARIANT, prediction, swath)
-        rows.append([chain.row(swath), tables.processor_row(swath, dpu.target), *network])
+        rows.append([pipeline.row(swath), tables.processor_row(swath, dpu.target), *network])
     dpus = [load_dpu(name) for name in board_names()]
     boards = tables.sweep_rows(model, swath, dpus, [TILE_PX])
     within = tables.within_words(boards, dpus, WITHIN_S)

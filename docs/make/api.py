@@ -18,7 +18,7 @@ examples also use `import numpy as np`. Other modules may change without notice 
 
 
 def document() -> str:
-    """The whole page as Markdown: a directive for each name, where that name is defined."""
+    """Return the page: a directive for each name, at the module that defines it."""
     names = sorted(vars(bd)["__all__"], key=str.lower)
     return "\n".join([OPENING, *(f"::: {getattr(bd, name).__module__}.{name}\n" for name in names)])
 

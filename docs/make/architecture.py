@@ -21,15 +21,13 @@ END = "<!-- end of packages -->\n"
 
 
 def box_of(name: str) -> str:
-    """The box that a module is drawn in: its top-level package, or the package or the module one
-    level below.
-    """
+    """Return the box of a module: its top-level package, or the package or module below."""
     parts = name.split(".")
     return parts[0] if parts[0] in WHOLE else ".".join(parts[:2])
 
 
 def modules() -> dict[str, Path]:
-    """Every module by its name, but for the files that only say what a package offers."""
+    """Return the path of each module by its name, without `__init__` files."""
     paths = {}
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
@@ -53,15 +51,13 @@ def imports_of(path: Path, paths: dict[str, Path]) -> set[str]:
 
 
 def in_folder(module: str) -> str:
-    """Where a module of the installed package lies in the checkout: `beers_deploy` itself is
-    deploy/.
-    """
+    """Return the name of an installed module in the checkout, where `beers_deploy` is deploy/."""
     inner = module.removeprefix(f"{INSTALLED}.")
     return inner if inner.partition(".")[0] in PACKAGES[1:] else f"{PACKAGES[0]}.{inner}"
 
 
 def arrows() -> dict[str, set[str]]:
-    """From each box to those that it needs."""
+    """Return the boxes that each box imports."""
     paths = modules()
     packages = defaultdict[str, set[str]](set)
     for name, path in paths.items():
@@ -72,7 +68,7 @@ def arrows() -> dict[str, set[str]]:
 
 
 def beyond(box: str, edges: dict[str, set[str]]) -> set[str]:
-    """All that a box needs by way of others."""
+    """Return the boxes that a box imports by way of others."""
     reached = set[str]()
     waiting = list(edges.get(box, ()))
     while waiting:
@@ -83,9 +79,7 @@ def beyond(box: str, edges: dict[str, set[str]]) -> set[str]:
 
 
 def chart() -> str:
-    """The Mermaid text: a frame a package, a box a part, and the arrows that no longer way
-    replaces.
-    """
+    """Return the Mermaid text: packages, boxes, and the arrows that no longer way implies."""
     edges = arrows()
     boxes = sorted(set(edges).union(*edges.values()))
     lines = ["flowchart TD"]
@@ -107,7 +101,7 @@ def chart() -> str:
 
 
 def page(text: str) -> str:
-    """The page with the picture as it is now."""
+    """Return the text of the page with the current picture."""
     before, rest = text.split(BEGIN)
     return before + BEGIN + chart() + END + rest.split(END)[1]
 

@@ -57,13 +57,13 @@ FINDINGS = """- Weights: one bit may cost nothing or 20 dB. CRC-32 finds every i
 
 
 def document(networks: Mapping[str, Sequence[Row]]) -> str:
-    """The whole page as Markdown."""
+    """Return the page as Markdown."""
     shown = {VARIANTS[0]: networks[VARIANTS[0]]}
     return "\n".join([OPENING + FINDINGS + "\n".join(price_lines(networks)), "", *table(shown), ""])
 
 
 def price_lines(networks: Mapping[str, Sequence[Row]]) -> Iterator[str]:
-    """What all guards cost each network on the board."""
+    """Yield a line for each network: the cost of all guards on the board."""
     for name, rows in networks.items():
         row = next(row for row in rows if row.table == "guards" and row.name == "all guards")
         time, share, loss = (f"{figure} {figure.unit}" for figure in row.figures.values())
@@ -75,9 +75,7 @@ def price_lines(networks: Mapping[str, Sequence[Row]]) -> Iterator[str]:
 
 
 def table(networks: Mapping[str, Sequence[Row]]) -> Iterator[str]:
-    """PSNR by kind of memory and rate, with no guard and with all of them, a
-    column pair a network.
-    """
+    """Yield the table of PSNR by kind of memory and rate, without guards and with all of them."""
     guard_sets = SETS[0], SETS[-1]
     yield "PSNR in dB (measured), mean over patches and injections:\n"
     heads = map(", ".join, product(networks, guard_sets))

@@ -71,7 +71,7 @@ The four shipped scenes under `pleiades-degraded` ask for these effects, with th
 
 
 def document() -> str:
-    """The page as Markdown."""
+    """Return the page as Markdown."""
     parameters = chain.from_iterable(values.items() for values in SHOWN.values())
     examples = ", ".join(f"{key} {value:g}" for key, value in parameters)
     scene = procedural_scene(1500, 1500, np.random.default_rng(0)).radiance
@@ -82,12 +82,12 @@ def document() -> str:
 
 
 def plain() -> Instrument:
-    """A sensor with no optional effect."""
+    """Return a sensor without optional effects."""
     return Sensor.load("pleiades-degraded").nominal()
 
 
 def figure() -> Image.Image:
-    """A grid of crops: no optional effect, each alone, all."""
+    """Draw a grid of crops: without optional effects, with each alone, and with all."""
     side = (SIDE_PX + 2 * MARGIN_PX) * RATIO
     radiance = procedural_scene(3520, 3520, np.random.default_rng(0)).radiance
     scene = prepare_scene(radiance[2000 : 2000 + side, 2300 : 2300 + side], RATIO)
@@ -109,7 +109,7 @@ def figure() -> Image.Image:
 
 
 def bounds(radiance: np.ndarray) -> Iterator[str]:
-    """The effects that each scene asks for, as a Markdown table of their bounds."""
+    """Yield the Markdown table of the bounds of the effects that each scene has."""
     plans = dict[str, Plan]()
     for name in scene_names():
         call = SceneCall.load(name)

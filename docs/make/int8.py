@@ -1,9 +1,9 @@
-"""Makes the shipped INT8 files anew, one for all sensors each, calibrated on photographs.
+"""Regenerate the shipped INT8 files, each for all sensors, calibrated on photographs.
 
-Minutes a file. A file that is made anew has no interval: `python -m benchmarks.interval calibrate`
+    python docs/make/int8.py --images aerial/ [convbeers-s ...]
+
+It takes minutes a file. A new file has no interval: `python -m benchmarks.interval calibrate`
 writes it.
-
-python docs/make/int8.py --images aerial/ [convbeers-s ...]
 """
 
 import argparse
@@ -19,7 +19,7 @@ WEIGHTS = Path(__file__).parents[2] / "model" / "weights"
 
 
 def main() -> None:
-    """Make them one by one."""
+    """Regenerate the files that are named."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -68,7 +68,7 @@ failed for each change, with the number of cases in parentheses.
 
 
 def broken(text: str, mutation: Mutation) -> str:
-    """A file's text with the mutation in it.
+    """Return the text of a file with the mutation.
 
     Raises:
         SystemExit: what should change does not stand there just once.
@@ -85,8 +85,8 @@ def broken(text: str, mutation: Mutation) -> str:
 
 @contextmanager
 def repository_copy() -> Iterator[Path]:
-    """What git knows of or would take, in a temporary folder, with a test that
-    this is what runs.
+    """Yield a temporary copy of all files that git tracks or would add, with a test that checks
+    that the copy is what runs.
     """
     command = ["git", "ls-files", "-co", "--exclude-standard", "-z"]
     listed = subprocess.check_output(command, cwd=ROOT, text=True)  # noqa: S603 - the developer's own git
@@ -105,7 +105,7 @@ def repository_copy() -> Iterator[Path]:
 
 
 def failures_of(copy: Path, mutation: Mutation) -> Failures:
-    """Break the copy, run its stability tests, put it right again."""
+    """Break the copy, run its stability tests, and restore it."""
     file = copy / mutation.file
     original = file.read_text(encoding="utf-8")
     file.write_text(broken(original, mutation), encoding="utf-8")
@@ -142,7 +142,7 @@ def failures(copy: Path) -> Failures:
 
 
 def document(failures_by: Mapping[str, Failures]) -> str:
-    """The page as Markdown."""
+    """Return the page as Markdown."""
     lines = [OPENING, "| mutation | file | tests that fail |", "|---|---|---|"]
     for mutation in MUTATIONS:
         tests = ", ".join(
@@ -153,12 +153,12 @@ def document(failures_by: Mapping[str, Failures]) -> str:
 
 
 def described(mutation: Mutation) -> str:
-    """The two cells that say what is changed."""
+    """Return the two cells that describe the change."""
     return f"**{mutation.name}**: {mutation.meaning} | `{mutation.file}`"
 
 
 def main() -> int:
-    """Run all, write the page, and say which versions survived."""
+    """Run all mutations, write the page, and print those that survived."""
     by_mutation = {}
     with repository_copy() as copy, steps("breaking", len(MUTATIONS) + 1) as bar:
         if failing := failures(copy):

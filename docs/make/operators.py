@@ -53,7 +53,7 @@ the end of a float network and refuses the network elsewhere.
 
 
 def document() -> str:
-    """The whole page as Markdown."""
+    """Return the page as Markdown."""
     parts = [OPENING, *_boards(), *_kinds()]
     parts += _rules("Sizes, for every node", SIZES)
     parts += _rules(
@@ -98,7 +98,7 @@ def _gigabytes(rate: Constant) -> str:
 
 
 def _kinds() -> Iterator[str]:
-    """One section for the kinds that share their rules."""
+    """Yield one section for the kinds that share their rules."""
     kinds: dict[tuple[Rule, ...], list[Kind]] = {}
     for kind, rules in RULES.items():
         kinds.setdefault(rules, []).append(kind)
@@ -110,14 +110,14 @@ def _kinds() -> Iterator[str]:
 
 
 def _rules(title: str, rules: Iterable[Callable[..., object]]) -> list[str]:
-    """A line for each rule, and for each wording where the boards differ in more than numbers."""
+    """Return a line for each rule, and for each wording if boards differ in more than numbers."""
     lines = list(chain.from_iterable(map(_lines, rules)))
     return [f"## {title}\n", *(lines or ["Runs on every DPU."]), ""]
 
 
 def _npu(npu: Dpu) -> Iterator[str]:
-    """Every rule of a board with an NPU: AMD's table of operators and the
-    numbers of a VINT8 file.
+    """Yield the rules of a board with an NPU: AMD's table of operators, and the numbers of a VINT8
+    file.
     """
     texts = {
         rule_name(rule): (rule, rule_text(rule, npu)) for rule in all_rules() if applies(rule, npu)
@@ -140,7 +140,7 @@ def _npu(npu: Dpu) -> Iterator[str]:
 
 
 def _texts(rule: Callable[..., object]) -> dict[str, str]:
-    """What a rule says on each board with a DPU to which it applies."""
+    """Return the text of a rule on each board with a DPU to which it applies."""
     return {
         name: _without_sources(rule_text(rule, dpu), dpu)
         for name, dpu in DPUS.items()
@@ -171,7 +171,7 @@ def _each(values: Mapping[str, str]) -> str:
 
 
 def _without_sources(text: str, dpu: Dpu) -> str:
-    """A rule's text without its parentheses of sources, in which boards with one limit differ."""
+    """Return the text of a rule without its sources, in which boards with one limit differ."""
     sources = set[str]()
     tables: list[Mapping[str, object]] = [*dpu.tables.values(), dpu.target.activations]
     for facts in tables:
@@ -182,7 +182,7 @@ def _without_sources(text: str, dpu: Dpu) -> str:
 
 
 def _alike(texts: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """Each text once, with the boards that it is of."""
+    """Yield the boards of each different text, and the text."""
     boards: dict[str, list[str]] = {}
     for name, text in texts.items():
         boards.setdefault(text, []).append(name)

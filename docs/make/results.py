@@ -1,4 +1,4 @@
-"""Puts the figures of an evaluation into the pages of docs/results: the tables between their
+"""Put the figures of an evaluation into the pages of docs/results: the tables between their
 markers.
 
     beers-deploy evaluate --images aerial-test/ --sweep ... --json evaluation.json
@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def tables_of(path: Path) -> dict[str, list[Row]]:
-    """The rows of a document, by their table."""
+    """Return the rows of a document, by their table."""
     document: Any = read_json(path)
     tables: dict[str, list[Row]] = {}
     for row in document["rows"]:

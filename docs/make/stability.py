@@ -37,7 +37,7 @@ its bound.
 
 
 def document(subject: Subject, results: list[StageResult]) -> str:
-    """The whole page as Markdown."""
+    """Return the page as Markdown."""
     cases = ["## Cases and stages\n", LEGEND, "", *case_lines(results)]
     findings = ["## What is found\n", *finding_lines(subject, results)]
     return "\n".join(
@@ -46,7 +46,7 @@ def document(subject: Subject, results: list[StageResult]) -> str:
 
 
 def finding_lines(subject: Subject, results: list[StageResult]) -> Iterator[str]:
-    """The finding in a few sentences, with the figures behind it."""
+    """Yield the findings in a few sentences with their figures."""
     failed, limited = (
         sum(bool(getattr(r, name)) for r in results) for name in ("failed", "limitations")
     )
@@ -78,14 +78,14 @@ def finding_lines(subject: Subject, results: list[StageResult]) -> Iterator[str]
 
 
 def stage_lines() -> Iterator[str]:
-    """What each stage looks at, in the words of its code."""
+    """Yield a line for each stage, from its docstring."""
     yield "## Stages\n"
     for name, look in STAGES.items():
         yield f"- **{name}**: {(look.__doc__ or '').strip().splitlines()[0]}"
 
 
 def case_lines(results: list[StageResult]) -> Iterator[str]:
-    """The cases that came out alike in every stage, a line each."""
+    """Yield a line for each group of cases with the same verdicts."""
     groups: dict[str, list[str]] = {}
     for row in battery_rows(results):
         groups.setdefault(
@@ -95,7 +95,7 @@ def case_lines(results: list[StageResult]) -> Iterator[str]:
 
 
 def limitation_lines() -> Iterator[str]:
-    """Every limitation that is known, met or not."""
+    """Yield a line for each known limitation."""
     yield "## Known limitations\n"
     for limit in LIMITATIONS:
         where, checks, cases = (

@@ -162,7 +162,7 @@ file has its constants, so leave out what your DPU does not limit.
 
 
 def shipped() -> dict[str, dict[str, list[Constant]]]:
-    """The constants of every shipped board with a DPU, by table and key."""
+    """Return the constants of every shipped board with a DPU, by table and key."""
     by_table: dict[str, dict[str, list[Constant]]] = defaultdict(lambda: defaultdict(list))
     for board in map(TargetProfile.load, board_names()):
         tables = [
@@ -176,19 +176,19 @@ def shipped() -> dict[str, dict[str, list[Constant]]]:
 
 
 def limits(table: str) -> Mapping[str, Limits]:
-    """The numbers that the keys of a table can have."""
+    """Return the limits of the keys of a table."""
     return target_limits.CONFIGURATION if table == BUILD else target_limits.TABLES[table]
 
 
 def accepted(limit: Limits) -> str:
-    """The numbers of a key in a few words."""
+    """Return the limits of a key in a few words."""
     low = "above 0" if limit.low == target_limits.SMALLEST else f"{limit.low:g}"
     return f"{'whole, ' if limit.whole else ''}{low} to {limit.high:g}"
 
 
 def line(key: str, unit: str, meaning: str, limit: Limits, constants: list[Constant]) -> str:
-    """A key: what it is, its unit, the values among the shipped boards, and
-    those that it can have.
+    """Return the line of a key: its meaning, its unit, the values of the shipped boards, and its
+    limits.
     """
     low = min(c.low for c in constants)
     high = max(c.high for c in constants)
@@ -197,7 +197,7 @@ def line(key: str, unit: str, meaning: str, limit: Limits, constants: list[Const
 
 
 def document() -> str:
-    """The whole page as Markdown."""
+    """Return the page as Markdown."""
     return "\n".join([OPENING, *_constants(), *_words(), ""])
 
 

@@ -31,11 +31,6 @@ def test_the_profile_holds_what_the_fit_finds(board: str) -> None:
     assert rounded(fit(Cases(published_cases(board), Structure.of(dpu)))) == Constants.of(dpu)
 
 
-@pytest.mark.parametrize("board", boards())
-def test_no_array_does_more_than_its_peak(board: str) -> None:
-    assert 0 < Constants.of(load_dpu(board)).array_efficiency <= 1
-
-
 @pytest.mark.slow
 def test_every_network_is_the_published_one_and_passes_the_rules_of_its_boards() -> None:
     """AMD compiled them for these boards: a rule that refuses one is wrong, or it is written down

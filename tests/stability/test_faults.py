@@ -193,7 +193,7 @@ def test_every_single_flip_is_found_and_the_layer_scrubbed(core: IntCore, guards
     generator = np.random.default_rng(3)
     for op in core.convolutions:
         for _ in range(8):
-            injected = with_ops(core, {op.name: flip_conv(op, 1, generator)})
+            injected = with_ops(core, [flip_conv(op, 1, generator)])
             wrong = {
                 name for name, sum_ in checksums(injected).items() if sum_ != guards.checksums[name]
             }

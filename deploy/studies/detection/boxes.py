@@ -13,14 +13,14 @@ from skimage.transform import resize
 
 from beers_deploy.profiles.errors import OptionError
 
-LEAST_VISIBLE = 0.3
+MIN_VISIBLE = 0.3
 """If a smaller share of a box is inside the image, finding it counts neither for nor against a
 detector.
 """
 PADDING = 114 / 255
 OVERLAP = 0.7
-MOST = 300
-CANDIDATES = 30_000
+MAX_BOXES = 300
+MAX_CANDIDATES = 30_000
 """The values with which Ultralytics validates: the grey around an image, the overlap above which
 the box with the lower score is removed, the number of boxes retained in an image, and the number
 compared, best scores first.
@@ -87,7 +87,7 @@ class Boxes:
         inside = np.clip(self.corners, 0, limits)
         visible = areas(inside)
         full = areas(self.corners)
-        ignored = self.ignored | (visible < LEAST_VISIBLE * full)
+        ignored = self.ignored | (visible < MIN_VISIBLE * full)
         return replace(self, corners=inside, ignored=ignored)[visible > 0]
 
 
@@ -121,9 +121,9 @@ def suppress(boxes: Boxes) -> Boxes:
     """Return the boxes of a detector after non-maximum suppression within each class, best score
     first.
     """
-    candidates = np.argsort(-boxes.scores, kind="stable")[:CANDIDATES]
+    candidates = np.argsort(-boxes.scores, kind="stable")[:MAX_CANDIDATES]
     selection = list[int]()
-    while len(candidates) and len(selection) < MOST:
+    while len(candidates) and len(selection) < MAX_BOXES:
         best = int(candidates[0])
         candidates = candidates[1:]
         selection.append(best)
@@ -177,10 +177,6 @@ class Letterbox:
         )
         padded = np.pad(fitted.astype(np.float32), self._border, constant_values=PADDING)
         return np.ascontiguousarray(padded.transpose(2, 0, 1))
-
-    def to_input(self, corners: np.ndarray) -> np.ndarray:
-        """Convert (N, 4) corners from px of the image to px of the input."""
-        return np.asarray(corners * self._gain + self._shift)
 
     def to_image(self, corners: np.ndarray) -> np.ndarray:
         """Convert (N, 4) corners from px of the input to px of the image."""

@@ -30,9 +30,9 @@ from beers_deploy.profiles.errors import (
 from beers_deploy.quant.onnx.graph import constants
 from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata
 from beers_deploy.quant.session import open_session
-from beers_deploy.studies.detection.boxes import MOST, Boxes, Letterbox, suppress
+from beers_deploy.studies.detection.boxes import MAX_BOXES, Boxes, Letterbox, suppress
 
-LEAST_SCORE = 1e-3
+MIN_SCORE = 1e-3
 """Detections below this score are dropped, as Ultralytics validates: average precision needs the
 doubtful ones.
 """
@@ -196,22 +196,24 @@ def _flag(model: onnx.ModelProto) -> str:
     if not any(node.op_type == "NonMaxSuppression" for node in model.graph.node):
         return ""
     values = constants(model)
-    greater_inputs = (node.input for node in model.graph.node if node.op_type == "Greater")
-    names = chain.from_iterable(greater_inputs)
-    limits = [values[name].max() for name in names if name in values and values[name].size]
+    comparisons = (node.input for node in model.graph.node if node.op_type == "Greater")
+    limits = [
+        values[name].max()
+        for name in chain.from_iterable(comparisons)
+        if name in values and values[name].size
+    ]
     if limits and max(limits) <= CUT:
         return ""
     where = f"confidence {max(limits):.3g}" if limits else "an unknown confidence"
-    effect = (
-        f"The detector's own suppression drops what lies below {where}, so average "
-        "precision is too low"
+    return (
+        f"The detector's own suppression drops what lies below {where}, so average precision is "
+        "too low: export it without nms, or with conf=0.001."
     )
-    return f"{effect}: export it without nms, or with conf=0.001."
 
 
 def _raw(output: np.ndarray) -> Boxes:
     """Return every pair of an anchor and a class with a sufficient score, in px of the input."""
-    classes, anchors = np.nonzero(output[4:] > LEAST_SCORE)
+    classes, anchors = np.nonzero(output[4:] > MIN_SCORE)
     middle = output[:2, anchors].T.astype(np.float64)
     half = output[2:4, anchors].T.astype(np.float64) / 2
     corners = np.hstack([middle - half, middle + half])
@@ -222,13 +224,13 @@ def _final(output: np.ndarray, classes: int) -> Boxes:
     """Return the rows with a sufficient score, best first. The other rows pad the list with
     zeros.
     """
-    rows = output[output[:, 4] > LEAST_SCORE]
+    rows = output[output[:, 4] > MIN_SCORE]
     if not np.isin(rows[:, 5], np.arange(classes)).all():
         raise ModelError(
             f"The detector returns classes other than 0 to {classes - 1} in its sixth column. "
             f"{REMEDY}"
         )
-    rows = rows[np.argsort(-rows[:, 4], kind="stable")[:MOST]]
+    rows = rows[np.argsort(-rows[:, 4], kind="stable")[:MAX_BOXES]]
     return Boxes.of(rows[:, :4], rows[:, 5], rows[:, 4])
 
 
@@ -255,11 +257,9 @@ def class_names(names: Any) -> tuple[str, ...]:
 
 def parse_classes(text: str) -> dict[str, str]:
     """Parse LABELLED=DETECTOR,... and return the detector's class for each labelled class."""
-    pairs = [
-        [part.strip() for part in entry.split("=")] for entry in text.split(",") if entry.strip()
-    ]
-    sound = pairs and all(len(pair) == 2 and all(map(letters, pair)) for pair in pairs)
-    if not sound or len({letters(pair[0]) for pair in pairs}) < len(pairs):
+    pairs = [[part.strip() for part in entry.split("=")] for entry in text.split(",")]
+    valid = all(len(pair) == 2 and all(map(letters, pair)) for pair in pairs)
+    if not valid or len({letters(pair[0]) for pair in pairs}) < len(pairs):
         raise OptionError(
             "`classes` must be LABELLED=DETECTOR,..., each labelled class once, such as "
             f"car=vehicle,minibus=vehicle, but it is {printable(repr(text))}."
@@ -268,15 +268,15 @@ def parse_classes(text: str) -> dict[str, str]:
 
 
 def class_numbers(
-    labelled: Sequence[str], detector: Sequence[str], given: Mapping[str, str]
+    labelled: Sequence[str], detector: Sequence[str], mapping: Mapping[str, str]
 ) -> np.ndarray:
-    """Return for each labelled class its number among the detector's classes: the one given, else
-    the one with the same letters.
+    """Return for each labelled class its number among the detector's classes: the one that it is
+    mapped to, else the one with the same letters.
 
     Args:
         labelled: names in the order of the labels' numbers.
         detector: names in the order of the detector's.
-        given: detector's names by labelled ones, as `parse_classes` returns them.
+        mapping: detector's names by labelled ones, as `parse_classes` returns them.
 
     Returns:
         (L,) int64, -1 for a class that the detector does not know, as `Boxes.renamed` accepts it.
@@ -287,21 +287,16 @@ def class_numbers(
             "`detector` must have classes that differ in their letters, but two have the same "
             "letters. Export one whose classes differ."
         )
-    for whose, requested, names in (
-        ("the labelled", given, labelled),
-        ("the detector's", given.values(), detector),
-    ):
+    for requested, names in ((mapping, labelled), (mapping.values(), detector)):
         for name in requested:
             if letters(name) not in map(letters, names):
                 raise OptionError(
-                    f"{printable(repr(name))} in `classes` is not one of {whose} classes "
-                    f"({printable(', '.join(names), 4 * LONGEST)}). Correct the name."
+                    f"{printable(repr(name))} in `classes` is not one of the classes "
+                    f"{printable(', '.join(names), 4 * LONGEST)}. Write LABELLED=DETECTOR."
                 )
-    detector_letters = {letters(name): letters(own) for name, own in given.items()}
-    labelled_letters = [letters(name) for name in labelled]
-    numbers = np.array(
-        [number.get(detector_letters.get(key, key), -1) for key in labelled_letters], np.int64
-    )
+    own = {letters(name): letters(other) for name, other in mapping.items()}
+    keys = [own.get(letters(name), letters(name)) for name in labelled]
+    numbers = np.array([number.get(key, -1) for key in keys], np.int64)
     if not (numbers >= 0).any():
         raise OptionError(
             f"The labelled classes ({printable(', '.join(labelled)) or 'none'}) have no class in "

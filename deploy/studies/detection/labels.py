@@ -23,7 +23,6 @@ from beers_deploy.profiles.toml import read_json, read_whole
 from beers_deploy.studies.detection.boxes import Boxes, areas
 from beers_deploy.studies.detection.detector import letters
 
-LAYOUTS = "VOC (.xml) or COCO (.json) labels"
 CORRECT = "Correct the labels."
 LABEL_BYTES = 1 << 23
 """The largest size of a file of labels, which is 25 000 boxes of XML."""
@@ -86,31 +85,31 @@ def _labels_near(folder: Path) -> Path:
     if any(path.suffix.lower() == ".xml" for path in folder.iterdir()):
         return folder
     json_files = sorted(folder.glob("*.json"))
-    if len(json_files) > 1:
+    if len(json_files) != 1:
         raise OptionError(
-            f"{folder} has {len(json_files)} JSON files, but one file of labels is needed. Name it "
-            "as `labels`."
-        )
-    if not json_files:
-        raise OptionError(
-            f"There are no labels for the images in {folder}. Give {LAYOUTS} as `labels`."
+            f"{folder} must have .xml files of VOC labels or one .json file of COCO labels, but it "
+            f"has {len(json_files)} .json files. Give the labels as `labels`."
         )
     return json_files[0]
 
 
 def _read_each(images: Sequence[Path], where: Path) -> list[_File]:
     if not where.is_dir():
-        fault = "is another file" if where.exists() else "does not exist"
-        raise OptionError(f"{where} {fault}. Give a folder of {LAYOUTS}.")
+        raise OptionError(f"{where} is no folder of VOC labels and no .json file. Give the labels.")
     names_there = {path.name for path in where.iterdir()}
     absent = [f"{image.stem}.xml" for image in images if f"{image.stem}.xml" not in names_there]
+    _require_all(absent, len(images), where)
+    return [_read_voc(image, where / f"{image.stem}.xml") for image in images]
+
+
+def _require_all(absent: Sequence[str], count: int, folder: Path) -> None:
+    """Raise OptionError if files are absent."""
     if absent:
         raise OptionError(
-            f"{where} must have a file of labels for every image, but {len(absent)} of "
-            f"{len(images)} are missing, the first {absent[0]}. Leave those images out, or give "
-            "them files without objects."
+            f"{len(absent)} of {count} files are missing in {folder}, the first "
+            f"{printable(repr(absent[0]))}. Add them: an image without objects needs a file of "
+            "labels too."
         )
-    return [_read_voc(image, where / f"{image.stem}.xml") for image in images]
 
 
 def _labelled_set(files: Sequence[_File], notes: Sequence[str] = ()) -> LabelledSet:
@@ -134,8 +133,19 @@ def _labelled_set(files: Sequence[_File], notes: Sequence[str] = ()) -> Labelled
             f"The labels must have at least one object, but they have none on {len(images)} "
             "images. Check the labels."
         )
-    remarks = [*notes, *_remarks([truth for _, truth in images], outside)]
-    return LabelledSet(images, names, remarks)
+    truths = [truth for _, truth in images]
+    empty = sum(not len(truth) for truth in truths)
+    ignored = sum(int(truth.ignored.sum()) for truth in truths)
+    remarks = {
+        f"Images without a labelled object, all found there is false: {empty} of {len(truths)}.": (
+            empty
+        ),
+        f"Boxes left out, without area inside their image: {len(outside)}, the first in "
+        f"{''.join(outside[:1])}.": len(outside),
+        "Boxes that count neither way, difficult, a crowd or visible by less than 30 %: "
+        f"{ignored}.": ignored,
+    }
+    return LabelledSet(images, names, [*notes, *(text for text, n in remarks.items() if n)])
 
 
 def _size_px(one: _File) -> tuple[int, int]:
@@ -150,22 +160,6 @@ def _size_px(one: _File) -> tuple[int, int]:
             f"image has {height} x {width} px. Give the image that was labelled."
         )
     return height, width
-
-
-def _remarks(truths: Sequence[Boxes], outside: Sequence[str]) -> list[str]:
-    empty = sum(not len(truth) for truth in truths)
-    ignored = sum(int(truth.ignored.sum()) for truth in truths)
-    remarks = []
-    if empty:
-        count = f"{empty} of {len(truths)}"
-        remarks.append(f"Images without a labelled object, all found there is false: {count}.")
-    if outside:
-        count = f"{len(outside)}, the first in {outside[0]}"
-        remarks.append(f"Boxes left out, without area inside their image: {count}.")
-    if ignored:
-        kinds = "difficult, a crowd or visible by less than 30 %"
-        remarks.append(f"Boxes that count neither way, {kinds}: {ignored}.")
-    return remarks
 
 
 def _read_voc_tree(folder: Path, split: str | None) -> list[_File]:
@@ -191,12 +185,7 @@ def _read_voc_tree(folder: Path, split: str | None) -> list[_File]:
             f"`split` must be one of the splits of {folder} ({', '.join(lists) or 'none'}), but "
             f"it is {split!r}."
         )
-    absent = [stem for stem in stems if stem not in images]
-    if absent:
-        raise OptionError(
-            f"{folder} must have every image of {list_name}, but {len(absent)} of {len(stems)} "
-            f"are missing, the first {printable(repr(absent[0]))}. Unpack all images."
-        )
+    _require_all([stem for stem in stems if stem not in images], len(stems), folder)
     return [_read_voc(images[stem], labels / f"{stem}.xml") for stem in stems]
 
 

@@ -1,4 +1,4 @@
-"""The page of a detection study: precision by recall, crops with boxes, and the tables."""
+"""The page of a detection study: crops with boxes, and the tables."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,15 +9,8 @@ from PIL import Image, ImageDraw
 from beers_deploy.model.io.pictures import grid, picture_url
 from beers_deploy.profiles.figures import by_table
 from beers_deploy.report.page import Picture, Report, Section, write_report
-from beers_deploy.report.plots import SERIES, Curve, curves_svg, data_url
 from beers_deploy.results import Table
-from beers_deploy.studies.detection.average_precision import (
-    ALL,
-    RECALLS,
-    match,
-    mean_known,
-    precisions,
-)
+from beers_deploy.studies.detection.average_precision import ALL, match
 from beers_deploy.studies.detection.boxes import Boxes
 from beers_deploy.studies.detection.study import REFERENCE, Comparison
 from beers_deploy.studies.detection.tables import BY_SIZE, MAIN, PAPER_NOTES
@@ -26,7 +19,7 @@ from beers_deploy.studies.evaluation.methods import DEGRADED
 CROP_PX = 88
 ZOOM = 3
 PICTURES = 4
-FOUND = "#2fd39b"
+HIT = "#2fd39b"
 MISSED = "#ff5a36"
 FALSE = "#ffd21f"
 """The colours of boxes: found, missed and false."""
@@ -67,32 +60,10 @@ def write_page(compared: Sequence[Comparison], table: Table, path: Path) -> None
     truths = [acquired.scene.truth for acquired in compared[0].scenes]
     objects = sum(int((~truth.ignored).sum()) for truth in truths)
     title = f"What restoration buys a detector: {objects} objects on {len(truths)} images"
-    pictures = [curves(compared), *crops(compared)]
     # The last note is the headline.
     *notes, line = table.notes
-    write_report(Report(title, line, tables, pictures, (*notes, *NOTES, *PAPER_NOTES)), path)
-
-
-def curves(compared: Sequence[Comparison]) -> Picture:
-    """Plot precision by recall at an overlap of one half, means over classes, with a panel for each
-    sensor.
-    """
-    panels = [
-        (comparison.name, [_curve(comparison, row) for row in comparison.hits])
-        for comparison in compared
-    ]
-    svg = curves_svg(panels, "recall", "precision", logarithmic=False)
-    caption = "At an overlap of 0.5, mean over the classes that are labelled."
-    return Picture("Precision by recall", data_url(svg), caption)
-
-
-def _curve(comparison: Comparison, row: str) -> Curve:
-    hits = comparison.hits[row]
-    once = np.ones((1, len(comparison.scenes)), np.int64)
-    by_class = [precisions(hits, kind, once)[0, 0] for kind in range(len(comparison.names))]
-    values = mean_known(np.array(by_class))
-    points = tuple(zip(RECALLS.tolist(), values.tolist(), strict=True))
-    return Curve(row, list(comparison.hits).index(row) % len(SERIES), row == REFERENCE, points)
+    remarks = (*notes, *NOTES, *PAPER_NOTES)
+    write_report(Report(title, line, tables, crops(compared), remarks), path)
 
 
 def crops(compared: Sequence[Comparison]) -> list[Picture]:
@@ -111,9 +82,10 @@ def _missed_objects(comparison: Comparison, number: int) -> np.ndarray:
     """Return a mask (M,) of the objects of a scene that are found on the reference and not on
     degraded images.
     """
-    return np.asarray(
-        _matched(comparison, REFERENCE, number)[-1] & ~_matched(comparison, DEGRADED, number)[-1]
+    on_reference, on_degraded = (
+        _matched(comparison, row, number)[-1] for row in (REFERENCE, DEGRADED)
     )
+    return np.asarray(on_reference & ~on_degraded)
 
 
 def _matched(
@@ -184,7 +156,7 @@ def _cell(comparison: Comparison, row: str, number: int, middle: np.ndarray) -> 
     layers = (
         (truth.corners[~matched & ~truth.ignored], MISSED),
         (boxes.corners[~hits & ~ignored], FALSE),
-        (boxes.corners[hits], FOUND),
+        (boxes.corners[hits], HIT),
     )
     for corners, colour in layers:
         for x1, y1, x2, y2 in (corners / ratio - np.tile(corner, 2)) * ZOOM:

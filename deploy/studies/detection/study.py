@@ -214,7 +214,7 @@ def acquired(
 
 def labelled_scenes(
     names: Sequence[str],
-    given: Mapping[str, str],
+    mapping: Mapping[str, str],
     images: Path,
     labels: Path | None = None,
     split: str | None = None,
@@ -224,15 +224,22 @@ def labelled_scenes(
 
     Args:
         names: of the classes that the detector knows.
-        given: the detector's names by labelled ones, where letters do not match.
+        mapping: the detector's names by labelled ones, where letters do not match.
         images: as `read_labelled` accepts it.
         labels: their path, if not next to the pictures.
         split: the part of a tree.
     """
     labelled = read_labelled(images, labels, split)
-    numbers = class_numbers(labelled.names, names, given)
+    numbers = class_numbers(labelled.names, names, mapping)
     scenes = [_of_file(path, truth.renamed(numbers)) for path, truth in labelled.images]
-    return scenes, [*labelled.notes, *left_out(labelled.names, numbers)]
+    notes = [*labelled.notes]
+    unknown = [name for name, number in zip(labelled.names, numbers, strict=True) if number < 0]
+    if unknown:
+        notes.append(
+            f"Not known to the detector and left out: {', '.join(unknown)}. What it finds there "
+            "counts as false."
+        )
+    return scenes, notes
 
 
 def _of_file(path: Path, truth: Boxes) -> LabelledScene:
@@ -240,12 +247,3 @@ def _of_file(path: Path, truth: Boxes) -> LabelledScene:
     return LabelledScene(
         path.name, site_of(path.name), truth, path, lambda sensor: read_scene(path, sensor).radiance
     )
-
-
-def left_out(labelled: Sequence[str], numbers: np.ndarray) -> list[str]:
-    """Return a sentence on the labelled classes that the detector does not know, if there are
-    any.
-    """
-    names = [name for name, number in zip(labelled, numbers, strict=True) if number < 0]
-    sentence = f"Not known to the detector and left out: {', '.join(names)}. What it finds there "
-    return [f"{sentence}counts as false."] if names else []

@@ -65,18 +65,25 @@ def detection_rows(comparison: Comparison) -> list[Row]:
     and by size.
     """
     # A class without a labelled object has no average precision.
-    labelled = [
-        name
-        for name in comparison.names
-        if not isnan(comparison.figures[REFERENCE][f"mAP50 of {name}"][0])
-    ]
-    by_class = {name: f"mAP50 of {name}" for name in labelled}
+    by_class = {
+        name: key
+        for name, key in ((name, f"mAP50 of {name}") for name in comparison.names)
+        if not isnan(comparison.figures[REFERENCE][key][0])
+    }
     by_size = {name: f"mAP50 {name}" for name in list(SIZES_PX)[1:]}
+    own = {"precision": "own precision", "recall": "own recall"}
     rows = [_main_row(comparison, row) for row in comparison.methods]
-    rows += [_own_row(comparison, row) for row in comparison.methods]
-    for table, keys in ((BY_CLASS, by_class), (BY_SIZE, by_size)):
-        name = f"{table}, {comparison.name}"
-        rows += [Row(name, row, _values(comparison, row, keys)) for row in comparison.methods]
+    for table, keys in ((OWN, own), (BY_CLASS, by_class), (BY_SIZE, by_size)):
+        for row in comparison.methods:
+            figures = _values(comparison, row, keys)
+            if table == OWN:
+                confidence = float(comparison.figures[row]["own confidence"][0])
+                figures["confidence"] = (
+                    unavailable("ratio", NO_OBJECT)
+                    if isnan(confidence)
+                    else measured(confidence, "ratio", "largest mean F1")
+                )
+            rows.append(Row(f"{table}, {comparison.name}", row, figures))
     return rows
 
 
@@ -124,15 +131,6 @@ def _regained(comparison: Comparison, gain: np.ndarray, loss: np.ndarray) -> Fig
     return _figure(
         comparison, np.divide(gain, loss, out=np.full(gain.shape, np.nan), where=loss != 0)
     )
-
-
-def _own_row(comparison: Comparison, row: str) -> Row:
-    figures = _values(comparison, row, {"precision": "own precision", "recall": "own recall"})
-    own = float(comparison.figures[row]["own confidence"][0])
-    confidence = (
-        unavailable("ratio", NO_OBJECT) if isnan(own) else measured(own, "ratio", "largest mean F1")
-    )
-    return Row(f"{OWN}, {comparison.name}", row, {**figures, "confidence": confidence})
 
 
 def _values(comparison: Comparison, row: str, keys: Mapping[str, str]) -> dict[str, Figure]:
@@ -200,19 +198,18 @@ def headline(compared: Sequence[Comparison]) -> str:
     """Return a sentence for each sensor: the loss, and the part that the last of the methods
     recovers.
     """
-    return " ".join(_sentence(comparison) for comparison in compared)
-
-
-def _sentence(comparison: Comparison) -> str:
-    rows = {row: _main_row(comparison, row) for row in comparison.methods}
-    text = f"{comparison.name}: mAP50 is {rows[REFERENCE].figures['mAP50']} % on reference images"
-    text += f" and {rows[DEGRADED].figures[LOSS]} points less on degraded ones"
-    last = list(rows.values())[-1]
-    if GAIN in last.figures:
-        share = last.figures[REGAINED]
-        text += (
-            f"; {last.name} changes it by {last.figures[GAIN]} points "
-            f"({last.text['against degraded']}"
+    sentences = []
+    for comparison in compared:
+        rows = {row: _main_row(comparison, row) for row in comparison.methods}
+        text = (
+            f"{comparison.name}: mAP50 is {rows[REFERENCE].figures['mAP50']} % on reference images "
+            f"and {rows[DEGRADED].figures[LOSS]} points less on degraded ones"
         )
-        text += f", {share} % of the loss regained)" if share.value is not None else ")"
-    return f"{text} (measured)."
+        last = list(rows.values())[-1]
+        if GAIN in last.figures:
+            text += f"; {last.name} changes it by {last.figures[GAIN]} points "
+            text += f"({last.text['against degraded']}"
+            share = last.figures[REGAINED]
+            text += f", {share} % of the loss regained)" if share.value is not None else ")"
+        sentences.append(f"{text} (measured).")
+    return " ".join(sentences)

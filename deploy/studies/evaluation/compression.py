@@ -137,16 +137,6 @@ def _code(image: np.ndarray, **options: object) -> bytes:
     return buffer.getvalue()
 
 
-def with_noise(sensor: Instrument, variance_dn2: float) -> Instrument:
-    """Return a sensor with more noise, the same at every radiance.
-
-    Args:
-        sensor: as it is.
-        variance_dn2: of the noise that is added.
-    """
-    return replace(sensor, beta=sensor.beta + variance_dn2 / sensor.gain_dn_per_radiance**2)
-
-
 @dataclass(frozen=True)
 class Trial:
     """PSNRs and rates of a method at one rate, image by image.
@@ -229,18 +219,22 @@ def run_compression(
     Returns:
         A row for each method and rate, then one for each method with its lossless rates.
     """
-    received = {
-        rate: _all_decompressed([p.degraded for p in pairs], rate, sensor) for rate in rates
-    }
+    raws = [pair.degraded for pair in pairs]
+    received = {rate: [decompressed(raw, rate, sensor.bits) for raw in raws] for rate in rates}
     restoring = [method for method in methods if method.name != DEGRADED] if rates else []
     rows = list[Row]()
     lossless = list[Row]()
     with steps("compression", len(restoring) * len(rates)) as bar:
         for method in restoring:
-            restored = [method.restore(pair.degraded) for pair in pairs]
-            lossless.append(_lossless_row(method.name, pairs, restored, sensor.bits))
-            for rate, raw in received.items():
-                trial = try_method(method, pairs, restored, raw, rate, sensor)
+            restored = [method.restore(raw) for raw in raws]
+            figures = {}
+            for key, several in {"raw": raws, "restored": restored}.items():
+                lossless_rates = [lossless_rate(image, sensor.bits) for image in several]
+                source = f"mean of {len(several)} images"
+                figures[key] = measured(float(np.mean(lossless_rates)), RATE, source)
+            lossless.append(Row(LOSSLESS, method.name, figures))
+            for rate, images in received.items():
+                trial = try_method(method, pairs, restored, images, rate, sensor)
                 rows.append(trial.row(f"{method.name}, {rate:g} {RATE}", seed))
                 bar.advance()
     return [*rows, *lossless]
@@ -264,7 +258,7 @@ def try_method(
         rate: in bits per pixel.
         sensor: the sensor that acquired the images.
     """
-    sent = _all_decompressed(restored, rate, sensor)
+    sent = [decompressed(image, rate, sensor.bits) for image in restored]
     shares = SHARES if method.specialise else SHARES[:1]
     board = np.empty(len(pairs))
     ground = np.empty((len(shares), len(pairs)))
@@ -275,30 +269,15 @@ def try_method(
         for k, share in enumerate(shares):
             specialised = method
             if share:
-                specialised = method.with_sensor(with_noise(sensor, share * errors[number]))
+                # The variance of the noise grows by the same number at every radiance.
+                variance = share * errors[number] / sensor.gain_dn_per_radiance**2
+                specialised = method.with_sensor(replace(sensor, beta=sensor.beta + variance))
             ground[k, number] = _psnr_db(specialised.restore(image.dn), pair, sensor)
     rates = [[image.rate for image in images] for images in (sent, raw)]
     return Trial(board, ground, np.array(rates), errors, [pair.site for pair in pairs])
-
-
-def _all_decompressed(
-    images: Sequence[np.ndarray], rate: float, sensor: Instrument
-) -> list[Decompressed]:
-    return [decompressed(image, rate, sensor.bits) for image in images]
 
 
 def _psnr_db(dn: np.ndarray, pair: NamedPair, sensor: Instrument) -> float:
     """Return the PSNR of inner pixels against the reference, without its noise if that is known."""
     truth = pair.reference if pair.noise_free is None else pair.noise_free
     return fidelity_db(inner(dn), inner(truth), inner(pair.degraded), sensor.max_dn)
-
-
-def _lossless_row(
-    name: str, pairs: Sequence[NamedPair], restored: Sequence[np.ndarray], bits: int
-) -> Row:
-    images = {"raw": [pair.degraded for pair in pairs], "restored": restored}
-    figures = {}
-    for key, several in images.items():
-        rates = [lossless_rate(image, bits) for image in several]
-        figures[key] = measured(float(np.mean(rates)), RATE, f"mean of {len(rates)} images")
-    return Row(LOSSLESS, name, figures)

@@ -37,7 +37,7 @@ TRADITIONAL: Final = "traditional"
 DECONVOLVE_FIRST: Final = "deconvolve-first"
 
 ORDERS: dict[str, Order] = {TRADITIONAL: "denoise-first", DECONVOLVE_FIRST: "deconvolve-first"}
-CHAINS: dict[str, tuple[str, Order]] = {
+PIPELINES: dict[str, tuple[str, Order]] = {
     **{
         f"{name}-{quality}": (quality, order)
         for (name, order), quality in product(ORDERS.items(), QUALITIES)
@@ -48,7 +48,7 @@ CHAINS: dict[str, tuple[str, Order]] = {
     },
 }
 """Quality and order of each traditional pipeline and of its peers, by name."""
-WITHOUT_NETWORK = (DEGRADED, *CHAINS)
+WITHOUT_NETWORK = (DEGRADED, *PIPELINES)
 """The input itself, and the traditional pipelines and their peers."""
 
 KNOWN = "known"
@@ -86,12 +86,12 @@ def method_without_network(name: str, degraded: Instrument, reference: Instrumen
     """
     if name == DEGRADED:
         return Method(name, lambda dn: dn, "the input itself")
-    quality, order = CHAINS[name]
+    quality, order = PIPELINES[name]
     run = PEERS.get(name, restore_traditional)
 
     def specialise(sensor: Instrument) -> Restore:
-        chain = Chain(sensor, reference.in_units_of(sensor), quality, order)
-        return lambda dn: run(torch.from_numpy(dn), chain).numpy()
+        pipeline = Chain(sensor, reference.in_units_of(sensor), quality, order)
+        return lambda dn: run(torch.from_numpy(dn), pipeline).numpy()
 
     return Method(name, specialise(degraded), KNOWN, specialise)
 

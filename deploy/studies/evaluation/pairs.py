@@ -2,7 +2,6 @@
 `simulate` wrote.
 """
 
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -158,16 +157,13 @@ def oversampling_note(pairs: Sequence[NamedPair], profile: Sensor) -> str:
     "".
     """
     own = int(profile.oversampling.low)
-    counts = Counter(pair.oversampling for pair in pairs if pair.oversampling is not None)
-    if not set(counts) - {own}:
+    ratios = {pair.oversampling for pair in pairs if pair.oversampling is not None}
+    if ratios <= {own}:
         return ""
-    used = " and ".join(
-        f"{ratio} ({count} of {len(pairs)} images)" for ratio, count in sorted(counts.items())[::-1]
-    )
     return (
-        f"Scene pixels per pixel: {used}, where {profile.name} states {own}; at most "
-        f"{OVERSAMPLINGS[0]} are taken, "
-        f"and {OVERSAMPLINGS[1]} of small images ('simulate' keeps the profile's)."
+        f"Scene pixels per pixel: {' and '.join(map(str, sorted(ratios)))}, where {profile.name} "
+        f"states {own}; at most {OVERSAMPLINGS[0]} are taken, and {OVERSAMPLINGS[1]} of small "
+        "images ('simulate' keeps the profile's)."
     )
 
 
@@ -184,12 +180,11 @@ def read_pairs(
             read_acquisition(path, max_dn=max_dn) for path in (degraded, reference)
         )
         if degraded_dn.shape != reference_dn.shape:
-            sizes = " and ".join(
-                f"{image.shape[1]} x {image.shape[0]}" for image in (degraded_dn, reference_dn)
-            )
             raise ImageError(
                 f"The two images of the pair {degraded.stem} must have one size, but they have "
-                f"{sizes} px. Crop them alike."
+                "{1} x {0} and {3} x {2} px. Crop them alike.".format(
+                    *degraded_dn.shape, *reference_dn.shape
+                )
             )
         place = recipe.site(degraded.stem) if recipe else None
         pairs.append(NamedPair(degraded.stem, degraded_dn, reference_dn, place))

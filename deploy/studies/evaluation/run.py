@@ -114,8 +114,11 @@ def run_evaluation(plan: Plan) -> Evaluation:
     instruments = scores.Instruments(distances, nominal.max_dn, nominal.offset_dn)
     remarks = list[str]()
     sensor_rows = list[Row]()
+    loaded = list[NamedPair]()
     if plan.given is not None:
-        loaded = [_named(number, pair) for number, pair in enumerate(plan.given)]
+        for number, pair in enumerate(plan.given):
+            degraded, reference = (image.astype(np.float32) for image in pair)
+            loaded.append(NamedPair(f"pair{number}", degraded, reference, noise_free=pair.clean))
     elif plan.folder is not None:
         loaded = read_pairs(plan.folder, nominal.max_dn, read_pairs_recipe(plan.folder))
         sensor_rows = [_sensor_row(loaded, sensors[0], str(plan.folder), plan.strict)]
@@ -181,14 +184,10 @@ def _compared(
 def _in_order(rows: Iterable[Row]) -> list[Row]:
     """Return the rows by table: means, targets, sites, images; with the sites' means among them."""
     tables = by_table(rows)
-    means: list[Row] = []
-    images: list[Row] = []
-    for name, table in tables.items():
-        if name.startswith("mean"):
-            means += table
-        if name.startswith("images"):
-            images += table
-    return [*means, *tables[targets.TARGETS], *scores.site_rows(tables["images"]), *images]
+    means = [table for name, table in tables.items() if name.startswith("mean")]
+    images = [table for name, table in tables.items() if name.startswith("images")]
+    sites = scores.site_rows(tables["images"])
+    return [*chain(*means, tables[targets.TARGETS], sites, *images)]
 
 
 def _sensor_row(pairs: Sequence[NamedPair], sensor: Sensor, name: str, strict: bool) -> Row:
@@ -219,11 +218,6 @@ def _inputs(plan: Plan) -> Iterator[Path | Input]:
     yield from chain.from_iterable(map(list_images, folders))
 
 
-def _named(number: int, pair: Pair) -> NamedPair:
-    degraded, reference = (image.astype(np.float32) for image in pair)
-    return NamedPair(f"pair{number}", degraded, reference, noise_free=pair.clean)
-
-
 def _method(
     name: str,
     source: NetworkLike | Restore,
@@ -246,14 +240,6 @@ CHECKED_IMAGES = 16
 """The largest number of images that are compared with the sensor."""
 
 
-def chosen_pairs(pairs: Sequence[NamedPair]) -> list[NamedPair]:
-    """Return the first pair of each of the first few sites."""
-    first = dict[str, NamedPair]()
-    for pair in pairs:
-        first.setdefault(pair.site, pair)
-    return list(first.values())[:SITES]
-
-
 def strip_of(pair: NamedPair, methods: Sequence[Method]) -> tuple[np.ndarray, float]:
     """Draw crops of every method and the reference, with the absolute errors below them.
 
@@ -261,13 +247,10 @@ def strip_of(pair: NamedPair, methods: Sequence[Method]) -> tuple[np.ndarray, fl
         The picture (h, w) uint8, and the error in DN that is shown white.
     """
     images = {method.name: method.restore(pair.degraded) for method in methods}
+    images["reference"] = pair.reference
     side = min(CROP_PX, *pair.degraded.shape)
     top, left = busiest_windows(pair.reference, side)[0]
-    images_and_reference = {**images, "reference": pair.reference}
-    crops = {
-        name: image[top : top + side, left : left + side]
-        for name, image in images_and_reference.items()
-    }
+    crops = {name: image[top : top + side, left : left + side] for name, image in images.items()}
     errors = {name: np.abs(crop - crops["reference"]) for name, crop in crops.items()}
     # The degraded input sets the scale of the errors, so that all methods share it.
     white = max(float(np.percentile(errors[methods[0].name], 99)), 1.0)
@@ -280,8 +263,11 @@ def strip_of(pair: NamedPair, methods: Sequence[Method]) -> tuple[np.ndarray, fl
 
 def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -> list[Picture]:
     """Draw a strip for each of a few sites, and also write it to OUT/SITE.png."""
+    # Reversed, so that the first pair of each site is the one that stays.
+    by_site = {pair.site: pair for pair in reversed(pairs)}
+    sites = list(dict.fromkeys(pair.site for pair in pairs))[:SITES]
     strips = []
-    for pair in chosen_pairs(pairs):
+    for pair in (by_site[site] for site in sites):
         strip, white = strip_of(pair, methods)
         with whole_file(out / f"{pair.site}.png") as temporary:
             Image.fromarray(strip).save(temporary, "PNG", optimize=True)
@@ -303,20 +289,11 @@ def evaluation_report(evaluation: Evaluation, strips: Sequence[Picture]) -> Repo
         if not name.startswith("images"):
             heading = HEADINGS.get(name, name)
             title = f"{heading[0].upper()}{heading[1:]}"
-            tables.append(Section(title, rows, caption_of(name)))
+            captions = (text for start, text in CAPTIONS.items() if name.startswith(start))
+            tables.append(Section(title, rows, next(captions)))
     return Report(
         evaluation.title, headline(evaluation.rows), tables, strips, (*NOTES, *evaluation.notes)
     )
-
-
-def caption_of(table: str) -> str:
-    """Return the sentence that explains a table to its reader."""
-    if table.startswith("mean"):
-        return MEAN_CAPTION if table == "mean" else DIMMED_CAPTION
-    if table == targets.TARGETS:
-        return TARGETS_CAPTION
-    captions = {compression.GAIN: GAIN_CAPTION, compression.LOSSLESS: LOSSLESS_CAPTION}
-    return captions.get(table, SWEEP_CAPTION if table.startswith("sweep") else SITES_CAPTION)
 
 
 MEAN_CAPTION = (
@@ -357,6 +334,16 @@ SWEEP_CAPTION = (
     "row, unless it says that another one is supposed. Of gains and losses the interval is that of "
     "differences on the same images."
 )
+CAPTIONS = {
+    "mean,": DIMMED_CAPTION,
+    "mean": MEAN_CAPTION,
+    targets.TARGETS: TARGETS_CAPTION,
+    compression.GAIN: GAIN_CAPTION,
+    compression.LOSSLESS: LOSSLESS_CAPTION,
+    "sweep": SWEEP_CAPTION,
+    "": SITES_CAPTION,
+}
+"""By the beginning of a table's name; the first that fits counts."""
 NOTES = (
     "MTF at Nyquist is measured on restored slanted edges.",
     (

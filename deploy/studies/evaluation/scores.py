@@ -234,27 +234,26 @@ def site_rows(rows: Sequence[Row]) -> list[Row]:
     for each method.
     """
     images = [row for row in rows if row.table == "images"]
-    there = [
+    keys = [
         key
         for key in images[0].figures
-        if any(row.figures[key].value is not None for row in images)
+        if key != "PSNR gain" and any(row.figures[key].value is not None for row in images)
     ]
-    keys = [key for key in there if key != "PSNR gain"]
     sites = dict.fromkeys(row.text["site"] for row in images)
-    by_site = {site: [row for row in images if row.text["site"] == site] for site in sites}
-    return [_site_row(key, site, here) for key, (site, here) in product(keys, by_site.items())]
-
-
-def _site_row(key: str, site: str, images: Sequence[Row]) -> Row:
-    figures: dict[str, Figure] = {}
-    for method in dict.fromkeys(row.name.split(": ")[0] for row in images):
-        here = [row.figures[key] for row in images if row.name.startswith(f"{method}: ")]
-        values = [figure.value for figure in here if figure.value is not None]
-        source = f"mean {key} of {len(values)} pairs"
-        figures[method] = (
-            measured(float(np.mean(values)), here[0].unit, source) if values else here[0]
-        )
-    return Row(f"{key} by site", site, figures, {"images": str(len(here))})
+    methods = dict.fromkeys(row.name.split(": ")[0] for row in images)
+    rows = []
+    for key, site in product(keys, sites):
+        here = [row for row in images if row.text["site"] == site]
+        figures: dict[str, Figure] = {}
+        for method in methods:
+            own = [row.figures[key] for row in here if row.name.startswith(f"{method}: ")]
+            values = [figure.value for figure in own if figure.value is not None]
+            source = f"mean {key} of {len(values)} pairs"
+            figures[method] = (
+                measured(float(np.mean(values)), own[0].unit, source) if values else own[0]
+            )
+        rows.append(Row(f"{key} by site", site, figures, {"images": str(len(own))}))
+    return rows
 
 
 SOURCE = "ConvBEERS paper, table on its simulated test set"

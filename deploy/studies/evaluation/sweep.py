@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -99,7 +100,7 @@ def run_sweep(
     reference: Sensor,
     seed: int,
     brightness: float = 1.0,
-) -> "Found":
+) -> "SweepResult":
     """Run the input, the pipeline and every network under every condition, on one scene of each
     site.
 
@@ -140,7 +141,7 @@ def run_sweep(
                 if brightness == 1 and supposed in (name, NOMINAL):
                     mtf[key] = restored_mtf(specialised, edges, sensor.max_dn)
                 bar.advance(1, f"{name}: {method.name}")
-    return Found(psnr, mtf, [pair.site for pair in pairs], seed, brightness)
+    return SweepResult(psnr, mtf, [pair.site for pair in pairs], seed, brightness)
 
 
 def _trials(
@@ -155,10 +156,7 @@ def _trials(
     drifted = [] if name == NOMINAL else [(NOMINAL, units, methods[1])]
     able = [method for method in methods if method.specialise is not None]
     supposed = suppositions(nominal, profile).get(name, {})
-    wrong = [
-        (supposition, other, method)
-        for (supposition, other), method in product(supposed.items(), able)
-    ]
+    wrong = [(other, sensor, method) for (other, sensor), method in product(supposed.items(), able)]
     return [*((name, sensor, method) for method in methods), *drifted, *wrong]
 
 
@@ -169,14 +167,8 @@ def _psnr_db(method: Method, pairs: Sequence[NamedPair], max_dn: int) -> np.ndar
     rows = []
     for pair in pairs:
         dn = method.restore(pair.degraded)
-        references = (pair.reference, pair.noise_free)
-        rows.append(
-            [
-                fidelity_db(dn, image, pair.degraded, max_dn)
-                for image in references
-                if image is not None
-            ]
-        )
+        references = [pair.reference, cast(np.ndarray, pair.noise_free)]
+        rows.append([fidelity_db(dn, image, pair.degraded, max_dn) for image in references])
     return np.array(rows).T
 
 
@@ -188,7 +180,7 @@ Key = tuple[str, str, str]
 
 
 @dataclass(frozen=True)
-class Found:
+class SweepResult:
     """The measurements of a sweep, trial by trial.
 
     Attributes:
@@ -215,11 +207,8 @@ class Found:
     @property
     def networks(self) -> list[str]:
         """The names of the methods that are neither the input nor the pipeline."""
-        return [
-            name
-            for name in dict.fromkeys(name for *_, name in self.psnr)
-            if name not in (DEGRADED, TRADITIONAL)
-        ]
+        names = dict.fromkeys(name for *_, name in self.psnr)
+        return [name for name in names if name not in (DEGRADED, TRADITIONAL)]
 
     @property
     def rows(self) -> list[Row]:
@@ -228,73 +217,56 @@ class Found:
 
         The MTF does not depend on the scenes, so it is left out if their brightness is changed.
         """
-        psnr, clean = (
-            {key: self._mean(both[k]) for key, both in self.psnr.items()} for k in (0, 1)
-        )
-        tables = [("sweep, PSNR", psnr), (f"sweep, {NOISE_FREE}", clean)]
+        names = ("sweep, PSNR", f"sweep, {NOISE_FREE}")
+        tables: list[tuple[str, Mapping[Key, Figure]]] = [
+            (name, {key: self._mean(both[k]) for key, both in self.psnr.items()})
+            for k, name in enumerate(names)
+        ]
         if self.brightness == 1:
-            tables.append(("sweep, MTF at Nyquist", dict(self.mtf)))
+            tables.append(("sweep, MTF at Nyquist", self.mtf))
         rows: list[Row] = []
         for (table, figures), truth in product(tables, self.conditions):
-            columns = self._columns(truth)
+            columns = {
+                DEGRADED: (truth, truth, DEGRADED),
+                TRUTH_KNOWN: (truth, truth, TRADITIONAL),
+                NOMINAL_KNOWN: (truth, NOMINAL, TRADITIONAL),
+                **{name: (truth, truth, name) for name in self.networks},
+            }
             row = {column: figures[key] for column, key in columns.items()}
             rows.append(Row(table, truth, row))
         rows += [*self._gains(), *self._wrong()]
         return [replace(row, table=table_at(self.brightness, row.table)) for row in rows]
 
-    def _columns(self, truth: str) -> dict[str, Key]:
-        """Return the keys of the input, the pipeline that knows the truth, the one that knows the
-        nominal sensor, and each network.
-        """
-        chains = {
-            TRUTH_KNOWN: (truth, truth, TRADITIONAL),
-            NOMINAL_KNOWN: (truth, NOMINAL, TRADITIONAL),
-        }
-        networks = {name: (truth, truth, name) for name in self.networks}
-        return {DEGRADED: (truth, truth, DEGRADED), **chains, **networks}
-
     def _gains(self) -> list[Row]:
         """Return the gain of each network over the pipeline that knows the truth: by condition,
         then over all of them.
         """
-        psnr = {
-            (truth, name): both[0]
-            for (truth, supposed, name), both in self.psnr.items()
-            if truth == supposed
-        }
+        table = "sweep, gain over the pipeline"
         gains = {
-            truth: {name: psnr[truth, name] - psnr[truth, TRADITIONAL] for name in self.networks}
+            truth: {
+                name: self.psnr[truth, truth, name][0] - self.psnr[truth, truth, TRADITIONAL][0]
+                for name in self.networks
+            }
             for truth in self.conditions
         }
-        rows = [
-            Row("sweep, gain over the pipeline", truth, self._means(by_network))
-            for truth, by_network in gains.items()
-        ]
+        rows = [Row(table, truth, self._means(by_name)) for truth, by_name in gains.items()]
         over_all = []
         for network in self.networks:
-            by_condition = {truth: by_network[network] for truth, by_network in gains.items()}
-            over_all.append(self._over_all(network, by_condition))
+            own = {truth: by_name[network] for truth, by_name in gains.items()}
+            least = min(own, key=lambda truth: float(own[truth].mean()))
+            mean = np.mean(list(own.values()), axis=0)
+            figures = self._means({f"mean of {len(own)} conditions": mean, "least": own[least]})
+            over_all.append(Row(f"{table}, all conditions", network, figures, {"least at": least}))
         return [*rows, *over_all] if over_all else []
-
-    def _over_all(self, network: str, gains: Mapping[str, np.ndarray]) -> Row:
-        least = min(gains, key=lambda truth: float(gains[truth].mean()))
-        mean = self._mean(np.mean(list(gains.values()), axis=0))
-        figures = {f"mean of {len(gains)} conditions": mean, "least": self._mean(gains[least])}
-        return Row(
-            "sweep, gain over the pipeline, all conditions", network, figures, {"least at": least}
-        )
 
     def _wrong(self) -> list[Row]:
         """Return the PSNR of each method that assumes a wrong sensor, and the loss due to that."""
         pairs = dict.fromkeys(key[:2] for key in self.psnr if key[1] not in (key[0], NOMINAL))
         psnr = []
         losses = []
-        for truth, supposed in pairs:
-            wrong = {
-                key[2]: values[0]
-                for key, values in self.psnr.items()
-                if key[:2] == (truth, supposed)
-            }
+        for pair in pairs:
+            truth, supposed = pair
+            wrong = {key[2]: values[0] for key, values in self.psnr.items() if key[:2] == pair}
             cost = {
                 name: self.psnr[truth, truth, name][0] - values for name, values in wrong.items()
             }

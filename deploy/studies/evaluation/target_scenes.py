@@ -129,8 +129,12 @@ def acquire_targets(sensor: Instrument, reference: Instrument, seed: int) -> Tar
     points = [
         _acquire_points(background, *sensors, next(draws)) for background in POINT_BACKGROUNDS
     ]
-    scenes = [*_bars(), *_zone_plates()]
-    patterns = [_acquire_pattern(*scene, *sensors, next(draws)) for scene in scenes]
+    patterns = []
+    for name, contrast, mask in (*_bars(), *_zone_plates()):
+        scene = (PATTERN_BACKGROUND * (1 + contrast)).astype(np.float32)
+        draw = next(draws)
+        raw = _acquire(scene, sensor, draw)
+        patterns.append(Pattern(name, raw, _without_noise(scene, sensors[1], draw), mask))
     return Targets(sensor, acquire_edges(sensor, seed), flats, points, patterns)
 
 
@@ -144,9 +148,8 @@ def _acquire(
 
 def _without_noise(scene: np.ndarray, sensor: Instrument, draw: Draw) -> np.ndarray:
     spectrum = scene_spectrum(scene)
-    return acquire(
-        spectrum, scene.shape[1], sensor, OVERSAMPLING, draw, "reference", margin_px=0, skip=NOISE
-    )
+    side = scene.shape[1]
+    return acquire(spectrum, side, sensor, OVERSAMPLING, draw, "reference", margin_px=0, skip=NOISE)
 
 
 def acquire_edges(sensor: Instrument, seed: int) -> Edges:
@@ -227,17 +230,3 @@ def _radius_px(side_px: int, ratio: int) -> np.ndarray:
     """
     place = _places_px(side_px, ratio) - (side_px - 1) / 2
     return np.hypot(place[:, None], place)
-
-
-def _acquire_pattern(
-    name: str,
-    contrast: np.ndarray,
-    mask: np.ndarray,
-    sensor: Instrument,
-    reference: Instrument,
-    draw: Draw,
-) -> Pattern:
-    scene = (PATTERN_BACKGROUND * (1 + contrast)).astype(np.float32)
-    return Pattern(
-        name, _acquire(scene, sensor, draw), _without_noise(scene, reference, draw), mask
-    )

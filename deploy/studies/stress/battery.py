@@ -127,13 +127,13 @@ def _excess(measure: Measure) -> float:
     return math.inf if math.isnan(measure.value) else measure.value - measure.allowed
 
 
-def chosen(names: str | Sequence[str] | None, known: Iterable[str], option: str) -> list[str]:
-    """Return names from a list, or from text with commas; all if None.
+def chosen(names: str | Sequence[str] | None, available: Iterable[str], option: str) -> list[str]:
+    """Return the names of a list, or of text with commas; all that are available if None.
 
     Raises:
-        OptionError: a name is unknown.
+        OptionError: a name is not available.
     """
-    every = list(known)
+    every = list(available)
     if names is None:
         return every
     parts = names.split(",") if isinstance(names, str) else names
@@ -141,8 +141,8 @@ def chosen(names: str | Sequence[str] | None, known: Iterable[str], option: str)
     for name in selection:
         if name not in every:
             raise OptionError(
-                f"`{option}` must be some of {', '.join(every)}, separated by commas, but it has "
-                f"{printable(repr(name))}."
+                f"`{option}` has no {printable(repr(name))}. Give some of {', '.join(every)}, "
+                "separated by commas."
             )
     return selection
 
@@ -172,11 +172,11 @@ def battery_table(
     """
     results = run_battery(subject, cases, stages, seed, side_px)
     layers = layer_rows(subject)
-    failed = [result for result in results if result.failed]
-    failures = "; ".join(
+    failed = [
         f"{result.case.name}, {result.stage}: {result.verdict.removeprefix('FAILED: ')}"
-        for result in failed
-    )
+        for result in results
+        if result.failed
+    ]
     # A sum that might overflow is a failure, even if no case makes it overflow.
     overflowing = [row.name for row in layers if row.text["can it overflow int32"] != "no"]
     reasons = dict.fromkeys(result.reason for result in results if result.reason)
@@ -191,7 +191,7 @@ def battery_table(
             *finding_rows(results),
         ),
         checks=(
-            Check("failures", len(failed), 0, "result", detail=failures),
+            Check("failures", len(failed), 0, "result", detail="; ".join(failed)),
             Check(
                 "sums that might overflow",
                 len(overflowing),

@@ -7,6 +7,7 @@ Then the DPU's arithmetic runs in integers.
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from math import exp
 
 import numpy as np
@@ -17,7 +18,7 @@ from beers_deploy.dpu.cost.model import Constants
 from beers_deploy.model.blocks import Placed
 from beers_deploy.model.metrics.fidelity import psnr_db
 from beers_deploy.model.progress import steps
-from beers_deploy.model.self_check import Judged, SelfCheck
+from beers_deploy.model.self_check import SelfCheck
 from beers_deploy.performance.swath import predict_network
 from beers_deploy.profiles.figures import Row, measured, predicted, unavailable
 from beers_deploy.profiles.shipped import TILE_PX
@@ -188,18 +189,6 @@ def _quality_db(
     return psnr_db(faults.restored(injected, guards), reference, 1.0)
 
 
-def _judged(check: SelfCheck, image: np.ndarray, restored: np.ndarray) -> Judged:
-    """Check the blocks of a patch.
-
-    Args:
-        check: the self-check of the patch's sensor.
-        image: the raw patch (1, 1, H, W) in [0, 1].
-        restored: the restored patch, likewise.
-    """
-    sides = (Placed(side, 0, 0, side) for side in image.shape[2:])
-    return check.judge(image[0, 0].astype(np.float32), restored[0, 0], *sides)
-
-
 def _drawn(
     target: FaultTarget, name: str, rate: float, draw: int, seed: int, clean: Quality
 ) -> Injection:
@@ -229,7 +218,9 @@ def _drawn(
     if memory.persistent:
         repaired = faults.corrected(injected, target.core, target.guards, rate, generator)
         guarded = _quality_db(repaired, target.guards, reference)
-    blocks = _judged(target.checks[draw % len(target.pairs)], injected.image, unguarded)
+    sides = (Placed(side, 0, 0, side) for side in image.shape[2:])
+    check = target.checks[draw % len(target.pairs)]
+    blocks = check.judge(injected.image[0, 0].astype(np.float32), unguarded[0, 0], *sides)
     return Injection(
         injected.flips,
         (bare, clamped, guarded),
@@ -294,7 +285,6 @@ def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Ro
     scrubbing_s = faults.weight_bits(target.core) / faults.INT8_BITS / rate
     # A shift is read as one byte from each of the three copies.
     copies_s = 3 * len(faults.shifts_of(target.core)) / rate
-    spread = exp(dpu.value("cost", "width_outside"))
     guards = {
         f"ReLU6 at {len(target.guards.relu6)} of {relus} ReLUs": (0.0, FUSED),
         f"limit of the correction, {target.guards.limit_dn:g} DN": (limit_s, INSTRUCTED),
@@ -302,45 +292,33 @@ def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Ro
         "triple modular redundancy of the shifts": (copies_s, READ),
         "all guards": (limit_s + scrubbing_s + copies_s, f"{INSTRUCTED}; {READ}"),
     }
-    return [
-        _price_row(name, time_s, source, prediction, spread)
-        for name, (time_s, source) in guards.items()
-    ]
-
-
-def _price_row(name: str, time_s: float, source: str, prediction: Prediction, spread: float) -> Row:
-    """Return the row of a guard.
-
-    Args:
-        name: of the guard.
-        time_s: time of the guard for a tile in seconds.
-        source: how the time was predicted.
-        prediction: the time of the network without the guard.
-        spread: factor by which the time may be off either way.
-    """
+    error_factor = exp(dpu.value("cost", "width_outside"))
     tile_s = prediction.batch_time_s / prediction.batch
     slow, fast = prediction.fps_interval
-    # The host prepares the next tile while the DPU runs. Only the time beyond that reduces the
-    # frame rate.
-    before_s = max(tile_s, prediction.host_s)
-    beside_s = max(tile_s, prediction.host_s + time_s)
-    times_s = (time_s / spread, time_s * spread)
-    # The share is largest at the highest frame rate, where a tile needs the least time.
-    most = 100 * time_s * spread * fast
-    figures = {
-        "time": predicted(1e3 * time_s, "ms/tile", (1e3 * times_s[0], 1e3 * times_s[1]), source),
-        "of a tile, if nothing hides": predicted(
-            100 * time_s / tile_s, "%", (100 * times_s[0] * slow, most), source
-        ),
-        "frame rate lost beside the DPU": predicted(
-            100 * (1 - before_s / beside_s), "%", (0.0, most), source
-        ),
-    }
-    return Row("guards", name, figures)
+    rows = []
+    for name, (time_s, source) in guards.items():
+        # The host prepares the next tile while the DPU runs. Only the time beyond that reduces the
+        # frame rate.
+        before_s = max(tile_s, prediction.host_s)
+        beside_s = max(tile_s, prediction.host_s + time_s)
+        low_s = time_s / error_factor
+        high_s = time_s * error_factor
+        # The share is largest at the highest frame rate, where a tile needs the least time.
+        most = 100 * high_s * fast
+        lost = 100 * (1 - before_s / beside_s)
+        figures = {
+            "time": predicted(1e3 * time_s, "ms/tile", (1e3 * low_s, 1e3 * high_s), source),
+            "of a tile, if nothing hides": predicted(
+                100 * time_s / tile_s, "%", (100 * low_s * slow, most), source
+            ),
+            "frame rate lost beside the DPU": predicted(lost, "%", (0.0, most), source),
+        }
+        rows.append(Row("guards", name, figures))
+    return rows
 
 
 def flip_curves_svg(networks: Mapping[str, Sequence[Row]]) -> str:
-    """Return a plot of PSNR against bit flips, with all guards and with none.
+    """Return a plot of PSNR against bit flips, with all guards and, dashed, with none.
 
     Args:
         networks: the rows of each network by its name. Only those of the table "bit flips" are
@@ -349,26 +327,17 @@ def flip_curves_svg(networks: Mapping[str, Sequence[Row]]) -> str:
     Returns:
         An SVG with a panel for each kind of memory.
     """
-    panels = [(memory, _curves(networks, memory)) for memory in faults.MEMORIES]
-    return curves_svg(panels, "bit flips in a megabit", "PSNR, dB (measured)")
-
-
-def _curves(networks: Mapping[str, Sequence[Row]], memory: str) -> list[Curve]:
-    """Return two curves of each network for a kind of memory.
-
-    Args:
-        networks: the rows of each network by its name.
-        memory: the kind of memory.
-
-    Returns:
-        PSNR in dB against the rate of flips, with all guards and, dashed, without guards.
-    """
-    curves = []
-    for colour, (name, rows) in enumerate(networks.items()):
-        by_name = {row.name: row.figures for row in rows if row.table == "bit flips"}
-        for guards in ("all guards", "no guard"):
-            rates = faults.MEMORIES[memory].rates
-            values = ((rate, by_name[name_of(memory, rate)][guards].value) for rate in rates)
-            points = tuple((rate, value) for rate, value in values if value is not None)
+    rows_of = {
+        name: {row.name: row.figures for row in rows if row.table == "bit flips"}
+        for name, rows in networks.items()
+    }
+    panels = []
+    for memory, kind in faults.MEMORIES.items():
+        curves = []
+        for (colour, name), guards in product(enumerate(rows_of), ("all guards", "no guard")):
+            figures = (rows_of[name][name_of(memory, rate)][guards] for rate in kind.rates)
+            values = (figure.value or 0.0 for figure in figures)
+            points = tuple(zip(kind.rates, values, strict=True))
             curves.append(Curve(f"{name}, {guards}", colour, guards == "no guard", points))
-    return curves
+        panels.append((memory, curves))
+    return curves_svg(panels, "bit flips in a megabit", "PSNR, dB (measured)")

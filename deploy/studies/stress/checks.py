@@ -188,11 +188,7 @@ LIMITATIONS: tuple[Limitation, ...] = (
 def limitation_of(stage: str, case: str, measure: Measure) -> Limitation | None:
     """Return the limitation that explains a measure outside its bound, or None."""
     for limit in LIMITATIONS:
-        applies = (
-            stage in limit.stages
-            and measure.check in limit.checks
-            and (not limit.cases or case in limit.cases)
-        )
-        if applies and measure.value <= limit.ceiling:
+        applies = stage in limit.stages and measure.check in limit.checks
+        if applies and case in (limit.cases or [case]) and measure.value <= limit.ceiling:
             return limit
     return None

@@ -66,9 +66,7 @@ def as_stored(core: IntCore) -> IntCore:
     for (op, field), shift in shifts_of(core).items():
         if not -(1 << (SHIFT_BITS - 1)) <= shift < 1 << (SHIFT_BITS - 1):
             raise _refused(f"{field} {shift} at {op}")
-    return replace(
-        core, ops=tuple(_narrow(op) if isinstance(op, IntConv) else op for op in core.ops)
-    )
+    return with_ops(core, map(_narrow, core.convolutions))
 
 
 def _narrow(op: IntConv) -> IntConv:
@@ -103,12 +101,12 @@ def flip_weights(core: IntCore, count: int, generator: np.random.Generator) -> I
     sizes = np.array([op.weight.size + op.bias.size for op in core.convolutions])
     # How many of the bits fall into each layer, as if all were drawn from one memory without
     # replacement.
-    share = generator.multivariate_hypergeometric(sizes * INT8_BITS, count)
-    hit = {
-        op.name: flip_conv(op, int(n), generator)
-        for op, n in zip(core.convolutions, share, strict=True)
-        if n
-    }
+    counts = generator.multivariate_hypergeometric(sizes * INT8_BITS, count).tolist()
+    hit = (
+        flip_conv(op, flips, generator)
+        for op, flips in zip(core.convolutions, counts, strict=True)
+        if flips
+    )
     return with_ops(core, hit)
 
 
@@ -120,9 +118,10 @@ def flip_conv(op: IntConv, count: int, generator: np.random.Generator) -> IntCon
     )
 
 
-def with_ops(core: IntCore, others: Mapping[str, IntConv]) -> IntCore:
-    """Return the core with the convolutions of these names replaced."""
-    return replace(core, ops=tuple(others.get(op.name, op) for op in core.ops))
+def with_ops(core: IntCore, others: Iterable[IntConv]) -> IntCore:
+    """Return the core with other convolutions in place of those of the same name."""
+    by_name = {op.name: op for op in others}
+    return replace(core, ops=tuple(by_name.get(op.name, op) for op in core.ops))
 
 
 def map_channels(core: IntCore) -> dict[str, int]:
@@ -207,12 +206,12 @@ def checksums(core: IntCore) -> dict[str, int]:
     }
 
 
-def scrubbed(core: IntCore, sound: IntCore, known: Mapping[str, int]) -> IntCore:
-    """Return the core after scrubbing: every convolution whose checksum differs from the known one
-    is replaced by a valid copy.
+def scrubbed(core: IntCore, sound: IntCore, checks: Mapping[str, int]) -> IntCore:
+    """Return the core after scrubbing: every convolution whose checksum differs from that in
+    `checks` is replaced by a valid copy.
     """
-    wrong = {name for name, _ in checksums(core).items() - known.items()}
-    return with_ops(core, {op.name: op for op in sound.convolutions if op.name in wrong})
+    wrong = {name for name, _ in checksums(core).items() - checks.items()}
+    return with_ops(core, (op for op in sound.convolutions if op.name in wrong))
 
 
 def voted(copies: tuple[Shifts, Shifts, Shifts]) -> Shifts:

@@ -1,4 +1,6 @@
-"""Choose a point by limits such as `latency<=20s`, and recommend it in one line."""
+"""Choose a point by limits such as `latency<=20s`, recommend it in one line, and compare the best
+point of each board with it.
+"""
 
 import math
 import re
@@ -6,13 +8,16 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from beers_deploy.profiles.errors import OptionError, printable
-from beers_deploy.profiles.figures import Figure, number
+from beers_deploy.profiles.figures import Figure, Row
 from beers_deploy.studies.tradeoff.front import (
+    BOARDS,
     COSTS,
+    LATENCY,
     PSNR,
     Comparison,
     Measured,
     ends,
+    figures_to_compare,
     placed,
     significant,
     verdict,
@@ -29,7 +34,6 @@ NAMES: dict[str, tuple[str, str]] = {
 }
 """The names that a user may write: the figure that each one stands for, and its unit."""
 BARE_UNITS = ("ratio", "distance")
-"""Units that are not written after a number."""
 
 WORTH_A_WORD_DB = 0.002
 """Smaller gains are not mentioned unless they are significant."""
@@ -37,6 +41,11 @@ WORTH_A_WORD_DB = 0.002
 CONSTRAINT = re.compile(
     r"(?P<name>[a-z0-9-]+)\s*(?P<side><=|>=)\s*(?P<limit>[+-]?\d+(\.\d+)?([eE][+-]?\d+)?)\s*(?P<unit>\S*)"
 )
+
+
+def with_unit(text: str, unit: str) -> str:
+    """Return a number with its unit, if that is written after numbers."""
+    return text if unit in BARE_UNITS else f"{text} {unit}"
 
 
 @dataclass(frozen=True)
@@ -49,20 +58,8 @@ class Constraint:
     unit: str
 
     def __str__(self) -> str:
-        return f"{self.key} {'<=' if self.at_most else '>='} {self.limit:g}{self._unit}"
-
-    def in_words(self, value: float) -> str:
-        """Return a value of the figure with its unit, with enough digits to distinguish it from the
-        limit.
-        """
-        digits = next(
-            (count for count in range(3, 9) if float(f"{value:.{count}g}") != self.limit), 9
-        )
-        return f"{number(value, digits)}{self._unit}"
-
-    @property
-    def _unit(self) -> str:
-        return "" if self.unit in BARE_UNITS else f" {self.unit}"
+        sign = "<=" if self.at_most else ">="
+        return f"{self.key} {sign} {with_unit(f'{self.limit:g}', self.unit)}"
 
     def violation(self, point: Measured) -> float:
         """Return the violation by a point as a share of the limit: 0 if it complies, infinity if it
@@ -129,11 +126,11 @@ class Question:
         """Return the cost that the budget names, else the first that any point has, starting with
         the board's latency.
         """
-        in_budget = (constraint.key for constraint in self.budget if constraint.key in COSTS)
-        available = (
+        limited = [constraint.key for constraint in self.budget]
+        available = [
             key for key in COSTS if any(not math.isnan(point.value(key)) for point in points)
-        )
-        return next(in_budget, next(available, COSTS[0]))
+        ]
+        return next(key for key in (*limited, *available, LATENCY) if key in COSTS)
 
 
 def recommend(points: Sequence[Measured], asked: Question) -> tuple[Measured | None, str]:
@@ -166,14 +163,9 @@ def recommend(points: Sequence[Measured], asked: Question) -> tuple[Measured | N
         and (gain.value or 0.0) >= WORTH_A_WORD_DB
     ):
         line += f"; {best.name} has {gain} dB more, {verdict(gain)}"
-    unsure = [
-        str(constraint)
-        for constraint in constraints
-        if not constraint.holds_throughout(choice.figures[constraint.key])
-    ]
-    if unsure:
-        verb = "holds" if len(unsure) == 1 else "hold"
-        line += f"; {' and '.join(unsure)} {verb} by value, not over the whole interval"
+    for constraint in constraints:
+        if not constraint.holds_throughout(choice.figures[constraint.key]):
+            line += f"; {constraint} holds by value, not over the whole interval"
     return choice, line
 
 
@@ -220,20 +212,74 @@ def _violation(point: Measured, constraints: Sequence[Constraint]) -> float:
 
 
 def nearest(points: Sequence[Measured], constraints: Sequence[Constraint]) -> str:
-    """Return the name of the point with the smallest violation, as the end of a sentence."""
+    """Return the point with the smallest violation and its figures, as the end of a sentence."""
     comparable = [point for point in points if math.isfinite(_violation(point, constraints))]
     if not comparable:
-        return ": no point has every figure asked for"
+        absent = [
+            each.key for each in constraints if points and math.isinf(each.violation(points[0]))
+        ]
+        return f": no point has every figure asked for{f', such as {absent[0]}' if absent else ''}"
     least = min(comparable, key=lambda point: _violation(point, constraints))
     return f"; nearest is {_words(least, [constraint.key for constraint in constraints])}"
 
 
 def _words(point: Measured, keys: Sequence[str]) -> str:
     # A constraint may name PSNR or the cost again: each figure is listed once.
-    figures = (f"{key} {_figure(point.figures[key])}" for key in dict.fromkeys(keys))
-    return f"{point.name}: {', '.join(figures)}"
+    parts = []
+    for key in dict.fromkeys(keys):
+        figure = point.figures[key]
+        parts.append(f"{key} {with_unit(str(figure), figure.unit)} ({figure.mode})")
+    return f"{point.name}: {', '.join(parts)}"
 
 
-def _figure(figure: Figure) -> str:
-    unit = "" if figure.unit in BARE_UNITS else f" {figure.unit}"
-    return f"{figure}{unit} ({figure.mode})"
+def board_rows(
+    points: Sequence[Measured], boards: Sequence[str], recommended: Measured | None, asked: Question
+) -> list[Row]:
+    """Return a row for each board: the figures of its best point, and how it compares with the
+    recommended one; or the reason why it has none.
+
+    Args:
+        points: of all boards.
+        boards: names, in the order of the rows.
+        recommended: None if there is none.
+        asked: budget and need.
+    """
+    cost = asked.cost(points)
+    limits = f" keeps {' and '.join(map(str, asked.constraints))}" if asked.constraints else ""
+    rows: list[Row] = []
+    for board in boards:
+        here = [point for point in points if point.text.get("board") == board]
+        candidates = within(here, asked.constraints, cost)
+        if not candidates:
+            reasons = [f"no point{limits}{nearest(placed(here, cost), asked.constraints)}"]
+            reasons += [
+                f"{point.name} does not fit its DPU: {point.point.reason}"
+                for point in points
+                if point.point is not None and point.point.refused_by == board
+            ]
+            rows.append(Row(BOARDS, board, {}, {"point": "none", "verdict": "; ".join(reasons)}))
+            continue
+        best, _ = choose(candidates, asked)
+        words = "within the limits"
+        if recommended is not None and recommended.text.get("board") == board:
+            best = recommended
+            words = "this is the recommended point"
+        elif recommended is not None:
+            difference = asked.compare.difference(best, recommended)
+            ratio = best.value(cost) / recommended.value(cost)
+            quality = f"PSNR {difference} dB against" if difference.value else "the PSNR of"
+            words = f"{quality} the recommended point, for {ratio:.3g} times its {cost}"
+        text = {"point": best.name, "verdict": words}
+        rows.append(Row(BOARDS, board, figures_to_compare(best, cost), text))
+    return rows
+
+
+def board_lines(rows: Sequence[Row]) -> list[str]:
+    """Return the rows of boards as sentences: those of several boards, or that of a single one if
+    it has no point.
+    """
+    return [
+        f"{row.name}: {row.text['point'] + ': ' if row.figures else ''}{row.text['verdict']}"
+        for row in rows
+        if len(rows) > 1 or not row.figures
+    ]

@@ -70,24 +70,20 @@ class Measured:
 
 
 def placed(points: Iterable[Measured], cost: str) -> list[Measured]:
-    """Return the points that have both a cost and a PSNR to compare, sorted by increasing cost."""
-    comparable = (
-        point for point in points if not math.isnan(point.value(cost) + point.value(PSNR))
-    )
-    return sorted(comparable, key=lambda point: _rank(point, cost))
+    """Return the points that have both a cost and a PSNR to compare, sorted by increasing cost.
 
-
-def _rank(point: Measured, cost: str) -> tuple[float, float, float, str]:
-    """Return the sort key of a point: its cost, then values that break ties independently of the
-    order of the points.
+    Ties are broken by values that do not depend on the order of the points.
     """
-    latency_s = point.value(LATENCY)
-    return (
-        point.value(cost),
-        -point.value(PSNR),
-        math.inf if math.isnan(latency_s) else latency_s,
-        point.name,
-    )
+
+    def rank(point: Measured) -> tuple[float, float, float, str]:
+        latency_s = point.value(LATENCY)
+        last = math.inf if math.isnan(latency_s) else latency_s
+        return point.value(cost), -point.value(PSNR), last, point.name
+
+    comparable = [
+        point for point in points if not math.isnan(point.value(cost) + point.value(PSNR))
+    ]
+    return sorted(comparable, key=rank)
 
 
 def pareto_front(points: Sequence[Measured], cost: str) -> list[Measured]:

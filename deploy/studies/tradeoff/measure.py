@@ -168,10 +168,8 @@ def measure_host(
         Swath(TILE_PX, TILE_PX), benchmark.degraded, benchmark.reference, benchmark.seed
     )
     times = host_times([method.restore for method in methods.values()], tile)
-    return {
-        variant: host_figures(times_s, tile.size)
-        for variant, times_s in zip(methods, times, strict=True)
-    }
+    figures = (host_figures(times_s, tile.size) for times_s in times)
+    return dict(zip(methods, figures, strict=True))
 
 
 def host_times(restores: Iterable[Restore], tile: np.ndarray) -> list[list[float]]:

@@ -1,25 +1,38 @@
-"""The result of a study, and its page: the recommended line, the plot with its front, boards, and
-all points.
+"""The result of a study, its plot, and its page: the recommended line, the plot with its front,
+boards, and all points.
 """
 
+import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+import numpy as np
+from markupsafe import Markup
 
 from beers_deploy.model.io.files import write_text
+from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.profiles.errors import optional
 from beers_deploy.profiles.figures import Row
 from beers_deploy.report.page import Picture, Report, Section, write_report
-from beers_deploy.report.plots import data_url
+from beers_deploy.report.plots import (
+    LIGHT,
+    SERIES,
+    data_url,
+    look,
+    new_figure,
+    set_ticks,
+    svg_of,
+)
 from beers_deploy.results import Table
-from beers_deploy.studies.tradeoff.advice import Constraint
-from beers_deploy.studies.tradeoff.front import BOARDS, FRONT, PSNR, Measured
-from beers_deploy.studies.tradeoff.plot import CAPTION, draw, plot_svg
+from beers_deploy.studies.tradeoff.advice import Constraint, with_unit
+from beers_deploy.studies.tradeoff.front import BOARDS, FRONT, PSNR, Measured, ends, placed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 FILES = ("tradeoff.html", "tradeoff.svg")
 
@@ -37,6 +50,33 @@ FRONT_CAPTION = (
 POINTS_CAPTION = (
     "Press a heading to sort by it, again to reverse. A swath on a board is predicted; images and "
     "times on this machine are measured."
+)
+
+SIZE_PX = (560, 520)
+TEXT_PX = 15
+"""Size of the plot and of its text. The plot fits a desktop screen, and its text stays legible on a
+telephone, where it is scaled down.
+"""
+FRONT_PX2 = 90
+OTHERS_PX2 = 34
+RING_PX2 = 330
+"""Areas of marks: those of the front, those of other points, and the ring around the recommended
+point.
+"""
+NEAR_PX = 16
+"""Marks at most this far apart share a label."""
+PALE = 0.45
+MARKERS = ("o", "s", "D", "^", "v", "P", "X")
+PIPELINES = "traditional pipelines"
+LIBRARIES = "other libraries"
+HOST = "this machine"
+LEGEND_COLUMNS = 2
+
+CAPTION = (
+    "Numbers are those of the front's table; the line is the front, small marks lie below it. The "
+    "ring is around the recommended point, dashed lines are the limits of budget and need. Upright "
+    "bars: 95 % interval of the gain in PSNR over the next cheaper point of the front. Bars "
+    "across: interval of the cost."
 )
 
 
@@ -121,3 +161,177 @@ def report_of(study: Tradeoff, svg: str) -> Report:
     return Report(
         "What accuracy costs in time", headline, tables, [picture], study.remarks, sorts=True
     )
+
+
+class Series(NamedTuple):
+    """Points of one style: those of one network, of the pipelines, or of other libraries, on one
+    board.
+    """
+
+    name: str
+    board: str
+    colour: str
+    marker: str
+    points: Sequence[Measured]
+
+
+def plot_svg(study: Tradeoff) -> Markup:
+    """Return the plot as an SVG file, with the numbers of the front's members."""
+    with look():
+        return svg_of(
+            figure_of(study), f"{PSNR} against {study.cost}; numbers as in the table of the front"
+        )
+
+
+def figure_of(study: Tradeoff) -> "Figure":
+    """Draw the plot. Call this within `look`."""
+    from matplotlib import rc_context
+
+    with rc_context({"font.size": TEXT_PX}):
+        figure = new_figure(*SIZE_PX)
+        # It makes room for labels below the axes, of which the last one is centred on its tick.
+        figure.set_layout_engine("constrained")
+        axes = figure.add_subplot()
+        draw(axes, study)
+        if axes.get_legend_handles_labels()[1]:
+            figure.legend(loc="outside lower center", ncols=LEGEND_COLUMNS)
+        # The distances between marks are known when the axes have their size.
+        figure.draw_without_rendering()
+        _draw_numbers(axes, study)
+    return figure
+
+
+def draw(axes: "Axes", study: Tradeoff) -> None:
+    """Draw points, front, limits and recommended point. The caller adds the numbers once it has
+    sized the axes.
+    """
+    axes.set(xscale="log", xlabel=_label(study, study.cost), ylabel=_label(study, PSNR))
+    groups = list(series(study))
+    for group in groups:
+        _scatter(axes, group, study)
+    _draw_front(axes, study)
+    # The points set the range: a limit outside must not widen it.
+    axes.margins(0.1)
+    axes.autoscale_view()
+    _draw_limits(axes, study)
+    if study.best is not None:
+        x, y = _places([study.best], study.cost)
+        ring: dict[str, Any] = {"facecolors": "none", "edgecolors": LIGHT["ink"], "linewidths": 1.8}
+        axes.scatter(x, y, s=RING_PX2, label="recommended", zorder=4, **ring)
+    _draw_legend(axes, groups, study)
+    if groups:
+        set_ticks(axes.xaxis, 6)
+        set_ticks(axes.yaxis, 8)
+
+
+def series(study: Tradeoff) -> Iterator[Series]:
+    """Yield the points by style: a colour for each network, and for several boards a marker for
+    each.
+    """
+    names: dict[str, int] = {}
+    groups: dict[tuple[str, str], list[Measured]] = {}
+    for point in placed(study.points, study.cost):
+        name = _kind(point)
+        names.setdefault(name, len(names))
+        groups.setdefault((name, point.text["board"]), []).append(point)
+    # By the order of names, so that a board has one marker however the boards were listed.
+    places = [HOST, *sorted(study.boards)]
+    for (name, board), members in groups.items():
+        colour = LIGHT[SERIES[names[name] % len(SERIES)]]
+        number = names[name] if len(study.boards) == 1 else places.index(board)
+        yield Series(name, board, colour, MARKERS[number % len(MARKERS)], members)
+
+
+def _kind(point: Measured) -> str:
+    if point.point is not None and point.point.variant.network is not None:
+        return point.text["method"]
+    return LIBRARIES if point.text["method"] in PEERS else PIPELINES
+
+
+def _scatter(axes: "Axes", group: Series, study: Tradeoff) -> None:
+    # The front's marks come last, so that they lie on top.
+    points = sorted(group.points, key=lambda point: point in study.front)
+    large = [point in study.front for point in points]
+    style: dict[str, Any] = {"alpha": np.where(large, 1.0, PALE), "marker": group.marker}
+    sizes = np.where(large, FRONT_PX2, OTHERS_PX2)
+    x, y = _places(points, study.cost)
+    axes.scatter(x, y, sizes, group.colour, linewidths=0, zorder=2, **style)
+
+
+def _places(points: Sequence[Measured], cost: str) -> tuple[list[float], list[float]]:
+    return [point.value(cost) for point in points], [point.value(PSNR) for point in points]
+
+
+def _draw_front(axes: "Axes", study: Tradeoff) -> None:
+    # Between two points of the front the cheaper one is the best that can be had.
+    axes.step(*_places(study.front, study.cost), where="post", color=LIGHT["soft"], lw=1, zorder=1)
+    for point, row in zip(study.front, study.front_rows, strict=True):
+        x = point.value(study.cost)
+        y = point.value(PSNR)
+        axes.plot(ends(point.figures[study.cost]), [y, y], color=LIGHT["line"], lw=2, zorder=0)
+        gain = row.figures.get("PSNR gain")
+        if gain is not None and gain.interval is not None:
+            before = y - (gain.value or 0.0)
+            axes.plot(
+                [x, x],
+                [before + end for end in gain.interval],
+                color=LIGHT["soft"],
+                lw=1.5,
+                zorder=1,
+            )
+
+
+def _draw_limits(axes: "Axes", study: Tradeoff) -> None:
+    """Draw the limits on cost and PSNR as dashed lines with their text. The axes retain their range
+    if a limit is outside.
+
+    A limit on another figure, such as power, has no place in the plot.
+    """
+    low, high = axes.get_xlim()
+    style: dict[str, Any] = {"color": LIGHT["ink"], "lw": 1.2, "ls": "--", "zorder": 1}
+    for limit in study.constraints:
+        if limit.key == study.cost and low <= limit.limit <= high:
+            axes.axvline(limit.limit, **style)
+            sign = "\N{LESS-THAN OR EQUAL TO}" if limit.at_most else "\N{GREATER-THAN OR EQUAL TO}"
+            # The axis is logarithmic, so its middle is the geometric mean of its limits.
+            side = "right" if limit.limit > np.sqrt(low * high) else "left"
+            place = (limit.limit, 1.01)
+            words = f"{sign} {with_unit(f'{limit.limit:g}', limit.unit)}"
+            axes.annotate(words, place, xycoords=("data", "axes fraction"), ha=side, va="bottom")
+        elif limit.key == PSNR and axes.get_ylim()[0] <= limit.limit <= axes.get_ylim()[1]:
+            axes.axhline(limit.limit, **style)
+
+
+def _draw_legend(axes: "Axes", groups: Sequence[Series], study: Tradeoff) -> None:
+    """Add the entries of the legend, as marks without a point: networks by colour, and for several
+    boards the markers.
+    """
+    several = len(study.boards) > 1
+    networks = {
+        group.name: (group.colour, MARKERS[0] if several else group.marker) for group in groups
+    }
+    boards = {group.board: (LIGHT["soft"], group.marker) for group in groups} if several else {}
+    for name, (colour, marker) in (*networks.items(), *sorted(boards.items())):
+        axes.scatter([], [], s=FRONT_PX2, c=colour, marker=marker, label=name, linewidths=0)
+
+
+def _draw_numbers(axes: "Axes", study: Tradeoff) -> None:
+    """Write the members' numbers next to their marks, with one label for neighbours whose marks
+    overlap.
+    """
+    x, y = _places(study.front, study.cost)
+    places_px = axes.transData.transform(np.column_stack([x, y]))
+    first = 0
+    for number in range(1, len(x) + 1):
+        if number < len(x) and math.dist(places_px[number], places_px[first]) < NEAR_PX:
+            continue
+        words = str(number) if number == first + 1 else f"{first + 1}\u2013{number}"
+        at = x[first], y[first]
+        axes.annotate(words, at, (-8, 9), "data", "offset points", ha="right", weight="bold")
+        first = number
+
+
+def _label(study: Tradeoff, key: str) -> str:
+    figure = next((point.figures[key] for point in study.points if key in point.figures), None)
+    where = f" on {study.boards[0]}" if key.startswith("board") and len(study.boards) == 1 else ""
+    return f"{key}{where}, {figure.unit}" if figure else key

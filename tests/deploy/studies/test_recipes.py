@@ -99,10 +99,7 @@ def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes
             ["--variant", "convbeers-xs"],
             "--variant has no effect with --recipe, which states it",
         ),
-        (["--steps", "5"], "--steps has no effect with --recipe"),
-        (["--sensor", "dior-high"], "--sensor has no effect with --recipe"),
         (["--conditioned"], "--conditioned has no effect with --recipe"),
-        (["--images", "nowhere"], "no such folder"),
         ([], "--recipe needs --images"),
     ],
 )

@@ -75,30 +75,18 @@ def dior(folder: Path, objects: dict[str, dict[str, list[Object]]]) -> Path:
 def coco(folder: Path) -> Path:
     """One file of JSON beside the images; its ids are in an order of their own."""
     names = sorted({box[0] for box in chain.from_iterable(OBJECTS.values())})
-    content: dict[str, list[dict[str, object]]] = {
-        "images": [],
-        "annotations": [],
-        "categories": [],
-    }
-    content["categories"] = [{"id": 7 + i, "name": name} for i, name in enumerate(names)]
+    images: list[dict[str, object]] = []
+    annotations: list[dict[str, object]] = []
     for number, (stem, objects) in enumerate(sorted(OBJECTS.items(), reverse=True)):
-        image(folder / f"{stem}.png")
-        entry = {
-            "id": number,
-            "file_name": f"{stem}.png",
-            "height": SIZE_PX[0],
-            "width": SIZE_PX[1],
-        }
-        content["images"].append(entry)
-        for name, x1, y1, x2, y2 in objects:
-            row = {
-                "id": len(content["annotations"]),
-                "image_id": number,
-                "bbox": [x1, y1, x2 - x1, y2 - y1],
-            }
-            content["annotations"].append(
-                row | {"category_id": 7 + names.index(name), "iscrowd": 0}
-            )
+        name = image(folder / f"{stem}.png").name
+        size = dict(zip(("height", "width"), SIZE_PX, strict=True))
+        images.append({"id": number, "file_name": name, **size})
+        for kind, x1, y1, x2, y2 in objects:
+            box = {"image_id": number, "bbox": [x1, y1, x2 - x1, y2 - y1], "iscrowd": 0}
+            category = {"id": len(annotations), "category_id": 7 + names.index(kind)}
+            annotations.append({**box, **category})
+    categories = [{"id": 7 + i, "name": name} for i, name in enumerate(names)]
+    content = {"images": images, "annotations": annotations, "categories": categories}
     text(folder / "labels.json", json.dumps(content))
     return folder
 

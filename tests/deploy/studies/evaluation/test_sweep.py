@@ -16,23 +16,21 @@ from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.restoration.method import Restore
 from beers_deploy.studies.evaluation import sweep as module
-from beers_deploy.studies.evaluation import target_scenes
 from beers_deploy.studies.evaluation.methods import BLIND, Method
 from beers_deploy.studies.evaluation.sweep import (
     NOMINAL_KNOWN,
     TRUTH_KNOWN,
-    Found,
     Key,
+    SweepResult,
     conditions,
     run_sweep,
     suppositions,
 )
 from tests.deploy.command_line import done
 from tests.deploy.documents import valid
+from tests.deploy.studies.evaluation.small_pairs import DEGRADED, REFERENCE, few_targets
 
-PROFILE = Sensor.load("pleiades-degraded")
-REFERENCE = Sensor.load("pleiades-reference")
-NOMINAL = PROFILE.nominal()
+NOMINAL = DEGRADED.nominal()
 DRIFTED = replace(NOMINAL, mtf_nyquist=0.03)
 DIM = replace(NOMINAL, gain_dn_per_radiance=0.7 * NOMINAL.gain_dn_per_radiance)
 
@@ -40,20 +38,12 @@ WRONG = "MTF 3%, supposed MTF 7%"
 WRONGLY = "sweep, sensor known wrongly", "sweep, lost by a sensor known wrongly"
 
 
-def test_every_condition_is_a_sensor_that_can_be() -> None:
-    sensors = conditions(NOMINAL, PROFILE)
-    assert sensors["nominal"] == NOMINAL
-    assert len(sensors) == 16
-    for sensor in sensors.values():
-        assert all(0 < mtf < 0.6 for mtf in sensor.mtf_axes)
-        assert min(sensor.alpha, sensor.beta) >= 0
-
-
 def test_what_is_supposed_wrongly_is_another_sensor_than_the_one_of_a_condition() -> None:
-    sensors = conditions(NOMINAL, PROFILE)
-    for truth, supposed in suppositions(NOMINAL, PROFILE).items():
+    sensors = conditions(NOMINAL, DEGRADED)
+    assert len(sensors) == 16
+    for truth, supposed in suppositions(NOMINAL, DEGRADED).items():
         assert sensors[truth] not in supposed.values()
-    more, less = suppositions(NOMINAL, PROFILE)["nominal"].values()
+    more, less = suppositions(NOMINAL, DEGRADED)["nominal"].values()
     for radiance in (25, 100):
         sigma = NOMINAL.noise_sigma(radiance)
         assert (
@@ -73,11 +63,7 @@ def half(dn: np.ndarray) -> np.ndarray:
 def quick() -> Iterator[None]:
     """Three conditions, on targets that are small and seen once."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(target_scenes, "REPEATS", 1)
-        patch.setattr(target_scenes, "ANGLES_DEG", (5.0, 8.0))
-        patch.setattr(target_scenes, "SIDE_PX", 100)
-        patch.setattr(target_scenes, "POINTS_A_SIDE", 3)
-        patch.setattr(target_scenes, "BAR_CONTRASTS", (0.1,))
+        few_targets(patch)
         patch.setattr(module, "conditions", few)
         yield
 
@@ -97,7 +83,7 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Swept:
     folder = tmp_path_factory.mktemp("scenes")
     scene = procedural_scene(500, 560, np.random.default_rng(5))
     tifffile.imwrite(folder / "scene.tif", scene.radiance)
-    rows = run_sweep([Method("half", half, BLIND), able], folder, PROFILE, REFERENCE, 0).rows
+    rows = run_sweep([Method("half", half, BLIND), able], folder, DEGRADED, REFERENCE, 0).rows
     return {
         table: {row.name: row for row in rows} for table, rows in by_table(rows).items()
     }, specialised
@@ -113,7 +99,7 @@ def psnr(swept: Swept, condition: str) -> Callable[[str], float]:
 
 def test_a_network_that_can_know_the_sensor_knows_that_of_each_condition(swept: Swept) -> None:
     """Then those that are supposed in its place; it never restores as it does by itself."""
-    supposed_for = suppositions(NOMINAL, PROFILE)
+    supposed_for = suppositions(NOMINAL, DEGRADED)
     supposed = [list(supposed_for[name].values()) for name in ("nominal", "MTF 3%")]
     assert swept[1] == [NOMINAL, *supposed[0], DRIFTED, *supposed[1], DIM]
     at = psnr(swept, "nominal")
@@ -121,19 +107,15 @@ def test_a_network_that_can_know_the_sensor_knows_that_of_each_condition(swept: 
 
 
 def test_the_truth_pays_where_the_sensor_has_drifted(swept: Swept) -> None:
-    nominal = psnr(swept, "nominal")
-    drifted = psnr(swept, "MTF 3%")
-    assert nominal(TRUTH_KNOWN) == nominal(NOMINAL_KNOWN)
-    assert drifted(TRUTH_KNOWN) > drifted(NOMINAL_KNOWN) + 1
-    assert nominal("half") < nominal("degraded") - 5
-
-
-def test_another_gain_is_told_to_the_chains_and_kept(swept: Swept) -> None:
     """The reference has the gain of the input, so brightness is no error of a method that knows no
     gains.
     """
     nominal = psnr(swept, "nominal")
+    drifted = psnr(swept, "MTF 3%")
     dim = psnr(swept, "dim")
+    assert nominal(TRUTH_KNOWN) == nominal(NOMINAL_KNOWN)
+    assert drifted(TRUTH_KNOWN) > drifted(NOMINAL_KNOWN) + 1
+    assert nominal("half") < nominal("degraded") - 5
     assert dim(NOMINAL_KNOWN) == dim(TRUTH_KNOWN)
     assert dim("degraded") == pytest.approx(nominal("degraded") + 3.1, abs=0.5)
 
@@ -152,7 +134,7 @@ def test_a_wrong_sensor_costs_the_methods_that_can_know_one(swept: Swept) -> Non
 SITES = ["a", "b", "c", "d", "e", "f"]
 
 
-def synthetic_sweep() -> Found:
+def synthetic_sweep() -> SweepResult:
     """Sites differ by 20 dB, the network's lead over the chain by nothing under one condition, a
     little under two.
     """
@@ -166,56 +148,31 @@ def synthetic_sweep() -> Found:
         }
     psnr["MTF 3%", "nominal", "traditional"] = np.stack([site - 2, site - 2])
     psnr["MTF 3%", "MTF 7%", "net"] = np.stack([site - 1, site - 1])
-    return Found(psnr, dict.fromkeys(psnr, unavailable("%", "no edges here")), SITES, 0)
+    return SweepResult(psnr, dict.fromkeys(psnr, unavailable("%", "no edges here")), SITES, 0)
 
 
-def test_the_interval_of_a_gain_is_that_of_differences_on_the_same_images() -> None:
-    nominal, blurred = (
-        row.figures["net"]
-        for row in by_table(synthetic_sweep().rows)["sweep, gain over the pipeline"]
+def test_gains_and_losses_are_those_of_differences_on_the_same_images() -> None:
+    tables = by_table(synthetic_sweep().rows)
+    noisy, clean = (
+        tables[f"sweep, PSNR{end}"][0].figures["net"].value or 0
+        for end in ("", ", reference without noise")
     )
+    assert clean - noisy == pytest.approx(1)
+    nominal, blurred = (row.figures["net"] for row in tables["sweep, gain over the pipeline"])
     assert nominal.value == pytest.approx(0.75)
     assert nominal.interval == pytest.approx((0.75, 0.75))
     assert blurred.interval is not None
     assert 0.1 <= blurred.interval[0] < (blurred.value or 0) < blurred.interval[1] <= 0.5
-
-
-def test_over_all_conditions_mean_and_least_gain_are_named() -> None:
-    (row,) = by_table(synthetic_sweep().rows)["sweep, gain over the pipeline, all conditions"]
+    (row,) = tables["sweep, gain over the pipeline, all conditions"]
     assert row.name == "net"
     assert row.figures["mean of 2 conditions"].value == pytest.approx((0.75 + 0.3) / 2)
     assert row.figures["least"].value == pytest.approx(0.3)
     assert row.text == {"least at": "MTF 3%"}
-
-
-def test_the_reference_without_noise_has_a_table_of_its_own() -> None:
-    noisy, clean = (
-        by_table(synthetic_sweep().rows)[f"sweep, PSNR{end}"][0].figures
-        for end in ("", ", reference without noise")
-    )
-    assert (clean["net"].value or 0) - (noisy["net"].value or 0) == pytest.approx(1)
-
-
-def test_tables_of_another_brightness_have_it_in_their_names_and_no_mtf() -> None:
-    result = replace(synthetic_sweep(), brightness=0.25)
-    tables = by_table(result.rows)
-    assert all(name.endswith(", radiance x 0.25") for name in tables)
-    assert len(tables) == len(by_table(synthetic_sweep().rows)) - 1
-    assert not [name for name in tables if "MTF" in name]
-
-
-def test_what_a_wrongly_known_sensor_costs_is_on_the_same_images() -> None:
-    (row,) = by_table(synthetic_sweep().rows)["sweep, lost by a sensor known wrongly"]
+    (row,) = tables["sweep, lost by a sensor known wrongly"]
     assert row.name == "MTF 3%, supposed MTF 7%"
     assert row.figures["net"].value == pytest.approx(1.3)
     assert row.figures["net"].interval is not None
     assert row.figures["net"].interval[1] - row.figures["net"].interval[0] < 0.5
-
-
-def test_without_networks_there_are_no_gains() -> None:
-    one = synthetic_sweep()
-    chain = {key: values for key, values in one.psnr.items() if key[2] != "net"}
-    assert not [row for row in Found(chain, one.mtf, SITES, 0).rows if "gain" in row.table]
 
 
 def test_the_command_sweeps_the_networks_alone_at_each_brightness(tmp_path: Path) -> None:
@@ -235,4 +192,7 @@ def test_the_command_sweeps_the_networks_alone_at_each_brightness(tmp_path: Path
     )
     assert list(bright) == list(dim) == ["nominal", "MTF 3%", "dim"]
     assert set(bright["nominal"]) >= {NOMINAL_KNOWN, TRUTH_KNOWN, "convbeers-xs"}
+    swept = {row["table"] for row in valid(document)["rows"] if row["table"].startswith("sweep")}
+    assert "sweep, MTF at Nyquist" in swept
+    assert "sweep, MTF at Nyquist, radiance x 0.1" not in swept
     assert dim["nominal"]["degraded"]["value"] > bright["nominal"]["degraded"]["value"] + 5

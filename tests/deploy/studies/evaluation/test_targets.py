@@ -12,7 +12,6 @@ from scipy.ndimage import gaussian_filter
 from beers_deploy.model.metrics.refusal import Refusal
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.instrument import Instrument
-from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.studies.evaluation import target_scenes
 from beers_deploy.studies.evaluation.methods import BLIND, Method, method_named
 from beers_deploy.studies.evaluation.target_scenes import Targets, acquire_targets
@@ -25,27 +24,17 @@ from beers_deploy.studies.evaluation.targets import (
     snr_name,
     target_row,
 )
-
-DEGRADED = Sensor.load("pleiades-degraded")
-REFERENCE = Sensor.load("pleiades-reference")
-SENSORS = DEGRADED.nominal(), REFERENCE.nominal()
-IDENTITY = Method("identity", lambda dn: dn, BLIND)
+from tests.deploy.studies.evaluation.small_pairs import DEGRADED, IDENTITY, REFERENCE, SENSORS
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick() -> Iterator[None]:
-    """Fewer edges, points and patterns."""
+@pytest.fixture(scope="module")
+def raw_targets() -> Iterator[Targets]:
+    """The targets as the degraded sensor sees them, with fewer edges, points and patterns."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(target_scenes, "REPEATS", 1)
         patch.setattr(target_scenes, "POINTS_A_SIDE", 3)
         patch.setattr(target_scenes, "BAR_CONTRASTS", (0.1,))
-        yield
-
-
-@pytest.fixture(scope="module")
-def raw_targets() -> Targets:
-    """The targets as the degraded sensor sees them."""
-    return acquire_targets(*SENSORS, 0)
+        yield acquire_targets(*SENSORS, 0)
 
 
 @pytest.fixture(scope="module")
@@ -70,18 +59,17 @@ def values(row: Row, unit: str) -> list[float]:
 
 def test_what_is_as_the_reference_has_all_flux_and_contrast(perfect: Targets) -> None:
     row = target_row(IDENTITY, perfect)
-    assert (row.table, row.name, row.text["sensor"]) == ("targets", "identity", BLIND)
+    assert (row.table, row.name, row.text["sensor"]) == ("targets", "degraded", BLIND)
     assert len(row.figures) == 6 + 3 + 2
     assert values(row, "%") == pytest.approx([100] * 6, abs=0.01)
     assert values(row, OF_REFERENCE) == pytest.approx([1] * 5, abs=1e-4)
 
 
-@pytest.mark.parametrize("factor", [1.01, 0.5])
-def test_a_factor_is_a_factor_of_flux_and_contrast(perfect: Targets, factor: float) -> None:
+def test_a_factor_is_one_of_flux_and_contrast_and_a_level_is_none(perfect: Targets) -> None:
     before = target_row(IDENTITY, perfect)
-    row = target_row(Method("scaled", lambda dn: dn * np.float32(factor), BLIND), perfect)
+    row = target_row(Method("scaled", lambda dn: np.float32(0.5) * dn + 37, BLIND), perfect)
     for key, figure in row.figures.items():
-        assert figure.value == pytest.approx(factor * (before.figures[key].value or 0), rel=1e-3)
+        assert figure.value == pytest.approx((before.figures[key].value or 0) / 2, rel=1e-3)
 
 
 def test_a_blur_takes_contrast_and_leaves_the_flux(perfect: Targets) -> None:
@@ -92,13 +80,6 @@ def test_a_blur_takes_contrast_and_leaves_the_flux(perfect: Targets) -> None:
     # A Gaussian of sigma 1 px leaves exp(-2 (pi f)^2) of the contrast at a frequency f, here 1/3.
     assert period_3 == pytest.approx(np.exp(-2 * (np.pi / 3) ** 2), rel=0.05)
     assert max(plates) < 0.1
-
-
-def test_a_level_that_is_off_is_no_flux_and_no_contrast(perfect: Targets) -> None:
-    before = target_row(IDENTITY, perfect)
-    row = target_row(Method("brighter", lambda dn: dn + np.float32(37), BLIND), perfect)
-    for key, figure in row.figures.items():
-        assert figure.value == pytest.approx(before.figures[key].value, abs=0.01)
 
 
 def test_what_is_erased_is_nothing_and_reversed_contrast_is_below_zero(perfect: Targets) -> None:
@@ -119,14 +100,6 @@ def test_flux_and_contrast_of_the_raw_image_are_those_of_its_blur(raw_targets: T
     assert all(0.2 < value < 0.5 for value in values(row, OF_REFERENCE))
 
 
-def test_points_and_their_flat_field_have_the_same_noise(raw_targets: Targets) -> None:
-    for points in raw_targets.points:
-        far = points.expected < 0.2
-        difference = points.acquired - points.flat
-        assert np.abs(difference[far]).max() <= 2
-        assert float(points.flat.std()) > 2 * float(difference[far].std())
-
-
 def test_targets_measure_the_sensor_and_what_a_chain_makes_of_it(raw_targets: Targets) -> None:
     assert len(raw_targets.edges) == 4
     before = mean_figures(IDENTITY, raw_targets)
@@ -144,5 +117,5 @@ def test_targets_measure_the_sensor_and_what_a_chain_makes_of_it(raw_targets: Ta
 def test_refused_edges_and_silent_fields_are_unavailable() -> None:
     figure = mtf_figure([Refusal("a step of 3 in noise of 2")] * 3)
     assert figure.value is None
-    assert figure.reason == "3 of 3 edges refused: a step of 3 in noise of 2"
+    assert "3 of 3 edges refused" in figure.reason
     assert flat_figure(np.full((9, 9), 100.0)).value is None

@@ -30,7 +30,7 @@ from beers_deploy.studies.tradeoff.front import (
     significant,
     verdict,
 )
-from tests.deploy.studies.tradeoff.made import COMPARE, DPU, family, made
+from tests.deploy.studies.tradeoff.synthetic import COMPARE, DPU, family, synthetic
 
 COST = "board latency"
 PLACES = st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9)), min_size=1, max_size=12)
@@ -66,8 +66,8 @@ def test_what_lacks_a_figure_or_was_published_is_not_on_the_front() -> None:
 
 
 def test_differences_are_paired_and_reach_less_far_than_the_sites_differ() -> None:
-    small = made("small", 45.0, 2.0)
-    medium = made("medium", 45.5, 4.0)
+    small = synthetic("small", 45.0, 2.0)
+    medium = synthetic("medium", 45.5, 4.0)
     difference = COMPARE.difference(medium, small)
     assert difference.interval is not None
     assert difference.value == pytest.approx(0.5)
@@ -78,17 +78,17 @@ def test_differences_are_paired_and_reach_less_far_than_the_sites_differ() -> No
 
 
 def test_the_same_pictures_do_not_differ_on_however_few_sites() -> None:
-    one = made("one", 45.0, 2.0)
-    other = replace(made("one", 45.0, 2.0), name="other")
+    one = synthetic("one", 45.0, 2.0)
+    other = replace(synthetic("one", 45.0, 2.0), name="other")
     difference = Comparison(("a",) * 6, 0).difference(one, other)
     assert (difference.value, difference.interval) == (0.0, (0.0, 0.0))
 
 
 def test_below_five_sites_values_decide_beyond_a_margin() -> None:
     few = Comparison(("a", "a", "b", "b", "c", "c"), 0)
-    base = made("one", 45.0, 2.0)
-    better = made("better", 45.2, 3.0)
-    alike = made("alike", 45.02, 3.0)
+    base = synthetic("one", 45.0, 2.0)
+    better = synthetic("better", 45.2, 3.0)
+    alike = synthetic("alike", 45.02, 3.0)
     difference = few.difference(better, base)
     assert difference.interval is None
     assert verdict(difference) == TOO_FEW
@@ -100,7 +100,7 @@ def test_a_ratio_of_latencies_on_a_board_has_the_width_of_pairs() -> None:
     cost = {**DPU.target.tables["cost"], "pair_width": Constant(0.2, "inferred", "a test")}
     target = replace(DPU.target, tables={**DPU.target.tables, "cost": cost})
     dpu = replace(DPU, target=target)
-    points = [made("small", 45.0, 2.0), made("large", 45.5, 6.0)]
+    points = [synthetic("small", 45.0, 2.0), synthetic("large", 45.5, 6.0)]
     cheap, costly = (
         replace(item, point=replace(item.point, board=target, dpu=dpu) if item.point else None)
         for item in points
@@ -108,19 +108,10 @@ def test_a_ratio_of_latencies_on_a_board_has_the_width_of_pairs() -> None:
     ratio = cost_ratio(costly, cheap, COST)
     assert ratio.value == pytest.approx(3)
     assert ratio.interval == pytest.approx((3 / math.exp(0.2), 3 * math.exp(0.2)))
-
-
-def test_tiles_of_one_network_differ_by_their_count_alone() -> None:
-    one = made("one", 45.0, 2.0, method="net")
-    ratio = cost_ratio(made("other", 45.0, 3.0, method="net"), one, COST)
-    assert ratio.interval == (ratio.value, ratio.value)
-    apart = cost_ratio(made("third", 45.0, 3.0, tile_px=176, method="net"), one, COST)
-    assert apart.interval is not None
-    assert apart.interval[0] < 1.5 < apart.interval[1]
-
-
-def test_a_ratio_of_host_times_is_measured() -> None:
-    assert cost_ratio(made("a", 45.0, 4.0), made("b", 45.0, 2.0), "host p50").mode == "measured"
+    # Points that differ in the halo alone differ by their number of tiles, which is exact.
+    one, other = (synthetic(name, 45.0, 2.0, method="net") for name in ("one", "other"))
+    assert cost_ratio(other, one, COST).interval == (1, 1)
+    assert cost_ratio(other, one, "host p50").mode == "measured"
 
 
 def test_front_rows_compare_each_member_with_the_next_cheaper_one() -> None:
@@ -147,21 +138,16 @@ def having(key: str, figure: Figure) -> Measured:
 @pytest.mark.parametrize("name", NAMES)
 def test_every_figure_can_be_limited_in_its_unit(name: str) -> None:
     key, unit = NAMES[name]
-    (constraint,) = parse_constraints("budget", f"{name.upper()} <= 2.5e1 {unit}")
-    assert constraint == Constraint(key, True, 25.0, unit)
-
-
-def test_several_constraints_stand_with_commas() -> None:
-    first, second = parse_constraints("budget", "latency<=20s, psnr>=44")
-    assert (str(first), str(second)) == ("board latency <= 20 s", "PSNR >= 44 dB")
-    assert parse_constraints("budget", None) == []
+    first, second = parse_constraints("budget", f"{name.upper()} <= 2.5e1 {unit},psnr>=44")
+    assert first == Constraint(key, True, 25.0, unit)
+    assert str(second) == "PSNR >= 44 dB"
+    assert math.isinf(first.violation(having(key, published(1, unit, "a paper"))))
+    assert math.isinf(first.violation(having(key, unavailable(unit, "no board"))))
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "NAME<=NUMBER"),
-        ("latency<20", "NAME<=NUMBER"),
         ("latency<=1e999", "NAME<=NUMBER"),
         ("speed<=3", "one of psnr"),
         ("latency<=20ms", "board latency in s"),
@@ -183,13 +169,6 @@ def test_a_violation_is_0_where_the_value_keeps_the_limit(
     assert (violation == 0) == (value <= limit if at_most else value >= limit)
 
 
-def test_no_figure_keeps_no_limit_and_a_published_one_compares_with_none() -> None:
-    limit = Constraint("board latency", True, 9, "s")
-    for figure in (unavailable("s", "no board"), published(1, "s", "a paper")):
-        assert math.isinf(limit.violation(having("board latency", figure)))
-    assert math.isinf(limit.violation(having("PSNR", measured(1, "dB", ""))))
-
-
 @pytest.mark.parametrize(
     ("budget", "need", "name"),
     [
@@ -206,13 +185,6 @@ def test_the_best_within_a_budget_is_taken_and_the_cheapest_for_a_need(
     assert recommendation(budget, need)[0] == name
 
 
-def test_what_is_not_significantly_better_is_not_paid_for() -> None:
-    name, line = recommendation("latency<=60s")
-    assert name == "medium"
-    assert "; large has 0.003 [" in line
-    assert "dB more, not significant" in line
-
-
 def test_the_line_has_value_interval_and_mode_and_says_what_only_the_value_keeps() -> None:
     line = recommendation("latency<=20s")[1]
     assert line.startswith(
@@ -220,10 +192,8 @@ def test_the_line_has_value_interval_and_mode_and_says_what_only_the_value_keeps
     )
     assert "board latency 4 [2.5, 6.4] s (predicted)" in line
     assert "not over" not in line
-    assert (
-        "board latency <= 5 s holds by value, not over the whole interval"
-        in recommendation("latency<=5s")[1]
-    )
+    assert "<= 5 s holds by value, not over the" in recommendation("latency<=5s")[1]
+    assert "large has 0.003 [" in recommendation("latency<=60s")[1]
 
 
 def test_where_nothing_keeps_the_limits_the_nearest_is_named() -> None:

