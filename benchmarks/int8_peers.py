@@ -4,7 +4,7 @@
         --quark-python quark/bin/python
 
 The script prints a Markdown table: the mean and the worst loss of PSNR in dB, over samples that
-neither training nor calibration saw. With --tuned it adds our integers fine-tuned on eight times
+neither training nor calibration saw, and the processor time of quantising in seconds. With --tuned it adds our integers fine-tuned on eight times
 the samples, and Quark's weights rounded by AdaRound.
 
 Quark needs other versions of its libraries, so it is installed in an environment of its own.
@@ -15,6 +15,7 @@ Without the CPU build of torch, pip would fetch gigabytes of CUDA packages:
     quark/bin/pip install amd-quark==0.13 onnxruntime==1.28.0
 """
 
+import resource
 import subprocess
 from collections.abc import Callable
 from functools import partial
@@ -65,6 +66,12 @@ def quark(python: Path, adaround_steps: int, network: Small, out: Path) -> None:
     subprocess.run(command, check=True, capture_output=True, cwd=out.parent)  # noqa: S603
 
 
+def processor_s() -> float:
+    """Return the processor time in seconds of this process and of those that it ran."""
+    parts = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(part.ru_utime + part.ru_stime for part in parts)
+
+
 def main() -> None:
     """Print one row for each network as soon as it is done."""
     parser = options(__doc__)
@@ -91,9 +98,11 @@ def main() -> None:
             cells = []
             for way in ways.values():
                 int8 = folder / "int8.onnx"
+                before_s = processor_s()
                 way(network, int8)
+                spent_s = processor_s() - before_s
                 losses_db = network.losses_db(int8)
-                cells.append(f"{losses_db.mean():.2f}, {losses_db.max():.2f}")
+                cells.append(f"{losses_db.mean():.2f}, {losses_db.max():.2f}, {spent_s:.0f} s")
             print(f"| {name} | {' | '.join(cells)} |", flush=True)
 
 
