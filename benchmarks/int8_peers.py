@@ -4,8 +4,8 @@
         --quark-python quark/bin/python
 
 The script prints a Markdown table: the mean and the worst loss of PSNR in dB, over samples that
-neither training nor calibration saw, and the processor time of quantising in seconds. With --tuned it adds our integers fine-tuned on eight times
-the samples, and Quark's weights rounded by AdaRound.
+neither training nor calibration saw, and the processor time of quantising in seconds. With --tuned
+it adds our integers fine-tuned on eight times the samples, and Quark's weights rounded by AdaRound.
 
 Quark needs other versions of its libraries, so it is installed in an environment of its own.
 Without the CPU build of torch, pip would fetch gigabytes of CUDA packages:
