@@ -356,20 +356,30 @@ def gate_row(result: GateResult, shares: Mapping[str, float] | None = None) -> R
         entries[f"{result.metric} lost"] = (result.metric_loss, unit)
     if shares is not None:
         entries["PSNR drop"] = (result.drop_db, "dB")
-    figures = {name: _figure(value, unit, result) for name, (value, unit) in entries.items()}
+    missing = "a network gave NaN" if math.isnan(result.mae) else "no reference of that size"
+    figures = {
+        name: figure_of(value, unit, result.source, missing)
+        for name, (value, unit) in entries.items()
+    }
     if shares is not None:
         figures["saturated results"] = _saturation(shares, result.source)
     return Row("gate", "INT8 against float", figures)
 
 
-def _figure(value: float, unit: str, result: GateResult) -> Figure:
+def figure_of(value: float, unit: str, source: str, missing: str) -> Figure:
+    """Return a measured value as a figure, or an unavailable one if it is infinite or NaN.
+
+    Args:
+        value: in the unit.
+        unit: of the figure.
+        source: how it was measured.
+        missing: why it is NaN.
+    """
     if math.isinf(value):
         return unavailable(unit, "infinite: the two images are identical")
     if math.isnan(value):
-        return unavailable(
-            unit, "a network gave NaN" if math.isnan(result.mae) else "no reference of that size"
-        )
-    return measured(value, unit, result.source)
+        return unavailable(unit, missing)
+    return measured(value, unit, source)
 
 
 def _saturation(shares: Mapping[str, float], source: str) -> Figure:

@@ -51,11 +51,6 @@ not yet rounded.
 
 WORST = 4
 BEYOND_DN = (1, 2, 4, 8, 16, 32, 64)
-ROUNDING = 1.4
-CLIPPING = 1.6
-"""Limits of std / MAE, which is 1.25 for a Gaussian: below the first the errors are rounding, above
-the second clipping.
-"""
 
 
 class Loss:
@@ -315,16 +310,6 @@ def headline(gate: GateResult, layers: Sequence[Row]) -> str:
     drop = "" if math.isnan(gate.drop_db) else f" and costs {gate.drop_db:.2f} dB"
     return (
         f"INT8 differs from float by {gate.mae:.2g} of full scale on average{drop} "
-        f"(measured). {kind_of_error(gate.std_over_mae)} Most of the squared error comes from: "
-        f"{names}."
+        f"(measured). std / MAE is {gate.std_over_mae:.2f}: rounding alone makes it 1.25, and "
+        f"clipping makes it larger. Most of the squared error comes from: {names}."
     )
-
-
-def kind_of_error(std_over_mae: float) -> str:
-    """Return one sentence on the meaning of std / MAE."""
-    sentence = f"std / MAE is {std_over_mae:.2f}, where a Gaussian has 1.25"
-    if std_over_mae <= ROUNDING:
-        return f"{sentence}: the errors are mostly those of rounding."
-    if std_over_mae <= CLIPPING:
-        return f"{sentence}: rounding, but of unequal size from place to place."
-    return f"{sentence}: a few pixels err far more than the rest, which is clipping."

@@ -1,6 +1,6 @@
 """Read stored samples: from a .npy or .npz file, from a folder of images, or from arrays."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -92,25 +92,39 @@ def sample_files(path: Path) -> list[Path]:
     )
 
 
-def stored_one(file: Path, ranges: Ranges = ()) -> tuple[str, np.ndarray, np.ndarray]:
-    """Return name, image (C, H, W) and reference of the one sample in a file of a folder.
+def stored_samples(
+    source: Path | Sequence[Pair], ranges: Ranges = ()
+) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yield the name, the image (C, H, W) and the reference of each sample.
 
     Args:
-        file: the path of an image file, or of a .npy file of values that the network reads.
+        source: a file of a batch, a folder of files of one image each, or samples in memory.
         ranges: of the network's channels, onto which 0 to full scale of image files are mapped;
             empty for [0, 1].
     """
-    if file.suffix.lower() != ARRAY_SUFFIX:
-        image = from_shares(_bands_first(file, read_pixels(file)), ranges)
+    if not isinstance(source, Path):
+        for number, pair in enumerate(source):
+            yield f"{IN_MEMORY}[{number}]", *pair
+    elif source.is_dir():
+        for file in sample_files(source):
+            yield file.name, _one_image(file, ranges), NO_REFERENCE
     else:
-        image, _ = _arrays(file)
-        if image.ndim != 3:
-            raise ImageError(f"{file} must be one image (C, H, W), got {sizes_of(image)}. {REMEDY}")
-    return file.name, image, NO_REFERENCE
+        for number, pair in enumerate(_pairs(source)):
+            yield f"{source.name}[{number}]", *pair
 
 
-def stored_batch(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield name, image (C, H, W) and reference of the samples of one file."""
+def _one_image(file: Path, ranges: Ranges) -> np.ndarray:
+    """Return the image (C, H, W) of an image file, or of a .npy file as the network reads it."""
+    if file.suffix.lower() != ARRAY_SUFFIX:
+        return from_shares(_bands_first(file, read_pixels(file)), ranges)
+    image, _ = _arrays(file)
+    if image.ndim != 3:
+        raise ImageError(f"{file} must be one image (C, H, W), got {sizes_of(image)}. {REMEDY}")
+    return image
+
+
+def _pairs(path: Path) -> Iterator[Pair]:
+    """Return the images (C, H, W) and references of the batch in one file."""
     images, references = _arrays(path)
     if images.ndim != 4:
         raise ImageError(
@@ -123,8 +137,7 @@ def stored_batch(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
             f"{path} must have a reference for each of its {len(images)} images, got references "
             f"of {sizes_of(references)}. {REMEDY}"
         )
-    for number, pair in enumerate(zip(images, references, strict=True)):
-        yield f"{path.name}[{number}]", *pair
+    return zip(images, references, strict=True)
 
 
 def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:

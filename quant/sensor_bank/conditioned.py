@@ -193,14 +193,9 @@ def with_delta(core: IntCore, delta: bytes, where: str = "The delta") -> tuple[I
         return replace(core, ops=tuple(ops), host_part=host_part), str(header["sensor"])
     except (zlib.error, *DAMAGE) as error:
         reason = printable(" ".join(f"{type(error).__name__}: {error}".split()))
-        fault = (
-            "is damaged"
-            if isinstance(error, zlib.error)
-            else f"belongs to another network ({reason})"
-        )
         raise ModelError(
-            f"{where} {fault}. Give a file that 'beers-deploy export --delta' wrote for the same "
-            "network."
+            f"{where} is damaged or belongs to another network ({reason}). Give a file that "
+            "'beers-deploy export --delta' wrote for the same network."
         ) from error
 
 

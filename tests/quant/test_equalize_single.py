@@ -170,7 +170,7 @@ def test_what_calibration_sees_is_not_clipped_where_the_image_itself_passes(
     model, _, _, singles = read("espcn")
     int8 = quickly(model, patches_of(images()))
     assert int8.core.host_part.decoding.offsets
-    largest = single.largest_values(int8.graph, singles, images(), int8.core.host_part)
+    largest = single_ranges(int8.graph, singles, images(), int8.core.host_part, 1.0, 1.0)
     assert largest.max() <= FULL * (1 + 1e-5)
 
 

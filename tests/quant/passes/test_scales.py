@@ -63,7 +63,7 @@ def test_coarse_weights_become_finer() -> None:
     """
     graph, core = chain(2)
     target = correction_of(core)
-    start = TrainableCore(core).with_finer_weights(0, by=-1)
+    start = TrainableCore(core).with_finer_numbers("weight", 0, by=-1)
     before = distance(start.core(), target)
     assert before > 0
     better = with_better_scales(start, graph, SHIFTS, lambda each: distance(each, target)).core()
