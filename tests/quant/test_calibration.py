@@ -2,7 +2,7 @@
 in pieces.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import chain
 
@@ -132,22 +132,14 @@ def test_pieces_hold_what_the_whole_image_gives(graph: Graph, shape: tuple[int, 
     pieces, without_halo = (
         list(tensor_values(session, names, full_image, px)) for px in (halo_px, 0)
     )
-    for k, tensor in enumerate(expected):
-        assert sum(piece[k].size for piece in pieces) == tensor.size
-        assert max(np.abs(piece[k]).max() for piece in pieces) == pytest.approx(
-            np.abs(tensor).max(), rel=1e-5
-        )
-        assert energy(piece[k] for piece in pieces) == pytest.approx(energy([tensor]), rel=1e-5)
+    for tensor, parts in zip(expected, zip(*pieces, strict=True), strict=True):
+        values = np.sort(np.concatenate([part.ravel() for part in parts]))
+        np.testing.assert_allclose(values, np.sort(tensor, axis=None), rtol=1e-5, atol=1e-6)
     sides_px = [array.base.shape[2] for array in chain.from_iterable(pieces)]  # type: ignore[union-attr]
     assert max(sides_px) <= TILE_PX + 2 * halo_px
     if len(pieces) > 1:
-        assert energy(piece[-1] for piece in without_halo) != pytest.approx(
-            energy(expected[-1:]), rel=1e-5
-        )
-
-
-def energy(parts: Iterable[np.ndarray]) -> float:
-    return sum(float(np.square(part, dtype=np.float64).sum()) for part in parts)
+        values = np.concatenate([piece[-1].ravel() for piece in without_halo])
+        assert np.abs(np.sort(values) - np.sort(expected[-1], axis=None)).max() > 1e-3
 
 
 def test_crops_tile_the_image() -> None:
