@@ -171,10 +171,10 @@ class Measured:
         """
         maes = []
         drops_db = []
-        for image, in_float, (given, reference) in zip(
+        for image, in_float, (degraded, reference) in zip(
             results, self.floats, self.pairs, strict=True
         ):
-            ranges = ranges_of_result(in_float, given, self.host_part.input_ranges)
+            ranges = ranges_of_result(in_float, degraded, self.host_part.input_ranges)
             float_shares, shares = (to_shares(each, ranges) for each in (in_float, image))
             maes.append(float(np.abs(shares - float_shares).mean()))
             drop_db = math.nan

@@ -283,14 +283,9 @@ def losses(
         return message
     costliest = _costliest(layers or layer_error_rows(result, patches))
     names = ", ".join(f"{name} ({share:.0f} %)" for name, share in costliest)
-    message = f"{message}: most of it in {names}"
-    remedies = []
     # Of a network that is fine-tuned already there is nothing left to gain by it.
-    if FINETUNE not in metadata(result.host):
-        remedies.append("`finetune` auto")
-    if not result.core.host_part.adds_image:
-        remedies.append("a network that ends with a global add, of which INT8 errs less")
-    return f"{message}; try {', or '.join(remedies)}" if remedies else message
+    advice = "" if FINETUNE in metadata(result.host) else "; try `finetune` auto"
+    return f"{message}: most of it in {names}{advice}"
 
 
 MOST = 3

@@ -71,6 +71,11 @@ def host_part_from_json(record: Mapping[str, Any]) -> HostPart:
         input_ranges=ranges,
         limits=limits,
     )
+    # The file is not trusted: its core must read what the host writes, and write what it decodes.
+    for key in ("planes", "gains"):
+        expected = host_part_to_json(part)[key]
+        if record[key] != expected:
+            raise ValueError(f"{key} of {record[key]!r} instead of {expected}")
     if len(ranges) not in (0, part.image_channels):
         raise ValueError(f"{len(ranges)} ranges of {part.image_channels} channels")
     return part
@@ -94,4 +99,4 @@ def _decoding(record: Mapping[str, Any]) -> OutputDecoding:
     # Files that were shipped earlier do not state `wide`, because they have no coarse copy.
     if record["banked"]:
         return BankSum(coarse_copies=int(bool(record.get("wide"))))
-    return DualRange() if int(record["gains"]) == 2 else Plain()
+    return DualRange() if record["gains"] == 2 else Plain()

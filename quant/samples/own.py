@@ -114,14 +114,14 @@ def digest_of(sample: np.ndarray) -> str:
 
 
 def samples_of(
-    model: onnx.ModelProto, given: object, input_range: object = None
+    model: onnx.ModelProto, samples: object, input_range: object = None
 ) -> OwnSamples | None:
     """Read a user's samples for a network; return None if there are none and simulated patches suit
     the network.
 
     Args:
         model: the network.
-        given: a path, or an input of `samples_in`; None for simulated patches.
+        samples: a path, or an input of `samples_in`; None for simulated patches.
         input_range: the ranges that the user states; None determines them from the samples.
 
     Raises:
@@ -134,8 +134,9 @@ def samples_of(
         multiple_px = tiling_of(model).alignment_px
     except ModelError:
         multiple_px = 0
-    if given is not None:
-        source = Path(given) if isinstance(given, str | os.PathLike) else samples_in(given)
+    if samples is not None:
+        is_path = isinstance(samples, str | os.PathLike)
+        source = Path(samples) if is_path else samples_in(samples)
         ranges = None if input_range is None else read_ranges(input_range, channels)
         return read_samples(source, channels, fixed_px, multiple_px or 1, ranges)
     # Simulated patches have one channel and PATCH_PX a side.

@@ -23,47 +23,42 @@ FULL_SCALE_8 = 255
 REMEDY = "See docs/reference/any-network.md for how to give samples."
 
 
-def samples_in(given: object) -> list[Pair]:
+def samples_in(samples: object) -> list[Pair]:
     """Return the samples in an array, in a pair of arrays (images, references), or in an iterable
     of these.
 
     Args:
-        given: a batch (N, C, H, W), or one image (C, H, W), of NumPy or torch; a tuple of two; a
+        samples: a batch (N, C, H, W), or one image (C, H, W), of NumPy or torch; a tuple of two; a
             simulated pair, which has its full scale; or an iterable of any of these, such as a
             DataLoader.
     """
     # A simulated pair holds digital numbers, and alone knows its full scale.
-    if hasattr(given, "degraded") and hasattr(given, "reference"):
-        pair: Any = given
+    if hasattr(samples, "degraded") and hasattr(samples, "reference"):
+        pair: Any = samples
         largest = np.float32(pair.sensor.max_dn)
         degraded = np.asarray(pair.degraded, np.float32)[None] / largest
         reference = np.asarray(pair.reference, np.float32)[None] / largest
         return [(degraded, reference)]
-    if hasattr(given, "ndim"):
-        return [(image, NO_REFERENCE) for image in _batch(given)]
-    if isinstance(given, tuple) and [hasattr(array, "ndim") for array in given] == [True, True]:
+    if hasattr(samples, "ndim"):
+        return [(image, NO_REFERENCE) for image in _batch(samples)]
+    if isinstance(samples, tuple) and [hasattr(array, "ndim") for array in samples] == [True, True]:
         # A reference may have another size than its image.
-        images = _batch(given[0])
-        references = _plain(given[1])
-        references = references[None] if np.ndim(given[0]) == 3 else references
-        if references.ndim == 0 or len(images) != len(references):
-            raise ImageError(
-                f"`{IN_MEMORY}` must have a reference for each image, got images of "
-                f"{times(images.shape)} and references of {sizes_of(references)}. {REMEDY}"
-            )
-        return list(zip(images, references, strict=True))
-    if not isinstance(given, Iterable) or isinstance(given, str | bytes | Mapping):
+        images = _batch(samples[0])
+        references = _plain(samples[1])
+        references = references[None] if np.ndim(samples[0]) == 3 else references
+        return _paired(f"`{IN_MEMORY}`", images, references)
+    if not isinstance(samples, Iterable) or isinstance(samples, str | bytes | Mapping):
         raise ImageError(
-            f"`{IN_MEMORY}` must be arrays (N, C, H, W) or a path, got {type(given).__name__}. "
+            f"`{IN_MEMORY}` must be arrays (N, C, H, W) or a path, got {type(samples).__name__}. "
             f"{REMEDY}"
         )
-    samples = list[Pair]()
-    for item in given:
+    pairs = list[Pair]()
+    for item in samples:
         # A DataLoader returns a batch as a list: of images and references, or of images alone.
         batch = tuple(item) if isinstance(item, list) and len(item) == 2 else item
         alone = isinstance(batch, list | tuple) and len(batch) == 1
-        samples += samples_in(batch[0] if alone else batch)
-    return samples
+        pairs += samples_in(batch[0] if alone else batch)
+    return pairs
 
 
 def _batch(array: Any) -> np.ndarray:
@@ -123,7 +118,7 @@ def _one_image(file: Path, ranges: Ranges) -> np.ndarray:
     return image
 
 
-def _pairs(path: Path) -> Iterator[Pair]:
+def _pairs(path: Path) -> list[Pair]:
     """Return the images (C, H, W) and references of the batch in one file."""
     images, references = _arrays(path)
     if images.ndim != 4:
@@ -132,12 +127,17 @@ def _pairs(path: Path) -> Iterator[Pair]:
         )
     if references is NO_REFERENCE:
         references = np.empty((len(images), 0), np.float32)
+    return _paired(str(path), images, references)
+
+
+def _paired(label: str, images: np.ndarray, references: np.ndarray) -> list[Pair]:
+    """Return images with their references; raise ImageError if their numbers differ."""
     if references.ndim == 0 or len(references) != len(images):
         raise ImageError(
-            f"{path} must have a reference for each of its {len(images)} images, got references "
+            f"{label} must have a reference for each of its {len(images)} images, got references "
             f"of {sizes_of(references)}. {REMEDY}"
         )
-    return zip(images, references, strict=True)
+    return list(zip(images, references, strict=True))
 
 
 def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:

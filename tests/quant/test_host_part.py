@@ -54,7 +54,15 @@ def test_a_description_states_the_whole_host_part(part: HostPart) -> None:
 
 @pytest.mark.parametrize(
     "damage",
-    [{"outputs": None}, {"front": 3}, {"margin_px": -1}, {"input_ranges": [[0, 2], [0, 1]]}],
+    [
+        {"outputs": None},
+        {"front": 3},
+        {"margin_px": -1},
+        {"input_ranges": [[0, 2], [0, 1]]},
+        {"planes": 5},
+        {"planes": None},
+        {"gains": 0},
+    ],
 )
 def test_a_damaged_description_is_refused(damage: dict[str, Any]) -> None:
     with pytest.raises((TypeError, ValueError)):
