@@ -223,8 +223,8 @@ class Measured:
                 that the difference of both losses is the loss by clipping.
         """
         graph = tuple(
-            dequantized(op, whole) if isinstance(op, Conv) and isinstance(whole, IntConv) else op
-            for op, whole in zip(result.graph, result.core.ops, strict=True)
+            dequantized(op, int_op) if isinstance(op, Conv) and isinstance(int_op, IntConv) else op
+            for op, int_op in zip(result.graph, result.core.ops, strict=True)
         )
         ends = (INT8_MIN, INT8_MAX) if clips else (-math.inf, math.inf)
         grids = {name: Grid(result.core.scale(name), *ends) for name in tensors(graph)}

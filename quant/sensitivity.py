@@ -239,9 +239,7 @@ def worst_row(number: int, patches: Patches, spread: Spread) -> Row:
 
 
 def _mtf(sensor: Instrument) -> str:
-    """Return one value, or two where the sensor's axes differ. The profile gave them to this patch;
-    nothing was measured.
-    """
+    """Format the MTF at Nyquist of the sensor profile: one value, or two if its axes differ."""
     across, along = (f"{100 * value:.3g} %" for value in sensor.mtf_axes)
     return across if across == along else f"{across} across the track, {along} along it"
 

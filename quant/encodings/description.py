@@ -71,7 +71,11 @@ def _plain(op: IntConv | Op) -> dict[str, Any]:
 
 
 def described_core(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
-    """Return the core that a description and the constants of its file make.
+    """Read a core from its description and from the constants of the same file.
+
+    Args:
+        text: of `describe`.
+        constants: weights and biases by name.
 
     Raises:
         ModelError: metadata that are damaged, or that do not fit the constants.

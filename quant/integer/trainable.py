@@ -70,11 +70,10 @@ def to_int8(values: Tensor, low: int = INT8_MIN, high: int = INT8_MAX) -> Tensor
 
 
 class TrainableCore(torch.nn.Module):
-    """An integer core whose weights and biases are parameters, in units of their own scale; all
-    scales stay.
+    """An integer core in torch, whose weights and biases are trained while all scales are fixed.
 
-    They may lie between integers while they are trained; forwards the nearest integers
-    count.
+    The parameters are in units of their own scale. They may lie between integers, but the forward
+    pass uses the nearest ones.
     """
 
     def __init__(self, core: IntCore) -> None:

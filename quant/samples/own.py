@@ -241,8 +241,8 @@ def _valid_reference(name: str, reference: np.ndarray) -> np.ndarray:
 def _valid_image(name: str, image: np.ndarray, channels: int, ranges: Ranges | None) -> np.ndarray:
     if image.dtype.kind not in "fui" or len(image) != channels:
         raise ImageError(
-            f"{name} must have {channels} channels of numbers, as the network reads, got "
-            f"{len(image)} channels of {image.dtype}. {REMEDY}"
+            f"The network reads {channels} channels of numbers, but {name} has {len(image)} "
+            f"channels of {image.dtype}. {REMEDY}"
         )
     if not image.size:
         raise ImageError(f"{name} has no pixels: its shape is {sizes_of(image)}. {REMEDY}")

@@ -150,8 +150,8 @@ def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:
         arrays = load_arrays(path)
     except ValueError as error:
         raise ImageError(
-            f"Samples are a .npy or .npz file of numbers, or a folder of images, but {path} cannot "
-            f"be read as such: {printable(str(error))}. {REMEDY}"
+            f"{path} cannot be read as samples: {printable(str(error))}. Give a .npy or .npz file "
+            f"of numbers, or a folder of images. {REMEDY}"
         ) from error
     # One array alone may have any name: `np.savez(file, images)` calls it `arr_0`.
     image = next(iter(arrays)) if len(arrays) == 1 else "image"

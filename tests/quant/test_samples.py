@@ -146,15 +146,15 @@ def cut_off(folder: Path) -> Path:
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        (of(RAMP), "must have 1 channels of numbers.*got 2"),
+        (of(RAMP), "reads 1 channels of numbers.*has 2"),
         (of(ONE_CHANNEL * 3e5), "a range of 0 to .*Divide them by full scale"),
         (of(np.full((1, 1, 9, 9), np.nan)), "81 values that are NaN or infinite"),
         (of(RAMP[0, 0]), "a batch of"),
         (of(ONE_CHANNEL[..., :3, :3]), "at least 4 pixels a side, got 3 x 3"),
         (of(ONE_CHANNEL[:0]), "contains no sample"),
-        (pickled, "a .npy or .npz file of numbers, or a folder.*x\\.npy"),
+        (pickled, r"x\.npy cannot be read as samples"),
         (two_arrays, "got first, second"),
-        (cut_off, "a .npy or .npz file of numbers"),
+        (cut_off, r"x\.npz cannot be read as samples"),
         (with_reference(np.array(0.5)), "a reference for each of its 3 images"),
         (
             with_reference(np.full((3, 2), "text")),
