@@ -10,7 +10,7 @@ import pytest
 from beers_deploy.quant.passes.selection import ALL, Passes
 from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.session import open_session, result_of
-from tests.quant.quick import patches_of, waves
+from tests.quant.quick import patches_of
 from tests.quant.test_odd_networks import Sketch, dead_channels
 
 pytestmark = pytest.mark.slow
@@ -18,12 +18,12 @@ pytestmark = pytest.mark.slow
 Results = Callable[[Passes], list[np.ndarray]]
 
 
-def images() -> list[np.ndarray]:
-    """Waves with few bright points: to clip these costs least."""
-    bright = waves()
-    for image in bright:
-        image[..., 5::16, 7::12] = 1.0
-    return bright
+def waves(phase: int) -> np.ndarray:
+    """An image (1, 1, H, W) of waves with few bright points: to clip these costs least."""
+    rows, columns = np.mgrid[:48, :36] / 40
+    image = 0.3 + 0.1 * np.sin(7 * rows + phase) * np.cos(5 * columns)
+    image[5::16, 7::12] = 1.0
+    return np.asarray(image, np.float32)[None, None]
 
 
 @pytest.fixture(scope="module")
@@ -31,12 +31,12 @@ def results(float_onnx: onnx.ModelProto) -> Results:
     """What two networks restore once quantised: one adds to the image, through the other it passes
     itself.
     """
-    patches = patches_of(images())
+    patches = patches_of([waves(phase) for phase in range(3)])
 
     def of_passes(passes: Passes) -> list[np.ndarray]:
         networks = (float_onnx, dead_channels(Sketch()))
         files = [quantize_model(network, patches, {}, passes=passes).host for network in networks]
-        return [result_of(open_session(file), images()[0]) for file in files]
+        return [result_of(open_session(file), waves(0)) for file in files]
 
     return of_passes
 
