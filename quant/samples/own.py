@@ -135,8 +135,10 @@ def samples_of(
     except ModelError:
         multiple_px = 0
     if samples is not None:
-        is_path = isinstance(samples, str | os.PathLike)
-        source = Path(samples) if is_path else samples_in(samples)
+        if isinstance(samples, str | os.PathLike):
+            source: Path | list[Pair] = Path(samples)
+        else:
+            source = samples_in(samples)
         ranges = None if input_range is None else read_ranges(input_range, channels)
         return read_samples(source, channels, fixed_px, multiple_px or 1, ranges)
     # Simulated patches have one channel and PATCH_PX a side.
