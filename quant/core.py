@@ -166,14 +166,14 @@ class IntCore:
         return [op for op in self.ops if isinstance(op, IntConv)]
 
 
-def dequantized(op: Conv, whole: IntConv) -> Conv:
+def dequantized(op: Conv, int_op: IntConv) -> Conv:
     """Return the float convolution with the values that the int8 weights and bias represent."""
-    weight = (whole.weight * 2.0**-whole.weight_frac_bits).astype(np.float32)
-    return replace(op, weight=weight, bias=whole.float_bias.astype(np.float32))
+    weight = (int_op.weight * 2.0**-int_op.weight_frac_bits).astype(np.float32)
+    return replace(op, weight=weight, bias=int_op.float_bias.astype(np.float32))
 
 
 def rounded_to(values: np.ndarray, frac_bits: int) -> np.ndarray:
-    """Round to integer multiples of 2^-n, half up, and clip, as the DPU does."""
+    """Round real values to multiples of 2^-frac_bits, half up, and clip them to int8's range."""
     scale = np.float32(2.0**frac_bits)
     # np.rint would round half to even, as onnxruntime does.
     units = np.floor(values * scale + np.float32(0.5))
@@ -212,8 +212,8 @@ def build_core(
         if not faults:
             return _with_biases_left(core, graph)
     raise ModelError(
-        f"The DPU's shifts do not reach all values of the float network: {faults[0]}. Look for "
-        "weights that are far too large or small."
+        f"The network cannot be quantised, because the DPU's shifts do not reach all its values "
+        f"({faults[0]}). Look for weights that are far too large or too small."
     )
 
 

@@ -60,8 +60,9 @@ def metric_value(name: str, result: np.ndarray, reference: np.ndarray) -> float:
     """Return the value of a metric, by its name, for one result (1, C, H, W)."""
     if reference.size != result.size:
         raise OptionError(
-            f"The `metric` {name!r} needs references of {times(result.shape)} for results of that "
-            f"size, got {times(reference.shape)}. Give these, or leave the metric out."
+            f"The `metric` {name!r} needs references of {times(result.shape)}, the size of the "
+            f"results, but they have {times(reference.shape)}. Give such references, or leave "
+            "`metric` out."
         )
     return METRICS[name].value(result, reference)
 
@@ -99,8 +100,10 @@ class Spread:
 
 @dataclass(frozen=True)
 class GateResult:
-    """Differences in [0, 1] of full scale over all pixels; PSNRs over full scale, in dB, NaN
-    without references.
+    """The measured differences between the INT8 and the float network, over all pixels.
+
+    Differences are shares of full scale. PSNRs are in dB over full scale, and NaN without
+    references.
 
     Attributes:
         mae: mean absolute difference of INT8 from float.
@@ -212,7 +215,7 @@ def compare(
     contrasts = []
     errors = []
     metric_values = []
-    unfit = dict[int, np.ndarray]()
+    unfit = list[int]()
     for number, (degraded, reference) in enumerate(patches.pairs):
         in_float, in_int8, ranges = _results(float_session, int8_session, degraded, patches.ranges)
         degraded = to_shares(degraded, patches.ranges)
@@ -226,7 +229,7 @@ def compare(
         changes.append(float(np.abs(in_float - degraded).mean()) if same_shape else math.nan)
         contrasts.append(float(np.abs(in_float - in_float.mean()).mean()))
         if reference.shape != in_float.shape:
-            unfit[number] = reference
+            unfit.append(number)
         elif ranges or patches.ranges:
             reference = to_shares(reference, ranges)
         elif not (reference.min() >= 0 and reference.max() <= LARGEST):
@@ -239,9 +242,7 @@ def compare(
             metric_values.append([metric_value(metric, r, reference) for r in (in_float, in_int8)])
     if unfit and len(unfit) < len(errors):
         # A mean over some of them would be NaN, and its check left out.
-        raise unfit_reference(
-            patches, next(iter(unfit)), "the PSNRs, because other samples have one"
-        )
+        raise unfit_reference(patches, unfit[0], "the mean PSNR")
     everything = np.concatenate(differences).astype(np.float64)
     degraded_db, float_db, int8_db = np.mean(errors, axis=0).tolist()
     metric_float, metric_int8 = np.mean(metric_values or [[math.nan] * 2], axis=0).tolist()
@@ -277,10 +278,10 @@ def _results(
     degraded: np.ndarray,
     ranges: Ranges,
 ) -> tuple[np.ndarray, np.ndarray, Ranges]:
-    """Return the float and the INT8 result as shares of their ranges, and these.
+    """Return the float result, the INT8 result and their ranges; both results are shares of these.
 
-    They are clipped to [0, 1] if they are images; NaN where infinite, which no clipping makes a
-    pixel.
+    If the network makes images, results are clipped to [0, 1]. Infinite values become NaN, because
+    clipping must not make pixels of them.
     """
     results = [result_of(session, degraded) for session in (float_session, int8_session)]
     if results[0].shape != results[1].shape:
@@ -292,8 +293,8 @@ def _results(
     if results[0].ndim != 4:
         raise ModelError(
             f"The results of the networks must be images (N, C, H, W), but they are "
-            f"{times(results[0].shape)}. The gate is for networks that make an image of an "
-            "image; 'check' and 'bench' read any network."
+            f"{times(results[0].shape)}. The gate compares image-to-image networks only. 'check' "
+            "and 'bench' read any network."
         )
     # The float result alone decides, so that both are treated alike.
     ranges = ranges_of_result(results[0], degraded, ranges)
@@ -321,8 +322,9 @@ def unfit_reference(patches: Patches, number: int, purpose: str) -> ImageError:
     shape = patches.pairs[number][1].shape
     fault = f"its reference has {times(shape[1:])}" if math.prod(shape) else "it has none"
     return ImageError(
-        f"{_name(patches, number)} must have a reference of the size of the network's results for "
-        f"{purpose}, but {fault}. Give references of that size for all samples, or none."
+        f"{_name(patches, number)} must have a reference of the size of the network's results, "
+        f"because {purpose} needs one for every sample, but {fault}. Give such references for all "
+        "samples, or for none."
     )
 
 
@@ -356,20 +358,30 @@ def gate_row(result: GateResult, shares: Mapping[str, float] | None = None) -> R
         entries[f"{result.metric} lost"] = (result.metric_loss, unit)
     if shares is not None:
         entries["PSNR drop"] = (result.drop_db, "dB")
-    figures = {name: _figure(value, unit, result) for name, (value, unit) in entries.items()}
+    missing = "a network gave NaN" if math.isnan(result.mae) else "no reference of that size"
+    figures = {
+        name: figure_of(value, unit, result.source, missing)
+        for name, (value, unit) in entries.items()
+    }
     if shares is not None:
         figures["saturated results"] = _saturation(shares, result.source)
     return Row("gate", "INT8 against float", figures)
 
 
-def _figure(value: float, unit: str, result: GateResult) -> Figure:
+def figure_of(value: float, unit: str, source: str, missing: str) -> Figure:
+    """Return a measured value as a figure, or an unavailable one if it is infinite or NaN.
+
+    Args:
+        value: in the unit.
+        unit: of the figure.
+        source: how it was measured.
+        missing: why it is NaN.
+    """
     if math.isinf(value):
         return unavailable(unit, "infinite: the two images are identical")
     if math.isnan(value):
-        return unavailable(
-            unit, "a network gave NaN" if math.isnan(result.mae) else "no reference of that size"
-        )
-    return measured(value, unit, result.source)
+        return unavailable(unit, missing)
+    return measured(value, unit, source)
 
 
 def _saturation(shares: Mapping[str, float], source: str) -> Figure:

@@ -50,6 +50,13 @@ SAMPLES = 16
 """The maximum number of measured samples that were held out from calibration."""
 PER_CHANNEL = (1, 2, 3)
 """Axes of weights (O, I, kh, kw) over which a scale for each output channel is shared."""
+STEPS: Mapping[str, tuple[tuple[int, ...] | None, bool, bool]] = {
+    "8 bits": (PER_CHANNEL, True, False),
+    "no zero point": (PER_CHANNEL, False, False),
+    "one scale for the weights of a layer": (None, False, False),
+    "powers of two as scales": (None, False, True),
+}
+"""The axes, the zero point and the powers of two of `Measured.cost_of_step`, in steps 1 to 4."""
 
 
 @dataclass(frozen=True)
@@ -164,10 +171,10 @@ class Measured:
         """
         maes = []
         drops_db = []
-        for image, in_float, (given, reference) in zip(
+        for image, in_float, (degraded, reference) in zip(
             results, self.floats, self.pairs, strict=True
         ):
-            ranges = ranges_of_result(in_float, given, self.host_part.input_ranges)
+            ranges = ranges_of_result(in_float, degraded, self.host_part.input_ranges)
             float_shares, shares = (to_shares(each, ranges) for each in (in_float, image))
             maes.append(float(np.abs(shares - float_shares).mean()))
             drop_db = math.nan
@@ -216,8 +223,8 @@ class Measured:
                 that the difference of both losses is the loss by clipping.
         """
         graph = tuple(
-            dequantized(op, whole) if isinstance(op, Conv) and isinstance(whole, IntConv) else op
-            for op, whole in zip(result.graph, result.core.ops, strict=True)
+            dequantized(op, int_op) if isinstance(op, Conv) and isinstance(int_op, IntConv) else op
+            for op, int_op in zip(result.graph, result.core.ops, strict=True)
         )
         ends = (INT8_MIN, INT8_MAX) if clips else (-math.inf, math.inf)
         grids = {name: Grid(result.core.scale(name), *ends) for name in tensors(graph)}
@@ -241,14 +248,9 @@ def price_rows(result: Quantized, held_out: Patches) -> list[Row]:
     graph = result.network.graph
     int8 = open_any_size(result.host)
     costs = {
-        "8 bits": samples.cost_of_step(graph, PER_CHANNEL, zero_point=True, powers=False),
-        "no zero point": samples.cost_of_step(graph, PER_CHANNEL, zero_point=False, powers=False),
-        "one scale for the weights of a layer": samples.cost_of_step(
-            graph, None, zero_point=False, powers=False
-        ),
-        "powers of two as scales": samples.cost_of_step(graph, None, zero_point=False, powers=True),
-        "INT8 as written": samples.cost(result_of(int8, image) for image, _ in samples.pairs),
+        name: samples.cost_of_step(graph, *restrictions) for name, restrictions in STEPS.items()
     }
+    costs["INT8 as written"] = samples.cost(result_of(int8, image) for image, _ in samples.pairs)
     source = f"{len(samples.pairs)} samples that calibration did not see"
     rows = []
     before = Cost(0.0, 0.0)

@@ -63,7 +63,6 @@ from beers_deploy.quant.passes.equalize import (
 from beers_deploy.quant.passes.equalize_single import (
     SingleTensors,
     equalize_single,
-    largest_values,
     single_ranges,
 )
 from beers_deploy.quant.passes.least_squares import choose_frac_bits
@@ -322,5 +321,5 @@ def _equalized_singles(
     if not plan.host_part.decoding.offsets:
         return graph
     # Here the image itself is in the tensors, with nothing on the host to make up for a clip.
-    largest = largest_values(graph, plan.singles, images, plan.host_part)
+    largest = single_ranges(graph, plan.singles, images, plan.host_part, 1.0, 1.0)
     return plan.singles.scaled(graph, FULL / np.maximum(largest, FULL))

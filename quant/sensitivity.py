@@ -51,11 +51,6 @@ not yet rounded.
 
 WORST = 4
 BEYOND_DN = (1, 2, 4, 8, 16, 32, 64)
-ROUNDING = 1.4
-CLIPPING = 1.6
-"""Limits of std / MAE, which is 1.25 for a Gaussian: below the first the errors are rounding, above
-the second clipping.
-"""
 
 
 class Loss:
@@ -244,9 +239,7 @@ def worst_row(number: int, patches: Patches, spread: Spread) -> Row:
 
 
 def _mtf(sensor: Instrument) -> str:
-    """Return one value, or two where the sensor's axes differ. The profile gave them to this patch;
-    nothing was measured.
-    """
+    """Format the MTF at Nyquist of the sensor profile: one value, or two if its axes differ."""
     across, along = (f"{100 * value:.3g} %" for value in sensor.mtf_axes)
     return across if across == along else f"{across} across the track, {along} along it"
 
@@ -288,14 +281,9 @@ def losses(
         return message
     costliest = _costliest(layers or layer_error_rows(result, patches))
     names = ", ".join(f"{name} ({share:.0f} %)" for name, share in costliest)
-    message = f"{message}: most of it in {names}"
-    remedies = []
     # Of a network that is fine-tuned already there is nothing left to gain by it.
-    if FINETUNE not in metadata(result.host):
-        remedies.append("`finetune` auto")
-    if not result.core.host_part.adds_image:
-        remedies.append("a network that ends with a global add, of which INT8 errs less")
-    return f"{message}; try {', or '.join(remedies)}" if remedies else message
+    advice = "" if FINETUNE in metadata(result.host) else "; try `finetune` auto"
+    return f"{message}: most of it in {names}{advice}"
 
 
 MOST = 3
@@ -315,16 +303,6 @@ def headline(gate: GateResult, layers: Sequence[Row]) -> str:
     drop = "" if math.isnan(gate.drop_db) else f" and costs {gate.drop_db:.2f} dB"
     return (
         f"INT8 differs from float by {gate.mae:.2g} of full scale on average{drop} "
-        f"(measured). {kind_of_error(gate.std_over_mae)} Most of the squared error comes from: "
-        f"{names}."
+        f"(measured). std / MAE is {gate.std_over_mae:.2f}: rounding alone makes it 1.25, and "
+        f"clipping makes it larger. Most of the squared error comes from: {names}."
     )
-
-
-def kind_of_error(std_over_mae: float) -> str:
-    """Return one sentence on the meaning of std / MAE."""
-    sentence = f"std / MAE is {std_over_mae:.2f}, where a Gaussian has 1.25"
-    if std_over_mae <= ROUNDING:
-        return f"{sentence}: the errors are mostly those of rounding."
-    if std_over_mae <= CLIPPING:
-        return f"{sentence}: rounding, but of unequal size from place to place."
-    return f"{sentence}: a few pixels err far more than the rest, which is clipping."

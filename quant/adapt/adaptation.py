@@ -14,7 +14,7 @@ import numpy as np
 import onnx
 
 from beers_deploy.profiles.errors import ModelError
-from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
+from beers_deploy.profiles.figures import Figure, Row
 from beers_deploy.quant.adapt.compensation import compensated
 from beers_deploy.quant.adapt.replacements import (
     APPROXIMATIONS,
@@ -23,7 +23,7 @@ from beers_deploy.quant.adapt.replacements import (
     nodes_by_kind,
     replaced,
 )
-from beers_deploy.quant.gate import GateResult, compare
+from beers_deploy.quant.gate import GateResult, compare, figure_of
 from beers_deploy.quant.graph import read_network
 from beers_deploy.quant.onnx.graph import OnnxGraph
 from beers_deploy.quant.onnx_file import fixed_tile_px
@@ -91,17 +91,11 @@ class Trial:
         source = f"{self.after.source} that no convolution was fitted on, in float"
         figures = {}
         for name, result in (("replaced", self.before), ("compensated", self.after)):
-            figures[f"PSNR lost, {name}"] = _db(result.drop_db, source)
-            figures[f"PSNR to the original, {name}"] = _db(result.psnr_between_db, source)
+            values = {"PSNR lost": result.drop_db, "PSNR to the original": result.psnr_between_db}
+            for key, value in values.items():
+                missing = "the samples have no references"
+                figures[f"{key}, {name}"] = figure_of(value, "dB", source, missing)
         return figures
-
-
-def _db(value: float, source: str) -> Figure:
-    if math.isinf(value):
-        return unavailable("dB", "infinite: the results are identical")
-    if math.isnan(value):
-        return unavailable("dB", "the samples have no references")
-    return measured(value, "dB", source)
 
 
 def adapt(model: onnx.ModelProto, samples: Patches, held_out: Patches) -> Adapted:

@@ -87,9 +87,9 @@ def kind_of(graph: OnnxGraph, node: Node) -> Kind | None:
         part_of_silu = readers and all(silu_input(graph, reader) for reader in readers)
         return None if part_of_silu else Kind.sigmoid
     if node.op_type == "HardSigmoid":
-        given = attributes.get("alpha", 0.2), attributes.get("beta", 0.5)
-        plain = np.allclose(given, (1 / 6, 0.5), 1e-4)
-        return None if plain or not given[0] else Kind.hard_sigmoid
+        slope = attributes.get("alpha", 0.2)
+        is_plain = np.allclose((slope, attributes.get("beta", 0.5)), (1 / 6, 0.5), 1e-4)
+        return None if is_plain or not slope else Kind.hard_sigmoid
     slopes = slopes_of(graph, node)
     if slopes is None:
         return None

@@ -32,6 +32,7 @@ from beers_deploy.quant.integer.arithmetic import (
     mean_factor,
 )
 from beers_deploy.quant.integer.reference import rounded, saturated
+from beers_deploy.quant.untrusted import times
 
 SUM_BITS = 30
 """Bits of the largest sum: int32 must also hold the half of a step that rounding adds."""
@@ -190,11 +191,6 @@ class LayerWriter:
 def plain(name: str) -> str:
     """Return a name from a file as text that cannot end a comment of C."""
     return "".join(c if c.isascii() and (c.isalnum() or c in "._- ,:") else "_" for c in name)[:200]
-
-
-def times(shape: Shape) -> str:
-    """Return sizes as text: channels x rows x columns."""
-    return " x ".join(map(str, shape))
 
 
 def comment(*paragraphs: str) -> str:

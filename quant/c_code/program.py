@@ -3,11 +3,12 @@
 import math
 from importlib.resources import files
 
-from beers_deploy.quant.c_code.layers import LayerWriter, Shape, comment, plain, times
+from beers_deploy.quant.c_code.layers import LayerWriter, Shape, comment, plain
 from beers_deploy.quant.c_code.memory import share_buffers
 from beers_deploy.quant.core import IntCore
 from beers_deploy.quant.encodings import board_model
 from beers_deploy.quant.graph import CORRECTION, PLANES
+from beers_deploy.quant.untrusted import times
 
 KERNELS = (
     "common",

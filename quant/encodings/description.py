@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from beers_deploy.profiles.errors import ModelError, printable
+from beers_deploy.profiles.errors import ModelError, reason_of
 from beers_deploy.quant.core import IntConv, IntCore
 from beers_deploy.quant.graph import (
     Activation,
@@ -71,28 +71,27 @@ def _plain(op: IntConv | Op) -> dict[str, Any]:
 
 
 def described_core(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
-    """Return the core that a description and the constants of its file make.
+    """Read a core from its description and from the constants of the same file.
+
+    Args:
+        text: of `describe`.
+        constants: weights and biases by name.
 
     Raises:
         ModelError: metadata that are damaged, or that do not fit the constants.
     """
     try:
-        return _described(text, constants)
+        description = json.loads(text)
+        # Offsets are values, which may be of any size; every other number is bounded.
+        _require_small({**description, HOST_PART: {**description[HOST_PART], "offsets": []}})
+        frac_bits = {str(name): int(bits) for name, bits in description["frac_bits"].items()}
+        ops = tuple(_op(dict(op), frac_bits, constants) for op in description["ops"])
+        return IntCore(ops, frac_bits, host_part_from_json(description[HOST_PART]))
     except DAMAGE as error:
-        reason = printable(" ".join(f"{type(error).__name__}: {error}".split()))
         raise ModelError(
             f"The metadata {KEY!r} of the INT8 network, which describe its integers, are damaged "
-            f"({reason}). Quantise the network again."
+            f"({type(error).__name__}: {reason_of(error)}). Quantise the network again."
         ) from error
-
-
-def _described(text: str, constants: Mapping[str, np.ndarray]) -> IntCore:
-    description = json.loads(text)
-    # Offsets are values, which may be of any size; every other number is bounded.
-    _require_small({**description, HOST_PART: {**description[HOST_PART], "offsets": []}})
-    frac_bits = {str(name): int(bits) for name, bits in description["frac_bits"].items()}
-    ops = tuple(_op(dict(op), frac_bits, constants) for op in description["ops"])
-    return IntCore(ops, frac_bits, host_part_from_json(description[HOST_PART]))
 
 
 def _require_small(value: object) -> None:

@@ -7,7 +7,6 @@ from typing import Any
 from beers_deploy.quant.graph import Shuffle
 from beers_deploy.quant.host_part.input_encoding import (
     BANK_SLICES,
-    BitSlices,
     Direct,
     InputEncoding,
 )
@@ -36,15 +35,16 @@ def host_part_to_json(part: HostPart) -> dict[str, Any]:
     for name in ("input_ranges", "limits"):
         if not record[name]:
             del record[name]
-    if isinstance(part.encoding, BitSlices) and part.encoding != BANK_SLICES:
-        # Files without a margin are described as they were before there was any.
-        record |= {"margin_px": part.encoding.margin_px} if part.encoding.margin_px else {}
+    # A bank has a margin of its own, and files without one are described as they were before.
+    if part.encoding != BANK_SLICES and part.encoding.margin_px:
+        record["margin_px"] = part.encoding.margin_px
     return {
         **record,
         "planes": part.encoding.planes,
         "direct": isinstance(part.encoding, Direct),
         "banked": part.encoding == BANK_SLICES,
-        "gains": _gains(decoding),
+        # Windows count as one gain.
+        "gains": 1 if decoding.offsets else len(decoding.gains),
         "offsets": decoding.offsets,
         "wide": decoding == BankSum(coarse_copies=1),
     }
@@ -60,38 +60,31 @@ def host_part_from_json(record: Mapping[str, Any]) -> HostPart:
     ranges = tuple((float(low), float(high)) for low, high in record.get("input_ranges", ()))
     limits = tuple(map(float, record.get("limits", ())))
     require_ranges((*ranges, limits) if limits else ranges)
-    encoding = _encoding(record, ranges)
-    # The file is not trusted: its core must read the planes that the host makes.
-    if int(record["planes"]) != encoding.planes:
-        raise ValueError(f"{record['planes']} planes of each channel instead of {encoding.planes}")
-    decoding = _decoding(record)
-    if int(record["gains"]) != _gains(decoding):
-        raise ValueError(f"{record['gains']} gains instead of {_gains(decoding)}")
     part = HostPart(
         channels=int(record["channels"]),
         outputs=int(record["outputs"]),
         **shuffles,
-        adds_image=bool(record.get("adds_image", True)),
-        unit=float(record.get("unit", 1.0)),
-        encoding=encoding,
-        decoding=decoding,
+        adds_image=bool(record["adds_image"]),
+        unit=float(record["unit"]),
+        encoding=_encoding(record, ranges),
+        decoding=_decoding(record),
         input_ranges=ranges,
         limits=limits,
     )
+    # The file is not trusted: its core must read what the host writes, and write what it decodes.
+    for key in ("planes", "gains"):
+        expected = host_part_to_json(part)[key]
+        if record[key] != expected:
+            raise ValueError(f"{key} of {record[key]!r} instead of {expected}")
     if len(ranges) not in (0, part.image_channels):
         raise ValueError(f"{len(ranges)} ranges of {part.image_channels} channels")
     return part
 
 
-def _gains(decoding: OutputDecoding) -> int:
-    """Return in how many gains a file states that the result comes: windows count as one."""
-    return 1 if decoding.offsets else len(decoding.gains)
-
-
 def _encoding(record: Mapping[str, Any], ranges: Ranges) -> InputEncoding:
-    if record.get("direct"):
+    if record["direct"]:
         return Direct()
-    if record.get("banked"):
+    if record["banked"]:
         return BANK_SLICES
     margin_px = int(record.get("margin_px", 0))
     if not 0 <= margin_px <= MOST_MARGIN_PX:
@@ -103,7 +96,7 @@ def _decoding(record: Mapping[str, Any]) -> OutputDecoding:
     offsets = tuple(tuple(map(float, window)) for window in record["offsets"])
     if offsets:
         return OffsetWindows(offsets)
-    # Files of earlier versions do not state `wide`, because they have no coarse copy.
-    if record.get("banked"):
+    # Files that were shipped earlier do not state `wide`, because they have no coarse copy.
+    if record["banked"]:
         return BankSum(coarse_copies=int(bool(record.get("wide"))))
-    return DualRange() if int(record["gains"]) == 2 else Plain()
+    return DualRange() if record["gains"] == 2 else Plain()

@@ -168,8 +168,8 @@ MEANS = {
     (3, 6): (7, 7),
     (6, 3): (7, 7),
     (7, 7): (21, 10),
+    (14, 14): (21, 12),
 }
-MEANS[14, 14] = (21, 12)
 """Kernels whose factors the DPU's quantiser defines (Vitis-AI 3.0, nndct_shared)."""
 
 

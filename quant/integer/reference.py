@@ -251,9 +251,9 @@ def rounded(sums: np.ndarray, shift: int, half_even: bool) -> tuple[np.ndarray, 
     return np.asarray(quotients), float(ties.mean())
 
 
-def saturated(whole: np.ndarray) -> np.ndarray:
-    """Clip integers to int8, as int16."""
-    return np.asarray(np.clip(whole, INT8_MIN, INT8_MAX), np.int16)
+def saturated(values: np.ndarray) -> np.ndarray:
+    """Clip integers to the range of int8, and return them as int16."""
+    return np.asarray(np.clip(values, INT8_MIN, INT8_MAX), np.int16)
 
 
 @dataclass(frozen=True)
@@ -360,8 +360,9 @@ def _layer_row(layers: list[LayerAgreement], source: str) -> Row:
 
 
 def _rounding_row(in_float: list[np.ndarray], results: list[list[np.ndarray]], source: str) -> Row:
-    """Return how far the DPU's rounding of ties, up, leads away from the runtime's, to even, and
-    which is nearer to float.
+    """Return a row that compares both rules for ties: the DPU rounds them up, the runtime to even.
+
+    It states how far the results differ, and the error of each against the float network.
     """
     up, even = (np.concatenate([pair[k].ravel() for pair in results]) for k in (0, 1))
     floats = np.concatenate([result.ravel() for result in in_float])

@@ -70,11 +70,10 @@ def to_int8(values: Tensor, low: int = INT8_MIN, high: int = INT8_MAX) -> Tensor
 
 
 class TrainableCore(torch.nn.Module):
-    """An integer core whose weights and biases are parameters, in units of their own scale; all
-    scales stay.
+    """An integer core in torch, whose weights and biases are trained while all scales are fixed.
 
-    They may lie between integers while they are trained; forwards the nearest integers
-    count.
+    The parameters are in units of their own scale. They may lie between integers, but the forward
+    pass uses the nearest ones.
     """
 
     def __init__(self, core: IntCore) -> None:
@@ -119,26 +118,22 @@ class TrainableCore(torch.nn.Module):
         copy._core = replace(self._core, frac_bits={**frac_bits, **finer})
         return copy
 
-    def with_finer_weights(self, number: int, by: int) -> "TrainableCore":
-        """Return a copy in which the weights of a convolution have `by` more fractional bits.
+    def with_finer_numbers(self, role: str, number: int, by: int) -> "TrainableCore":
+        """Return a copy in which the weights or biases of a convolution have `by` more fractional
+        bits.
 
         Args:
+            role: "weight" or "bias".
             number: place of the convolution among the core's convolutions.
-            by: fractional bits to add; negative ones make the weights coarser.
+            by: fractional bits to add; negative ones make the numbers coarser.
         """
         copy = deepcopy(self)
         op = self._convs[number]
-        copy._convs[number] = replace(op, weight_frac_bits=op.weight_frac_bits + by)
+        key = f"{role}_frac_bits"
+        copy._convs[number] = replace(op, **{key: getattr(op, key) + by})
+        numbers = copy.weights if role == "weight" else copy.biases
         # Clipped numbers start at the end of int8, where the gradient is not 0.
-        copy.weights[number].data.mul_(2.0**by).clamp_(INT8_MIN, INT8_MAX)
-        return copy
-
-    def with_finer_biases(self, number: int, by: int) -> "TrainableCore":
-        """Return a copy in which the biases of a convolution have `by` more fractional bits."""
-        copy = deepcopy(self)
-        op = self._convs[number]
-        copy._convs[number] = replace(op, bias_frac_bits=op.bias_frac_bits + by)
-        copy.biases[number].data.mul_(2.0**by).clamp_(INT8_MIN, INT8_MAX)
+        numbers[number].data.mul_(2.0**by).clamp_(INT8_MIN, INT8_MAX)
         return copy
 
     def forward(self, planes: Tensor) -> Tensor:

@@ -62,9 +62,15 @@ TURNS = 4
 
 
 def channel_groups(ranges: np.ndarray, most: int) -> list[np.ndarray]:
-    """Return the numbers of the channels to be tried together, for ranges (C,): neighbours in size.
+    """Divide channels into groups of similar range, whose factors are tried together.
 
-    There is one group for each channel if `most` allows.
+    Args:
+        ranges: of the channels, (C,).
+        most: the maximum number of groups; 0 for none. If it is at least C, each channel is a group
+            of its own.
+
+    Returns:
+        The numbers of the channels of each group.
     """
     if most >= len(ranges):
         return list(np.arange(len(ranges))[:, None])

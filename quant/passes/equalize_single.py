@@ -132,28 +132,23 @@ class SingleTensors:
 
 
 def single_ranges(
-    graph: Graph, singles: SingleTensors, images: Iterable[np.ndarray], host_part: HostPart
-) -> np.ndarray:
-    """Return the range of every channel over images (1, C, H, W) that most tiles stay within."""
-    return _over_tiles(graph, singles, images, host_part, QUANTILE, TILES)
-
-
-def largest_values(
-    graph: Graph, singles: SingleTensors, images: Iterable[np.ndarray], host_part: HostPart
-) -> np.ndarray:
-    """Return the largest size of every channel over images (1, C, H, W)."""
-    return _over_tiles(graph, singles, images, host_part, 1.0, 1.0)
-
-
-def _over_tiles(
     graph: Graph,
     singles: SingleTensors,
     images: Iterable[np.ndarray],
     host_part: HostPart,
-    quantile: float,
-    tiles: float,
+    quantile: float = QUANTILE,
+    tiles: float = TILES,
 ) -> np.ndarray:
-    """Return a quantile over the tiles of a quantile of each channel's sizes in a tile."""
+    """Return the range of every channel over images (1, C, H, W) that most tiles stay within.
+
+    Args:
+        graph: of which the tensors are.
+        singles: the tensors.
+        images: that are cut to tiles.
+        host_part: of the graph.
+        quantile: of a channel's absolute values in a tile; 1 returns the largest.
+        tiles: the quantile of these over the tiles.
+    """
     sizes = channel_sizes(graph, list(singles.tensors), images, host_part, quantile)
     by_tensor = zip(*sizes, strict=True)
     return np.concatenate([above_dead(np.quantile(each, tiles, axis=0)) for each in by_tensor])

@@ -18,6 +18,7 @@ more, and one bit coarser, where it rounds more. The error of the result decides
 import logging
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import product
 
 from beers_deploy.quant.core import IntCore, Shifts, shift_faults
 from beers_deploy.quant.graph import PLANES, Activation, Add, Conv, Graph, ties_scales
@@ -43,10 +44,10 @@ def with_better_scales(
     Returns:
         The core with the least error found; `trainable` itself if no move reduces it.
     """
-    least = loss_of(trainable.core())
-    tried = 0
     start = trainable.core()
-    for move in _moves(trainable.core(), graph):
+    least = loss_of(start)
+    tried = 0
+    for move in _moves(start, graph):
         for by in (1, -1):
             candidate = move(trainable, by=by)
             core = candidate.core()
@@ -100,9 +101,9 @@ def _moves(core: IntCore, graph: Graph) -> Iterator[Callable[..., TrainableCore]
             yield partial(TrainableCore.with_finer_tensors, names=together)
     # 3.
     writes_copies = core.host_part.decoding.copies > 1
-    for number in range(len(core.convolutions) - writes_copies):
-        yield partial(TrainableCore.with_finer_weights, number=number)
-        yield partial(TrainableCore.with_finer_biases, number=number)
+    convolutions = range(len(core.convolutions) - writes_copies)
+    for number, role in product(convolutions, ("weight", "bias")):
+        yield partial(TrainableCore.with_finer_numbers, role=role, number=number)
 
 
 def moved(core: IntCore, other: IntCore) -> int:

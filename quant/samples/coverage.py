@@ -119,11 +119,7 @@ def uncovered(judged: SampleRange, calibrated: SampleRange | None) -> str:
         f"the samples reach {judged.p99_9:.2f} of full scale (99.9th percentile): "
         "nothing brighter was judged"
     )
-    if calibrated is None:
-        return f"{sentence}, and the INT8 file does not record what its calibration covered"
-    if not calibrated.reaches_full_scale:
-        return (
-            f"{sentence}, and by the INT8 file's own record its calibration reached "
-            f"{calibrated.p99_9:.2f}"
-        )
-    return sentence
+    if calibrated is None or calibrated.reaches_full_scale:
+        return sentence
+    reached = f"{calibrated.p99_9:.2f}"
+    return f"{sentence}, and by the INT8 file's own record its calibration reached {reached}"

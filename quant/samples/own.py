@@ -9,9 +9,8 @@ and the target of the network, as `image` and `reference`.
 
 import hashlib
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -37,11 +36,9 @@ from beers_deploy.quant.samples.stored import (
     IN_MEMORY,
     NO_REFERENCE,
     REMEDY,
-    sample_files,
     samples_in,
     sizes_of,
-    stored_batch,
-    stored_one,
+    stored_samples,
 )
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from beers_deploy.quant.untrusted import times
@@ -117,14 +114,14 @@ def digest_of(sample: np.ndarray) -> str:
 
 
 def samples_of(
-    model: onnx.ModelProto, given: object, input_range: object = None
+    model: onnx.ModelProto, samples: object, input_range: object = None
 ) -> OwnSamples | None:
     """Read a user's samples for a network; return None if there are none and simulated patches suit
     the network.
 
     Args:
         model: the network.
-        given: a path, or an input of `samples_in`; None for simulated patches.
+        samples: a path, or an input of `samples_in`; None for simulated patches.
         input_range: the ranges that the user states; None determines them from the samples.
 
     Raises:
@@ -137,8 +134,11 @@ def samples_of(
         multiple_px = tiling_of(model).alignment_px
     except ModelError:
         multiple_px = 0
-    if given is not None:
-        source = Path(given) if isinstance(given, str | os.PathLike) else samples_in(given)
+    if samples is not None:
+        if isinstance(samples, str | os.PathLike):
+            source: Path | list[Pair] = Path(samples)
+        else:
+            source = samples_in(samples)
         ranges = None if input_range is None else read_ranges(input_range, channels)
         return read_samples(source, channels, fixed_px, multiple_px or 1, ranges)
     # Simulated patches have one channel and PATCH_PX a side.
@@ -182,17 +182,11 @@ def read_samples(
     # Messages name a sample by its file or, in memory, by its place.
     label = f"`{IN_MEMORY}`"
     name = IN_MEMORY
-    items: Iterable[tuple[str, np.ndarray, np.ndarray]]
     if isinstance(source, Path):
         label = str(source)
         name = source.name
-        folder = source.is_dir()
-        read_one = partial(stored_one, ranges=ranges or ())
-        items = map(read_one, sample_files(source)) if folder else stored_batch(source)
-    else:
-        items = ((f"{IN_MEMORY}[{k}]", *pair) for k, pair in enumerate(source))
     samples = list[Named]()
-    for sample, image, reference in items:
+    for sample, image, reference in stored_samples(source, ranges or ()):
         pixels = _valid_image(sample, image, channels, ranges)
         target = _valid_reference(sample, reference)
         samples += [(sample, p) for p in _cut(pixels, target, sample, fixed_px, multiple_px)]
@@ -200,7 +194,13 @@ def read_samples(
         raise ImageError(f"{label} contains no sample, but at least one is needed. {REMEDY}")
     stated = ranges is not None
     if ranges is None:
-        ranges = _ranges_of(label, (image for _, (image, _) in samples))
+        ranges = ranges_of(image for _, (image, _) in samples)
+        try:
+            require_ranges(ranges)
+        except ValueError as error:
+            raise ImageError(
+                f"The values of {label} have {error}. Divide them by full scale."
+            ) from error
     # Any network preserves a constant image, so a mean over such samples would hide errors. A map
     # of noise levels is constant in each sample.
     textured = [s for s in samples if _contrast(s[1][0], ranges) >= LEAST_CONTRAST]
@@ -211,21 +211,21 @@ def read_samples(
     return OwnSamples(name, textured, ranges, stated)
 
 
-def _ranges_of(label: str, images: Iterable[np.ndarray]) -> Ranges:
-    """Return the ranges that samples span; raise ImageError if no network is quantised for them."""
-    ranges = ranges_of(images)
-    try:
-        require_ranges(ranges)
-    except ValueError as error:
-        raise ImageError(
-            f"The values of {label} have {error}. Divide them by full scale."
-        ) from error
-    return ranges
-
-
 def _contrast(image: np.ndarray, ranges: Ranges) -> float:
     """Return the largest share of its range that a channel of an image (1, C, h, w) spans."""
     return float(np.ptp(to_shares(image, ranges), (2, 3)).max())
+
+
+def _finite(name: str, values: np.ndarray) -> np.ndarray:
+    """Return numbers as float32, or raise ImageError if some are NaN or infinite."""
+    finite = np.asarray(values, np.float32)
+    missing = np.count_nonzero(~np.isfinite(finite))
+    if missing:
+        raise ImageError(
+            f"{name} has {missing} values that are NaN or infinite. Leave out samples with missing "
+            "pixels."
+        )
+    return finite
 
 
 def _valid_reference(name: str, reference: np.ndarray) -> np.ndarray:
@@ -234,35 +234,21 @@ def _valid_reference(name: str, reference: np.ndarray) -> np.ndarray:
     Whether it must be an image in [0, 1] of the result's size depends on the measurement:
     `quant.gate.compare`.
     """
+    name = f"The reference of {name}"
     if reference.dtype.kind not in "fuib":
-        raise ImageError(
-            f"The reference of {name} must be of real numbers, got {reference.dtype}. {REMEDY}"
-        )
-    values = np.asarray(reference, np.float32)
-    missing = np.count_nonzero(~np.isfinite(values))
-    if missing:
-        raise ImageError(
-            f"The reference of {name} has {missing} values that are NaN or infinite. Leave out "
-            "samples whose references lack pixels."
-        )
-    return values
+        raise ImageError(f"{name} must be of real numbers, got {reference.dtype}. {REMEDY}")
+    return _finite(name, reference)
 
 
 def _valid_image(name: str, image: np.ndarray, channels: int, ranges: Ranges | None) -> np.ndarray:
     if image.dtype.kind not in "fui" or len(image) != channels:
         raise ImageError(
-            f"{name} must have {channels} channels of numbers, as the network reads, got "
-            f"{len(image)} channels of {image.dtype}. {REMEDY}"
+            f"The network reads {channels} channels of numbers, but {name} has {len(image)} "
+            f"channels of {image.dtype}. {REMEDY}"
         )
     if not image.size:
         raise ImageError(f"{name} has no pixels: its shape is {sizes_of(image)}. {REMEDY}")
-    values = np.asarray(image, np.float32)
-    missing = np.count_nonzero(~np.isfinite(values))
-    if missing:
-        raise ImageError(
-            f"{name} has {missing} values that are NaN or infinite. Leave out samples with missing "
-            "pixels."
-        )
+    values = _finite(name, image)
     shares = to_shares(values, ranges or ())
     within = shares.min() >= 1 - LARGEST and shares.max() <= LARGEST
     if ranges is not None and not within:

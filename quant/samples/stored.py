@@ -1,6 +1,6 @@
 """Read stored samples: from a .npy or .npz file, from a folder of images, or from arrays."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,47 +23,42 @@ FULL_SCALE_8 = 255
 REMEDY = "See docs/reference/any-network.md for how to give samples."
 
 
-def samples_in(given: object) -> list[Pair]:
+def samples_in(samples: object) -> list[Pair]:
     """Return the samples in an array, in a pair of arrays (images, references), or in an iterable
     of these.
 
     Args:
-        given: a batch (N, C, H, W), or one image (C, H, W), of NumPy or torch; a tuple of two; a
+        samples: a batch (N, C, H, W), or one image (C, H, W), of NumPy or torch; a tuple of two; a
             simulated pair, which has its full scale; or an iterable of any of these, such as a
             DataLoader.
     """
     # A simulated pair holds digital numbers, and alone knows its full scale.
-    if hasattr(given, "degraded") and hasattr(given, "reference"):
-        pair: Any = given
+    if hasattr(samples, "degraded") and hasattr(samples, "reference"):
+        pair: Any = samples
         largest = np.float32(pair.sensor.max_dn)
         degraded = np.asarray(pair.degraded, np.float32)[None] / largest
         reference = np.asarray(pair.reference, np.float32)[None] / largest
         return [(degraded, reference)]
-    if hasattr(given, "ndim"):
-        return [(image, NO_REFERENCE) for image in _batch(given)]
-    if isinstance(given, tuple) and [hasattr(array, "ndim") for array in given] == [True, True]:
+    if hasattr(samples, "ndim"):
+        return [(image, NO_REFERENCE) for image in _batch(samples)]
+    if isinstance(samples, tuple) and [hasattr(array, "ndim") for array in samples] == [True, True]:
         # A reference may have another size than its image.
-        images = _batch(given[0])
-        references = _plain(given[1])
-        references = references[None] if np.ndim(given[0]) == 3 else references
-        if references.ndim == 0 or len(images) != len(references):
-            raise ImageError(
-                f"`{IN_MEMORY}` must have a reference for each image, got images of "
-                f"{times(images.shape)} and references of {sizes_of(references)}. {REMEDY}"
-            )
-        return list(zip(images, references, strict=True))
-    if not isinstance(given, Iterable) or isinstance(given, str | bytes | Mapping):
+        images = _batch(samples[0])
+        references = _plain(samples[1])
+        references = references[None] if np.ndim(samples[0]) == 3 else references
+        return _paired(f"`{IN_MEMORY}`", images, references)
+    if not isinstance(samples, Iterable) or isinstance(samples, str | bytes | Mapping):
         raise ImageError(
-            f"`{IN_MEMORY}` must be arrays (N, C, H, W) or a path, got {type(given).__name__}. "
+            f"`{IN_MEMORY}` must be arrays (N, C, H, W) or a path, got {type(samples).__name__}. "
             f"{REMEDY}"
         )
-    samples = list[Pair]()
-    for item in given:
+    pairs = list[Pair]()
+    for item in samples:
         # A DataLoader returns a batch as a list: of images and references, or of images alone.
         batch = tuple(item) if isinstance(item, list) and len(item) == 2 else item
         alone = isinstance(batch, list | tuple) and len(batch) == 1
-        samples += samples_in(batch[0] if alone else batch)
-    return samples
+        pairs += samples_in(batch[0] if alone else batch)
+    return pairs
 
 
 def _batch(array: Any) -> np.ndarray:
@@ -92,25 +87,39 @@ def sample_files(path: Path) -> list[Path]:
     )
 
 
-def stored_one(file: Path, ranges: Ranges = ()) -> tuple[str, np.ndarray, np.ndarray]:
-    """Return name, image (C, H, W) and reference of the one sample in a file of a folder.
+def stored_samples(
+    source: Path | Sequence[Pair], ranges: Ranges = ()
+) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yield the name, the image (C, H, W) and the reference of each sample.
 
     Args:
-        file: the path of an image file, or of a .npy file of values that the network reads.
+        source: a file of a batch, a folder of files of one image each, or samples in memory.
         ranges: of the network's channels, onto which 0 to full scale of image files are mapped;
             empty for [0, 1].
     """
-    if file.suffix.lower() != ARRAY_SUFFIX:
-        image = from_shares(_bands_first(file, read_pixels(file)), ranges)
+    if not isinstance(source, Path):
+        for number, pair in enumerate(source):
+            yield f"{IN_MEMORY}[{number}]", *pair
+    elif source.is_dir():
+        for file in sample_files(source):
+            yield file.name, _one_image(file, ranges), NO_REFERENCE
     else:
-        image, _ = _arrays(file)
-        if image.ndim != 3:
-            raise ImageError(f"{file} must be one image (C, H, W), got {sizes_of(image)}. {REMEDY}")
-    return file.name, image, NO_REFERENCE
+        for number, pair in enumerate(_pairs(source)):
+            yield f"{source.name}[{number}]", *pair
 
 
-def stored_batch(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield name, image (C, H, W) and reference of the samples of one file."""
+def _one_image(file: Path, ranges: Ranges) -> np.ndarray:
+    """Return the image (C, H, W) of an image file, or of a .npy file as the network reads it."""
+    if file.suffix.lower() != ARRAY_SUFFIX:
+        return from_shares(_bands_first(file, read_pixels(file)), ranges)
+    image, _ = _arrays(file)
+    if image.ndim != 3:
+        raise ImageError(f"{file} must be one image (C, H, W), got {sizes_of(image)}. {REMEDY}")
+    return image
+
+
+def _pairs(path: Path) -> list[Pair]:
+    """Return the images (C, H, W) and references of the batch in one file."""
     images, references = _arrays(path)
     if images.ndim != 4:
         raise ImageError(
@@ -118,13 +127,17 @@ def stored_batch(path: Path) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
         )
     if references is NO_REFERENCE:
         references = np.empty((len(images), 0), np.float32)
+    return _paired(str(path), images, references)
+
+
+def _paired(label: str, images: np.ndarray, references: np.ndarray) -> list[Pair]:
+    """Return images with their references; raise ImageError if their numbers differ."""
     if references.ndim == 0 or len(references) != len(images):
         raise ImageError(
-            f"{path} must have a reference for each of its {len(images)} images, got references "
+            f"{label} must have a reference for each of its {len(images)} images, got references "
             f"of {sizes_of(references)}. {REMEDY}"
         )
-    for number, pair in enumerate(zip(images, references, strict=True)):
-        yield f"{path.name}[{number}]", *pair
+    return list(zip(images, references, strict=True))
 
 
 def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -137,8 +150,8 @@ def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:
         arrays = load_arrays(path)
     except ValueError as error:
         raise ImageError(
-            f"Samples are a .npy or .npz file of numbers, or a folder of images, but {path} cannot "
-            f"be read as such: {printable(str(error))}. {REMEDY}"
+            f"{path} cannot be read as samples: {printable(str(error))}. Give a .npy or .npz file "
+            f"of numbers, or a folder of images. {REMEDY}"
         ) from error
     # One array alone may have any name: `np.savez(file, images)` calls it `arr_0`.
     image = next(iter(arrays)) if len(arrays) == 1 else "image"

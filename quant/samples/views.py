@@ -213,7 +213,7 @@ def relit(
 
 
 def assign_lightings(count: int, lightings: Lightings, generator: np.random.Generator) -> list[str]:
-    """Return a lighting for each of `count` patches, in random order, in their shares."""
+    """Assign a lighting to each of `count` patches at random, each in its share of the patches."""
     names = list(lightings)
     # Each patch stands for the middle of an equal part of [0, 1], which rounds the shares to whole
     # patches.

@@ -234,7 +234,7 @@ def quantize_behind_bank(
 
 
 def map_steps(conditioned: ConditionedCore, weights: Weights) -> list[np.ndarray]:
-    """Compute the value of an integer 1 of the maps in those of the float network, at a gain of 1.
+    """Compute the float value of one integer step of each feature map, at a gain of 1.
 
     Equalization multiplied each channel by a factor: the ratio of integer weights to float ones.
 

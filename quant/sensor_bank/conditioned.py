@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from beers_deploy.model.bank import Bank
 from beers_deploy.model.variants import SENSOR_VALUES, Kernels
-from beers_deploy.profiles.errors import ModelError, printable
+from beers_deploy.profiles.errors import ModelError, reason_of
 from beers_deploy.quant.core import SHIFTS, IntConv, IntCore, Shifts, quantize_bias
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.graph import PLANES, Op
@@ -192,15 +192,10 @@ def with_delta(core: IntCore, delta: bytes, where: str = "The delta") -> tuple[I
         host_part = replace(core.host_part, unit=float(header["unit"]))
         return replace(core, ops=tuple(ops), host_part=host_part), str(header["sensor"])
     except (zlib.error, *DAMAGE) as error:
-        reason = printable(" ".join(f"{type(error).__name__}: {error}".split()))
-        fault = (
-            "is damaged"
-            if isinstance(error, zlib.error)
-            else f"belongs to another network ({reason})"
-        )
         raise ModelError(
-            f"{where} {fault}. Give a file that 'beers-deploy export --delta' wrote for the same "
-            "network."
+            f"{where} is damaged or belongs to another network ({type(error).__name__}: "
+            f"{reason_of(error)}). Give a file that 'beers-deploy export --delta' wrote for the "
+            "same network."
         ) from error
 
 

@@ -19,7 +19,6 @@ from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.quant.gate import Spread
 from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, make_model, save_onnx
 from beers_deploy.quant.samples.patches import Patches
-from beers_deploy.quant.sensitivity import kind_of_error
 from beers_deploy.quant.session import open_session
 from beers_deploy.quantization import steps_of
 from beers_deploy.report.plots import FONT_PX, MOST_BARS, bins, histogram_url
@@ -174,13 +173,6 @@ def test_labels_of_the_histogram_can_be_read_on_the_narrowest_page(farthest: int
             across.append((left, left + wide))
     assert len(across) >= 3
     assert all(one[1] < other[0] for one, other in pairwise(across))
-
-
-def test_the_ratio_is_put_into_words() -> None:
-    """The ratio of deviation to MAE is explained, since few readers know what 1.25 means."""
-    assert "mostly those of rounding." in kind_of_error(1.27)
-    assert "unequal" in kind_of_error(1.5)
-    assert "clipping" in kind_of_error(3.0)
 
 
 def test_a_report_on_samples_shows_the_worst_of_them(tmp_path: Path) -> None:

@@ -38,9 +38,21 @@ def image(height: int = 37, width: int = 53, seed: int = 0) -> np.ndarray:
     return dn.astype(np.float32) / np.float32(4095)
 
 
+def waves(count: int = 3) -> list[np.ndarray]:
+    """Smooth images (1, 1, 40, 40)."""
+    rows, columns = np.mgrid[:40, :40] / 40
+    images = [0.4 + 0.3 * np.sin(9 * rows + k) * np.cos(7 * columns) for k in range(count)]
+    return [each.astype(np.float32)[None, None] for each in images]
+
+
 def patches_of(images: list[np.ndarray]) -> Patches:
     """These images, each its own reference."""
     return Patches([(image, image) for image in images], images)
+
+
+def without_references(patches: Patches) -> Patches:
+    nothing = np.empty(0, np.float32)
+    return Patches([(image, nothing) for image in patches.degraded], patches.degraded)
 
 
 def drawn(count: int, seed: int, scene: int = 1, patch_px: int = 128) -> Patches:

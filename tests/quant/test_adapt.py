@@ -27,7 +27,7 @@ from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session, result_of
 from beers_deploy.quant.simplify.simplify import simplify
 from beers_deploy.quant.structure import structure_checks
-from tests.quant.quick import changed, image, one_guess, quickly
+from tests.quant.quick import change, changed, image, one_guess, quickly
 
 FEATURES = 6
 IMAGE_WEIGHTS = (FEATURES, 1, 3, 3)
@@ -62,7 +62,6 @@ def gated(w: GraphWriter, x: str, name: str) -> str:
 
 def leaky(slope: float) -> Act:
     """Return a LeakyReLU of a slope."""
-
     return lambda w, x, name: w.node("LeakyRelu", name, [x], alpha=slope)
 
 
@@ -267,19 +266,11 @@ def test_compensation_comes_nearer_to_the_original_and_keeps_the_rest(name: str)
     after = compensated(model, before, outputs, SAMPLES.degraded)
     read_network(after)
     assert squared_error(model, after) < 0.3 * squared_error(model, before)
-    # Only weights of convolutions that there were before may differ.
-    assert conv_names(model) == conv_names(after)
-    assert other_nodes(before) == other_nodes(after)
-
-
-def conv_names(model: onnx.ModelProto) -> set[str]:
-    """Return the names of the convolutions."""
-    return {node.name for node in OnnxGraph(model).nodes if node.op_type == "Conv"}
-
-
-def other_nodes(model: onnx.ModelProto) -> list[onnx.NodeProto]:
-    """Return all nodes but the convolutions."""
-    return [node.written() for node in OnnxGraph(model).nodes if node.op_type != "Conv"]
+    kinds_before, kinds_after = (
+        [(node.op_type, node.name, node.outputs) for node in OnnxGraph(each).nodes]
+        for each in (before, after)
+    )
+    assert kinds_before == kinds_after
 
 
 @pytest.mark.parametrize(
@@ -328,6 +319,7 @@ def test_an_exact_replacement_is_chosen_where_the_other_loses_too_much() -> None
     """
     near = adapt(network(leaky(0.1)), BARE, BARE)
     assert "compensated" in near.record
+    assert near.rows[-1].figures["PSNR lost, compensated"].mode == "unavailable"
     steep = network(leaky(-0.9))
     far = adapt(steep, BARE, BARE)
     assert "exactly" in far.record
@@ -336,19 +328,6 @@ def test_an_exact_replacement_is_chosen_where_the_other_loses_too_much() -> None
     assert kind.value is not None
     assert kind.value < NEAR_DB
     assert together.value is None or together.value > 100
-
-
-def test_without_references_the_original_decides() -> None:
-    """Without references no PSNR is reported as lost, and the results of the original are the
-    measure.
-    """
-    figures = adapt(network(silu), BARE, BARE).rows[-1].figures
-    assert figures["PSNR lost, compensated"].mode == "unavailable"
-    before = figures["PSNR to the original, replaced"].value
-    after = figures[TO_ORIGINAL].value
-    assert before is not None
-    assert after is not None
-    assert after > before + 5
 
 
 def tanh(w: GraphWriter, x: str, name: str) -> str:
@@ -377,15 +356,7 @@ def test_what_a_dpu_has_and_what_nothing_replaces_stays() -> None:
         adapt(network(silu_but_tanh_third), BARE, BARE)
 
 
-def test_prelu_of_the_dpus_own_slope_becomes_its_leaky_relu() -> None:
-    """A PReLU whose slopes all are the DPU's own is the same function as its LeakyReLU."""
-    model = network(prelu(*[DPU_SLOPE] * FEATURES))
-    adapted = adapt(model, BARE, BARE)
-    assert "compensated" in adapted.record
-    assert_same(model, adapted.model)
-
-
-@pytest.mark.parametrize("act", [silu, leaky(0.2), prelu(0.2), hard_sigmoid(0.2, 0.5)])
+@pytest.mark.parametrize("act", [prelu(0.2), hard_sigmoid(0.2, 0.5)])
 def test_the_refusal_names_adapt(act: Act) -> None:
     """The error about an activation that can be replaced names the option that replaces it."""
     with pytest.raises(ModelError, match=r"quantize --adapt"):
@@ -450,10 +421,7 @@ def test_the_gate_counts_the_relus_of_an_adapted_network(
     """
     model = network(act)
     # On scales of some hundreds all of HardSwish and HardSigmoid that bends is one unit.
-    for values in model.graph.initializer:
-        if values.name == "a.w":
-            weight = 1e4 * onnx.numpy_helper.to_array(values)
-            values.CopyFrom(onnx.numpy_helper.from_array(weight, "a.w"))
+    change(model, "a.w", lambda weight: 1e4 * weight)
     int8 = quickly(replaced(model, approximated, exact), BARE)
 
     def relus_off(ops: Any) -> float:
@@ -462,16 +430,14 @@ def test_the_gate_counts_the_relus_of_an_adapted_network(
         return structure_checks(model, host)[0].value
 
     assert relus_off(int8.core.ops) == 0
-    ops = list(int8.core.ops)
-    for place, op in enumerate(ops):
-        before = ops[:place]
-        behind = ops[place + 1 :]
+    for place, op in enumerate(int8.core.ops):
+        ops = list(int8.core.ops)
         if isinstance(op, IntConv | Add | Pointwise) and op.activation is Activation.relu:
-            lost = dataclasses.replace(op, activation=Activation.none)
-            assert relus_off([*before, lost, *behind]) == 1
+            ops[place] = dataclasses.replace(op, activation=Activation.none)
+            assert relus_off(ops) == 1
         if isinstance(op, IntConv) and op.activation is Activation.none:
-            added = dataclasses.replace(op, activation=Activation.relu)
-            assert relus_off([*before, added, *behind]) == 1
+            ops[place] = dataclasses.replace(op, activation=Activation.relu)
+            assert relus_off(ops) == 1
 
 
 @pytest.mark.parametrize("free", [False, True])
@@ -514,14 +480,10 @@ def test_finetuning_learns_from_the_original() -> None:
 
 
 def test_nothing_to_replace_is_a_note_and_conditioned_weights_are_refused() -> None:
-    """`adapt` without an effect is a note for a user's network, and an error for a shipped one.
-
-    A shipped network has no such activations, so there the option is a mistake.
-    """
-    samples = np.concatenate(SAMPLES.degraded)
-    own = network(leaky(DPU_SLOPE))
+    """`adapt` without an effect is a note for a user's network, and an error for a shipped one."""
+    samples, _ = batches(SAMPLES)
     with one_guess():
-        int8 = bd.quantize(own, samples=samples, adapt=True, progress=False)
+        int8 = bd.quantize(network(leaky(DPU_SLOPE)), samples=samples, adapt=True, progress=False)
     assert int8.table is not None
     assert any("replaced nothing" in note for note in int8.table.notes)
     with pytest.raises(OptionError, match="`adapt` has no effect"):

@@ -56,3 +56,7 @@ def test_what_the_rule_moves_is_counted(quantized: Quantized) -> None:
     np.testing.assert_array_equal(layers.up, merged_correction(quantized.core, up))
     np.testing.assert_array_equal(layers.even, merged_correction(quantized.core, even))
     assert max(layer.moved for layer in layers.layers) > 0
+    # The first layer differs at its ties alone, one unit up; later layers carry that on.
+    first = layers.layers[0]
+    assert 0 < first.moved <= first.report.ties
+    assert set(np.unique(up["head"] - even["head"])) == {0, 1}

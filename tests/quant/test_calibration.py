@@ -2,7 +2,7 @@
 in pieces.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import chain
 
@@ -53,6 +53,8 @@ def test_patches_are_the_same_however_they_are_asked_for(drawn: Patches) -> None
         assert alone.dtype == once[1].dtype == np.float32
         np.testing.assert_array_equal(once, second)
         np.testing.assert_array_equal(alone, once[0])
+        # Both sensors see the same ground.
+        assert np.corrcoef(once[0].ravel(), once[1].ravel())[0, 1] > 0.7
     with pytest.raises(IndexError):
         drawn.pairs[12]
 
@@ -63,12 +65,6 @@ def test_the_digest_names_the_bytes(scenes: list[Scene], drawn: Patches) -> None
 
     assert digest(3) == drawn.digest
     assert len({digest(3), digest(4), digest(3, 11)}) == 3
-
-
-def test_the_pair_shows_the_same_ground(drawn: Patches) -> None:
-    for degraded, reference in drawn.pairs:
-        assert np.corrcoef(degraded.ravel(), reference.ravel())[0, 1] > 0.7
-        assert 0 <= degraded.min() <= degraded.max() <= 1
 
 
 def test_the_ranges_are_covered_without_gaps(scenes: list[Scene]) -> None:
@@ -132,22 +128,14 @@ def test_pieces_hold_what_the_whole_image_gives(graph: Graph, shape: tuple[int, 
     pieces, without_halo = (
         list(tensor_values(session, names, full_image, px)) for px in (halo_px, 0)
     )
-    for k, tensor in enumerate(expected):
-        assert sum(piece[k].size for piece in pieces) == tensor.size
-        assert max(np.abs(piece[k]).max() for piece in pieces) == pytest.approx(
-            np.abs(tensor).max(), rel=1e-5
-        )
-        assert energy(piece[k] for piece in pieces) == pytest.approx(energy([tensor]), rel=1e-5)
+    for tensor, parts in zip(expected, zip(*pieces, strict=True), strict=True):
+        values = np.sort(np.concatenate([part.ravel() for part in parts]))
+        np.testing.assert_allclose(values, np.sort(tensor, axis=None), rtol=1e-5, atol=1e-6)
     sides_px = [array.base.shape[2] for array in chain.from_iterable(pieces)]  # type: ignore[union-attr]
     assert max(sides_px) <= TILE_PX + 2 * halo_px
     if len(pieces) > 1:
-        assert energy(piece[-1] for piece in without_halo) != pytest.approx(
-            energy(expected[-1:]), rel=1e-5
-        )
-
-
-def energy(parts: Iterable[np.ndarray]) -> float:
-    return sum(float(np.square(part, dtype=np.float64).sum()) for part in parts)
+        values = np.concatenate([piece[-1].ravel() for piece in without_halo])
+        assert np.abs(np.sort(values) - np.sort(expected[-1], axis=None)).max() > 1e-3
 
 
 def test_crops_tile_the_image() -> None:

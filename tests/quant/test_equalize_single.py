@@ -24,17 +24,16 @@ from beers_deploy.quant.graph import (
 )
 from beers_deploy.quant.host_part import IMAGE_SLICES, HostPart, Plain
 from beers_deploy.quant.integer.reference import run_core
-from beers_deploy.quant.passes import equalize_single as single
 from beers_deploy.quant.passes.effort import Effort
 from beers_deploy.quant.passes.equalize import FULL
-from beers_deploy.quant.passes.equalize_single import SingleTensors, single_ranges
+from beers_deploy.quant.passes.equalize_single import SingleTensors, equalize_single, single_ranges
 from beers_deploy.quant.passes.residual_groups import GROUP_FRAC_BITS, single_tensors
 from beers_deploy.quant.passes.trial import Costs
 from beers_deploy.quant.quantize import quantize_model
 from beers_deploy.quant.session import open_session
 from beers_deploy.quant.simplify.simplify import simplify
 from examples.networks import build, to_onnx
-from tests.quant.quick import in_float, patches_of, quickly, with_relu6
+from tests.quant.quick import in_float, patches_of, quickly, waves, with_relu6
 
 
 def read(name: str) -> tuple[onnx.ModelProto, Graph, HostPart, SingleTensors]:
@@ -43,51 +42,26 @@ def read(name: str) -> tuple[onnx.ModelProto, Graph, HostPart, SingleTensors]:
     graph = read_planes(network.graph)
     host_part = HostPart.of(network, Plain())
     widths = channels_of(graph, {PLANES: host_part.planes})
-    alone = single_tensors(graph)
-    return (
-        model,
-        graph,
-        host_part,
-        SingleTensors(tuple(alone), tuple(widths[tensor] for tensor in alone)),
-    )
+    names = single_tensors(graph)
+    singles = SingleTensors(tuple(names), tuple(widths[name] for name in names))
+    return model, graph, host_part, singles
 
 
-def images(count: int = 3, side_px: int = 40) -> list[np.ndarray]:
-    rows, columns = np.mgrid[:side_px, :side_px] / side_px
-    waves = [0.4 + 0.3 * np.sin(9 * rows + k) * np.cos(7 * columns) for k in range(count)]
-    return [wave.astype(np.float32)[None, None] for wave in waves]
-
-
-def correction(graph: Graph, host_part: HostPart) -> np.ndarray:
-    return in_float(graph, images()[1], host_part)
+def assert_same(graph: Graph, other: Graph, host_part: HostPart) -> None:
+    actual, expected = (in_float(each, waves()[1], host_part) for each in (graph, other))
+    np.testing.assert_allclose(actual, expected, atol=2e-5 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("name", ["dncnn", "espcn", "unet", "segment", "mobile"])
 def test_equalizing_leaves_the_float_network_as_it_was(name: str) -> None:
     _, graph, host_part, singles = read(name)
     factors = np.random.default_rng(1).uniform(0.2, 5, sum(singles.widths))
-    expected = correction(graph, host_part)
-    np.testing.assert_allclose(
-        correction(singles.scaled(graph, factors), host_part),
-        expected,
-        atol=2e-5 * np.abs(expected).max(),
-    )
-    pairs = zip(singles.scaled(graph, factors), graph, strict=True)
-    assert any(isinstance(op, Conv) and not np.allclose(op.weight, was.weight) for op, was in pairs)  # type: ignore[attr-defined]
-
-
-def test_what_others_read_or_factors_do_not_pass_is_left_alone() -> None:
-    _, graph, _, singles = read("unet")
-    pooled = set[str]()
-    for op in graph:
-        if not isinstance(op, Conv):
-            pooled |= {*op.inputs, op.output}
-    assert pooled
-    assert not pooled & set(singles.tensors)
-    _, graph, _, singles = read("segment")
-    curved = {op.output for op in graph if op.name.endswith("HardSwish") or "Hardswish" in op.name}
-    assert not curved & set(singles.tensors)
-    assert CORRECTION not in singles.tensors
+    scaled = singles.scaled(graph, factors)
+    assert_same(scaled, graph, host_part)
+    place = next(k for k, op in enumerate(scaled) if op is not graph[k])
+    one_alone = (*graph[:place], scaled[place], *graph[place + 1 :])
+    with pytest.raises(AssertionError):
+        assert_same(one_alone, graph, host_part)
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 1.0, 3.0]))
@@ -97,21 +71,17 @@ def test_relu6_is_the_end_of_int8_whatever_the_factors(seed: int, size: float) -
     singles = SingleTensors(tuple(single_tensors(graph)), (5, 5, 4))
     assert singles.tensors == ("a", "b", "c")
     scaled = singles.scaled(graph, np.random.default_rng(seed).lognormal(-2, 1, 14))
-    expected = correction(graph, host_part)
-    np.testing.assert_allclose(
-        correction(scaled, host_part), expected, atol=2e-5 * np.abs(expected).max()
-    )
+    assert_same(scaled, graph, host_part)
     core = build_core(
         scaled, {PLANES: PLANES_FRAC_BITS, CORRECTION: 4} | dict.fromkeys("abc", GROUP_FRAC_BITS)
     )
     kinds = [op.activation for op in core.convolutions]
     assert kinds == [Activation.relu] * 3 + [Activation.none]
-    tensors, _ = run_core(core, IMAGE_SLICES.encode(images()[0]))
+    tensors, _ = run_core(core, IMAGE_SLICES.encode(waves()[0]))
     for op in scaled[:-1]:
         assert isinstance(op, Conv)
-        assert (
-            tensors[op.output].max((0, 2, 3)) * core.scale(op.output) <= op.ceilings * (1 + 1e-6)
-        ).all()
+        largest = tensors[op.output].max((0, 2, 3)) * core.scale(op.output)
+        assert (largest <= op.ceilings * (1 + 1e-6)).all()
 
 
 class Bowl:
@@ -137,26 +107,15 @@ class Bowl:
 )
 def test_the_search_never_ends_above_its_start(effort: Effort, most_groups: int) -> None:
     _, graph, host_part, singles = read("espcn")
-    ranges = single_ranges(graph, singles, images(), host_part)
+    ranges = single_ranges(graph, singles, waves(), host_part)
     trial = Bowl(graph)
-    for start in (
-        np.ones(sum(singles.widths)),
-        np.concatenate([trial.lowest, np.ones(singles.widths[1])]),
-    ):
-        factors = single.equalize_single(
+    for first in (np.ones_like(trial.lowest), trial.lowest):
+        start = np.concatenate([first, np.ones(singles.widths[1])])
+        factors = equalize_single(
             graph, singles, ranges, start, lambda *_: trial, effort, most_groups
         )
-        before, after = (
-            trial(singles.scaled(graph, trial_factors))(None).sum()
-            for trial_factors in (start, factors)
-        )
-        assert after <= before
-
-
-def test_the_start_leaves_each_tensor_the_scale_it_has() -> None:
-    *_, singles = read("espcn")
-    factors = singles.unscaled(dict.fromkeys(singles.tensors, GROUP_FRAC_BITS - 2))
-    np.testing.assert_array_equal(factors, np.full(sum(singles.widths), 0.25))
+        before = trial(singles.scaled(graph, start))(None).sum()
+        assert trial(singles.scaled(graph, factors))(None).sum() <= before
 
 
 @pytest.mark.parametrize("loud", [0.1, 20.0])
@@ -168,9 +127,9 @@ def test_what_calibration_sees_is_not_clipped_where_the_image_itself_passes(
         lambda _g, _c, ranges, *_: loud * FULL / ranges,
     )
     model, _, _, singles = read("espcn")
-    int8 = quickly(model, patches_of(images()))
+    int8 = quickly(model, patches_of(waves()))
     assert int8.core.host_part.decoding.offsets
-    largest = single.largest_values(int8.graph, singles, images(), int8.core.host_part)
+    largest = single_ranges(int8.graph, singles, waves(), int8.core.host_part, 1.0, 1.0)
     assert largest.max() <= FULL * (1 + 1e-5)
 
 
@@ -181,11 +140,8 @@ def test_unequal_channels_err_half_as_much_once_they_are_equalized(
     normalisation leaves them.
     """
     network = build("dncnn", torch.Generator().manual_seed(0))
-    layers = [
-        layer
-        for layer in network.modules()
-        if isinstance(layer, torch.nn.Conv2d | torch.nn.BatchNorm2d)
-    ]
+    kinds = torch.nn.Conv2d | torch.nn.BatchNorm2d
+    layers = [layer for layer in network.modules() if isinstance(layer, kinds)]
     with torch.no_grad():
         for norm, conv in zip(layers[2::2], layers[3::2], strict=True):
             factors = torch.logspace(0, -1.5, norm.weight.numel())
@@ -193,8 +149,7 @@ def test_unequal_channels_err_half_as_much_once_they_are_equalized(
             norm.bias.mul_(factors)  # type: ignore[union-attr]
             conv.weight.div_(factors[:, None, None])
     model = simplify(to_onnx("dncnn", network), "dncnn")
-    image_list = images()
-    patches = patches_of(image_list)
+    patches = patches_of(waves())
 
     def mae() -> float:
         int8 = quantize_model(model, patches, {}, effort=Effort.fast)

@@ -1,7 +1,5 @@
 """What a user measures results by, and the gate that limits it."""
 
-from itertools import product
-
 import numpy as np
 import pytest
 import torch
@@ -16,23 +14,15 @@ from examples.networks import build, to_onnx
 from tests.quant.quick import one_guess, patches_of
 
 
-def measured(name: str, results: list[np.ndarray], references: list[np.ndarray]) -> float:
-    values = [metric_value(name, *pair) for pair in zip(results, references, strict=True)]
-    return float(np.mean(values))
-
-
 def test_images_are_measured_as_everywhere_else() -> None:
-    generator = np.random.default_rng(0)
-    results, references = ([generator.random((1, 2, 23, 31)) for _ in range(3)] for _ in range(2))
-    pairs = list(zip(results, references, strict=True))
-    assert measured("psnr", results, references) == pytest.approx(
-        np.mean([psnr_db(*pair, 1.0) for pair in pairs])
-    )
-    assert measured("mae", results, references) == pytest.approx(
-        np.mean([np.abs(a - b).mean() for a, b in pairs])
-    )
-    similarities = [ssim(a[0, k], b[0, k], 1.0) for (a, b), k in product(pairs, range(2))]
-    assert measured("ssim", results, references) == pytest.approx(np.mean(similarities))
+    result, reference = np.random.default_rng(0).random((2, 1, 2, 23, 31))
+    expected = {
+        "psnr": psnr_db(result, reference, 1.0),
+        "ssim": np.mean([ssim(result[0, k], reference[0, k], 1.0) for k in range(2)]),
+        "mae": np.abs(result - reference).mean(),
+    }
+    for name in METRICS:
+        assert metric_value(name, result, reference) == pytest.approx(expected[name])
 
 
 def test_references_of_another_size_are_refused() -> None:
@@ -50,20 +40,17 @@ def test_a_gate_limits_what_a_metric_loses() -> None:
     samples = images[8:], references[8:]
     limits = {"metric_loss": 0.5, "mae": 0.1, "drop_share": 1.0}
     verdict = bd.gate(int8, samples=samples, metric="ssim", limits=limits, progress=False)
-    figures = verdict.rows[0].figures
     assert verdict
-    lost = float(figures["ssim lost"].value or 0)
+    figures = {name: figure.value or 0 for name, figure in verdict.rows[0].figures.items()}
+    lost = figures["ssim lost"]
     assert lost > 0
-    assert lost == pytest.approx(
-        (figures["ssim float"].value or 0) - (figures["ssim INT8"].value or 0)
-    )
+    assert lost == pytest.approx(figures["ssim float"] - figures["ssim INT8"])
     limits["metric_loss"] = lost / 2
     broken = bd.gate(int8, samples=samples, metric="ssim", limits=limits, progress=False)
     assert [check.name for check in broken.failed] == ["ssim lost"]
     with pytest.raises(OptionError, match="'metric_loss' needs a `metric`"):
         bd.gate(int8, samples=samples, limits={"metric_loss": 0.1}, progress=False)
-    names = ", ".join(map(repr, METRICS))
-    with pytest.raises(OptionError, match=f"`metric` must be one of {names}, got 'auc'"):
+    with pytest.raises(OptionError, match=r"`metric` must be one of .*, got 'auc'"):
         bd.gate(int8, samples=samples, metric="auc", progress=False)  # type: ignore[arg-type]
     with pytest.raises(OptionError, match="must have references for `metric`"):
         bd.gate(int8, samples=samples[0], metric="ssim", progress=False)

@@ -8,7 +8,7 @@ import onnx
 import pytest
 
 from beers_deploy.model.progress import Step, progress, reporting
-from beers_deploy.quant.core import SHIFTS, IntConv, op_shifts
+from beers_deploy.quant.core import IntConv
 from beers_deploy.quant.gate import compare
 from beers_deploy.quant.graph import (
     CORRECTION,
@@ -67,21 +67,17 @@ def test_equalizing_leaves_the_float_network_as_it_was(graph: Graph) -> None:
 
 def test_ranges_are_equalized_to_the_group_s_own(graph: Graph, patches: Patches) -> None:
     images = [image for image, _ in patches.pairs]
-    ranges = channel_ranges(graph, group_of(graph), images)
+    group = group_of(graph)
+    ranges = channel_ranges(graph, group, images)
     assert ranges.shape == (8,)
     factors = first_guess(ranges, 1.0, 1.0)
     np.testing.assert_allclose(ranges * factors, 127 * 2.0**-GROUP_FRAC_BITS)
-    new_ranges = channel_ranges(equalize(graph, group_of(graph), factors), group_of(graph), images)
+    new_ranges = channel_ranges(equalize(graph, group, factors), group, images)
     np.testing.assert_allclose(new_ranges, ranges * factors, rtol=1e-4)
-
-
-def test_a_dead_channel_is_not_blown_up(graph: Graph, patches: Patches) -> None:
-    dead = np.ones(8)
-    dead[3] = 1e-12
-    ranges = channel_ranges(
-        equalize(graph, group_of(graph), dead), group_of(graph), [patches.pairs[0][0]]
-    )
-    assert ranges[3] >= 1e-4 * ranges.max()
+    # A channel that is dead but for rounding keeps a range, so that no factor amplifies it.
+    dead = equalize(graph, group, np.where(np.arange(8) == 3, 1e-12, 1))
+    dead_ranges = channel_ranges(dead, group, images[:1])
+    assert dead_ranges[3] >= 1e-4 * dead_ranges.max()
 
 
 def skipping(seed: int = 0) -> Graph:
@@ -101,16 +97,13 @@ def skipping(seed: int = 0) -> Graph:
         bias = generator.normal(0, 0.5, outputs).astype(np.float32)
         return Conv(f"{output}.conv", source, output, weight, bias, activation)
 
-    block = conv(PLANES, "head", 3, 3, Activation.relu6), conv("head", "inner", 3, 3)
-    down = (
+    return (
+        conv(PLANES, "head", 3, 3, Activation.relu6),
+        conv("head", "inner", 3, 3),
         Add("add", ("head", "inner"), "sum"),
         MaxPool("max", "sum", "pooled", (2, 2), Window((2, 2))),
-    )
-    deep = conv("pooled", "deep", 2, 3), Resize("resize", "deep", "up", 2)
-    return (
-        *block,
-        *down,
-        *deep,
+        conv("pooled", "deep", 2, 3),
+        Resize("resize", "deep", "up", 2),
         Concat("join", ("up", "sum"), "both"),
         conv("both", CORRECTION, 1, 5),
     )
@@ -118,26 +111,17 @@ def skipping(seed: int = 0) -> Graph:
 
 def test_a_group_goes_through_pools_enlargements_and_concats() -> None:
     graph = skipping()
-    fine = slice(2, 5)
-    coarse = slice(0, 2)
-    expected = {
-        "head": fine,
-        "inner": fine,
-        "sum": fine,
-        "pooled": fine,
-        "deep": coarse,
-        "up": coarse,
-    }
-    assert group_of(graph) == expected | {"both": slice(0, 5)}
+    group = group_of(graph)
+    fine = dict.fromkeys(("head", "inner", "sum", "pooled"), slice(2, 5))
+    coarse = dict.fromkeys(("deep", "up"), slice(0, 2))
+    assert group == {**fine, **coarse, "both": slice(0, 5)}
     planes = {PLANES: np.random.default_rng(1).normal(0, 3, (1, 3, 6, 10)).astype(np.float32)}
-    results = [
-        open_session(graph_to_onnx(variant, [CORRECTION])).run(None, planes)[0]
-        for variant in (
-            graph,
-            equalize(graph, group_of(graph), np.random.default_rng(2).lognormal(-1, 1, 5)),
-        )
-    ]
-    np.testing.assert_allclose(results[1], results[0], atol=1e-4)
+    scaled = equalize(graph, group, np.random.default_rng(2).lognormal(-1, 1, 5))
+    expected, actual = (
+        open_session(graph_to_onnx(each, [CORRECTION])).run(None, planes)[0]
+        for each in (graph, scaled)
+    )
+    np.testing.assert_allclose(actual, expected, atol=1e-4)
 
 
 def test_a_tensor_that_would_have_two_places_is_in_no_group() -> None:
@@ -213,21 +197,18 @@ def test_the_search_ends_below_its_best_guess_and_drops_a_trial_that_fails_on_it
     assert runs.count(FIRST_CROPS) > len(runs) / 3
 
 
-def test_without_groups_of_channels_the_search_ends_with_the_best_guess(graph: Graph) -> None:
-    guesses, cost, runs = searched(graph, np.arange(1.0, CROPS + 1), 0)
-    assert cost == min(guesses)
-    assert len(runs) == len(guesses)
-
-
 def test_more_groups_of_channels_try_more_and_never_end_higher(graph: Graph) -> None:
-    ends = [searched(graph, np.arange(1.0, CROPS + 1), most)[1:] for most in (0, 2, 4, 8)]
-    costs = [cost for cost, _ in ends]
-    assert costs == sorted(costs, reverse=True)
-    counts = [len(runs) for _, runs in ends]
-    assert counts == sorted(counts)
+    """Without any, the search ends with the best guess."""
     stage = Stage(group_of(graph), FIRST_GUESSES, len(RANGES))
-    for most, count in zip((0, 2, 4, 8), counts, strict=True):
-        assert count <= stage.candidates(most)
+    guesses, best, runs = searched(graph, np.arange(1.0, CROPS + 1), 0)
+    assert (best, len(runs)) == (min(guesses), FIRST_GUESSES)
+    tried = len(runs)
+    for most in (2, 4, 8):
+        _, cost, runs = searched(graph, np.arange(1.0, CROPS + 1), most)
+        assert cost <= best
+        assert tried <= len(runs) <= stage.candidates(most)
+        best = cost
+        tried = len(runs)
 
 
 def test_a_trial_that_the_costliest_crops_favour_still_has_to_win_on_all(graph: Graph) -> None:
@@ -242,8 +223,7 @@ def test_a_shared_residual_scale_adds_without_rounding(quantized: Quantized) -> 
     adds = [op for op in quantized.core.ops if isinstance(op, Add)]
     assert len(adds) == 3
     for op in adds:
-        shifts = {name: value for name, value, _ in op_shifts(op, quantized.core.frac_bits, SHIFTS)}
-        assert shifts == {"shift_read": 0, "shift_write": 0}
+        assert len({quantized.core.frac_bits[name] for name in (*op.inputs, op.output)}) == 1
 
 
 def test_the_second_gain_is_the_same_correction_coarser(graph: Graph) -> None:

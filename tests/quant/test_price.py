@@ -21,23 +21,9 @@ from beers_deploy.quant.price import Measured, grid_of, price_rows, rounded_weig
 from beers_deploy.quant.quantize import Quantized
 from beers_deploy.quant.samples.patches import Patches
 from beers_deploy.quant.session import open_session, result_of
-from tests.quant.quick import quickly
+from tests.quant.quick import quickly, without_references
 
-
-def alone(patches: Patches) -> Patches:
-    """The patches without their references."""
-    nothing = np.empty(0, np.float32)
-    return Patches([(image, nothing) for image in patches.degraded], patches.degraded)
-
-
-STEPS = [
-    "8 bits",
-    "no zero point",
-    "one scale for the weights of a layer",
-    "powers of two as scales",
-    "INT8 as written",
-    "clipping, of INT8 as written",
-]
+CLIPPED = "clipping, of INT8 as written"
 
 
 def prices(rows: list[Row]) -> dict[str, float]:
@@ -53,7 +39,7 @@ def test_steps_add_up_to_what_the_gate_measures(
     twice.
     """
     rows = price_rows(quantized, unseen)
-    assert [row.name for row in rows] == STEPS
+    assert [row.name for row in rows] == [*price.STEPS, "INT8 as written", CLIPPED]
     gate = compare(open_session(float_onnx), open_session(quantized.host), unseen)
     last = rows[-2].figures
     assert last["MAE"].value == pytest.approx(gate.mae, rel=1e-3)
@@ -100,15 +86,12 @@ def float_errors(quantized: Quantized, unseen: Patches) -> dict[str, float]:
 def with_equal_channels(quantized: Quantized) -> Quantized:
     """The network with weights of each output channel that reach as far."""
 
-    def equal(op: Conv) -> Conv:
-        """Scale the weights of each output channel to the same largest size."""
-        largest = np.abs(op.weight).max((1, 2, 3), keepdims=True)
-        return replace(op, weight=(op.weight * (0.25 / largest)).astype(np.float32))
-
-    graph = quantized.network.graph
-    ops = tuple(equal(op) if isinstance(op, Conv) else op for op in graph)
-    network = replace(quantized.network, graph=ops)
-    return replace(quantized, network=network)
+    ops = list(quantized.network.graph)
+    for place, op in enumerate(ops):
+        if isinstance(op, Conv):
+            largest = np.abs(op.weight).max((1, 2, 3), keepdims=True)
+            ops[place] = replace(op, weight=(op.weight * (0.25 / largest)).astype(np.float32))
+    return replace(quantized, network=replace(quantized.network, graph=tuple(ops)))
 
 
 def test_one_scale_for_equal_channels_costs_nothing(quantized: Quantized, unseen: Patches) -> None:
@@ -126,7 +109,7 @@ def test_without_references_prices_are_differences_of_the_mae(
     """Without references there is no PSNR, so prices are MAE against the float network and add
     up too.
     """
-    rows = price_rows(quantized, alone(unseen))
+    rows = price_rows(quantized, without_references(unseen))
     assert {row.figures["price"].unit for row in rows} == {"of full scale"}
     assert all("PSNR drop" not in row.figures for row in rows)
     assert sum(prices(rows[:-1]).values()) == pytest.approx(rows[-2].figures["MAE"].value)
@@ -140,15 +123,15 @@ def test_what_clips_nothing_pays_nothing_for_it_and_what_clips_much_does(
     """
     passes = Passes(dual_range=False, least_squares=False, equalization=False)
     unclipped = quickly(float_onnx, patches, passes=passes)
-    images = alone(patches)
+    images = without_references(patches)
     rows = price_rows(unclipped, images)
     # Channels are scaled by a quantile of their sizes, so a few values may be clipped.
-    assert abs(prices(rows)[STEPS[-1]]) < 0.01 * (rows[-2].figures["MAE"].value or 0)
+    assert abs(prices(rows)[CLIPPED]) < 0.01 * (rows[-2].figures["MAE"].value or 0)
     finer = {name: bits + 3 * (name != PLANES) for name, bits in unclipped.core.frac_bits.items()}
     core = build_core(unclipped.graph, finer, host_part=unclipped.core.host_part)
     clipped = replace(unclipped, core=core, host=host_model(core, {}))
     rows = price_rows(clipped, images)
-    assert prices(rows)[STEPS[-1]] > 0.5 * (rows[-2].figures["MAE"].value or 0)
+    assert prices(rows)[CLIPPED] > 0.5 * (rows[-2].figures["MAE"].value or 0)
 
 
 @given(low=st.floats(-10, 0), high=st.floats(0, 10), zero_point=st.booleans(), powers=st.booleans())

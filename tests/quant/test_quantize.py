@@ -3,12 +3,12 @@ from dataclasses import replace
 import numpy as np
 import onnx
 import pytest
-from onnx import numpy_helper
 
-from beers_deploy.quant.core import IntConv, build_core, shift_faults
+from beers_deploy.quant.core import build_core, shift_faults
 from beers_deploy.quant.encodings import board_model
 from beers_deploy.quant.gate import compare
-from beers_deploy.quant.graph import correction_graph, read_planes
+from beers_deploy.quant.graph import PLANES, Graph
+from beers_deploy.quant.onnx.graph import constants
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.samples.patches import Patches
@@ -18,33 +18,25 @@ from beers_deploy.quant.tiling.receptive_field import tiling_of
 
 def test_scales_are_powers_of_two_and_numbers_are_int8(quantized: Quantized) -> None:
     for model in (quantized.host, board_model(quantized.core, {})):
-        for tensor in model.graph.initializer:
-            value = numpy_helper.to_array(tensor)
-            if tensor.name.startswith("scale_"):
+        for name, value in constants(model).items():
+            if name.startswith("scale_"):
                 assert np.log2(value) == np.rint(np.log2(value))
-    for op in quantized.core.ops:
-        if isinstance(op, IntConv):
-            assert op.weight.dtype == op.bias.dtype == np.int8
+    for op in quantized.core.convolutions:
+        assert op.weight.dtype == op.bias.dtype == np.int8
 
 
 def test_every_shift_is_within_its_window_and_one_that_is_not_is_named(
     quantized: Quantized,
 ) -> None:
     assert shift_faults(quantized.core) == []
-    faults = shift_faults(
-        replace(quantized.core, frac_bits={**quantized.core.frac_bits, "head": 40})
-    )
+    bits = quantized.core.frac_bits
+    faults = shift_faults(replace(quantized.core, frac_bits={**bits, "head": 40}))
     assert any(fault.startswith("head: shift_cut") for fault in faults)
 
 
-def test_unreachable_positions_are_moved_to_legal_ones(
-    float_onnx: onnx.ModelProto, quantized: Quantized
-) -> None:
-    graph = read_planes(correction_graph(float_onnx))
-    wild = {
-        name: (p if name == "planes" else p + 20) for name, p in quantized.core.frac_bits.items()
-    }
-    assert shift_faults(build_core(graph, wild)) == []
+def test_unreachable_scales_are_moved_to_legal_ones(graph: Graph, quantized: Quantized) -> None:
+    bits = {name: n + 20 * (name != PLANES) for name, n in quantized.core.frac_bits.items()}
+    assert shift_faults(build_core(graph, bits)) == []
 
 
 def test_every_convolution_is_an_integer_kernel(quantized: Quantized) -> None:
@@ -77,7 +69,6 @@ def test_the_file_says_what_it_was_calibrated_on(quantized: Quantized, patches: 
 def test_the_radius_is_read_from_the_graph(
     encoding: str, float_onnx: onnx.ModelProto, quantized: Quantized
 ) -> None:
-    model = {"float": float_onnx, "host": quantized.host, "board": board_model(quantized.core, {})}[
-        encoding
-    ]
-    assert tiling_of(model).halo_px == 7
+    board = board_model(quantized.core, {})
+    models = {"float": float_onnx, "host": quantized.host, "board": board}
+    assert tiling_of(models[encoding]).halo_px == 7

@@ -1,7 +1,6 @@
 """VINT8 says what the host's file says, to the bit, in the layout of AMD's quantiser."""
 
 from collections import Counter
-from collections.abc import Callable
 from itertools import chain
 from typing import Any
 
@@ -35,64 +34,61 @@ def conv(
     return ops.Conv(f"{output}.conv", source, output, weight, bias, **kind)
 
 
-def plain() -> Graph:
-    return (
-        conv(PLANES, "a", (5, 3), "relu"),
-        conv("a", "bb", (4, 5), "leaky_relu"),
-        conv("bb", CORRECTION, (1, 4)),
-    )
-
-
 def residual() -> Graph:
-    block = conv(PLANES, "a", (4, 3)), conv("a", "bb", (4, 4), "relu6"), conv("bb", "ccc", (4, 4))
-    sums = (
+    return (
+        conv(PLANES, "a", (4, 3), "leaky_relu"),
+        conv("a", "bb", (4, 4), "relu6"),
+        conv("bb", "ccc", (4, 4)),
         ops.Add("add", ("a", "ccc"), "sum", Activation.relu),
         ops.Add("twice", ("sum", "sum"), "double"),
+        conv("double", CORRECTION, (1, 4)),
     )
-    return *block, *sums, conv("double", CORRECTION, (1, 4))
 
 
 def unet() -> Graph:
-    down = conv(PLANES, "a", (3, 3), "relu"), conv("a", "bb", (5, 3), "relu", window=TWO)
-    up = conv("bb", "ccc", (3, 5), "relu", window=TWO, transposed=True)
-    return *down, up, ops.Concat("join", ("a", "ccc"), "both"), conv("both", CORRECTION, (1, 6))
+    return (
+        conv(PLANES, "a", (3, 3), "relu"),
+        conv("a", "bb", (5, 3), "relu", window=TWO),
+        conv("bb", "ccc", (3, 5), "relu", window=TWO, transposed=True),
+        ops.Concat("join", ("a", "ccc"), "both"),
+        conv("both", CORRECTION, (1, 6)),
+    )
 
 
 def pools() -> Graph:
-    largest = ops.MaxPool("max", "a", "bb", (3, 3), ONE)
-    mean = ops.AveragePool("mean", "a", "ccc", (2, 2), Window(pads=(0, 0, 1, 1)))
-    joined = ops.Concat("join", ("bb", "a", "ccc"), "both")
-    return conv(PLANES, "a", (4, 3)), largest, mean, joined, conv("both", CORRECTION, (1, 12))
+    return (
+        conv(PLANES, "a", (4, 3)),
+        ops.MaxPool("max", "a", "bb", (3, 3), ONE),
+        ops.AveragePool("mean", "a", "ccc", (2, 2), Window(pads=(0, 0, 1, 1))),
+        ops.Concat("join", ("bb", "a", "ccc"), "both"),
+        conv("both", CORRECTION, (1, 12)),
+    )
 
 
-NETWORKS = pytest.mark.parametrize("network", [plain, residual, unet, pools])
+NETWORKS = pytest.mark.parametrize("graph", [residual(), unet(), pools()])
 
 
 @NETWORKS
 @settings(max_examples=8, deadline=None)
 @given(data=st.data(), tile_px=st.sampled_from([5, 9, 17, 31]), seed=st.integers(0, 99))
-def test_the_host_files_bits(
-    network: Callable[[], Graph], data: st.DataObject, tile_px: int, seed: int
-) -> None:
-    bits = {name: data.draw(st.integers(2, 7)) for name in ops.tensors(network())}
-    core = build_core(network(), {PLANES: PLANES_FRAC_BITS, **bits})
+def test_the_host_files_bits(graph: Graph, data: st.DataObject, tile_px: int, seed: int) -> None:
+    bits = {name: data.draw(st.integers(2, 7)) for name in ops.tensors(graph)}
+    core = build_core(graph, {PLANES: PLANES_FRAC_BITS, **bits})
     image = np.random.default_rng(seed).random((1, 1, tile_px, tile_px), np.float32)
     model = vint8_model(core, {}, tile_px)
     host = host_model(core, {})
     for optimise in (True, False):
         result = open_session(model, optimise=optimise).run(None, {PLANES: planes_of(image)})[0]
-        np.testing.assert_array_equal(
-            result, correction(core, core.host_part.encode(image), half_even=True)
-        )
+        expected = correction(core, core.host_part.encode(image), half_even=True)
+        np.testing.assert_array_equal(result, expected)
         by_host = run(open_session(host, optimise=optimise), image)
         np.testing.assert_array_equal(core.host_part.finish(image, result), by_host)
 
 
 @NETWORKS
-def test_the_layout_of_amds_quantizer(network: Callable[[], Graph]) -> None:
-    core = build_core(
-        network(), {PLANES: PLANES_FRAC_BITS, **dict.fromkeys(ops.tensors(network()), 5)}
-    )
+def test_the_layout_of_amds_quantizer(graph: Graph) -> None:
+    bits = dict.fromkeys(ops.tensors(graph), 5)
+    core = build_core(graph, {PLANES: PLANES_FRAC_BITS, **bits})
     model = vint8_model(core, {}, 9)
     onnx.checker.check_model(model, full_check=True)
     assert [(opset.domain, opset.version) for opset in model.opset_import] == [("", 17)]
@@ -117,6 +113,5 @@ def test_the_layout_of_amds_quantizer(network: Callable[[], Graph]) -> None:
             feeds = {writers[name] for name in node.input if name in writers}
             assert feeds == {"Conv" if node.op_type == "LeakyRelu" else "DequantizeLinear"}
     scaled = {(node.input[1], node.input[0]) for node in nodes if node.op_type == "QuantizeLinear"}
-    assert (
-        len({scale for scale, _ in scaled}) == len({tensor for _, tensor in scaled}) == len(scaled)
-    )
+    scales, tensors = map(set, zip(*scaled, strict=True))
+    assert len(scales) == len(tensors) == len(scaled)

@@ -26,7 +26,7 @@ from beers_deploy.quant.passes.residual_groups import residual_groups
 from beers_deploy.quant.passes.trial import CropTrials
 from beers_deploy.quant.quantize import Quantized, quantize_model
 from beers_deploy.quant.session import open_session
-from tests.quant.quick import image, patches_of
+from tests.quant.quick import image, patches_of, waves
 
 EFFORTS = list(Effort)
 
@@ -74,12 +74,6 @@ def test_work_counts_multiply_accumulates(graph: Graph) -> None:
     assert work_of(graph, ONE_CHANNEL, image(20, 30))[0] == 600 * head
 
 
-def waves(count: int = 3) -> list[np.ndarray]:
-    rows, columns = np.mgrid[:40, :40] / 40
-    images = [0.4 + 0.3 * np.sin(9 * rows + k) * np.cos(7 * columns) for k in range(count)]
-    return [each.astype(np.float32)[None, None] for each in images]
-
-
 def counted(
     model: onnx.ModelProto, level: Effort, monkeypatch: pytest.MonkeyPatch
 ) -> tuple[Quantized, int]:
@@ -114,17 +108,6 @@ def test_no_more_is_tried_than_is_announced_and_more_effort_tries_more(
     assert counts == sorted(counts)
 
 
-def test_the_same_samples_give_the_same_bytes(
-    float_onnx: onnx.ModelProto, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(effort_module.MOST_GROUPS, Effort.normal, 2)
-    first, again = (
-        quantize_model(float_onnx, patches_of(waves()), {}).host.SerializeToString()
-        for _ in range(2)
-    )
-    assert first == again
-
-
 def test_running_only_what_changes_costs_the_same_as_running_all(
     float_onnx: onnx.ModelProto, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -134,11 +117,10 @@ def test_running_only_what_changes_costs_the_same_as_running_all(
     def both(self: CropTrials, parts: list, values: list, core: IntCore):  # type: ignore[no-untyped-def,type-arg]
         cost = costs(self, parts, values, core)
         whole = open_session(host_model(core, {}), threads=1)
-        restored = [whole.run(None, {"image": crop})[0] for crop, _ in self.targets]
-        errors = [
-            np.sqrt(np.square(a - b, dtype=np.float64).mean()) / change
-            for a, (_, b), change in zip(restored, self.targets, self.changes, strict=True)
-        ]
+        errors = []
+        for (crop, target), change in zip(self.targets, self.changes, strict=True):
+            difference = whole.run(None, {"image": crop})[0] - target
+            errors.append(np.linalg.norm(difference) / np.sqrt(difference.size) / change)
         seen.append((cost(None), np.array(errors)))
         return cost
 

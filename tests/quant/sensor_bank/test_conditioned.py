@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import onnx
 import pytest
 import torch
 
@@ -25,12 +26,10 @@ from beers_deploy.quant.sensor_bank.calibrate import bank_results, map_steps, qu
 from beers_deploy.quant.sensor_bank.conditioned import (
     SENSOR_BIASES,
     ConditionedCore,
-    conditioned_core,
     delta_of_file,
     required_conditioned_core,
     with_delta,
 )
-from beers_deploy.quant.sensor_bank.filters import channels
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.quant.tiling.receptive_field import tiling_of
 from tests.model.networks import told_of
@@ -73,14 +72,31 @@ def pair(request: pytest.FixtureRequest) -> "Pair":
 
 
 Pair = tuple[BankedConvBEERS, ConditionedCore]
+Image = np.ndarray
 
 
 def core_of(conditioned: ConditionedCore, vector: tuple[float, ...]) -> IntCore:
     return conditioned.for_sensor(bank_of_vector(vector), vector)
 
 
-def about(conditioned: ConditionedCore) -> dict[str, str]:
-    return {SENSOR_BIASES: conditioned.biases_to_json()}
+def file_of(conditioned: ConditionedCore, vector: tuple[float, ...]) -> onnx.ModelProto:
+    """Return the file of a sensor, which is named by its vector."""
+    about = {SENSOR_BIASES: conditioned.biases_to_json(), "sensor": str(vector)}
+    return host_model(core_of(conditioned, vector), about)
+
+
+def in_int8(conditioned: ConditionedCore, vector: tuple[float, ...], image: Image) -> Image:
+    return run(open_session(file_of(conditioned, vector)), image)
+
+
+def in_float(network: BankedConvBEERS, vector: tuple[float, ...], image: Image) -> Image:
+    with torch.inference_mode():
+        result = network(torch.from_numpy(image), told_of(torch.tensor([vector])))
+    return np.asarray(result.clamp(0, 1).numpy())
+
+
+def rms(values: Image) -> float:
+    return float(np.sqrt(np.square(values).mean()))
 
 
 @pytest.mark.parametrize("vector", SENSORS)
@@ -90,16 +106,10 @@ def test_int8_is_near_the_float_network_for_every_sensor(
     float_network, conditioned = pair
     # The texture stays within eight units of the quietest sensor, where INT8 ends.
     image = 0.3 + 0.3 * textured(46, 58, 9)
-    with torch.inference_mode():
-        expected = (
-            float_network(torch.from_numpy(image), told_of(torch.tensor([vector])))
-            .clamp(0, 1)
-            .numpy()
-        )
-    actual = run(open_session(host_model(core_of(conditioned, vector), {})), image)
+    expected = in_float(float_network, vector, image)
     unit = bank_of_vector(vector).unit
-    assert np.sqrt(np.square(actual - expected).mean()) < 0.05 * unit
-    assert np.sqrt(np.square(image - expected).mean()) > 0.1 * unit
+    assert rms(in_int8(conditioned, vector, image) - expected) < 0.05 * unit
+    assert rms(image - expected) > 0.1 * unit
 
 
 @pytest.mark.parametrize("vector", SENSORS)
@@ -113,13 +123,8 @@ def test_points_and_saturated_edges_are_corrected_as_far_as_in_float(
     image = np.full((1, 1, 46, 58), 0.1, np.float32)
     image[..., 10:30, 20:40] = 1.0
     image[..., 38, 8] = 0.5
-    with torch.inference_mode():
-        expected = (
-            float_network(torch.from_numpy(image), told_of(torch.tensor([vector])))
-            .clamp(0, 1)
-            .numpy()
-        )
-    actual = run(open_session(host_model(core_of(conditioned, vector), {})), image)
+    expected = in_float(float_network, vector, image)
+    actual = in_int8(conditioned, vector, image)
     bank = bank_of_vector(vector)
     most = np.abs(expected - image).max()
     reach = LARGEST * bank.unit / bank.gain
@@ -143,9 +148,8 @@ def test_a_float_network_rounded_as_its_file_errs_as_that_does(
         plain = float_network(torch.from_numpy(image), condition)
         steps = Rounding(stream, tuple(inner)).steps(condition.gains)
         rounded = float_network(torch.from_numpy(image), condition, steps=steps)
-    file = run(open_session(host_model(core_of(conditioned, vector), {})), image)
-    errors = file - plain.clamp(0, 1).numpy(), (rounded - plain).numpy()
-    ratio = np.linalg.norm(errors[1]) / np.linalg.norm(errors[0])
+    error = in_int8(conditioned, vector, image) - in_float(float_network, vector, image)
+    ratio = np.linalg.norm((rounded - plain).numpy()) / np.linalg.norm(error)
     # Only the file rounds weights, the bank and the last sum, so the ratio is not 1.
     assert 0.4 < ratio < 1.1
 
@@ -180,8 +184,9 @@ def test_the_file_is_what_its_integers_ask_for_and_the_reference_gives_the_same(
     file = host_model(core, {"precision": "int8 legal"})
     assert encoding_faults(file) == []
     core_again = read_core(file)
-    tensors, _ = run_core(core_again, core_again.host_part.encode(image), half_even=True)
-    mine = core_again.host_part.finish(image, merged_correction(core_again, tensors))
+    host_part = core_again.host_part
+    tensors, _ = run_core(core_again, host_part.encode(image), half_even=True)
+    mine = host_part.finish(image, merged_correction(core_again, tensors))
     np.testing.assert_allclose(mine, run(open_session(file), image), atol=1e-7)
 
 
@@ -210,85 +215,53 @@ def test_a_body_finer_by_its_gain_makes_what_it_makes_at_a_gain_of_one(
     """Far from int8's ends, but for rounding: the image, filters and biases agree on the gain."""
     image = 0.4 + 0.02 * textured(46, 58, 3)
     bank = bank_of_vector(vector)
-    own = run(open_session(host_model(core_of(pair[1], vector), {})), image)
+    own = in_int8(pair[1], vector, image)
     monkeypatch.setattr("beers_deploy.model.bank.GAINS", (1.0, 1.0))
-    plain = run(open_session(host_model(core_of(pair[1], vector), {})), image)
-    assert np.sqrt(np.square(own - plain).mean()) < 0.05 * bank.unit
+    assert rms(own - in_int8(pair[1], vector, image)) < 0.05 * bank.unit
     assert bank.gain == 1
 
 
-def test_the_file_of_any_sensor_can_be_told_another(
-    pair: Pair,
-) -> None:
+def test_any_sensors_file_becomes_another_to_the_byte(pair: Pair) -> None:
+    """By the biases in its metadata, and by a delta."""
     conditioned = pair[1]
-    first, second = (
-        host_model(core_of(conditioned, vector), {SENSOR_BIASES: conditioned.biases_to_json()})
-        for vector in SENSORS[:2]
-    )
-    stored = conditioned_core(first)
-    assert stored is not None
-    rebuilt = host_model(core_of(stored, SENSORS[1]), {SENSOR_BIASES: stored.biases_to_json()})
-    assert rebuilt.SerializeToString(deterministic=True) == second.SerializeToString(
-        deterministic=True
-    )
-
-
-def test_a_delta_makes_any_sensors_file_that_sensors_to_the_byte(
-    pair: Pair,
-) -> None:
-    conditioned = pair[1]
-    first, second = (
-        host_model(
-            core_of(conditioned, vector),
-            {SENSOR_BIASES: conditioned.biases_to_json(), "sensor": str(k)},
-        )
-        for k, vector in enumerate(SENSORS[:2])
-    )
+    first, second = (file_of(conditioned, vector) for vector in SENSORS[:2])
+    stored = required_conditioned_core(first)
+    expected = second.SerializeToString(deterministic=True)
+    assert file_of(stored, SENSORS[1]).SerializeToString(deterministic=True) == expected
     delta = delta_of_file(second)
     assert len(delta) < 3000
-    core, name = with_delta(required_conditioned_core(first).core, delta)
-    rebuilt = host_model(core, {**about(conditioned), "sensor": name})
-    assert rebuilt.SerializeToString(deterministic=True) == second.SerializeToString(
-        deterministic=True
-    )
+    core, name = with_delta(stored.core, delta)
+    rebuilt = host_model(core, {SENSOR_BIASES: stored.biases_to_json(), "sensor": name})
+    assert rebuilt.SerializeToString(deterministic=True) == expected
 
 
 @pytest.mark.parametrize(
     "change", [lambda d: d[:-9], lambda d: d[:0], lambda d: b"x" + d, lambda d: d[:40] + d[41:]]
 )
-def test_a_damaged_delta_is_one_sentence(pair: Pair, change: Callable[[bytes], bytes]) -> None:
-    file = host_model(core_of(pair[1], SENSORS[1]), about(pair[1]))
-    with pytest.raises(
-        ModelError,
-        match=r"^The delta (is damaged|belongs to another network).*--delta",
-    ):
-        with_delta(required_conditioned_core(file).core, change(delta_of_file(file)))
-
-
-def test_a_delta_of_another_network_is_refused(
-    pair: Pair,
+def test_a_damaged_delta_and_one_of_another_network_are_refused(
+    pair: Pair, change: Callable[[bytes], bytes]
 ) -> None:
-    file = host_model(core_of(pair[1], SENSORS[1]), about(pair[1]))
-    other = replace(
-        required_conditioned_core(file).core, ops=required_conditioned_core(file).core.ops[1:]
-    )
-    with pytest.raises(ModelError, match="KeyError"):
-        with_delta(other, delta_of_file(file))
+    core = core_of(pair[1], SENSORS[1])
+    delta = delta_of_file(file_of(pair[1], SENSORS[1]))
+    for other, content in ((core, change(delta)), (replace(core, ops=core.ops[1:]), delta)):
+        with pytest.raises(ModelError, match=r"^The delta is damaged or .*network \(.*--delta"):
+            with_delta(other, content)
 
 
 def test_words_of_another_network_are_refused(
     pair: Pair,
 ) -> None:
     core = core_of(pair[1], SENSORS[0])
-    assert conditioned_core(host_model(core, {})) is None
+    with pytest.raises(ModelError, match="cannot be conditioned"):
+        required_conditioned_core(host_model(core, {}))
     for words in ("[]", '{"head": [[0, 0, 0, 0, 0]]}', '{"other": []}', "{"):
         with pytest.raises(ModelError, match="the INT8 network"):
-            conditioned_core(host_model(core, {SENSOR_BIASES: words}))
+            required_conditioned_core(host_model(core, {SENSOR_BIASES: words}))
 
 
 def test_tiles_give_the_whole_images_result(pair: Pair) -> None:
     """Mirrored borders reach no farther inside than the halo."""
-    file = host_model(core_of(pair[1], SENSORS[1]), {})
+    file = file_of(pair[1], SENSORS[1])
     image = textured(96, 80, 6)
     session = open_session(file)
     tiling = tiling_of(file)
@@ -296,29 +269,26 @@ def test_tiles_give_the_whole_images_result(pair: Pair) -> None:
     halo = tiling.halo_px
     assert tiling.alignment_px == pair[0].variant.scale
     for top, left in ((0, 0), (32, 24), (64, 48)):
-        bottom = top + 32
-        right = left + 32
         above = max(top - halo, 0)
         before = max(left - halo, 0)
-        tile = run(
-            session, np.ascontiguousarray(image[..., above : bottom + halo, before : right + halo])
-        )
-        core_rows = tile[..., top - above : bottom - above, left - before : right - before]
-        np.testing.assert_array_equal(core_rows, at_once[..., top:bottom, left:right])
+        read = image[..., above : top + 32 + halo, before : left + 32 + halo]
+        tile = run(session, np.ascontiguousarray(read))[..., top - above :, left - before :]
+        expected = at_once[..., top : top + 32, left : left + 32]
+        np.testing.assert_array_equal(tile[..., :32, :32], expected)
 
 
-def test_no_image_leaves_the_bounds_that_are_proven(
-    pair: Pair,
-) -> None:
+def test_no_image_leaves_the_bounds_that_are_proven(pair: Pair) -> None:
     core = core_of(pair[1], SENSORS[3])
     bounds = {bound.name: bound for bound in layer_bounds(core)}
     checkerboard = (np.indices((24, 28)).sum(0) % 2).astype(np.float32)[None, None]
     for image in (checkerboard, textured(24, 28, 4), np.ones_like(checkerboard)):
         tensors, reports = run_core(core, core.host_part.encode(image))
         for op, report in zip(core.ops, reports, strict=True):
-            assert report.peak_bits <= bounds[op.name].bits + 1e-9
-            assert np.clip(bounds[op.name].low, -128, 127) <= tensors[op.output].min()
-            assert tensors[op.output].max() <= np.clip(bounds[op.name].high, -128, 127)
+            bound = bounds[op.name]
+            low, high = np.clip([bound.low, bound.high], -128, 127)
+            assert report.peak_bits <= bound.bits + 1e-9
+            assert low <= tensors[op.output].min()
+            assert tensors[op.output].max() <= high
 
 
 def test_the_dpu_runs_all_of_it(pair: Pair) -> None:
@@ -329,11 +299,5 @@ def test_the_dpu_runs_all_of_it(pair: Pair) -> None:
     assert [node.op.name for node in placed.nodes if node.broken] == []
     size = board.graph.input[0].type.tensor_type.shape.dim[2].dim_value
     assert size == (70 if core.host_part.place_px == 1 else 36)
-
-
-def test_the_first_layer_writes_whole_groups_of_sixteen_channels(
-    pair: Pair,
-) -> None:
-    first = core_of(pair[1], SENSORS[0]).convolutions[0]
-    assert len(first.weight) == 16 * pair[0].variant.pixels
-    assert len(channels()) == 16
+    # The DPU works on groups of 16 channels.
+    assert len(core.convolutions[0].weight) == 16 * pair[0].variant.pixels
