@@ -64,6 +64,20 @@ def test_equalizing_leaves_the_float_network_as_it_was(name: str) -> None:
         assert_same(one_alone, graph, host_part)
 
 
+def test_what_others_read_or_factors_do_not_pass_is_left_alone() -> None:
+    _, graph, _, singles = read("unet")
+    pooled = set[str]()
+    for op in graph:
+        if not isinstance(op, Conv):
+            pooled |= {*op.inputs, op.output}
+    assert pooled
+    assert not pooled & set(singles.tensors)
+    _, graph, _, singles = read("segment")
+    curved = {op.output for op in graph if op.name.endswith("HardSwish") or "Hardswish" in op.name}
+    assert not curved & set(singles.tensors)
+    assert CORRECTION not in singles.tensors
+
+
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 1.0, 3.0]))
 def test_relu6_is_the_end_of_int8_whatever_the_factors(seed: int, size: float) -> None:
     graph = with_relu6(size)

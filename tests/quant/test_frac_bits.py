@@ -30,6 +30,11 @@ def test_the_best_scale_has_the_least_squared_error(seed: int, scale: float) -> 
         return float(((values - restored) ** 2).sum())
 
     assert error(best) <= min(error(best + k) for k in (-2, -1, 1, 2)) * (1 + 1e-5)
+
+
+def test_an_outlier_is_clipped_rather_than_coarsening_the_rest_and_zeros_have_a_scale() -> None:
+    values = np.concatenate([np.linspace(-1, 1, 10_001), [4.0]])
+    assert best_frac_bits(values) > unclipped_frac_bits(4.0)
     assert best_frac_bits(np.zeros(3)) == 0
 
 

@@ -1,6 +1,6 @@
 """Small cores of integers with every kind of operation, drawn by Hypothesis."""
 
-from dataclasses import replace
+import math
 
 import numpy as np
 from hypothesis import strategies as st
@@ -22,7 +22,6 @@ from beers_deploy.quant.graph import (
     Window,
 )
 from beers_deploy.quant.host_part import HostPart
-from beers_deploy.quant.integer.reference import layer_sums
 
 ACTIVATIONS = (Activation.none, Activation.relu, Activation.relu6, Activation.leaky_relu)
 TABLES = (Activation.hard_sigmoid, Activation.hard_swish, Activation.relu6)
@@ -41,6 +40,7 @@ KINDS = (
     "to channels",
     "table",
 )
+Shape = tuple[int, int, int]
 
 
 class CoreDrawer:
@@ -52,26 +52,21 @@ class CoreDrawer:
         self.generator = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
         self.ops: list[IntConv | Op] = []
         self.frac_bits = {PLANES: 7}
-        self.tensors = {PLANES: np.zeros((1, 3, tile_px, tile_px), np.int16)}
+        self.shapes: dict[str, Shape] = {PLANES: (3, tile_px, tile_px)}
 
     def number(self, low: int, high: int) -> int:
         """Draw an integer between two ends, both included."""
         return self.draw(st.integers(low, high))
 
-    def shape(self, name: str) -> tuple[int, ...]:
-        """Return channels, rows and columns of a tensor."""
-        return self.tensors[name].shape[1:]
-
     def tensor(self) -> str:
         """Return a tensor that an operation may read: planes are for convolutions alone."""
-        return self.draw(st.sampled_from([op.output for op in self.ops]))
+        return self.draw(st.sampled_from([name for name in self.shapes if name != PLANES]))
 
-    def append(self, op: IntConv | Op, frac_bits: int) -> None:
-        """Append an operation, and note the scale and the shape of its result."""
+    def append(self, op: IntConv | Op, shape: Shape, frac_bits: int) -> None:
+        """Append an operation, and note the shape and the scale of its result."""
         self.ops.append(op)
+        self.shapes[op.output] = shape
         self.frac_bits[op.output] = frac_bits
-        sums, *_ = layer_sums(IntCore((op,), self.frac_bits), op, self.tensors)
-        self.tensors[op.output] = np.zeros(sums.shape, np.int16)
 
     def name(self) -> str:
         """Return a new name, which has the characters that end a comment of C."""
@@ -81,9 +76,8 @@ class CoreDrawer:
         """Return the name of the next result."""
         return f"t{len(self.ops)}"
 
-    def window(self, kernel: tuple[int, ...], source: str, plain: bool = False) -> Window:
-        """Draw a window that has at least one place on a map."""
-        size = self.shape(source)[1:]
+    def window(self, kernel: tuple[int, int], size: tuple[int, int], plain: bool = False) -> Window:
+        """Draw a window that has at least one place on a map of this size."""
         pads = tuple(self.number(0, kernel[axis % 2] - 1) for axis in range(4))
         dilations = (1, 1) if plain else (self.number(1, 2), self.number(1, 2))
         window = Window((self.number(1, 3), self.number(1, 2)), pads, dilations)  # type: ignore[arg-type]
@@ -92,26 +86,29 @@ class CoreDrawer:
 
     def convolution(self, source: str, outputs: int, groups: int = 1) -> None:
         """Append a convolution with a kernel that fits its map."""
-        channels, *size = self.shape(source)
+        channels, *size = self.shapes[source]
         kernel = tuple(self.number(1, min(side, 4)) for side in size)
-        window = self.window(kernel, source)
-        self._conv(source, (outputs, channels // groups, *kernel), window, groups)
+        window = self.window(kernel, (size[0], size[1]))  # type: ignore[arg-type]
+        sizes = [window.output_size(axis, kernel[axis], size[axis]) for axis in (0, 1)]
+        self._conv(source, (outputs, channels // groups, *kernel), window, sizes, groups)
 
     def _transposed(self, source: str) -> None:
         """Append a transposed convolution whose result is not smaller than its map."""
+        channels, *size = self.shapes[source]
         stride = self.number(1, 3)
         kernel = (self.number(stride, 4), self.number(stride, 4))
         pads = tuple(self.number(0, (kernel[axis % 2] - 1) // 2) for axis in range(4))
         window = Window((stride, stride), pads)  # type: ignore[arg-type]
-        shape = (self.number(1, 5), self.shape(source)[0], *kernel)
-        self._conv(source, shape, window, transposed=True)
+        sizes = [window.transposed_size(axis, kernel[axis], size[axis]) for axis in (0, 1)]
+        self._conv(source, (self.number(1, 5), channels, *kernel), window, sizes, 1, True)
 
     def _conv(
         self,
         source: str,
         shape: tuple[int, ...],
         window: Window,
-        groups: int = 1,
+        sizes: list[int],
+        groups: int,
         transposed: bool = False,
     ) -> None:
         """Append a convolution with drawn integers and scales.
@@ -138,7 +135,7 @@ class CoreDrawer:
             groups,
             transposed,
         )
-        self.append(op, frac_bits)
+        self.append(op, (shape[0], sizes[0], sizes[1]), frac_bits)
 
     def of_kind(self, kind: str) -> None:
         """Append an operation of a kind, and before it what it needs."""
@@ -150,14 +147,14 @@ class CoreDrawer:
 
     def _grouped(self, source: str) -> None:
         """Append a depthwise convolution with one or two results a channel."""
-        channels = self.shape(source)[0]
+        channels = self.shapes[source][0]
         self.convolution(source, channels * self.number(1, 2), channels)
 
     def _pair(self, source: str) -> tuple[str, str]:
         """Return a tensor, and another of the same shape and mostly of another scale."""
         self._table(source)
-        outputs = [op.output for op in self.ops]
-        names = [name for name in outputs if self.shape(name) == self.shape(source)]
+        shape = self.shapes[source]
+        names = [name for name in self.shapes if self.shapes[name] == shape and name != PLANES]
         return source, self.draw(st.sampled_from(names))
 
     def _add(self, source: str) -> None:
@@ -166,22 +163,27 @@ class CoreDrawer:
         activation = self.draw(st.sampled_from(ACTIVATIONS))
         finest = max(self.frac_bits[name] for name in pair)
         add = Add(self.name(), pair, self.result(), activation)
-        self.append(add, finest - self.number(-2, 5))
+        self.append(add, self.shapes[source], finest - self.number(-2, 5))
 
     def _mul(self, source: str) -> None:
         """Append a product, whose bits before rounding are those of both factors."""
         pair = self._pair(source)
         finest = sum(self.frac_bits[name] for name in pair)
         mul = Mul(self.name(), pair, self.result())
-        self.append(mul, finest - self.number(0, 10))
+        self.append(mul, self.shapes[source], finest - self.number(0, 10))
 
     def _concat(self, source: str) -> None:
         """Append the channels of all tensors that have the same size and scale."""
-        size = self.shape(source)[1:]
+        channels, rows, columns = self.shapes[source]
         bits = self.frac_bits[source]
-        same_size = [op.output for op in self.ops if self.shape(op.output)[1:] == size]
-        parts = [name for name in same_size if self.frac_bits[name] == bits]
-        self.append(Concat(self.name(), (*parts, source), self.result()), bits)
+        parts = [
+            name
+            for name, shape in self.shapes.items()
+            if shape[1:] == (rows, columns) and self.frac_bits[name] == bits and name != PLANES
+        ]
+        width = channels + sum(self.shapes[name][0] for name in parts)
+        concat = Concat(self.name(), (*parts, source), self.result())
+        self.append(concat, (width, rows, columns), bits)
 
     def _maximum(self, source: str) -> None:
         """Append a maximum over windows, which may be dilated."""
@@ -193,16 +195,19 @@ class CoreDrawer:
 
     def _pool(self, source: str, pool: type[MaxPool | AveragePool], plain: bool) -> None:
         """Append a pooling, which keeps the scale of what it reads."""
-        _, rows, columns = self.shape(source)
-        kernel = (self.number(1, min(rows, 3)), self.number(1, min(columns, 3)))
-        window = self.window(kernel, source, plain)
+        channels, *size = self.shapes[source]
+        kernel = (self.number(1, min(size[0], 3)), self.number(1, min(size[1], 3)))
+        window = self.window(kernel, (size[0], size[1]), plain)
+        rows, columns = (window.output_size(axis, kernel[axis], size[axis]) for axis in (0, 1))
         op = pool(self.name(), source, self.result(), kernel, window)
-        self.append(op, self.frac_bits[source])
+        self.append(op, (channels, rows, columns), self.frac_bits[source])
 
     def _enlarge(self, source: str, factor: int, bilinear: bool) -> None:
         """Append an enlargement, which keeps the scale of what it reads."""
+        channels, rows, columns = self.shapes[source]
         resize = Resize(self.name(), source, self.result(), factor, bilinear)
-        self.append(resize, self.frac_bits[source])
+        shape = (channels, rows * factor, columns * factor)
+        self.append(resize, shape, self.frac_bits[source])
 
     def _repeat(self, source: str) -> None:
         """Append an enlargement that repeats pixels."""
@@ -216,28 +221,32 @@ class CoreDrawer:
         """Append eight channels and their shuffle to pixels, in either order of ONNX."""
         self.convolution(source, 8)
         source = self.ops[-1].output
+        _, rows, columns = self.shapes[source]
         order = self.draw(st.booleans())
         up = Shuffle(self.name(), source, self.result(), 2, True, order)
-        self.append(up, self.frac_bits[source])
+        self.append(up, (2, 2 * rows, 2 * columns), self.frac_bits[source])
 
     def _to_channels(self, source: str) -> None:
         """Append an enlarged map and the shuffle of its pixels to channels."""
+        channels, rows, columns = self.shapes[source]
         # Not by repetition, which would make the values of a square equal.
         self._enlarge(source, 2, bilinear=True)
         down = Shuffle(self.name(), self.ops[-1].output, self.result(), 2, False, False)
-        self.append(down, self.frac_bits[source])
+        self.append(down, (4 * channels, rows, columns), self.frac_bits[source])
 
     def _table(self, source: str) -> None:
         """Append an activation that is computed as a table of 256 values."""
         activation = self.draw(st.sampled_from(TABLES))
         table = Pointwise(self.name(), source, self.result(), activation)
-        self.append(table, self.number(2, 7))
+        self.append(table, self.shapes[source], self.number(2, 7))
 
     def core(self) -> IntCore:
         """Return the core, whose last operation is a convolution of what was written last."""
         self.convolution(self.ops[-1].output, 2)
         last = self.ops.pop()
-        self.ops.append(replace(last, output=CORRECTION))  # type: ignore[type-var]
+        assert isinstance(last, IntConv)
+        fields = {**vars(last), "output": CORRECTION}
+        self.ops.append(IntConv(**fields))
         self.frac_bits[CORRECTION] = self.frac_bits[last.output]
         part = HostPart(outputs=2, adds_image=False)
         return IntCore(tuple(self.ops), self.frac_bits, part)
@@ -252,6 +261,6 @@ def cores(draw: st.DrawFn, kinds: tuple[str, ...] = KINDS, most: int = 8) -> tup
     for kind in draw(st.lists(st.sampled_from(kinds), min_size=1, max_size=most)):
         drawer.of_kind(kind)
         # Enlargements in a row would make a test of seconds.
-        if drawer.tensors[drawer.ops[-1].output].size > 1 << 14:
+        if math.prod(drawer.shapes[drawer.ops[-1].output]) > 1 << 14:
             break
     return drawer.core(), tile_px

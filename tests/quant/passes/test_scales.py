@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.quant.core import SHIFTS, IntCore, Shifts, build_core, shift_faults
-from beers_deploy.quant.graph import CORRECTION, PLANES, Add, Conv, Graph
+from beers_deploy.quant.graph import CORRECTION, PLANES, Add, Conv, Graph, ties_scales
 from beers_deploy.quant.integer.trainable import TrainableCore
 from beers_deploy.quant.passes.scales import moved, with_better_scales
 from tests.quant.quick import with_relu6
@@ -117,6 +117,31 @@ def test_every_core_tried_is_legal_and_trained_as_the_reference_runs_it(
         assert each.frac_bits[PLANES] == 7
         assert each.frac_bits["b"] == core.frac_bits["b"]
     hold_to_reference(TrainableCore(cores[-1]), PLANES_OF_NOISE)
+
+
+def test_what_shares_a_scale_moves_together() -> None:
+    """Tensors that must share a scale share it in every core, however many moves were kept."""
+    graph = odd_operations(np.random.default_rng(3))
+    core = build_core(graph, {op.output: 5 for op in graph} | {PLANES: 7})
+    after = tried(core, graph)[-1]
+    for op in after.ops:
+        if ties_scales(op):
+            assert len({after.frac_bits[name] for name in (*op.inputs, op.output)}) == 1
+    assert moved(core, after) > 3
+
+
+def test_finer_weights_stand_for_the_same_values() -> None:
+    """Made coarser and finer again, weights have the coarser values on the finer scale."""
+    _, core = chain(2)
+    coarse = TrainableCore(core).with_finer_numbers("weight", 0, by=-2)
+    fine = coarse.with_finer_numbers("weight", 0, by=2)
+    before, after = (each.core().convolutions[0] for each in (coarse, fine))
+    assert np.any(before.weight)
+    assert after.weight_frac_bits == before.weight_frac_bits + 2
+    error = (
+        after.weight * 2.0**-after.weight_frac_bits - before.weight * 2.0**-before.weight_frac_bits
+    )
+    assert np.abs(error).max() <= 2.0**-before.weight_frac_bits / 2
 
 
 def test_where_relu6_clips_the_end_of_int8_stays() -> None:
