@@ -46,29 +46,6 @@ def test_the_pages_board_is_the_zcu102_but_for_what_it_states(tmp_path: Path) ->
     assert mine.target.documents == base.target.documents
 
 
-def test_the_zcu104_is_the_zcu102_but_for_cores_clock_and_memory() -> None:
-    one = TargetProfile.load("zcu102")
-    other = TargetProfile.load("zcu104")
-    differing = set[tuple[str, str]]()
-    for table, constants in one.tables.items():
-        if table == "cost":  # Each board's cost table is fitted to its own rates.
-            continue
-        theirs = {key: constant.value for key, constant in other.tables[table].items()}
-        for key, constant in constants.items():
-            if key not in theirs or theirs[key] != constant.value:
-                differing.add((table, key))
-    assert differing == {
-        ("array", "pl_clock_hz"),
-        ("tile", "memory_bytes"),
-        ("power", "dpu_range_w"),
-    }
-    for size, constants in other.configurations.items():
-        changed = {
-            key for key, constant in one.configurations[size].items() if constants[key] != constant
-        }
-        assert changed == {"cores", "peak_tops"}
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
