@@ -114,14 +114,6 @@ def test_a_checkpoint_of_another_recipe_is_refused(tmp_path: Path) -> None:
         other.resume(tmp_path / "checkpoint.safetensors")
 
 
-def test_training_lowers_the_loss(tmp_path: Path) -> None:
-    losses: list[float] = []
-    recipe = TrainingRecipe(steps=60, batch=3, warm_up_steps=5)
-    schedule = Schedule(20, report=lambda _, terms, __: losses.append(terms["l1"]))
-    Trainer(VARIANT, recipe).run(source().batches, tmp_path / "c", schedule)
-    assert losses[-1] < 0.8 * losses[0]
-
-
 class Poisoned(PatchSource):
     """A source whose batches are NaN, all or those of some numbers."""
 
