@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from beers_deploy.model.shipped import SENSOR
@@ -19,7 +18,7 @@ from beers_deploy.verbs.parameters import (
     Targets,
     Tiles,
 )
-from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, path_or_none, refuse_with, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.performance.board import Bench
@@ -123,7 +122,7 @@ def bench(
 
     tiles_px = parse_tiles(tile)
     profile = Sensor.load(sensor)
-    paths = [None if path is None else Path(path) for path in (image, measured)]
+    paths = [path_or_none(path) for path in (image, measured)]
     if target in HOSTS:
         refuse_with("`target` host", **given(*OF_BOARDS))
         return _on_this_machine(network, profile, tiles_px, threads)

@@ -2,12 +2,11 @@
 
 import logging
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.verbs.parameters import Edges, Images, Interval, Mtf, Progress, RequiredFile
-from beers_deploy.verbs.verb import verb
+from beers_deploy.verbs.verb import path_or_none, verb
 
 if TYPE_CHECKING:
     from beers_deploy.studies.characterize import MeasuredSensor
@@ -64,7 +63,7 @@ def characterize(
     from beers_deploy.model.io.files import write_text
     from beers_deploy.studies.characterize import Stated, measured_sensor
 
-    file = None if out is None else Path(out)
+    file = path_or_none(out)
     edges = [edge] if isinstance(edge, str) else list(edge)
     stated = Stated(bits, gain, gsd, black_level, None if mtf is None else contrasts(mtf))
     sensor, toml = measured_sensor(images, edges, stated)

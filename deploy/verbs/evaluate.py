@@ -23,7 +23,7 @@ from beers_deploy.verbs.parameters import (
     Seed,
     SensorLike,
 )
-from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, path_or_none, refuse_with, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.pairs import Pair
@@ -118,7 +118,7 @@ def evaluate(
     """
     from beers_deploy.model.raster.images import list_images
 
-    folder = None if out is None else Path(out)
+    folder = path_or_none(out)
     given = partial(changed, evaluate, locals())
     if detector is not None:
         steps = ("consistency", "exposure", "strict")
@@ -161,10 +161,10 @@ def evaluate(
     plan = Plan(
         methods=named,
         sensors=sensors,
-        scenes=None if images is None else Path(images),
+        scenes=path_or_none(images),
         folder=stored,
         given=in_memory,
-        lpips=None if lpips is None else Path(lpips),
+        lpips=path_or_none(lpips),
         factors=check_brightness(numbers_of("brightness", brightness, "0.25,0.05")),
         rates=rates,
         sweep=sweep,
@@ -265,7 +265,7 @@ def _detection(
         network.names,
         {} if classes is None else parse_classes(classes),
         Path(images),
-        None if labels is None else Path(labels),
+        path_or_none(labels),
         split,
     )
     compared = run_study(

@@ -15,7 +15,7 @@ from beers_deploy.verbs.parameters import (
     ShippedOrFile,
     TargetLike,
 )
-from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, path_or_none, refuse_with, refuse_without, verb
 
 
 @verb
@@ -89,7 +89,7 @@ def export(
         refuse_without("an INT8 `network`", **given("board_file", "c", "delta", "apply"))
     if apply is not None:
         refuse_with("`apply`", **given("sensor", "delta"))
-    core, c_file = (None if file is None else Path(file) for file in (board_file, c))
+    core, c_file = (path_or_none(file) for file in (board_file, c))
     deltas = {} if delta is None else delta_files(Path(delta), sensor or SENSOR)
     inputs = [
         path,
@@ -102,7 +102,7 @@ def export(
     if path.suffix != ".onnx":
         export_float(path, Path(out), sensor, tile)
         return Path(out)
-    model = conditioned_int8(path, sensor or SENSOR, None if apply is None else Path(apply))
+    model = conditioned_int8(path, sensor or SENSOR, path_or_none(apply))
     export_int8(model, Path(out), tile, core, board, c_file)
     for factor, file in deltas.items():
         save_delta(model, sensor or SENSOR, factor, file)

@@ -25,7 +25,7 @@ from beers_deploy.verbs.parameters import (
     Steps,
     TargetLike,
 )
-from beers_deploy.verbs.verb import recorded, refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import path_or_none, recorded, refuse_with, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.network import Network
@@ -145,12 +145,12 @@ def quantize(
             seed=seed != 0,
         )
     board = TargetProfile.load(target)
-    files = [None if path is None else Path(path) for path in (out, board_file)]
+    files = [path_or_none(path) for path in (out, board_file)]
     inputs = [Path(each) for each in (network, samples) if isinstance(each, str | os.PathLike)]
     pages = _report_files(report, network)
     require_onnx_name(*files)
     require_core_file(board, files[1], tile, inputs)
-    scenes = None if images is None else Path(images)
+    scenes = path_or_none(images)
     data = Data(Sensor.load(sensor), samples, scenes, patches, seed, patch, input_range)
     result, held_out = quantized(network, data, board, finetune, Effort(effort), adapt, output)
     # Both are made before the first is written: a core that is refused leaves no file.

@@ -20,7 +20,7 @@ from beers_deploy.verbs.parameters import (
     Progress,
     PythonOnly,
 )
-from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, path_or_none, refuse_with, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.restoration.output import Output
@@ -171,7 +171,7 @@ def restore(
     if path is not None and not dry_run:
         how: dict[str, Any] = {"compression": compression, "cog": cog, "resume": resume}
         how["interval"] = interval
-        how["self_check"] = None if self_check is None else Path(self_check)
+        how["self_check"] = path_or_none(self_check)
         output = _output(out, (stac, view), overwrite or resume, fix_detectors or "", **how)
     sensors = sensors_of(sensor)
     unknown = is_unknown(sensors)
@@ -259,7 +259,7 @@ def _output(
             raise OptionError(
                 f"{each} exists already. Add `overwrite` to replace it, or choose another name."
             )
-    named = [None if document is None else Path(document) for document in documents]
+    named = [path_or_none(document) for document in documents]
     if named[0] is not None:
         optional("pystac", "stac")
         (item,) = network_paths(named[0], 1)

@@ -23,7 +23,7 @@ from beers_deploy.verbs.parameters import (
     Seed,
     SensorLike,
 )
-from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, path_or_none, refuse_with, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.model.dataset import DatasetRecipe
@@ -177,7 +177,7 @@ def _files(images: Images | None) -> list[Path | None]:
     for image in several:
         if image is not None and not isinstance(image, str | os.PathLike):
             raise OptionError("`images` must be paths for a data set. Save the pixels first.")
-        path = None if image is None else Path(image)
+        path = path_or_none(image)
         files += list_images(path) if path and path.is_dir() else [path]
     return files or [None]
 

@@ -18,7 +18,7 @@ from beers_deploy.verbs.parameters import (
     SensorLike,
     TargetLike,
 )
-from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, path_or_none, refuse_with, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.results import Table
@@ -97,7 +97,7 @@ def stress(
         from beers_deploy.profiles.target import TargetProfile
         from beers_deploy.quant.samples.simulated import Calibration
 
-        scenes = None if images is None else Path(images)
+        scenes = path_or_none(images)
         patches = Calibration(Sensor.load(sensor), scenes, draws, side, seed)
         table = flip_table(subject, patches, TargetProfile.load(target))
         if out is not None:

@@ -19,7 +19,7 @@ from beers_deploy.verbs.parameters import (
     Size,
     Targets,
 )
-from beers_deploy.verbs.verb import refuse_with, verb
+from beers_deploy.verbs.verb import path_or_none, refuse_with, verb
 
 if TYPE_CHECKING:
     from beers_deploy.network import NetworkLike
@@ -105,7 +105,7 @@ def tradeoff(
     networks = _networks(network)
     # Limits are read before torch is loaded.
     limits = parse_constraints("budget", budget), parse_constraints("need", need)
-    folder = None if out is None else Path(out)
+    folder = path_or_none(out)
     from beers_deploy.studies.tradeoff.run import Study, preview
 
     degraded = Sensor.load(sensor)
@@ -113,9 +113,9 @@ def tradeoff(
         networks=[_loaded(each, degraded) for each in networks],
         boards=boards_of(target),
         sensors=(degraded, reference_beside(degraded, reference)),
-        scenes=None if images is None else Path(images),
-        lpips=None if lpips is None else Path(lpips),
-        calibration=None if calibration is None else Path(calibration),
+        scenes=path_or_none(images),
+        lpips=path_or_none(lpips),
+        calibration=path_or_none(calibration),
         size=parse_size(size),
         budget=limits[0],
         need=limits[1],

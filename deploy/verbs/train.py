@@ -19,7 +19,7 @@ from beers_deploy.verbs.parameters import (
     Seed,
     SensorLike,
 )
-from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, path_or_none, refuse_with, refuse_without, verb
 
 logger = logging.getLogger(__name__)
 
@@ -146,10 +146,10 @@ def train(
     from beers_deploy.network_files import weights_file
     from beers_deploy.quantization import rounding_of
 
-    stored = None if pairs is None else Path(pairs)
+    stored = path_or_none(pairs)
     start_file = None if start is None else weights_file(Path(start))
     rounding_file = None if rounding is None else weights_file(Path(rounding))
-    lpips_file = None if lpips is None else Path(lpips)
+    lpips_file = path_or_none(lpips)
     sources = [*folders] if stored is None else [stored, stored / "degraded", stored / "reference"]
     profiles = [Path(each) for each in (sensor, reference) if isinstance(each, str | os.PathLike)]
     inputs = (*sources, lpips_file, start_file, rounding_file, *profiles)

@@ -15,7 +15,7 @@ from typing import Any, Literal, ParamSpec, TypeVar, cast, get_args, get_origin
 from annotated_types import Interval
 
 from beers_deploy.profiles.errors import BeersError, OptionError, missing_extra
-from beers_deploy.verbs.parameters import Beside, Holds, Labelled, Written
+from beers_deploy.verbs.parameters import Beside, Holds, InputPath, Labelled, Written
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -210,6 +210,11 @@ def parts_of(annotation: Any) -> Iterator[Any]:
     if get_origin(annotation) is not Literal:
         for part in get_args(annotation):
             yield from parts_of(part)
+
+
+def path_or_none(value: InputPath | None) -> Path | None:
+    """Return the path that a parameter names, or None if it is not given."""
+    return None if value is None else Path(value)
 
 
 def changed(
