@@ -178,8 +178,8 @@ def read_baseline(path: Path, arguments: Mapping[str, Any]) -> Baseline:
 
 
 def _plain(name: str, value: object) -> str:
-    """Return an argument as text. Of a folder of images only the name is used, because the folder
-    may be elsewhere.
+    """Return an argument as text. A path is reduced to its name, because the files may be
+    elsewhere now.
     """
     return encodable(
         Path(str(value)).name if name in ("images", "samples", "sensor") else str(value)

@@ -40,7 +40,7 @@ def characterize(
         edge: box with one straight edge, FILE:X,Y,WIDTH,HEIGHT; edges are searched for if none.
         mtf: contrast at Nyquist across the track, or across and along it, if you know it: 0.07 is
             7 %; measured if none.
-        black_level: value of the dark in the images; 0 is assumed to be dark if none.
+        black_level: pixel value of the dark; assumed to be 0 if none.
         bits: bits of a pixel; found from clipped pixels if none.
         gain: DN per W/m2/sr/um; full scale is assumed to be 400 W/m2/sr/um if none.
         gsd: ground sampling distance in m; no pixel depends on it.

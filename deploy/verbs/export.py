@@ -48,12 +48,12 @@ def export(
             'quantize' made of weights of 'train --conditioned'.
         sensor: sensor of the network: a name, a .toml file, or blind; pleiades-degraded if none.
         tile: side in pixels of the one tile that the input is fixed to, such as 640 for a board.
-        board_file: of an INT8 network: also write its core in the board's encoding, QDQ ONNX or an
+        board_file: also write the core of an INT8 network in the board's encoding, QDQ ONNX or an
             NPU's VINT8.
-        c: of an INT8 network: also write its core as one C99 file for one tile, with integers only.
+        c: also write the core of an INT8 network as one C99 file for one tile, with integers only.
         target: board or NPU of `board_file`: a name, or a .toml file.
-        delta: of an INT8 network: also write what the sensor changes in it, 1 to 3 kB.
-        apply: of an INT8 network: condition it on the sensor of this delta, in place of `sensor`.
+        delta: also write what the sensor changes in an INT8 network, 1 to 3 kB.
+        apply: condition the INT8 network on the sensor of this delta, in place of `sensor`.
 
     Returns:
         The path of the ONNX file.
@@ -63,7 +63,7 @@ def export(
         OptionError: options that do not go together.
         ProfileError: no such sensor or board.
     """
-    given = partial(changed, export, locals())
+    options = partial(changed, export, locals())
 
     from beers_deploy.kit.board_file import require_core_file
     from beers_deploy.model.io.files import require_writable
@@ -84,11 +84,11 @@ def export(
         shipped_weights(source.name.removesuffix(INT8))
     path = weights_file(source)
     if board_file is None:
-        refuse_without("`board_file`", **given("target"))
+        refuse_without("`board_file`", **options("target"))
     if path.suffix != ".onnx":
-        refuse_without("an INT8 `network`", **given("board_file", "c", "delta", "apply"))
+        refuse_without("an INT8 `network`", **options("board_file", "c", "delta", "apply"))
     if apply is not None:
-        refuse_with("`apply`", **given("sensor", "delta"))
+        refuse_with("`apply`", **options("sensor", "delta"))
     core, c_file = (path_or_none(file) for file in (board_file, c))
     deltas = {} if delta is None else delta_files(Path(delta), sensor or SENSOR)
     inputs = [

@@ -86,11 +86,11 @@ def quantize(
         images: folder of scenes for the simulated patches; drawn scenes if none.
         patches: number of simulated patches.
         patch: side of a simulated patch in pixels.
-        effort: of the search that equalizes channels: first guesses alone, groups of channels
-            within a bound of time, or each channel by itself without one. An estimate of the time
-            is printed before it begins.
+        effort: how thoroughly channels are equalized: fast takes first guesses, normal searches
+            groups of channels within a bound of time, best searches each channel without a bound.
+            An estimate of the time is printed first.
         finetune: number of steps that train the integers on the patches, between which scales are
-            moved; 'auto' trains for minutes, while it helps.
+            moved; 'auto' trains for some minutes, as long as the error falls.
         adapt: replace activations that the DPU lacks: SiLU by HardSwish, Sigmoid by HardSigmoid,
             LeakyReLU and PReLU by LeakyReLU of 26/256, or exactly if that loses more than 0.05 dB.
             The convolutions around them are fitted to the original network, and the table has the

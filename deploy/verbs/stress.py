@@ -77,11 +77,11 @@ def stress(
         ModelError: a network that cannot be tiled, or a float and an INT8 network that are swapped.
         OptionError: no such case or stage, or options that do not go together.
     """
-    given = partial(changed, stress, locals())
+    options = partial(changed, stress, locals())
     if bit_flips:
-        refuse_with("`bit_flips`", **given("cases", "stages"))
+        refuse_with("`bit_flips`", **options("cases", "stages"))
     else:
-        refuse_without("`bit_flips`", **given("draws", "images", "target"))
+        refuse_without("`bit_flips`", **options("draws", "images", "target"))
     # These load torch.
     from beers_deploy.model.io.files import write_text
     from beers_deploy.studies.stress.battery import battery_table, chosen

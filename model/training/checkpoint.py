@@ -89,7 +89,7 @@ class Guards:
     count: int = 0
 
     def skipped(self, step: int) -> None:
-        """Count a step whose loss or gradient was not finite."""
+        """Count a step without a finite loss or gradient; raise ModelError after too many."""
         self.bad_steps += 1
         if self.bad_steps > MAX_BAD_STEPS:
             raise ModelError(
@@ -98,7 +98,7 @@ class Guards:
             )
 
     def passed(self, step: int, loss: float) -> None:
-        """Take note of a step's loss."""
+        """Count the loss of a step, and raise ModelError if the mean of a window diverges."""
         self.sum = self.sum + loss
         self.count = self.count + 1
         if self.count < WINDOW_STEPS:
