@@ -33,13 +33,11 @@ def departure(sensor: Instrument, kernels: Kernels) -> str:
             formula's curve only.
     """
     zero = np.zeros((1, 1))
-    for axis, contrast in zip(("across", "along"), sensor.mtf_axes, strict=True):
-        frequency = FREQUENCIES[None]
-        response = (
-            sensor_mtf(frequency, zero, sensor)
-            if axis == "across"
-            else sensor_mtf(zero, frequency.T, sensor)
-        )
+    frequency = FREQUENCIES[None]
+    responses = sensor_mtf(frequency, zero, sensor), sensor_mtf(zero, frequency.T, sensor)
+    for axis, contrast, response in zip(
+        ("across", "along"), sensor.mtf_axes, responses, strict=True
+    ):
         curve = np.abs(np.ravel(response))
         # The stated contrast does not include smear.
         smeared = axis == "along" and bool(sensor.smear_px)

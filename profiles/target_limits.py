@@ -55,8 +55,17 @@ LIMITS: Mapping[str, Limits] = {
 }
 """The limits of each key, which are the same in every table that has the key."""
 
-ANY_KEY = ("published_latency_ms", "published_throughput_fps", "array", "memory", "elementwise")
-ANY_KEY += ("cost", "power")
+ANY_KEY = frozenset(
+    {
+        "published_latency_ms",
+        "published_throughput_fps",
+        "array",
+        "memory",
+        "elementwise",
+        "cost",
+        "power",
+    }
+)
 """Tables that may have further keys, such as the name of a published network: above 0."""
 
 

@@ -73,9 +73,7 @@ class Worker:
         """Return True if any worker raises the flag; all workers get the same answer."""
         if self.count == 1:
             return flag
-        raised: Tensor = torch.tensor(float(flag), device=device)
-        torch.distributed.all_reduce(raised, torch.distributed.ReduceOp.MAX)
-        return bool(raised > 0)
+        return bool(largest_of_all(torch.tensor(float(flag), device=device)) > 0)
 
 
 @contextmanager
