@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beers_deploy.model.io.files import sha256, write_text
-from beers_deploy.model.manifest import ROLES, Line, image_of, line_text, matching_lines
+from beers_deploy.model.manifest import DIGESTS, ROLES, Line, image_of, line_text, matching_lines
 from beers_deploy.model.progress import steps
 from beers_deploy.model.raster.writer import write_tiff
 from beers_deploy.model.simulator.acquire import MARGIN_PX, prepare_scene, simulate_planned
@@ -31,7 +31,8 @@ from beers_deploy.model.simulator.detector import Draw, to_uint16
 from beers_deploy.model.simulator.plan import TOLERANCE_DN, make_plan
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene, read_scene, resample
-from beers_deploy.profiles.errors import ImageError, OptionError
+from beers_deploy.profiles.errors import ImageError, OptionError, reason_of
+from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.reference import require_same_units
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.toml import parse_json
@@ -145,17 +146,46 @@ def _make_patch(recipe: DatasetRecipe, window: Window, radiance: np.ndarray) -> 
     right = window.left + window.width
     part = prepare_scene(radiance[window.top : bottom, window.left : right], recipe.oversampling)
     draw = Draw(recipe.seed, window.number)
-    line: Line = {"number": window.number, "name": window.name, "seed": recipe.seed}
-    line |= {"source": window.name.split("-", 1)[1], "top_px": window.top, "left_px": window.left}
+    line, sensors = _drawn(recipe, window)
     images = []
-    for role, profile in (("degraded", recipe.degraded), ("reference", recipe.reference)):
-        sensor, rejected = profile.draw_counted(draw.generator(f"sensor-{role}"))
+    for role, sensor in sensors.items():
         plan = make_plan(sensor, part.stats, recipe.tolerance_dn)
         images.append(to_uint16(simulate_planned(part, sensor, draw, plan, role)))
-        # The response is the same for all pairs, and stands in the recipe.
-        numbers = asdict(replace(sensor, response=None))
-        line[role] = {"sensor": numbers, "rejected_snr_pairs": rejected, "plan": plan.to_json()}
+        line[role] = {**line[role], PLAN: plan.to_json()}
     return Patch(images[0], images[1], line)
+
+
+PLAN = "plan"
+"""Key of the simulated effects of a role, which depend on the pixels of the scene."""
+
+
+def _drawn(recipe: DatasetRecipe, window: Window) -> tuple[dict[str, Any], dict[str, Instrument]]:
+    """Return a pair's line of the manifest without its plans, and its sensors by role: no pixel
+    decides them.
+    """
+    draw = Draw(recipe.seed, window.number)
+    line: dict[str, Any] = {"number": window.number, "name": window.name, "seed": recipe.seed}
+    line |= {"source": window.name.split("-", 1)[1], "top_px": window.top, "left_px": window.left}
+    sensors = {}
+    for role, profile in (("degraded", recipe.degraded), ("reference", recipe.reference)):
+        sensors[role], rejected = profile.draw_counted(draw.generator(f"sensor-{role}"))
+        # The response is the same for all pairs, and stands in the recipe.
+        numbers = asdict(replace(sensors[role], response=None))
+        line[role] = {"sensor": numbers, "rejected_snr_pairs": rejected}
+    return line, sensors
+
+
+def _is_drawn(recipe: DatasetRecipe, window: Window, text: str) -> bool:
+    """Return True if a line of the manifest states what the recipe draws.
+
+    A digest alone does not prove that, because whoever forges a line can compute it.
+    """
+    line: Any = parse_json(text)
+    del line[DIGESTS]
+    for role in ROLES:
+        line[role] = {key: value for key, value in line[role].items() if key != PLAN}
+    drawn_line, _ = _drawn(recipe, window)
+    return json.dumps(line, sort_keys=True) == json.dumps(drawn_line, sort_keys=True)
 
 
 CHUNK = 32
@@ -194,7 +224,7 @@ def write_dataset(
     _remove_left_overs(out)
     manifest = out / "manifest.jsonl"
     parts = {out / "parts" / f"{chunk[0].number:08d}.jsonl": chunk for chunk in _chunks(windows)}
-    lines = _lines_left(out, windows, parts) if resume else {}
+    lines = _lines_left(recipe, out, windows, parts) if resume else {}
     waiting = {path: [w for w in chunk if w.number not in lines] for path, chunk in parts.items()}
     waiting = {path: chunk for path, chunk in waiting.items() if chunk}
     with ExitStack() as stack:
@@ -215,13 +245,11 @@ def write_dataset(
                 lines[window.number] = line_text(out, patch.line)
             write_text(path, "".join(lines[window.number] for window in parts[path]))
             bar.advance(len(patches))
-    write_text(manifest, "".join(lines[window.number] for window in windows))
+    content = "".join(lines[window.number] for window in windows)
+    if not manifest.is_file() or manifest.read_bytes() != content.encode():
+        write_text(manifest, content)
     shutil.rmtree(out / "parts", ignore_errors=True)
-    rejected = 0
-    for line in lines.values():
-        pair: Any = parse_json(line)
-        rejected += sum(pair[role]["rejected_snr_pairs"] for role in ROLES)
-    return {"patches": len(lines), "rejected_share": rejected / (rejected + 2 * len(lines))}
+    return _read_summary(manifest)
 
 
 def _chunks(windows: list[Window]) -> Iterator[list[Window]]:
@@ -243,6 +271,7 @@ def _remove_left_overs(out: Path) -> None:
 
 
 def _lines_left(
+    recipe: DatasetRecipe,
     out: Path,
     windows: list[Window],
     parts: Mapping[Path, list[Window]],
@@ -255,7 +284,7 @@ def _lines_left(
     lines = {}
     for window in windows:
         text = texts.get((window.number, window.name))
-        if text is not None:
+        if text is not None and _is_drawn(recipe, window, text):
             lines[window.number] = text
     candidates = windows
     if not manifest.exists():
@@ -299,7 +328,9 @@ def _check_folder(recipe: DatasetRecipe, out: Path, resume: bool) -> None:
     if not path.exists():
         write_text(path, content)
         return
-    if not path.is_file() or path.read_bytes() != content.encode():
+    present = path.read_bytes() if path.is_file() else b""
+    # An editor or Git may have changed how its lines end.
+    if present.replace(b"\r\n", b"\n") != content.encode():
         raise OptionError(
             f"`out` must be a folder without a dataset, but {out} holds another dataset. Choose "
             "another folder."
@@ -309,3 +340,25 @@ def _check_folder(recipe: DatasetRecipe, out: Path, resume: bool) -> None:
             f"`out` must be a folder without a dataset, but {out} holds this dataset. Add `resume` "
             "or choose another folder."
         )
+    if present != content.encode():
+        write_text(path, content)
+
+
+def _read_summary(path: Path) -> dict[str, float]:
+    """Read the number of patches and the share of redrawn SNR pairs from a manifest."""
+    try:
+        lines: list[Any] = [
+            parse_json(line) for line in path.read_text(encoding="utf-8").split("\n") if line
+        ]
+        if not lines:
+            raise ValueError("it is empty")
+        rejected = sum(
+            int(line[role]["rejected_snr_pairs"])
+            for line, role in product(lines, ("degraded", "reference"))
+        )
+        return {"patches": len(lines), "rejected_share": rejected / (rejected + 2 * len(lines))}
+    except (ArithmeticError, LookupError, OSError, TypeError, ValueError) as error:
+        reason = reason_of(error)
+        raise OptionError(
+            f"{path} is not the manifest of a dataset: {reason}. Choose another folder."
+        ) from error

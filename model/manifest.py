@@ -66,6 +66,10 @@ def _matching(out: Path, text: str) -> dict[str, Any] | None:
         # A line without its line break was cut short, whatever its digest.
         if digests.pop("line") != _digest(line) or not text.endswith("\n"):
             return None
+        if not (
+            isinstance(line["number"], int) and all(isinstance(line[role], dict) for role in ROLES)
+        ):
+            return None
         matches = digests == {role: sha256(image_of(out, role, line["name"])) for role in ROLES}
     except (LookupError, OSError, TypeError, ValueError):
         return None

@@ -21,6 +21,7 @@ from beers_deploy.model.dataset import (
     plan_windows,
     write_dataset,
 )
+from beers_deploy.model.manifest import DIGESTS, Line, line_text
 from beers_deploy.model.progress import Step, reporting
 from beers_deploy.profiles.effects import TABLES
 from beers_deploy.profiles.errors import ImageError, OptionError
@@ -176,6 +177,35 @@ def test_damaged_pairs_of_a_finished_dataset_are_made_again(
     assert all("they are simulated again" in message for message in caplog.messages)
 
 
+def rejected(value: object) -> Callable[[Line], None]:
+    return lambda line: line["degraded"].update(rejected_snr_pairs=value)  # type: ignore[attr-defined]
+
+
+FORGED: dict[str, Callable[[Line], object]] = {
+    "number as a list": lambda line: line.update(number=[0]),
+    "number as a float": lambda line: line.update(number=0.0),
+    "many rejected": rejected(10**9),
+    "rejected as text": rejected("x"),
+    "no sensor": lambda line: line.update(degraded=3),
+}
+
+
+@pytest.mark.parametrize("kind", FORGED)
+def test_a_forged_line_with_its_digest_is_made_again(
+    kind: str, scene: Path, dataset: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = Path(shutil.copytree(dataset, tmp_path / "forged"))
+    lines = (folder / "manifest.jsonl").read_text().splitlines(keepends=True)
+    line = json.loads(lines[0])
+    del line[DIGESTS]
+    FORGED[kind](line)
+    (folder / "manifest.jsonl").write_text("".join([line_text(folder, line), *lines[1:]]))
+    with caplog.at_level(logging.WARNING, "beers_deploy"):
+        write_dataset(small(scene), folder, 1, resume=True)
+    assert bytes_of(folder) == bytes_of(dataset)
+    assert caplog.messages[0].startswith("1 of ")
+
+
 def test_left_overs_of_a_run_are_deleted_and_nothing_else(
     scene: Path, dataset: Path, tmp_path: Path
 ) -> None:
@@ -200,6 +230,16 @@ def test_a_damaged_part_of_an_unfinished_dataset_is_made_again(
     part.write_text("".join(lines[:5]))
     (folder / "manifest.jsonl").unlink()
     damage(part)
+    write_dataset(small(scene), folder, 1, resume=True)
+    assert bytes_of(folder) == bytes_of(dataset)
+
+
+def test_a_recipe_with_the_line_ends_of_windows_is_the_same(
+    scene: Path, dataset: Path, tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(dataset, tmp_path / "other"))
+    recipe = folder / "recipe.json"
+    recipe.write_bytes(recipe.read_bytes().replace(b"\n", b"\r\n"))
     write_dataset(small(scene), folder, 1, resume=True)
     assert bytes_of(folder) == bytes_of(dataset)
 
