@@ -200,6 +200,8 @@ def weights_of(path: Path) -> dict[str, torch.Tensor]:
         ("--drawn 1 --lpips none.npz", "no such file"),
         ("--drawn 1 --device cuda", "CUDA"),
         ("--resume --drawn 1", "no such file"),
+        ("--drawn 1 --learning-rate inf", "learning rate must be a finite number"),
+        ("--drawn 1 --fft-weight inf", "weight of fft in the loss must be a finite number"),
         ("--drawn 1 --l1-weight 0 --lpips-weight 0 --fft-weight 0", "The loss is always 0"),
         ("--drawn 1 --variant convbeers-half --patch 33", "--patch must be a multiple of 2 px"),
     ],
