@@ -90,24 +90,7 @@ def extend(
         high = min(stop, placed.size_px)
         slices.append(slice(low - first, high - first))
         pads.append((low - start, stop - high))
-    inside = image[slices[0], slices[1]]
-    if not any(map(any, pads)):
-        return inside
-    return _mirrored(image, sides, origin, around_px)
-
-
-def _mirrored(
-    image: Image, sides: tuple[Placed, Placed], origin: tuple[int, int], around_px: int
-) -> NDArray[np.float32]:
-    """Return the pixels of `extend` one by one: c b a | a b c | c b a, folded back whatever the
-    image's size.
-    """
-    numbers = []
-    for placed, first in zip(sides, origin, strict=True):
-        period = 2 * placed.size_px
-        number = np.arange(*placed.span(around_px)) % period
-        numbers.append(np.minimum(number, period - 1 - number) - first)
-    return np.asarray(image[np.ix_(*numbers)])
+    return np.pad(image[slices[0], slices[1]], pads, "symmetric")
 
 
 def weighted_sums(image: Image, weights: Image, axis: int) -> Image:

@@ -192,12 +192,9 @@ class Consistency:
         """Compute block means of the near part of H x from pixels padded by NEAR_PX on
         every side.
         """
-        total: Image | None = None
-        for row, column in zip(self.rows, self.columns, strict=True):
-            term = weighted_sums(weighted_sums(padded, row, 0), column, 1)
-            total = term if total is None else total + term
-        assert total is not None  # noqa: S101 - RANK is at least 1
-        return total
+        terms = zip(self.rows, self.columns, strict=True)
+        sums = (weighted_sums(weighted_sums(padded, row, 0), column, 1) for row, column in terms)
+        return np.asarray(sum(sums))
 
     def _far(
         self, finite: Image, missing: NDArray[np.bool_] | None, down: Placed, across: Placed

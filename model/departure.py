@@ -24,22 +24,20 @@ and more (measured).
 
 
 def departure(sensor: Instrument, kernels: Kernels) -> str:
-    """Say where a sensor's curve departs from the curves that a network was trained on; "" if it
+    """Return a sentence on where a sensor's MTF leaves the range of the training curves; "" if it
     does not.
 
     Args:
-        sensor: its MTF and smear.
-        kernels: of the network's banks: networks of before they were fitted know the formula's
-            curve alone.
+        sensor: its MTF and smear are used.
+        kernels: the kind of the network's banks. Networks behind cut kernels were trained on the
+            formula's curve only.
     """
     zero = np.zeros((1, 1))
-    for axis, contrast in zip(("across", "along"), sensor.mtf_axes, strict=True):
-        frequency = FREQUENCIES[None]
-        response = (
-            sensor_mtf(frequency, zero, sensor)
-            if axis == "across"
-            else sensor_mtf(zero, frequency.T, sensor)
-        )
+    frequency = FREQUENCIES[None]
+    responses = sensor_mtf(frequency, zero, sensor), sensor_mtf(zero, frequency.T, sensor)
+    for axis, contrast, response in zip(
+        ("across", "along"), sensor.mtf_axes, responses, strict=True
+    ):
         curve = np.abs(np.ravel(response))
         # The stated contrast does not include smear.
         smeared = axis == "along" and bool(sensor.smear_px)

@@ -67,18 +67,17 @@ def profiles_for(
     if recipe is None:
         degraded = Sensor.load(sensor or SENSOR)
         return degraded, reference_beside(degraded, reference)
-    sensor_profile = Sensor.load(sensor) if sensor else None
-    # A dataset's images are in the degraded sensor's units: so is its reference.
-    reference_profile = None
+    if sensor:
+        _require_made_by("sensor", Sensor.load(sensor), recipe.degraded)
     if reference:
-        reference_profile = Sensor.load(reference).in_units_of(recipe.degraded)
-    _require_made_by("sensor", sensor_profile, recipe.degraded)
-    _require_made_by("reference", reference_profile, recipe.reference)
+        # A dataset's images are in the degraded sensor's units: so is its reference.
+        profile = Sensor.load(reference).in_units_of(recipe.degraded)
+        _require_made_by("reference", profile, recipe.reference)
     return recipe.degraded, recipe.reference
 
 
-def _require_made_by(option: str, profile: Sensor | None, of_recipe: Sensor) -> None:
-    if profile is not None and not same_instrument(profile, of_recipe):
+def _require_made_by(option: str, profile: Sensor, of_recipe: Sensor) -> None:
+    if not same_instrument(profile, of_recipe):
         raise OptionError(
             f"`{option}` must be the sensor that made the pairs, {of_recipe.name} with the numbers "
             f"in recipe.json, but it is {profile.name} with other numbers. Leave it out."

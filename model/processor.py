@@ -7,6 +7,7 @@ computation with a known result, run at most once per process when it is needed.
 
 import os
 import platform
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -126,27 +127,13 @@ def _linux_name() -> str:
     # User-mode emulation shows the name of the processor beneath the emulated one.
     if COMM.read_text(encoding="utf-8", errors="replace").startswith("qemu-"):
         return ""
-    cores = _fields(CPUINFO.read_text(encoding="utf-8", errors="replace"))
-    if names := cores.get("model name"):
-        return ", ".join(names)
-    if parts := cores.get("CPU part"):  # ARM's kernel knows numbers alone.
-        return (
-            f"ARM part {', '.join(parts)} of implementer "
-            f"{', '.join(cores.get('CPU implementer', ['unknown']))}"
-        )
+    text = CPUINFO.read_text(encoding="utf-8", errors="replace")
+    # Large and small cores differ in name. ARM's kernel knows numbers alone.
+    for key, prefix in (("model name", ""), ("CPU part", "ARM part ")):
+        names = re.findall(rf"^{key}[ \t]*:[ \t]*(\S.*)$", text, re.MULTILINE)
+        if names:
+            return prefix + ", ".join(dict.fromkeys(map(str.strip, names)))
     return ""
-
-
-def _fields(cpuinfo: str) -> dict[str, list[str]]:
-    """Return the distinct values of each field in order, because large and small cores differ in
-    name.
-    """
-    fields: dict[str, list[str]] = {}
-    for line in cpuinfo.splitlines():
-        key, _, value = (part.strip() for part in line.partition(":"))
-        if value and value not in fields.setdefault(key, []):
-            fields[key].append(value)
-    return fields
 
 
 def _macos_name() -> str:

@@ -122,9 +122,9 @@ def _new_bar() -> "Bar":
 
 
 class Steps:
-    """Counts steps of one piece of work."""
+    """Counts steps of one piece of work; `total` is None if their number is unknown."""
 
-    def __init__(self, label: str, total: int, task: "TaskID | None", nested: bool) -> None:
+    def __init__(self, label: str, total: int | None, task: "TaskID | None", nested: bool) -> None:
         self.label = label
         self.total = total
         self.done = 0
@@ -135,25 +135,32 @@ class Steps:
     def advance(self, steps: int = 1, note: str = "") -> None:
         """Report that further steps are done."""
         self.done += steps
+        self.show(f"{self.label} {note}".strip(), f"{self.label}: {self.done}/{self.total} {note}")
+
+    def show(self, text: str, line: str) -> None:
+        """Show the present state of the work, on a bar as `text` or as a plain line."""
         sink = _sink.get()
-        text = f"{self.label} {note}".strip()
         if callable(sink):
             sink(Step(text, self.done, self.total))
         elif self._task is not None and Display.bar is not None:
             Display.bar.update(self._task, completed=self.done, description=one_line(text))
         elif sink is not False and self._is_due():
             self._printed = time.monotonic()
-            _line(f"{self.label}: {self.done}/{self.total} {note}".rstrip())
+            sys.stderr.write(f"{one_line(line.rstrip())}\n")
 
     def _is_due(self) -> bool:
         """Return True if a plain line is due: now and then, and at the end of outer work."""
-        if time.monotonic() - self._printed > LINE_EVERY_S:
+        if self.total is None or time.monotonic() - self._printed > LINE_EVERY_S:
             return True
         return self.done >= self.total and not self._nested
 
 
+_work: ContextVar[Steps | None] = ContextVar("work", default=None)
+_nested: ContextVar[bool] = ContextVar("nested", default=False)
+
+
 @contextmanager
-def steps(label: str, total: int) -> Iterator[Steps]:
+def steps(label: str, total: int | None) -> Iterator[Steps]:
     """Show the progress of `total` steps while the block runs."""
     with _task(label, total) as task:
         nested = _nested.get()
@@ -164,51 +171,26 @@ def steps(label: str, total: int) -> Iterator[Steps]:
             _nested.reset(token)
 
 
-@dataclass
-class Work:
-    """Work whose steps are named one after the other."""
-
-    label: str
-    task: "TaskID | None"
-    done: int = 0
-
-
-_work: ContextVar[Work | None] = ContextVar("work", default=None)
-_nested: ContextVar[bool] = ContextVar("nested", default=False)
-
-
 @contextmanager
 def progress(label: str) -> Iterator[None]:
     """Show the steps that `step` names while the block runs."""
-    with _task(label, None) as task:
-        token = _work.set(Work(label, task))
-        within = _nested.set(True)
+    with steps(label, None) as work:
+        token = _work.set(work)
         try:
             yield
         finally:
-            _nested.reset(within)
             _work.reset(token)
 
 
 def step(name: str) -> None:
     """Name the step that begins now, for the progress report of this work."""
     work = _work.get()
-    sink = _sink.get()
-    if work is None or sink is False:
+    if work is None or _sink.get() is False:
         logger.debug(name)
         return
     text = f"{work.label}: {name}"
-    if callable(sink):
-        sink(Step(text, work.done, None))
-    elif work.task is not None and Display.bar is not None:
-        Display.bar.update(work.task, completed=work.done, description=one_line(text))
-    else:
-        _line(text)
+    work.show(text, text)
     work.done += 1
-
-
-def _line(text: str) -> None:
-    sys.stderr.write(f"{one_line(text)}\n")
 
 
 class Interrupt:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 
+from beers_deploy.profiles.arrays import ALONE, load_arrays
 from beers_deploy.profiles.errors import ProfileError, printable
 from beers_deploy.profiles.response import (
     KEPT_SIDE,
@@ -15,7 +16,6 @@ from beers_deploy.profiles.response import (
     centroid,
     packed,
 )
-from beers_deploy.profiles.toml import unreadable
 from beers_deploy.profiles.validation import CONFIG, validated
 
 FILE_SIDE = 4096
@@ -111,15 +111,9 @@ def _trimmed(samples: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _read_samples(where: str, path: Path) -> NDArray[np.float64]:
     """Read the samples (H, W) of a .npy file, or raise ProfileError."""
-    reason = unreadable(path) if path.suffix.lower() == ".npy" else f"it ends in {path.suffix!r}"
-    if reason:
-        raise ProfileError(
-            f"{where} cannot be read as a .npy file: {reason}. Check the path, which is relative "
-            "to the profile's folder."
-        )
     try:
         # Mapped: nothing is read before its shape is known.
-        samples = np.load(path, mmap_mode="r", allow_pickle=False)
+        samples = load_arrays(path).get(ALONE, np.zeros(0))
         if (
             samples.ndim != 2
             or samples.dtype.kind not in "iuf"
@@ -127,10 +121,9 @@ def _read_samples(where: str, path: Path) -> NDArray[np.float64]:
         ):
             raise ValueError(f"it is {samples.dtype} of shape {samples.shape}")
         return np.asarray(samples, np.float64)
-    # The bytes of a damaged file may lead to anything.
-    except Exception as error:
-        reason = printable(str(error)) or type(error).__name__
+    except ValueError as error:
         raise ProfileError(
-            f"{where} is not one array of real numbers, (rows, columns), of at most {FILE_SIDE} a "
-            f"side: {reason}. Crop it, leave one plane, and save it with numpy.save."
+            f"{where} is not a .npy file of one array of real numbers, (rows, columns), of at most "
+            f"{FILE_SIDE} a side: {printable(str(error))}. Check the path, which is relative to "
+            "the profile's folder; crop the array, leave one plane, and save it with numpy.save."
         ) from error

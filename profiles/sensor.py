@@ -11,12 +11,12 @@ from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
+from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from beers_deploy.profiles.constant import Constant, Limits, Stated
 from beers_deploy.profiles.effects import Effect, Effects, settled
-from beers_deploy.profiles.errors import ProfileError, printable
+from beers_deploy.profiles.errors import ProfileError
 from beers_deploy.profiles.instrument import (
     OFFSET,
     Instrument,
@@ -25,7 +25,7 @@ from beers_deploy.profiles.instrument import (
     snr_0_bounds,
     with_offset_of,
 )
-from beers_deploy.profiles.response import MtfTable, PointSpread, Response, unpacked
+from beers_deploy.profiles.response import MtfTable, Response, unpacked
 from beers_deploy.profiles.sensor_file import (
     GROUPS,
     LEAST,
@@ -54,20 +54,6 @@ def _bright(fields: dict[str, Constant]) -> Constant:
 
 def _dark(fields: dict[str, Constant]) -> Constant:
     return Constant(fields["radiance_1"].low / 4, "inferred", "a quarter of radiance_1")
-
-
-def _response(raw: object) -> object:
-    """Read a response from JSON; its keys determine whether it is a table or a point-spread
-    function.
-    """
-    if raw is None or isinstance(raw, MtfTable | PointSpread):
-        return raw
-    if not isinstance(raw, Mapping):
-        raise ValueError(
-            f"must be a table of contrasts or a point-spread function, got {printable(repr(raw))}. "
-            "Generate the file again."
-        )
-    return TypeAdapter(PointSpread if "samples" in raw else MtfTable).validate_python(raw)
 
 
 @dataclass(frozen=True, repr=False, config=CONFIG)
@@ -106,7 +92,7 @@ class Sensor:
     beta: Variance | None = None
     effects: Effects = Field(default_factory=dict)
     mtf_nyquist_along: Contrast | None = None
-    response: Annotated[Response | None, BeforeValidator(_response)] = None
+    response: Response | None = None
 
     @model_validator(mode="after")
     def _noise_is_possible(self) -> Self:
@@ -385,10 +371,16 @@ class Sensor:
         effects: Mapping[str, Effect],
         mtf_along: float | None,
     ) -> Instrument:
-        gain = self.gain_dn_per_radiance.low
-        bits = int(self.bits.low)
-        radiance_1 = self.radiance_1.low
-        return Instrument(mtf, *noise, gain, bits, effects, mtf_along, radiance_1, self.response)
+        return Instrument(
+            mtf,
+            *noise,
+            self.gain_dn_per_radiance.low,
+            int(self.bits.low),
+            effects,
+            mtf_along,
+            self.radiance_1.low,
+            self.response,
+        )
 
     def _impossible_snr(self) -> str:
         """Return the error message for SNRs that no alpha and beta can have."""

@@ -66,7 +66,7 @@ def table_keys(table: str) -> tuple[str, ...]:
 
 
 def constant_keys(table: str) -> tuple[str, ...]:
-    """Return those of them that are constants."""
+    """Return the keys of a table that are constants, and fields of `Sensor`."""
     return tuple(key for key in table_keys(table) if key not in RESPONSE)
 
 
@@ -137,15 +137,15 @@ def _blur(label: str, raw: Mapping[str, object], folder: Path) -> dict[str, Any]
 
 
 def axes_of(response: Response, status: Status, source: str) -> dict[str, Constant | None]:
-    """Return the contrasts at Nyquist as a profile's constants; none along the track where it is
-    that across.
+    """Return the contrasts at Nyquist as constants of a profile. That along the track is None if it
+    equals that across it.
     """
     across, along = (Constant(value, status, source) for value in response.at_nyquist)
     return {"mtf_nyquist": across, "mtf_nyquist_along": along if along != across else None}
 
 
 def sensor_toml(description: str, tables: Mapping[str, Mapping[str, object]]) -> str:
-    """Return the text of a sensor's file, of its tables as plain or stated values."""
+    """Return the text of a sensor's TOML file. Values of its tables may be plain or `Stated`."""
     lines = [f"description = {_toml(description)}"]
     for name, table in tables.items():
         lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in table.items())]
@@ -153,7 +153,7 @@ def sensor_toml(description: str, tables: Mapping[str, Mapping[str, object]]) ->
 
 
 def _toml(value: object) -> str:
-    """Return a value in TOML's notation: of JSON's it differs in tables alone."""
+    """Return a value in TOML's notation, which differs from JSON's in tables only."""
     entries = vars(value) if isinstance(value, Stated) else value
     if isinstance(entries, dict):
         return "{ " + ", ".join(f"{key} = {_toml(entry)}" for key, entry in entries.items()) + " }"

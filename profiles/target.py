@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass
 from beers_deploy.profiles.constant import Constant, Words
 from beers_deploy.profiles.errors import OptionError, ProfileError, printable
 from beers_deploy.profiles.shipped import MODEL_SUFFIX, board_names, target_names
-from beers_deploy.profiles.target_limits import CONFIGURATION, TABLES, check_limits
+from beers_deploy.profiles.target_limits import check_limits
 from beers_deploy.profiles.toml import read_toml
 from beers_deploy.profiles.validation import CONFIG, check_keys, validated
 
@@ -69,9 +69,9 @@ class TargetProfile:
     @model_validator(mode="after")
     def _is_possible(self) -> Self:
         for name, table in self.tables.items():
-            check_limits(name, TABLES.get(name, {}), table)
+            check_limits(name, table)
         for name, table in self.configurations.items():
-            check_limits(f"configurations.{name}", CONFIGURATION, table)
+            check_limits(f"configurations.{name}", table)
         return self
 
     @classmethod

@@ -24,102 +24,39 @@ SHARE = Limits(SMALLEST, 1)
 POSITIVE = Limits(SMALLEST, 1e9)
 OPEN = Limits(SMALLEST, 1e30)
 
-WINDOW = {"kernel": COUNT, "stride": COUNT}
-PADDED = {**WINDOW, "pad_begin": PADDING, "pad_end": PADDING}
-SIZES = {
-    "input_channel_parallel": COUNT,
-    "pixel_parallel": COUNT,
-    "feature_map_bytes": BYTES,
-    "weight_bytes": BYTES,
-    "weight_banks": COUNT,
-    "channels_per_cycle": COUNT,
-    "pixels_per_cycle": LANES,
+LIMITS: Mapping[str, Limits] = {
+    **dict.fromkeys(("kernel", "stride", "window_max", "window_channels"), COUNT),
+    **dict.fromkeys(("kernel_per_stride", "bilinear_scale", "half_pixel_scale"), COUNT),
+    **dict.fromkeys(("input_channel_parallel", "pixel_parallel", "column_parallel"), COUNT),
+    **dict.fromkeys(("input_groups", "channel_groups", "channels_per_cycle"), COUNT),
+    **dict.fromkeys(("weight_banks", "weight_bank_depth", "feature_map_groups"), COUNT),
+    **dict.fromkeys(("cores", "batch_handlers", "cpb", "aie_cores"), COUNT),
+    **dict.fromkeys(("min_runs", "opset_max"), COUNT),
+    **dict.fromkeys(("pixels_per_cycle", "area_max"), LANES),
+    **dict.fromkeys(("feature_map_bytes", "weight_bytes", "memory_bytes"), BYTES),
+    **dict.fromkeys(("fitted_map_bytes", "fitted_operations"), BYTES),
+    **dict.fromkeys(("pl_clock_hz", "aie_clock_hz", "ddr_bytes_per_s"), CLOCK),
+    **dict.fromkeys(("pad_begin", "pad_end", "output_padding"), PADDING),
+    **dict.fromkeys(("weight_bias_depth", "channels_max"), PADDING),
+    **dict.fromkeys(("shift_cut", "shift_bias_max", "shift_read", "shift_write"), SHIFT),
+    **dict.fromkeys(("accumulator_bits", "bias_bits"), BITS),
+    "zero_point": Limits(-128, 255, whole=True),
+    **dict.fromkeys(("alpha", "array_efficiency", "memory_efficiency"), SHARE),
+    **dict.fromkeys(("overlap", "families_held"), SHARE),
+    **dict.fromkeys(("peak_tops", "dpu_range_w", "cpu_run_w", "min_time_s"), POSITIVE),
+    **dict.fromkeys(("layer_s", "host_image_s", "crowding"), POSITIVE),
+    **dict.fromkeys(("width_array", "width_lanes", "width_memory", "width_start"), POSITIVE),
+    **dict.fromkeys(("width_copies", "width_task", "width_outside", "pair_width"), POSITIVE),
+    **dict.fromkeys(("error_left_out", "clock_ghz", "product_flops_per_cycle"), POSITIVE),
+    "chain_s_per_mpx": POSITIVE,
+    **dict.fromkeys(("port_bytes_per_cycle", "host_in_bytes_per_s", "host_out_bytes_per_s"), RATE),
+    **dict.fromkeys(("argmax_values_per_s", "softmax_values_per_s", "sort_values_per_s"), RATE),
+    **dict.fromkeys(("image_values_per_s", "moved_bytes_per_s", "decoding_mips_per_ghz"), RATE),
 }
-"""Keys that a configuration may state as well as the board."""
+"""The limits of each key, which are the same in every table that has the key."""
 
-CONFIGURATION = {
-    "cores": COUNT,
-    "batch_handlers": COUNT,
-    "cpb": COUNT,
-    "aie_cores": COUNT,
-    "peak_tops": POSITIVE,
-    **SIZES,
-}
-"""Limits of the keys of a table [configurations.NAME]."""
-
-TABLES: Mapping[str, Mapping[str, Limits]] = {
-    "array": {
-        "input_channel_parallel": COUNT,
-        "pixel_parallel": COUNT,
-        "column_parallel": COUNT,
-        "input_groups": COUNT,
-        "channel_groups": COUNT,
-        "pl_clock_hz": CLOCK,
-        "aie_clock_hz": CLOCK,
-    },
-    "memory": {
-        "feature_map_bytes": BYTES,
-        "weight_bytes": BYTES,
-        "weight_banks": COUNT,
-        "feature_map_groups": COUNT,
-        "weight_bank_depth": COUNT,
-        "ddr_bytes_per_s": CLOCK,
-    },
-    "conv": {
-        **WINDOW,
-        "weight_bias_depth": PADDING,
-        "window_max": COUNT,
-        "window_channels": COUNT,
-        "area_max": LANES,
-    },
-    "depthwise": {**PADDED, "window_max": COUNT},
-    "transposed": {"kernel_per_stride": COUNT, "output_padding": PADDING},
-    "pool": PADDED,
-    "leaky_relu": {"alpha": SHARE},
-    "elementwise": {"channels_per_cycle": COUNT, "pixels_per_cycle": LANES},
-    "resize": {"bilinear_scale": COUNT, "half_pixel_scale": COUNT},
-    "argmax": {"channels_max": PADDING},
-    "numbers": {
-        **dict.fromkeys(("shift_cut", "shift_bias_max", "shift_read", "shift_write"), SHIFT),
-        "accumulator_bits": BITS,
-        "bias_bits": BITS,
-        "zero_point": Limits(-128, 255, whole=True),
-    },
-    "power": dict.fromkeys(("dpu_range_w", "cpu_run_w"), POSITIVE),
-    "tile": {"memory_bytes": BYTES},
-    "cost": {
-        **dict.fromkeys(
-            ("array_efficiency", "memory_efficiency", "overlap", "families_held"), SHARE
-        ),
-        **dict.fromkeys(("layer_s", "host_image_s", "crowding"), POSITIVE),
-        **dict.fromkeys(
-            ("port_bytes_per_cycle", "host_in_bytes_per_s", "host_out_bytes_per_s"), RATE
-        ),
-        **dict.fromkeys(("argmax_values_per_s", "softmax_values_per_s"), RATE),
-        **dict.fromkeys(("sort_values_per_s", "image_values_per_s"), RATE),
-        **dict.fromkeys(
-            [
-                f"width_{part}"
-                for part in ("array", "lanes", "memory", "start", "copies", "task", "outside")
-            ],
-            POSITIVE,
-        ),
-        **dict.fromkeys(("pair_width", "error_left_out"), POSITIVE),
-        "fitted_map_bytes": BYTES,
-        "fitted_operations": BYTES,
-    },
-    "cpu": {
-        "cores": COUNT,
-        **dict.fromkeys(("clock_ghz", "product_flops_per_cycle", "chain_s_per_mpx"), POSITIVE),
-        **dict.fromkeys(("moved_bytes_per_s", "decoding_mips_per_ghz"), RATE),
-    },
-    "measurement": {"min_time_s": POSITIVE, "min_runs": COUNT},
-    "file": {"opset_max": COUNT},
-}
-"""Limits of each key, by its table."""
-
-ANY_KEY = dict.fromkeys(
-    (
+ANY_KEY = frozenset(
+    {
         "published_latency_ms",
         "published_throughput_fps",
         "array",
@@ -127,30 +64,27 @@ ANY_KEY = dict.fromkeys(
         "elementwise",
         "cost",
         "power",
-    ),
-    OPEN,
+    }
 )
-"""Tables that may have further keys, such as the name of a published network, and the limits of
-those.
-"""
+"""Tables that may have further keys, such as the name of a published network: above 0."""
 
 
-def check_limits(place: str, limits: Mapping[str, Limits], table: Mapping[str, Constant]) -> None:
+def check_limits(place: str, table: Mapping[str, Constant]) -> None:
     """Raise ValueError if a number is outside its limits.
+
+    A key without limits is used by no rule and no prediction.
 
     Args:
         place: the dotted name of the table.
-        limits: of its keys. A key without limits is used by no rule and no prediction.
         table: its constants.
 
     Raises:
         ValueError: the dotted key, its limits and its number.
     """
     for key, constant in table.items():
-        allowed = limits.get(key, ANY_KEY.get(place))
-        if allowed is None:
-            continue
+        limits = LIMITS.get(key, OPEN if place in ANY_KEY else None)
         try:
-            allowed.check(constant)
+            if limits is not None:
+                limits.check(constant)
         except ValueError as error:
             raise ValueError(f"{place}.{key} {error}") from None

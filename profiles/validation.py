@@ -2,9 +2,9 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from difflib import get_close_matches
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from beers_deploy.profiles.errors import ProfileError, printable
 
@@ -12,6 +12,11 @@ T = TypeVar("T")
 
 CONFIG = ConfigDict(extra="forbid")
 """The configuration of every model: an unknown key is an error and never ignored."""
+
+Count = Annotated[int, Field(strict=True, ge=0)]
+"""An integer of 0 or more, and neither a text nor True, which Python counts as an integer."""
+Amount = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
+"""A finite number of 0 or more."""
 
 TABLE_TYPES = ("dataclass_type", "dict_type", "mapping_type", "model_type")
 EXPECTED = {

@@ -54,7 +54,7 @@ def run(
     except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - no fault must look like a failed gate
         message, code = ending(error, command)
         if isinstance(error, BeersError) and options.get("junit") not in (None, STDOUT):
-            _write_junit(command, _given(options), json, message)
+            _write_junit(command, _arguments(options), json, message)
         if verbose or code == CRASHED:
             traceback.print_exc()
         typer.echo(f"beers-deploy: {visible(message)}", err=True)
@@ -65,12 +65,14 @@ def run(
         raise typer.Exit(1)
 
 
-def _given(options: dict[str, Any]) -> dict[str, Any]:
+def _arguments(options: dict[str, Any]) -> dict[str, Any]:
     """Return the options that are on the command line or have a default."""
     return {name: value for name, value in options.items() if value not in (None, [])}
 
 
-def _write_junit(command: Command, given: dict[str, Any], json: Path | None, message: str) -> None:
+def _write_junit(
+    command: Command, arguments: dict[str, Any], json: Path | None, message: str
+) -> None:
     """Write the reason why a gate could not judge to its JUnit file, unless an output path is
     refused.
     """
@@ -78,22 +80,22 @@ def _write_junit(command: Command, given: dict[str, Any], json: Path | None, mes
     from beers_deploy.verdict import junit_error
 
     with suppress(BeersError):
-        require_apart(command.verb, given, json)
-        write_text(given["junit"], junit_error("INT8 gate", message))
+        require_apart(command.verb, arguments, json)
+        write_text(arguments["junit"], junit_error("INT8 gate", message))
 
 
 def _result(command: Command, options: dict[str, Any], json: Path | None) -> Any:
     """Call the verb with the options that are given."""
-    given = _given(options)
+    arguments = _arguments(options)
     for parameter in command.parameters:
         needed = marker(parameter, RequiredUnless)
-        if needed and parameter.name not in given and not given.get(needed.other):
+        if needed and parameter.name not in arguments and not arguments.get(needed.other):
             raise OptionError(f"`{parameter.name}` is missing. Give it, or add `{needed.other}`.")
     if json is not None and json != STDOUT:
-        delete_older(command.verb, given)
-        delete_results(json, paths_of(command.verb, given).inputs)
-        require_apart(command.verb, given, json)
-    return command.verb(**given)
+        delete_older(command.verb, arguments)
+        delete_results(json, paths_of(command.verb, arguments).inputs)
+        require_apart(command.verb, arguments, json)
+    return command.verb(**arguments)
 
 
 def table_of(result: Any) -> Any:

@@ -9,7 +9,7 @@ from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import OptionError, ProfileError, printable
 from beers_deploy.profiles.shipped import MODEL_SUFFIX, board_names
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.profiles.target_limits import CONFIGURATION
+from beers_deploy.profiles.target_limits import LIMITS
 
 BoardLike = TargetProfile | str | os.PathLike[str]
 """A board: its profile, its name, or the path of its .toml file."""
@@ -166,7 +166,7 @@ def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
         if key not in constants:
             raise ProfileError(
                 f"The table [configurations.{name}] of the target {profile.name} has no {key}. Add "
-                f"it: {CONFIGURATION[key]} that a board can have."
+                f"it: {LIMITS[key]} that a board can have."
             )
     # The rules quote these documents: without them a rule's text would have no source.
     if not profile.documents:

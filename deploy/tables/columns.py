@@ -31,7 +31,7 @@ class Column:
         return ", ".join(filter(None, (self.unit, self.mode)))
 
     def stated(self, figure: Figure) -> tuple[str, str]:
-        """Return a figure with its unit, and its mode, without those that the heading states."""
+        """Return the figure with its unit, and its mode, unless the heading states them."""
         unit = "" if self.unit else figure.unit
         return " ".join(filter(None, (str(figure), unit))), "" if self.mode else figure.mode
 
@@ -60,7 +60,7 @@ def _common(words: Set[str]) -> str:
 
 
 def words_of(rows: Sequence[Row]) -> list[str]:
-    """Return the names of the words that any row has, in their order."""
+    """Return the names of the text columns that any row has, in order."""
     return list(dict.fromkeys(chain.from_iterable(row.text for row in rows)))
 
 

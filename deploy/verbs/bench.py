@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from beers_deploy.model.shipped import SENSOR
@@ -19,7 +18,7 @@ from beers_deploy.verbs.parameters import (
     Targets,
     Tiles,
 )
-from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, path_or_none, refuse_with, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.performance.board import Bench
@@ -68,7 +67,7 @@ def bench(
     """Predict a network on a DPU, next to the traditional pipeline and the paper's figures.
 
     The DPU's figures come from a cost model; the traditional pipeline is measured on crops on this
-    machine. A network that cannot be tiled is predicted by the frame. `-v` adds where the time
+    machine. A network that cannot be tiled is predicted by the frame. -v adds where the time
     goes, layer by layer.
 
     Args:
@@ -84,7 +83,7 @@ def bench(
         tile: side of a tile in pixels; several with commas are compared.
         halo: context around each tile in pixels, or 'exact' (no seams).
         dpu: configuration of the DPU, such as C32B3; all compares those of the board.
-        host_task: work of the host on the results, if the file does not tell: copy reads them,
+        host_task: work of the host on the results, if its file does not state it: copy reads them,
             argmax and softmax find the best class, sort finds boxes, image adds an image.
         measured: JSON list of runs on your board, which correct the cost model.
         traditional: measure the traditional pipeline on this machine; takes some seconds.
@@ -110,7 +109,7 @@ def bench(
         >>> slow < fast
         True
     """
-    given = partial(changed, bench, locals())
+    options = partial(changed, bench, locals())
 
     from beers_deploy.dpu.board import boards_of
     from beers_deploy.model.raster.images import read_acquisition
@@ -123,15 +122,15 @@ def bench(
 
     tiles_px = parse_tiles(tile)
     profile = Sensor.load(sensor)
-    paths = [None if path is None else Path(path) for path in (image, measured)]
+    paths = [path_or_none(path) for path in (image, measured)]
     if target in HOSTS:
-        refuse_with("`target` host", **given(*OF_BOARDS))
+        refuse_with("`target` host", **options(*OF_BOARDS))
         return _on_this_machine(network, profile, tiles_px, threads)
-    refuse_without("`target` host", **given("threads"))
+    refuse_without("`target` host", **options("threads"))
     if image is None:
-        refuse_without("`image`", **given("full_scale"))
+        refuse_without("`image`", **options("full_scale"))
     else:
-        refuse_with("`image`", **given("size"))
+        refuse_with("`image`", **options("size"))
     source = Network.load(network, sensor=profile, int8=True)
     # The digests are those of the files that are read from here on.
     inputs = inputs_of(*paths)
@@ -139,7 +138,7 @@ def bench(
     # Next to other boards an NPU is refused below, because nothing can be predicted of it.
     if len(boards) == 1 and boards[0].npu:
         refuse_with(
-            f"`target` {boards[0].name}, for which nothing is predicted", **given(*OF_BOARDS)
+            f"`target` {boards[0].name}, for which nothing is predicted", **options(*OF_BOARDS)
         )
         return quoted(source, boards[0])
     configurations, corrections = boards_for(boards, dpu, paths[1])

@@ -2,12 +2,11 @@
 
 import logging
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.verbs.parameters import Edges, Images, Interval, Mtf, Progress, RequiredFile
-from beers_deploy.verbs.verb import verb
+from beers_deploy.verbs.verb import path_or_none, verb
 
 if TYPE_CHECKING:
     from beers_deploy.studies.characterize import MeasuredSensor
@@ -41,7 +40,7 @@ def characterize(
         edge: box with one straight edge, FILE:X,Y,WIDTH,HEIGHT; edges are searched for if none.
         mtf: contrast at Nyquist across the track, or across and along it, if you know it: 0.07 is
             7 %; measured if none.
-        black_level: value of the dark in the images; 0 is assumed to be dark if none.
+        black_level: pixel value of the dark; assumed to be 0 if none.
         bits: bits of a pixel; found from clipped pixels if none.
         gain: DN per W/m2/sr/um; full scale is assumed to be 400 W/m2/sr/um if none.
         gsd: ground sampling distance in m; no pixel depends on it.
@@ -64,7 +63,7 @@ def characterize(
     from beers_deploy.model.io.files import write_text
     from beers_deploy.studies.characterize import Stated, measured_sensor
 
-    file = None if out is None else Path(out)
+    file = path_or_none(out)
     edges = [edge] if isinstance(edge, str) else list(edge)
     stated = Stated(bits, gain, gsd, black_level, None if mtf is None else contrasts(mtf))
     sensor, toml = measured_sensor(images, edges, stated)

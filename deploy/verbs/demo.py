@@ -10,7 +10,7 @@ from beers_deploy.verbs.check import check
 from beers_deploy.verbs.gate import gate
 from beers_deploy.verbs.parameters import Holds, InputPath, OutputFolder, Progress, Seed, SensorLike
 from beers_deploy.verbs.restore import restore
-from beers_deploy.verbs.verb import refuse_without, verb
+from beers_deploy.verbs.verb import path_or_none, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.results import Table
@@ -66,7 +66,7 @@ def demo(
     from beers_deploy.studies import demo as parts
 
     folder = Path(out)
-    path = None if image is None else Path(image)
+    path = path_or_none(image)
     with steps("demo:", STEPS) as bar:
         bar.advance(0, "reading the image")
         sensors = parts.load_sensors(sensor)

@@ -23,7 +23,7 @@ from beers_deploy.verbs.parameters import (
     Seed,
     SensorLike,
 )
-from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, path_or_none, refuse_with, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.pairs import Pair
@@ -82,13 +82,14 @@ def evaluate(
         lpips: weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.
         out: folder for report.html and pictures.
         calibrate: copy of the network's file to write with the interval that 'restore --interval'
-            uses, fitted on these pairs; `methods` must be that file alone. A level of 90 % takes
-            9 images at least, beyond those of the sites that the fit takes.
+            uses, fitted on these pairs; `methods` must be that file alone. A level of 90 % needs
+            at least 9 images in addition to those of the sites that the fit uses.
         sweep: also compare under 16 sensors that are known exactly, and 7 that are known wrongly.
         brightness: also compare with the radiance of the scenes times these factors, separated by
             commas, such as 0.25,0.05.
-        bits_per_pixel: also compare restoration on board, before JPEG 2000 compresses to so many
-            bits per pixel, with restoration on the ground after it; several with commas: 1,2,3.
+        bits_per_pixel: also compare restoration on board, before JPEG 2000 compresses to this
+            number of bits per pixel, with restoration on the ground after it; several with commas:
+            1,2,3.
         consistency: networks that are given the sensor agree with the image at low frequencies.
         exposure: shipped networks restore dark parts at a higher exposure.
         strict: refuse pairs whose pixels contradict the sensor, instead of a warning.
@@ -118,12 +119,12 @@ def evaluate(
     """
     from beers_deploy.model.raster.images import list_images
 
-    folder = None if out is None else Path(out)
-    given = partial(changed, evaluate, locals())
+    folder = path_or_none(out)
+    options = partial(changed, evaluate, locals())
     if detector is not None:
         steps = ("consistency", "exposure", "strict")
         others = ("pairs", "lpips", "calibrate", "sweep", "brightness", "bits_per_pixel", *steps)
-        refuse_with("`detector`", **given(*others))
+        refuse_with("`detector`", **options(*others))
         return _detection(
             methods,
             images,
@@ -137,9 +138,9 @@ def evaluate(
             seed,
             folder,
         )
-    refuse_without("`detector`", **given("labels", "split", "side", "classes"))
+    refuse_without("`detector`", **options("labels", "split", "side", "classes"))
     if pairs is not None:
-        refuse_with("`pairs`", **given("images", "sweep", "brightness"))
+        refuse_with("`pairs`", **options("images", "sweep", "brightness"))
     if images is not None:
         # An empty folder is refused before torch is loaded.
         list_images(Path(images))
@@ -161,10 +162,10 @@ def evaluate(
     plan = Plan(
         methods=named,
         sensors=sensors,
-        scenes=None if images is None else Path(images),
+        scenes=path_or_none(images),
         folder=stored,
         given=in_memory,
-        lpips=None if lpips is None else Path(lpips),
+        lpips=path_or_none(lpips),
         factors=check_brightness(numbers_of("brightness", brightness, "0.25,0.05")),
         rates=rates,
         sweep=sweep,
@@ -190,20 +191,20 @@ def named_methods(methods: Methods) -> dict[str, Any]:
     return {name.strip(): name.strip() for name in ("degraded", *names)}
 
 
-def numbers_of(name: str, given: Factors, example: str) -> tuple[float, ...]:
+def numbers_of(name: str, value: Factors, example: str) -> tuple[float, ...]:
     """Return the numbers of an option, which are text with commas or numbers.
 
     Args:
         name: of the option.
-        given: its value.
+        value: its value.
         example: of a value, for the error.
     """
-    parts = given.split(",") if isinstance(given, str) else given
+    parts = value.split(",") if isinstance(value, str) else value
     try:
         return tuple(float(part) for part in parts)
     except ValueError as error:
         raise OptionError(
-            f"`{name}` must be numbers separated by commas, such as {example}, got {given!r}."
+            f"`{name}` must be numbers separated by commas, such as {example}, got {value!r}."
         ) from error
 
 
@@ -220,14 +221,14 @@ def _sensors(
     sensor: SensorLike | None,
     reference: SensorLike | None,
     stored: Path | None,
-    given: "Sequence[Pair] | None",
+    pairs: "Sequence[Pair] | None",
 ) -> "tuple[Sensor, Sensor]":
     """Return the sensors of the degraded and of the reference images."""
     from beers_deploy.model.pairs_recipe import profiles_for, read_pairs_recipe
 
-    if given and sensor is None:
+    if pairs and sensor is None:
         # Simulated pairs know the sensors that made them.
-        sensor, own = given[0].profiles
+        sensor, own = pairs[0].profiles
         reference = own if reference is None else reference
     return profiles_for(sensor, reference, read_pairs_recipe(stored) if stored else None)
 
@@ -265,7 +266,7 @@ def _detection(
         network.names,
         {} if classes is None else parse_classes(classes),
         Path(images),
-        None if labels is None else Path(labels),
+        path_or_none(labels),
         split,
     )
     compared = run_study(

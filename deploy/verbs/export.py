@@ -15,7 +15,7 @@ from beers_deploy.verbs.parameters import (
     ShippedOrFile,
     TargetLike,
 )
-from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, path_or_none, refuse_with, refuse_without, verb
 
 
 @verb
@@ -48,12 +48,12 @@ def export(
             'quantize' made of weights of 'train --conditioned'.
         sensor: sensor of the network: a name, a .toml file, or blind; pleiades-degraded if none.
         tile: side in pixels of the one tile that the input is fixed to, such as 640 for a board.
-        board_file: of an INT8 network: also write its core in the board's encoding, QDQ ONNX or an
+        board_file: also write the core of an INT8 network in the board's encoding, QDQ ONNX or an
             NPU's VINT8.
-        c: of an INT8 network: also write its core as one C99 file for one tile, with integers only.
+        c: also write the core of an INT8 network as one C99 file for one tile, with integers only.
         target: board or NPU of `board_file`: a name, or a .toml file.
-        delta: of an INT8 network: also write what the sensor changes in it, 1 to 3 kB.
-        apply: of an INT8 network: condition it on the sensor of this delta, in place of `sensor`.
+        delta: also write what the sensor changes in an INT8 network, 1 to 3 kB.
+        apply: condition the INT8 network on the sensor of this delta, in place of `sensor`.
 
     Returns:
         The path of the ONNX file.
@@ -63,7 +63,7 @@ def export(
         OptionError: options that do not go together.
         ProfileError: no such sensor or board.
     """
-    given = partial(changed, export, locals())
+    options = partial(changed, export, locals())
 
     from beers_deploy.kit.board_file import require_core_file
     from beers_deploy.model.io.files import require_writable
@@ -84,12 +84,12 @@ def export(
         shipped_weights(source.name.removesuffix(INT8))
     path = weights_file(source)
     if board_file is None:
-        refuse_without("`board_file`", **given("target"))
+        refuse_without("`board_file`", **options("target"))
     if path.suffix != ".onnx":
-        refuse_without("an INT8 `network`", **given("board_file", "c", "delta", "apply"))
+        refuse_without("an INT8 `network`", **options("board_file", "c", "delta", "apply"))
     if apply is not None:
-        refuse_with("`apply`", **given("sensor", "delta"))
-    core, c_file = (None if file is None else Path(file) for file in (board_file, c))
+        refuse_with("`apply`", **options("sensor", "delta"))
+    core, c_file = (path_or_none(file) for file in (board_file, c))
     deltas = {} if delta is None else delta_files(Path(delta), sensor or SENSOR)
     inputs = [
         path,
@@ -102,7 +102,7 @@ def export(
     if path.suffix != ".onnx":
         export_float(path, Path(out), sensor, tile)
         return Path(out)
-    model = conditioned_int8(path, sensor or SENSOR, None if apply is None else Path(apply))
+    model = conditioned_int8(path, sensor or SENSOR, path_or_none(apply))
     export_int8(model, Path(out), tile, core, board, c_file)
     for factor, file in deltas.items():
         save_delta(model, sensor or SENSOR, factor, file)

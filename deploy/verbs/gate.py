@@ -22,7 +22,7 @@ from beers_deploy.verbs.parameters import (
     VerdictFile,
     VerdictFolder,
 )
-from beers_deploy.verbs.verb import changed, recorded, refuse_with, verb
+from beers_deploy.verbs.verb import changed, path_or_none, recorded, refuse_with, verb
 
 if TYPE_CHECKING:
     from beers_deploy.verdict import Verdict
@@ -93,8 +93,8 @@ def gate(
         >>> bool(verdict)
         True
     """
-    junit_file = None if junit is None else Path(junit)
-    folder = None if record is None else Path(record)
+    junit_file = path_or_none(junit)
+    folder = path_or_none(record)
     # Standard output is for the results document.
     if junit_file == Path("-"):
         raise OptionError("`junit` must be a file, got '-'. Name the file to write.")
@@ -116,7 +116,7 @@ def gate(
     board = TargetProfile.load(target)
     profile = Sensor.load(sensor)
     floating, int8 = pair_of(float_network, int8_network, profile, output)
-    scenes = None if images is None else Path(images)
+    scenes = path_or_none(images)
     data = Data(profile, samples, scenes, patches, seed)
     earlier = baseline_for(baseline, {**data.arguments, "output": output}, allowed, metric)
     # Missing references are refused before the networks run.

@@ -56,8 +56,8 @@ def golden(
     from beers_deploy.kit.golden_results import compare_golden
 
     if compare is not None:
-        given = changed(golden, locals(), "out", "tile", "target")
-        refuse_with("`compare`", **given)
+        options = changed(golden, locals(), "out", "tile", "target")
+        refuse_with("`compare`", **options)
         return compare_golden(compare, str(network))
     if out is None:
         raise OptionError(

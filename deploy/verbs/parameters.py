@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 from annotated_types import Interval as Interval
 
 from beers_deploy.model.processor import SEEDS
+from beers_deploy.model.shipped import INT8, shipped_names
+from beers_deploy.profiles.shipped import board_names, npu_names, scene_names, sensor_names
 
 
 @dataclass(frozen=True)
@@ -92,33 +94,18 @@ class PythonOnly:
 
 def network_names() -> list[str]:
     """Return the names of the shipped networks, in float32 and in INT8."""
-    from beers_deploy.model.shipped import INT8, shipped_names
-
-    names: list[str] = []
-    for name in shipped_names():
-        names += [name, f"{name}{INT8}"]
-    return names
-
-
-def sensor_names() -> list[str]:
-    """Return the names of the shipped sensors."""
-    from beers_deploy.profiles.shipped import sensor_names as shipped
-
-    return list(shipped())
+    names = shipped_names()
+    return sorted([*names, *(f"{name}{INT8}" for name in names)])
 
 
 @lru_cache(maxsize=1)
 def target_names() -> list[str]:
     """Return the names of the boards and NPUs."""
-    from beers_deploy.profiles.shipped import board_names, npu_names
-
     return [*board_names(), *npu_names()]
 
 
 def profile_names() -> list[str]:
     """Return the names of all shipped profiles."""
-    from beers_deploy.profiles.shipped import scene_names
-
     return [*sensor_names(), *scene_names(), *target_names()]
 
 

@@ -25,7 +25,7 @@ from beers_deploy.verbs.parameters import (
     Steps,
     TargetLike,
 )
-from beers_deploy.verbs.verb import recorded, refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import path_or_none, recorded, refuse_with, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.network import Network
@@ -86,11 +86,11 @@ def quantize(
         images: folder of scenes for the simulated patches; drawn scenes if none.
         patches: number of simulated patches.
         patch: side of a simulated patch in pixels.
-        effort: of the search that equalizes channels: first guesses alone, groups of channels
-            within a bound of time, or each channel by itself without one. An estimate of the time
-            is printed before it begins.
+        effort: how thoroughly channels are equalized: fast takes first guesses, normal searches
+            groups of channels within a bound of time, best searches each channel without a bound.
+            An estimate of the time is printed first.
         finetune: number of steps that train the integers on the patches, between which scales are
-            moved; 'auto' trains for minutes, while it helps.
+            moved; 'auto' trains for some minutes, as long as the error falls.
         adapt: replace activations that the DPU lacks: SiLU by HardSwish, Sigmoid by HardSigmoid,
             LeakyReLU and PReLU by LeakyReLU of 26/256, or exactly if that loses more than 0.05 dB.
             The convolutions around them are fitted to the original network, and the table has the
@@ -145,12 +145,12 @@ def quantize(
             seed=seed != 0,
         )
     board = TargetProfile.load(target)
-    files = [None if path is None else Path(path) for path in (out, board_file)]
+    files = [path_or_none(path) for path in (out, board_file)]
     inputs = [Path(each) for each in (network, samples) if isinstance(each, str | os.PathLike)]
     pages = _report_files(report, network)
     require_onnx_name(*files)
     require_core_file(board, files[1], tile, inputs)
-    scenes = None if images is None else Path(images)
+    scenes = path_or_none(images)
     data = Data(Sensor.load(sensor), samples, scenes, patches, seed, patch, input_range)
     result, held_out = quantized(network, data, board, finetune, Effort(effort), adapt, output)
     # Both are made before the first is written: a core that is refused leaves no file.

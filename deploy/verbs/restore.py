@@ -20,7 +20,7 @@ from beers_deploy.verbs.parameters import (
     Progress,
     PythonOnly,
 )
-from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, path_or_none, refuse_with, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.restoration.output import Output
@@ -98,9 +98,10 @@ def restore(
         stac: STAC item of the output to write; needs `cog`.
         self_check: TIFF to write with one pixel for each block of 64 x 64 pixels: whether the
             result, blurred as the sensor blurs, agrees with the image.
-        interval: also write OUT-interval.tif, half-widths that the error of the result stays within
-            in so many percent of the pixels; needs the sensor, and a network with a calibrated
-            interval, as shipped ones have. In Python an array returns (restored, half_width).
+        interval: also write OUT-interval.tif: for each pixel the half-width of an interval that
+            contains the error of this percentage of pixels. It needs the sensor, and a network with
+            a calibrated interval, as shipped ones have. In Python an array returns (restored,
+            half_width).
         view: HTML file to write that shows raw and restored in a browser, to swipe and zoom.
         strict: refuse an image whose pixels contradict the sensor, and a result that fails the
             self-check, instead of a warning.
@@ -136,7 +137,7 @@ def restore(
         >>> bool(pair.psnr(restored) > pair.psnr(pair.degraded))
         True
     """
-    given = partial(changed, restore, locals())
+    options = partial(changed, restore, locals())
 
     from beers_deploy.model.raster.reader import require_image_file
     from beers_deploy.restoration.arrays import restore_array
@@ -151,27 +152,27 @@ def restore(
     if method == "traditional":
         refuse_with(
             "`method` traditional",
-            **given("network", "tile", "halo", "resume", "runtime", "threads", "scheduler"),
-            **given("consistency", "exposure", "dry_run", "interval"),
+            **options("network", "tile", "halo", "resume", "runtime", "threads", "scheduler"),
+            **options("consistency", "exposure", "dry_run", "interval"),
         )
     else:
-        refuse_without("`method` traditional", **given("quality"))
+        refuse_without("`method` traditional", **options("quality"))
     path = _file_of(image)
     if path is None:
         refuse_with(
             "an array",
-            **given("out", "compression", "cog", "stac", "self_check", "view", "resume"),
-            **given("overwrite", "dry_run", "fix_detectors", "scheduler"),
+            **options("out", "compression", "cog", "stac", "self_check", "view", "resume"),
+            **options("overwrite", "dry_run", "fix_detectors", "scheduler"),
         )
     else:
-        refuse_with("an image file, which states its own", **given("nodata"))
+        refuse_with("an image file, which states its own", **options("nodata"))
         refuse_without("`cog`", stac=stac is not None and not cog)
         require_image_file(path)
     output = None
     if path is not None and not dry_run:
         how: dict[str, Any] = {"compression": compression, "cog": cog, "resume": resume}
         how["interval"] = interval
-        how["self_check"] = None if self_check is None else Path(self_check)
+        how["self_check"] = path_or_none(self_check)
         output = _output(out, (stac, view), overwrite or resume, fix_detectors or "", **how)
     sensors = sensors_of(sensor)
     unknown = is_unknown(sensors)
@@ -259,7 +260,7 @@ def _output(
             raise OptionError(
                 f"{each} exists already. Add `overwrite` to replace it, or choose another name."
             )
-    named = [None if document is None else Path(document) for document in documents]
+    named = [path_or_none(document) for document in documents]
     if named[0] is not None:
         optional("pystac", "stac")
         (item,) = network_paths(named[0], 1)

@@ -23,7 +23,7 @@ from beers_deploy.verbs.parameters import (
     Seed,
     SensorLike,
 )
-from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, path_or_none, refuse_with, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.model.dataset import DatasetRecipe
@@ -79,7 +79,7 @@ def simulate(
 
     Args:
         images: scenes: image files, or folders of them, of 8 bits, 16-bit DN or float radiance;
-            several if repeated. In Python also the pixels of one. A drawn scene if none.
+            repeat it for several. In Python also the pixels of one. A drawn scene if none.
         out: folder of the data set; in Python one pair is returned if none.
         sensor: sensor of the degraded images, a name or a .toml file: each of its ranges is drawn
             from; pleiades-degraded if none.
@@ -88,9 +88,10 @@ def simulate(
         size: side in pixels of the pair of a drawn scene, in Python.
         patch: side of a patch in pixels; whole scenes if none.
         oversampling: number of scene pixels for each pixel; the sensor's if none.
-        scene: what the scene calls for: night-port, snow and others, or a .toml file.
-        with_: effect to add, at typical values; several if repeated.
-        without: effect to leave out; several if repeated.
+        scene: scene whose light and effects are applied: night-port, snow and others, or a .toml
+            file.
+        with_: effect to add, at typical values; repeat it for several.
+        without: effect to leave out; repeat it for several.
         explain: print for each effect what is decided and why, and write nothing.
         tolerance: largest change of a pixel in DN for which an effect is skipped.
         workers: number of processes; 0 uses all cores.
@@ -116,24 +117,24 @@ def simulate(
         >>> degraded.shape, degraded.dtype
         ((96, 96), dtype('uint16'))
     """
-    given = partial(changed, simulate, locals())
+    options = partial(changed, simulate, locals())
 
     from beers_deploy.profiles.scene_call import SceneCall, calling_for, origins
     from beers_deploy.profiles.sensor import Sensor
 
     if out is None:
-        refuse_without("`out`", **given("resume", "workers", "scheduler"))
+        refuse_without("`out`", **options("resume", "workers", "scheduler"))
     else:
-        refuse_with("`out`", **given("explain", "size"))
+        refuse_with("`out`", **options("explain", "size"))
     if scheduler is not None:
-        refuse_with("`scheduler`", **given("workers"))
+        refuse_with("`scheduler`", **options("workers"))
     usual, patch_px = (SENSOR, None) if preset is None else PRESETS[preset]
     call = None if scene is None else SceneCall.load(os.fspath(scene))
     own = Sensor.load(sensor or usual)
     degraded = calling_for(own, call, with_, without)
     scale = call.radiance_scale.low if call else 1.0
     if out is None and not explain:
-        refuse_without("`out`", **given("preset", "patch", "tolerance"))
+        refuse_without("`out`", **options("preset", "patch", "tolerance"))
         from beers_deploy.pairs import simulated_pair
 
         aim = degraded.reference if reference is None else Sensor.load(reference)
@@ -177,7 +178,7 @@ def _files(images: Images | None) -> list[Path | None]:
     for image in several:
         if image is not None and not isinstance(image, str | os.PathLike):
             raise OptionError("`images` must be paths for a data set. Save the pixels first.")
-        path = None if image is None else Path(image)
+        path = path_or_none(image)
         files += list_images(path) if path and path.is_dir() else [path]
     return files or [None]
 

@@ -18,7 +18,7 @@ from beers_deploy.verbs.parameters import (
     SensorLike,
     TargetLike,
 )
-from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, path_or_none, refuse_with, refuse_without, verb
 
 if TYPE_CHECKING:
     from beers_deploy.results import Table
@@ -77,11 +77,11 @@ def stress(
         ModelError: a network that cannot be tiled, or a float and an INT8 network that are swapped.
         OptionError: no such case or stage, or options that do not go together.
     """
-    given = partial(changed, stress, locals())
+    options = partial(changed, stress, locals())
     if bit_flips:
-        refuse_with("`bit_flips`", **given("cases", "stages"))
+        refuse_with("`bit_flips`", **options("cases", "stages"))
     else:
-        refuse_without("`bit_flips`", **given("draws", "images", "target"))
+        refuse_without("`bit_flips`", **options("draws", "images", "target"))
     # These load torch.
     from beers_deploy.model.io.files import write_text
     from beers_deploy.studies.stress.battery import battery_table, chosen
@@ -97,7 +97,7 @@ def stress(
         from beers_deploy.profiles.target import TargetProfile
         from beers_deploy.quant.samples.simulated import Calibration
 
-        scenes = None if images is None else Path(images)
+        scenes = path_or_none(images)
         patches = Calibration(Sensor.load(sensor), scenes, draws, side, seed)
         table = flip_table(subject, patches, TargetProfile.load(target))
         if out is not None:

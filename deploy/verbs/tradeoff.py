@@ -19,7 +19,7 @@ from beers_deploy.verbs.parameters import (
     Size,
     Targets,
 )
-from beers_deploy.verbs.verb import refuse_with, verb
+from beers_deploy.verbs.verb import path_or_none, refuse_with, verb
 
 if TYPE_CHECKING:
     from beers_deploy.network import NetworkLike
@@ -57,9 +57,9 @@ def tradeoff(
     """Find what accuracy costs in time, over networks and boards, and recommend a point.
 
     Networks and pipelines are measured on the same images, and their runs on boards are predicted.
-    All boards are compared, whatever their order; a line says for each one that is not recommended
-    why. The command exits with 1 if no point keeps the budget and the need; the page is written all
-    the same.
+    All boards are compared, and a line states for each one that is not recommended why it is not.
+    The command exits with 1 if no point keeps the budget and the need; the page is written all the
+    same.
 
     Args:
         out: folder of the page and the figures.
@@ -105,7 +105,7 @@ def tradeoff(
     networks = _networks(network)
     # Limits are read before torch is loaded.
     limits = parse_constraints("budget", budget), parse_constraints("need", need)
-    folder = None if out is None else Path(out)
+    folder = path_or_none(out)
     from beers_deploy.studies.tradeoff.run import Study, preview
 
     degraded = Sensor.load(sensor)
@@ -113,9 +113,9 @@ def tradeoff(
         networks=[_loaded(each, degraded) for each in networks],
         boards=boards_of(target),
         sensors=(degraded, reference_beside(degraded, reference)),
-        scenes=None if images is None else Path(images),
-        lpips=None if lpips is None else Path(lpips),
-        calibration=None if calibration is None else Path(calibration),
+        scenes=path_or_none(images),
+        lpips=path_or_none(lpips),
+        calibration=path_or_none(calibration),
         size=parse_size(size),
         budget=limits[0],
         need=limits[1],
@@ -128,20 +128,20 @@ def _networks(network: Networks) -> "list[NetworkLike]":
     """Return networks of one, several, or text with commas; "all" stands for the shipped ones."""
     from beers_deploy.model.shipped import shipped_names
 
-    given: list[NetworkLike] = []
+    names: list[NetworkLike] = []
     several = [cast("NetworkLike", network)]
     if isinstance(network, list | tuple):
         several = list(network)
     for each in several:
         if not isinstance(each, str):
-            given.append(each)
+            names.append(each)
             continue
         for name in each.split(","):
-            given += shipped_names() if name.strip() == "all" else [name.strip()]
-    if not given:
+            names += shipped_names() if name.strip() == "all" else [name.strip()]
+    if not names:
         raise OptionError("`network` names no network. Give a name, a file, or all.")
     # A name that is given twice is compared once.
-    return [each for k, each in enumerate(given) if each not in given[:k]]
+    return [each for k, each in enumerate(names) if each not in names[:k]]
 
 
 def _loaded(network: "NetworkLike", sensor: "Sensor") -> "NetworkLike":

@@ -19,7 +19,7 @@ from beers_deploy.verbs.parameters import (
     Seed,
     SensorLike,
 )
-from beers_deploy.verbs.verb import changed, refuse_with, refuse_without, verb
+from beers_deploy.verbs.verb import changed, path_or_none, refuse_with, refuse_without, verb
 
 logger = logging.getLogger(__name__)
 
@@ -71,10 +71,10 @@ def train(
 
     Args:
         out: folder of checkpoint, logs, pictures and weights.
-        recipe: make a shipped network by its name, or a network of your own recipe (.toml), which
-            states everything else.
-        images: folder of sharp aerial images (8-bit RGB, or 16-bit mono) to simulate from; several
-            if repeated.
+        recipe: recipe to run, a shipped name or a .toml file; it states all other options of the
+            training.
+        images: folder of sharp aerial images (8-bit RGB, or 16-bit mono) to simulate from; repeat
+            it for several.
         pairs: folder of pairs that 'simulate' wrote, in place of images.
         variant: size of the network.
         sensor: sensor of the degraded images: a name, or a .toml file; of pairs the one that made
@@ -93,11 +93,11 @@ def train(
         psnr_weight: weight of the mean PSNR of the patches in the loss, such as 0.01 without L1.
         lpips: weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.
         start: weights to start from; those of a smaller network are widened.
-        rounding: INT8 file of the `start` weights: trains with feature maps rounded as there, so
-            that a new quantisation loses less.
+        rounding: INT8 file of the `start` weights, whose rounding of the feature maps is applied in
+            training, so that a new quantisation loses less.
         validate_every: number of steps between validations; 0 for none.
         seed: seed of every random draw.
-        device: cpu, or cuda.
+        device: device of the training, cpu or cuda.
         precision: number format of the convolutions; bfloat16 is faster where the device has units
             for it.
         resume: continue the run from its checkpoint.
@@ -114,15 +114,15 @@ def train(
         ProfileError: no such sensor.
         MissingExtraError: torch is not installed.
     """
-    given = partial(changed, train, locals())
+    options = partial(changed, train, locals())
     several = [images] if isinstance(images, str | os.PathLike) else images
     folders = tuple(map(Path, several))
     if recipe is not None:
         stated = [name for name in signature(train).parameters if name not in BESIDE_RECIPE]
-        refuse_with("`recipe`, which states it", **given(*stated))
+        refuse_with("`recipe`, which states it", **options(*stated))
         return _make(recipe, folders, Path(out), resume, device)
     if pairs is not None:
-        refuse_with("`pairs`", images=bool(folders), **given("drawn", "conditioned"))
+        refuse_with("`pairs`", images=bool(folders), **options("drawn", "conditioned"))
     if rounding is not None and not (conditioned and start):
         raise OptionError(
             "`rounding` has no effect without `conditioned` and `start`. Add both, or leave "
@@ -130,9 +130,9 @@ def train(
         )
     # 0 asks for no validation, which a run without images has none of.
     if not folders and validate_every:
-        refuse_without("`images`", **given("validate_every"))
+        refuse_without("`images`", **options("validate_every"))
     if not lpips_weight:
-        refuse_with("`lpips_weight` 0", **given("lpips"))
+        refuse_with("`lpips_weight` 0", **options("lpips"))
     # These load torch.
     from beers_deploy.model.family import SensorFamily
     from beers_deploy.model.io.files import require_writable, sha256
@@ -146,10 +146,10 @@ def train(
     from beers_deploy.network_files import weights_file
     from beers_deploy.quantization import rounding_of
 
-    stored = None if pairs is None else Path(pairs)
+    stored = path_or_none(pairs)
     start_file = None if start is None else weights_file(Path(start))
     rounding_file = None if rounding is None else weights_file(Path(rounding))
-    lpips_file = None if lpips is None else Path(lpips)
+    lpips_file = path_or_none(lpips)
     sources = [*folders] if stored is None else [stored, stored / "degraded", stored / "reference"]
     profiles = [Path(each) for each in (sensor, reference) if isinstance(each, str | os.PathLike)]
     inputs = (*sources, lpips_file, start_file, rounding_file, *profiles)

@@ -15,7 +15,7 @@ from typing import Any, Literal, ParamSpec, TypeVar, cast, get_args, get_origin
 from annotated_types import Interval
 
 from beers_deploy.profiles.errors import BeersError, OptionError, missing_extra
-from beers_deploy.verbs.parameters import Beside, Holds, Labelled, Written
+from beers_deploy.verbs.parameters import Beside, Holds, InputPath, Labelled, Written
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -55,11 +55,11 @@ def verb(function: Callable[P, R]) -> Callable[P, R]:
             if isinstance(error, BeersError):
                 raise
             raise missing_extra(error, function.__name__) from error
-        given = {k: v for k, v in bound.arguments.items() if k not in NOT_RECORDED}
+        arguments = {k: v for k, v in bound.arguments.items() if k not in NOT_RECORDED}
 
         def named(table: Table) -> Table:
-            arguments = {**recorded(given), **table.arguments}
-            return replace(table, command=function.__name__, arguments=arguments)
+            own = {**recorded(arguments), **table.arguments}
+            return replace(table, command=function.__name__, arguments=own)
 
         if isinstance(result, Table):
             return cast(R, named(result))
@@ -199,7 +199,7 @@ Marker = TypeVar("Marker")
 
 
 def marker(parameter: Parameter, kind: type[Marker]) -> Marker | None:
-    """Return what the annotation of a parameter says of a kind: an `Interval` or a `Written`."""
+    """Return the marker of a type in a parameter's annotation, such as its `Interval`."""
     parts = parts_of(parameter.annotation)
     return next((part for part in parts if isinstance(part, kind)), None)
 
@@ -210,6 +210,11 @@ def parts_of(annotation: Any) -> Iterator[Any]:
     if get_origin(annotation) is not Literal:
         for part in get_args(annotation):
             yield from parts_of(part)
+
+
+def path_or_none(value: InputPath | None) -> Path | None:
+    """Return the path that a parameter names, or None if it is not given."""
+    return None if value is None else Path(value)
 
 
 def changed(
@@ -226,27 +231,27 @@ def changed(
     return {name: bool(values[name] != parameters[name].default) for name in names}
 
 
-def refuse_with(other: str, **given: bool) -> None:
+def refuse_with(other: str, **options: bool) -> None:
     """Raise OptionError for the first option that is given although it has no effect with another.
 
     Args:
         other: the other option, in backquotes, with its value where that matters.
-        given: whether each option is given, by its name.
+        options: whether each option is given, by its name.
     """
-    for name, is_given in given.items():
-        if is_given:
+    for name, is_set in options.items():
+        if is_set:
             raise OptionError(f"`{name}` has no effect with {other}. Leave one of the two out.")
 
 
-def refuse_without(other: str, **given: bool) -> None:
+def refuse_without(other: str, **options: bool) -> None:
     """Raise OptionError for the first option that is given although it needs another.
 
     Args:
         other: the other option, in backquotes.
-        given: whether each option is given, by its name.
+        options: whether each option is given, by its name.
     """
-    for name, is_given in given.items():
-        if is_given:
+    for name, is_set in options.items():
+        if is_set:
             raise OptionError(
                 f"`{name}` has no effect without {other}. Add {other}, or leave `{name}` out."
             )

@@ -7,7 +7,7 @@ has.
 """
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 from beers_deploy.profiles import target_limits
@@ -175,11 +175,6 @@ def shipped() -> dict[str, dict[str, list[Constant]]]:
     return by_table
 
 
-def limits(table: str) -> Mapping[str, Limits]:
-    """Return the limits of the keys of a table."""
-    return target_limits.CONFIGURATION if table == BUILD else target_limits.TABLES[table]
-
-
 def accepted(limit: Limits) -> str:
     """Return the limits of a key in a few words."""
     low = "above 0" if limit.low == target_limits.SMALLEST else f"{limit.low:g}"
@@ -217,7 +212,7 @@ def _constants() -> Iterator[str]:
             key: constant for key, constant in keys.items() if table != BUILD or key not in SIZES
         }
         yield from (
-            line(key, *constant, limits(table)[key], constants[table][key])
+            line(key, *constant, target_limits.LIMITS[key], constants[table][key])
             for key, constant in selected.items()
         )
 

@@ -7,10 +7,12 @@ network that learns from them only restores dark, hazy and soft ground worse tha
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import with_config
 
 from beers_deploy.model.simulator.chart import log_uniform
+from beers_deploy.profiles.validation import CONFIG, Amount
 
-Range = tuple[float, float]
+Range = tuple[Amount, Amount]
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,7 @@ class Look:
     softness_px: float = 0.0
 
 
+@with_config(CONFIG)
 @dataclass(frozen=True)
 class Looks:
     """The distribution from which looks are drawn.
@@ -44,11 +47,11 @@ class Looks:
     """
 
     exposures: Range = (0.5, 1.25)
-    lit_share: float = 0.0
+    lit_share: Amount = 0.0
     lights: Range = (0.03, 2.5)
-    calm_share: float = 0.0
+    calm_share: Amount = 0.0
     contrasts: Range = (0.05, 1.0)
-    soft_share: float = 0.0
+    soft_share: Amount = 0.0
     softness_px: Range = (0.3, 1.5)
 
     def draw(self, generator: np.random.Generator) -> Look:

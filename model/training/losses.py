@@ -19,14 +19,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
+from pydantic import with_config
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from beers_deploy.model.blocks import BLOCK_PX
 from beers_deploy.model.metrics.perceptual import Lpips
 from beers_deploy.profiles.instrument import MAX_DN
+from beers_deploy.profiles.validation import CONFIG, Amount
 
 
+@with_config(CONFIG)
 @dataclass(frozen=True)
 class LossWeights:
     """The weight of each term; a term of weight 0 is not computed.
@@ -34,11 +37,11 @@ class LossWeights:
     `coarse` is the share, in all terms, of the part of an error that the consistency step removes.
     """
 
-    l1: float = 1.0
-    lpips: float = 0.5
-    fft: float = 0.1
-    psnr: float = 0.0
-    coarse: float = 1.0
+    l1: Amount = 1.0
+    lpips: Amount = 0.5
+    fft: Amount = 0.1
+    psnr: Amount = 0.0
+    coarse: Amount = 1.0
 
 
 PAPER = LossWeights()

@@ -4,59 +4,24 @@
 runs it.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Annotated
+
+from pydantic import Field, StrictBool, with_config
 
 from beers_deploy.model.training.looks import Looks
 from beers_deploy.model.training.losses import LossWeights
 from beers_deploy.model.training.trainer import Precision
 from beers_deploy.model.variants import variant_named
-from beers_deploy.profiles.constant import is_number
 from beers_deploy.profiles.errors import ProfileError, printable
 from beers_deploy.profiles.toml import read_toml_text
-from beers_deploy.profiles.validation import check_keys
+from beers_deploy.profiles.validation import CONFIG, Amount, Count, validated
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 
-T = TypeVar("T")
 
-
-def _whole(value: Any) -> bool:
-    # Python counts True as an int.
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
-
-
-def _number(value: Any) -> bool:
-    return is_number(value) and value >= 0
-
-
-def _list_of(value: Any, fits: Callable[[Any], bool]) -> bool:
-    return isinstance(value, list) and all(map(fits, value))
-
-
-KINDS: Mapping[object, tuple[Callable[[Any], bool], str]] = {
-    bool: (lambda value: isinstance(value, bool), "true or false"),
-    str: (lambda value: isinstance(value, str), "a string"),
-    int: (_whole, "an integer of 0 or more"),
-    float: (_number, "a number of 0 or more"),
-    tuple[float, float]: (
-        lambda value: _list_of(value, _number) and len(value) == 2,
-        "two numbers of 0 or more",
-    ),
-    tuple[str, ...]: (
-        lambda value: _list_of(value, lambda item: isinstance(item, str)),
-        "a list of strings",
-    ),
-    Precision: (
-        lambda value: value in get_args(Precision),
-        f"one of {', '.join(get_args(Precision))}",
-    ),
-}
-"""The values that a field of each type accepts: a check, and their description in messages."""
-
-
+@with_config(CONFIG)
 @dataclass(frozen=True)
 class Stage:
     """A part of a training with one learning rate schedule.
@@ -73,14 +38,15 @@ class Stage:
     """
 
     name: str
-    steps: int
-    batch: int = 8
-    learning_rate: float = 1e-3
-    rounding: bool = False
+    steps: Count
+    batch: Count = 8
+    learning_rate: Amount = 1e-3
+    rounding: StrictBool = False
     precision: Precision = "bfloat16"
-    average: float = 0.999
+    average: Amount = 0.999
 
 
+@with_config(CONFIG)
 @dataclass(frozen=True)
 class NetworkRecipe:
     """The complete parameters of a network's training.
@@ -101,13 +67,13 @@ class NetworkRecipe:
     """
 
     variant: str
-    stages: tuple[Stage, ...]
+    stages: Annotated[tuple[Stage, ...], Field(min_length=1)]
     start: str = ""
-    seed: int = 0
-    patch_px: int = 96
-    charts: int = 0
+    seed: Count = 0
+    patch_px: Count = 96
+    charts: Count = 0
     held_out: tuple[str, ...] = ()
-    other_curves: float = 0.0
+    other_curves: Amount = 0.0
     looks: Looks = field(default_factory=Looks)
     loss: LossWeights = field(default_factory=LossWeights)
     attribution: tuple[str, ...] = ()
@@ -147,65 +113,17 @@ def load_recipe(name: str) -> NetworkRecipe:
     path = recipe_file(name)
     try:
         raw = read_toml_text(path)
-    except OSError as error:
-        reason = error.strerror or str(error)
+    except (OSError, ValueError) as error:
         raise ProfileError(
-            f"The recipe {path} cannot be read: {reason}. Check the path."
-        ) from error
-    except ValueError as error:
-        raise ProfileError(
-            f"The recipe {path} is not valid TOML: {printable(str(error))}. Correct that line."
+            f"The recipe {path} cannot be read: {printable(str(error))}. Correct the file or its "
+            "path."
         ) from error
     where = f"recipe {path.name}"
-    tables = raw.get("stages")
-    if not isinstance(tables, list) or not tables:
-        raise ProfileError(
-            f"The {where} has no stages. Add each stage of the training as a table [[stages]]."
-        )
-    stages = tuple(
-        _build(Stage, f"{where}: stage {number}", table) for number, table in enumerate(tables, 1)
-    )
-    parts: dict[str, Any] = {"stages": stages}
-    for key, kind in (("looks", Looks), ("loss", LossWeights)):
-        if key in raw:
-            parts[key] = _build(kind, f"{where}: {key}", raw[key])
-    recipe = _build(NetworkRecipe, where, {**raw, **parts})
+    recipe = validated(NetworkRecipe, raw, where)
     variant_named(recipe.variant)
-    if stages[0].rounding and not recipe.start:
+    if recipe.stages[0].rounding and not recipe.start:
         raise ProfileError(
             f"The {where} begins with a stage with rounding, which needs the INT8 file of trained "
             "weights, but there are none yet. Put a stage without rounding in front."
         )
     return recipe
-
-
-def _build(kind: type[T], where: str, raw: object) -> T:
-    """Build a dataclass from a table, with each value checked against the type of its field."""
-    if not isinstance(raw, Mapping):
-        raise ProfileError(f"{where} must be a table, got {printable(repr(raw))}.")
-    fields_by_name = {field_.name: field_ for field_ in fields(kind)}  # type: ignore[arg-type]
-    required = {
-        n
-        for n, field_ in fields_by_name.items()
-        if field_.default is MISSING and field_.default_factory is MISSING
-    }
-    check_keys(where, raw, required, set(fields_by_name) - required)
-    return kind(
-        **{
-            key: _value(f"{where}: {key}", fields_by_name[key].type, value)
-            for key, value in raw.items()
-        }
-    )
-
-
-def _value(where: str, kind: object, value: object) -> object:
-    """Return a value of a file as its field stores it, or raise ProfileError.
-
-    A value of another type than those in KINDS, such as a nested dataclass, is returned unchanged.
-    """
-    if kind not in KINDS:
-        return value
-    fits, expected = KINDS[kind]
-    if not fits(value):
-        raise ProfileError(f"{where} must be {expected}, got {printable(repr(value))}.")
-    return tuple(value) if isinstance(value, list) else value

@@ -141,14 +141,11 @@ def _given(run: Run, path: Path) -> Network:
     network, _ = load_network(path)
     kind = ConvBEERS if run.patches.family is None else BankedConvBEERS
     if not isinstance(network, kind):
-        if kind is ConvBEERS:
-            raise ModelError(
-                f"{path} holds the weights of a conditioned network, but this training is of a "
-                "plain one. Give other weights, or add `conditioned`."
-            )
+        kinds = ["plain", "conditioned"]
+        own, other = kinds if kind is ConvBEERS else reversed(kinds)
         raise ModelError(
-            f"{path} holds the weights of a plain network, but this training is of a conditioned "
-            "one. Give weights that were trained with `conditioned`."
+            f"{path} holds the weights of a {other} network, but this training is of a {own} one. "
+            f"Give weights of a {own} network, or add or remove `conditioned`."
         )
     if run.rounding is not None and network.variant != variant_named(run.variant):
         raise OptionError(

@@ -73,9 +73,7 @@ class Worker:
         """Return True if any worker raises the flag; all workers get the same answer."""
         if self.count == 1:
             return flag
-        raised: Tensor = torch.tensor(float(flag), device=device)
-        torch.distributed.all_reduce(raised, torch.distributed.ReduceOp.MAX)
-        return bool(raised > 0)
+        return bool(largest_of_all(torch.tensor(float(flag), device=device)) > 0)
 
 
 @contextmanager
@@ -131,26 +129,6 @@ class Speed:
 
     patches_per_s: float
     waited: float
-
-
-class Spent:
-    """Measures the time since its creation, and the share of it spent waiting for patches."""
-
-    def __init__(self) -> None:
-        self.begun = time.monotonic()
-        self.waited_s = 0.0
-
-    @contextmanager
-    def waiting(self) -> Iterator[None]:
-        """Count the time within the block as waiting."""
-        begun = time.monotonic()
-        yield
-        self.waited_s += time.monotonic() - begun
-
-    def figures(self, patches: int) -> Speed:
-        """Return the speed of training on `patches` patches."""
-        elapsed_s = max(time.monotonic() - self.begun, 1e-9)
-        return Speed(patches / elapsed_s, self.waited_s / elapsed_s)
 
 
 def largest_of_all(flag: Tensor) -> Tensor:
@@ -223,18 +201,20 @@ class Trainer:
             schedule: when to report, validate and save; with several workers, the first does.
         """
         schedule = schedule if self.worker.first else Schedule()
-        spent = Spent()
-        saved_at = time.monotonic()
+        reported_at = saved_at = time.monotonic()
+        waited_s = 0.0
         rows = list[list[float]]()
         with held_back() as interrupt:
             following = batches(self.step)
             while self.step < self.recipe.steps and not self.worker.any(
                 interrupt.asked, self.device
             ):
-                with spent.waiting():
-                    batch = next(following)
+                asked_at = time.monotonic()
+                batch = next(following)
+                waited_s += time.monotonic() - asked_at
                 self.train_step(batch)
-                save = time.monotonic() - saved_at > schedule.save_s
+                now = time.monotonic()
+                save = now - saved_at > schedule.save_s
                 if (
                     save
                     or self._due(schedule.report_steps)
@@ -244,9 +224,12 @@ class Trainer:
                     rows += self.collected()
                 if self._due(schedule.report_steps):
                     patches = len(rows) * self.recipe.batch * self.worker.count
-                    schedule.report(self.step, self._means(rows), spent.figures(patches))
+                    elapsed_s = max(now - reported_at, 1e-9)
+                    speed = Speed(patches / elapsed_s, waited_s / elapsed_s)
+                    schedule.report(self.step, self._means(rows), speed)
                     rows = []
-                    spent = Spent()
+                    reported_at = now
+                    waited_s = 0.0
                 if self._due(schedule.validate_steps):
                     schedule.validate(self.step, self.averaged())
                 if save:

@@ -143,13 +143,6 @@ def test_a_photograph_is_no_raw_image_until_its_scale_is_named(tmp_path: Path) -
     assert restored.max() <= 255
 
 
-def test_rules_need_a_board_that_has_them(tmp_path: Path) -> None:
-    paths = [str(tmp_path / name) for name in ("float.onnx", "int8.onnx")]
-    done("export --network convbeers-xs --out", paths[0])
-    fails(["quantize", paths[0], "--target", "host-cpu", "--out", paths[1]], "--target", "host-cpu")
-    assert not Path(paths[1]).exists()
-
-
 def test_profiles_show_scenes_targets_and_sensors_with_every_source() -> None:
     for name in ("snow", "vck190", "pleiades-variable"):
         assert "source" in done(f"profiles {name}")

@@ -186,13 +186,6 @@ def test_a_verdict_that_its_checks_do_not_bear_out_is_invalid(change: dict[str, 
         jsonschema.validate({**content, **change}, SCHEMA)
 
 
-def test_a_host_of_version_2_says_which_kernels_it_took() -> None:
-    content = judged(CHECKS[0])
-    del content["host"]["kernels"]
-    with pytest.raises(jsonschema.ValidationError, match="'kernels' is a required"):
-        jsonschema.validate(content, SCHEMA)
-
-
 def test_a_printed_table_shows_its_figures_and_notes() -> None:
     rows = (
         Row("speed", "here", {"time": measured(1.5, "s", "a clock")}),

@@ -139,10 +139,8 @@ def test_a_run_with_the_roundings_of_int8_differs_from_one_without_and_resumes_t
     ("options", "words"),
     [
         ("--start convbeers-xs", "--conditioned and --start"),
-        ("--conditioned", "--conditioned and --start"),
         ("--conditioned --start convbeers-s", "the INT8 file of"),
         ("--conditioned --start none.safetensors", "no such file"),
-        ("--conditioned --start convbeers-xs --rounding none.onnx", "no such file"),
         ("--conditioned --start convbeers-xs --variant convbeers-s", "weights of convbeers-s"),
     ],
 )
@@ -198,7 +196,6 @@ def weights_of(path: Path) -> dict[str, torch.Tensor]:
         ("--images nowhere", "no such folder"),
         ("", "Give --images, --pairs or --drawn"),
         ("--drawn 1 --variant huge", "variant"),
-        ("--drawn 1 --start none.safetensors", "no such file"),
         ("--drawn 1 --start convbeers-xs", "holds the weights of a conditioned network"),
         ("--drawn 1 --lpips none.npz", "no such file"),
         ("--drawn 1 --device cuda", "CUDA"),
@@ -242,15 +239,6 @@ def test_pairs_bring_their_sensor_and_its_full_scale(
     done(command)
     assert load_network(tmp_path / "r" / "convbeers-xs.safetensors")[1]["degraded"] == "mine"
     assert (stores[0].max_dn, stores[0].quarters) == (16383, False)
-
-
-def test_a_loss_of_nothing_but_lpips_needs_its_weights(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv("BEERS_LPIPS_WEIGHTS", raising=False)
-    options = "--drawn 1 --l1-weight 0 --fft-weight 0 --steps 1"
-    message = refused(f"train --out {tmp_path}/r {options}")
-    assert "except that of LPIPS, whose network was not found" in message
 
 
 @pytest.mark.parametrize("more", ["--validate-every 2", "--conditioned"])

@@ -53,11 +53,6 @@ def test_factors_begin_with_1_rise_and_stay_within_training(times: float) -> Non
         assert excess_of(sensor, 2 * factors[-1]) > NOISE_BEYOND
 
 
-@given(st.floats(0.05, 20), st.floats(1, 4))
-def test_a_noisier_sensor_has_no_higher_factor(times: float, more: float) -> None:
-    assert factors_for(noisier(times * more))[-1] <= factors_for(noisier(times))[-1]
-
-
 @pytest.mark.parametrize(
     ("name", "factors"),
     [("pleiades-degraded", (1, 4, 8)), ("dior-medium", (1, 2, 4)), ("dior-high", (1,))],
@@ -142,20 +137,6 @@ def test_with_a_pixel_less_around_it_a_part_may_choose_otherwise() -> None:
     assert (choose_factors(image[:, :20], (1, 8), 5, FULL_SCALE, 0.0) != in_image[:, :20]).any()
 
 
-@settings(max_examples=40)
-@given(st.integers(0, 999), sides, sides, st.integers(0, 9), st.floats(0, 500), st.floats(0, 300))
-def test_a_brighter_image_takes_no_higher_factor(
-    seed: int, height: int, width: int, radius_px: int, more: float, offset: float
-) -> None:
-    image = image_of(seed, height, width)
-    brighter = image + np.float32(more) * (np.arange(width) % 3 == 0).astype(np.float32)
-    before, after = (
-        choose_factors(scene, (1, 4, 8), radius_px, FULL_SCALE, offset)
-        for scene in (image, brighter)
-    )
-    assert (after <= before).all()
-
-
 def test_the_offset_is_no_light() -> None:
     """A factor multiplies what lies above the offset: an image and its offset copy take the same
     factors.
@@ -169,8 +150,3 @@ def test_the_offset_is_no_light() -> None:
     assert (counted_as_light <= plain).all()
     # The control: with the offset counted as light some factors are lower.
     assert (counted_as_light < plain).any()
-
-
-def test_pixels_below_the_offset_take_the_highest_factor() -> None:
-    dark = np.zeros((3, 4), np.float32)
-    assert (choose_factors(dark, (1, 4, 8), 1, FULL_SCALE, 120.0) == 8).all()

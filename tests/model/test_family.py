@@ -128,10 +128,3 @@ def test_smear_counts_as_contrast_lost_along_the_track() -> None:
     across, along = (sensor_values(smeared)[name] for name in ("mtf_across", "mtf_along"))
     assert across == 0.07
     assert along == pytest.approx(0.07 * 2 / np.pi)
-
-
-def test_a_turned_image_has_the_turned_vector() -> None:
-    sensor = replace(NOMINAL, mtf_nyquist=0.12, mtf_nyquist_along=0.05)
-    turned = replace(NOMINAL, mtf_nyquist=0.05, mtf_nyquist_along=0.12)
-    assert torch.equal(vector_tensor(sensor)[[1, 0, 2, 3]], vector_tensor(turned))
-    assert not torch.equal(vector_tensor(sensor), vector_tensor(turned))

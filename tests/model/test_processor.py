@@ -84,7 +84,7 @@ ARM = "".join(CORE.format(core, part) for core, part in enumerate(["0xd03", "0xd
     ("cpuinfo", "name"),
     [
         (X86, "Some CPU @ 2.0GHz"),
-        (ARM, "ARM part 0xd03, 0xd09 of implementer 0x41"),
+        (ARM, "ARM part 0xd03, 0xd09"),
         ("processor : 0\nisa : rv64imafdc\n", None),
         ("", None),
         ("\x00: \n:::\n", None),

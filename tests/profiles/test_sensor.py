@@ -54,14 +54,10 @@ def test_every_target_constant_has_a_source(name: str) -> None:
         ("gsd_m", "gsd", ("'gsd'", "'gsd_m'", "unit")),
         ("mtf_nyquist =", "sharpness =", ("'sharpness'", "mtf_nyquist")),
         ("value = 0.07", "value = 0.7", ("mtf_nyquist", "0.6366", "0.7")),
-        ("value = 0.07", "value = 0", ("mtf_nyquist", "above 0")),
         ("value = 0.07", "value = [0.07, 0.03]", ("range [low, high]",)),
         ("value = 50,", "value = 90,", ("27.5 to 55", "90", "not dB")),
-        ("value = 50,", "value = 20,", ("27.5 to 55", "20")),
-        ("value = 12,", "value = 0,", ("bits", "at least 1 and at most 16")),
         ("value = 5,", "value = 2.5,", ("oversampling", "integer of at least 1", "2.5")),
         ("[mtf]", "[mtf", ("TOML",)),
-        ("[noise]", "mtf_nyquist_along = 0.7\n[noise]", ("mtf_nyquist_along", "0.6366", "0.7")),
         (
             "[noise]",
             "mtf_nyquist_vertical = 0.05\n[noise]",
@@ -72,9 +68,7 @@ def test_every_target_constant_has_a_source(name: str) -> None:
             "mtf_nyquist_along = 0.5\n[antialias]\nsigma_px = 0.4\n[noise]",
             ("mtf_nyquist_along", "at most"),
         ),
-        ('status = "assumed"', 'status = "guessed"', ("guessed", "'published', 'inferred'")),
         ('"paper, table 1: L0, in W/m2/sr/um"', '""', ("source",)),
-        ("value = 25,", 'value = "bright",', ("finite number",)),
     ],
 )
 def test_a_wrong_file_gets_one_sentence(
@@ -165,9 +159,7 @@ def test_a_table_calls_for_its_effect(tmp_path: Path) -> None:
     [
         ("[antialias]\nsigma_px = 0.5\n", ("0.1854", "anti-alias", "0.25")),
         ("[smear]\nlength = 0.2\n", ("'length'", "length_px")),
-        ("[prnu]\nrms = 0.5\n", ("prnu.rms", "at most 0.2")),
         ("[clouds]\ncover = 0.5\n", ("'clouds'",)),
-        ("smear = 3\n", ("smear",)),
     ],
 )
 def test_a_wrong_effect_gets_one_sentence(

@@ -107,21 +107,6 @@ def test_a_resumed_run_goes_on_where_the_killed_one_was_saved(tmp_path: Path) ->
     assert later.step == 4
 
 
-def test_a_checkpoint_of_another_recipe_is_refused(tmp_path: Path) -> None:
-    train(tmp_path, 4)
-    other = Trainer(VARIANT, TrainingRecipe(steps=5))
-    with pytest.raises(ModelError, match="another recipe"):
-        other.resume(tmp_path / "checkpoint.safetensors")
-
-
-def test_training_lowers_the_loss(tmp_path: Path) -> None:
-    losses: list[float] = []
-    recipe = TrainingRecipe(steps=60, batch=3, warm_up_steps=5)
-    schedule = Schedule(20, report=lambda _, terms, __: losses.append(terms["l1"]))
-    Trainer(VARIANT, recipe).run(source().batches, tmp_path / "c", schedule)
-    assert losses[-1] < 0.8 * losses[0]
-
-
 class Poisoned(PatchSource):
     """A source whose batches are NaN, all or those of some numbers."""
 
@@ -225,15 +210,6 @@ def test_guards_survive_a_resume(tmp_path: Path) -> None:
         trainer.save(tmp_path / "c")
         resumed.resume(tmp_path / "c")
         assert resumed.guards == guards
-
-
-def test_fine_tuning_starts_from_the_weights_given(tmp_path: Path) -> None:
-    first = train(tmp_path, 4).averaged()
-    tuned = Trainer(VARIANT, TrainingRecipe(steps=4), start=first)
-    assert all(
-        torch.equal(a, b)
-        for a, b in zip(first.parameters(), tuned.network.parameters(), strict=True)
-    )
 
 
 def test_in_float32_the_network_is_the_plain_one_and_in_bfloat16_its_body_is_rounded() -> None:
