@@ -28,6 +28,7 @@ from beers_deploy.performance.tables import (
     frame_row,
     host_words,
     layer_rows,
+    named,
     predicted_rows,
     processor_row,
     published_rows,
@@ -193,9 +194,9 @@ def _counted_alike(network: Network, asked: Question, swath: Swath) -> list[Row]
 
     Whole tiles with a halo are more work than the paper counts: their time is no match for its.
     """
-    boards = [dpu for dpu in asked.boards if dpu.target.name == PAPER_TARGET]
-    default = boards[0].target.default_configuration
-    dpu = next((board for board in boards if board.name == default), boards[0])
+    boards = {dpu.name: dpu for dpu in asked.boards if dpu.target.name == PAPER_TARGET}
+    first = next(iter(boards.values()))
+    dpu = boards.get(str(first.target.default_configuration), first)
     prediction = predict_network(network, dpu, swath.tile_px, asked.task, swath.step_px)
     return predicted_rows(network.name, prediction, swath)[:1]
 
@@ -248,17 +249,12 @@ def exposure_words(counts: Mapping[int, int]) -> list[str]:
         return []
     total = sum(counts.values())
     shares = ", ".join(f"x{factor} {count / total:.0%}" for factor, count in counts.items())
-    return [
-        (
-            f"runs of the network by exposure (measured on the image's pixels): {shares}; one tile "
-            "may need several"
-        )
-    ]
+    how = "runs of the network by exposure (measured on the image's pixels)"
+    return [f"{how}: {shares}; one tile may need several"]
 
 
 def _layers(network: Network, prediction: Prediction) -> tuple[str, list[Row]]:
-    dpu = prediction.dpu
-    title = f"{network.input.name}, one batch on {dpu.target.name} {dpu.name}; {TRAFFIC}"
+    title = f"{network.input.name}, one batch on {named(prediction.dpu)}; {TRAFFIC}"
     return title, layer_rows(prediction)
 
 

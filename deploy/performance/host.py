@@ -19,7 +19,7 @@ from beers_deploy.model.consistency import Consistency
 from beers_deploy.model.processor import require_cores
 from beers_deploy.network import Network, NetworkLike, other_precision
 from beers_deploy.performance.timing import cpu_load, interleaved, resident_bytes
-from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
+from beers_deploy.profiles.figures import Figure, Row, measured
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.onnx_file import is_quantized
@@ -74,8 +74,8 @@ def _row(run: Timed, tile_px: int, conditions: Mapping[str, Figure]) -> Row:
 
 
 def _ratio_row(runs: Sequence[Timed]) -> Row:
-    # False sorts before True: the INT8 network comes first.
-    int8, float32 = sorted(runs, key=lambda run: not is_quantized(run.model))
+    # False sorts before True: the INT8 network comes last.
+    float32, int8 = sorted(runs, key=lambda run: is_quantized(run.model))
     ratio = statistics.median(float32.times_s) / statistics.median(int8.times_s)
     source = f"medians of {len(int8.times_s)} runs each, interleaved"
     return Row("host", "float32 time / INT8 time, here", {"ratio": measured(ratio, "x", source)})
@@ -83,13 +83,12 @@ def _ratio_row(runs: Sequence[Timed]) -> Row:
 
 def _mean_power(run: Timed) -> Figure:
     """Mean over the network's own runs, or why there is none."""
-    no_power = next((power for power in run.powers if power.value is None), None)
-    if no_power is not None:
-        return unavailable("W", no_power.reason)
     # Runs differ in length: the mean power is energy over time, not the mean of the powers.
-    energy_j = sum(
-        (power.value or 0.0) * time_s for power, time_s in zip(run.powers, run.times_s, strict=True)
-    )
+    energy_j = 0.0
+    for power, time_s in zip(run.powers, run.times_s, strict=True):
+        if power.value is None:
+            return power
+        energy_j += power.value * time_s
     return measured(energy_j / sum(run.times_s), "W", run.powers[0].source)
 
 

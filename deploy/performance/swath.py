@@ -100,28 +100,29 @@ def swath_figures(
     """Return the figures of a swath that takes `frames` tiles in `batches` batches."""
     power = dpu_power(prediction.dpu)
     latency = swath_latency(prediction, batches)
-    step = {"consistency step": step_time(prediction, swath)} if swath.consistency else {}
-    runs = {"your runs": run_factor(prediction)} if prediction.dpu.runs else {}
-    return {
+    figures = {
         "tiles": exact(frames, "tile", ARITHMETIC),
         "network runs": exact(
             swath.runs, "run/tile", "exposures that the image's tiles ask for; 1 without an image"
         ),
         "work factor": exact(frames * swath.tile_px**2 / swath.pixels, "px/px", ARITHMETIC),
         "latency": latency,
-        "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
+        "throughput": throughput(prediction),
         "power": power,
         "energy": energy(latency, power),
         "efficiency": efficiency(swath.pixels, latency, power),
-        **step,
-        **runs,
     }
+    if swath.consistency:
+        figures["consistency step"] = step_time(prediction, swath)
+    # How many times as fast as the shipped model states the owner's runs make the prediction.
+    if prediction.dpu.runs:
+        figures["your runs"] = exact(prediction.speed, "x", "your runs, weighed by kinship")
+    return figures
 
 
-def run_factor(prediction: Prediction) -> Figure:
-    """How many times as fast as the shipped model says the owner's runs make the prediction."""
-    speed = prediction.speed
-    return predicted(speed, "x", (speed, speed), "your runs, weighed by kinship")
+def throughput(prediction: Prediction) -> Figure:
+    """Return the frames per second of the DPU and its host."""
+    return predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE)
 
 
 def step_time(prediction: Prediction, swath: Swath) -> Figure:
@@ -150,9 +151,8 @@ def one_thread_latency(prediction: Prediction) -> Figure:
     low_s, high_s = prediction.latency_interval_s
     handlers = prediction.dpu.handlers
     images = f"a batch of {handlers}" if handlers > 1 else "one image"
-    source = (
-        f"{COST_SOURCE}, its fit to rates with one thread: {images} through one core, then the host"
-    )
+    how = f"its fit to rates with one thread: {images} through one core, then the host"
+    source = f"{COST_SOURCE}, {how}"
     return predicted(1e3 * prediction.latency_s, "ms/batch", (1e3 * low_s, 1e3 * high_s), source)
 
 

@@ -19,7 +19,6 @@ from beers_deploy.dpu.cost.latency import (
 from beers_deploy.dpu.cost.model import Task, between
 from beers_deploy.network import NetworkLike
 from beers_deploy.performance.swath import (
-    COST_SOURCE,
     Swath,
     chain_rate,
     efficiency,
@@ -33,6 +32,7 @@ from beers_deploy.performance.swath import (
     scaled,
     swath_figures,
     swath_latency,
+    throughput,
 )
 from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.figures import Figure, Row, number, predicted, published, unavailable
@@ -94,14 +94,12 @@ def published_rows() -> list[Row]:
         "paper, 13600 x 9016: ConvBEERS, INT8 on the DPU": (42, 7.2, 29.6, 98965),
     }
     units = {"latency": "s", "throughput": "frame/s", "power": "W", "efficiency": "px/s/W"}
-    return [
-        Row(
-            TABLE,
-            name,
-            {k: published(v, units[k], PAPER) for k, v in zip(units, values, strict=True)},
-        )
-        for name, values in runs.items()
-    ]
+    rows = []
+    for name, values in runs.items():
+        printed = zip(units.items(), values, strict=True)
+        figures = {key: published(value, unit, PAPER) for (key, unit), value in printed}
+        rows.append(Row(TABLE, name, figures))
+    return rows
 
 
 def processor_row(swath: Swath, board: TargetProfile) -> Row:
@@ -155,25 +153,17 @@ def _layer_row(layer: LayerCost, prediction: Prediction) -> Row:
         "work": exact(work.operations / 1e9, "GOP"),
         "time": scaled(1e3 * layer.time_s, "ms/batch", prediction),
         "rate": scaled(batch * work.operations / seconds / 1e9, "GOP/s", prediction),
-        "LdFM": exact(
-            work.load_map_bytes / 1e6,
-            "MB",
-            "feature maps that an image loads, by the graph's shapes",
-        ),
-        "LdWB": exact(
-            work.weight_bytes / 1e6,
-            "MB",
-            "weights and biases that a batch loads, by the graph's shapes",
-        ),
-        "StFM": exact(
-            work.store_map_bytes / 1e6,
-            "MB",
-            "feature maps that an image stores, by the graph's shapes",
-        ),
+        "LdFM": _moved(work.load_map_bytes, "feature maps that an image loads"),
+        "LdWB": _moved(work.weight_bytes, "weights and biases that a batch loads"),
+        "StFM": _moved(work.store_map_bytes, "feature maps that an image stores"),
         "bandwidth": scaled(moved_bytes / seconds / 1e9, "GB/s", prediction),
         "array use": exact(100 * work.array_use, "%"),
     }
     return Row(LAYERS, work.name, figures, {"bound": layer.bound})
+
+
+def _moved(size_bytes: int, what: str) -> Figure:
+    return exact(size_bytes / 1e6, "MB", f"{what}, by the graph's shapes")
 
 
 MOST_TILE_PX = 8192
@@ -209,11 +199,12 @@ def swath_row(prediction: Prediction, swath: Swath) -> Row:
         # A Counter is typed to hold integers: the times are added up in picoseconds.
         bound[layer.bound] += round(1e12 * layer.time_s)
     words = {"bound": bound.most_common(1)[0][0], "fitted range": fitted_range(prediction)}
-    return Row("sweep", f"{_named(prediction)}, tiles of {swath.tile_px}", figures, words)
+    return Row("sweep", f"{named(prediction.dpu)}, tiles of {swath.tile_px}", figures, words)
 
 
-def _named(prediction: Prediction) -> str:
-    return f"{prediction.dpu.target.name} {prediction.dpu.name}"
+def named(dpu: Dpu) -> str:
+    """Return the names of the board and of the configuration."""
+    return f"{dpu.target.name} {dpu.name}"
 
 
 def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) -> str:
@@ -258,21 +249,21 @@ def frame_row(prediction: Prediction) -> Row:
     figures = {
         "work": exact(prediction.operations / 1e9, "GOP"),
         "batch": exact(prediction.batch, "frame", "images in flight"),
-        "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
+        "throughput": throughput(prediction),
         "one-thread latency": one_thread_latency(prediction),
         "host next to the DPU": host_time(prediction, "ms/frame"),
         "power": power,
         "energy": energy(frame_s, power),
     }
     words = {"host's task": prediction.task, "fitted range": fitted_range(prediction)}
-    return Row("frames", f"{_named(prediction)}, whole images", figures, words)
+    return Row("frames", f"{named(prediction.dpu)}, whole images", figures, words)
 
 
 def host_words(prediction: Prediction) -> list[str]:
     """What was assumed of the file, and what the processor runs because the DPU refuses it; a
     sentence each.
     """
-    sentences = [prediction.note] if prediction.note else []
+    sentences = list(filter(None, [prediction.note]))
     if prediction.refused:
         low_ms, high_ms = (1e3 * end_s for end_s in prediction.refused_s)
         sentences.append(

@@ -29,10 +29,10 @@ def timed(work: Callable[[], Result], powercap: Path = POWERCAP) -> tuple[Result
 
 
 def _power(before: dict[Path, int] | str, after: dict[Path, int] | str, elapsed_s: float) -> Figure:
-    if isinstance(before, str) or isinstance(after, str):
-        return unavailable("W", before if isinstance(before, str) else str(after))
-    if elapsed_s <= 0:
-        return unavailable("W", "the work took no time that the clock can tell")
+    if isinstance(before, str):
+        return unavailable("W", before)
+    if isinstance(after, str):
+        return unavailable("W", after)
     energy_uj = sum(_advance(domain, before[domain], after[domain]) for domain in before)
     return measured(energy_uj / 1e6 / elapsed_s, "W", "RAPL package counters over the same window")
 
@@ -50,13 +50,10 @@ def _advance(domain: Path, before: int, after: int) -> int:
 def _read(powercap: Path) -> dict[Path, int] | str:
     """Counters of the packages in microjoules, or why there are none."""
     try:
-        names = {
-            domain: (domain / "name").read_text(encoding="utf-8")
-            for domain in powercap.glob("*rapl*:*")
-        }
-        packages = [domain for domain, name in names.items() if name.startswith("package")]
         counters = {
-            domain: int((domain / "energy_uj").read_text(encoding="utf-8")) for domain in packages
+            domain: int((domain / "energy_uj").read_text(encoding="utf-8"))
+            for domain in powercap.glob("*rapl*:*")
+            if (domain / "name").read_text(encoding="utf-8").startswith("package")
         }
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else "no number in it"

@@ -4,13 +4,10 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
-from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.simulator.sampling import Scene
-from beers_deploy.profiles.errors import ImageError
 from beers_deploy.quant.samples.own import read_samples
 from examples.networks import NETWORKS, build
 from examples.samples import GAINS, batches, bright, main
@@ -44,12 +41,6 @@ def test_bands_show_one_ground_with_a_gain_and_a_noise_of_their_own(scenes: list
     assert float(between.std(1).min()) > 0
     # One noise in every band would cancel and leave only rounding.
     assert float(torch.corrcoef(between[2:])[0, 1]) < 0.5
-
-
-def test_images_too_small_for_four_bands_are_refused() -> None:
-    small = [procedural_scene(120, 120, np.random.default_rng(0))]
-    with pytest.raises(ImageError, match="None of the training images is large enough"):
-        next(batches("edsr4", small, 0))
 
 
 def test_bright_is_what_is_bright_around_a_pixel_and_not_the_pixel_alone() -> None:

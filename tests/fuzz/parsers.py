@@ -43,7 +43,7 @@ from tests.fuzz.detection import (
     label_seeds,
     read_beside,
 )
-from tests.fuzz.mutation import Mutate, of_json, of_onnx, of_png, of_safetensors, of_tiff, of_xml
+from tests.fuzz.mutation import Mutate, of_json, of_onnx, of_safetensors, of_xml
 from tests.fuzz.networks import (
     SIDE_PX,
     checkpoint_seeds,
@@ -240,9 +240,9 @@ PARSERS: tuple[Parser, ...] = (
     Parser("ONNX, folded", ".onnx", exported_seeds, look_at_onnx, of_onnx),
     Parser("ONNX, understood", ".onnx", onnx_seeds, understand_onnx, of_onnx),
     Parser("ONNX, run", ".onnx", onnx_seeds, run_onnx, of_onnx, 0.3),
-    Parser("TIFF, whole", ".tif", tiff_seeds, read_pixels, of_tiff),
-    Parser("TIFF, by rows", ".tif", tiff_seeds, read_rows, of_tiff),
-    Parser("PNG", ".png", lambda _: [image_of({"format": "PNG"})], read_pixels, of_png),
+    Parser("TIFF, whole", ".tif", tiff_seeds, read_pixels),
+    Parser("TIFF, by rows", ".tif", tiff_seeds, read_rows),
+    Parser("PNG", ".png", lambda _: [image_of({"format": "PNG"})], read_pixels),
     Parser("JPEG", ".jpg", lambda _: [image_of({"format": "JPEG"})], read_pixels),
     *(of_gdal(kind, name) for kind, name in GDAL.items()),
     Parser(

@@ -262,22 +262,19 @@ def _scores(placement: Placement) -> float:
         for node in placement.nodes
         if node.op.out_shape is not None and not back.isdisjoint(node.op.outputs)
     }
-    if len(channels) != 1:
-        return 1.0
-    (count,) = channels
-    boxes = count % BOXES == 0 and count >= LEAST * BOXES
-    return BOXES / count if boxes else 1.0
+    # Of maps with different numbers of channels all is read, as of one whose number is 1.
+    count = channels.pop() if len(channels) == 1 else 1
+    return BOXES / count if count % BOXES == 0 and count >= LEAST * BOXES else 1.0
 
 
 def task_of(placement: Placement) -> Task:
     """What a file tells of the host; one result of few bands, no smaller than the image, becomes an
     image.
     """
-    behind = [node.op.op_type for node in placement.nodes if node.part == "host-back"]
-    task = next((OPERATORS[name] for name in behind if name in OPERATORS), None)
+    for node in placement.nodes:
+        if node.part == "host-back" and node.op.op_type in OPERATORS:
+            return OPERATORS[node.op.op_type]
     onto, back = _crossing_bytes(placement)
-    if task:
-        return task
     return "image" if back >= onto and _gives_an_image(placement) else "copy"
 
 
@@ -319,21 +316,20 @@ def refused_interval_s(operations: Sequence[Operation], dpu: Dpu) -> Interval:
     """
     if not operations:
         return 0.0, 0.0
-    times = [_core_s(op, dpu) for op in operations]
-    cores = dpu.whole("cpu", "cores")
-    low_s = math.fsum(low for low, _ in times)
-    high_s = math.fsum(high for _, high in times)
-    return low_s / cores, high_s / cores
+    times = []
+    for op in operations:
+        values = op.out_bytes + sum(math.prod(shape) for shape in op.in_shapes if shape is not None)
+        moved_values = values + op.weight_bytes
+        times.append(_plain_work_s(op.operations, moved_values, op.out_bytes, dpu))
+    low_s, high_s = (
+        math.fsum(ends) / dpu.whole("cpu", "cores") for ends in zip(*times, strict=True)
+    )
+    return low_s, high_s
 
 
 def between(interval: Interval) -> float:
     """The geometric mean: the ends are factors apart."""
     return math.sqrt(interval[0] * interval[1])
-
-
-def _core_s(op: Operation, dpu: Dpu) -> Interval:
-    values = op.out_bytes + sum(math.prod(shape) for shape in op.in_shapes if shape is not None)
-    return _plain_work_s(op.operations, values + op.weight_bytes, op.out_bytes, dpu)
 
 
 def _plain_work_s(operations: float, moved_values: float, results: float, dpu: Dpu) -> Interval:

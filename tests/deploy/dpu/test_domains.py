@@ -95,11 +95,6 @@ def test_a_function_of_the_file_is_no_operator_of_onnx(domain: str, tmp_path: Pa
     assert "inline its functions" in message
 
 
-def test_onnxruntimes_optimised_file_names_the_remedy(tmp_path: Path) -> None:
-    path = network(tmp_path / "a.onnx", "between", "com.microsoft")
-    assert "give the file that onnxruntime read" in refused_by_load(path)
-
-
 @given(
     st.sampled_from(sorted(INTEGER_OPERATORS)), st.sampled_from(["", "ai.onnx", "com.microsoft"])
 )

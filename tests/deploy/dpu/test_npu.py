@@ -156,14 +156,3 @@ def test_quantize_writes_vint8_and_the_configuration_of_the_compiler(tmp_path: P
     assert config["passes"][1]["vaiml_config"] == {"device": "ve2-xc2ve3858", "optimize_level": 2}
     checks = bd.gate(network, tmp_path / "i.onnx", target="vek385", samples=samples).checks
     assert "nodes that break a rule" in {check.name for check in checks if check.passed}
-
-
-def test_export_writes_vint8_of_a_shipped_network(tmp_path: Path) -> None:
-    core = tmp_path / "core.onnx"
-    network = f"--network convbeers-half-xs-int8 --out {tmp_path}/i.onnx"
-    assert "--board-file" in refused(f"export {network} --target vek385")
-    command = f"export {network} --target vek385 --board-file {core}"
-    assert "--tile" in refused(command)
-    assert "multiple of 2" in refused(f"{command} --tile 63")
-    done(f"{command} --tile 62")
-    assert "check passed" in done(f"check {core} --target vek385")

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from beers_deploy.dpu.board import load_dpu
-from beers_deploy.dpu.checker.conv_rules import conv_kernel
-from beers_deploy.dpu.checker.operators import all_rules, rule_name, rule_text
+from beers_deploy.dpu.checker.operators import all_rules, rule_name
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.reading import read_network
 from tests.deploy.dpu.draws import (
@@ -29,7 +28,6 @@ from tests.deploy.dpu.graphs import IntegerSketch, Sketch, Value
 from tests.deploy.dpu.test_number_graphs import CASES as NUMBER_CASES
 
 DPU = load_dpu("vck190")
-WIDE_ARRAY = "C64B1"
 NARROW_ARRAY = "C32B1"
 
 
@@ -260,14 +258,6 @@ def test_all_broken_rules_of_a_node_are_listed(tmp_path: Path) -> None:
     assert rules == ["conv kernel", "conv stride", "conv padding", "conv window", "conv groups"]
 
 
-def test_a_wider_array_needs_more_of_the_weight_bank(tmp_path: Path) -> None:
-    """The same weights fit the bank of a narrow array and not that of a wide one."""
-    sketch = Sketch(1024)
-    path = sketch.save(tmp_path / "w.onnx", sketch.conv("image", (4, 1024, 8, 8)))
-    assert broken_rules(path, load_dpu("vck190", NARROW_ARRAY)) == []
-    assert broken_rules(path, load_dpu("vck190", WIDE_ARRAY)) == ["conv weight bank"]
-
-
 def test_a_float_convolution_in_a_quantized_file_is_refused(tmp_path: Path) -> None:
     """A float convolution between integer ones is refused, because a DPU computes no float."""
     sketch = IntegerSketch()
@@ -277,12 +267,6 @@ def test_a_float_convolution_in_a_quantized_file_is_refused(tmp_path: Path) -> N
     last = sketch.conv(floating, (1, 4, 3, 3))
     path = sketch.save(tmp_path / "f.onnx", last)
     assert "on integers" in broken_rules(path)
-
-
-def test_rules_read_with_the_targets_limits() -> None:
-    """The text of a rule states the limits of the target and the page that they are from."""
-    text = rule_text(conv_kernel, DPU)
-    assert text == "Kernel height and width are 1 to 16 (UG1414 3.5, DPUCVDX8G, conv2d)."
 
 
 def test_findings_name_the_numbers_and_a_remedy(tmp_path: Path) -> None:

@@ -75,15 +75,6 @@ def test_an_unknown_full_scale_is_reported_as_open(kind: str, model: Path, tmp_p
     assert text["full scale from"] == "asked for"
 
 
-def test_time_here_is_predicted_from_what_was_timed(model: Path, tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "in.tif", np.ones((90, 70), np.uint16))
-    figure = about(tmp_path / "in.tif", model, 23).figures["time here"]
-    assert figure.mode == "predicted"
-    assert figure.value is not None
-    assert figure.interval is not None
-    assert 0 < figure.interval[0] <= figure.value <= figure.interval[1]
-
-
 def test_time_on_the_board_is_the_cost_model_s(tmp_path: Path) -> None:
     """Twice the height needs twice the tiles, and twice the time except for the last batch."""
     times = []
