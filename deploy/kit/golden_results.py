@@ -31,7 +31,7 @@ class Written:
 
     @property
     def differs(self) -> np.ndarray:
-        """A mask of the values that differ, (N, C, H, W)."""
+        """Return a mask of the values that differ, (N, C, H, W)."""
         return np.asarray(self.sound != self.board)
 
 

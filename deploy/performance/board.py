@@ -97,7 +97,7 @@ class Bench(Table):
 
     @property
     def layers(self) -> list[Row]:
-        """Where the time goes, layer by layer, of one configuration; empty of several."""
+        """Return the rows of the layers; they exist if one configuration was predicted."""
         return [row for row in self.rows if row.table == LAYERS]
 
 
@@ -224,7 +224,7 @@ POOR = 0.15
 
 
 def poor_words(boards: Sequence[Dpu]) -> list[str]:
-    """Return a sentence for each board of which the cost model knows little."""
+    """Return a sentence for each board whose cost model rests on little data."""
     errors = {dpu.target.name: dpu.value("cost", "error_left_out") for dpu in boards}
     return [
         f"Of {name} little is known: networks left out of the fit are off by {error:.0%}"
@@ -244,7 +244,7 @@ def fitted_words(rows: Sequence[Row]) -> list[str]:
 
 
 def exposure_words(counts: Mapping[int, int]) -> list[str]:
-    """Say which share of an image's tiles asks for each exposure; nothing without counts."""
+    """Return a sentence with the share of the tiles for each exposure, if there are several."""
     if len(counts) < 2:
         return []
     total = sum(counts.values())

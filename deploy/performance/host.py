@@ -82,7 +82,7 @@ def _ratio_row(runs: Sequence[Timed]) -> Row:
 
 
 def _mean_power(run: Timed) -> Figure:
-    """Mean over the network's own runs, or why there is none."""
+    """Return the mean power over the network's own runs, or the figure that is unavailable."""
     # Runs differ in length: the mean power is energy over time, not the mean of the powers.
     energy_j = 0.0
     for power, time_s in zip(run.powers, run.times_s, strict=True):
@@ -99,8 +99,8 @@ def host_rows(
     threads: int = 0,
     sensor: Sensor | None = None,
 ) -> list[Row]:
-    """A network's time for one tile through onnxruntime, float32 and INT8 interleaved, and how much
-    faster INT8 is.
+    """Time a network for one tile through onnxruntime, float32 and INT8 interleaved, and return how
+    much faster INT8 is.
 
     With a `sensor` the time of the consistency step is a row too.
 
@@ -146,5 +146,5 @@ def step_row(sensor: Sensor, tile_px: int, min_time_s: float, min_runs: int) -> 
 
 
 def conditions_of(threads: int) -> dict[str, Figure]:
-    """Under what conditions something was measured since the last call of `cpu_load`."""
+    """Return the conditions of a measurement since the last call of `cpu_load`."""
     return {"threads": measured(threads, "thread", "of the runtime"), "CPU load": cpu_load()}

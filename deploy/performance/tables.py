@@ -48,7 +48,7 @@ PAPER_TARGET = "vck190"
 
 
 def predicted_rows(name: str, prediction: Prediction, swath: Swath) -> list[Row]:
-    """A network on the DPU, twice: as the paper counts, and with whole tiles."""
+    """Return two rows of a network on the DPU: counted as the paper counts, and in whole tiles."""
     batches = math.ceil(swath.tiles * swath.runs / prediction.batch)
     counts = {
         "as the paper counts": (swath.frames, swath.frames * swath.runs / prediction.batch),
@@ -73,8 +73,8 @@ figure's name and unit.
 
 
 def quoted_rows(network: str, target: TargetProfile) -> list[Row]:
-    """A network on a board without a cost model, unavailable; and what the board's maker prints of
-    other networks.
+    """Return a network on a board without a cost model as unavailable, and the published figures of
+    other networks on that board.
     """
     reason = f"too few rates of {target.name} are published to fit a cost model"
     figures = {key: unavailable(unit, reason) for key, unit in QUOTED.items()}
@@ -88,7 +88,9 @@ def quoted_rows(network: str, target: TargetProfile) -> list[Row]:
 
 
 def published_rows() -> list[Row]:
-    """The paper's two runs on the VCK190, as printed; its DPU configuration is not named."""
+    """Return the paper's two runs on the VCK190 as printed. It does not name the configuration of
+    the DPU.
+    """
     runs = {
         "paper, 13600 x 9016: traditional on the VCK190's CPU": (1724, 0.2, 22.5, 3161),
         "paper, 13600 x 9016: ConvBEERS, INT8 on the DPU": (42, 7.2, 29.6, 98965),
@@ -103,8 +105,8 @@ def published_rows() -> list[Row]:
 
 
 def processor_row(swath: Swath, board: TargetProfile) -> Row:
-    """The traditional pipeline on the board's own processor, from the time of 10^6 pixels that its
-    file states.
+    """Return the traditional pipeline on the board's own processor, scaled from the time of 10^6
+    pixels in the board's file.
     """
     cpu = board.tables.get("cpu", {})
     mpx = swath.pixels / 1e6
@@ -132,7 +134,7 @@ def processor_row(swath: Swath, board: TargetProfile) -> Row:
 
 
 def layer_rows(prediction: Prediction) -> list[Row]:
-    """One row a layer; their times add up to that of a batch, the last row.
+    """Return a row for each layer, and a last one with the sum of their times.
 
     The columns are those of AMD's vaitrace, with what bounds the layer; bytes are those of one
     image.
@@ -177,7 +179,7 @@ def sweep_rows(
     tiles_px: Sequence[int],
     task: Task | None = None,
 ) -> list[Row]:
-    """A row a configuration and tile size, for whole tiles with the swath's halo."""
+    """Return a row for each configuration and tile size, in whole tiles with the swath's halo."""
     rows = []
     for dpu, tile_px in product(boards, tiles_px):
         tiled = replace(swath, tile_px=tile_px)
@@ -187,7 +189,7 @@ def sweep_rows(
 
 
 def swath_row(prediction: Prediction, swath: Swath) -> Row:
-    """A swath in whole tiles on one configuration."""
+    """Return the swath in whole tiles on one configuration."""
     batches = math.ceil(swath.tiles * swath.runs / prediction.batch)
     on_chip = [not layer.work.map_bytes for layer in prediction.layers]
     figures = swath_figures(prediction, swath, swath.tiles, batches) | {
@@ -208,8 +210,8 @@ def named(dpu: Dpu) -> str:
 
 
 def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) -> str:
-    """Which DPU, the one of the lowest peak, meets a time for the swath: surely, probably, or only
-    at best.
+    """Name the DPU with the lowest peak that computes the swath in time: by the whole interval, by
+    the prediction, or at best.
 
     One that does so surely is not named again for what is less. Peaks stand for prices, which no
     file states.
@@ -243,7 +245,9 @@ def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) ->
 
 
 def frame_row(prediction: Prediction) -> Row:
-    """A network that is run on whole images, on one configuration: frames instead of a swath."""
+    """Return a network that runs on whole images, on one configuration: per frame instead of per
+    swath.
+    """
     power = dpu_power(prediction.dpu)
     frame_s = swath_latency(prediction, 1 / prediction.batch)
     figures = {
@@ -260,8 +264,8 @@ def frame_row(prediction: Prediction) -> Row:
 
 
 def host_words(prediction: Prediction) -> list[str]:
-    """What was assumed of the file, and what the processor runs because the DPU refuses it; a
-    sentence each.
+    """Return sentences about what was assumed of the file, and what the processor runs because the
+    DPU refuses it.
     """
     sentences = list(filter(None, [prediction.note]))
     if prediction.refused:

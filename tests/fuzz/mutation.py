@@ -193,6 +193,28 @@ def of_safetensors(content: bytes, rng: Rng) -> bytes:
     return len(header).to_bytes(8, "little") + header + content[8 + size :]
 
 
+def of_tiff(content: bytes, rng: Rng) -> bytes:
+    """Change tag, type, count or value of an entry of the first directory (classic and
+    little-endian).
+    """
+    if content[:4] != b"II*\0" or len(content) < 8:
+        return content
+    # Bytes 4 to 7 of a classic TIFF are the place of its first directory, a count and entries of 12
+    # bytes.
+    start = int.from_bytes(content[4:8], "little")
+    count = int.from_bytes(content[start : start + 2], "little")
+    if not 0 < count < 100:
+        return content
+    at = start + 2 + 12 * int(rng.integers(count))
+    field, width = ((0, 2), (2, 2), (4, 4), (8, 4))[int(rng.choice(4, p=(0.1, 0.1, 0.2, 0.6)))]
+    number = pick(NUMBERS, rng) if rng.random() < 0.7 else int(rng.integers(70_000))
+    value = (number % 2 ** (8 * width)).to_bytes(width, "little")
+    if field == 0 and rng.random() < 0.5:
+        tags = (256, 257, 258, 259, 277, 278, 284, 317, 322, 323, 330, 339, 50838)
+        value = int(rng.choice(tags)).to_bytes(2, "little")
+    return b"".join((content[: at + field], value, content[at + field + width :]))
+
+
 def of_onnx(content: bytes, rng: Rng) -> bytes:
     """Change one field somewhere in a model; as it was where it is no model any more."""
     model = onnx.ModelProto()

@@ -65,8 +65,8 @@ class Checked(Table):
         if any(check.name == ACCEPTED for check in self.checks):
             return "check passed: it fits once 'quantize' has rewritten it to INT8"
         return (
-            "check passed: its nodes run on the DPU; 'quantize' is for networks that make one "
-            "image of one image"
+            "check passed: its nodes run on the DPU, but 'quantize' accepts only networks that map "
+            "one image to one image"
         )
 
 

@@ -56,7 +56,9 @@ class LayerCost:
 
     @property
     def bound(self) -> str:
-        """What takes longest: compute, memory or, as overhead, what is neither."""
+        """Return the name of the longest part of the time: compute, memory, or overhead for the
+        rest.
+        """
         overhead_s = self.time_s - self.compute_s - self.memory_s
         parts = {"compute": self.compute_s, "memory": self.memory_s, "overhead": overhead_s}
         return max(parts, key=lambda name: parts[name])
@@ -100,23 +102,25 @@ class Prediction:
 
     @property
     def batch(self) -> int:
-        """Images in flight."""
+        """Return the number of images that are processed at once."""
         return self.dpu.batch
 
     @cached_property
     def batch_time_s(self) -> float:
-        """Time of one batch on the DPU: its layers, nothing else."""
+        """Return the time of the layers of one batch on the DPU, without the host."""
         return math.fsum(layer.time_s for layer in self.layers)
 
     @property
     def fps(self) -> float:
-        """Images a second, batches back to back, the host working on others beside them."""
+        """Return the images per second, if batches follow each other and the host works in
+        parallel.
+        """
         return self._rate(self.host_s)
 
     @property
     def fps_interval(self) -> Interval:
-        """Least and most images a second: the host at its slowest and at its fastest, and the
-        width.
+        """Return the lowest and the highest rate: the host at its slowest and at its fastest, both
+        widened by `spread`.
         """
         # The host at its fastest comes first.
         fast, slow = map(self._rate, self._host_ends_s)
@@ -124,13 +128,13 @@ class Prediction:
 
     @property
     def host_interval_s(self) -> Interval:
-        """Least and most of `host_s`."""
+        """Return the lowest and the highest value of `host_s`."""
         return self._widened(*self._host_ends_s)
 
     @property
     def latency_s(self) -> float:
-        """From the first image of a batch to the last result, with one thread: one core, then one
-        core of the host.
+        """Return the time from the first image of a batch to its last result with one thread, which
+        uses one core of the DPU and then one core of the host.
 
         Its error is about that of the rate (docs/reference/boards.md), and it shares the rate's
         width.
@@ -139,7 +143,7 @@ class Prediction:
 
     @property
     def latency_interval_s(self) -> Interval:
-        """Least and most of `latency_s`."""
+        """Return the lowest and the highest value of `latency_s`."""
         return self._widened(*map(self._latency_s, self._host_ends_s))
 
     def _widened(self, low: float, high: float) -> Interval:
@@ -151,12 +155,14 @@ class Prediction:
 
     @property
     def spread(self) -> float:
-        """By how many times a part may be off either way."""
+        """Return the factor by which each time may be wrong in either direction."""
         return math.exp(self.width)
 
     @property
     def _host_ends_s(self) -> Interval:
-        """With the refused nodes and the consistency step at their least and at their most."""
+        """Return the host's time with the shortest and with the longest time of the refused nodes
+        and of the consistency step.
+        """
         rest_s = self.host_s - between(self.refused_s) - between(self.step_s)
         # Only these two parts have ends of their own: the rest of the host's time is fitted.
         low_s, high_s = (sum(ends) for ends in zip(self.refused_s, self.step_s, strict=True))
@@ -169,12 +175,12 @@ class Prediction:
 
     @property
     def operations(self) -> int:
-        """int8 operations for one image."""
+        """Return the int8 operations for one image."""
         return sum(layer.work.operations for layer in self.layers)
 
     @property
     def streamed_bytes(self) -> int:
-        """Feature-map bytes that one image moves through memory."""
+        """Return the bytes of feature maps that pass through memory for one image."""
         return sum(layer.work.map_bytes for layer in self.layers)
 
 
@@ -256,8 +262,8 @@ network is not beyond it.
 
 
 def _outside(core: Sequence[Operation], dpu: Dpu) -> tuple[str, ...]:
-    """What of a network lies beyond the fitted ones, each with the end of the
-    range that it passes.
+    """Return a sentence for each property of a network that exceeds the range of the fitted
+    networks.
     """
     operations = sum(op.operations for op in core)
     values = (
@@ -275,7 +281,8 @@ def _outside(core: Sequence[Operation], dpu: Dpu) -> tuple[str, ...]:
 
 
 def dpu_power(dpu: Dpu) -> Figure:
-    """Power in W while the DPU runs: the range of what is published of the board, for any network.
+    """Return the power in W while the DPU runs: the published range of the board, whatever the
+    network.
 
     The published points contradict each other: above idle the VCK190 takes 0.8 pJ for an operation
     with YOLOv8s and 2.3 pJ with ConvBEERS, so no energy for an operation or a byte can be told.

@@ -69,7 +69,7 @@ class Run:
 
     @property
     def ratio(self) -> tuple[Levels, float]:
-        """What this run has in common with others, and ln(given / predicted)."""
+        """Return the levels of kinship of the run, and ln(given / predicted)."""
         return self.predicted.levels, math.log(self.fps / self.predicted.fps)
 
 
@@ -113,12 +113,13 @@ def read_own_runs(path: Path, dpu: Dpu) -> OwnRuns:
         entries = ENTRIES.validate_python(read_json(path))
     except ValidationError as error:
         fault = error.errors(include_url=False)[0]
-        place = printable(".".join(map(str, fault["loc"])) or "the file")
-        raise OptionError(
-            f"{path} is not a list of runs: {place}: {fault['msg']}. {EXAMPLE}"
-        ) from None
+        where = f"{path} must be a list of runs"
+        if fault["loc"]:
+            number, *keys = fault["loc"]
+            where = " ".join([f"Run {int(number) + 1} in {path.name}", *map(str, keys)])
+        raise OptionError(f"{printable(where)}: {fault['msg']}. {EXAMPLE}") from None
     except (OSError, ValueError) as error:
-        reason = unreadable(path) or printable(str(error))
+        reason = unreadable(path) or f"it is not valid JSON ({printable(str(error))})"
         raise OptionError(f"{path} cannot be read: {reason}. {EXAMPLE}") from error
     runs = [
         _run(entry, path, f"Run {number} in {path.name}", dpu)

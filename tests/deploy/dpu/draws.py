@@ -71,13 +71,38 @@ def padded(mode: str) -> Draw:
     return lambda sketch, source: sketch.node("Pad", source, sketch.constant(pads), mode=mode)
 
 
+def in_two(first: Draw, second: Draw) -> Draw:
+    """Two draws, one behind the other."""
+    return lambda sketch, source: second(sketch, first(sketch, source))
+
+
+def conv_3x3(**attributes: Value) -> Draw:
+    return conv(8, 8, 3, 3, **attributes)
+
+
+def depthwise(height: int, width: int, **attributes: Value) -> Draw:
+    return conv(8, 1, height, width, group=8, **attributes)
+
+
+def max_pool(rows: int, columns: int, **attributes: Value) -> Draw:
+    return node("MaxPool", kernel_shape=[rows, columns], **attributes)
+
+
+def doubled(sketch: Sketch, source: str) -> str:
+    return sketch.node("Add", source, source)
+
+
 def behind_conv(op_type: str, **attributes: Value) -> Draw:
-    return lambda sketch, source: sketch.node(
-        op_type, sketch.conv(source, (8, 8, 3, 3)), **attributes
-    )
+    return in_two(conv_3x3(), node(op_type, **attributes))
+
+
+def behind_depthwise(op_type: str, **attributes: Value) -> Draw:
+    return in_two(depthwise(3, 3), node(op_type, **attributes))
 
 
 def behind_sum(op_type: str, **attributes: Value) -> Draw:
-    return lambda sketch, source: sketch.node(
-        op_type, sketch.node("Add", source, source), **attributes
-    )
+    return in_two(doubled, node(op_type, **attributes))
+
+
+def behind_pool(op_type: str, **attributes: Value) -> Draw:
+    return in_two(max_pool(2, 2), node(op_type, **attributes))

@@ -23,15 +23,19 @@ from beers_deploy.performance.swath import efficiency, energy
 from beers_deploy.profiles.figures import predicted
 from beers_deploy.profiles.shipped import board_names, npu_names
 from beers_deploy.profiles.target import TargetProfile
-from beers_deploy.quant.core import SHIFTS, target_shifts
 from beers_deploy.quant.onnx_file import load_onnx
 from tests.deploy.dpu.draws import (
     Draw,
     behind_conv,
+    behind_depthwise,
+    behind_pool,
     behind_sum,
     between_convs,
     broken_rules,
     conv,
+    depthwise,
+    doubled,
+    in_two,
     node,
 )
 from tests.deploy.dpu.graphs import Sketch
@@ -41,30 +45,11 @@ DPUS = {name: load_dpu(name) for name in board_names()}
 ZYNQ = ("kv260", "zcu102", "zcu104")
 KINDS = {"DPUCZDX8G": ZYNQ, "DPUCVDX8G": ("vck190",), "DPUCV2DX8G": ("vek280",)}
 ALPHA = 26 / 256
-
-
-def depthwise(height: int, width: int) -> Draw:
-    return conv(8, 1, height, width, group=8, pads=[0] * 4)
-
-
-def behind_depthwise(op_type: str, **attributes: float) -> Draw:
-    return lambda s, x: s.node(op_type, s.conv(x, (8, 1, 3, 3), group=8), **attributes)
-
-
-def behind_pool(op_type: str) -> Draw:
-    return lambda s, x: s.node(op_type, s.node("MaxPool", x, kernel_shape=[2, 2]))
-
-
-def added(s: Sketch, x: str) -> str:
-    return s.node("Add", x, x)
+UNPADDED = [0] * 4
 
 
 def prelu(s: Sketch, x: str) -> str:
     return s.node("PRelu", x, s.weight(8, 1, 1))
-
-
-def in_two(first: Draw, second: Draw) -> Draw:
-    return lambda s, x: second(s, first(s, x))
 
 
 # What only these boards refuse, with the rule, the network, the same with the remedy followed, and
@@ -80,8 +65,8 @@ CASES: list[tuple[tuple[str, ...], str, Draw, Draw, int]] = [
     (
         (*ZYNQ, "vek280"),
         "depthwise kernel",
-        depthwise(64, 33),
-        in_two(depthwise(64, 1), depthwise(1, 33)),
+        depthwise(64, 33, pads=UNPADDED),
+        in_two(depthwise(64, 1, pads=UNPADDED), depthwise(1, 33, pads=UNPADDED)),
         8,
     ),
     (
@@ -96,13 +81,13 @@ CASES: list[tuple[tuple[str, ...], str, Draw, Draw, int]] = [
     (
         ("vek280",),
         "depthwise kernel",
-        depthwise(21, 21),
-        in_two(depthwise(21, 1), depthwise(1, 21)),
+        depthwise(21, 21, pads=UNPADDED),
+        in_two(depthwise(21, 1, pads=UNPADDED), depthwise(1, 21, pads=UNPADDED)),
         8,
     ),
     (("vek280",), "activation place", prelu, behind_conv("Relu"), 8),
-    (("vek280",), "activation of sums", in_two(added, prelu), behind_sum("Relu"), 8),
-    (("vck190",), "conv window", conv(8, 8, 9, 8, pads=[0] * 4), conv(8, 8, 7, 7), 8),
+    (("vek280",), "activation of sums", in_two(doubled, prelu), behind_sum("Relu"), 8),
+    (("vck190",), "conv window", conv(8, 8, 9, 8, pads=UNPADDED), conv(8, 8, 7, 7), 8),
 ]
 NOT_OF_VEK280 = {"conv window"}
 """Its conv area is tighter: it refuses the same network for that."""
@@ -136,7 +121,7 @@ def compared(channels: int) -> Draw:
         (conv(4097, 8, 1, 1), {"vek280"}),
         # With padding it is split into parts of three rows.
         (conv(8, 8, 16, 16, pads=[7] * 4), set(DPUS)),
-        (conv(8, 8, 16, 16, pads=[0] * 4), set(ZYNQ)),
+        (conv(8, 8, 16, 16, pads=UNPADDED), set(ZYNQ)),
     ],
 )
 def test_which_boards_take_what(draw: Draw, boards: set[str], tmp_path: Path) -> None:
@@ -208,12 +193,6 @@ def test_the_shipped_files_run_whole_on_every_board(variant: str) -> None:
         placement = place(network, dpu)
         assert placement.dpu_subgraphs == 1, name
         assert placement.failed == (), name
-
-
-def test_every_board_has_the_shifts_of_the_quantizer() -> None:
-    assert {name: target_shifts(dpu.target) for name, dpu in DPUS.items()} == dict.fromkeys(
-        DPUS, SHIFTS
-    )
 
 
 def test_power_that_nobody_published_is_unavailable_and_so_is_what_follows() -> None:

@@ -214,34 +214,11 @@ def test_shares_are_by_how_much_the_rate_follows_the_parts(crowding: float) -> N
     assert alone == pytest.approx([*(parts[:4] / parts[:4].sum()), 0, 0])
 
 
-def test_a_host_that_is_slower_sets_the_rate(tmp_path: Path) -> None:
-    """A network of one small layer: the host cannot bring its images fast enough."""
-    sketch = Sketch(8)
-    prediction = predict_network(
-        sketch.save(tmp_path / "s.onnx", sketch.conv("image", (1, 8, 1, 1))), DPU, 640
-    )
-    dpu_s = prediction.batch_time_s / prediction.batch
-    assert prediction.host_s > dpu_s
-    assert prediction.bound == "host"
-    assert 1 / (prediction.host_s + dpu_s) < prediction.fps < 1 / prediction.host_s
-
-
 def test_a_network_without_convolutions_has_no_prediction(tmp_path: Path) -> None:
     sketch = Sketch(8)
     path = sketch.save(tmp_path / "p.onnx", sketch.node("MaxPool", "image", kernel_shape=[2, 2]))
     with pytest.raises(ModelError, match="no convolution"):
         predict_network(path, DPU)
-
-
-def test_a_task_that_is_stated_takes_the_place_of_what_the_file_tells(tmp_path: Path) -> None:
-    """Heads that are read and no more, or ranked: the file is the same."""
-    sketch = Sketch(8)
-    path = sketch.save(tmp_path / "h.onnx", sketch.conv("image", (80, 8, 3, 3)))
-    copied = predict_network(path, DPU, 96)
-    ranked = predict_network(path, DPU, 96, "sort")
-    assert (copied.task, ranked.task) == ("copy", "sort")
-    assert ranked.host_s > copied.host_s
-    assert ranked.batch_time_s == copied.batch_time_s
 
 
 @pytest.mark.parametrize(

@@ -14,53 +14,26 @@ from tests.deploy.dpu.draws import (
     TILE_PX,
     Draw,
     behind_conv,
+    behind_pool,
     behind_sum,
     between_convs,
     broken_rules,
     conv,
+    conv_3x3,
+    depthwise,
+    in_two,
+    max_pool,
     node,
     padded,
     resized,
     scaled,
     transposed,
 )
-from tests.deploy.dpu.graphs import IntegerSketch, Sketch, Value
+from tests.deploy.dpu.graphs import IntegerSketch, Sketch
 from tests.deploy.dpu.test_number_graphs import CASES as NUMBER_CASES
 
 DPU = load_dpu("vck190")
 NARROW_ARRAY = "C32B1"
-
-
-def conv_3x3(**attributes: Value) -> Draw:
-    """Return a draw of a convolution of 3 x 3 from 8 channels to 8."""
-    return conv(8, 8, 3, 3, **attributes)
-
-
-def depthwise(rows: int, columns: int, **attributes: Value) -> Draw:
-    """Return a draw of a convolution of each of 8 channels by itself."""
-    return conv(8, 1, rows, columns, group=8, **attributes)
-
-
-def max_pool(rows: int, columns: int, **attributes: Value) -> Draw:
-    """Return a draw of a maximum over a window."""
-    return node("MaxPool", kernel_shape=[rows, columns], **attributes)
-
-
-def behind_pool(op_type: str, **attributes: Value) -> Draw:
-    """Return a draw of an operator that reads a maximum over 2 x 2."""
-
-    def draw(sketch: Sketch, source: str) -> str:
-        """Write the maximum, and the operator that reads it."""
-        pooled = max_pool(2, 2)(sketch, source)
-        return sketch.node(op_type, pooled, **attributes)
-
-    return draw
-
-
-def pool_of_relu(sketch: Sketch, source: str) -> str:
-    """Write a ReLU, and a maximum over 2 x 2 of it."""
-    relu = sketch.node("Relu", source)
-    return max_pool(2, 2)(sketch, relu)
 
 
 # Each rule with a network that breaks it alone, and the same network with the remedy followed.
@@ -105,7 +78,7 @@ CASES: dict[str, tuple[Draw, Draw]] = {
         max_pool(20, 20, pads=[16, 0, 0, 0]),
         max_pool(20, 20, pads=[15, 0, 0, 0]),
     ),
-    "activation place": (behind_pool("Relu"), pool_of_relu),
+    "activation place": (behind_pool("Relu"), in_two(node("Relu"), max_pool(2, 2))),
     "activation of sums": (behind_sum("HardSwish"), behind_sum("Relu")),
     "leaky relu alpha": (
         behind_conv("LeakyRelu", alpha=0.1),

@@ -211,15 +211,10 @@ def test_the_command_writes_and_compares(tmp_path: Path) -> None:
     assert "noise/00-planes.npy has other numbers" in refused("golden", folder, "--compare", out)
 
 
-@pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_golden(network(SHIPPED[0]), tmp_path_factory.mktemp("small"), tile=TILE_PX)
-
-
 @pytest.fixture
-def copied(small: Path, tmp_path: Path) -> Path:
-    """A copy of golden vectors with one case, which a test damages."""
-    shutil.copytree(small, tmp_path / "golden")
+def copied(tmp_path: Path) -> Path:
+    """Golden vectors with one case, which a test damages."""
+    write_golden(SHIPPED[0], tmp_path / "golden", tile=TILE_PX)
     index = json.loads((tmp_path / "golden" / INDEX).read_text())
     index["cases"] = {"noise": index["cases"]["noise"]}
     (tmp_path / "golden" / INDEX).write_text(json.dumps(index))
@@ -262,7 +257,7 @@ def test_an_index_leads_nowhere_else_and_its_claims_are_no_inputs(
     (copied / INDEX).write_text(
         json.dumps(index | {"cases": {"../noise": index["cases"]["noise"]}})
     )
-    assert "is damaged (ValueError: the case '../noise')" in refused(
+    assert "is damaged (the case '../noise')" in refused(
         "golden", tmp_path, "--compare", copied
     )
 
@@ -271,7 +266,7 @@ def test_older_vectors_do_not_stay(copied: Path) -> None:
     stale = copied / "odd" / "99-gone.npy"
     np.save(stale, np.zeros(1))
     (copied / "odd" / "notes.txt").touch()
-    write_golden(network(SHIPPED[0]), copied, tile=TILE_PX)
+    write_golden(SHIPPED[0], copied, tile=TILE_PX)
     assert not stale.exists()
     assert (copied / "odd" / "notes.txt").exists()
     assert read_golden(copied)

@@ -78,10 +78,9 @@ def test_an_unknown_full_scale_is_reported_as_open(kind: str, model: Path, tmp_p
 def test_time_on_the_board_is_the_cost_model_s(tmp_path: Path) -> None:
     """Twice the height needs twice the tiles, and twice the time except for the last batch."""
     times = []
-    for height in (6000, 12000):
-        image = tifffile.memmap(tmp_path / f"{height}.tif", shape=(height, 6000), dtype="uint16")
-        del image
-        row = about(tmp_path / f"{height}.tif", shipped_pair()[1])
+    for height in (600, 1200):
+        tifffile.imwrite(tmp_path / f"{height}.tif", np.ones((height, 600), np.uint16))
+        row = about(tmp_path / f"{height}.tif", shipped_pair()[1], 64)
         times.append(row.figures["time on vck190"])
     assert all(figure.mode == "predicted" for figure in times)
     first, second = (figure.value or math.nan for figure in times)
