@@ -3,7 +3,9 @@ predicted of it.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from operator import mul
 
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.placement import place
@@ -176,30 +178,28 @@ def fitted_range(prediction: Prediction) -> str:
 
 
 def energy(latency: Figure, power: Figure) -> Figure:
-    """Return the energy of the swath in J, the product of time and power, with the products of
-    their ends.
-    """
-    if power.value is None or latency.value is None:
-        return unavailable("J", power.reason or latency.reason)
-    fast_s, slow_s = interval_ends(latency)
-    low_w, high_w = interval_ends(power)
-    ends = fast_s * low_w, slow_s * high_w
-    return predicted(latency.value * power.value, "J", ends, f"{latency.source}; {power.source}")
+    """Return the energy of the swath in J."""
+    return _of_time_and_power(latency, power, "J", mul)
 
 
 def efficiency(pixels: int, latency: Figure, power: Figure) -> Figure:
-    """Return the pixels per second and watt. The interval pairs the slowest run with the highest
-    power and the reverse.
+    """Return the pixels per second and watt."""
+    return _of_time_and_power(
+        latency, power, "px/s/W", lambda time_s, power_w: pixels / time_s / power_w
+    )
+
+
+def _of_time_and_power(
+    latency: Figure, power: Figure, unit: str, compute: Callable[[float, float], float]
+) -> Figure:
+    """Compute a figure from time and power. Its interval pairs the fastest run with the lowest
+    power, and the slowest run with the highest power.
     """
-    unit = "px/s/W"
     if power.value is None or latency.value is None:
         return unavailable(unit, power.reason or latency.reason)
-    value = pixels / latency.value / power.value
-    fast_s, slow_s = interval_ends(latency)
-    low_w, high_w = interval_ends(power)
-    # The slowest run at the highest power is the least efficient, and the reverse.
-    interval = (pixels / slow_s / high_w, pixels / fast_s / low_w)
-    return predicted(value, unit, interval, f"{latency.source}; {power.source}")
+    low, high = sorted(map(compute, interval_ends(latency), interval_ends(power)))
+    source = f"{latency.source}; {power.source}"
+    return predicted(compute(latency.value, power.value), unit, (low, high), source)
 
 
 def interval_ends(figure: Figure) -> Interval:

@@ -41,13 +41,3 @@ def test_a_file_of_samples_is_read_as_data(
     pairs = list(read_samples(out, NETWORKS[name].inputs, None).all.pairs)
     assert len(pairs) == 5
     assert (pairs[0][1].size > 0) == NETWORKS[name].restores
-
-
-def test_other_names_and_counts_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["segment", "--out", str(tmp_path / "samples.npy")]) == 2
-    assert "ends in .npz" in capsys.readouterr().err
-    with pytest.raises(SystemExit, match="2"):
-        main(["segment", "--count", "0", "--out", str(tmp_path / "samples.npz")])
-    assert not list(tmp_path.iterdir())

@@ -25,20 +25,6 @@ def test_a_board_file_keeps_only_the_conversions_at_its_border_and_its_numbers(
     )
 
 
-def test_shapes_go_on_past_operators_of_onnxruntime_and_odd_ones(tmp_path: Path) -> None:
-    sketch = Sketch(4)
-    apart = sketch.node("SpaceToDepth", sketch.conv("image", (4, 4, 3, 3)), blocksize=2)
-    up = sketch.node(
-        "ConvTranspose", apart, sketch.weight(16, 6, 4, 4), strides=[2, 2], pads=[1, 1, 1, 1]
-    )
-    joined = sketch.node("Concat", up, up, axis=1)
-    path = sketch.save(
-        tmp_path / "o.onnx", sketch.node("MaxPool", joined, kernel_shape=[2, 2], strides=[2, 2])
-    )
-    shapes = [op.out_shape for op in read_network(path, 30).operations]
-    assert shapes == [(4, 30, 30), (16, 15, 15), (6, 30, 30), (12, 30, 30), (12, 15, 15)]
-
-
 def test_an_unknown_operator_hides_the_shape_but_not_the_network(tmp_path: Path) -> None:
     sketch = Sketch(4)
     odd = sketch.node("Mystery", sketch.conv("image", (4, 4, 3, 3)), domain="com.microsoft")

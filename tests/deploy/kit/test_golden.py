@@ -257,9 +257,7 @@ def test_an_index_leads_nowhere_else_and_its_claims_are_no_inputs(
     (copied / INDEX).write_text(
         json.dumps(index | {"cases": {"../noise": index["cases"]["noise"]}})
     )
-    assert "is damaged (the case '../noise')" in refused(
-        "golden", tmp_path, "--compare", copied
-    )
+    assert "is damaged (the case '../noise')" in refused("golden", tmp_path, "--compare", copied)
 
 
 def test_older_vectors_do_not_stay(copied: Path) -> None:
