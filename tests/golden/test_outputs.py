@@ -62,13 +62,12 @@ def test_figures_are_those_that_were_stored(current: Outputs) -> None:
     figures = stored("figures")
     assert sorted(current.figures) == sorted(figures)
     for name, value in figures.items():
+        actual = current.figures[name]
         rel = 0.05 if name.startswith("gate, ") else 1e-3
         if isinstance(value, float):
-            assert current.figures[name] == pytest.approx(value, rel=rel, abs=1e-6, nan_ok=True), (
-                name
-            )
+            assert actual == pytest.approx(value, rel=rel, abs=1e-6, nan_ok=True), name
         else:
-            assert current.figures[name] == value, name
+            assert actual == value, name
 
 
 def test_shipped_int8_files_have_the_stored_digests(current: Outputs) -> None:
