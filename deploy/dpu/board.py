@@ -28,13 +28,15 @@ def boards_of(board: BoardLike | Sequence[BoardLike]) -> list[TargetProfile]:
         board: a board, several, or names separated by commas, each with or without the suffix
             -model; "all" stands for the shipped boards with a DPU.
     """
-    if isinstance(board, str) and board.removesuffix(MODEL_SUFFIX) == ALL:
-        return [TargetProfile.load(name) for name in board_names()]
-    if isinstance(board, str):
-        return [TargetProfile.load(name.strip()) for name in board.split(",")]
+    sources: Sequence[BoardLike]
     if isinstance(board, os.PathLike | TargetProfile):
-        return [TargetProfile.load(board)]
-    return [TargetProfile.load(source) for source in board]
+        sources = [board]
+    elif isinstance(board, str):
+        every = board.removesuffix(MODEL_SUFFIX) == ALL
+        sources = board_names() if every else [name.strip() for name in board.split(",")]
+    else:
+        sources = board
+    return list(map(TargetProfile.load, sources))
 
 
 REQUIRED = ("cores", "batch_handlers", "cpb", "peak_tops")
@@ -165,8 +167,8 @@ def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
     for key in REQUIRED:
         if key not in constants:
             raise ProfileError(
-                f"The table [configurations.{name}] of the target {profile.name} has no {key}. Add "
-                f"it: {LIMITS[key]} that a board can have."
+                f"The table [configurations.{name}] of the target {profile.name} has no key "
+                f"{key!r}. Add {LIMITS[key]}."
             )
     # The rules quote these documents: without them a rule's text would have no source.
     if not profile.documents:

@@ -48,13 +48,13 @@ class Operation:
 
     @property
     def output(self) -> str:
-        """The first result."""
+        """Return the name of the first result."""
         return self.outputs[0]
 
     @property
     def operations(self) -> int:
-        """The int8 operations for one image: 2 kh kw ic oc h w, per group, or 0 if no products are
-        summed.
+        """Return the int8 operations for one image: 2 kh kw ic oc h w per group, or 0 if no
+        products are summed.
         """
         if self.kind not in CONVOLUTIONS:
             return 0
@@ -65,7 +65,7 @@ class Operation:
 
     @property
     def out_bytes(self) -> int:
-        """Size of the result as int8."""
+        """Return the size of the result as int8."""
         return _pixels(self.name, self.out_shape) * (self.out_shape or (0,))[0]
 
 

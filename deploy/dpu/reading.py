@@ -67,9 +67,9 @@ def _places(model: onnx.ModelProto) -> tuple[int, int]:
     """Return what a board's file states about its planes: the side of a place in pixels, and how
     far they extend beyond the image.
     """
-    place_px, border_px = (
-        int(metadata(model).get(key, least)) for key, least in ((PLACE_PX, 1), (BORDER_PX, 0))
-    )
+    about = metadata(model)
+    place_px = int(about.get(PLACE_PX, 1))
+    border_px = int(about.get(BORDER_PX, 0))
     if not (1 <= place_px <= PLACE_MAX_PX and 0 <= border_px <= PLACE_MAX_PX):
         raise ValueError(f"places of {place_px} px, {border_px} px around")
     return place_px, border_px
@@ -88,23 +88,17 @@ def network_of(
             "export' or 'beers-deploy quantize'."
         )
     with contradictions(where):
-        graph = with_shuffles(model)
-        return _Reader(graph, _inputs(graph, tile_px, _places(model), where)).network()
+        return _Reader(with_shuffles(model), inputs_of(model, tile_px, where)).network()
 
 
 def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str) -> dict[str, Shape]:
     """Return the inputs of a file as it is, by name: (C, H, W) in places, for a tile or as the file
     states them.
     """
-    return _inputs(OnnxGraph(model), tile_px, _places(model), where)
-
-
-def _inputs(
-    graph: OnnxGraph, tile_px: int | None, places: tuple[int, int], where: str
-) -> dict[str, Shape]:
+    places = _places(model)
     return {
         name: _input_shape(name, sizes, tile_px, places, where)
-        for name, sizes in graph.inputs.items()
+        for name, sizes in OnnxGraph(model).inputs.items()
     }
 
 
@@ -165,13 +159,10 @@ class _Reader:
         These are max(q, zero point), which is the ReLU of integers, Clip from 0 to 6, which is
         ReLU6, and the Clip of a bank at the limits where int8 saturates.
         """
-        constants = [
-            value
-            for k in range(1, len(node.inputs))
-            if (value := self.graph.value(node, k)) is not None
-        ]
+        values = [self.graph.value(node, k) for k in range(1, len(node.inputs))]
+        constants = [value for value in values if value is not None]
         if node.op_type == "Max":
-            return self.integers.is_integer(node) and len(constants) == len(node.inputs) - 1 == 1
+            return self.integers.is_integer(node) and len(constants) == len(values) == 1
         # A limit that is no single constant cannot be ReLU6, and is left out: the lists then
         # differ.
         limits = [float(value.ravel()[0]) for value in constants if value.size == 1]
@@ -223,15 +214,10 @@ def _input_shape(
             beyond the image.
         where: the file, in messages.
     """
-    if len(sizes) != 4 or sizes[1] < 1:
+    if len(sizes) != 4 or sizes[1] < 1 or sizes[0] > 1:
         raise ModelError(
-            f"The inputs of {where} must be (N, C, H, W), got {printable(name)} {sizes}. Export "
-            "the network with such inputs."
-        )
-    if sizes[0] > 1:
-        raise ModelError(
-            f"The inputs of {where} must hold one image, but {printable(name)} holds {sizes[0]}. "
-            "Export the network for any number of images, or for one."
+            f"The inputs of {where} must be one image (N, C, H, W), got {printable(name)} {sizes}. "
+            "Export the network for one image, or for any number of them."
         )
     if tile_px is None:
         if not all(sizes[2:]):

@@ -77,14 +77,12 @@ class Board(TargetProfile):
             ProfileError: there is no such sensor.
         """
         profile = None if sensor is None else Sensor.load(sensor)
-        network = Network.load(int8, sensor=BLIND if profile is None else profile)
+        conditioned_on = profile or Sensor.load(BLIND)
+        network = Network.load(int8, sensor=conditioned_on)
         folder = Path(out)
-        if (
-            profile is not None
-            and profile.name != BLIND
-            and (doubt := other_sensor(network.model, profile))
-        ):
-            logger.warning(doubt)
+        warning = other_sensor(network.model, conditioned_on)
+        if warning and conditioned_on.name != BLIND:
+            logger.warning(warning)
         # A missing library is refused before anything is written.
         if record:
             require_library()
@@ -107,10 +105,8 @@ class Board(TargetProfile):
         vectors_px = np.load(vectors / "noise" / PICTURE).shape[-1]
         network.core(self, vectors_px).save(vectors / "core.onnx")
         if record:
-            conditioned_on = Sensor.load(BLIND) if profile is None else profile
-            write_record(
-                check_network(network, self, None, tile), network, conditioned_on, folder / "record"
-            )
+            checked = check_network(network, self, None, tile)
+            write_record(checked, network, conditioned_on, folder / "record")
         words = {
             "network": markdown_text(network.name),
             "board": markdown_text(self.name),

@@ -88,8 +88,6 @@ def write_golden(
         "schema_version": SCHEMA_VERSION,
         "tool_version": __version__,
         "cases": digests,
-    }
-    index |= {
         "network": network.input._asdict(),
         "half_even": half_even,
         "layers": _layers(core, names),
@@ -157,11 +155,11 @@ def _images(
     side = fixed_px or tile or -(-GOLDEN_TILE_PX // alignment_px) * alignment_px
     if (tile or side) != side or side < 1 or side % alignment_px:
         rule = (
-            f"{fixed_px} px, to which the network is fixed"
+            f"{fixed_px} px, the network's own size"
             if fixed_px
             else f"a multiple of {alignment_px} px"
         )
-        raise OptionError(f"`tile` must be {rule}, got {tile} px. Choose another.")
+        raise OptionError(f"`tile` of this network must be {rule}, got {tile} px. Choose another.")
     shape = 1, channels, side, side
     steps = np.indices((side, side)).sum(0) // 8 % 2
     steps[3::11, 5::13] = 1
@@ -270,13 +268,10 @@ def _index(path: Path) -> tuple[dict[str, dict[str, str]], bool]:
             raise ValueError(f"the case {foreign[0]!r}")
         return digests, bool(document["half_even"])
     except (AttributeError, LookupError, OSError, TypeError, ValueError) as error:
-        reason = unreadable(path)
-        fault = (
-            f"cannot be read: {reason}"
-            if reason
-            else f"is damaged ({type(error).__name__}: {' '.join(str(error).split())[:80]})"
-        )
-        raise OptionError(f"The index of golden vectors {path} {fault}. {AGAIN}") from error
+        reason = unreadable(path) or f"it is damaged ({printable(str(error))[:80]})"
+        raise OptionError(
+            f"The index of golden vectors {path} cannot be read: {reason}. {AGAIN}"
+        ) from error
 
 
 def _planes(path: Path, core: IntCore) -> np.ndarray:

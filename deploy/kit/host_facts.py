@@ -48,9 +48,18 @@ def host_facts(
         )
     if facts is None:
         return None
-    units = {str(factor): _unit(facts, other, tile_px) for factor, other in others.items()}
-    check = None if sensor is None or step is None else self_check_facts(sensor)
-    return {**facts, **exposure_facts(sensor, units), "consistency": step, "self_check": check}
+    instrument = None if sensor is None or sensor.name == BLIND else sensor.nominal()
+    return {
+        **facts,
+        "exposures": {
+            str(factor): _unit(facts, other, tile_px) for factor, other in others.items()
+        },
+        # The headroom and the offset decide which factor a pixel gets, as shares of full scale.
+        "headroom": HEADROOM,
+        "offset": instrument.offset_dn / instrument.max_dn if instrument else 0.0,
+        "consistency": step,
+        "self_check": None if sensor is None or step is None else self_check_facts(sensor),
+    }
 
 
 def host_constants(network: Network, tile_px: int) -> Facts | None:
@@ -103,15 +112,6 @@ def _unit(facts: Facts, brighter: Network, tile_px: int) -> object:
     assert own is not None  # noqa: S101 - the same network for another sensor
     assert {**own, UNIT: None} == {**facts, UNIT: None}  # noqa: S101 - host.json has one value for all exposures
     return own[UNIT]
-
-
-def exposure_facts(sensor: Sensor | None, units: Mapping[str, object]) -> Facts:
-    """Return the unit of each factor above 1, and the constants that decide which factor a pixel
-    gets, as shares of full scale.
-    """
-    instrument = None if sensor is None or sensor.name == BLIND else sensor.nominal()
-    offset = instrument.offset_dn / instrument.max_dn if instrument else 0.0
-    return {"exposures": dict(units), "headroom": HEADROOM, "offset": offset}
 
 
 def self_check_facts(sensor: Sensor) -> Facts:

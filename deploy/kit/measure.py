@@ -76,30 +76,30 @@ def arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def measure(given: argparse.Namespace) -> dict[str, object]:
+def measure(options: argparse.Namespace) -> dict[str, object]:
     """Measure one run, and return it as an entry of the list."""
     session = open_session(
-        given.model, given.provider, dict(option.split("=", 1) for option in given.option)
+        options.model, options.provider, dict(option.split("=", 1) for option in options.option)
     )
-    feed = make_feed(session, given.batch, given.tile)
-    if not given.no_compare:
-        compare(given.model, session, feed)
+    feed = make_feed(session, options.batch, options.tile)
+    if not options.no_compare:
+        compare(options.model, session, feed)
     stamps, _ = run_threads(session, feed, 1 + WARM_UP_CALLS + LATENCY_CALLS, 1, [])
     latency_ms = 1e3 * statistics.median(np.diff(stamps)[WARM_UP_CALLS:])
     print(
-        f"latency of a call of {given.batch}: median {latency_ms:.2f} ms over {LATENCY_CALLS} "
+        f"latency of a call of {options.batch}: median {latency_ms:.2f} ms over {LATENCY_CALLS} "
         "calls, one thread"
     )
     stamps, power_w = run_threads(
-        session, feed, -(-given.frames // given.batch), given.threads, given.power_file
+        session, feed, -(-options.frames // options.batch), options.threads, options.power_file
     )
-    fps = throughput(stamps, given.batch)
+    fps = throughput(stamps, options.batch)
     print(
-        f"throughput: {fps:.3f} frame/s over {len(stamps) * given.batch} frames, "
-        f"{given.threads} threads"
+        f"throughput: {fps:.3f} frame/s over {len(stamps) * options.batch} frames, "
+        f"{options.threads} threads"
     )
-    entry: dict[str, object] = {"model": given.model.name, "configuration": given.configuration}
-    entry.update(tile_px=given.tile, fps=round(fps, 4), provider=given.provider)
+    entry: dict[str, object] = {"model": options.model.name, "configuration": options.configuration}
+    entry.update(tile_px=options.tile, fps=round(fps, 4), provider=options.provider)
     if power_w:
         entry["power_w"] = round(statistics.fmean(power_w), 3)
     return entry

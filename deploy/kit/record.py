@@ -18,7 +18,7 @@ from beers_deploy.model.io.tensors import read_conditioned
 from beers_deploy.model.shipped import INT8, SHIPPED, shipped_names, shipped_weights
 from beers_deploy.network import Network
 from beers_deploy.network_files import int8_for_sensor
-from beers_deploy.profiles.errors import ModelError, one_line, optional, printable
+from beers_deploy.profiles.errors import one_line, optional, printable
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.encodings.description import KEY
@@ -86,11 +86,9 @@ def record_of(
     """
     about = metadata(network.model)
     weights = _verified_weights(network, sensor, floating)
-    in_range = (
-        {key: list(ends) for key, ends in RANGES.items()}
-        if weights and _has_family(network)
-        else None
-    )
+    in_range = None
+    if weights and conditioned_core(network.model) is not None:
+        in_range = {key: list(ends) for key, ends in RANGES.items()}
     return {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
@@ -107,14 +105,6 @@ def record_of(
     }
 
 
-def _has_family(network: Network) -> bool:
-    """Return True if the file can be conditioned on other sensors. A damaged file cannot."""
-    try:
-        return conditioned_core(network.model) is not None
-    except ModelError:
-        return False
-
-
 def code_sha256() -> str:
     """Return the SHA-256 of all sources of this package: their names and bytes, in order."""
     root = Path(__file__).parents[1]
@@ -129,13 +119,11 @@ def _verified_weights(network: Network, sensor: Sensor, floating: Network | None
     """Return the shipped weights that an INT8 file claims, if its float network or its integers are
     derived from them.
     """
-    claimed = metadata(network.model).get(WEIGHTS)
-    name = next(
-        (name for name in shipped_names() if sha256(shipped_weights(name)) == claimed), None
-    )
-    if name is None:
+    paths = {sha256(path): path for path in map(shipped_weights, shipped_names())}
+    path = paths.get(metadata(network.model).get(WEIGHTS, ""))
+    if path is None:
         return None
-    path = shipped_weights(name)
+    name = path.stem
     if floating is not None and floating.model.graph == float_for(path, name, sensor).graph:
         return path
     shipped = int8_for_sensor(load_onnx(SHIPPED / f"{name}{INT8}.onnx"), sensor)

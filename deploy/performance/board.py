@@ -28,6 +28,7 @@ from beers_deploy.performance.tables import (
     frame_row,
     host_words,
     layer_rows,
+    named,
     predicted_rows,
     processor_row,
     published_rows,
@@ -96,7 +97,7 @@ class Bench(Table):
 
     @property
     def layers(self) -> list[Row]:
-        """Where the time goes, layer by layer, of one configuration; empty of several."""
+        """Return the rows of the layers; they exist if one configuration was predicted."""
         return [row for row in self.rows if row.table == LAYERS]
 
 
@@ -193,9 +194,9 @@ def _counted_alike(network: Network, asked: Question, swath: Swath) -> list[Row]
 
     Whole tiles with a halo are more work than the paper counts: their time is no match for its.
     """
-    boards = [dpu for dpu in asked.boards if dpu.target.name == PAPER_TARGET]
-    default = boards[0].target.default_configuration
-    dpu = next((board for board in boards if board.name == default), boards[0])
+    boards = {dpu.name: dpu for dpu in asked.boards if dpu.target.name == PAPER_TARGET}
+    first = next(iter(boards.values()))
+    dpu = boards.get(str(first.target.default_configuration), first)
     prediction = predict_network(network, dpu, swath.tile_px, asked.task, swath.step_px)
     return predicted_rows(network.name, prediction, swath)[:1]
 
@@ -223,7 +224,7 @@ POOR = 0.15
 
 
 def poor_words(boards: Sequence[Dpu]) -> list[str]:
-    """Return a sentence for each board of which the cost model knows little."""
+    """Return a sentence for each board whose cost model rests on little data."""
     errors = {dpu.target.name: dpu.value("cost", "error_left_out") for dpu in boards}
     return [
         f"Of {name} little is known: networks left out of the fit are off by {error:.0%}"
@@ -243,22 +244,17 @@ def fitted_words(rows: Sequence[Row]) -> list[str]:
 
 
 def exposure_words(counts: Mapping[int, int]) -> list[str]:
-    """Say which share of an image's tiles asks for each exposure; nothing without counts."""
+    """Return a sentence with the share of the tiles for each exposure, if there are several."""
     if len(counts) < 2:
         return []
     total = sum(counts.values())
     shares = ", ".join(f"x{factor} {count / total:.0%}" for factor, count in counts.items())
-    return [
-        (
-            f"runs of the network by exposure (measured on the image's pixels): {shares}; one tile "
-            "may need several"
-        )
-    ]
+    how = "runs of the network by exposure (measured on the image's pixels)"
+    return [f"{how}: {shares}; one tile may need several"]
 
 
 def _layers(network: Network, prediction: Prediction) -> tuple[str, list[Row]]:
-    dpu = prediction.dpu
-    title = f"{network.input.name}, one batch on {dpu.target.name} {dpu.name}; {TRAFFIC}"
+    title = f"{network.input.name}, one batch on {named(prediction.dpu)}; {TRAFFIC}"
     return title, layer_rows(prediction)
 
 

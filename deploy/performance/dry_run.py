@@ -50,7 +50,7 @@ def preview_row(
     network = next(iter(pipeline.networks.values()))
     with open_raster(image, reading.force) as source:
         raster = source.raster
-        scale = known_scale(image.name, raster, reading)
+        scale = header_scale(image.name, raster, reading)
         check = SensorCheck()
         # Where full scale is open, no pixel counts as saturated.
         saturation = scale.value if isinstance(scale, FullScale) else math.inf
@@ -83,8 +83,8 @@ def preview_row(
     return Row("restore", image.name, figures, text)
 
 
-def known_scale(name: str, raster: Raster, reading: Reading) -> FullScale | str:
-    """Full scale as far as no pixel is read; else why it is open."""
+def header_scale(name: str, raster: Raster, reading: Reading) -> FullScale | str:
+    """Return the full scale if it does not depend on the pixels, else the reason why it is open."""
     if raster.dtype.kind == "f" and reading.full_scale is None:
         return (
             "the pixels decide when they are read: digital numbers if one is above 2, else "
@@ -116,7 +116,8 @@ def place_words(raster: Raster) -> Mapping[str, str]:
 
 
 def time_here(network: Network, plan: Plan, engine: Engine) -> Figure:
-    """The time of all tiles, from those timed here; reading and writing are done beside it.
+    """Predict the time of all tiles on this machine from the tiles that are timed here. Reading and
+    writing run in parallel.
 
     The interval is of the quickest and the slowest of the runs.
     """
@@ -137,8 +138,8 @@ def time_here(network: Network, plan: Plan, engine: Engine) -> Figure:
 
 
 def time_on_board(network: Network, plan: Plan, target: TargetProfile) -> Figure:
-    """The time of all tiles on a board's DPU, by the cost model, in whole batches and with one
-    exposure each.
+    """Predict the time of all tiles on a board's DPU by the cost model, in whole batches and with
+    one exposure per tile.
 
     The host takes the consistency step where the network gives a pixel for each pixel.
     """

@@ -19,7 +19,7 @@ from beers_deploy.model.consistency import Consistency
 from beers_deploy.model.processor import require_cores
 from beers_deploy.network import Network, NetworkLike, other_precision
 from beers_deploy.performance.timing import cpu_load, interleaved, resident_bytes
-from beers_deploy.profiles.figures import Figure, Row, measured, unavailable
+from beers_deploy.profiles.figures import Figure, Row, measured
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.quant.onnx_file import is_quantized
@@ -74,22 +74,21 @@ def _row(run: Timed, tile_px: int, conditions: Mapping[str, Figure]) -> Row:
 
 
 def _ratio_row(runs: Sequence[Timed]) -> Row:
-    # False sorts before True: the INT8 network comes first.
-    int8, float32 = sorted(runs, key=lambda run: not is_quantized(run.model))
+    # False sorts before True: the INT8 network comes last.
+    float32, int8 = sorted(runs, key=lambda run: is_quantized(run.model))
     ratio = statistics.median(float32.times_s) / statistics.median(int8.times_s)
     source = f"medians of {len(int8.times_s)} runs each, interleaved"
     return Row("host", "float32 time / INT8 time, here", {"ratio": measured(ratio, "x", source)})
 
 
 def _mean_power(run: Timed) -> Figure:
-    """Mean over the network's own runs, or why there is none."""
-    no_power = next((power for power in run.powers if power.value is None), None)
-    if no_power is not None:
-        return unavailable("W", no_power.reason)
+    """Return the mean power over the network's own runs, or the figure that is unavailable."""
     # Runs differ in length: the mean power is energy over time, not the mean of the powers.
-    energy_j = sum(
-        (power.value or 0.0) * time_s for power, time_s in zip(run.powers, run.times_s, strict=True)
-    )
+    energy_j = 0.0
+    for power, time_s in zip(run.powers, run.times_s, strict=True):
+        if power.value is None:
+            return power
+        energy_j += power.value * time_s
     return measured(energy_j / sum(run.times_s), "W", run.powers[0].source)
 
 
@@ -100,8 +99,8 @@ def host_rows(
     threads: int = 0,
     sensor: Sensor | None = None,
 ) -> list[Row]:
-    """A network's time for one tile through onnxruntime, float32 and INT8 interleaved, and how much
-    faster INT8 is.
+    """Time a network for one tile through onnxruntime, float32 and INT8 interleaved, and return how
+    much faster INT8 is.
 
     With a `sensor` the time of the consistency step is a row too.
 
@@ -147,5 +146,5 @@ def step_row(sensor: Sensor, tile_px: int, min_time_s: float, min_runs: int) -> 
 
 
 def conditions_of(threads: int) -> dict[str, Figure]:
-    """Under what conditions something was measured since the last call of `cpu_load`."""
+    """Return the conditions of a measurement since the last call of `cpu_load`."""
     return {"threads": measured(threads, "thread", "of the runtime"), "CPU load": cpu_load()}

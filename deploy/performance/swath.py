@@ -3,7 +3,9 @@ predicted of it.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from operator import mul
 
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.placement import place
@@ -47,13 +49,13 @@ class Swath:
 
     @property
     def pixels(self) -> int:
-        """Pixels of the image."""
+        """Return the number of pixels of the image."""
         return self.width_px * self.height_px
 
     @property
     def frames(self) -> float:
-        """Tiles as the paper counts: pixels of the image over pixels of a tile, a fraction, without
-        halo.
+        """Return the number of tiles as the paper counts them: the pixels of the image over those
+        of a tile, a fraction, without halo.
 
         13600 x 9016 at 640 is 299.4; at the published 7.2 frames a second that is the published 42
         s.
@@ -62,8 +64,8 @@ class Swath:
 
     @property
     def tiles(self) -> int:
-        """Whole tiles of the grid, the last row and column moved inward: 384 of the paper's swath,
-        halo 35.
+        """Return the number of whole tiles of the grid, whose last row and column are moved inward:
+        384 for the paper's swath with halo 35.
         """
         rows, columns = (
             plan_side(side, self.tile_px, self.halo_px) for side in (self.height_px, self.width_px)
@@ -72,8 +74,8 @@ class Swath:
 
     @property
     def step_px(self) -> float:
-        """Pixels of the image for which the host takes the consistency step, for each run of the
-        network.
+        """Return the number of pixels for which the host computes the consistency step, per run of
+        the network.
         """
         return self.pixels / (self.tiles * self.runs) if self.consistency else 0.0
 
@@ -100,33 +102,34 @@ def swath_figures(
     """Return the figures of a swath that takes `frames` tiles in `batches` batches."""
     power = dpu_power(prediction.dpu)
     latency = swath_latency(prediction, batches)
-    step = {"consistency step": step_time(prediction, swath)} if swath.consistency else {}
-    runs = {"your runs": run_factor(prediction)} if prediction.dpu.runs else {}
-    return {
+    figures = {
         "tiles": exact(frames, "tile", ARITHMETIC),
         "network runs": exact(
             swath.runs, "run/tile", "exposures that the image's tiles ask for; 1 without an image"
         ),
         "work factor": exact(frames * swath.tile_px**2 / swath.pixels, "px/px", ARITHMETIC),
         "latency": latency,
-        "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
+        "throughput": throughput(prediction),
         "power": power,
         "energy": energy(latency, power),
         "efficiency": efficiency(swath.pixels, latency, power),
-        **step,
-        **runs,
     }
+    if swath.consistency:
+        figures["consistency step"] = step_time(prediction, swath)
+    # How many times as fast as the shipped model states the owner's runs make the prediction.
+    if prediction.dpu.runs:
+        figures["your runs"] = exact(prediction.speed, "x", "your runs, weighed by kinship")
+    return figures
 
 
-def run_factor(prediction: Prediction) -> Figure:
-    """How many times as fast as the shipped model says the owner's runs make the prediction."""
-    speed = prediction.speed
-    return predicted(speed, "x", (speed, speed), "your runs, weighed by kinship")
+def throughput(prediction: Prediction) -> Figure:
+    """Return the frames per second of the DPU and its host."""
+    return predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE)
 
 
 def step_time(prediction: Prediction, swath: Swath) -> Figure:
-    """Time of the consistency step for the swath on the host's cores, in s; it runs while the DPU
-    works.
+    """Return the time of the consistency step for the swath on the host's cores, in s. It runs
+    while the DPU works.
     """
     runs = swath.tiles * swath.runs
     low_s, high_s = (end_s * runs for end_s in prediction.step_s)
@@ -138,26 +141,25 @@ def step_time(prediction: Prediction, swath: Swath) -> Figure:
 
 
 def host_time(prediction: Prediction, unit: str) -> Figure:
-    """What the host's cores together take for an image, in ms."""
+    """Return the time of all cores of the host for an image, in ms."""
     low_s, high_s = prediction.host_interval_s
     return predicted(1e3 * prediction.host_s, unit, (1e3 * low_s, 1e3 * high_s), COST_SOURCE)
 
 
 def one_thread_latency(prediction: Prediction) -> Figure:
-    """From image to result where one thread runs one core's batch and does the host's work itself,
-    in ms.
+    """Return the time from image to result in ms if one thread runs one core's batch and then the
+    host's work.
     """
     low_s, high_s = prediction.latency_interval_s
     handlers = prediction.dpu.handlers
     images = f"a batch of {handlers}" if handlers > 1 else "one image"
-    source = (
-        f"{COST_SOURCE}, its fit to rates with one thread: {images} through one core, then the host"
-    )
+    how = f"its fit to rates with one thread: {images} through one core, then the host"
+    source = f"{COST_SOURCE}, {how}"
     return predicted(1e3 * prediction.latency_s, "ms/batch", (1e3 * low_s, 1e3 * high_s), source)
 
 
 def swath_latency(prediction: Prediction, batches: float) -> Figure:
-    """Time of so many batches, in seconds."""
+    """Return the time of a number of batches, in seconds."""
     images = batches * prediction.batch
     # The lower end of the rate is the upper end of the time.
     slow_s, fast_s = (images / fps for fps in prediction.fps_interval)
@@ -165,8 +167,8 @@ def swath_latency(prediction: Prediction, batches: float) -> Figure:
 
 
 def fitted_range(prediction: Prediction) -> str:
-    """Whether the fitted networks speak for this one, and how often the board's intervals held, if
-    too rarely.
+    """Return whether the network lies within the range of the fitted networks, and how often the
+    board's intervals held if that is too rarely.
     """
     words = f"outside: {'; '.join(prediction.outside)}" if prediction.outside else "inside"
     share = prediction.dpu.value("cost", "families_held")
@@ -176,37 +178,39 @@ def fitted_range(prediction: Prediction) -> str:
 
 
 def energy(latency: Figure, power: Figure) -> Figure:
-    """Energy of the swath, in J: time and power, and their ends."""
-    if power.value is None or latency.value is None:
-        return unavailable("J", power.reason or latency.reason)
-    fast_s, slow_s = interval_ends(latency)
-    low_w, high_w = interval_ends(power)
-    ends = fast_s * low_w, slow_s * high_w
-    return predicted(latency.value * power.value, "J", ends, f"{latency.source}; {power.source}")
+    """Return the energy of the swath in J."""
+    return _of_time_and_power(latency, power, "J", mul)
 
 
 def efficiency(pixels: int, latency: Figure, power: Figure) -> Figure:
-    """Pixels a second and watt; its interval pairs the slowest run with the highest power and the
-    reverse.
+    """Return the pixels per second and watt."""
+    return _of_time_and_power(
+        latency, power, "px/s/W", lambda time_s, power_w: pixels / time_s / power_w
+    )
+
+
+def _of_time_and_power(
+    latency: Figure, power: Figure, unit: str, compute: Callable[[float, float], float]
+) -> Figure:
+    """Compute a figure from time and power. Its interval pairs the fastest run with the lowest
+    power, and the slowest run with the highest power.
     """
-    unit = "px/s/W"
     if power.value is None or latency.value is None:
         return unavailable(unit, power.reason or latency.reason)
-    value = pixels / latency.value / power.value
-    fast_s, slow_s = interval_ends(latency)
-    low_w, high_w = interval_ends(power)
-    # The slowest run at the highest power is the least efficient, and the reverse.
-    interval = (pixels / slow_s / high_w, pixels / fast_s / low_w)
-    return predicted(value, unit, interval, f"{latency.source}; {power.source}")
+    low, high = sorted(map(compute, interval_ends(latency), interval_ends(power)))
+    source = f"{latency.source}; {power.source}"
+    return predicted(compute(latency.value, power.value), unit, (low, high), source)
 
 
 def interval_ends(figure: Figure) -> Interval:
-    """The interval, or the value twice where it has none."""
+    """Return the interval of a figure, or its value twice if it has none."""
     return figure.interval or (figure.value or 0.0, figure.value or 0.0)
 
 
 def chain_rate(swath: Swath, latency: Figure) -> Figure:
-    """Tiles a second, as the paper counts them, of a predicted latency of the swath."""
+    """Return the tiles per second, counted as the paper counts them, given the predicted latency of
+    the swath.
+    """
     low, high = (swath.frames / end_s for end_s in reversed(interval_ends(latency)))
     return predicted(
         swath.frames / (latency.value or math.inf), "frame/s", (low, high), latency.source
@@ -216,12 +220,12 @@ def chain_rate(swath: Swath, latency: Figure) -> Figure:
 def exact(
     value: float, unit: str, source: str = "arithmetic of the graph's shapes, one image"
 ) -> Figure:
-    """A number that follows from shapes alone."""
+    """Return a figure that follows from shapes alone."""
     return predicted(value, unit, (value, value), source)
 
 
 def scaled(value: float, unit: str, prediction: Prediction) -> Figure:
-    """A part of the prediction, with the relative error of the whole."""
+    """Return a part of the prediction as a figure with the relative error of the whole."""
     return predicted(
         value, unit, (value / prediction.spread, value * prediction.spread), COST_SOURCE
     )

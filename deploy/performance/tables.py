@@ -19,7 +19,6 @@ from beers_deploy.dpu.cost.latency import (
 from beers_deploy.dpu.cost.model import Task, between
 from beers_deploy.network import NetworkLike
 from beers_deploy.performance.swath import (
-    COST_SOURCE,
     Swath,
     chain_rate,
     efficiency,
@@ -33,6 +32,7 @@ from beers_deploy.performance.swath import (
     scaled,
     swath_figures,
     swath_latency,
+    throughput,
 )
 from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.figures import Figure, Row, number, predicted, published, unavailable
@@ -48,7 +48,7 @@ PAPER_TARGET = "vck190"
 
 
 def predicted_rows(name: str, prediction: Prediction, swath: Swath) -> list[Row]:
-    """A network on the DPU, twice: as the paper counts, and with whole tiles."""
+    """Return two rows of a network on the DPU: counted as the paper counts, and in whole tiles."""
     batches = math.ceil(swath.tiles * swath.runs / prediction.batch)
     counts = {
         "as the paper counts": (swath.frames, swath.frames * swath.runs / prediction.batch),
@@ -73,8 +73,8 @@ figure's name and unit.
 
 
 def quoted_rows(network: str, target: TargetProfile) -> list[Row]:
-    """A network on a board without a cost model, unavailable; and what the board's maker prints of
-    other networks.
+    """Return a network on a board without a cost model as unavailable, and the published figures of
+    other networks on that board.
     """
     reason = f"too few rates of {target.name} are published to fit a cost model"
     figures = {key: unavailable(unit, reason) for key, unit in QUOTED.items()}
@@ -88,25 +88,25 @@ def quoted_rows(network: str, target: TargetProfile) -> list[Row]:
 
 
 def published_rows() -> list[Row]:
-    """The paper's two runs on the VCK190, as printed; its DPU configuration is not named."""
+    """Return the paper's two runs on the VCK190 as printed. It does not name the configuration of
+    the DPU.
+    """
     runs = {
         "paper, 13600 x 9016: traditional on the VCK190's CPU": (1724, 0.2, 22.5, 3161),
         "paper, 13600 x 9016: ConvBEERS, INT8 on the DPU": (42, 7.2, 29.6, 98965),
     }
     units = {"latency": "s", "throughput": "frame/s", "power": "W", "efficiency": "px/s/W"}
-    return [
-        Row(
-            TABLE,
-            name,
-            {k: published(v, units[k], PAPER) for k, v in zip(units, values, strict=True)},
-        )
-        for name, values in runs.items()
-    ]
+    rows = []
+    for name, values in runs.items():
+        printed = zip(units.items(), values, strict=True)
+        figures = {key: published(value, unit, PAPER) for (key, unit), value in printed}
+        rows.append(Row(TABLE, name, figures))
+    return rows
 
 
 def processor_row(swath: Swath, board: TargetProfile) -> Row:
-    """The traditional pipeline on the board's own processor, from the time of 10^6 pixels that its
-    file states.
+    """Return the traditional pipeline on the board's own processor, scaled from the time of 10^6
+    pixels in the board's file.
     """
     cpu = board.tables.get("cpu", {})
     mpx = swath.pixels / 1e6
@@ -134,7 +134,7 @@ def processor_row(swath: Swath, board: TargetProfile) -> Row:
 
 
 def layer_rows(prediction: Prediction) -> list[Row]:
-    """One row a layer; their times add up to that of a batch, the last row.
+    """Return a row for each layer, and a last one with the sum of their times.
 
     The columns are those of AMD's vaitrace, with what bounds the layer; bytes are those of one
     image.
@@ -155,25 +155,17 @@ def _layer_row(layer: LayerCost, prediction: Prediction) -> Row:
         "work": exact(work.operations / 1e9, "GOP"),
         "time": scaled(1e3 * layer.time_s, "ms/batch", prediction),
         "rate": scaled(batch * work.operations / seconds / 1e9, "GOP/s", prediction),
-        "LdFM": exact(
-            work.load_map_bytes / 1e6,
-            "MB",
-            "feature maps that an image loads, by the graph's shapes",
-        ),
-        "LdWB": exact(
-            work.weight_bytes / 1e6,
-            "MB",
-            "weights and biases that a batch loads, by the graph's shapes",
-        ),
-        "StFM": exact(
-            work.store_map_bytes / 1e6,
-            "MB",
-            "feature maps that an image stores, by the graph's shapes",
-        ),
+        "LdFM": _moved(work.load_map_bytes, "feature maps that an image loads"),
+        "LdWB": _moved(work.weight_bytes, "weights and biases that a batch loads"),
+        "StFM": _moved(work.store_map_bytes, "feature maps that an image stores"),
         "bandwidth": scaled(moved_bytes / seconds / 1e9, "GB/s", prediction),
         "array use": exact(100 * work.array_use, "%"),
     }
     return Row(LAYERS, work.name, figures, {"bound": layer.bound})
+
+
+def _moved(size_bytes: int, what: str) -> Figure:
+    return exact(size_bytes / 1e6, "MB", f"{what}, by the graph's shapes")
 
 
 MOST_TILE_PX = 8192
@@ -187,7 +179,7 @@ def sweep_rows(
     tiles_px: Sequence[int],
     task: Task | None = None,
 ) -> list[Row]:
-    """A row a configuration and tile size, for whole tiles with the swath's halo."""
+    """Return a row for each configuration and tile size, in whole tiles with the swath's halo."""
     rows = []
     for dpu, tile_px in product(boards, tiles_px):
         tiled = replace(swath, tile_px=tile_px)
@@ -197,7 +189,7 @@ def sweep_rows(
 
 
 def swath_row(prediction: Prediction, swath: Swath) -> Row:
-    """A swath in whole tiles on one configuration."""
+    """Return the swath in whole tiles on one configuration."""
     batches = math.ceil(swath.tiles * swath.runs / prediction.batch)
     on_chip = [not layer.work.map_bytes for layer in prediction.layers]
     figures = swath_figures(prediction, swath, swath.tiles, batches) | {
@@ -209,16 +201,17 @@ def swath_row(prediction: Prediction, swath: Swath) -> Row:
         # A Counter is typed to hold integers: the times are added up in picoseconds.
         bound[layer.bound] += round(1e12 * layer.time_s)
     words = {"bound": bound.most_common(1)[0][0], "fitted range": fitted_range(prediction)}
-    return Row("sweep", f"{_named(prediction)}, tiles of {swath.tile_px}", figures, words)
+    return Row("sweep", f"{named(prediction.dpu)}, tiles of {swath.tile_px}", figures, words)
 
 
-def _named(prediction: Prediction) -> str:
-    return f"{prediction.dpu.target.name} {prediction.dpu.name}"
+def named(dpu: Dpu) -> str:
+    """Return the names of the board and of the configuration."""
+    return f"{dpu.target.name} {dpu.name}"
 
 
 def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) -> str:
-    """Which DPU, the one of the lowest peak, meets a time for the swath: surely, probably, or only
-    at best.
+    """Name the DPU with the lowest peak that computes the swath in time: by the whole interval, by
+    the prediction, or at best.
 
     One that does so surely is not named again for what is less. Peaks stand for prices, which no
     file states.
@@ -252,27 +245,29 @@ def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) ->
 
 
 def frame_row(prediction: Prediction) -> Row:
-    """A network that is run on whole images, on one configuration: frames instead of a swath."""
+    """Return a network that runs on whole images, on one configuration: per frame instead of per
+    swath.
+    """
     power = dpu_power(prediction.dpu)
     frame_s = swath_latency(prediction, 1 / prediction.batch)
     figures = {
         "work": exact(prediction.operations / 1e9, "GOP"),
         "batch": exact(prediction.batch, "frame", "images in flight"),
-        "throughput": predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE),
+        "throughput": throughput(prediction),
         "one-thread latency": one_thread_latency(prediction),
         "host next to the DPU": host_time(prediction, "ms/frame"),
         "power": power,
         "energy": energy(frame_s, power),
     }
     words = {"host's task": prediction.task, "fitted range": fitted_range(prediction)}
-    return Row("frames", f"{_named(prediction)}, whole images", figures, words)
+    return Row("frames", f"{named(prediction.dpu)}, whole images", figures, words)
 
 
 def host_words(prediction: Prediction) -> list[str]:
-    """What was assumed of the file, and what the processor runs because the DPU refuses it; a
-    sentence each.
+    """Return sentences about what was assumed of the file, and what the processor runs because the
+    DPU refuses it.
     """
-    sentences = [prediction.note] if prediction.note else []
+    sentences = list(filter(None, [prediction.note]))
     if prediction.refused:
         low_ms, high_ms = (1e3 * end_s for end_s in prediction.refused_s)
         sentences.append(

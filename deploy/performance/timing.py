@@ -18,8 +18,8 @@ Result = TypeVar("Result")
 
 
 def timed(work: Callable[[], Result], powercap: Path = POWERCAP) -> tuple[Result, float, Figure]:
-    """Do some work; return its result, its wall time in seconds, and the processor packages' mean
-    power.
+    """Run some work, and return its result, its wall time in seconds, and the mean power of the
+    processor packages.
     """
     before = _read(powercap)
     start = time.perf_counter()
@@ -29,17 +29,17 @@ def timed(work: Callable[[], Result], powercap: Path = POWERCAP) -> tuple[Result
 
 
 def _power(before: dict[Path, int] | str, after: dict[Path, int] | str, elapsed_s: float) -> Figure:
-    if isinstance(before, str) or isinstance(after, str):
-        return unavailable("W", before if isinstance(before, str) else str(after))
-    if elapsed_s <= 0:
-        return unavailable("W", "the work took no time that the clock can tell")
+    if isinstance(before, str):
+        return unavailable("W", before)
+    if isinstance(after, str):
+        return unavailable("W", after)
     energy_uj = sum(_advance(domain, before[domain], after[domain]) for domain in before)
     return measured(energy_uj / 1e6 / elapsed_s, "W", "RAPL package counters over the same window")
 
 
 def _advance(domain: Path, before: int, after: int) -> int:
-    """Counts between two readings of a counter that starts again at its range; one turn at most
-    (minutes).
+    """Return the difference of two readings of a counter, which may have started again once at its
+    range.
     """
     if after >= before:
         return after - before
@@ -48,15 +48,12 @@ def _advance(domain: Path, before: int, after: int) -> int:
 
 
 def _read(powercap: Path) -> dict[Path, int] | str:
-    """Counters of the packages in microjoules, or why there are none."""
+    """Read the counters of the packages in microjoules, or return the reason why there are none."""
     try:
-        names = {
-            domain: (domain / "name").read_text(encoding="utf-8")
-            for domain in powercap.glob("*rapl*:*")
-        }
-        packages = [domain for domain, name in names.items() if name.startswith("package")]
         counters = {
-            domain: int((domain / "energy_uj").read_text(encoding="utf-8")) for domain in packages
+            domain: int((domain / "energy_uj").read_text(encoding="utf-8"))
+            for domain in powercap.glob("*rapl*:*")
+            if (domain / "name").read_text(encoding="utf-8").startswith("package")
         }
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else "no number in it"
@@ -67,7 +64,7 @@ def _read(powercap: Path) -> dict[Path, int] | str:
 def interleaved(
     calls: Sequence[Callable[[], object]], rounds: int, least_s: float = 0.0
 ) -> list[list[tuple[float, Figure]]]:
-    """Time and power of every call, each run once a round, and so compared fairly.
+    """Time every call once per round, and return time and power of each run.
 
     Args:
         calls: what is timed, already warmed up.
@@ -89,14 +86,14 @@ def interleaved(
 
 
 def cpu_load() -> Figure:
-    """Load of all CPUs since the last call in this process, other processes included."""
+    """Measure the load of all CPUs since the last call in this process, others included."""
     return measured(
         psutil.cpu_percent(), "%", "all CPUs over the same window, other processes included"
     )
 
 
 def own_cpu_s() -> float:
-    """CPU time that this process has taken, in seconds."""
+    """Return the CPU time of this process, in seconds."""
     times = psutil.Process().cpu_times()
     return float(times.user + times.system)
 
@@ -114,5 +111,5 @@ def load_of_others(load: Figure, own_s: float, elapsed_s: float) -> float:
 
 
 def resident_bytes() -> int:
-    """Resident memory of this process."""
+    """Return the resident memory of this process."""
     return int(psutil.Process().memory_info().rss)

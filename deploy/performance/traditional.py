@@ -44,7 +44,9 @@ class ChainTime:
     """Share of all CPUs that other processes took meanwhile."""
 
     def row(self, swath: Swath) -> Row:
-        """The swath by proportion; the interval is that of the fastest and the slowest crop."""
+        """Return the swath in proportion to the crops. The interval is that of the fastest and the
+        slowest crop.
+        """
         median = statistics.median(self.s_per_mpx)
         mpx = swath.pixels / 1e6
         here = f"{len(self.s_per_mpx)} crops of {self.crop} on this processor, the default quality"
@@ -62,7 +64,7 @@ class ChainTime:
 
 
 def measure_chain(dn: np.ndarray, degraded: Sensor, reference: Sensor) -> ChainTime:
-    """Time the pipeline on crops of (H, W) digital numbers, after one small run for warm-up."""
+    """Time the pipeline on crops of digital numbers (H, W), after one small run for warm-up."""
     chain = Chain(degraded.nominal(), reference.nominal())
     crops = [torch.from_numpy(np.ascontiguousarray(crop, dtype=np.float32)) for crop in _crops(dn)]
     restore_traditional(crops[0][:32, :32], chain)
@@ -83,7 +85,9 @@ def measure_chain(dn: np.ndarray, degraded: Sensor, reference: Sensor) -> ChainT
 def drawn_acquisition(
     swath: Swath, degraded: Sensor, reference: Sensor, seed: int = 0
 ) -> np.ndarray:
-    """Digital numbers of a drawn scene, as large as the swath but no larger than the crops need."""
+    """Simulate the digital numbers of a drawn scene, as large as the swath but not larger than the
+    crops need.
+    """
     ratio = int(degraded.oversampling.low)
     sides = min(swath.height_px, CROP_PX), min(swath.width_px, CROPS * CROP_PX)
     # The simulator cuts a margin off each side, which keeps the wrap of its Fourier transform out.
@@ -94,7 +98,7 @@ def drawn_acquisition(
 
 
 def _crops(dn: np.ndarray) -> Iterator[np.ndarray]:
-    """Square crops along the image's diagonal, or the image where it is no larger."""
+    """Yield square crops along the image's diagonal, or the image if it is not larger."""
     height, width = (min(CROP_PX, side) for side in dn.shape)
     for k in range(CROPS):
         top, left = (

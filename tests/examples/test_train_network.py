@@ -34,11 +34,3 @@ def test_both_files_hold_the_trained_network(
     network = build("segment", torch.Generator().manual_seed(1))
     network.load_state_dict({name: torch.from_numpy(value) for name, value in tensors.items()})
     assert to_onnx("segment", network) == onnx.load(out)
-
-
-def test_another_suffix_is_refused_before_any_work(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["segment", "--steps", "3", "--out", str(tmp_path / "segment.pt")]) == 2
-    assert "ends in .onnx" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())

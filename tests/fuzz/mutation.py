@@ -5,7 +5,6 @@ generator.
 import json
 import struct
 import xml.etree.ElementTree as ET
-import zlib
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any, TypeVar
@@ -192,26 +191,6 @@ def of_safetensors(content: bytes, rng: Rng) -> bytes:
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             pass
     return len(header).to_bytes(8, "little") + header + content[8 + size :]
-
-
-def of_png(content: bytes, rng: Rng) -> bytes:
-    """Change a chunk's kind or bytes, and its checksum with them."""
-    chunks = []
-    # A PNG file begins with a signature of 8 bytes. A chunk adds 12 bytes to its data: length, kind
-    # and checksum.
-    at = 8
-    while at + 12 <= len(content):
-        size = int.from_bytes(content[at : at + 4])
-        chunks.append(content[at + 4 : at + 8 + size])
-        at += 12 + size
-    if not chunks:
-        return content
-    place = int(rng.integers(len(chunks)))
-    chunks[place] = of_bytes(chunks[place], chunks, rng)
-    if rng.random() < 0.1:
-        chunks.insert(place, pick(chunks, rng))
-    packed = (len(c[4:]).to_bytes(4) + c + zlib.crc32(c).to_bytes(4) for c in chunks if len(c) >= 4)
-    return content[:8] + b"".join(packed)
 
 
 def of_tiff(content: bytes, rng: Rng) -> bytes:

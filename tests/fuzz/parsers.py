@@ -34,7 +34,7 @@ from beers_deploy.quant.limits import limits_of
 from beers_deploy.restoration.checkpoint import Checkpoint, FinishedRow, journal_text
 from beers_deploy.restoration.outcome import Tally
 from beers_deploy.results import Table
-from beers_deploy.verdict import PATCHES, read_baseline, read_document
+from beers_deploy.verdict import PATCHES, read_baseline
 from tests.deploy.dpu.graphs import integer_convbeers
 from tests.deploy.studies.detection.folders import coco, voc
 from tests.fuzz.detection import (
@@ -43,7 +43,7 @@ from tests.fuzz.detection import (
     label_seeds,
     read_beside,
 )
-from tests.fuzz.mutation import Mutate, of_json, of_onnx, of_png, of_safetensors, of_tiff, of_xml
+from tests.fuzz.mutation import Mutate, of_json, of_onnx, of_safetensors, of_tiff, of_xml
 from tests.fuzz.networks import (
     SIDE_PX,
     checkpoint_seeds,
@@ -164,11 +164,6 @@ def document_seeds(_: Path) -> list[bytes]:
     return [json.dumps(Table("gate", GATED, (), rows, (check,)).to_dict()).encode()]
 
 
-def read_results(path: Path) -> None:
-    """What `gate --baseline` reads."""
-    read_document(path)
-
-
 def journal_seeds(_: Path) -> list[bytes]:
     row = FinishedRow(4, 64, "0" * 64, Tally())
     return [journal_text(JOB, [row]).encode(), journal_text(JOB, []).encode()]
@@ -242,7 +237,7 @@ PARSERS: tuple[Parser, ...] = (
     Parser("ONNX, run", ".onnx", onnx_seeds, run_onnx, of_onnx, 0.3),
     Parser("TIFF, whole", ".tif", tiff_seeds, read_pixels, of_tiff),
     Parser("TIFF, by rows", ".tif", tiff_seeds, read_rows, of_tiff),
-    Parser("PNG", ".png", lambda _: [image_of({"format": "PNG"})], read_pixels, of_png),
+    Parser("PNG", ".png", lambda _: [image_of({"format": "PNG"})], read_pixels),
     Parser("JPEG", ".jpg", lambda _: [image_of({"format": "JPEG"})], read_pixels),
     *(of_gdal(kind, name) for kind, name in GDAL.items()),
     Parser(
@@ -256,7 +251,6 @@ PARSERS: tuple[Parser, ...] = (
     Parser("scene TOML", ".toml", lambda _: _files("scenes"), lambda p: SceneCall.load(str(p))),
     Parser("target TOML", ".toml", lambda _: _files("targets"), board_of, share=0.3),
     Parser("gate limits TOML", ".toml", lambda _: LIMITS, limits_of),
-    Parser("results JSON", ".json", document_seeds, read_results, of_json),
     Parser(
         "gate baseline JSON", ".json", document_seeds, lambda p: read_baseline(p, GATED), of_json
     ),

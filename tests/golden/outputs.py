@@ -82,23 +82,23 @@ class Outputs:
 
 def outputs(folder: Path) -> Outputs:
     """Run everything in an empty folder."""
-    made = Outputs()
+    current = Outputs()
     networks = _networks(folder)
     for name, files in networks.items():
-        made.add_network(name, files, folder)
+        current.add_network(name, files, folder)
     for name in NETWORKS:
-        made.add_integers(name, quantized(name, folder))
+        current.add_integers(name, quantized(name, folder))
     for name in shipped_names():
         file = folder / f"{name}-int8.onnx"
         _run("export", "--network", f"{name}-int8", "--out", file)
-        made.digests[name] = sha256(file)
+        current.digests[name] = sha256(file)
     bench = (f"bench, {SHIPPED}", folder, "bench", f"{SHIPPED}-int8", "--size", "3000x2000")
-    made.figures.update(_figures(*bench))
-    made.figures.update(_evaluated(folder))
+    current.figures.update(_figures(*bench))
+    current.figures.update(_evaluated(folder))
     for name in CREATION:
-        made.layouts[name] = restored(name, networks[SHIPPED][1], folder)
-    made.answers.update(_answers(folder))
-    return made
+        current.layouts[name] = restored(name, networks[SHIPPED][1], folder)
+    current.answers.update(_answers(folder))
+    return current
 
 
 def _evaluated(folder: Path) -> dict[str, Any]:
@@ -199,17 +199,17 @@ def _figures(key: str, folder: Path, *command: object) -> dict[str, Any]:
 def main() -> None:
     """Write the stored outputs again."""
     with tempfile.TemporaryDirectory() as folder:
-        made = outputs(Path(folder))
-    np.savez_compressed(STORED.with_suffix(".npz"), **made.arrays)  # type: ignore[arg-type]
+        current = outputs(Path(folder))
+    np.savez_compressed(STORED.with_suffix(".npz"), **current.arrays)  # type: ignore[arg-type]
     document = {
-        "figures": made.figures,
-        "digests": made.digests,
-        "layouts": made.layouts,
-        "wrong calls": made.answers,
+        "figures": current.figures,
+        "digests": current.digests,
+        "layouts": current.layouts,
+        "wrong calls": current.answers,
     }
     text = json.dumps(document, indent=0, ensure_ascii=False)
     STORED.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
-    sys.stdout.write(f"{len(made.arrays)} arrays, {len(made.figures)} figures\n")
+    sys.stdout.write(f"{len(current.arrays)} arrays, {len(current.figures)} figures\n")
 
 
 if __name__ == "__main__":

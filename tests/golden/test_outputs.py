@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Outputs:
+def current(tmp_path_factory: pytest.TempPathFactory) -> Outputs:
     return outputs(tmp_path_factory.mktemp("golden"))
 
 
@@ -40,15 +40,15 @@ def close(name: str, array: np.ndarray, expected: np.ndarray) -> bool:
     return bool(difference.sum() - spared <= 0.01 * np.abs(expected).sum())
 
 
-def test_images_and_integers_are_those_that_were_stored(made: Outputs) -> None:
+def test_images_and_integers_are_those_that_were_stored(current: Outputs) -> None:
     with np.load(STORED.with_suffix(".npz")) as stored_arrays:
         arrays = dict(stored_arrays)
     # The search for the example DnCNN ends at other scales on some processors, by the same code.
     with np.load(OTHER_SEARCH) as stored_arrays:
         others = dict(stored_arrays)
-    assert made.arrays.keys() == arrays.keys()
+    assert current.arrays.keys() == arrays.keys()
     for name, expected in arrays.items():
-        array = made.arrays[name]
+        array = current.arrays[name]
         assert (array.shape, array.dtype) == (expected.shape, expected.dtype), name
         # Shipped integers are the same everywhere.
         if name.startswith(f"{SHIPPED}, ") and "float32," not in name:
@@ -58,26 +58,27 @@ def test_images_and_integers_are_those_that_were_stored(made: Outputs) -> None:
             assert any(close(name, array, end) for end in ends), name
 
 
-def test_figures_are_those_that_were_stored(made: Outputs) -> None:
+def test_figures_are_those_that_were_stored(current: Outputs) -> None:
     figures = stored("figures")
-    assert sorted(made.figures) == sorted(figures)
+    assert sorted(current.figures) == sorted(figures)
     for name, value in figures.items():
+        actual = current.figures[name]
         rel = 0.05 if name.startswith("gate, ") else 1e-3
         if isinstance(value, float):
-            assert made.figures[name] == pytest.approx(value, rel=rel, abs=1e-6, nan_ok=True), name
+            assert actual == pytest.approx(value, rel=rel, abs=1e-6, nan_ok=True), name
         else:
-            assert made.figures[name] == value, name
+            assert actual == value, name
 
 
-def test_shipped_int8_files_have_the_stored_digests(made: Outputs) -> None:
-    assert made.digests == stored("digests")
+def test_shipped_int8_files_have_the_stored_digests(current: Outputs) -> None:
+    assert current.digests == stored("digests")
 
 
 @pytest.mark.parametrize("name", stored("layouts"))
-def test_a_layout_is_restored_or_refused_as_before(name: str, made: Outputs) -> None:
-    assert made.layouts[name] == stored("layouts")[name]
+def test_a_layout_is_restored_or_refused_as_before(name: str, current: Outputs) -> None:
+    assert current.layouts[name] == stored("layouts")[name]
 
 
 @pytest.mark.parametrize("words", stored("wrong calls"))
-def test_a_wrong_call_is_answered_as_before(words: str, made: Outputs) -> None:
-    assert made.answers[words] == stored("wrong calls")[words]
+def test_a_wrong_call_is_answered_as_before(words: str, current: Outputs) -> None:
+    assert current.answers[words] == stored("wrong calls")[words]

@@ -1,17 +1,12 @@
 """`restore` gives the pixels of the integer reference, for any tiles and threads."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-import tifffile
 
-from beers_deploy.model.shipped import SENSOR
 from beers_deploy.quant.encodings import read_core
 from beers_deploy.quant.integer.reference import merged_correction, run_core
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.verbs.restore import restore
-from tests.deploy.command_line import done
 from tests.shipped import shipped_pair
 
 MAX_DN = np.float32(4095)
@@ -46,14 +41,4 @@ def test_an_array_has_the_pixels_of_the_integer_reference(name: str) -> None:
         )
 
 
-PLAIN = ("--no-consistency", "--no-exposure")
 """The network alone, as the reference computes it."""
-
-
-def test_the_command_writes_the_same_pixels(tmp_path: Path) -> None:
-    dn = raw(70, 41)
-    tifffile.imwrite(tmp_path / "raw.tif", dn)
-    done(f"restore {tmp_path}/raw.tif {tmp_path}/restored.tif --tile 64 --sensor {SENSOR}", *PLAIN)
-    np.testing.assert_array_equal(
-        tifffile.imread(tmp_path / "restored.tif"), by_reference(dn, "convbeers-s")
-    )

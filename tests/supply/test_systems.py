@@ -4,14 +4,10 @@ needs one of them.
 
 import ast
 import re
-import tomllib
 from itertools import chain
 from pathlib import Path
 
 import pytest
-from packaging.requirements import Requirement
-from packaging.specifiers import SpecifierSet
-from packaging.version import Version
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("deploy", "model", "quant", "profiles")
@@ -30,37 +26,10 @@ OF_ONE_SYSTEM = {
     "winreg",
 }
 TORCH = re.compile(r"pip install[^\n]*?[ '\"]torch((?:[<>=!~]=?[\d.]+,?)+)")
-VERSIONS = [
-    Version(text)
-    for text in ("2.4.1", "2.5.0", "2.9.1", "2.13.0", "2.13.1", "2.14.0", "2.15.0", "3.0.0")
-]
-
-
-def asked_for(name: str) -> SpecifierSet:
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
-        "optional-dependencies"
-    ]
-    return next(
-        requirement.specifier
-        for requirement in map(Requirement, extras[name])
-        if requirement.name == name
-    )
 
 
 def pages() -> list[Path]:
     return [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob(".github/workflows/*.yml")]
-
-
-def test_torch_is_asked_for_by_a_range_with_both_ends() -> None:
-    specifiers = asked_for("torch")
-    assert {specifier.operator for specifier in specifiers} == {">=", "<"}
-    assert [str(version) for version in VERSIONS if version in specifiers] == [
-        "2.5.0",
-        "2.9.1",
-        "2.13.0",
-        "2.13.1",
-    ]
-    assert Version("2.13.0+cpu") in specifiers
 
 
 def test_every_page_installs_a_torch_that_the_project_keeps() -> None:

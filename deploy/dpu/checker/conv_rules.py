@@ -1,6 +1,7 @@
 """The DPU's rules for plain, depthwise and transposed convolutions, one function for each rule."""
 
 import math
+from operator import floordiv
 
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.finding import Finding, beyond_range, groups_of, outside, shown
@@ -11,21 +12,16 @@ from beers_deploy.dpu.graph import Operation
 
 def conv_kernel(op: Operation, dpu: Dpu) -> Finding | None:
     """Kernel height and width are {conv[kernel]} ({conv[kernel].source})."""
-    limit = dpu.limit("conv", "kernel")
     remedy = (
-        f"use a kernel of at most {limit.high:g}, or stack small ones: two 3 x 3 see as "
-        "far as one 5 x 5"
+        "use a kernel of at most {most}, or stack small ones: two 3 x 3 see as far as one 5 x 5"
     )
-    return beyond_range("kernel", op.kernel, limit, remedy)
+    return beyond_range("kernel", op.kernel, dpu.limit("conv", "kernel"), remedy)
 
 
 def conv_stride(op: Operation, dpu: Dpu) -> Finding | None:
     """Strides are {conv[stride]} ({conv[stride].source})."""
-    limit = dpu.limit("conv", "stride")
-    remedy = (
-        f"use a stride of at most {limit.high:g}, or two convolutions whose strides multiply to it"
-    )
-    return beyond_range("stride", op.window.strides, limit, remedy)
+    remedy = "use a stride of at most {most}, or two convolutions whose strides multiply to it"
+    return beyond_range("stride", op.window.strides, dpu.limit("conv", "stride"), remedy)
 
 
 def conv_channels(op: Operation, dpu: Dpu) -> Finding | None:
@@ -140,10 +136,8 @@ def depthwise_kernel(op: Operation, dpu: Dpu) -> Finding | None:
 
 def depthwise_stride(op: Operation, dpu: Dpu) -> Finding | None:
     """Strides are {depthwise[stride]} ({depthwise[stride].source})."""
-    limit = dpu.limit("depthwise", "stride")
-    return beyond_range(
-        "stride", op.window.strides, limit, f"use a stride of at most {limit.high:g}"
-    )
+    remedy = "use a stride of at most {most}"
+    return beyond_range("stride", op.window.strides, dpu.limit("depthwise", "stride"), remedy)
 
 
 def depthwise_padding(op: Operation, dpu: Dpu) -> Finding | None:
@@ -164,10 +158,9 @@ def transposed_kernel(op: Operation, dpu: Dpu) -> Finding | None:
     ({documents[operators]}).
     """
     limit = dpu.limit("transposed", "kernel_per_stride")
-    ratios: list[int] = []
-    for kernel, stride in zip(op.kernel, op.window.strides, strict=True):
-        ratios += [kernel // stride, groups_of(kernel, stride)]
-    if not outside(tuple(ratios), limit):
+    strides = op.window.strides
+    ratios = (*map(floordiv, op.kernel, strides), *map(groups_of, op.kernel, strides))
+    if not outside(ratios, limit):
         return None
     sides = f"kernel ({shown(op.kernel)}) / stride ({shown(op.window.strides)})"
     remedy = "use a kernel at least as large as the stride, such as 4 x 4 with stride 2"

@@ -34,10 +34,14 @@ def shown(sides: tuple[int, int]) -> str:
 
 
 def beyond_range(what: str, sides: tuple[int, int], limit: Constant, remedy: str) -> Finding | None:
-    """Return a finding if one side of a kernel or a stride lies outside the limit, else None."""
+    """Return a finding if one side of a kernel or a stride lies outside the limit, else None.
+
+    In the remedy, {most} stands for the largest side.
+    """
     if not outside(sides, limit):
         return None
-    return Finding(f"{what} ({shown(sides)}) is not in the DPU's range {limit}", remedy)
+    reason = f"{what} ({shown(sides)}) is not in the DPU's range {limit}"
+    return Finding(reason, remedy.format(most=f"{limit.high:g}"))
 
 
 def groups_of(count: int, size: int) -> int:

@@ -39,17 +39,15 @@ def int8_alone(op: Operation, dpu: Dpu) -> Finding | None:
     """Tensors are int8 around {numbers[zero_point]} ({numbers[zero_point].source})."""
     zero_points = {dpu.value("numbers", "zero_point")}
     # A bias has rules of its own, `int8_bias` and `int32_bias`.
-    others = {r: s for r, s in op.scales.items() if r != "bias"}
     faults = [
-        r
-        for r, s in others.items()
-        if s.integer_type != "int8" or set(s.zero_points) != zero_points
+        role
+        for role, scale in op.scales.items()
+        if role != "bias"
+        and (scale.integer_type != "int8" or set(scale.zero_points) != zero_points)
     ]
-    return (
-        Finding(f"{', '.join(faults)}: not int8 around 0", f"quantise to int8; {AGAIN}")
-        if faults
-        else None
-    )
+    if not faults:
+        return None
+    return Finding(f"{', '.join(faults)}: not int8 around 0", f"quantise to int8; {AGAIN}")
 
 
 def per_tensor(op: Operation, dpu: Dpu) -> Finding | None:
@@ -65,11 +63,10 @@ def per_tensor(op: Operation, dpu: Dpu) -> Finding | None:
 def power_of_two(op: Operation, dpu: Dpu) -> Finding | None:
     """Scales are powers of two ({documents[quantiser]})."""
     # A tensor of several scales is reported by `per_tensor`.
-    single = {role: scale for role, scale in op.scales.items() if len(scale.scales) == 1}
     faults = [
         f"{role} scale {scale.scales[0]:.4g}"
-        for role, scale in single.items()
-        if scale.frac_bits is None
+        for role, scale in op.scales.items()
+        if len(scale.scales) == 1 and scale.frac_bits is None
     ]
     remedy = f"round each scale to 2^-n; {AGAIN}, and so does AMD Quark's XINT8"
     return _reported(faults, remedy)
@@ -87,11 +84,7 @@ def one_format(op: Operation, dpu: Dpu) -> Finding | None:
 
 def shift_cut(op: Operation, dpu: Dpu) -> Finding | None:
     """Weight + input - output fractional bits: {numbers[shift_cut]} ({documents[quantiser]})."""
-    cut = _cut(op)
-    limit = dpu.limit("numbers", "shift_cut")
-    if cut is None or not outside((cut,), limit):
-        return None
-    return Finding(f"shift_cut {cut}, allowed {limit}", MOVE)
+    return _shift(_cut(op), dpu, "shift_cut")
 
 
 def shift_bias(op: Operation, dpu: Dpu) -> Finding | None:
@@ -127,12 +120,10 @@ def bias_width(op: Operation, dpu: Dpu) -> Finding | None:
     largest = np.abs(values.astype(np.float64)).max(initial=0)
     most = 2 ** (dpu.whole("numbers", "bias_bits") - 1) - 1
     size = largest * 2.0 ** (product - frac_bits)
+    if size <= most:
+        return None
     remedy = "train with smaller biases, or with larger weights behind a smaller scale"
-    return (
-        None
-        if size <= most
-        else Finding(f"a bias of {size:g} in units of the products, at most {most}", remedy)
-    )
+    return Finding(f"a bias of {size:g} in units of the products, at most {most}", remedy)
 
 
 def shift_read(op: Operation, dpu: Dpu) -> Finding | None:
@@ -140,23 +131,14 @@ def shift_read(op: Operation, dpu: Dpu) -> Finding | None:
     ({documents[quantiser]}).
     """
     inputs = _inputs(op)
-    limit = dpu.limit("numbers", "shift_read")
-    shift = max(inputs) - min(inputs) if inputs else 0
-    return (
-        Finding(f"shift_read {shift}, allowed {limit}", MOVE) if outside((shift,), limit) else None
-    )
+    return _shift(max(inputs) - min(inputs) if inputs else None, dpu, "shift_read")
 
 
 def shift_write(op: Operation, dpu: Dpu) -> Finding | None:
     """An add's coarsest input - output fractional bits: {numbers[shift_write]}
     ({documents[quantiser]}).
     """
-    inputs = _inputs(op)
-    output = _frac_bits(op, "output")
-    limit = dpu.limit("numbers", "shift_write")
-    if not inputs or output is None or not outside((min(inputs) - output,), limit):
-        return None
-    return Finding(f"shift_write {min(inputs) - output}, allowed {limit}", MOVE)
+    return _shift(_difference(min(_inputs(op), default=None), op), dpu, "shift_write")
 
 
 def same_scale(op: Operation, dpu: Dpu) -> Finding | None:
@@ -198,18 +180,27 @@ def _inputs(op: Operation) -> list[int]:
 
 
 def _cut(op: Operation) -> int | None:
-    product = product_frac_bits(op)
+    return _difference(product_frac_bits(op), op)
+
+
+def _difference(frac_bits: int | None, op: Operation) -> int | None:
+    """Return the number of fractional bits that the output of an operation has less."""
     output = _frac_bits(op, "output")
-    return None if product is None or output is None else product - output
+    return None if frac_bits is None or output is None else frac_bits - output
+
+
+def _shift(shift: int | None, dpu: Dpu, key: str) -> Finding | None:
+    """Return a finding if a shift lies outside the limit of that key, or None."""
+    limit = dpu.limit("numbers", key)
+    if shift is None or not outside((shift,), limit):
+        return None
+    return Finding(f"{key} {shift}, allowed {limit}", MOVE)
 
 
 def _words(scale: Scale) -> str:
     scales = ", ".join(f"{s:.9g}" for s in scale.scales[:1])
-    zeros = scale.zero_points[:1]
-    return (
-        f"{scale.integer_type} at scale {scales or 'unknown'} around "
-        f"{zeros[0] if zeros else 'nothing'}"
-    )
+    zeros = ", ".join(map(str, scale.zero_points[:1]))
+    return f"{scale.integer_type} at scale {scales or 'unknown'} around {zeros or 'nothing'}"
 
 
 BYTES = ("int8", "uint8")
@@ -241,11 +232,9 @@ def int8_bias(op: Operation, dpu: Dpu) -> Finding | None:
     if "bias" not in op.constants or op.op_type == "QLinearConv" or not byte_weights:
         return None
     kind = _kind(op.constants["bias"])
-    return (
-        None
-        if kind == "int8"
-        else Finding(f"its bias is {kind}", f"quantise the bias to int8; {AGAIN}")
-    )
+    if kind == "int8":
+        return None
+    return Finding(f"its bias is {kind}", f"quantise the bias to int8; {AGAIN}")
 
 
 def int32_bias(op: Operation, dpu: Dpu) -> Finding | None:
@@ -262,7 +251,9 @@ def int32_bias(op: Operation, dpu: Dpu) -> Finding | None:
     remedy = f"round the bias to int8 at a scale of its own; {AGAIN}"
     if values is None or _kind(values) != "int32":
         return Finding(f"its bias is {_kind(values)}", remedy)
-    shift = min(high, _spare_bits(values))
+    # The lowest bit that is set in any value, if not all values are 0.
+    bits = int(np.bitwise_or.reduce(values, axis=None))
+    shift = min(high, max((bits & -bits).bit_length() - 1, 0))
     # The bits that are shifted out are 0 in every value: nothing is rounded.
     shifted = values >> shift
     low = int(shifted.min(initial=0))
@@ -277,10 +268,3 @@ def int32_bias(op: Operation, dpu: Dpu) -> Finding | None:
 
 def _kind(values: np.ndarray | None) -> str:
     return "computed by other nodes" if values is None else str(values.dtype)
-
-
-def _spare_bits(values: np.ndarray) -> int:
-    """Return the number of low bits that are 0 in every value, or 0 if all values are 0."""
-    bits = int(np.bitwise_or.reduce(values, axis=None))
-    # `bits & -bits` isolates the lowest bit that is set.
-    return (bits & -bits).bit_length() - 1 if bits else 0

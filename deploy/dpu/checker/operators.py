@@ -20,7 +20,6 @@ from beers_deploy.dpu.checker import conv_rules, number_rules, other_rules
 from beers_deploy.dpu.checker.finding import Finding, Rule
 from beers_deploy.dpu.graph import Operation
 from beers_deploy.dpu.shapes import Kind
-from beers_deploy.profiles.errors import MachineError
 from beers_deploy.profiles.validation import check_keys
 from beers_deploy.quant.onnx.window import Window
 
@@ -162,14 +161,13 @@ def forms(op: Operation, dpu: Dpu) -> Iterator[Operation]:
 def fully_connected(op: Operation) -> bool:
     """Return True if a convolution is as large as its map, so that its result has one pixel."""
     shape = op.in_shapes[0] if op.in_shapes else None
-    window = op.window
-    covers_map = (
-        shape is not None
+    return (
+        op.kind == "conv"
+        and shape is not None
         and op.kernel == shape[1:]
-        and window.dilations == (1, 1)
-        and not any(window.pads)
+        and op.window.dilations == (1, 1)
+        and not any(op.window.pads)
     )
-    return op.kind == "conv" and covers_map
 
 
 def all_rules() -> Iterator[Rule]:
@@ -220,13 +218,8 @@ def _facts(dpu: Dpu) -> Mapping[str, Mapping[str, object]]:
 
 @cache
 def _template(rule: Callable[..., object]) -> str:
-    text = inspect.getdoc(rule)
-    if text is None:
-        raise MachineError(
-            "Python removed the docstrings, which contain the texts of the rules. Start it without "
-            "-OO and PYTHONOPTIMIZE=2."
-        )
-    return " ".join(text.split())
+    # Without docstrings (python -OO) the command line has no help either, and does not start.
+    return " ".join(str(inspect.getdoc(rule)).split())
 
 
 @cache

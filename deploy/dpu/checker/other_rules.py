@@ -162,9 +162,8 @@ def pool_kernel(op: Operation, dpu: Dpu) -> Finding | None:
 
 def pool_stride(op: Operation, dpu: Dpu) -> Finding | None:
     """Pool strides are {pool[stride]} ({pool[stride].source})."""
-    return beyond_range(
-        "stride", op.window.strides, dpu.limit("pool", "stride"), "pool in two steps"
-    )
+    limit = dpu.limit("pool", "stride")
+    return beyond_range("stride", op.window.strides, limit, "pool in two steps")
 
 
 def pool_padding(op: Operation, dpu: Dpu) -> Finding | None:

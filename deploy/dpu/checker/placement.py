@@ -31,29 +31,29 @@ SCALING = {"Mul", "Div", "Add", "Sub", "Clip", "Cast", "Round", "Floor", "Identi
 it.
 """
 
-SHAPING = {
+RESULTS = {
     "ArgMax",
     "DepthToSpace",
+    "Exp",
     "Flatten",
     "Gather",
     "NonMaxSuppression",
+    "Pow",
     "Reshape",
     "Sigmoid",
     "Slice",
     "Softmax",
+    "Softplus",
     "Split",
+    "Sqrt",
     "Squeeze",
+    "Tanh",
     "TopK",
     "Transpose",
     "Unsqueeze",
 }
 """Operators that a float file may apply to the result after the network. They move values, compare
-them, or convert them to scores.
-"""
-
-DECODING = {"Exp", "Pow", "Sigmoid", "Slice", "Softplus", "Split", "Sqrt", "Tanh", "Transpose"}
-"""Operators that a float file may use to decode boxes from the result. `quantize` leaves them to
-the host too.
+them, convert them to scores, or decode boxes. `quantize` leaves them to the host too.
 """
 
 FLOAT_NOTE = "a float file: judged as if its tensors had 8 bits, its final add left to the host"
@@ -229,7 +229,7 @@ def _is_host_back(op: Operation, network: SizedGraph, *, leads: bool) -> bool:
         return False
     if network.quantized:
         return not op.integer and (op.kind == "dequantize" or op.op_type in SCALING)
-    if op.op_type in SHAPING | DECODING:
+    if op.op_type in RESULTS:
         return not leads
     return op.op_type in SCALING and (
         bool(set(op.inputs) & set(network.inputs)) or len(op.inputs) == 1

@@ -35,11 +35,9 @@ def subgraphs(placement: Placement, dpu: Dpu, tile_px: int) -> str:
     xcompiler).
     """
     count = placement.dpu_subgraphs
-    return (
-        f"{count} DPU subgraphs: the CPU starts each, and carries maps between them"
-        if count > 1
-        else ""
-    )
+    if count < 2:
+        return ""
+    return f"{count} DPU subgraphs: the CPU starts each, and carries maps between them"
 
 
 def streaming(placement: Placement, dpu: Dpu, tile_px: int) -> str:
@@ -53,11 +51,11 @@ def streaming(placement: Placement, dpu: Dpu, tile_px: int) -> str:
     if not large:
         return ""
     # The size of a map grows with the square of the tile's side.
-    kept_px = math.isqrt(room * tile_px * tile_px // max(large))
+    side_px = math.isqrt(room * tile_px * tile_px // max(large))
     return (
         f"{len(large)} of {len(sizes)} maps exceed {room / 2**20:g} MiB, the largest has "
         f"{max(large) / 1e6:.1f} MB: "
-        f"they stream through memory; tiles of {kept_px} px and less would keep every map on chip"
+        f"they stream through memory; tiles of {side_px} px and less would keep every map on chip"
     )
 
 
@@ -87,10 +85,10 @@ def depthwise(placement: Placement, dpu: Dpu, tile_px: int) -> str:
     (Vitis AI 6.3).
     """
     count = sum(op.kind == "depthwise" for op in placement.core)
+    if not count:
+        return ""
     return (
         f"{count} depthwise convolutions, legal but slow: AMD's YOLOX-nano has dense ones instead"
-        if count
-        else ""
     )
 
 
@@ -105,7 +103,7 @@ def float_islands(placement: Placement, dpu: Dpu, tile_px: int) -> str:
 def is_island(node: PlacedNode, placement: Placement) -> bool:
     """Return True if a quantised file leaves a node in float between its integer nodes."""
     op = node.op
-    weight = node.op.constants.get("weight")
+    weight = op.constants.get("weight")
     in_float = not op.integer or (weight is not None and weight.dtype == np.float32)
     return not placement.note and node.device == "DPU" and op.kind != "dequantize" and in_float
 

@@ -65,8 +65,8 @@ class Checked(Table):
         if any(check.name == ACCEPTED for check in self.checks):
             return "check passed: it fits once 'quantize' has rewritten it to INT8"
         return (
-            "check passed: its nodes run on the DPU; 'quantize' is for networks that make one "
-            "image of one image"
+            "check passed: its nodes run on the DPU, but 'quantize' accepts only networks that map "
+            "one image to one image"
         )
 
 
@@ -103,7 +103,10 @@ def check_network(
     npu = bool(target.npu)
     checks = [legality(placement, npu=npu), *(_file_checks(source.model, build) if npu else [])]
     if not is_quantized(source.model) and _makes_image(sized):
-        checks.append(_acceptance(source.model))
+        reason = refusal(source.model)
+        checks.append(Check(ACCEPTED, int(bool(reason)), 0, "network", detail=reason))
+    # A quantised file whose numbers nobody reads here is placed as if it were in float.
+    note = OTHERS_NOTE if placement.note and is_quantized(source.model) else placement.note
     return Checked(
         title=f"{source.input.name} on {target.name} {build.name}, tile {tile_px}",
         command="check",
@@ -111,7 +114,7 @@ def check_network(
         inputs=(source.input,),
         rows=(*_rows(placement, build, tile_px), *_profile_rows(source.model)),
         checks=tuple(checks),
-        notes=tuple(_notes(placement, source)),
+        notes=tuple(filter(None, [note])),
         headings=HEADINGS,
         details=DETAILS,
         placement=placement,
@@ -140,19 +143,6 @@ def _makes_image(network: SizedGraph) -> bool:
     results = [op.out_shape for op in network.operations if op.output in network.outputs]
     sides_px = [min(shape[1:]) for shape in results if shape is not None]
     return len(network.inputs) == 1 and len(network.outputs) == 1 and max(sides_px, default=0) > 1
-
-
-def _acceptance(model: onnx.ModelProto) -> Check:
-    """Return the check that fails if 'quantize' refuses a float network."""
-    reason = refusal(model)
-    return Check(ACCEPTED, int(bool(reason)), 0, "network", detail=reason)
-
-
-def _notes(placement: Placement, source: Network) -> list[str]:
-    """Return the notes for the reader of a network that was not quantised here."""
-    if not placement.note:
-        return []
-    return [OTHERS_NOTE if is_quantized(source.model) else placement.note]
 
 
 def _rows(placement: Placement, dpu: Dpu, tile_px: int) -> list[Row]:
@@ -207,9 +197,8 @@ def _file_checks(model: onnx.ModelProto, dpu: Dpu) -> list[Check]:
     # ONNX allows both names for its own domain.
     opset = max(entry.version for entry in model.opset_import if entry.domain in ("", "ai.onnx"))
     most = dpu.limit("file", "opset_max")
-    tensors = [*model.graph.input, *model.graph.output]
     sides = []
-    for tensor in tensors:
+    for tensor in (*model.graph.input, *model.graph.output):
         dims = tensor.type.tensor_type.shape.dim
         sides += [f"{tensor.name} {dim.dim_param}" for dim in dims if not dim.dim_value]
     return [
@@ -222,8 +211,7 @@ def _device_rows(placement: Placement, dpu: Dpu) -> list[Row]:
     """Return a row for each device: the number of nodes that it runs, and their operators."""
     operators: dict[str, Counter[str]] = {}
     for node in placement.nodes:
-        device = _npu_words(node, placement, dpu) if dpu.target.npu else node.device
-        operators.setdefault(device, Counter())[node.op.op_type] += 1
+        operators.setdefault(_device(node, placement, dpu), Counter())[node.op.op_type] += 1
     rows = []
     for device, counts in operators.items():
         words = ", ".join(f"{name} {count}" for name, count in counts.most_common())
@@ -247,36 +235,32 @@ def _refusal_rows(placement: Placement) -> list[Row]:
 
 
 def _node_rows(node: PlacedNode, placement: Placement, dpu: Dpu) -> list[Row]:
-    words = {"operator": node.op.op_type, "part": node.part, "device": node.device}
-    if dpu.target.npu:
-        words |= {
-            "part": node.part.removeprefix("dpu-"),
-            "device": _npu_words(node, placement, dpu),
-        }
+    words = {
+        "operator": node.op.op_type,
+        "part": node.part.removeprefix("dpu-") if dpu.target.npu else node.part,
+        "device": _device(node, placement, dpu),
+    }
     if not node.broken:
         return [Row("nodes", node.op.name, {}, words)]
-    breaches = [
-        {"rule": b.text, "reason": b.finding.reason, "remedy": b.finding.remedy}
-        for b in node.broken
-    ]
-    return [Row("nodes", node.op.name, {}, {**words, **why}) for why in breaches]
+    rows = []
+    for breach in node.broken:
+        finding = breach.finding
+        why = {"rule": breach.text, "reason": finding.reason, "remedy": finding.remedy}
+        rows.append(Row("nodes", node.op.name, {}, words | why))
+    return rows
 
 
-def _npu_words(node: PlacedNode, placement: Placement, dpu: Dpu) -> str:
-    """Return the device of an NPU's board on which a node would be computed, according to AMD's
-    table.
-    """
-    if node.device == "host":
-        return "host"
+def _device(node: PlacedNode, placement: Placement, dpu: Dpu) -> str:
+    """Return the device of a node: for an NPU, the one that AMD's table states."""
+    if node.device == "host" or not dpu.target.npu:
+        return node.device
     if node.broken:
         return "refused"
     if is_island(node, placement):
         return "float, BF16 by the compiler's default"
-    return (
-        "NPU by AMD's table"
-        if node.op.op_type in dpu.target.npu["int8"].value
-        else "not read in AMD's table"
-    )
+    if node.op.op_type in dpu.target.npu["int8"].value:
+        return "NPU by AMD's table"
+    return "not read in AMD's table"
 
 
 def _subgraph_rows(placement: Placement) -> list[Row]:
@@ -296,18 +280,11 @@ def _subgraph_rows(placement: Placement) -> list[Row]:
 
 
 def _cut_row(cut: Cut) -> Row:
-    unit = "byte/image"
-    size = (
-        unavailable(unit, "its shape is unknown")
-        if cut.size_bytes is None
-        else _count(cut.size_bytes, unit)
-    )
-    return Row(
-        "cuts",
-        cut.tensor,
-        {"size": size},
-        {"direction": "onto the DPU" if cut.onto_dpu else "off the DPU"},
-    )
+    size = unavailable("byte/image", "its shape is unknown")
+    if cut.size_bytes is not None:
+        size = _count(cut.size_bytes, "byte/image")
+    words = {"direction": "onto the DPU" if cut.onto_dpu else "off the DPU"}
+    return Row("cuts", cut.tensor, {"size": size}, words)
 
 
 def _count(value: int, unit: str) -> Figure:

@@ -23,7 +23,7 @@ of the network in one size on one configuration. What is left is the scatter of 
 
 
 def levels_of(operations: Sequence[Operation], dpu: Dpu, bound: str) -> Levels:
-    """Return what a run has in common with others, for each of SHARES.
+    """Return the keys of the levels at which a run is related to others, one for each of SHARES.
 
     Args:
         operations: of the network, in order.
@@ -42,7 +42,8 @@ def levels_of(operations: Sequence[Operation], dpu: Dpu, bound: str) -> Levels:
 
 
 def correction(of: Levels, runs: Sequence[tuple[Levels, float]]) -> tuple[float, float]:
-    """Return how many times as fast as predicted a network is, and what is left of its width.
+    """Return the factor by which a network is faster than predicted, and the share of its
+    interval's width that remains.
 
     Args:
         of: the network.

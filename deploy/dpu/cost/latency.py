@@ -12,8 +12,11 @@ no narrower than `width_outside` (docs/explanation/cost-model.md).
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
+
+import numpy as np
 
 from beers_deploy.dpu.board import Dpu, Levels
 from beers_deploy.dpu.checker.placement import Placement
@@ -39,6 +42,8 @@ from beers_deploy.dpu.graph import Operation
 from beers_deploy.profiles.errors import ModelError, printable
 from beers_deploy.profiles.figures import Figure, predicted, unavailable
 
+Bound = Literal["host", "DPU"]
+
 
 @dataclass(frozen=True)
 class LayerCost:
@@ -51,7 +56,9 @@ class LayerCost:
 
     @property
     def bound(self) -> str:
-        """What takes longest: compute, memory or, as overhead, what is neither."""
+        """Return the name of the longest part of the time: compute, memory, or overhead for the
+        rest.
+        """
         overhead_s = self.time_s - self.compute_s - self.memory_s
         parts = {"compute": self.compute_s, "memory": self.memory_s, "overhead": overhead_s}
         return max(parts, key=lambda name: parts[name])
@@ -69,6 +76,7 @@ class Prediction:
         host_s: time of an image on the host's cores together.
         task: what the host does with the results.
         width: half that of the interval, in ln(FPS).
+        bound: what sets the rate.
         levels: what it has in common with runs of an owner's board.
         speed: how many times as fast as the constants say it is by these runs.
         outside: what lies beyond the fitted networks; empty where nothing does.
@@ -83,53 +91,50 @@ class Prediction:
     host_s: float
     task: Task
     width: float
-    levels: Levels = ()
-    speed: float = 1.0
-    outside: tuple[str, ...] = ()
-    note: str = ""
-    refused: tuple[str, ...] = ()
-    refused_s: Interval = (0.0, 0.0)
-    step_s: Interval = (0.0, 0.0)
+    bound: Bound
+    levels: Levels
+    speed: float
+    outside: tuple[str, ...]
+    note: str
+    refused: tuple[str, ...]
+    refused_s: Interval
+    step_s: Interval
 
     @property
     def batch(self) -> int:
-        """Images in flight."""
+        """Return the number of images that are processed at once."""
         return self.dpu.batch
 
     @cached_property
     def batch_time_s(self) -> float:
-        """Time of one batch on the DPU: its layers, nothing else."""
+        """Return the time of the layers of one batch on the DPU, without the host."""
         return math.fsum(layer.time_s for layer in self.layers)
 
     @property
-    def bound(self) -> str:
-        """What sets the rate: the host or the DPU."""
-        return "host" if self.host_s > self.batch_time_s / self.batch else "DPU"
-
-    @property
     def fps(self) -> float:
-        """Images a second, batches back to back, the host working on others beside them."""
+        """Return the images per second, if batches follow each other and the host works in
+        parallel.
+        """
         return self._rate(self.host_s)
 
     @property
     def fps_interval(self) -> Interval:
-        """Least and most images a second: the host at its slowest and at its fastest, and the
-        width.
+        """Return the lowest and the highest rate: the host at its slowest and at its fastest, both
+        widened by `spread`.
         """
         # The host at its fastest comes first.
         fast, slow = map(self._rate, self._host_ends_s)
-        return slow / self.spread, fast * self.spread
+        return self._widened(slow, fast)
 
     @property
     def host_interval_s(self) -> Interval:
-        """Least and most of `host_s`."""
-        low_s, high_s = self._host_ends_s
-        return low_s / self.spread, high_s * self.spread
+        """Return the lowest and the highest value of `host_s`."""
+        return self._widened(*self._host_ends_s)
 
     @property
     def latency_s(self) -> float:
-        """From the first image of a batch to the last result, with one thread: one core, then one
-        core of the host.
+        """Return the time from the first image of a batch to its last result with one thread, which
+        uses one core of the DPU and then one core of the host.
 
         Its error is about that of the rate (docs/reference/boards.md), and it shares the rate's
         width.
@@ -138,9 +143,11 @@ class Prediction:
 
     @property
     def latency_interval_s(self) -> Interval:
-        """Least and most of `latency_s`."""
-        low_s, high_s = map(self._latency_s, self._host_ends_s)
-        return low_s / self.spread, high_s * self.spread
+        """Return the lowest and the highest value of `latency_s`."""
+        return self._widened(*map(self._latency_s, self._host_ends_s))
+
+    def _widened(self, low: float, high: float) -> Interval:
+        return low / self.spread, high * self.spread
 
     def _latency_s(self, host_s: float) -> float:
         # `host_s` is the time of all cores together: one thread does the work on one of them.
@@ -148,12 +155,14 @@ class Prediction:
 
     @property
     def spread(self) -> float:
-        """By how many times a part may be off either way."""
+        """Return the factor by which each time may be wrong in either direction."""
         return math.exp(self.width)
 
     @property
     def _host_ends_s(self) -> Interval:
-        """With the refused nodes and the consistency step at their least and at their most."""
+        """Return the host's time with the shortest and with the longest time of the refused nodes
+        and of the consistency step.
+        """
         rest_s = self.host_s - between(self.refused_s) - between(self.step_s)
         # Only these two parts have ends of their own: the rest of the host's time is fitted.
         low_s, high_s = (sum(ends) for ends in zip(self.refused_s, self.step_s, strict=True))
@@ -166,12 +175,12 @@ class Prediction:
 
     @property
     def operations(self) -> int:
-        """int8 operations for one image."""
+        """Return the int8 operations for one image."""
         return sum(layer.work.operations for layer in self.layers)
 
     @property
     def streamed_bytes(self) -> int:
-        """Feature-map bytes that one image moves through memory."""
+        """Return the bytes of feature maps that pass through memory for one image."""
         return sum(layer.work.map_bytes for layer in self.layers)
 
 
@@ -203,59 +212,44 @@ def predict(
         )
     columns = Layers.of(works, dpu)
     parts_s = columns.parts_s(constants, structure)
-    times = (
-        columns.compute_s(constants),
-        columns.memory_s(constants),
-        columns.time_s(constants, structure),
-    )
-    parts = zip(works, *(time_s.tolist() for time_s in times), strict=True)
-    layers = tuple(LayerCost(*part) for part in parts)
+    times_s = columns.time_s(constants, structure)
     refused = [node.op for node in placement.failed]
-    cores = dpu.whole("cpu", "cores")
     refused_s = refused_interval_s(refused, dpu)
     task = task or task_of(placement)
     step_s = consistency_interval_s(step_px, dpu) if step_px else (0.0, 0.0)
-    host_parts = host_parts_s(placed_work(placement, task)[None], constants) / cores
+    host_parts = host_parts_s(placed_work(placement, task)[None], constants)
+    host_parts /= dpu.whole("cpu", "cores")
     # Work that no rate is published for is taken at the geometric mean of its two ends.
     host_parts[0, 0] += between(refused_s) + between(step_s)
+    host_s = float(host_parts.sum())
     shares = shares_of(parts_s.sum(axis=0)[None] / dpu.batch, host_parts, structure.crowding)
     width = float(shares[0] @ [dpu.value("cost", WIDTHS[part]) for part in PARTS])
     outside = _outside(placement.core, dpu)
     if outside:
         width = max(width, dpu.value("cost", WIDTHS["outside"]))
-    prediction = Prediction(
+    bound: Bound = "host" if host_s > math.fsum(times_s) / dpu.batch else "DPU"
+    levels = levels_of(placement.core, dpu, bound)
+    # The runs of the owner's board correct all times alike.
+    speed, width_left = correction(levels, dpu.runs)
+    layer_times_s = np.stack(
+        [columns.compute_s(constants), columns.memory_s(constants), times_s], axis=1
+    )
+    layers = zip(works, (layer_times_s / speed).tolist(), strict=True)
+    return Prediction(
         dpu=dpu,
-        alone_s=float(columns.time_s(constants, structure, alone=True).sum()),
-        layers=layers,
-        host_s=float(host_parts.sum()),
+        alone_s=float(columns.time_s(constants, structure, alone=True).sum()) / speed,
+        layers=tuple(LayerCost(work, *seconds) for work, seconds in layers),
+        host_s=host_s / speed,
         task=task,
-        width=width,
+        width=width * width_left,
+        bound=bound,
+        levels=levels,
+        speed=speed,
         outside=outside,
         note=placement.note,
         refused=tuple(op.name for op in refused),
-        refused_s=refused_s,
-        step_s=step_s,
-    )
-    return _corrected(prediction, levels_of(placement.core, dpu, prediction.bound))
-
-
-def _corrected(prediction: Prediction, levels: Levels) -> Prediction:
-    """Return a prediction as the runs of the owner's board correct it: all its times alike."""
-    speed, left = correction(levels, prediction.dpu.runs)
-    layers = tuple(
-        LayerCost(layer.work, layer.compute_s / speed, layer.memory_s / speed, layer.time_s / speed)
-        for layer in prediction.layers
-    )
-    return replace(
-        prediction,
-        alone_s=prediction.alone_s / speed,
-        layers=layers,
-        host_s=prediction.host_s / speed,
-        width=prediction.width * left,
-        levels=levels,
-        speed=speed,
-        refused_s=(prediction.refused_s[0] / speed, prediction.refused_s[1] / speed),
-        step_s=(prediction.step_s[0] / speed, prediction.step_s[1] / speed),
+        refused_s=(refused_s[0] / speed, refused_s[1] / speed),
+        step_s=(step_s[0] / speed, step_s[1] / speed),
     )
 
 
@@ -268,16 +262,16 @@ network is not beyond it.
 
 
 def _outside(core: Sequence[Operation], dpu: Dpu) -> tuple[str, ...]:
-    """What of a network lies beyond the fitted ones, each with the end of the
-    range that it passes.
+    """Return a sentence for each property of a network that exceeds the range of the fitted
+    networks.
     """
     operations = sum(op.operations for op in core)
-    values = {
-        "map_bytes": ("largest map", largest_map_bytes(core), 1e-6, "MB"),
-        "operations": ("work", operations, 1e-9, "GOP"),
-    }
+    values = (
+        ("map_bytes", "largest map", largest_map_bytes(core), 1e-6, "MB"),
+        ("operations", "work", operations, 1e-9, "GOP"),
+    )
     sentences = []
-    for key, (name, value, scale, unit) in values.items():
+    for key, name, value, scale, unit in values:
         most = dpu.limit("cost", f"fitted_{key}").high
         # The ends of the fitted range are rounded in the file: the largest fitted network lies
         # inside.
@@ -287,14 +281,15 @@ def _outside(core: Sequence[Operation], dpu: Dpu) -> tuple[str, ...]:
 
 
 def dpu_power(dpu: Dpu) -> Figure:
-    """Power in W while the DPU runs: the range of what is published of the board, for any network.
+    """Return the power in W while the DPU runs: the published range of the board, whatever the
+    network.
 
     The published points contradict each other: above idle the VCK190 takes 0.8 pJ for an operation
     with YOLOv8s and 2.3 pJ with ConvBEERS, so no energy for an operation or a byte can be told.
     """
     if "dpu_range_w" not in dpu.tables.get("power", {}):
         return unavailable("W", f"no power of {dpu.target.name} under its DPU is published")
-    known = dpu.limit("power", "dpu_range_w")
-    ends = known.low, known.high
-    source = f"not predictable from public data: the range of what is published: {known.source}"
+    power = dpu.limit("power", "dpu_range_w")
+    ends = power.low, power.high
+    source = f"not predictable from public data: the range of what is published: {power.source}"
     return predicted(between(ends), "W", ends, source)

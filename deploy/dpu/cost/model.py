@@ -1,10 +1,12 @@
 """The formula of the cost model, and its constants, which stand in a target's [cost].
 
-compute = array operations / (peak array_efficiency) + lane steps / lanes memory  = longer of
-(weights + maps) / port and cores (weights + batch handlers maps) / (DDR memory_efficiency) layer
-= longer of the two + (1 - overlap) shorter of the two + layer_s batch   = sum of layers host    =
-host_image_s + bytes in / rate + bytes out / rate + values of the task / its rate rate    = 1 /
-(dpu^crowding + host^crowding)^(1 / crowding)
+compute = array operations / (peak array_efficiency) + lane steps / lanes
+memory  = longer of (weights + maps) / port and
+          cores (weights + batch handlers maps) / (DDR memory_efficiency)
+layer   = longer of the two + (1 - overlap) shorter of the two + layer_s
+batch   = sum of layers
+host    = host_image_s + bytes in / rate + bytes out / rate + values of the task / its rate
+rate    = 1 / (dpu^crowding + host^crowding)^(1 / crowding)
 """
 
 import math
@@ -62,7 +64,9 @@ class Constants:
 
     @property
     def host_s_per_unit(self) -> Array:
-        """Time of an image, of a byte in, of a byte out and of a value of each task, (7,)."""
+        """Return the time of an image, of a byte in, of a byte out and of a value of each task,
+        (7,).
+        """
         host_names = NAMES[NAMES.index("host_image_s") :]
         image_s, *rates = (getattr(self, name) for name in host_names)
         return np.array([image_s, *(1 / rate for rate in rates)])
@@ -127,11 +131,15 @@ class Layers:
         return cls(*np.array(rows, dtype=np.float64).reshape(-1, 10).T)
 
     def compute_s(self, constants: Constants) -> Array:
-        """Time of the array and of the engines beside it, (n,): all batch handlers work at once."""
+        """Return the time of the array and of the engines next to it, (n,). All batch handlers work
+        at once.
+        """
         return self.array_s / constants.array_efficiency + self.lane_s
 
     def memory_s(self, constants: Constants, *, alone: bool = False) -> Array:
-        """Time of the transfers, for a batch of every core or, `alone`, of one core (n,)."""
+        """Return the time of the transfers for a batch of every core or, if `alone`, of one core,
+        (n,).
+        """
         port = constants.port_bytes_per_cycle * self.pl_clock_hz
         shared = constants.memory_efficiency * self.memory_bytes_per_s
         shared_s = (self.weight_bytes + self.handlers * self.map_bytes) / shared
@@ -142,12 +150,12 @@ class Layers:
         return np.maximum(port_s, (1.0 if alone else self.cores) * shared_s)
 
     def time_s(self, constants: Constants, structure: Structure, *, alone: bool = False) -> Array:
-        """Time of each layer, for a batch (n,)."""
+        """Return the time of each layer for a batch, (n,)."""
         times: Array = self.parts_s(constants, structure, alone=alone).sum(axis=1)
         return times
 
     def parts_s(self, constants: Constants, structure: Structure, *, alone: bool = False) -> Array:
-        """Time of each layer by the first four of PARTS, for a batch (n, 4)."""
+        """Return the time of each layer for a batch by the first four of PARTS, (n, 4)."""
         compute = self.compute_s(constants)
         memory = self.memory_s(constants, alone=alone)
         # What the longer of the two hides of the shorter counts for neither.
@@ -190,7 +198,9 @@ def shares_of(dpu_s: Array, host_s: Array, crowding: float) -> Array:
 
 
 def frame_rate(dpu_s: float, host_s: float, crowding: float) -> float:
-    """Images a second, from the time that the DPU and the host's cores take for one image."""
+    """Return the images per second, given the time of the DPU and of the host's cores for one
+    image.
+    """
     longer = max(dpu_s, host_s)
     shorter = min(dpu_s, host_s)
     # (dpu^q + host^q)^(1/q) with the longer time factored out: no power leaves the floats' range.
@@ -216,8 +226,8 @@ BANDS = 4
 
 
 def host_work(bytes_in: float, bytes_out: float, values: float, task: Task) -> Array:
-    """Units of the host's work for one image, (7,): 1, bytes in, bytes out, values of each task but
-    copying.
+    """Return the units of the host's work for one image, (7,): 1, bytes in, bytes out, and the
+    values of each task except copying.
 
     An image needs no other reading of its bytes than becoming pixels.
     """
@@ -230,14 +240,16 @@ COPIES = 3
 
 
 def host_parts_s(units: Array, constants: Constants) -> Array:
-    """Time of the host's copies and of its task on one core, (n, 2), of units (n, 7)."""
+    """Return the time of the host's copies and of its task on one core, (n, 2), given the units (n,
+    7).
+    """
     times = units * constants.host_s_per_unit
     return np.stack([times[:, :COPIES].sum(axis=1), times[:, COPIES:].sum(axis=1)], axis=1)
 
 
 def placed_work(placement: Placement, task: Task) -> Array:
-    """Units of the host's work for a network of a file, (7,): the task takes every value of the
-    results, but of YOLO's maps one score for each box.
+    """Return the units of the host's work for a placed network, (7,). The task reads every value of
+    the results, but for YOLO's maps only one score per box.
     """
     onto, back = _crossing_bytes(placement)
     return host_work(onto, back, back * (_scores(placement) if task == "sort" else 1), task)
@@ -262,27 +274,24 @@ def _scores(placement: Placement) -> float:
         for node in placement.nodes
         if node.op.out_shape is not None and not back.isdisjoint(node.op.outputs)
     }
-    if len(channels) != 1:
-        return 1.0
-    (count,) = channels
-    boxes = count % BOXES == 0 and count >= LEAST * BOXES
-    return BOXES / count if boxes else 1.0
+    # Of maps with different numbers of channels all is read, as of one whose number is 1.
+    count = channels.pop() if len(channels) == 1 else 1
+    return BOXES / count if count % BOXES == 0 and count >= LEAST * BOXES else 1.0
 
 
 def task_of(placement: Placement) -> Task:
-    """What a file tells of the host; one result of few bands, no smaller than the image, becomes an
-    image.
+    """Return the task of the host, derived from its operators. A single result of few bands that is
+    not smaller than the input becomes an image.
     """
-    behind = [node.op.op_type for node in placement.nodes if node.part == "host-back"]
-    task = next((OPERATORS[name] for name in behind if name in OPERATORS), None)
+    for node in placement.nodes:
+        if node.part == "host-back" and node.op.op_type in OPERATORS:
+            return OPERATORS[node.op.op_type]
     onto, back = _crossing_bytes(placement)
-    if task:
-        return task
     return "image" if back >= onto and _gives_an_image(placement) else "copy"
 
 
 def _crossing_bytes(placement: Placement) -> tuple[int, int]:
-    """Bytes of one image that the host hands to the DPU, and takes back."""
+    """Return the bytes of one image that the host sends to the DPU, and those that it receives."""
     onto = sum(cut.size_bytes or 0 for cut in placement.cuts if cut.onto_dpu)
     return onto, sum(cut.size_bytes or 0 for cut in placement.cuts if not cut.onto_dpu)
 
@@ -310,8 +319,8 @@ two (assumed).
 
 
 def refused_interval_s(operations: Sequence[Operation], dpu: Dpu) -> Interval:
-    """Time that the board's processor takes for operations that the DPU refuses: one image, all
-    cores, in s.
+    """Return the shortest and the longest time in s of the board's processor, with all cores, for
+    the operations of one image that the DPU refuses.
 
     None of it is fitted: no published rate tells such work apart. The least is what the processor's
     published rates allow, products as a good library does them and every number moved once; the
@@ -319,26 +328,25 @@ def refused_interval_s(operations: Sequence[Operation], dpu: Dpu) -> Interval:
     """
     if not operations:
         return 0.0, 0.0
-    times = [_core_s(op, dpu) for op in operations]
-    cores = dpu.whole("cpu", "cores")
-    low_s = math.fsum(low for low, _ in times)
-    high_s = math.fsum(high for _, high in times)
-    return low_s / cores, high_s / cores
+    times = []
+    for op in operations:
+        values = op.out_bytes + sum(math.prod(shape) for shape in op.in_shapes if shape is not None)
+        moved_values = values + op.weight_bytes
+        times.append(_plain_work_s(op.operations, moved_values, op.out_bytes, dpu))
+    low_s, high_s = (
+        math.fsum(ends) / dpu.whole("cpu", "cores") for ends in zip(*times, strict=True)
+    )
+    return low_s, high_s
 
 
 def between(interval: Interval) -> float:
-    """The geometric mean: the ends are factors apart."""
+    """Return the geometric mean of two ends, which are factors apart."""
     return math.sqrt(interval[0] * interval[1])
 
 
-def _core_s(op: Operation, dpu: Dpu) -> Interval:
-    values = op.out_bytes + sum(math.prod(shape) for shape in op.in_shapes if shape is not None)
-    return _plain_work_s(op.operations, values + op.weight_bytes, op.out_bytes, dpu)
-
-
 def _plain_work_s(operations: float, moved_values: float, results: float, dpu: Dpu) -> Interval:
-    """Time of one core for float32 work, least and most: as a good library does it, and number by
-    number.
+    """Return the shortest and the longest time of one core for float32 work: by a good library, and
+    by plain code.
     """
     keys = ("clock_ghz", "product_flops_per_cycle", "moved_bytes_per_s", "decoding_mips_per_ghz")
     clock, products, bandwidth, decoding = (dpu.limit("cpu", key) for key in keys)
@@ -351,8 +359,8 @@ def _plain_work_s(operations: float, moved_values: float, results: float, dpu: D
 
 
 def consistency_interval_s(pixels: float, dpu: Dpu) -> Interval:
-    """Time that the board's processor takes for the consistency step on so many pixels: all cores,
-    in s.
+    """Return the shortest and the longest time in s of the board's processor, with all cores, for
+    the consistency step on `pixels` pixels.
 
     None of it is fitted. The raw and the restored image are read and the result is written; the
     step's other numbers stay in the caches.

@@ -6,9 +6,13 @@ count too.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from beers_deploy.dpu.board import Dpu, Levels, dpu_of
 from beers_deploy.dpu.checker.placement import Placement, place
@@ -16,18 +20,40 @@ from beers_deploy.dpu.cost.latency import Prediction, predict
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.figures import Row, predicted, published
+from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.profiles.target import TargetProfile
 from beers_deploy.profiles.toml import read_json, unreadable
+from beers_deploy.profiles.validation import CONFIG
 
 EXAMPLE = 'Write [{"model": "core.onnx", "configuration": "C32B3", "tile_px": 640, "fps": 9.5}].'
-RUNS = 100
-TILE_PX = (16, 1 << 16)
 FAR = 10_000
-"""Most runs; least and most of a tile's side; and how many times off a rate of this network may be
-predicted.
-"""
-POWER_W = (0.01, 1000.0)
-KEYS = {"model", "configuration", "tile_px", "fps", "power_w", "provider", "target"}
+"""The largest factor by which the rate of a run may differ from the prediction of its network."""
+
+
+@pydantic_dataclass(frozen=True, config=CONFIG)
+class Entry:
+    """One run as a file states it, such as `measure.py` writes it.
+
+    Attributes:
+        model: the path of the network, relative to the file.
+        fps: frames per second.
+        tile_px: side of a tile in pixels.
+        configuration: of the DPU; the board's default if None.
+        target: the board, if it is another one with the same DPU.
+        provider: of onnxruntime.
+        power_w: not used, because runs correct rates alone.
+    """
+
+    model: str
+    fps: Annotated[float, Field(strict=True, gt=0)]
+    tile_px: Annotated[int, Field(strict=True, ge=16, le=1 << 16)] = TILE_PX
+    configuration: str | None = None
+    target: str | None = None
+    provider: str | None = None
+    power_w: Annotated[float, Field(strict=True, ge=0)] | None = None
+
+
+ENTRIES = TypeAdapter(Annotated[list[Entry], Field(min_length=1, max_length=100)])
 
 
 @dataclass(frozen=True)
@@ -43,7 +69,7 @@ class Run:
 
     @property
     def ratio(self) -> tuple[Levels, float]:
-        """What it has in common with others, and ln(given / predicted)."""
+        """Return the levels of kinship of the run, and ln(given / predicted)."""
         return self.predicted.levels, math.log(self.fps / self.predicted.fps)
 
 
@@ -55,11 +81,11 @@ class OwnRuns:
     runs: Sequence[Run]
 
     def applied(self, dpu: Dpu) -> Dpu:
-        """The configuration, whose predictions the runs correct."""
+        """Return the configuration with the runs, which correct its predictions."""
         return replace(dpu, runs=tuple(run.ratio for run in self.runs))
 
     def run_rows(self) -> list[Row]:
-        """The rate given for each run, and what is predicted without runs and by the others."""
+        """Return a row for each run: its rate, and the predictions without and by other runs."""
         rows = []
         for run in self.runs:
             before = run.predicted
@@ -78,81 +104,50 @@ class OwnRuns:
 
 
 def read_own_runs(path: Path, dpu: Dpu) -> OwnRuns:
-    """Compare the runs in a file with what is predicted of them on `dpu`'s board."""
+    """Compare the runs in a file with their predictions on the board of `dpu`.
+
+    Raises:
+        OptionError: the file is not a list of runs, or a run is not one of this board.
+    """
+    try:
+        entries = ENTRIES.validate_python(read_json(path))
+    except ValidationError as error:
+        fault = error.errors(include_url=False)[0]
+        where = f"{path} must be a list of runs"
+        if fault["loc"]:
+            number, *keys = fault["loc"]
+            where = " ".join([f"Run {int(number) + 1} in {path.name}", *map(str, keys)])
+        raise OptionError(f"{printable(where)}: {fault['msg']}. {EXAMPLE}") from None
+    except (OSError, ValueError) as error:
+        reason = unreadable(path) or f"it is not valid JSON ({printable(str(error))})"
+        raise OptionError(f"{path} cannot be read: {reason}. {EXAMPLE}") from error
     runs = [
         _run(entry, path, f"Run {number} in {path.name}", dpu)
-        for number, entry in enumerate(_read(path), 1)
+        for number, entry in enumerate(entries, 1)
     ]
     return OwnRuns(f"{len(runs)} runs in {path.name}, weighed by kinship", runs)
 
 
-def _read(path: Path) -> Sequence[Mapping[str, object]]:
-    try:
-        runs = read_json(path)
-    except (OSError, ValueError) as error:
-        if fault := unreadable(path):
-            message = f"{path} cannot be read: {fault}. Check the path."
-        else:
-            message = f"{path} is not a valid JSON file: {printable(str(error))}. {EXAMPLE}"
-        raise OptionError(message) from error
-    if (
-        not isinstance(runs, list)
-        or not 0 < len(runs) <= RUNS
-        or not all(isinstance(run, dict) for run in runs)
-    ):
-        actual = f"a list of {len(runs)}" if isinstance(runs, list) else type(runs).__name__
-        raise OptionError(f"{path} must be a list of 1 to {RUNS} runs, got {actual}. {EXAMPLE}")
-    return runs
-
-
-def _run(entry: Mapping[str, object], path: Path, where: str, board: Dpu) -> Run:
-    if "model" not in entry or set(entry) - KEYS:
-        given = printable(", ".join(sorted(entry)) or "none")
-        others = ", ".join(sorted(KEYS - {"model"}))
-        raise OptionError(
-            f"{where} must have the key model, and may have {others}, got {given}. {EXAMPLE}"
-        )
+def _run(entry: Entry, path: Path, where: str, board: Dpu) -> Run:
     # onnxruntime's CPU provider runs the file on a processor: its rate says nothing of the DPU.
-    if entry.get("provider") == "CPUExecutionProvider":
+    if entry.provider == "CPUExecutionProvider":
         raise OptionError(
             f"{where} is a run of onnxruntime's CPU provider, not of the board. Measure it with "
             "the board's provider."
         )
-    tile_px = _number(entry.get("tile_px", 640), "tile_px", TILE_PX, where)
-    if tile_px != int(tile_px):
-        raise OptionError(f"{where} must have tile_px in whole pixels, got {tile_px}. {EXAMPLE}")
-    dpu = _dpu(entry, where, board)
-    model = path.parent / str(entry["model"])
-    placement = place(read_network(model, int(tile_px)), dpu)
-    prediction = predict(placement, dpu)
-    # A power is checked but not used: the runs correct rates alone.
-    if "power_w" in entry:
-        _number(entry["power_w"], "power_w", POWER_W, where)
-    fps = _number(entry.get("fps"), "fps", (prediction.fps / FAR, prediction.fps * FAR), where)
-    return Run(f"{model.stem}, tiles of {tile_px:g}", placement, fps, prediction)
-
-
-def _dpu(entry: Mapping[str, object], where: str, board: Dpu) -> Dpu:
-    """Return the configuration of a run, which may be of another board with the same DPU."""
-    name = entry.get("target")
-    target = TargetProfile.load(str(name)) if name else board.target
+    target = TargetProfile.load(entry.target) if entry.target else board.target
     if target.documents.get("operators") != board.target.documents["operators"]:
         raise OptionError(
             f"{where} is of {printable(target.name)}, whose DPU is not that of "
             f"{board.target.name}. Give runs of boards with the same DPU."
         )
-    return dpu_of(target, str(entry.get("configuration", "")) or None)
-
-
-def _number(value: object, key: str, ends: tuple[float, float], where: str) -> float:
-    # A bool is an int in Python, and true is no number of a run.
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, int | float)
-        or not ends[0] <= value <= ends[1]
-    ):
+    dpu = dpu_of(target, entry.configuration)
+    model = path.parent / entry.model
+    placement = place(read_network(model, entry.tile_px), dpu)
+    prediction = predict(placement, dpu)
+    if not prediction.fps / FAR <= entry.fps <= prediction.fps * FAR:
         raise OptionError(
-            f"{where} must have {key} of {ends[0]:g} to {ends[1]:g}, got "
-            f"{printable(repr(value))}. {EXAMPLE}"
+            f"{where} has {entry.fps:g} frames per second, but {prediction.fps:.3g} are predicted, "
+            "which is too far away to be the same network. Correct fps or model."
         )
-    return float(value)
+    return Run(f"{model.stem}, tiles of {entry.tile_px}", placement, entry.fps, prediction)

@@ -48,22 +48,24 @@ class Work:
 
     @property
     def array_use(self) -> float:
-        """Operations used over computed, 0 to 1; 1 for what does not run on the array."""
+        """Return the share of the array's operations that are needed, 0 to 1; 1 for work outside
+        the array.
+        """
         return self.operations / self.array_operations if self.array_operations else 1.0
 
     @property
     def map_bytes(self) -> int:
-        """Of feature maps, loaded and stored."""
+        """Return the bytes of feature maps that are loaded and stored."""
         return self.load_map_bytes + self.store_map_bytes
 
     @property
     def launched(self) -> bool:
-        """Whether it has a start of its own."""
+        """Return True if the operation has a start of its own."""
         return self.kind not in UNSTARTED
 
 
 def count_work(operations: Sequence[Operation], dpu: Dpu) -> tuple[Work, ...]:
-    """The work of operations that run one behind the other on the DPU."""
+    """Count the work of operations that run in sequence on the DPU."""
     flow = _Flow(operations, dpu)
     works = []
     for op in operations:
@@ -84,7 +86,7 @@ def count_work(operations: Sequence[Operation], dpu: Dpu) -> tuple[Work, ...]:
 
 
 def _array_operations(op: Operation, dpu: Dpu) -> int:
-    """Input and output channels, rows and columns are filled up.
+    """Return the operations of the array, which fills up channels, rows and columns.
 
     A transposed convolution runs as one convolution for each phase of its stride, which gives one
     pixel of every block of the output. No zeros are multiplied.
@@ -106,7 +108,7 @@ def _array_operations(op: Operation, dpu: Dpu) -> int:
 
 
 def _row_inputs(channels: int, columns: int, dpu: Dpu) -> int:
-    """Inputs that a row of a window takes, used or not.
+    """Return the number of inputs that the array reads for one row of a window, used or not.
 
     Where there are few channels, several columns of the window are taken in side by side (channel
     augmentation).
@@ -134,8 +136,8 @@ def _lane_steps(op: Operation, dpu: Dpu) -> int:
 
 
 def _positions(shape: Shape | None, rows: int, columns: int = 1) -> int:
-    """Output pixels, filled up to the rows, and to the columns of them, that are computed at a
-    time.
+    """Return the number of output pixels, rounded up to the rows and columns that are computed at
+    once.
     """
     return _up(shape[1], rows) * _up(shape[2], columns) if shape else 0
 
@@ -158,7 +160,7 @@ class _Flow:
     def __init__(self, operations: Sequence[Operation], dpu: Dpu) -> None:
         # A group of banks is read while another is written.
         groups = dpu.value("memory", "feature_map_groups") / 2
-        self._kept_bytes = dpu.value("memory", "feature_map_bytes") * groups
+        self._bank_bytes = dpu.value("memory", "feature_map_bytes") * groups
         self._lanes = dpu.input_parallel
         self._same: dict[str, str] = {}
         for op in operations:
@@ -182,7 +184,7 @@ class _Flow:
         self._sums = {self._root(self._fused(op)): op.output for op in sums}
 
     def serial(self, op: Operation) -> bool:
-        """Whether an operation adds or multiplies two maps that do not fit the chip."""
+        """Return True if an operation adds or multiplies two maps that do not fit the chip."""
         return (
             op.kind in ("add", "mul")
             and len(op.inputs) == 2
@@ -191,8 +193,8 @@ class _Flow:
         )
 
     def load(self, op: Operation) -> int:
-        """Bytes read: all operands but the one that an add is fused with, and what that one has
-        read already.
+        """Return the bytes that are read. The operand that an add is fused with, and what that
+        operation has read, are on the chip.
         """
         # A concat computes nothing: its operands were stored where it joins them.
         if op.kind == "concat":
@@ -212,7 +214,9 @@ class _Flow:
         )
 
     def store(self, op: Operation) -> int:
-        """Bytes written; a fused add's are those of the operation that it is fused with."""
+        """Return the bytes that are written. A fused add writes in place of the operation that it
+        is fused with.
+        """
         if op.kind in UNSTARTED:
             return 0
         name = self._root(op.output)
@@ -227,8 +231,8 @@ class _Flow:
         return size // piece * _up(piece, BURST_BYTES) if piece else size
 
     def _piece_channels(self, operations: Sequence[Operation]) -> dict[str, int]:
-        """Channels of a pixel that lie in one piece, by result; a shuffle at a network's end is
-        left to the host.
+        """Return the number of contiguous channels of a pixel, by result. A pixel shuffle at the
+        end of a network is left to the host.
         """
         pieces: dict[str, int] = {}
         for op in operations:
@@ -242,7 +246,7 @@ class _Flow:
         return pieces
 
     def _fused(self, add: Operation) -> str:
-        """The operand of an add that is made last."""
+        """Return the operand of an add that is computed last."""
         return max(add.inputs, key=lambda name: self._order.get(self._root(name), -1))
 
     def _leaves(self, name: str) -> bool:
@@ -253,7 +257,7 @@ class _Flow:
     def _fits(self, root: str) -> bool:
         shape = self._shapes.get(root)
         # In the banks channels are filled up to the lanes too.
-        return shape is None or _up(shape[0], self._lanes) * shape[1] * shape[2] <= self._kept_bytes
+        return shape is None or _up(shape[0], self._lanes) * shape[1] * shape[2] <= self._bank_bytes
 
     def _root(self, name: str) -> str:
         return self._same.get(name, name)
@@ -264,5 +268,5 @@ def _size(shape: Shape | None) -> int:
 
 
 def largest_map_bytes(operations: Sequence[Operation]) -> int:
-    """The largest result of a network."""
+    """Return the size of the largest result of a network."""
     return max(op.out_bytes for op in operations if op.kind not in FUSED)

@@ -34,17 +34,8 @@ def between_convs(tmp_path: Path, draw: Draw, dpu: Dpu = DPU, channels: int = 8)
     sketch = Sketch(channels)
     middle = draw(sketch, sketch.conv("image", (channels, channels, 1, 1)))
     result = sketch.node("AveragePool", middle, kernel_shape=[1, 1])
-    end = sketch.conv(result, (1, sketch_channels(sketch, middle, channels), 1, 1))
+    end = sketch.conv(result, (1, channels, 1, 1))
     return broken_rules(sketch.save(tmp_path / "net.onnx", end), dpu)
-
-
-def sketch_channels(sketch: Sketch, tensor: str, default: int) -> int:
-    """Output channels of a convolution's result; the stream's own for all else."""
-    weights = {t.name: t.dims for t in sketch.constants}
-    for node in sketch.nodes:
-        if node.output[0] == tensor and node.op_type in ("Conv", "ConvTranspose"):
-            return int(weights[node.input[1]][0 if node.op_type == "Conv" else 1])
-    return default
 
 
 def conv(*weight: int, **attributes: Value) -> Draw:
@@ -80,13 +71,38 @@ def padded(mode: str) -> Draw:
     return lambda sketch, source: sketch.node("Pad", source, sketch.constant(pads), mode=mode)
 
 
+def in_two(first: Draw, second: Draw) -> Draw:
+    """Two draws, one behind the other."""
+    return lambda sketch, source: second(sketch, first(sketch, source))
+
+
+def conv_3x3(**attributes: Value) -> Draw:
+    return conv(8, 8, 3, 3, **attributes)
+
+
+def depthwise(height: int, width: int, **attributes: Value) -> Draw:
+    return conv(8, 1, height, width, group=8, **attributes)
+
+
+def max_pool(rows: int, columns: int, **attributes: Value) -> Draw:
+    return node("MaxPool", kernel_shape=[rows, columns], **attributes)
+
+
+def doubled(sketch: Sketch, source: str) -> str:
+    return sketch.node("Add", source, source)
+
+
 def behind_conv(op_type: str, **attributes: Value) -> Draw:
-    return lambda sketch, source: sketch.node(
-        op_type, sketch.conv(source, (8, 8, 3, 3)), **attributes
-    )
+    return in_two(conv_3x3(), node(op_type, **attributes))
+
+
+def behind_depthwise(op_type: str, **attributes: Value) -> Draw:
+    return in_two(depthwise(3, 3), node(op_type, **attributes))
 
 
 def behind_sum(op_type: str, **attributes: Value) -> Draw:
-    return lambda sketch, source: sketch.node(
-        op_type, sketch.node("Add", source, source), **attributes
-    )
+    return in_two(doubled, node(op_type, **attributes))
+
+
+def behind_pool(op_type: str, **attributes: Value) -> Draw:
+    return in_two(max_pool(2, 2), node(op_type, **attributes))

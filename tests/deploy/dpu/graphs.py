@@ -118,26 +118,19 @@ def board_convbeers(path: Path, blocks: int, features: int) -> Path:
     """The board's QDQ encoding of the core by itself, int8 weights and bias through
     DequantizeLinear.
     """
-    s = IntegerSketch()
-
-    def pair(source: str) -> str:
-        return s.node("DequantizeLinear", s.node("QuantizeLinear", source, *s.numbers), *s.numbers)
+    s = QdqSketch(1)
 
     def conv(source: str, *weight: int) -> str:
-        feeds = (s.constant(np.ones(shape, np.int8)) for shape in (weight, weight[:1]))
-        return s.node(
-            "Conv",
-            source,
-            *(s.node("DequantizeLinear", f, *s.numbers) for f in feeds),
-            pads=[1] * 4,
-        )
+        feeds = (s.stored(np.ones(shape, np.int8)) for shape in (weight, weight[:1]))
+        return s.node("Conv", source, *feeds, pads=[1] * 4)
 
-    stream = head = pair(conv(pair("image"), features, 1, 3, 3))
+    wide = (features, features, 3, 3)
+    stream = head = s.pair(conv(s.pair("image"), features, 1, 3, 3))
     for _ in range(blocks):
-        inner = pair(s.node("Relu", conv(stream, features, features, 3, 3)))
-        stream = pair(s.node("Add", stream, pair(conv(inner, features, features, 3, 3))))
-    deep = pair(s.node("Add", head, pair(conv(stream, features, features, 3, 3))))
-    return s.save(path, pair(conv(deep, 1, features, 3, 3)))
+        inner = s.pair(s.node("Relu", conv(stream, *wide)))
+        stream = s.pair(s.node("Add", stream, s.pair(conv(inner, *wide))))
+    deep = s.pair(s.node("Add", head, s.pair(conv(stream, *wide))))
+    return s.save(path, s.pair(conv(deep, 1, features, 3, 3)))
 
 
 class QdqSketch(Sketch):

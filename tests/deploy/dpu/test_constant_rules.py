@@ -19,7 +19,6 @@ from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.graph import Operation
 from beers_deploy.dpu.reading import network_of, read_network
 from beers_deploy.float_onnx import to_onnx
-from beers_deploy.model.shipped import shipped_names
 from beers_deploy.model.variants import Variant
 from beers_deploy.quant.encodings import board_model
 from beers_deploy.quant.graph.quantized import Scale
@@ -27,8 +26,7 @@ from beers_deploy.quant.quantize import Quantized, quantize_model
 from tests.deploy.dpu.draws import rules_of
 from tests.deploy.dpu.graphs import IntegerSketch
 from tests.model.networks import plain
-from tests.quant.quick import changed, copied, drawn
-from tests.shipped import shipped_pair
+from tests.quant.quick import copied, drawn
 
 DPU = load_dpu("vck190")
 HALF = Scale((0.5,), (0,), "int8")
@@ -98,27 +96,11 @@ def test_the_bias_of_an_integer_kernel_is_looked_at(
     assert all("beers-deploy quantize" in node.broken[0].finding.remedy for node in nodes)
 
 
-@pytest.mark.parametrize("name", shipped_names())
-def test_the_shipped_files_keep_every_rule(name: str) -> None:
-    assert rules(onnx.load_model(shipped_pair(name)[1])) == set()
-
-
 @pytest.mark.parametrize("spread", [0.1, 3.0])
 def test_what_quantize_writes_of_random_networks_keeps_every_rule(spread: float) -> None:
     """In both encodings, biases small and large beside the products."""
     network = quantized(spread)
     assert rules(network.host) == rules(board_model(network.core, {})) == set()
-
-
-def test_a_bias_with_one_more_on_a_value_is_refused() -> None:
-    """Of those with a shift above 0: each has a largest value that needs its shift."""
-    values = {tensor.name: numpy_helper.to_array(tensor) for tensor in own_file().graph.initializer}
-    biases = [node.input[8] for node in own_file().graph.node if node.op_type == "QLinearConv"]
-    shifted = [name for name in biases if not (values[name] % 2).any()]
-    assert len(shifted) > len(biases) // 2
-    for name in shifted:
-        model = changed(own_file(), name, lambda bias: bias + (np.arange(len(bias)) == 0))
-        assert rules(model) == {"int32 bias"}, name
 
 
 @pytest.mark.parametrize(

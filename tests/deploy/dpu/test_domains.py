@@ -17,7 +17,6 @@ from beers_deploy.quant.domains import INTEGER_OPERATORS, is_foreign, operator_n
 from beers_deploy.quant.graph import refusal
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.verbs.check import check
-from tests.deploy.command_line import done
 from tests.deploy.dpu.graphs import Sketch
 
 BOARDS = [*board_names(), *npu_names()]
@@ -69,35 +68,6 @@ def refused_by_load(path: Path) -> str:
 
 def test_the_same_network_without_another_domain_is_legal(tmp_path: Path) -> None:
     assert check(network(tmp_path / "a.onnx", "nowhere", "my.ops"), tile=64)
-
-
-def with_function(path: Path, domain: str) -> Path:
-    """A Relu that the file itself defines, as its negation."""
-    sketch = Sketch(8)
-    sketch.save(path, sketch.conv(sketch.node("Relu", sketch.conv("image"), domain=domain)))
-    model = onnx.load_model(path)
-    body = [helper.make_node("Neg", ["x"], ["y"])]
-    opsets = [helper.make_opsetid("", 17)]
-    model.functions.append(helper.make_function(domain, "Relu", ["x"], ["y"], body, opsets))
-    if domain:
-        model.opset_import.append(helper.make_opsetid(domain, 1))
-    path.write_bytes(model.SerializeToString())
-    return path
-
-
-@pytest.mark.parametrize("domain", ["local", ""])
-def test_a_function_of_the_file_is_no_operator_of_onnx(domain: str, tmp_path: Path) -> None:
-    path = with_function(tmp_path / "a.onnx", domain)
-    output = done(f"check {path} --tile 64", code=1)
-    assert f"{domain}::Relu" in output
-    message = refused_by_load(path)
-    assert f"Relu of {domain!r}, a function" in message
-    assert "inline its functions" in message
-
-
-def test_onnxruntimes_optimised_file_names_the_remedy(tmp_path: Path) -> None:
-    path = network(tmp_path / "a.onnx", "between", "com.microsoft")
-    assert "give the file that onnxruntime read" in refused_by_load(path)
 
 
 @given(

@@ -11,10 +11,10 @@ from tests.deploy.dpu.graphs import Sketch
 DPU = load_dpu("vck190")
 
 
-def placed(path: Path, weight: tuple[int, ...], tile_px: int) -> PlacedNode:
-    """A convolution without padding over a map of that side."""
+def placed(path: Path, weight: tuple[int, ...], tile_px: int, *pads: int) -> PlacedNode:
+    """A convolution over a map of that side."""
     sketch = Sketch(weight[1])
-    sketch.save(path, sketch.conv("image", weight, pads=[0] * 4))
+    sketch.save(path, sketch.conv("image", weight, pads=[*pads] or [0] * 4))
     return place(read_network(path, tile_px), DPU).nodes[-1]
 
 
@@ -23,6 +23,9 @@ def test_a_layer_as_large_as_its_map_is_also_one_pixel_of_all_its_values(tmp_pat
     assert fully_connected(op)
     shapes = [(form.kernel, form.channels) for form in forms(op, DPU)]
     assert shapes[1:] == [((20, 20), (8, 10)), ((1, 1), (3200, 10))]
+    padded = placed(tmp_path / "p.onnx", (10, 8, 20, 20), 20, 0, 0, 1, 1)
+    assert not fully_connected(padded.op)
+    assert padded.broken
 
 
 @pytest.mark.parametrize(
@@ -47,11 +50,3 @@ def test_a_fully_connected_layer_is_taken_in_any_form_that_fits(
     node = placed(tmp_path / "n.onnx", weight, tile_px)
     assert {violation.rule for violation in node.broken} == rules
     assert node.device == ("CPU" if rules else "DPU")
-
-
-def test_padding_makes_it_another_layer(tmp_path: Path) -> None:
-    sketch = Sketch(8)
-    sketch.save(tmp_path / "p.onnx", sketch.conv("image", (10, 8, 20, 20), pads=[0, 0, 1, 1]))
-    (node,) = place(read_network(tmp_path / "p.onnx", 20), DPU).nodes
-    assert not fully_connected(node.op)
-    assert node.broken

@@ -9,11 +9,10 @@ from types import FrameType
 from typing import Any
 
 import numpy as np
-import onnx
 import pytest
-from onnx import TensorProto, helper, numpy_helper
 
 from beers_deploy.verbs.check import check
+from tests.deploy.dpu.graphs import IntegerSketch
 
 TraceFunction = Callable[[FrameType, str, Any], Any]
 
@@ -23,124 +22,64 @@ QUADRATIC = 2.5
 """A linear step takes twice as many more for the second doubling as for the first, a quadratic one
 four times.
 """
-
-
 CHANNELS = 8
 WEIGHT = np.random.default_rng(0).normal(0, 0.05, (CHANNELS, CHANNELS, 3, 3)).astype(np.float32)
 SHUFFLED = ((0, 2, 2, 2, 64, 64), (0, 2, 128, 128))
 """Two shapes by which exporters spell a pixel shuffle."""
 
 
-class Chain:
-    """A network under construction; `last` is the tensor that it has come to."""
-
-    def __init__(self) -> None:
-        self.last = "image"
-        self.nodes: list[onnx.NodeProto] = []
-        self.constants: list[onnx.TensorProto] = []
-
-    def then(
-        self, op_type: str, *inputs: str, domain: str = "", **attributes: int | list[int]
-    ) -> str:
-        """Append a node of these inputs, or of the last tensor, and return its result."""
-        sources = list(inputs or (self.last,))
-        self.last = f"{op_type}{len(self.nodes)}"
-        node = helper.make_node(op_type, sources, [self.last], name=self.last, domain=domain)
-        node.attribute.extend(
-            helper.make_attribute(key, value) for key, value in attributes.items()
-        )
-        self.nodes.append(node)
-        return self.last
-
-    def constant(self, value: object) -> str:
-        """Add a constant and return its name."""
-        name = f"constant{len(self.constants)}"
-        self.constants.append(numpy_helper.from_array(np.asarray(value), name))
-        return name
-
-    def convolve(self) -> str:
-        """Append a convolution with weights of its own."""
-        return self.then("Conv", self.last, self.constant(WEIGHT), pads=[1] * 4)
-
-    def model(self) -> onnx.ModelProto:
-        """Return the network that ends with the last tensor."""
-        image = helper.make_tensor_value_info("image", TensorProto.FLOAT, ["N", CHANNELS, "H", "W"])
-        result = helper.make_tensor_value_info(self.last, TensorProto.FLOAT, ["N", "C", "H2", "W2"])
-        graph = helper.make_graph(self.nodes, "chain", [image], [result], self.constants)
-        opsets = [helper.make_opsetid("", 17), helper.make_opsetid("com.microsoft", 1)]
-        return helper.make_model(graph, opset_imports=opsets, ir_version=8)
+def convolved(s: IntegerSketch, x: str) -> str:
+    """Convolve with weights of their own."""
+    return s.node("Conv", x, s.constant(WEIGHT), pads=[1] * 4)
 
 
-def residual(chain: Chain) -> None:
+def residual(s: IntegerSketch, x: str) -> str:
     """Add a convolution with a ReLU to what it reads."""
-    before = chain.last
-    chain.convolve()
-    chain.then("Add", before, chain.then("Relu"))
+    return s.node("Add", x, s.node("Relu", convolved(s, x)))
 
 
-def scaled(chain: Chain) -> None:
+def scaled(s: IntegerSketch, x: str) -> str:
     """Scale each channel in front of a convolution, which takes the scale in."""
-    chain.then("Relu")
-    chain.then("Mul", chain.last, chain.constant(np.full((1, CHANNELS, 1, 1), 0.9, np.float32)))
-    chain.convolve()
+    factor = s.constant(np.full((1, CHANNELS, 1, 1), 0.9, np.float32))
+    return convolved(s, s.node("Mul", s.node("Relu", x), factor))
 
 
-def pointwise(chain: Chain) -> None:
+def pointwise(s: IntegerSketch, x: str) -> str:
     """Change values by themselves, one node after the other."""
-    chain.then("Relu")
-    chain.then("Mul", chain.last, chain.constant(np.float32(0.99)))
-    chain.then("Sigmoid")
+    factor = s.constant(np.array(0.99, np.float32))
+    return s.node("Sigmoid", s.node("Mul", s.node("Relu", x), factor))
 
 
-def shuffled(chain: Chain) -> None:
+def shuffled(s: IntegerSketch, x: str) -> str:
     """Spell a pixel shuffle as exporters do, and take it back."""
-    chain.then("Reshape", chain.last, chain.constant(np.array(SHUFFLED[0])))
-    chain.then("Transpose", perm=[0, 1, 4, 2, 5, 3])
-    chain.then("Reshape", chain.last, chain.constant(np.array(SHUFFLED[1])))
-    chain.then("SpaceToDepth", blocksize=2)
-    chain.convolve()
+    apart, whole = (s.constant(np.array(shape)) for shape in SHUFFLED)
+    moved = s.node("Transpose", s.node("Reshape", x, apart), perm=[0, 1, 4, 2, 5, 3])
+    back = s.node("SpaceToDepth", s.node("Reshape", moved, whole), blocksize=2)
+    return convolved(s, back)
 
 
-def integers(chain: Chain) -> None:
+def integers(s: IntegerSketch, x: str) -> str:
     """Convolve, rectify and add on integers."""
-    if chain.last == "image":
-        values: dict[str, np.ndarray] = {
-            "scale": np.array(1 / 64, np.float32),
-            "zero": np.array(64, np.uint8),
-            "weight_zero": np.array(0, np.int8),
-            "weight": np.clip(WEIGHT * 64, -127, 127).astype(np.int8),
-            "bias": np.zeros(CHANNELS, np.int32),
-        }
-        chain.constants.extend(
-            numpy_helper.from_array(value, name) for name, value in values.items()
-        )
-        chain.then("QuantizeLinear", "image", "scale", "zero")
-    before = chain.last
-    constants = ("scale", "zero")
-    weights = ("weight", "scale", "weight_zero", *constants, "bias")
-    chain.then("QLinearConv", before, *constants, *weights, pads=[1] * 4)
-    chain.then("Max", chain.last, "zero")
-    chain.then(
-        "QLinearAdd", before, *constants, chain.last, *constants, *constants, domain="com.microsoft"
-    )
+    before = s.quantized(x) if x == "image" else x
+    return s.qadd(before, s.node("Relu", s.qconv(before, WEIGHT.shape)))
 
 
-KINDS: tuple[Callable[[Chain], None], ...] = (residual, scaled, pointwise, shuffled, integers)
+KINDS = (residual, scaled, pointwise, shuffled, integers)
 
 
-def network(kind: Callable[[Chain], None], nodes: int) -> onnx.ModelProto:
-    """Return a chain of blocks of a kind, with at least so many nodes."""
-    chain = Chain()
-    while len(chain.nodes) < nodes:
-        kind(chain)
-    return chain.model()
+def network(kind: Callable[[IntegerSketch, str], str], nodes: int, path: Path) -> Path:
+    """Write a chain of blocks of a kind, with at least so many nodes."""
+    sketch = IntegerSketch(CHANNELS)
+    last = "image"
+    while len(sketch.nodes) < nodes:
+        last = kind(sketch, last)
+    return sketch.save(path, last)
 
 
-def steps(model: onnx.ModelProto, path: Path) -> int:
+def steps(path: Path) -> int:
     """Count the instructions of Python that this package carries out; time would depend on the
     machine.
     """
-    onnx.save_model(model, path)
     count = 0
 
     def step(_frame: FrameType, event: str, _argument: object) -> TraceFunction:
@@ -165,10 +104,12 @@ def steps(model: onnx.ModelProto, path: Path) -> int:
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
-def test_steps_grow_with_the_nodes(kind: Callable[[Chain], None], tmp_path: Path) -> None:
+def test_steps_grow_with_the_nodes(
+    kind: Callable[[IntegerSketch, str], str], tmp_path: Path
+) -> None:
     # The first call also counts what is read once a process.
-    steps(network(kind, FEWEST), tmp_path / "a.onnx")
+    check(network(kind, FEWEST, tmp_path / "a.onnx"))
     few, more, most = (
-        steps(network(kind, FEWEST * times), tmp_path / "a.onnx") for times in (1, 2, 4)
+        steps(network(kind, FEWEST * times, tmp_path / "a.onnx")) for times in (1, 2, 4)
     )
     assert most - more < QUADRATIC * (more - few)

@@ -50,27 +50,22 @@ def runs_of(folder: Path, factor: float, *more: dict[str, str], name: str = "dee
 
 def test_a_run_corrects_by_kinship(folder: Path) -> None:
     """Nearly wholly the same again, less on another configuration or of another size, less again a
-    network of the same kinds of layers, and one that the host bounds not at all.
+    network of the same kinds of layers, and one that the host bounds not at all. What is corrected
+    is narrower.
     """
     runs = runs_of(folder, 0.5)
-    other = runs.applied(load_dpu("vck190", "C32B6"))
-    corrected = [
-        rate(folder, "deep", runs.applied(DPU)),
-        rate(folder, "deep", other),
-        rate(folder, "kin", runs.applied(DPU)),
-        rate(folder, "flat", runs.applied(DPU)),
-    ]
-    shares = [math.log(prediction.speed) / math.log(0.5) for prediction in corrected]
-    assert shares == pytest.approx([sum(SHARES), sum(SHARES[:3]), sum(SHARES[:2]), 0])
-    assert rate(folder, "deep", runs.applied(DPU), 256).speed == pytest.approx(corrected[1].speed)
-
-
-def test_what_is_corrected_is_narrower(folder: Path) -> None:
-    runs = runs_of(folder, 0.5)
-    for name, dpu in (("deep", DPU), ("deep", load_dpu("vck190", "C32B6")), ("kin", DPU)):
-        before = rate(folder, name, dpu)
-        after = rate(folder, name, runs.applied(dpu))
-        share = math.log(after.speed) / math.log(0.5)
+    six = load_dpu("vck190", "C32B6")
+    for name, dpu, tile_px, kinship in (
+        ("deep", DPU, 320, 4),
+        ("deep", six, 320, 3),
+        ("deep", DPU, 256, 3),
+        ("kin", DPU, 320, 2),
+        ("flat", DPU, 320, 0),
+    ):
+        before = rate(folder, name, dpu, tile_px)
+        after = rate(folder, name, runs.applied(dpu), tile_px)
+        share = sum(SHARES[:kinship])
+        assert after.speed == pytest.approx(0.5**share)
         assert after.width == pytest.approx(before.width * math.sqrt(1 - share**2))
         assert after.fps == pytest.approx(before.fps * after.speed)
         assert after.latency_s == pytest.approx(before.latency_s / after.speed)
@@ -114,20 +109,13 @@ def test_each_run_is_compared_with_what_the_others_say_of_it(folder: Path) -> No
     [
         "{",
         "[]",
-        "3",
         '[{"fps": 3}]',
-        '[{"model": "deep.onnx", "fps": 0}]',
         '[{"model": "deep.onnx", "fps": true}]',
-        '[{"network": "resnet-50", "fps": 3}]',
         '[{"model": "deep.onnx", "fps": 3, "tile_px": 8}]',
         '[{"model": "deep.onnx", "fps": 3, "tile_px": 64.5}]',
         '[{"model": "deep.onnx", "fps": 3, "speed": 8}]',
         '[{"model": "deep.onnx", "fps": 3, "provider": "CPUExecutionProvider"}]',
-        '[{"model": "deep.onnx", "fps": 1e-300}]',
-        '[{"model": "deep.onnx", "fps": 3, "power_w": "x"}]',
         '[{"model": "deep.onnx", "fps": 1e999}]',
-        '[{"model": "deep.onnx", "fps": 3, "tile_px": 1048576}]',
-        f'[{{"model": "deep.onnx", "fps": 3, "tile_px": {10**300}}}]',
         '[{"model": "deep.onnx", "fps": 1e-8, "tile_px": 320}]',
         '[{"model": "deep.onnx", "fps": 1e8, "tile_px": 320}]',
         f"[{', '.join(101 * [RUN])}]",

@@ -1,6 +1,8 @@
+from collections.abc import Callable
 from pathlib import Path
 
 import onnx
+import pytest
 
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import FLOAT_NOTE, Placement, place
@@ -21,35 +23,26 @@ def placed(path: Path, tile_px: int = 21) -> Placement:
     return place(read_network(path, tile_px), DPU)
 
 
-def test_the_integer_file_has_three_parts_and_one_subgraph(tmp_path: Path) -> None:
-    placement = placed(integer_convbeers(tmp_path / "i.onnx", 2, 8), 53)
-    parts = [node.part for node in placement.nodes]
-    assert parts[0] == "host-front"
-    assert parts[-2:] == ["host-back", "host-back"]
-    assert set(parts[1:-2]) == {"dpu-core"}
-    assert placement.dpu_subgraphs == 1
-    assert not placement.failed
-    assert [(cut.size_bytes, cut.onto_dpu) for cut in placement.cuts] == [
-        (53 * 53, True),
-        (53 * 53, False),
-    ]
+@pytest.mark.parametrize(
+    ("make", "host"),
+    [
+        (float_convbeers, ["Add"]),
+        (integer_convbeers, ["QuantizeLinear", "DequantizeLinear", "Add"]),
+        (board_convbeers, ["QuantizeLinear", "DequantizeLinear"]),
+    ],
+)
+def test_the_core_of_each_encoding_is_one_subgraph_between_host_parts(
+    tmp_path: Path, make: Callable[..., Path], host: list[str]
+) -> None:
+    placement = placed(make(tmp_path / "n.onnx", 2, 8), 53)
+    assert [node.op.op_type for node in placement.nodes if node.device == "host"] == host
+    assert (placement.dpu_subgraphs, placement.failed) == (1, ())
+    assert placement.note == (FLOAT_NOTE if make is float_convbeers else "")
+    cuts = [(cut.size_bytes, cut.onto_dpu) for cut in placement.cuts]
+    assert cuts == [(53 * 53, True), (53 * 53, False)]
     remarks = remarks_on(placement, DPU, 53)
     assert placement.cuts[1].tensor in remarks["fix2float"]
     assert "subgraphs" not in remarks
-
-
-def test_a_float_file_is_judged_as_if_quantized(tmp_path: Path) -> None:
-    placement = placed(float_convbeers(tmp_path / "f.onnx", 2, 8))
-    assert placement.note == FLOAT_NOTE
-    assert [node.part for node in placement.nodes].count("host-back") == 1
-    assert placement.nodes[-1].part == "host-back"
-    assert (placement.dpu_subgraphs, placement.failed) == (1, ())
-
-
-def test_the_board_file_is_all_core_but_its_conversions(tmp_path: Path) -> None:
-    placement = placed(board_convbeers(tmp_path / "b.onnx", 2, 8))
-    assert [node.device for node in placement.nodes if node.part != "dpu-core"] == ["host", "host"]
-    assert (placement.dpu_subgraphs, placement.failed) == (1, ())
 
 
 def test_an_operator_in_the_middle_cuts_the_core_in_two(tmp_path: Path) -> None:
@@ -69,12 +62,6 @@ def test_a_branch_past_the_cpu_does_not_join_what_it_parts(tmp_path: Path) -> No
     first = sketch.conv("image")
     end = sketch.node("Add", first, sketch.conv(sketch.node("Sigmoid", first)))
     assert placed(sketch.save(tmp_path / "b.onnx", end)).dpu_subgraphs == 2
-
-
-def test_two_heads_of_one_input_are_two_subgraphs(tmp_path: Path) -> None:
-    sketch = Sketch(8)
-    path = sketch.save(tmp_path / "t.onnx", sketch.conv("image"), sketch.conv("image"))
-    assert placed(path).dpu_subgraphs == 2
 
 
 def test_scaling_in_front_is_the_hosts_but_other_operators_are_refused(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ and no more.
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
 from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
 
@@ -95,16 +94,3 @@ def test_onnxruntimes_files_are_refused_for_their_numbers_alone(
     core = [node.op for node in placement.nodes if node.part == "dpu-core"]
     assert {op.kind for op in core} >= {"conv", "add", "pool", "transposed", "activation"}
     assert all(op.out_shape is not None and op.integer for op in core)
-
-
-def test_nodes_of_a_quantizer_that_onnx_does_not_know_are_named_with_a_remedy(
-    tmp_path: Path,
-) -> None:
-    s = Sketch(4)
-    fixed = s.node("FixNeuron", s.conv("image", (4, 4, 3, 3)), domain="com.vai.quantize")
-    path = s.save(tmp_path / "v.onnx", s.conv(fixed, (4, 4, 3, 3)))
-    model = onnx.load_model(path)
-    model.opset_import.append(onnx.helper.make_opsetid("com.vai.quantize", 1))
-    onnx.save_model(model, path)
-    (violation,) = place(read_network(path, TILE_PX), DPU).nodes[1].broken
-    assert "QDQ" in violation.finding.remedy

@@ -3,9 +3,8 @@
 import math
 import re
 from collections.abc import Sequence
-from inspect import signature
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Any
 
 import numpy as np
 import onnx
@@ -15,18 +14,16 @@ from torch import nn
 
 import beers_deploy as bd
 from beers_deploy.dpu.board import boards_of, load_dpu
-from beers_deploy.dpu.cost.model import TASKS
 from beers_deploy.model.raster.images import read_acquisition
 from beers_deploy.network import Network
 from beers_deploy.performance import traditional
 from beers_deploy.performance.board import Bench, Question, bench_board, boards_for
-from beers_deploy.performance.swath import Swath, predict_network
-from beers_deploy.performance.tables import frame_row, sweep_rows, within_words
+from beers_deploy.performance.swath import Swath
+from beers_deploy.performance.tables import sweep_rows, within_words
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import board_names, npu_names
-from beers_deploy.verbs.verb import parts_of
 from tests.deploy.dpu.graphs import integer_convbeers
 
 
@@ -141,17 +138,6 @@ def test_a_network_that_is_not_tiled_is_predicted_by_the_frame(classifier: Path)
         bench(classifier, size="300x260")
 
 
-def test_a_frame_need_not_be_square(classifier: Path, tmp_path: Path) -> None:
-    model = onnx.load(classifier)
-    model.graph.input[0].type.tensor_type.shape.dim[3].dim_value = 96
-    onnx.save(model, tmp_path / "wide.onnx")
-    square, wide = (
-        frame_row(predict_network(path, load_dpu("vck190"), None)).figures["work"].value or 0
-        for path in (classifier, tmp_path / "wide.onnx")
-    )
-    assert wide > 2.5 * square
-
-
 @pytest.mark.parametrize("target", ["all", "kv260,vck190"])
 def test_one_configuration_or_runs_of_several_boards_are_refused(
     target: str, network: Path, tmp_path: Path
@@ -167,12 +153,6 @@ def test_an_npu_is_refused_next_to_boards_that_are_predicted(npu: str, network: 
     for target in (f"{npu},vck190", f"vck190,{npu}"):
         with pytest.raises(OptionError, match=f"target '{npu}' has no DPU"):
             bench(network, target)
-
-
-def test_bench_accepts_the_host_tasks_of_the_cost_model() -> None:
-    hint = signature(bd.bench).parameters["host_task"].annotation
-    (choices,) = (get_args(part) for part in parts_of(hint) if get_origin(part) is Literal)
-    assert choices == tuple(TASKS)
 
 
 @pytest.mark.parametrize("bits", [12, 14])

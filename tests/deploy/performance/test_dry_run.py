@@ -75,22 +75,12 @@ def test_an_unknown_full_scale_is_reported_as_open(kind: str, model: Path, tmp_p
     assert text["full scale from"] == "asked for"
 
 
-def test_time_here_is_predicted_from_what_was_timed(model: Path, tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "in.tif", np.ones((90, 70), np.uint16))
-    figure = about(tmp_path / "in.tif", model, 23).figures["time here"]
-    assert figure.mode == "predicted"
-    assert figure.value is not None
-    assert figure.interval is not None
-    assert 0 < figure.interval[0] <= figure.value <= figure.interval[1]
-
-
 def test_time_on_the_board_is_the_cost_model_s(tmp_path: Path) -> None:
     """Twice the height needs twice the tiles, and twice the time except for the last batch."""
     times = []
-    for height in (6000, 12000):
-        image = tifffile.memmap(tmp_path / f"{height}.tif", shape=(height, 6000), dtype="uint16")
-        del image
-        row = about(tmp_path / f"{height}.tif", shipped_pair()[1])
+    for height in (600, 1200):
+        tifffile.imwrite(tmp_path / f"{height}.tif", np.ones((height, 600), np.uint16))
+        row = about(tmp_path / f"{height}.tif", shipped_pair()[1], 64)
         times.append(row.figures["time on vck190"])
     assert all(figure.mode == "predicted" for figure in times)
     first, second = (figure.value or math.nan for figure in times)

@@ -1,15 +1,12 @@
 """Measured on this machine: networks interleaved, their nodes, load and memory."""
 
 from dataclasses import replace
-from mmap import mmap
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from beers_deploy.network import Network, other_precision
 from beers_deploy.performance.host import host_rows
-from beers_deploy.performance.timing import cpu_load, resident_bytes
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.target import TargetProfile
@@ -64,17 +61,3 @@ def test_a_network_of_another_make_runs_alone(tmp_path: Path) -> None:
     assert [row.name for row in host_rows(path, QUICK, 32, 1) if row.table == "host"] == [
         "f, 32 x 32"
     ]
-
-
-def test_memory_that_is_taken_is_seen() -> None:
-    before = resident_bytes()
-    # The block comes from the system: an allocator may still hold what earlier tests freed.
-    block = mmap(-1, 40_000_000)
-    np.frombuffer(block, np.uint8).fill(1)
-    assert 30e6 < resident_bytes() - before < 200e6
-
-
-def test_the_load_is_that_of_the_work_since_the_last_call() -> None:
-    cpu_load()
-    sum(range(3_000_000))
-    assert 0 < (cpu_load().value or 0) <= 100
