@@ -4,7 +4,6 @@ an ML-BOM.
 
 import hashlib
 import json
-from importlib.metadata import metadata as of_package
 from pathlib import Path
 from typing import Any
 from uuid import NAMESPACE_URL, uuid5
@@ -18,7 +17,7 @@ from beers_deploy.model.io.tensors import read_conditioned
 from beers_deploy.model.shipped import INT8, SHIPPED, shipped_names, shipped_weights
 from beers_deploy.network import Network
 from beers_deploy.network_files import int8_for_sensor
-from beers_deploy.profiles.errors import one_line, optional, printable
+from beers_deploy.profiles.errors import ModelError, one_line, optional, printable
 from beers_deploy.profiles.figures import Row
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.quant.encodings.description import KEY
@@ -29,6 +28,7 @@ from beers_deploy.results import Table
 
 SCHEMA = "beers-deploy/record"
 SCHEMA_VERSION = 1
+WEIGHTS_LICENCE = "Apache-2.0"
 LIMITATIONS = (
     (
         "Nothing here has run on a board: figures of a board are predicted by a cost model, or "
@@ -87,7 +87,7 @@ def record_of(
     about = metadata(network.model)
     weights = _verified_weights(network, sensor, floating)
     in_range = None
-    if weights and conditioned_core(network.model) is not None:
+    if weights and _has_family(network):
         in_range = {key: list(ends) for key, ends in RANGES.items()}
     return {
         "schema": SCHEMA,
@@ -99,10 +99,18 @@ def record_of(
         "says": {key: text for key, text in about.items() if key not in BULKY},
         "sensors_in_range": in_range,
         "limitations": [*LIMITATIONS, *judged.notes],
-        "licence": of_package("beers-deploy")["License-Expression"] if weights else None,
+        "licence": WEIGHTS_LICENCE if weights else None,
         "passed": bool(judged),
         "results": judged.to_dict(),
     }
+
+
+def _has_family(network: Network) -> bool:
+    """Return True if the file can be conditioned on other sensors. A damaged file cannot."""
+    try:
+        return conditioned_core(network.model) is not None
+    except ModelError:
+        return False
 
 
 def code_sha256() -> str:

@@ -305,13 +305,13 @@ def price_rows(target: FaultTarget, prediction: Prediction, dpu: Dpu) -> list[Ro
         high_s = time_s * error_factor
         # The share is largest at the highest frame rate, where a tile needs the least time.
         most = 100 * high_s * fast
-        lost = 100 * (1 - before_s / beside_s)
+        loss = 100 * (1 - before_s / beside_s)
         figures = {
             "time": predicted(1e3 * time_s, "ms/tile", (1e3 * low_s, 1e3 * high_s), source),
             "of a tile, if nothing hides": predicted(
                 100 * time_s / tile_s, "%", (100 * low_s * slow, most), source
             ),
-            "frame rate lost beside the DPU": predicted(lost, "%", (0.0, most), source),
+            "frame rate lost beside the DPU": predicted(loss, "%", (0.0, most), source),
         }
         rows.append(Row("guards", name, figures))
     return rows

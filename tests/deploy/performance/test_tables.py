@@ -155,7 +155,7 @@ def test_bench_on_this_machine(tmp_path: Path) -> None:
         ("--dpu C1B1", "--dpu"),
         ("--tile 16 --halo 8", "--tile"),
         ("--image colour.tif", "one band"),
-        ("--image half.tif", "0.5, which may be shares"),
+        ("--image half.tif", "floats of at most 0.5"),
         ("--target kv261", "kv261"),
     ],
 )
