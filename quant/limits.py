@@ -125,18 +125,17 @@ def _require_breakable(where: str, name: str, value: object) -> None:
     """Raise OptionError unless a value is a limit that a broken network exceeds: a gate that cannot
     fail is none.
     """
-    low, high = BREAKABLE.get(name, (math.inf, -math.inf))
-    # Python's bool is an int, so that `mae = true` would pass as 1.
-    is_limit = (
-        isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high
-    )
-    if not is_limit:
-        allowed = ", ".join(
-            f"{key} ({low:g} to {high:g})" for key, (low, high) in BREAKABLE.items()
-        )
+    if name not in BREAKABLE:
         raise OptionError(
-            f"{printable(f'{name} = {value!r}')} in {where} is not a limit. These are the limits, "
-            f"with the values that a broken network exceeds: {allowed}."
+            f"{where} has a limit {printable(repr(name))}, which does not exist. Use "
+            f"{', '.join(BREAKABLE)}."
+        )
+    low, high = BREAKABLE[name]
+    # Python's bool is an int, so that `mae = true` would pass as 1.
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise OptionError(
+            f"{where}: the limit {name} must be between {low:g} and {high:g}, got "
+            f"{printable(repr(value))}. Set a limit that a broken network would not meet."
         )
 
 
