@@ -14,7 +14,7 @@ import pytest
 import tifffile
 from numpy.testing import assert_array_equal
 
-from beers_deploy.model.raster.facts import Raster
+from beers_deploy.model.raster.facts import Extent, Raster
 from beers_deploy.model.raster.reader import open_raster
 from beers_deploy.profiles.errors import ImageError, OptionError
 from beers_deploy.profiles.figures import Row
@@ -172,3 +172,10 @@ def test_the_count_outlives_a_stop(run: Run, monkeypatch: pytest.MonkeyPatch) ->
             run(pixels, full_scale=1023)
     _, row, _ = run(pixels, full_scale=1023, resume=True)
     assert row.figures["clipped pixels"].value == SHAPE[1]
+
+
+def test_floats_of_digital_numbers_have_the_sensor_s_full_scale_and_shares_none() -> None:
+    floats = Raster(1, 9, 9, np.dtype(np.float32))
+    assert full_scale_of("x", floats, [Extent(900.0, whole=False)], bits=10).value == 1023
+    with pytest.raises(ImageError, match="full_scale"):
+        full_scale_of("x", floats, [Extent(0.9, whole=False)], bits=10)

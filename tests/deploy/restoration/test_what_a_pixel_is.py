@@ -13,6 +13,7 @@ import rasterio
 import tifffile
 from numpy.testing import assert_array_equal
 from onnx import numpy_helper
+from PIL import Image
 from rasterio.enums import ColorInterp, MaskFlags
 
 from beers_deploy.profiles.errors import ImageError, OptionError
@@ -228,3 +229,13 @@ def test_a_result_that_no_restoration_has_is_refused(
         restored(tmp_path / "in.tif", scaled(*how), sensor=sensor)
     assert [path.name for path in tmp_path.iterdir()] == ["in.tif"]
     restored(tmp_path / "in.tif", scaled(*how), force=True, sensor=sensor)
+
+
+@pytest.mark.parametrize("mode", ["LA", "RGBA"])
+def test_alpha_of_a_png_is_no_light(mode: str, model: Path, tmp_path: Path) -> None:
+    planes = np.random.default_rng(0).integers(1, 255, (31, 29, len(mode))).astype(np.uint8)
+    planes[3:9, 4:20, -1] = 0
+    Image.fromarray(planes, mode).save(tmp_path / "in.png")
+    result, _ = restored(tmp_path / "in.png", model, full_scale=255)
+    assert_array_equal(result[-1], planes[..., -1])
+    assert_array_equal(result[0, 3:9, 4:20], planes[3:9, 4:20, 0])
