@@ -1,5 +1,6 @@
 """Files restored in tiles: the pixels of the whole image's result bit for bit, and the metadata."""
 
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from beers_deploy.profiles.figures import Row
 from beers_deploy.quant.onnx_file import load_onnx
 from beers_deploy.quant.session import open_session, run
 from beers_deploy.restoration import runtime
-from beers_deploy.restoration.runtime import Infer
+from beers_deploy.restoration.runtime import Infer, open_runtime
 from beers_deploy.restoration.tiles.exposures import restore_window
 from beers_deploy.verbs.restore import restore
 from tests.deploy.restoration.runs import noise, restored
@@ -212,3 +213,32 @@ def test_openvino_gives_them_on_processors_whose_kernels_saturate_too(
     monkeypatch.setattr(runtime, "_adds_exactly", lambda _: False)
     restored = runtime.open_openvino(model, 1)[0](image)
     assert_array_equal(restored, run(open_session(model), image))
+
+
+def test_floats_of_about_0_to_1_are_refused_until_their_scale_is_named(
+    model: Path, tmp_path: Path
+) -> None:
+    shares = (noise(61, 37) / 4095).astype(np.float32)
+    shares[5:9] = -9999
+    nodata = {"extratags": [(42113, "s", 0, "-9999", True)]}
+    options: dict[str, Any] = {"network": model, "tile": 23}
+    words = "floats of at most 1", "`full_scale`"
+    refused(tmp_path, shares, ImageError, *words, tags=nodata, **options)
+    (tmp_path / "out.tif").unlink()
+    result, _ = by_file(tmp_path, shares, nodata, **options, full_scale=1)
+    assert 0 < result[result != -9999].mean() < result.max() <= 1
+
+
+@pytest.mark.parametrize(("dtype", "predictor"), [(np.uint8, 2), (np.uint16, 2), (np.float32, 1)])
+def test_integers_are_packed_as_differences(
+    dtype: type, predictor: int, model: Path, tmp_path: Path
+) -> None:
+    by_file(tmp_path, (noise(70, 90) // 20).astype(dtype), network=model, full_scale=255)
+    with tifffile.TiffFile(tmp_path / "out.tif") as file:
+        assert file.pages.first.predictor == predictor
+
+
+def test_a_missing_openvino_is_one_sentence(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "openvino", None)
+    with pytest.raises(MachineError, match=r"pip install 'beers-deploy\[openvino\]'"):
+        open_runtime("openvino", load_onnx(model), 1)
