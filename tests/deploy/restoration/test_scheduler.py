@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -196,3 +197,44 @@ def test_a_worker_of_another_version_is_refused() -> None:
         MachineError, match=r"worker tcp://worker must have numpy \d.*got 0\.0\..*the same versions"
     ):
         cluster._require_same_versions(Client())
+
+
+WITHOUT_TORCH = """
+import importlib.metadata
+import sys
+
+sys.modules["torch"] = None  # an import of it raises ModuleNotFoundError
+version = importlib.metadata.version
+
+
+def version_of(package):
+    if package == "torch":
+        raise importlib.metadata.PackageNotFoundError(package)
+    return version(package)
+
+
+importlib.metadata.version = version_of
+from beers_deploy.cli.commands import app
+
+app(sys.argv[1:])
+"""
+
+
+def test_restores_where_torch_is_not_installed(image: Path, scheduler: str, tmp_path: Path) -> None:
+    out = tmp_path / "out.tif"
+    options = f"--network convbeers-xs-int8 --scheduler {scheduler}".split()
+    words = ("restore", str(image), str(out), *options)
+    process = subprocess.run(
+        [sys.executable, "-c", WITHOUT_TORCH, *words], capture_output=True, text=True, check=False
+    )
+    assert process.returncode == 0, process.stderr
+    assert tifffile.imread(out).shape == tifffile.imread(image).shape
+
+
+def test_a_missing_dask_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with (
+        pytest.raises(MachineError, match=r"pip install 'beers-deploy\[dask\]'"),
+        open_cluster("host:8786"),
+    ):
+        pass
