@@ -16,6 +16,7 @@ from PIL import Image
 
 from beers_deploy.model.raster.reader import open_raster
 from beers_deploy.model.self_check import BLOCK_PX, OUTSIDE, SMOOTH, WITHIN
+from beers_deploy.profiles.errors import MachineError, OptionError
 from beers_deploy.report import view_layers
 from beers_deploy.report.view import TILE_PX, pyramid, write_view
 from beers_deploy.report.view_layers import SELF_CHECK, STATES, Layer, layers_of
@@ -258,3 +259,18 @@ def test_the_line_parts_left_from_right_at_the_width_of_a_desk_and_of_a_telephon
         assert look["elsewhere"] == []
         assert "300 DN" in look["keys"]
         assert "agrees with the raw image" in look["keys"]
+
+
+def test_a_view_is_refused_where_it_cannot_be_written(model: Path, tmp_path: Path) -> None:
+    image = write(tmp_path / "raw.tif", noise(60, 80))
+    out = tmp_path / "out.tif"
+    with pytest.raises(OptionError, match=r"`view` has no effect with an array"):
+        restore(noise(60, 80), network=model, view=tmp_path / "view.html")
+    with pytest.raises(OptionError, match="is an input of this run"):
+        restore(image, out, network=model, view=image)
+    with pytest.raises(OptionError, match="is the path of another output"):
+        restore(image, out, network=model, view=out)
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(MachineError, match="is a folder"):
+        restore(image, out, network=model, view=tmp_path / "folder")
+    assert not out.exists()

@@ -10,6 +10,7 @@ import signal
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -158,3 +159,12 @@ def test_killed_among_its_rows_and_at_its_cog_it_is_resumed_to_the_same_bytes(
     assert last.returncode == 0, output
     assert out.read_bytes() == expected
     assert {path.name for path in tmp_path.iterdir()} == before | {"out.tif"}
+
+
+def test_a_swath_that_the_disk_cannot_hold_is_refused_first(
+    image: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
+    with pytest.raises(MachineError, match="free"):
+        restore(image, tmp_path / "out.tif", network=model, tile=TILE_PX)
+    assert [p.name for p in tmp_path.iterdir()] == ["in.tif"]

@@ -81,12 +81,13 @@ def test_an_image_without_a_place_has_no_geometry(model: Path, tmp_path: Path) -
     assert "bbox" not in content
 
 
-def test_an_item_needs_its_package(
+def test_an_item_needs_a_cog_and_its_package(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image = images.write_tiff(tmp_path / "in.tif", images.digital_numbers())
     command = f"restore {image} {tmp_path}/out.tif --stac {tmp_path}/i.json --network {model}"
     monkeypatch.setitem(sys.modules, "pystac", None)
+    assert "--stac has no effect without --cog" in refused(command)
     assert "beers-deploy[stac]" in refused(f"{command} --cog")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.tif"]
 
