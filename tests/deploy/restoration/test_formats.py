@@ -8,6 +8,7 @@ import rasterio
 from numpy.testing import assert_allclose
 
 from beers_deploy.model.raster.reader import open_raster
+from beers_deploy.model.raster.source import fingerprint
 from beers_deploy.profiles.errors import BeersError, ImageError
 from beers_deploy.verbs.restore import restore
 from tests.deploy.command_line import refused
@@ -93,3 +94,13 @@ def test_a_tile_is_no_output(model: Path, tmp_path: Path) -> None:
     for words in (out, "--dry-run"):
         assert tile.name in refused(f"restore {image} {words} --json {tile}")
         assert tile.read_bytes() == before
+
+
+def test_a_changed_tile_makes_another_image(tmp_path: Path) -> None:
+    image = images.write_vrt(tmp_path / "a.vrt", images.digital_numbers())
+    with open_raster(image) as source:
+        before = fingerprint(source.files)
+    images.write_jp2(
+        tmp_path / "R64C80.jp2", np.zeros((2, images.HEIGHT - 64, images.WIDTH - 80), np.uint16)
+    )
+    assert fingerprint(source.files) != before

@@ -1,5 +1,6 @@
 """An image is compared with its sensor: a wrong sensor leads to a warning, or to an error."""
 
+import logging
 import re
 import time
 from pathlib import Path
@@ -161,3 +162,15 @@ def test_the_time_of_the_check_is_not_that_of_the_restoration(
     assert check_s >= 2
     assert row.figures["throughput"].value == pytest.approx(raw.size / time_s / 1e6)
     assert time_s <= whole_s - check_s
+
+
+def test_the_library_logs_a_warning_and_strict_refuses(
+    raw: np.ndarray, caplog: pytest.LogCaptureFixture
+) -> None:
+    noisy = SENSOR.replace(snr_0=25, snr_1=55)
+    bd.restore(raw, network="convbeers-xs-int8", sensor=noisy)
+    (record,) = caplog.records
+    assert record.levelno == logging.WARNING
+    assert record.getMessage().startswith("look at the sensor: noise at")
+    with pytest.raises(ValueError, match="contradicts the sensor"):
+        bd.restore(raw, network="convbeers-xs-int8", sensor=noisy, strict=True)
