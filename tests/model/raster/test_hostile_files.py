@@ -1,6 +1,7 @@
 """Images whose headers would make a decoder take memory, open other files or run other programs."""
 
 import struct
+import subprocess
 import tracemalloc
 import zlib
 from collections.abc import Iterator
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from PIL import Image
 
 from beers_deploy.model.raster.images import read_pixels
@@ -111,4 +113,43 @@ def test_a_gigantic_tiff_header_allocates_nothing(side: int, tmp_path: Path) -> 
     """The last two: the number of pixels does not fit 63 bits, or only just."""
     path = tiff(tmp_path / "huge.tif", bytes(4), width=side, height=side, rows=side, bits=16)
     with little_memory(), pytest.raises(BeersError, match=r"readable|free memory"):
+        read_pixels(path)
+
+
+def test_other_files_that_a_microscopes_tiff_names_are_not_opened(tmp_path: Path) -> None:
+    """OME-XML says which file a plane lies in: `../secret.tif` is as good as any."""
+    tifffile.imwrite(tmp_path / "secret.tif", np.full((16, 16), 77, np.uint8), ome=True)
+    folder = tmp_path / "in"
+    folder.mkdir()
+    with tifffile.TiffFile(tmp_path / "secret.tif") as file:
+        identity = file.ome_metadata.split('UUID="')[1].split('"')[0]  # type: ignore[union-attr]
+    xml = (
+        '<?xml version="1.0"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06" '
+        'UUID="urn:uuid:1">'
+        '<Image><Pixels DimensionOrder="XYZCT" Type="uint8" SizeX="16" SizeY="16" SizeZ="1" '
+        'SizeC="1" SizeT="1">'
+        '<TiffData IFD="0" PlaneCount="1"><UUID '
+        f'FileName="../secret.tif">{identity}</UUID></TiffData>'
+        "</Pixels></Image></OME>"
+    )
+    tifffile.imwrite(folder / "a.tif", GREY, description=xml, metadata=None)
+    np.testing.assert_array_equal(read_pixels(folder / "a.tif"), GREY)
+    np.testing.assert_array_equal(rows(folder / "a.tif")[0], GREY)
+
+
+def test_what_is_no_png_or_jpeg_starts_no_other_program(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pillow hands EPS to Ghostscript, whatever the file is called."""
+
+    def started(*_: object, **__: object) -> None:
+        raise AssertionError("a program was started")
+
+    for name in ("Popen", "check_call", "run"):
+        monkeypatch.setattr(subprocess, name, started)
+    path = tmp_path / "a.png"
+    path.write_bytes(
+        b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\nshowpage\n%%EOF\n"
+    )
+    with pytest.raises(ImageError, match=r"a\.png"):
         read_pixels(path)
