@@ -70,18 +70,24 @@ ALPHA, BETA = noise_from_snr(25, 15, 100, 50)
 NOISY = replace(DEGRADED, mtf_nyquist=0.03, alpha=ALPHA, beta=BETA)
 
 
-@pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize(("sensor", "gain_db"), [(DEGRADED, 12.9), (NOISY, 9.6)])
-def test_the_chain_gains_as_many_decibels_as_were_measured(
-    sensor: Instrument, gain_db: float, order: Order, camera: Tensor
+def test_both_orders_of_the_chain_gain_as_many_decibels_as_were_measured(
+    sensor: Instrument, gain_db: float, camera: Tensor
 ) -> None:
-    """Denoising first gains 13.09 and 9.78 dB, deconvolving first 13.35 and 10.10 dB."""
+    """Denoising first gains 13.09 and 9.78 dB, deconvolving first 13.35 and 10.10 dB, which is
+    never more than 0.1 dB worse.
+    """
     pair = seen_by(camera, sensor)
-    restored = restore_traditional(pair.degraded, Chain(sensor, REFERENCE, order=order))
-    assert restored.shape == pair.degraded.shape
-    assert restored.dtype == torch.float32
-    assert psnr_db(restored, pair.reference) > psnr_db(pair.degraded, pair.reference) + gain_db
-    assert float(restored.mean() / pair.degraded.mean()) == pytest.approx(1, abs=5e-3)
+    before = psnr_db(pair.degraded, pair.reference)
+    gains = dict[Order, float]()
+    for order in ORDERS:
+        restored = restore_traditional(pair.degraded, Chain(sensor, REFERENCE, order=order))
+        assert restored.shape == pair.degraded.shape
+        assert restored.dtype == torch.float32
+        gains[order] = psnr_db(restored, pair.reference) - before
+        assert gains[order] > gain_db
+        assert float(restored.mean() / pair.degraded.mean()) == pytest.approx(1, abs=5e-3)
+    assert gains["deconvolve-first"] >= gains["denoise-first"] - 0.1
 
 
 def test_each_half_of_the_chain_is_needed(pair: Seen) -> None:
@@ -210,3 +216,9 @@ def test_any_bits_are_restored(bits: int, camera: Tensor) -> None:
 def test_an_unknown_quality_is_refused() -> None:
     with pytest.raises(OptionError, match="fast, standard, best"):
         restore_traditional(torch.ones(3, 3), Chain(DEGRADED, REFERENCE, "superb"))
+
+
+def test_the_result_stays_within_the_converter() -> None:
+    checkerboard = torch.from_numpy(np.indices((29, 31)).sum(0) % 2 * 4095).float()
+    restored = restore_traditional(checkerboard, Chain(DEGRADED, REFERENCE, "fast"))
+    assert 0 <= float(restored.min()) <= float(restored.max()) <= 4095
