@@ -320,3 +320,12 @@ def test_a_recorded_step_learns_as_the_processor_does(conditioned: bool, tmp_pat
         # Patches of the processor for both: a GPU draws other noise.
         trainer.run(source(conditioned=conditioned).batches, tmp_path / device, note)
     np.testing.assert_allclose(losses["cuda"], losses["cpu"], rtol=0.02)
+
+
+def test_fine_tuning_starts_from_the_weights_given(tmp_path: Path) -> None:
+    first = train(tmp_path, 4).averaged()
+    tuned = Trainer(VARIANT, TrainingRecipe(steps=4), start=first)
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(first.parameters(), tuned.network.parameters(), strict=True)
+    )
