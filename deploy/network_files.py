@@ -30,7 +30,11 @@ from beers_deploy.profiles.shipped import BLIND, BLIND_PROFILE
 from beers_deploy.profiles.toml import unreadable
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.onnx_file import fixed_tile_px, load_onnx, metadata
-from beers_deploy.quant.sensor_bank.conditioned import required_conditioned_core, with_delta
+from beers_deploy.quant.sensor_bank.conditioned import (
+    SENSOR_BIASES,
+    required_conditioned_core,
+    with_delta,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -116,8 +120,16 @@ def warn_outside(sensor: Sensor, kernels: Kernels) -> None:
 
 def other_sensor(model: onnx.ModelProto, sensor: Sensor) -> str:
     """Return a warning if a network was made for another sensor than the given one, else ""."""
-    own = metadata(model).get("sensor", "")
-    if own in ("", BLIND, BLIND_PROFILE, sensor.name):
+    about = metadata(model)
+    own = about.get("sensor", "")
+    is_blind = own in ("", BLIND, BLIND_PROFILE)
+    if is_blind and SENSOR_BIASES in about:
+        return (
+            f"look at the sensor: the INT8 file is that of an unknown sensor. For {sensor.name} "
+            "condition it by 'beers-deploy export --network FILE --sensor SENSOR --out NEW', which "
+            "restores better"
+        )
+    if is_blind or own == sensor.name:
         return ""
     return f"look at the sensor: the network was made for {own}, not for {sensor.name}"
 

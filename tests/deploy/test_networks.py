@@ -22,7 +22,7 @@ from beers_deploy.model.shipped import (
     shipped_weights,
 )
 from beers_deploy.network import Network
-from beers_deploy.network_files import int8_for_sensor, weights_file
+from beers_deploy.network_files import int8_for_sensor, other_sensor, weights_file
 from beers_deploy.profiles.errors import ModelError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.sensor_numbers import numbers_of
@@ -221,3 +221,13 @@ def test_a_run_parses_and_opens_a_network_once(
     else:
         bd.restore(tmp_path / "in.tif", tmp_path / "out.tif", network=model, tile=23)
     assert counts == {"parse_onnx": 1, "tiling_of": 1, "InferenceSession": 1}
+
+
+def test_a_file_for_an_unknown_sensor_says_how_to_condition_it() -> None:
+    """An INT8 file for every sensor restores blindly where it is given by its path."""
+    stored = load_onnx(SHIPPED / "convbeers-xs-int8.onnx")
+    sensor = Sensor.load("dior-medium")
+    assert "beers-deploy export --network" in other_sensor(stored, sensor)
+    conditioned_on = int8_for_sensor(stored, sensor)
+    assert not other_sensor(conditioned_on, sensor)
+    assert "made for dior-medium" in other_sensor(conditioned_on, Sensor.load("pleiades-degraded"))

@@ -4,6 +4,7 @@ They are the input itself, the traditional pipeline in both orders and three qua
 other libraries, and networks.
 """
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
@@ -18,7 +19,7 @@ from beers_deploy.model.traditional.patch_groups import QUALITIES
 from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.model.traditional.pipeline import Chain, Order, restore_traditional
 from beers_deploy.network import Network
-from beers_deploy.network_files import conditioned, warn_outside
+from beers_deploy.network_files import conditioned, other_sensor, warn_outside
 from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.errors import OptionError, printable
 from beers_deploy.profiles.instrument import Instrument
@@ -28,6 +29,8 @@ from beers_deploy.profiles.shipped import BLIND_PROFILE
 from beers_deploy.quant.onnx_file import metadata
 from beers_deploy.restoration.method import Restore, network_method
 from beers_deploy.restoration.steps import BOTH, Around, exposures_of
+
+logger = logging.getLogger(__name__)
 
 Specialise = Callable[[Instrument], Restore]
 """Maps a sensor to the restoration of images that it acquired."""
@@ -124,7 +127,11 @@ def method_named(name: str, degraded: Sensor, reference: Sensor, around: Around 
     sensor = Sensor.load(other) if other else degraded
     weights = conditioned(Path(network))
     if weights is None:
-        return method_of(name, Network.load(network), sensor, reference, around, degraded.name)
+        loaded = Network.load(network)
+        warning = other_sensor(loaded.model, sensor)
+        if warning and sensor.name != NOT_KNOWN:
+            logger.warning("%s: %s", network, warning)
+        return method_of(name, loaded, sensor, reference, around, degraded.name)
     int8 = network.endswith(INT8)
     warn_outside(sensor, weights.kernels)
     network_for = Network.for_sensor(weights, sensor, int8=int8)

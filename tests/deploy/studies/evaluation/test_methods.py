@@ -1,10 +1,12 @@
 """Methods of an evaluation by their names, and which sensor each is given."""
 
+import logging
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from beers_deploy.model.shipped import SHIPPED
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.studies.evaluation.methods import (
     BLIND,
@@ -72,3 +74,12 @@ def test_who_can_know_a_sensor_says_so_and_what_depends_on_none_stays_as_it_is()
         assert fixed.with_sensor(OTHER) is fixed
     method = Method("net", np.sqrt, BLIND, lambda _: np.abs)
     assert (method.with_sensor(OTHER).sensor_known, method.sensor_known) == (KNOWN, BLIND)
+
+
+def test_a_file_for_an_unknown_sensor_is_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    file = str(SHIPPED / "convbeers-xs-int8.onnx")
+    with caplog.at_level(logging.WARNING):
+        method_named(f"{file}@blind", DEGRADED, REFERENCE)
+        assert not caplog.messages
+        method_named(file, DEGRADED, REFERENCE)
+    assert any("that of an unknown sensor" in message for message in caplog.messages)
