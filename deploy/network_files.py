@@ -119,7 +119,12 @@ def warn_outside(sensor: Sensor, kernels: Kernels) -> None:
 
 
 def other_sensor(model: onnx.ModelProto, sensor: Sensor) -> str:
-    """Return a warning if a network was made for another sensor than the given one, else ""."""
+    """Return a warning if a network was made for another sensor than the given one, else "".
+
+    An unknown sensor contradicts no network.
+    """
+    if sensor.name == BLIND:
+        return ""
     about = metadata(model)
     own = about.get("sensor", "")
     is_blind = own in ("", BLIND, BLIND_PROFILE)

@@ -81,7 +81,7 @@ class Board(TargetProfile):
         network = Network.load(int8, sensor=conditioned_on)
         folder = Path(out)
         warning = other_sensor(network.model, conditioned_on)
-        if warning and conditioned_on.name != BLIND:
+        if warning:
             logger.warning(warning)
         # A missing library is refused before anything is written.
         if record:

@@ -85,8 +85,10 @@ def _log_network(network: Network, sensors: Mapping[str, Sensor]) -> None:
     """Log which network restores, and warn if it was made for another sensor."""
     names = ", ".join(sensor.name for sensor in sensors.values())
     if network.weights is None:
-        if not is_unknown(sensors) and (doubt := other_sensor(network.model, sensors[""])):
-            logger.warning(doubt)
+        (sensor,) = sensors.values()
+        warning = other_sensor(network.model, sensor)
+        if warning:
+            logger.warning(warning)
     elif is_unknown(sensors):
         logger.info(
             "network: %s, for an unknown sensor; it restores better if it is given the sensor",

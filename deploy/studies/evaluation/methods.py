@@ -129,7 +129,7 @@ def method_named(name: str, degraded: Sensor, reference: Sensor, around: Around 
     if weights is None:
         loaded = Network.load(network)
         warning = other_sensor(loaded.model, sensor)
-        if warning and sensor.name != NOT_KNOWN:
+        if warning:
             logger.warning("%s: %s", network, warning)
         return method_of(name, loaded, sensor, reference, around, degraded.name)
     int8 = network.endswith(INT8)
