@@ -3,7 +3,7 @@ import torch
 from torch.nn.functional import conv2d, pad
 
 from beers_deploy.model.bank import bank_of_vector
-from beers_deploy.model.convbeers import ConvBEERS, for_sensor
+from beers_deploy.model.convbeers import ConvBEERS, for_sensor, in_steps
 from beers_deploy.model.variants import VARIANTS, Variant
 from tests.model.networks import behind_a_bank, plain, radius_px, told_of
 
@@ -121,3 +121,21 @@ def test_a_body_that_adds_nothing_leaves_the_analytic_restoration(scale: int) ->
         torch.testing.assert_close(
             network(image, told_of(VECTORS[1:2])), expected, rtol=0, atol=1e-6
         )
+
+
+def test_a_rounded_map_is_in_int8_steps_and_its_gradient_passes_only_where_it_is_not_clipped() -> (
+    None
+):
+    maps = 8 * torch.randn(2, 3, 5, 7, generator=torch.Generator().manual_seed(1))
+    maps.requires_grad_()
+    step = torch.tensor([0.03125, 0.1, 0.7]).view(3, 1, 1).expand(2, 3, 1, 1)
+
+    rounded = in_steps(maps, step)
+    rounded.sum().backward()
+
+    levels = (rounded / step).detach()
+    torch.testing.assert_close(levels, levels.round(), rtol=0, atol=1e-5)
+    torch.testing.assert_close(levels, (maps / step).detach().round().clamp(-128, 127))
+    unclipped = (maps / step >= -128) & (maps / step <= 127)
+    assert 0 < int(unclipped.sum()) < unclipped.numel()
+    torch.testing.assert_close(maps.grad, unclipped.float())
