@@ -126,7 +126,7 @@ class _InSteps(Function):
         return levels.round_().clamp_(-128, 127).mul_(step)
 
     @staticmethod
-    def backward(context: Any, gradient: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+    def backward(context: Any, gradient: Tensor) -> tuple[Tensor, None]:
         """Return the gradient of the maps; the step size is not trained."""
         (unclipped,) = context.saved_tensors
         return gradient * unclipped, None

@@ -131,7 +131,7 @@ def test_a_rounded_map_is_in_int8_steps_and_its_gradient_passes_only_where_it_is
     step = torch.tensor([0.03125, 0.1, 0.7]).view(3, 1, 1).expand(2, 3, 1, 1)
 
     rounded = in_steps(maps, step)
-    rounded.sum().backward()
+    rounded.sum().backward()  # type: ignore[no-untyped-call]
 
     levels = (rounded / step).detach()
     torch.testing.assert_close(levels, levels.round(), rtol=0, atol=1e-5)
