@@ -44,7 +44,7 @@ LIMITS: Mapping[str, Limits] = {
     **dict.fromkeys(("alpha", "array_efficiency", "memory_efficiency"), SHARE),
     **dict.fromkeys(("overlap", "families_held"), SHARE),
     **dict.fromkeys(("peak_tops", "dpu_range_w", "cpu_run_w", "min_time_s"), POSITIVE),
-    **dict.fromkeys(("layer_s", "host_image_s", "crowding"), POSITIVE),
+    **dict.fromkeys(("layer_s", "host_image_s", "contention_exponent"), POSITIVE),
     **dict.fromkeys(("width_array", "width_lanes", "width_memory", "width_start"), POSITIVE),
     **dict.fromkeys(("width_copies", "width_task", "width_outside", "pair_width"), POSITIVE),
     **dict.fromkeys(("error_left_out", "clock_ghz", "product_flops_per_cycle"), POSITIVE),

@@ -157,14 +157,14 @@ class Cases:
         return shares_of(
             np.add.reduceat(parts_s, self._starts) / images[:, None],
             host_parts_s(self._host, constants) / self.host_cores[:, None],
-            self.structure.crowding,
+            self.structure.contention_exponent,
         )
 
     def predicted(self, times: Times) -> Array:
         """Return ln(FPS) with several threads, (n,)."""
         dpu = np.log(times.dpu_s)
         host = np.log(times.host_s / self.host_cores)
-        q = self.structure.crowding
+        q = self.structure.contention_exponent
         return -np.logaddexp(q * dpu, q * host) / q
 
     def residuals(self, constants: Constants) -> Array:

@@ -67,7 +67,12 @@ def cost_table(board: str) -> Iterator[tuple[str, str, str, str]]:
         "assumed",
         "benchmarks/cost_model/validation.py, OVERLAP",
     )
-    yield "crowding", f"{validation.cases.structure.crowding:g}", "inferred", CHOSEN
+    yield (
+        "contention_exponent",
+        f"{validation.cases.structure.contention_exponent:g}",
+        "inferred",
+        CHOSEN,
+    )
     families = len(set(validation.cases.families))
     left_out = (
         "|ln(predicted / published)| that nine of ten families keep to, from "

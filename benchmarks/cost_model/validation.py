@@ -3,9 +3,9 @@ follow.
 
 Networks of one family resemble one another, so a family is left out as a whole. What is chosen and
 what is judged are selected apart by two rounds (nested cross-validation): for each family left out,
-`crowding` is chosen, and the width of the interval made, from errors on others of the families that
-remain. Boards of one processor share `crowding`. `nested` is what the errors of the documents and
-the widths of [cost] come from.
+`contention_exponent` is chosen, and the width of the interval computed, from errors on others of
+the families that remain. Boards of one processor share `contention_exponent`. The errors in the
+documents and the widths in [cost] come from `nested`.
 """
 
 from collections import Counter, defaultdict
@@ -26,7 +26,7 @@ from beers_deploy.profiles.target import TargetProfile
 from benchmarks.cost_model.fit import Cases, fit
 from benchmarks.cost_model.published import boards, host_cores, published_cases, written
 
-CROWDINGS = (2.0, 4.0)
+CONTENTION_EXPONENTS = (2.0, 4.0)
 """The values among which the cross-validation chooses."""
 OVERLAP = {"DPUCZDX8G": 1.0, "DPUCVDX8G": 0.5, "DPUCV2DX8G": 0.5}
 """By DPU.
@@ -102,8 +102,8 @@ def nested(board: str) -> Nested:
 
 @cache
 def chosen(board: str, left_out: str = "") -> float:
-    """Return the crowding of least mean error, over the boards of a board's processor and all
-    families but one.
+    """Return the contention exponent of least mean error, over the boards of a board's processor
+    and all families but one.
 
     Args:
         board: its name.
@@ -111,21 +111,24 @@ def chosen(board: str, left_out: str = "") -> float:
     """
     similar = [other for other in boards() if host_cores(other) == host_cores(board)]
     scores = [
-        np.mean([_trial(other, crowding).score(left_out) for other in similar])
-        for crowding in CROWDINGS
+        np.mean([_trial(other, contention_exponent).score(left_out) for other in similar])
+        for contention_exponent in CONTENTION_EXPONENTS
     ]
-    return CROWDINGS[int(np.argmin(scores))]
+    return CONTENTION_EXPONENTS[int(np.argmin(scores))]
 
 
 @cache
-def _trial(board: str, crowding: float) -> "Trial":
+def _trial(board: str, contention_exponent: float) -> "Trial":
     documents = TargetProfile.load(board).documents["operators"]
     overlap = next(OVERLAP[name] for name in OVERLAP if name in documents)
-    return Trial(Cases(published_cases(board), Structure(overlap, crowding)))
+    return Trial(Cases(published_cases(board), Structure(overlap, contention_exponent)))
 
 
 class Trial:
-    """A crowding under trial: its cases and their families; fits begin near that of all rows."""
+    """A contention exponent under trial, with its cases and their families.
+
+    Fits begin near the fit of all rows.
+    """
 
     def __init__(self, cases: Cases) -> None:
         self.cases = cases

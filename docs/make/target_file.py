@@ -114,7 +114,10 @@ KEYS: dict[str, dict[str, tuple[str, str]]] = {
         "sort_values_per_s": ("1/s", "likewise, for boxes and key points"),
         "image_values_per_s": ("1/s", "likewise, for an image"),
         "overlap": ("1", "share of the shorter of computing and moving that is hidden; assumed"),
-        "crowding": ("1", "how sharply the slower of DPU and host sets the rate; cross-validated"),
+        "contention_exponent": (
+            "1",
+            "how sharply the slower of DPU and host sets the rate; cross-validated",
+        ),
         "width_array": ("1", "half width of the interval of ln(FPS) as far as the array sets it"),
         "width_lanes": ("1", "the same for the ALU and the element-wise engine"),
         "width_memory": ("1", "the same for transfers"),

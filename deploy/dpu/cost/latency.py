@@ -171,7 +171,7 @@ class Prediction:
     def _rate(self, host_s: float) -> float:
         """Return images a second if the host takes that long for an image."""
         dpu_s = self.batch_time_s / self.batch
-        return frame_rate(dpu_s, host_s, self.dpu.value("cost", "crowding"))
+        return frame_rate(dpu_s, host_s, self.dpu.value("cost", "contention_exponent"))
 
     @property
     def operations(self) -> int:
@@ -222,7 +222,9 @@ def predict(
     # Work that no rate is published for is taken at the geometric mean of its two ends.
     host_parts[0, 0] += between(refused_s) + between(step_s)
     host_s = float(host_parts.sum())
-    shares = shares_of(parts_s.sum(axis=0)[None] / dpu.batch, host_parts, structure.crowding)
+    shares = shares_of(
+        parts_s.sum(axis=0)[None] / dpu.batch, host_parts, structure.contention_exponent
+    )
     width = float(shares[0] @ [dpu.value("cost", WIDTHS[part]) for part in PARTS])
     outside = _outside(placement.core, dpu)
     if outside:

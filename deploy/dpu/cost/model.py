@@ -6,7 +6,7 @@ memory  = longer of (weights + maps) / port and
 layer   = longer of the two + (1 - overlap) shorter of the two + layer_s
 batch   = sum of layers
 host    = host_image_s + bytes in / rate + bytes out / rate + values of the task / its rate
-rate    = 1 / (dpu^crowding + host^crowding)^(1 / crowding)
+rate    = 1 / (dpu^q + host^q)^(1 / q), with q = contention_exponent
 """
 
 import math
@@ -81,7 +81,7 @@ class Structure:
 
     overlap: float
     """Share of the shorter of compute and memory that is hidden behind the longer."""
-    crowding: float
+    contention_exponent: float
     """Exponent q of (dpu^q + host^q)^(1/q): 2 where the two get in each other's way, large where
     they do not.
     """
@@ -179,7 +179,7 @@ the DPU, then the host's copies and its task. The prediction of each is off by a
 """
 
 
-def shares_of(dpu_s: Array, host_s: Array, crowding: float) -> Array:
+def shares_of(dpu_s: Array, host_s: Array, contention_exponent: float) -> Array:
     """Return by how much the rate follows each of PARTS, (n, 6), which adds up to 1.
 
     A rate falls by h % where the host takes 1 % longer, and by 1 - h % where the DPU does.
@@ -187,24 +187,28 @@ def shares_of(dpu_s: Array, host_s: Array, crowding: float) -> Array:
     Args:
         dpu_s: time of an image by the first four parts, (n, 4).
         host_s: time by the last two, on all cores, (n, 2).
-        crowding: exponent of `frame_rate`.
+        contention_exponent: exponent of `frame_rate`.
     """
     dpu, host = (times.sum(axis=1, keepdims=True) for times in (dpu_s, host_s))
-    follows_host = host**crowding / (host**crowding + dpu**crowding)
+    follows_host = host**contention_exponent / (
+        host**contention_exponent + dpu**contention_exponent
+    )
     # Where the rates are those of the DPU alone the host takes no time.
     host_shares = np.divide(host_s, host, out=np.zeros_like(host_s), where=host > 0)
     parts = [(1 - follows_host) * dpu_s / dpu, follows_host * host_shares]
     return np.concatenate(parts, axis=1)
 
 
-def frame_rate(dpu_s: float, host_s: float, crowding: float) -> float:
+def frame_rate(dpu_s: float, host_s: float, contention_exponent: float) -> float:
     """Return the images per second, given the time of the DPU and of the host's cores for one
     image.
     """
     longer = max(dpu_s, host_s)
     shorter = min(dpu_s, host_s)
     # (dpu^q + host^q)^(1/q) with the longer time factored out: no power leaves the floats' range.
-    return float(1 / (longer * (1 + (shorter / longer) ** crowding) ** (1 / crowding)))
+    return float(
+        1 / (longer * (1 + (shorter / longer) ** contention_exponent) ** (1 / contention_exponent))
+    )
 
 
 Task = Literal["copy", "argmax", "softmax", "sort", "image"]

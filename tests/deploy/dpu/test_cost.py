@@ -200,17 +200,17 @@ def test_beyond_the_fitted_networks_the_interval_is_no_narrower_than_the_widest(
     assert outside.width == DPU.value("cost", WIDTHS["outside"]) > inside.width
 
 
-@pytest.mark.parametrize("crowding", [2.0, 4.0])
-def test_shares_are_by_how_much_the_rate_follows_the_parts(crowding: float) -> None:
+@pytest.mark.parametrize("contention_exponent", [2.0, 4.0])
+def test_shares_are_by_how_much_the_rate_follows_the_parts(contention_exponent: float) -> None:
     """Each part 1 % longer, and the rate falls by its share of 1 %."""
     parts = np.array([3.0, 0.5, 2, 0.1, 1.5, 2])
-    shares = shares_of(parts[None, :4], parts[None, 4:], crowding)[0]
+    shares = shares_of(parts[None, :4], parts[None, 4:], contention_exponent)[0]
     assert shares.sum() == pytest.approx(1)
     for k, share in enumerate(shares):
         longer = parts * np.where(np.arange(6) == k, 1.0001, 1)
-        rates = [frame_rate(p[:4].sum(), p[4:].sum(), crowding) for p in (parts, longer)]
+        rates = [frame_rate(p[:4].sum(), p[4:].sum(), contention_exponent) for p in (parts, longer)]
         assert math.log(rates[0] / rates[1]) == pytest.approx(share * 1e-4, rel=1e-3)
-    alone = shares_of(parts[None, :4], np.zeros((1, 2)), crowding)[0]
+    alone = shares_of(parts[None, :4], np.zeros((1, 2)), contention_exponent)[0]
     assert alone == pytest.approx([*(parts[:4] / parts[:4].sum()), 0, 0])
 
 
