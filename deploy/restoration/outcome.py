@@ -57,7 +57,7 @@ class Tally:
     Values are shares of full scale.
 
     Attributes:
-        known: number of results that are not missing.
+        valid_results: number of results that are not missing.
         clipped: number of pixels of the image above full scale.
         at_ends: number of results at 0 or at full scale where the image lies between.
         compared: number of pixels of the image in the sums; 0 if the network returns other bands.
@@ -78,7 +78,7 @@ class Tally:
         blank: number of pixels of the image in squares of 8 x 8 that are exactly 0.
     """
 
-    known: int = 0
+    valid_results: int = 0
     clipped: int = 0
     at_ends: int = 0
     compared: int = 0
@@ -102,7 +102,7 @@ class Tally:
         stored: np.ndarray,
         restored: np.ndarray,
         valid: np.ndarray | None,
-        known: np.ndarray | None,
+        valid_restored: np.ndarray | None,
     ) -> "Tally":
         """Return the tally of a part of an image.
 
@@ -110,7 +110,7 @@ class Tally:
             stored: its pixels (bands, h, w), in shares of full scale.
             restored: its results (bands', h s, w s) at a scale s.
             valid: mask of the pixels that are not missing; None if none is missing.
-            known: mask of the results that are not missing; None if none is missing.
+            valid_restored: mask of the results that are not missing; None if none is missing.
         """
         alike = len(stored) == len(restored)
         between = (stored > 0) & (stored < 1)
@@ -119,10 +119,10 @@ class Tally:
         at_ends = ((restored <= 0) | (restored >= 1)) & within
         before = stored
         after = restored
-        if valid is not None and known is not None:
-            at_ends = at_ends & known
+        if valid is not None and valid_restored is not None:
+            at_ends = at_ends & valid_restored
             before = stored[valid]
-            after = restored[known]
+            after = restored[valid_restored]
         ends = int(at_ends.sum())
         blank = 0 if valid is not None else _blank_px(stored)
         counts = cls(after.size, int((before > 1).sum()), ends, network_at_ends=ends, blank=blank)
@@ -175,12 +175,12 @@ class Tally:
     @property
     def share_at_ends(self) -> float:
         """The share of the results at 0 or full scale where the image lies between."""
-        return self.at_ends / max(self.known, 1)
+        return self.at_ends / max(self.valid_results, 1)
 
     @property
     def means(self) -> tuple[float, float]:
         """Mean before and after, in shares of full scale; 0 if they cannot be compared."""
-        return self.before / max(self.compared, 1), self.after / max(self.known, 1)
+        return self.before / max(self.compared, 1), self.after / max(self.valid_results, 1)
 
     @property
     def moved(self) -> float:
@@ -201,7 +201,7 @@ class Tally:
         """Standard deviation before and after, in shares of full scale."""
         before, after = self.means
         before_square = self.before_squared / max(self.compared, 1)
-        after_square = self.after_squared / max(self.known, 1)
+        after_square = self.after_squared / max(self.valid_results, 1)
         # Rounding may leave the mean square below the square of the mean.
         return math.sqrt(max(before_square - before**2, 0)), math.sqrt(
             max(after_square - after**2, 0)
@@ -231,7 +231,7 @@ class Tally:
         """Figures of the exposures of the network, for the results of a run."""
         runs = "exposures that tiles asked for, mean of the tiles"
         pixels = "restored at an exposure above 1"
-        share = 100 * self.brightened / max(self.known, 1)
+        share = 100 * self.brightened / max(self.valid_results, 1)
         return {
             "network runs": measured(self.runs / max(self.tiles, 1), "run/tile", runs),
             "brightened pixels": measured(share, "%", pixels),
@@ -240,7 +240,7 @@ class Tally:
     @property
     def consistency_figures(self) -> Mapping[str, Figure]:
         """The change by the consistency step, for the results of a run."""
-        rms = math.sqrt(self.change_squared / max(self.known, 1))
+        rms = math.sqrt(self.change_squared / max(self.valid_results, 1))
         source = "root mean square of what the step added to the known pixels"
         return {"consistency step": measured(100 * rms, "% of full scale", source)}
 
@@ -281,7 +281,7 @@ class Tally:
             network.share_at_ends > MANY_AT_ENDS or abs(network.moved) > FAR or network.flat
         )
 
-        if self.known >= FEW and (
+        if self.valid_results >= FEW and (
             impossible or self.clipped > MANY_AT_ENDS * max(self.compared, 1)
         ):
             raise ImageError(

@@ -275,7 +275,7 @@ def _finish_rows(checkpoint: Checkpoint, work: Restoration) -> None:
         # A generator that is closed cancels the tiles that still wait.
         with closing(work.rows(checkpoint.rows, tick)) as finished:
             _write_behind(finished, checkpoint)
-        if not checkpoint.tally.known:
+        if not checkpoint.tally.valid_results:
             raise ImageError(
                 f"{work.name} has no pixels with values, only NaN or nodata. Check that it is the "
                 "right file."

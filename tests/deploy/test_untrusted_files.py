@@ -108,16 +108,16 @@ ENDS = (4, SHAPE[1])
 @pytest.mark.parametrize(
     "journal",
     [
-        json.dumps({"job": JOB, "rows": 4, "known": 32}),
+        json.dumps({"job": JOB, "rows": 4, "valid_results": 32}),
         journal_text({"job": 1}, [stored_rows()[1]]),
-        journal_text(JOB, [stored_rows(known=-5)[1]]),
+        journal_text(JOB, [stored_rows(valid_results=-5)[1]]),
         journal_text(JOB, [stored_rows(10**9 // SHAPE[2])[1]]),
         journal_text(JOB, [replace(stored_rows()[1], rows_px=0)]),
         journal_text(JOB, [replace(stored_rows()[1], rows_px=4.0)]),  # type: ignore[arg-type]
-        journal_text(JOB, [stored_rows(known=1.5)[1]]),  # type: ignore[arg-type]
+        journal_text(JOB, [stored_rows(valid_results=1.5)[1]]),  # type: ignore[arg-type]
         journal_text(JOB, [stored_rows(2)[1]]),
         journal_text(JOB, [stored_rows()[1]])[:-40],
-        journal_text(JOB, [stored_rows()[1]]).replace('"known": 0', '"known": 1'),
+        journal_text(JOB, [stored_rows()[1]]).replace('"valid_results": 0', '"valid_results": 1'),
     ],
 )
 def test_a_journal_that_counts_rows_that_are_not_there_is_refused(

@@ -33,7 +33,7 @@ def running(infer: Infer, at_once: int, tick: Callable[[], None] = lambda: None)
     result = np.empty(SHAPE, np.uint16)
     source = ArraySource(pixels, raster)
     for row, pixels_out, tally in restore_rows(source, restorer, plan.rows, tick, at_once):
-        assert (tally.known, tally.clipped) == (pixels_out.size, 0)
+        assert (tally.valid_results, tally.clipped) == (pixels_out.size, 0)
         result[:, row.keep_start : row.keep_stop] = pixels_out
     return result
 

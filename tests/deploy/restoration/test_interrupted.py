@@ -54,7 +54,9 @@ def rows_of(pixels: np.ndarray, heights: list[int]) -> Iterator[RestoredRow]:
     top = 0
     for height in heights:
         part = pixels[:, top : top + height]
-        yield RestoredRow(Span(top, top + height, top, top + height), part, Tally(known=part.size))
+        yield RestoredRow(
+            Span(top, top + height, top, top + height), part, Tally(valid_results=part.size)
+        )
         top += height
 
 
@@ -81,7 +83,7 @@ def test_rows_that_match_their_digests_are_kept_and_no_others(
         resumed = Checkpoint(out, shape, np.dtype(kind), JOB, resume=True)
         assert resumed.rows + resumed.damaged_rows == sum(heights)
         assert resumed.rows in np.cumsum([0, *heights])
-        assert resumed.tally.known == bands * resumed.rows * width
+        assert resumed.tally.valid_results == bands * resumed.rows * width
         for band in range(bands):
             np.testing.assert_array_equal(
                 resumed.read(band, 0, resumed.rows), pixels[band, : resumed.rows]
