@@ -13,7 +13,7 @@ import torch
 from beers_deploy.model.simulator.acquire import MARGIN_PX, simulate_pair
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
-from beers_deploy.model.traditional.pipeline import Chain, restore_traditional
+from beers_deploy.model.traditional.pipeline import TraditionalPipeline, restore_traditional
 from beers_deploy.performance.host import conditions_of
 from beers_deploy.performance.swath import Swath, chain_rate, efficiency
 from beers_deploy.performance.tables import TABLE
@@ -26,7 +26,7 @@ CROPS = 3
 
 
 @dataclass(frozen=True)
-class ChainTime:
+class PipelineTime:
     """What the pipeline takes here for 10^6 pixels, crop by crop.
 
     Attributes:
@@ -63,23 +63,23 @@ class ChainTime:
         return Row(TABLE, "traditional pipeline on this CPU", figures)
 
 
-def measure_chain(dn: np.ndarray, degraded: Sensor, reference: Sensor) -> ChainTime:
+def measure_pipeline(dn: np.ndarray, degraded: Sensor, reference: Sensor) -> PipelineTime:
     """Time the pipeline on crops of digital numbers (H, W), after one small run for warm-up."""
-    chain = Chain(degraded.nominal(), reference.nominal())
+    pipeline = TraditionalPipeline(degraded.nominal(), reference.nominal())
     crops = [torch.from_numpy(np.ascontiguousarray(crop, dtype=np.float32)) for crop in _crops(dn)]
-    restore_traditional(crops[0][:32, :32], chain)
+    restore_traditional(crops[0][:32, :32], pipeline)
     # The load is measured from one call to the next: this one opens the window of the timed run.
     cpu_load()
     before_s = own_cpu_s()
     times_s, elapsed_s, power = timed(
-        lambda: [timed(partial(restore_traditional, crop, chain))[1] for crop in crops]
+        lambda: [timed(partial(restore_traditional, crop, pipeline))[1] for crop in crops]
     )
     per_mpx = [1e6 * time_s / crop.numel() for time_s, crop in zip(times_s, crops, strict=True)]
     height, width = crops[0].shape
     own_s = own_cpu_s() - before_s
     conditions = conditions_of(torch.get_num_threads())
     others = load_of_others(conditions["CPU load"], own_s, elapsed_s)
-    return ChainTime(per_mpx, power, conditions, f"{width} x {height} pixels", others)
+    return PipelineTime(per_mpx, power, conditions, f"{width} x {height} pixels", others)
 
 
 def drawn_acquisition(

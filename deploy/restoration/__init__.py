@@ -10,7 +10,7 @@
     runtime      the network, on onnxruntime or OpenVINO, here or by the workers of a `cluster`
     steps        the steps around the network: its exposures, and the consistency step
     prepare      all of these made ready: `NetworkPipeline`
-    traditional  the same for the traditional pipeline: `TraditionalPipeline`
+    traditional  the same for the traditional pipeline: `TraditionalMethod`
     tiles        the one tile loop, for files, arrays and Dask
     outcome      a comparison of the result with the image
     checkpoint   the finished rows on the disk and their journal, from which a later run continues

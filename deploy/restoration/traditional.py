@@ -15,7 +15,7 @@ from torch import Tensor
 
 from beers_deploy.model.progress import Steps, steps
 from beers_deploy.model.raster.source import Source, strips
-from beers_deploy.model.traditional.pipeline import Chain, restore_strips
+from beers_deploy.model.traditional.pipeline import TraditionalPipeline, restore_strips
 from beers_deploy.profiles.figures import Figure
 from beers_deploy.restoration.bands import in_order
 from beers_deploy.restoration.cluster import Cluster
@@ -46,10 +46,10 @@ class TraditionalRestoration(Restoration):
     No run can continue from a strip, because the pipeline looks hundreds of rows back.
 
     Attributes:
-        chains: the pipeline of each band.
+        pipelines: the pipeline of each band.
     """
 
-    chains: tuple[Chain, ...]
+    pipelines: tuple[TraditionalPipeline, ...]
 
     def ticks(self, done_px: int) -> int:
         """Return the number of rows."""
@@ -65,8 +65,8 @@ class TraditionalRestoration(Restoration):
         """
         height_px = self.source.raster.height_px
         by_band = [
-            restore_strips(self.read(band), height_px, chain)
-            for band, chain in enumerate(self.chains)
+            restore_strips(self.read(band), height_px, pipeline)
+            for band, pipeline in enumerate(self.pipelines)
         ]
         top = 0
         for bands in zip(*by_band, strict=True):
@@ -81,7 +81,7 @@ class TraditionalRestoration(Restoration):
 
     def _to_dn(self, band: int) -> np.float32:
         """Return the digital number of the sensor for a pixel value of 1."""
-        return np.float32(self.chains[band].degraded.max_dn / self.scale.value)
+        return np.float32(self.pipelines[band].degraded.max_dn / self.scale.value)
 
     def read(self, band: int) -> Iterator[Tensor]:
         """Read strips (rows, width) float32 of digital numbers, NaN where they are missing."""
@@ -104,12 +104,12 @@ class TraditionalRestoration(Restoration):
         The regularisation is the Wiener optimum of the whole image, so it needs all strips, but
         little time.
         """
-        with steps("measuring noise and contrast", len(self.chains) * self.ticks(0)) as bar:
-            chains = [
-                chain.fitted_to(_counted(self.read(band), bar))
-                for band, chain in enumerate(self.chains)
+        with steps("measuring noise and contrast", len(self.pipelines) * self.ticks(0)) as bar:
+            pipelines = [
+                pipeline.fitted_to(_counted(self.read(band), bar))
+                for band, pipeline in enumerate(self.pipelines)
             ]
-        return replace(self, chains=tuple(chains))
+        return replace(self, pipelines=tuple(pipelines))
 
     def _stored(self, dn: np.ndarray, top: int) -> RestoredRow:
         """Return restored rows (bands, rows, width) of digital numbers as they are stored."""
@@ -141,7 +141,7 @@ def _counted(strips_read: Iterator[Tensor], bar: Steps) -> Iterator[Tensor]:
 
 
 @dataclass(frozen=True)
-class TraditionalPipeline:
+class TraditionalMethod:
     """The traditional pipeline, as a method that can restore images.
 
     Attributes:
@@ -176,8 +176,9 @@ class TraditionalPipeline:
         extents = (raster.extent(source.read(*strip)) for strip in rows)
         scale = full_scale_of(name, raster, extents, reading.full_scale, reading.sensor_bits)
         check, check_s = check_sensor(source, (), reading, scale.value, name)
-        chains = tuple(
-            Chain(sensor.nominal(), sensor.reference.nominal(), self.quality) for sensor in sensors
+        pipelines = tuple(
+            TraditionalPipeline(sensor.nominal(), sensor.reference.nominal(), self.quality)
+            for sensor in sensors
         )
         restoration = TraditionalRestoration(
             source=source,
@@ -193,6 +194,6 @@ class TraditionalPipeline:
                 "method": "traditional",
                 "sensor": ", ".join(sensor.name for sensor in sensors),
             },
-            chains=chains,
+            pipelines=pipelines,
         )
         return restoration.fitted()

@@ -21,7 +21,7 @@ from beers_deploy.network import Network
 from beers_deploy.performance import board as bench_board
 from beers_deploy.performance import tables
 from beers_deploy.performance.swath import Swath, predict_network
-from beers_deploy.performance.traditional import measure_chain
+from beers_deploy.performance.traditional import measure_pipeline
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.figures import Row, measured
 from beers_deploy.profiles.instrument import MAX_DN
@@ -120,7 +120,7 @@ def bench_tables(model: Network, dn: np.ndarray, sensors: tuple[Sensor, Sensor])
     """
     dpu = load_dpu(DEFAULT_TARGET)
     halo_px = model.tiling.halo_px
-    pipeline = measure_chain(dn, *sensors)
+    pipeline = measure_pipeline(dn, *sensors)
     rows = []
     for width, height in ((dn.shape[1], dn.shape[0]), SWATH_PX):
         swath = Swath(width, height, TILE_PX, halo_px, consistency=True)

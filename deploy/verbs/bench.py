@@ -188,7 +188,7 @@ def _on_this_machine(
 def _with_traditional(table: "Bench", swath: "Swath") -> "Bench":
     """Return a table with the traditional pipeline, measured on this machine."""
     try:
-        from beers_deploy.performance.traditional import drawn_acquisition, measure_chain
+        from beers_deploy.performance.traditional import drawn_acquisition, measure_pipeline
     except ImportError as error:
         reason = missing_extra(error, "bench")
         note = f"The traditional pipeline is not measured here: {reason}"
@@ -198,12 +198,12 @@ def _with_traditional(table: "Bench", swath: "Swath") -> "Bench":
 
     sensors = Sensor.load(SENSOR), Sensor.load(REFERENCE)
     dn = drawn_acquisition(swath, *sensors) if table.dn is None else table.dn
-    chain = measure_chain(dn, *sensors)
+    pipeline = measure_pipeline(dn, *sensors)
     headings = dict(table.headings)
-    if chain.others > BUSY:
+    if pipeline.others > BUSY:
         first = table.rows[0].table
         headings[first] += (
-            f". This machine is busy: other programs took {chain.others:.0%} of it while the "
+            f". This machine is busy: other programs took {pipeline.others:.0%} of it while the "
             "traditional pipeline was measured, whose time is too long"
         )
-    return replace(table, rows=(*table.rows, chain.row(swath)), headings=headings)
+    return replace(table, rows=(*table.rows, pipeline.row(swath)), headings=headings)

@@ -223,9 +223,9 @@ def _traditional(quality: str, unknown: bool) -> "Callable[[], Pipeline]":
             "profile ('beers-deploy profiles' lists them), or give your .toml file."
         )
     # It loads torch, which is optional.
-    from beers_deploy.restoration.traditional import TraditionalPipeline
+    from beers_deploy.restoration.traditional import TraditionalMethod
 
-    return partial(TraditionalPipeline, quality)
+    return partial(TraditionalMethod, quality)
 
 
 def _output(

@@ -6,7 +6,7 @@
 3. `compensate`: regularised inverse filter, from the degraded sensor's MTF to the reference's;
    `regularisation` derives its strength from the noise and the contrast of the image.
 
-`pipeline` chains them, in this order or with 3 first; `peers` are restorations of scikit-image to
-compare it with. Every step accepts and returns strips of rows (`rows`), so a chain of any height
-runs in the memory of some hundred rows; NaN marks missing pixels.
+`pipeline` runs them in this order, or with 3 first. `baselines` has methods of scikit-image to
+compare it with. Every step accepts and returns strips of rows (`rows`), so an image of any height
+needs the memory of some hundred rows. NaN marks missing pixels.
 """

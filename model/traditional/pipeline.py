@@ -1,5 +1,5 @@
-"""Chain the two traditional pipelines. Every parameter derives from the two sensors and from the
-image.
+"""Restore an image by the two traditional pipelines. Every parameter derives from the two sensors
+and from the image.
 
 - denoise first: stabilise, NL-Bayes, inverse, MTF compensation. NL-Bayes sees the white noise that
   it assumes; the residual noise is amplified afterwards.
@@ -42,7 +42,7 @@ Order = Literal["denoise-first", "deconvolve-first"]
 
 
 @dataclass(frozen=True)
-class Chain:
+class TraditionalPipeline:
     """The parameters of a restoration from images of `degraded` to those that `reference` would
     have acquired without its noise.
 
@@ -57,11 +57,11 @@ class Chain:
     order: Order = "denoise-first"
     epsilon: float | None = None
 
-    def fitted_to(self, strips: Iterable[Tensor]) -> "Chain":
+    def fitted_to(self, strips: Iterable[Tensor]) -> "TraditionalPipeline":
         """Return the pipeline with the epsilon for an image in strips (any, W) of digital numbers,
         NaN where missing.
 
-        A chain that has an epsilon is returned unchanged, and no strip is read.
+        A pipeline that has an epsilon is returned unchanged, and no strip is read.
         """
         if self.epsilon is not None:
             return self
@@ -74,33 +74,38 @@ class Chain:
         """
         if self.epsilon is None:
             raise OptionError(
-                "The pipeline has no epsilon yet. Call Chain.fitted_to with the strips of the "
-                "image first."
+                "The pipeline has no epsilon yet. Call TraditionalPipeline.fitted_to with the "
+                "strips of the image first."
             )
         return compensation_kernel(self.degraded.blur, self.reference.blur, self.epsilon)
 
 
-def restore_traditional(dn: Tensor, chain: Chain) -> Tensor:
+def restore_traditional(dn: Tensor, pipeline: TraditionalPipeline) -> Tensor:
     """Restore digital numbers (H, W) float32 of the degraded sensor to those of the reference.
 
     The result is clipped and not rounded. NaN marks missing pixels, and remains.
     """
-    return torch.cat(list(restore_strips([dn], dn.shape[0], chain.fitted_to([dn]))))
+    return torch.cat(list(restore_strips([dn], dn.shape[0], pipeline.fitted_to([dn]))))
 
 
-def restore_strips(strips: Iterable[Tensor], height: int, chain: Chain) -> Iterator[Tensor]:
+def restore_strips(
+    strips: Iterable[Tensor], height: int, pipeline: TraditionalPipeline
+) -> Iterator[Tensor]:
     """Restore an image that arrives in strips of rows, (any, W) each, with the same bits as
     `restore_traditional`.
 
-    The chain needs an epsilon (see `Chain.fitted_to`), because the strips are read only once. Some
-    700 rows of the image, and the tallest strip, are held in memory.
+    The strips are read only once. Some 700 rows of the image, and the tallest strip, are held in
+    memory.
+
+    Raises:
+        OptionError: the pipeline has no epsilon. `TraditionalPipeline.fitted_to` derives it.
     """
-    radiance = (to_radiance(strip, chain.degraded) for strip in finite_or_missing(strips))
+    radiance = (to_radiance(strip, pipeline.degraded) for strip in finite_or_missing(strips))
     # The converter's rounding adds a twelfth of a squared DN, which NL-Bayes must know of.
-    sensor = with_rounding_noise(chain.degraded)
-    kernel = chain.kernel()
-    quality = quality_named(chain.quality)
-    if chain.order == "denoise-first":
+    sensor = with_rounding_noise(pipeline.degraded)
+    kernel = pipeline.kernel()
+    quality = quality_named(pipeline.quality)
+    if pipeline.order == "denoise-first":
         clean = denoise_radiance(radiance, height, sensor, Noise(WORKING_SIGMA), quality)
         restored = filter_strips(clean, height, kernel)
     else:
@@ -114,7 +119,7 @@ def restore_strips(strips: Iterable[Tensor], height: int, chain: Chain) -> Itera
             sharp, height, amplified, replace(coloured, sigma=WORKING_SIGMA), quality
         )
     for strip in restored:
-        yield to_dn(strip, chain.reference)
+        yield to_dn(strip, pipeline.reference)
 
 
 def denoise_radiance(

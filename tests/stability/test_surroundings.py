@@ -22,7 +22,11 @@ from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.mtf import mtf, sensor_transfer
 from beers_deploy.model.simulator.plan import ringing_of, scene_stats
 from beers_deploy.model.simulator.sampling import read_scene, sample, scene_spectrum
-from beers_deploy.model.traditional.pipeline import Chain, restore_strips, restore_traditional
+from beers_deploy.model.traditional.pipeline import (
+    TraditionalPipeline,
+    restore_strips,
+    restore_traditional,
+)
 from beers_deploy.model.training.losses import LossWeights, RestorationLoss
 from beers_deploy.profiles.errors import BeersError
 from beers_deploy.profiles.instrument import Instrument
@@ -142,37 +146,39 @@ others say.
 
 @named([BY_NAME[name] for name in TRADITIONAL])
 def test_the_traditional_pipeline_is_calm(case: Case) -> None:
-    chain = Chain(sensor_of(case), Sensor.load(REFERENCE).nominal(), "fast")
+    pipeline = TraditionalPipeline(sensor_of(case), Sensor.load(REFERENCE).nominal(), "fast")
     for image in images(case):
-        result = restored(image, chain)
+        result = restored(image, pipeline)
         valid = ~np.isnan(image)
         assert 0 <= result[valid].min() <= result[valid].max() <= FULL_DN
-        assert np.array_equal(result, restored(image, chain), equal_nan=True)
+        assert np.array_equal(result, restored(image, pipeline), equal_nan=True)
         torch.set_num_threads(2)
-        assert np.array_equal(result, restored(image, chain), equal_nan=True)
+        assert np.array_equal(result, restored(image, pipeline), equal_nan=True)
         torch.set_num_threads(1)
         strips = [torch.from_numpy(image[top : top + 13]) for top in range(0, len(image), 13)]
         joined = torch.cat(
-            list(restore_strips(strips, len(image), chain.fitted_to(strips)))
+            list(restore_strips(strips, len(image), pipeline.fitted_to(strips)))
         ).numpy()
         assert np.array_equal(result, joined, equal_nan=True)
         assert np.array_equal(result[~valid], image[~valid], equal_nan=True)
         if case.pixels == "sound":
-            faithful(image, result, chain)
+            faithful(image, result, pipeline)
 
 
-def faithful(image: np.ndarray, result: np.ndarray, chain: Chain) -> None:
-    exact = restore_traditional(torch.from_numpy(image).double(), chain).numpy()
-    change = gain(lambda pixels: restored(pixels, chain), image, result, np.random.default_rng(0))
+def faithful(image: np.ndarray, result: np.ndarray, pipeline: TraditionalPipeline) -> None:
+    exact = restore_traditional(torch.from_numpy(image).double(), pipeline).numpy()
+    change = gain(
+        lambda pixels: restored(pixels, pipeline), image, result, np.random.default_rng(0)
+    )
     assert ringing(result, image, 19, 100).holds
     assert change <= GROUPS_DN
     assert np.abs(result - exact).max() <= GROUPS_DN
     assert image.std() > 0 or abs(float(result.mean() - image.mean())) <= FLAT_DN
 
 
-def restored(image: np.ndarray, chain: Chain) -> np.ndarray:
+def restored(image: np.ndarray, pipeline: TraditionalPipeline) -> np.ndarray:
     return np.asarray(
-        restore_traditional(torch.from_numpy(np.asarray(image, np.float32)), chain).numpy()
+        restore_traditional(torch.from_numpy(np.asarray(image, np.float32)), pipeline).numpy()
     )
 
 

@@ -22,7 +22,7 @@ from beers_deploy.model.traditional.patch_groups import (
     first_pass,
     second_pass,
 )
-from beers_deploy.model.traditional.pipeline import Chain, Order, restore_traditional
+from beers_deploy.model.traditional.pipeline import Order, TraditionalPipeline, restore_traditional
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Sensor
 from tests.model.traditional.whole import compensate
@@ -130,7 +130,7 @@ def test_trap_13_infinity_is_no_missing_pixel() -> None:
     orders: tuple[Order, Order] = ("denoise-first", "deconvolve-first")
     for order in orders:
         with pytest.raises(ImageError, match="infinity"):
-            restore_traditional(image, Chain(degraded, reference, "fast", order))
+            restore_traditional(image, TraditionalPipeline(degraded, reference, "fast", order))
 
 
 def test_trap_15_the_variance_in_float32_comes_out_negative() -> None:

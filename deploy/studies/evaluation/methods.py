@@ -15,9 +15,9 @@ import onnx
 import torch
 
 from beers_deploy.model.shipped import INT8, shipped_names
+from beers_deploy.model.traditional.baselines import BASELINES
 from beers_deploy.model.traditional.patch_groups import QUALITIES
-from beers_deploy.model.traditional.peers import PEERS
-from beers_deploy.model.traditional.pipeline import Chain, Order, restore_traditional
+from beers_deploy.model.traditional.pipeline import Order, TraditionalPipeline, restore_traditional
 from beers_deploy.network import Network
 from beers_deploy.network_files import conditioned, other_sensor, warn_outside
 from beers_deploy.profiles.constant import Constant
@@ -47,12 +47,12 @@ PIPELINES: dict[str, tuple[str, Order]] = {
     },
     **{
         name: ("standard", order)
-        for name, order in (ORDERS | dict.fromkeys(PEERS, ORDERS[TRADITIONAL])).items()
+        for name, order in (ORDERS | dict.fromkeys(BASELINES, ORDERS[TRADITIONAL])).items()
     },
 }
-"""Quality and order of each traditional pipeline and of its peers, by name."""
+"""Quality and order of each traditional pipeline and of each baseline of scikit-image, by name."""
 WITHOUT_NETWORK = (DEGRADED, *PIPELINES)
-"""The input itself, and the traditional pipelines and their peers."""
+"""The input itself, the traditional pipelines, and the baselines of scikit-image."""
 
 KNOWN = "known"
 BLIND = "blind"
@@ -90,10 +90,10 @@ def method_without_network(name: str, degraded: Instrument, reference: Instrumen
     if name == DEGRADED:
         return Method(name, lambda dn: dn, "the input itself")
     quality, order = PIPELINES[name]
-    run = PEERS.get(name, restore_traditional)
+    run = BASELINES.get(name, restore_traditional)
 
     def specialise(sensor: Instrument) -> Restore:
-        pipeline = Chain(sensor, reference.in_units_of(sensor), quality, order)
+        pipeline = TraditionalPipeline(sensor, reference.in_units_of(sensor), quality, order)
         return lambda dn: run(torch.from_numpy(dn), pipeline).numpy()
 
     return Method(name, specialise(degraded), KNOWN, specialise)
@@ -101,8 +101,8 @@ def method_without_network(name: str, degraded: Instrument, reference: Instrumen
 
 METHOD_NAMES = (
     f"degraded, {TRADITIONAL}, {DECONVOLVE_FIRST} (each also with -fast or -best), "
-    f"{', '.join(PEERS)}, a shipped network ({', '.join(shipped_names())}, each also with -int8, "
-    "and with @SENSOR or @blind for another sensor), or an ONNX or safetensors file"
+    f"{', '.join(BASELINES)}, a shipped network ({', '.join(shipped_names())}, each also "
+    "with -int8, and with @SENSOR or @blind for another sensor), or an ONNX or safetensors file"
 )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from markupsafe import Markup
 
 from beers_deploy.model.io.files import write_text
-from beers_deploy.model.traditional.peers import PEERS
+from beers_deploy.model.traditional.baselines import BASELINES
 from beers_deploy.profiles.errors import optional
 from beers_deploy.profiles.figures import Row
 from beers_deploy.report.page import Picture, Report, Section, write_report
@@ -245,7 +245,7 @@ def series(study: Tradeoff) -> Iterator[Series]:
 def _kind(point: Measured) -> str:
     if point.point is not None and point.point.variant.network is not None:
         return point.text["method"]
-    return LIBRARIES if point.text["method"] in PEERS else PIPELINES
+    return LIBRARIES if point.text["method"] in BASELINES else PIPELINES
 
 
 def _scatter(axes: "Axes", group: Series, study: Tradeoff) -> None:

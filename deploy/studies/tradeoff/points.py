@@ -20,8 +20,8 @@ from beers_deploy.dpu.cost.latency import dpu_power, predict
 from beers_deploy.dpu.graph import SizedGraph
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.model.shipped import shipped_names
+from beers_deploy.model.traditional.baselines import BASELINES
 from beers_deploy.model.traditional.patch_groups import QUALITIES
-from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.performance import tables
 from beers_deploy.performance.swath import Swath, chain_rate, efficiency, energy, swath_latency
@@ -177,7 +177,7 @@ def points_of(
     return [
         *chain.from_iterable(of_networks),
         *(Point(variant, board) for variant, board in product(traditional, boards)),
-        *(Point(Variant(peer)) for peer in PEERS),
+        *(Point(Variant(baseline)) for baseline in BASELINES),
     ]
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from beers_deploy.performance.swath import PAPER_SIZE, Swath, parse_size
 from beers_deploy.performance.tables import processor_row
-from beers_deploy.performance.traditional import CROP_PX, drawn_acquisition, measure_chain
+from beers_deploy.performance.traditional import CROP_PX, drawn_acquisition, measure_pipeline
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.target import TargetProfile
 
@@ -16,7 +16,7 @@ SWATH = Swath(*parse_size(PAPER_SIZE))
 
 
 def test_crops_are_measured_and_the_swath_is_their_proportion() -> None:
-    row = measure_chain(np.full((70, 90), 1000, np.float32), *SENSORS).row(SWATH)
+    row = measure_pipeline(np.full((70, 90), 1000, np.float32), *SENSORS).row(SWATH)
     time = row.figures["time"]
     latency = row.figures["latency"]
     assert (time.mode, time.unit, latency.mode) == ("measured", "s/Mpx", "predicted")

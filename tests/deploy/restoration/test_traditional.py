@@ -11,7 +11,7 @@ import tifffile
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
-from beers_deploy.model.traditional.pipeline import Chain, restore_traditional
+from beers_deploy.model.traditional.pipeline import TraditionalPipeline, restore_traditional
 from beers_deploy.profiles.errors import ImageError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.verbs.restore import restore
@@ -29,7 +29,7 @@ def noise(seed: int = 0) -> np.ndarray:
 
 
 def of_array(pixels: np.ndarray, sensor: Sensor = SENSOR) -> np.ndarray:
-    chain = Chain(sensor.nominal(), sensor.reference.nominal())
+    chain = TraditionalPipeline(sensor.nominal(), sensor.reference.nominal())
     return restore_traditional(torch.from_numpy(pixels.astype(np.float32)), chain).numpy()
 
 

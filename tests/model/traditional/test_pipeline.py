@@ -1,4 +1,4 @@
-"""The whole chain on a simulated pair: what it gains, and what it loses when
+"""The whole pipeline on a simulated pair: what it gains, and what it loses when
 told the wrong sensor.
 """
 
@@ -12,12 +12,12 @@ from torch import Tensor
 
 from beers_deploy.model.simulator.acquire import simulate_pair
 from beers_deploy.model.simulator.detector import Draw
-from beers_deploy.model.traditional import pipeline
+from beers_deploy.model.traditional import pipeline as pipeline_module
+from beers_deploy.model.traditional.baselines import BASELINES
 from beers_deploy.model.traditional.noise import Noise, coloured_by, with_rounding_noise
-from beers_deploy.model.traditional.peers import PEERS
 from beers_deploy.model.traditional.pipeline import (
-    Chain,
     Order,
+    TraditionalPipeline,
     restore_strips,
     restore_traditional,
 )
@@ -35,7 +35,7 @@ NOISE_FREE = replace(REFERENCE, alpha=0.0, beta=0.0)
 
 
 class Seen(NamedTuple):
-    """Two acquisitions (H, W), as the chain takes them."""
+    """Two acquisitions (H, W), as the pipeline takes them."""
 
     degraded: Tensor
     reference: Tensor
@@ -62,8 +62,8 @@ def psnr_db(image: Tensor, truth: Tensor) -> float:
     return float(10 * torch.log10(DEGRADED.max_dn**2 / difference.square().mean()))
 
 
-def restored_db(pair: Seen, chain: Chain) -> float:
-    return psnr_db(restore_traditional(pair.degraded, chain), pair.reference)
+def restored_db(pair: Seen, pipeline: TraditionalPipeline) -> float:
+    return psnr_db(restore_traditional(pair.degraded, pipeline), pair.reference)
 
 
 ALPHA, BETA = noise_from_snr(25, 15, 100, 50)
@@ -81,7 +81,9 @@ def test_both_orders_of_the_chain_gain_as_many_decibels_as_were_measured(
     before = psnr_db(pair.degraded, pair.reference)
     gains = dict[Order, float]()
     for order in ORDERS:
-        restored = restore_traditional(pair.degraded, Chain(sensor, REFERENCE, order=order))
+        restored = restore_traditional(
+            pair.degraded, TraditionalPipeline(sensor, REFERENCE, order=order)
+        )
         assert restored.shape == pair.degraded.shape
         assert restored.dtype == torch.float32
         gains[order] = psnr_db(restored, pair.reference) - before
@@ -91,20 +93,23 @@ def test_both_orders_of_the_chain_gain_as_many_decibels_as_were_measured(
 
 
 def test_each_half_of_the_chain_is_needed(pair: Seen) -> None:
-    full_chain = restored_db(pair, Chain(DEGRADED, REFERENCE))
-    # A reference with the sensor's own MTF leaves nothing to sharpen, so this chain only denoises.
-    assert restored_db(pair, Chain(DEGRADED, replace(REFERENCE, mtf_nyquist=0.07))) < full_chain - 3
-    assert psnr_db(compensate(pair.degraded, 0.07, 0.25, 3e-3), pair.reference) < full_chain - 3
+    full_pipeline = restored_db(pair, TraditionalPipeline(DEGRADED, REFERENCE))
+    # A reference with the sensor's own MTF leaves nothing to sharpen: this pipeline only denoises.
+    assert (
+        restored_db(pair, TraditionalPipeline(DEGRADED, replace(REFERENCE, mtf_nyquist=0.07)))
+        < full_pipeline - 3
+    )
+    assert psnr_db(compensate(pair.degraded, 0.07, 0.25, 3e-3), pair.reference) < full_pipeline - 3
 
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_strips_change_no_bit(order: Order, pair: Seen) -> None:
-    chain = Chain(DEGRADED, REFERENCE, "fast", order)
+    pipeline = TraditionalPipeline(DEGRADED, REFERENCE, "fast", order)
     dn = pair.degraded.clone()
     dn[:9, 20:50] = torch.nan
-    fitted = chain.fitted_to(torch.split(dn, 31))
+    fitted = pipeline.fitted_to(torch.split(dn, 31))
     strips = torch.cat(list(restore_strips(torch.split(dn, 23), dn.shape[0], fitted)))
-    at_once = restore_traditional(dn, chain)
+    at_once = restore_traditional(dn, pipeline)
     assert torch.equal(strips.nan_to_num(-1), at_once.nan_to_num(-1))
     assert torch.equal(at_once.isnan(), dn.isnan())
 
@@ -112,21 +117,22 @@ def test_strips_change_no_bit(order: Order, pair: Seen) -> None:
 def test_without_the_colour_deconvolving_first_loses_decibels(
     pair: Seen, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    chain = Chain(DEGRADED, REFERENCE, order="deconvolve-first", epsilon=0.0)
-    with_colour = restored_db(pair, chain)
+    pipeline = TraditionalPipeline(DEGRADED, REFERENCE, order="deconvolve-first", epsilon=0.0)
+    with_colour = restored_db(pair, pipeline)
 
     def as_white(kernel: Tensor, sigma: float) -> Noise:
         return Noise(coloured_by(kernel, sigma).sigma)
 
-    monkeypatch.setattr(pipeline, "coloured_by", as_white)
-    assert restored_db(pair, chain) < with_colour - 0.5
+    monkeypatch.setattr(pipeline_module, "coloured_by", as_white)
+    assert restored_db(pair, pipeline) < with_colour - 0.5
 
 
 def test_the_gain_of_each_sensor_is_its_own(pair: Seen) -> None:
     crop = pair.degraded[:37, :45]
-    same = restore_traditional(crop, Chain(DEGRADED, REFERENCE, "fast"))
+    same = restore_traditional(crop, TraditionalPipeline(DEGRADED, REFERENCE, "fast"))
     half = restore_traditional(
-        crop, Chain(DEGRADED, replace(REFERENCE, gain_dn_per_radiance=10.2375 / 2), "fast")
+        crop,
+        TraditionalPipeline(DEGRADED, replace(REFERENCE, gain_dn_per_radiance=10.2375 / 2), "fast"),
     )
     torch.testing.assert_close(half * 2, same)
 
@@ -136,7 +142,9 @@ def test_the_gain_of_each_sensor_is_its_own(pair: Seen) -> None:
     "sensor", [DEGRADED, NOISE_FREE, Sensor.load("pleiades-variable").nominal()]
 )
 def test_a_black_and_a_saturated_image(level: float, sensor: Instrument) -> None:
-    restored = restore_traditional(torch.full((13, 21), level), Chain(sensor, REFERENCE))
+    restored = restore_traditional(
+        torch.full((13, 21), level), TraditionalPipeline(sensor, REFERENCE)
+    )
     torch.testing.assert_close(restored, torch.full((13, 21), level), rtol=0, atol=0.05)
 
 
@@ -155,7 +163,7 @@ def test_the_chain_restores_a_point_spread_as_the_formula_it_was_made_of(camera:
     formula = replace(DEGRADED, mtf_nyquist=0.12, mtf_nyquist_along=0.05)
     point = with_response(DEGRADED, formula_point(formula.mtf_axes, 2, 129, odd=True))
     levels_db = [
-        restored_db(seen_by(camera, sensor), Chain(sensor, REFERENCE))
+        restored_db(seen_by(camera, sensor), TraditionalPipeline(sensor, REFERENCE))
         for sensor in (formula, point)
     ]
     assert levels_db[1] == pytest.approx(levels_db[0], abs=0.05)
@@ -170,8 +178,8 @@ WRONG += [(DEGRADED, replace(DEGRADED, mtf_nyquist=0.15), "denoise-first")]
 WRONG += [(DEGRADED, replace(DEGRADED, alpha=0.5), "denoise-first")]
 WRONG += [(AXES, TURNED, "denoise-first"), (AXES, ONE, "denoise-first")]
 WRONG += [(DISC, replace(DISC, response=None), order) for order in ORDERS]
-"""A sensor, and another that the chain is told: the formula with the contrasts of a leaning disc is
-another blur.
+"""A sensor, and the one that the pipeline is given: the formula with the contrasts of a leaning
+disc is another blur.
 """
 
 
@@ -181,17 +189,20 @@ def test_the_wrong_sensor_costs_decibels(
 ) -> None:
     pair = seen_by(camera, sensor)
     right, wrong = (
-        restored_db(pair, Chain(stated, REFERENCE, order=order)) for stated in (sensor, profile)
+        restored_db(pair, TraditionalPipeline(stated, REFERENCE, order=order))
+        for stated in (sensor, profile)
     )
     assert right > wrong + 1
 
 
 @pytest.mark.parametrize("name", ["wiener", "nl-means"])
-def test_peers_undo_the_whole_response(name: str, camera: Tensor) -> None:
+def test_baselines_undo_the_whole_response(name: str, camera: Tensor) -> None:
     sensor = with_response(DEGRADED, leaning_disc())
     pair = seen_by(camera, sensor)
     right, wrong = (
-        psnr_db(PEERS[name](pair.degraded, Chain(profile, REFERENCE)), pair.reference)
+        psnr_db(
+            BASELINES[name](pair.degraded, TraditionalPipeline(profile, REFERENCE)), pair.reference
+        )
         for profile in (sensor, replace(sensor, response=None))
     )
     assert right > wrong + 1
@@ -205,7 +216,7 @@ def test_any_bits_are_restored(bits: int, camera: Tensor) -> None:
         replace(s, bits=bits, gain_dn_per_radiance=gain) for s in (DEGRADED, NOISE_FREE)
     )
     pair = seen_by(camera, degraded, reference)
-    restored = restore_traditional(pair.degraded, Chain(degraded, reference))
+    restored = restore_traditional(pair.degraded, TraditionalPipeline(degraded, reference))
     before, after = (
         psnr_db(dn * (4095 / (2**bits - 1)), pair.reference * (4095 / (2**bits - 1)))
         for dn in (pair.degraded, restored)
@@ -215,10 +226,10 @@ def test_any_bits_are_restored(bits: int, camera: Tensor) -> None:
 
 def test_an_unknown_quality_is_refused() -> None:
     with pytest.raises(OptionError, match="fast, standard, best"):
-        restore_traditional(torch.ones(3, 3), Chain(DEGRADED, REFERENCE, "superb"))
+        restore_traditional(torch.ones(3, 3), TraditionalPipeline(DEGRADED, REFERENCE, "superb"))
 
 
 def test_the_result_stays_within_the_converter() -> None:
     checkerboard = torch.from_numpy(np.indices((29, 31)).sum(0) % 2 * 4095).float()
-    restored = restore_traditional(checkerboard, Chain(DEGRADED, REFERENCE, "fast"))
+    restored = restore_traditional(checkerboard, TraditionalPipeline(DEGRADED, REFERENCE, "fast"))
     assert 0 <= float(restored.min()) <= float(restored.max()) <= 4095

@@ -16,7 +16,11 @@ from beers_deploy.model.metrics.slanted_edge import edge_mtf, slanted_edge
 from beers_deploy.model.simulator.acquire import acquire
 from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.sampling import scene_spectrum
-from beers_deploy.model.traditional.pipeline import Chain, restore_strips, restore_traditional
+from beers_deploy.model.traditional.pipeline import (
+    TraditionalPipeline,
+    restore_strips,
+    restore_traditional,
+)
 from beers_deploy.model.traditional.regularisation import (
     BLOCK_PX,
     LARGEST_EPSILON,
@@ -148,15 +152,15 @@ def test_epsilon_is_bounded_by_the_share_of_noise(seed: int, mean_dn: float) -> 
 
 def test_infinite_pixels_are_refused() -> None:
     with pytest.raises(ImageError, match="infinity"):
-        Chain(DEGRADED, REFERENCE).fitted_to([torch.full((3, 3), torch.inf)])
+        TraditionalPipeline(DEGRADED, REFERENCE).fitted_to([torch.full((3, 3), torch.inf)])
 
 
 def test_strips_need_an_epsilon_and_one_that_is_given_stays() -> None:
-    chain = Chain(DEGRADED, REFERENCE)
+    pipeline = TraditionalPipeline(DEGRADED, REFERENCE)
     dn = walk((9, 9))
     with pytest.raises(OptionError, match="fitted_to"):
-        list(restore_strips([dn], 9, chain))
-    given_one = replace(chain, epsilon=0.01)
+        list(restore_strips([dn], 9, pipeline))
+    given_one = replace(pipeline, epsilon=0.01)
     assert given_one.fitted_to([dn]) is given_one
 
 
@@ -169,12 +173,14 @@ def test_the_restored_mtf_comes_near_that_of_the_reference() -> None:
 
 
 def restored_mtf(angle_deg: float, number: int) -> float:
-    """Return the MTF at Nyquist of a slanted edge that the chain restored."""
+    """Return the MTF at Nyquist of a slanted edge that the pipeline restored."""
     scene = slanted_edge(240, 5, angle_deg)
     edge = acquire(
         scene_spectrum(scene), scene.shape[1], DEGRADED, 5, Draw(0, number), "degraded", margin_px=0
     )
-    restored = restore_traditional(torch.from_numpy(edge), Chain(DEGRADED, REFERENCE)).numpy()
+    restored = restore_traditional(
+        torch.from_numpy(edge), TraditionalPipeline(DEGRADED, REFERENCE)
+    ).numpy()
     mtf = edge_mtf(restored[80:160, 80:160], angle_deg, DEGRADED.max_dn)
     assert isinstance(mtf, float)
     return mtf
@@ -184,8 +190,8 @@ def test_a_dark_scene_gets_more_regularisation_and_gains_from_it(camera: Tensor)
     """At 1/20 of the radiance what suits the bright scene loses, and the other way round."""
     reference = replace(NOISE_FREE, gain_dn_per_radiance=DEGRADED.gain_dn_per_radiance)
     bright, dark = (seen_by(camera * share, DEGRADED, reference) for share in (1, 1 / 20))
-    chain = Chain(DEGRADED, REFERENCE)
-    for_bright, for_dark = (chain.fitted_to([view.degraded]) for view in (bright, dark))
+    pipeline = TraditionalPipeline(DEGRADED, REFERENCE)
+    for_bright, for_dark = (pipeline.fitted_to([view.degraded]) for view in (bright, dark))
     assert for_bright.epsilon is not None
     assert for_dark.epsilon is not None
     assert for_dark.epsilon > 3 * for_bright.epsilon

@@ -20,7 +20,7 @@ def small_studies() -> Iterator[None]:
             (measure, "PATCHES", 2),
             (measure, "PATCH_PX", 32),
             (points, "QUALITIES", ("fast",)),
-            (points, "PEERS", ()),
+            (points, "BASELINES", ()),
             (measure, "host_times", _steady),
         ):
             patch.setattr(module, name, value)

@@ -1,37 +1,37 @@
-"""scikit-image's restorations: better than the input, behind the chain, sound on any shape."""
+"""scikit-image's restorations: better than the input, behind the pipeline, sound on any shape."""
 
 import pytest
 import torch
 from torch import Tensor
 
-from beers_deploy.model.traditional.peers import PEERS
-from beers_deploy.model.traditional.pipeline import Chain
+from beers_deploy.model.traditional.baselines import BASELINES
+from beers_deploy.model.traditional.pipeline import TraditionalPipeline
 from beers_deploy.profiles.sensor import Sensor
 from tests.model.traditional.test_pipeline import Seen, psnr_db, restored_db, seen_by
 
-CHAIN = Chain(
+PIPELINE = TraditionalPipeline(
     Sensor.load("pleiades-degraded").nominal(), Sensor.load("pleiades-reference").nominal()
 )
 
 
 @pytest.fixture(scope="module")
 def pair(camera: Tensor) -> Seen:
-    return seen_by(camera, CHAIN.degraded, CHAIN.reference)
+    return seen_by(camera, PIPELINE.degraded, PIPELINE.reference)
 
 
-@pytest.mark.parametrize("name", PEERS)
-def test_a_peer_gains_decibels_and_stays_behind_the_chain(name: str, pair: Seen) -> None:
-    """Were a peer misled about gain, shift or target MTF, it would lose, and flatter the chain."""
-    restored = PEERS[name](pair.degraded, CHAIN)
+@pytest.mark.parametrize("name", BASELINES)
+def test_a_baseline_gains_decibels_and_stays_behind_the_pipeline(name: str, pair: Seen) -> None:
+    """A baseline that is misled about gain, shift or target MTF would flatter the pipeline."""
+    restored = BASELINES[name](pair.degraded, PIPELINE)
     before, after = (psnr_db(image, pair.reference) for image in (pair.degraded, restored))
-    assert before + 3 < after < restored_db(pair, CHAIN)
+    assert before + 3 < after < restored_db(pair, PIPELINE)
     assert float(restored.mean() / pair.degraded.mean()) == pytest.approx(1, abs=5e-3)
 
 
-@pytest.mark.parametrize("name", PEERS)
+@pytest.mark.parametrize("name", BASELINES)
 @pytest.mark.parametrize("shape", [(37, 53), (14, 21)])
 def test_any_shape_comes_back_within_range(name: str, shape: tuple[int, int], pair: Seen) -> None:
-    restored = PEERS[name](pair.degraded[: shape[0], : shape[1]], CHAIN)
+    restored = BASELINES[name](pair.degraded[: shape[0], : shape[1]], PIPELINE)
     assert restored.shape == shape
     assert bool(torch.isfinite(restored).all())
     assert 0 <= float(restored.min()) <= float(restored.max()) <= 4095

@@ -24,7 +24,7 @@ from beers_deploy.model.traditional.noise import (
     stabilise,
     with_rounding_noise,
 )
-from beers_deploy.model.traditional.pipeline import Chain
+from beers_deploy.model.traditional.pipeline import TraditionalPipeline
 from beers_deploy.model.traditional.rows import mirrored
 
 PAD_PX = 64
@@ -34,7 +34,7 @@ NLM_PATCH_PX = 5
 NLM_DISTANCE_PX = 6
 NLM_STRENGTH = 0.6
 
-Peer = Callable[[Tensor, Chain], Tensor]
+Baseline = Callable[[Tensor, TraditionalPipeline], Tensor]
 """A function of digital numbers (H, W) of the degraded sensor and the two sensors. It returns those
 of the reference.
 """
@@ -65,45 +65,47 @@ def richardson_lucy(image: np.ndarray, blur: np.ndarray) -> np.ndarray:
     )
 
 
-def nl_means(dn: Tensor, chain: Chain) -> Tensor:
-    """Run the chain with scikit-image's non-local means, and return (H, W) DN.
+def nl_means(dn: Tensor, pipeline: TraditionalPipeline) -> Tensor:
+    """Run the pipeline with scikit-image's non-local means, and return (H, W) DN.
 
     It uses 5 x 5 patches within 6 pixels and h = 0.6 sigma.
     """
-    sensor = with_rounding_noise(chain.degraded)
-    stable = stabilise(to_radiance(dn, chain.degraded), sensor)
+    sensor = with_rounding_noise(pipeline.degraded)
+    stable = stabilise(to_radiance(dn, pipeline.degraded), sensor)
     clean = restoration.denoise_nl_means(
         stable.numpy(), NLM_PATCH_PX, NLM_DISTANCE_PX, h=NLM_STRENGTH, sigma=1.0, fast_mode=True
     )
     radiance = destabilise(torch.from_numpy(clean).float(), sensor) + bias_radiance(sensor)
-    kernel = chain.fitted_to([dn]).kernel()
+    kernel = pipeline.fitted_to([dn]).kernel()
     sharp = torch.cat(list(filter_strips([radiance], len(radiance), kernel)))
-    return to_dn(sharp, chain.reference)
+    return to_dn(sharp, pipeline.reference)
 
 
 def _deconvolved(
-    deconvolve: Callable[[np.ndarray, np.ndarray], np.ndarray], dn: Tensor, chain: Chain
+    deconvolve: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    dn: Tensor,
+    pipeline: TraditionalPipeline,
 ) -> Tensor:
     """Undo the degraded MTF on mirrored borders, at a scale of 1 for full scale, and blur to the
     reference's.
 
     `deconvolve` accepts an image (H, W) and the half spectrum of its blur, (H, W // 2 + 1).
     """
-    full_scale = chain.degraded.max_dn / chain.degraded.gain_dn_per_radiance
+    full_scale = pipeline.degraded.max_dn / pipeline.degraded.gain_dn_per_radiance
     rows, columns = (mirrored(-PAD_PX, size + PAD_PX, size) for size in dn.shape)
     height = len(rows)
     width = len(columns)
-    share = (dn.double() - chain.degraded.offset_dn) / chain.degraded.max_dn
+    share = (dn.double() - pipeline.degraded.offset_dn) / pipeline.degraded.max_dn
     padded = share[rows][:, columns].numpy()
     blur, target = (
-        transfer_function(height, width, 1, s.blur) for s in (chain.degraded, chain.reference)
+        transfer_function(height, width, 1, s.blur) for s in (pipeline.degraded, pipeline.reference)
     )
     sharp = fft.rfft2(deconvolve(padded, blur)) * target
     inside = fft.irfft2(sharp, s=(height, width))[PAD_PX:-PAD_PX, PAD_PX:-PAD_PX]
-    return to_dn(torch.from_numpy((inside * full_scale).astype(np.float32)), chain.reference)
+    return to_dn(torch.from_numpy((inside * full_scale).astype(np.float32)), pipeline.reference)
 
 
-PEERS: dict[str, Peer] = {
+BASELINES: dict[str, Baseline] = {
     "wiener": partial(_deconvolved, wiener),
     "unsupervised-wiener": partial(_deconvolved, unsupervised_wiener),
     "richardson-lucy": partial(_deconvolved, richardson_lucy),
