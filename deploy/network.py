@@ -143,12 +143,15 @@ class Network:
 
     @classmethod
     def for_sensor(cls, weights: Conditioned, sensor: Sensor, *, int8: bool) -> "Network":
-        """Return a network conditioned on a sensor.
+        """Build the network that sensor-conditioned weights give for one sensor.
 
         Args:
-            weights: the weights of the network.
-            sensor: the sensor, of which the middle of each range is used.
-            int8: True for INT8, False for float32.
+            weights: the sensor-conditioned weights.
+            sensor: the sensor profile. If a value is a range, its middle is used.
+            int8: True for the INT8 network, False for float32.
+
+        Returns:
+            The network for this sensor alone.
 
         Raises:
             ModelError: INT8 is requested, and the weights have no INT8 file.

@@ -68,7 +68,12 @@ class Conditioned:
 
 
 def conditioned(path: Path) -> Conditioned | None:
-    """Return the conditioned network for a name or a file, or None for any other file."""
+    """Return the sensor-conditioned weights of a shipped name or a file.
+
+    Returns:
+        None if the path is neither the name of a shipped network nor a .safetensors file of
+        sensor-conditioned weights.
+    """
     if _is_shipped(path):
         name = path.name.removesuffix(INT8)
         return Conditioned(name, shipped_weights(name))
@@ -96,7 +101,14 @@ def _is_shipped(path: Path) -> bool:
 
 
 def require_known(path: Path) -> Path:
-    """Return a path that may be a file or a shipped name. Raise an error for any other."""
+    """Return the path of a network if it can be a file or a shipped name.
+
+    A path with a suffix is returned without a check that the file exists.
+
+    Raises:
+        ModelError: the path has no suffix, does not exist, and is not the name of a shipped
+            network.
+    """
     if path.suffix or path.exists() or _is_shipped(path):
         return path
     raise ModelError(

@@ -139,7 +139,7 @@ def quantize_alone(
     effort: Effort,
     adapts: bool = False,
 ) -> Network:
-    """Quantise a network that is calibrated by itself.
+    """Quantise a network for one sensor, with its own calibration.
 
     Args:
         origin: the float network.
@@ -148,6 +148,9 @@ def quantize_alone(
         steps: of fine-tuning; None to continue while it helps, 0 for none.
         effort: of the search for equalization factors.
         adapts: replace operators that the DPU lacks. The result is compared with `origin` as it is.
+
+    Returns:
+        The INT8 network, with statistics of each layer.
     """
     shifts = _shifts_of(target)
     tuning = None
@@ -186,15 +189,19 @@ def quantize_conditioned(
     target: TargetProfile,
     effort: Effort,
 ) -> Network:
-    """Quantise a network that is conditioned on its sensor, over the whole family of sensors.
+    """Quantise a sensor-conditioned network for all sensors of the trained range.
 
     Args:
-        network: its weights.
+        network: the sensor-conditioned weights.
         origin: the float network for `sensor`.
-        calibration: patches on which the integer layers are described.
+        calibration: where images and patches come from. Its patches also give the statistics of
+            each layer.
         sensor: the sensor that the result is conditioned on.
         target: the board whose rules apply.
         effort: of the search for equalization factors.
+
+    Returns:
+        The INT8 network for `sensor`, with statistics of each layer.
     """
     images = [] if calibration.images is None else [calibration.images]
     family = family_model(network, images, calibration.seed, _shifts_of(target), effort=effort)

@@ -24,7 +24,7 @@ import onnx
 from jsonschema import Draft202012Validator
 
 from beers_deploy.comparison import Comparison
-from beers_deploy.dpu.board import ruled
+from beers_deploy.dpu.board import device_of
 from beers_deploy.dpu.checker.placement import place
 from beers_deploy.dpu.checker.table import legality
 from beers_deploy.dpu.reading import network_of
@@ -68,7 +68,11 @@ REMAKE = "Make it again with 'gate --json' and these arguments."
 
 
 def read_document(path: Path) -> dict[str, object]:
-    """Read a results document. Raise an error if it does not follow the schema."""
+    """Read a results document, and check it against the schema.
+
+    Raises:
+        OptionError: the file cannot be read, is not JSON, or does not follow the schema.
+    """
     try:
         document = read_json(path)
         schema = Draft202012Validator(json.loads(SCHEMA_PATH.read_text(encoding="utf-8")))
@@ -335,7 +339,7 @@ def file_checks(
         return checks
     with faults_named(int8.label):
         graph = network_of(int8.model, fixed_tile_px(int8.model) or TILE_PX, int8.name)
-    return [legality(place(graph, ruled(target)), npu=bool(target.npu)), *checks]
+    return [legality(place(graph, device_of(target)), npu=bool(target.npu)), *checks]
 
 
 def junit_text(title: str, checks: Sequence[Check]) -> str:

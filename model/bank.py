@@ -81,8 +81,11 @@ or at the edge of a saturated area.
 
 @dataclass(frozen=True)
 class Bank:
-    """The filters of one sensor: D_k, (4, 7, 7) float64, and its noise over full scale at a quarter
-    of full scale.
+    """The filters of one sensor.
+
+    Attributes:
+        details: D_k, (4, 7, 7) float64.
+        sigma: standard deviation of the noise at a quarter of full scale, as a share of full scale.
     """
 
     details: NDArray[np.float64]
@@ -90,16 +93,16 @@ class Bank:
 
     @cached_property
     def units(self) -> NDArray[np.float64]:
-        """20 sigma n_k, shape (4,): the share of full scale that corresponds to 1 in plane k."""
+        """The share of full scale that is 1 in plane k, 20 sigma n_k, shape (4,)."""
         return np.asarray(UNIT * self.sigma * np.sqrt(np.square(self.details).sum((1, 2))))
 
     @property
     def gain(self) -> float:
-        """The factor by which quantization steps are finer than 1/24 of a unit, and those of the
-        image finer than 1/32.
+        """The factor by which quantisation steps, in units, are finer than at the noise SIGMA.
 
-        It is rounded to eighths, so that the single weight of the image is an integer: no
-        duplicated channel corrects its rounding.
+        A step of a plane is 1 / (24 gain) of a unit, and a step of the image is 32 / gain digital
+        numbers of 12 bits. The gain is sigma / SIGMA within GAINS, rounded to eighths, so that the
+        single weight of the image is an integer: no duplicated channel corrects its rounding.
         """
         # In eighths the image's one weight is an integer in INT8. No copy would correct its
         # rounding.
@@ -269,15 +272,19 @@ def restoring_gain(
 
 
 def cut_filter(whole: NDArray[np.float64], radius_px: int, total: float) -> NDArray[np.float64]:
-    """Cut a filter (H, W) around its first pixel to (2 R + 1, 2 R + 1), and correct its sum.
+    """Crop a filter to (2 R + 1, 2 R + 1), and correct its sum.
 
-    The sum is set to `total` by adding a smooth window, which changes frequencies near 0 only.
-    Dividing by the sum would raise all other frequencies.
+    A smooth window is added so that the sum becomes `total`. It changes only frequencies near 0,
+    while dividing by the sum would change all of them.
 
     Args:
-        whole: the filter, centred on its first pixel.
+        whole: (H, W), the filter with its centre in pixel (0, 0) and periodic borders, as the
+            inverse FFT returns it.
         radius_px: R.
         total: the sum of the result.
+
+    Returns:
+        The filter (2 R + 1, 2 R + 1), with its centre in the middle.
     """
     side_px = 2 * radius_px + 1
     kernel = np.roll(whole, (radius_px, radius_px), (0, 1))[:side_px, :side_px]

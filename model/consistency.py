@@ -99,7 +99,10 @@ EXCESS_SIGMAS = 6.0
 
 @dataclass(frozen=True)
 class Consistency:
-    """The consistency step for images of one sensor.
+    """The consistency step x + G (y - H x) for images of one sensor.
+
+    H blurs a restored image x from the reference's MTF to the sensor's. G averages over blocks and
+    interpolates between their centres.
 
     Attributes:
         rows: weights (RANK, BLOCK_PX + 2 NEAR_PX) of the rows that enter a block's mean of the near
@@ -152,14 +155,17 @@ class Consistency:
     def correction(
         self, raw: Image, restored: Image, down: Placed, across: Placed, raw_at: tuple[int, int]
     ) -> Image:
-        """Compute G (y - H x) for the kept pixels.
+        """Compute the correction G (y - H x) for the kept pixels.
+
+        Blocks near missing or saturated pixels are excluded. Pixels around them get the correction
+        of the other blocks, which fades out where too few of these are near.
 
         Args:
             raw: y, (h, w) pixel values; they reach RAW_REACH_PX beyond the kept pixels, as far as
                 the image does.
             restored: x, (h', w'), NaN where a pixel is missing; it reaches REACH_PX beyond,
                 likewise.
-            down: where the rows of `restored` lie, and which are kept.
+            down: where the rows of `restored` lie in the image, and which are kept.
             across: where its columns lie, and which are kept.
             raw_at: row and column in the image of the first pixel of `raw`.
 

@@ -35,12 +35,15 @@ PUPIL_GRID = 256
 
 
 def draw_table(across: float, along: float, generator: np.random.Generator) -> MtfTable:
-    """Draw a curve that is not the formula's.
+    """Draw a random MTF curve whose shape differs from the formula's.
 
     Args:
-        across: contrast at Nyquist across the track.
-        along: contrast at Nyquist along it; the curve is of the same kind.
-        generator: of the kind and of its numbers.
+        across: contrast at Nyquist across the track, in (0, 1).
+        along: contrast at Nyquist along it. Both curves have optics of the same kind.
+        generator: draws the kind of the optics, their parameters and the motion.
+
+    Returns:
+        The MTF at FREQUENCIES, across and along the track.
     """
     optics = _drawn_optics(generator)
     smear_px = float(generator.choice([0.0, generator.uniform(0, LONGEST_SMEAR_PX)]))

@@ -87,7 +87,10 @@ class Exponents:
     noise: float
 
     def of_sensor(self, sensor: Instrument) -> tuple[float, float]:
-        """Return the exponent of s / sigma, and the factor of a sensor."""
+        """Return the exponent of s / sigma and the constant factor of a sensor's half-widths.
+
+        The half-width of a pixel is quantile * factor * sigma * (s / sigma)^exponent.
+        """
         m, n = _logarithms(sensor)
         return self.detail + self.detail_by_blur * m, math.exp(self.blur * m + self.noise * n)
 
@@ -282,20 +285,28 @@ class Sample:
         return cls(sensor, noise.flat[places], detail.flat[places], error.flat[places])
 
     def scores(self, exponents: Exponents) -> Array:
-        """Return |error| over the half-width at a quantile of 1, (n,)."""
+        """Return the nonconformity score of each pixel, (n,): its absolute error over its
+        half-width.
+
+        The half-width is the one that the exponents give for a quantile of 1. So a quantile of the
+        scores is the factor that scales half-widths to a level.
+        """
         exponent, factor = exponents.of_sensor(self.sensor)
         return np.asarray(self.error / (factor * self.noise * self.detail**exponent))
 
 
 def calibrated(fitted: Sequence[Sample], held_out: Sequence[Sample]) -> PixelInterval:
-    """Calibrate an interval.
+    """Calibrate the interval of a network by conformal prediction.
 
     Args:
         fitted: acquisitions that the exponents are fitted on.
-        held_out: acquisitions of other places, which the quantiles are taken from.
+        held_out: acquisitions of other places, from which the quantiles are computed.
+
+    Returns:
+        The exponents, and a quantile for each level that `held_out` is large enough for.
 
     Raises:
-        OptionError: too few of these for any level.
+        OptionError: `held_out` has too few acquisitions for any level.
     """
     exponents = fit_exponents([sample for sample in fitted if sample.error.size])
     scores = [sample.scores(exponents) for sample in held_out if sample.error.size]

@@ -56,7 +56,12 @@ _sink: ContextVar[Progress] = ContextVar("progress", default=None)
 
 @contextmanager
 def reporting(callback: Progress) -> Iterator[None]:
-    """Report the work of this block as a caller wants; None changes nothing."""
+    """Set how progress is reported inside the `with` block.
+
+    Args:
+        callback: a function that is called with each step, False for no report, True for a bar or
+            plain lines. None leaves the setting of the surrounding block.
+    """
     token = _sink.set(_sink.get() if callback is None else callback)
     try:
         yield

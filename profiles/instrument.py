@@ -108,17 +108,19 @@ class Instrument:
 
     @property
     def offset_dn(self) -> float:
-        """The digital number of the dark; 0 without an offset."""
+        """The digital number without light; 0 without an offset."""
         return float(getattr(self.effects.get(OFFSET), "offset_dn", 0))
 
     @property
     def antialias_px(self) -> float:
-        """Standard deviation of the anti-alias filter in target pixels; 0 without one."""
+        """Standard deviation of the anti-alias filter in pixels of this sensor; 0 without one."""
         return float(getattr(self.effects.get("antialias"), "sigma_px", 0))
 
     @property
     def smear_px(self) -> float:
-        """Length of the motion along the track in target pixels; 0 without smear."""
+        """Length of the motion along the track during an exposure, in pixels of this sensor; 0
+        without smear.
+        """
         return float(getattr(self.effects.get("smear"), "length_px", 0))
 
     def in_units_of(self, other: "Instrument") -> "Instrument":

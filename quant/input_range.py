@@ -66,13 +66,13 @@ def read_ranges(option: object, channels: int) -> Ranges:
 
 
 def require_ranges(ranges: Iterable[tuple[float, ...]]) -> None:
-    """Raise ValueError if a pair is no range, or of no sensible size.
+    """Raise ValueError if a pair is not a valid range (see `is_range`).
 
     Args:
         ranges: pairs (low, high) in the network's units.
 
     Raises:
-        ValueError: low is not below high, or the larger of their sizes is outside SIZES.
+        ValueError: low is not below high, or the larger absolute value is outside SIZES.
     """
     for low, high in ranges:
         if not is_range(low, high):
@@ -80,13 +80,13 @@ def require_ranges(ranges: Iterable[tuple[float, ...]]) -> None:
 
 
 def is_range(low: float, high: float) -> bool:
-    """Return True if `low` is below `high` and the larger of their sizes is within SIZES."""
+    """Return True if `low` < `high` and the larger absolute value of the two is within SIZES."""
     # NaN fails every comparison, so it is refused as well.
     return low < high and SIZES[0] <= largest_size(low, high) <= SIZES[1]
 
 
 def largest_size(low: float, high: float) -> float:
-    """Return the size of the end of a range that is farther from 0."""
+    """Return the larger absolute value of the two ends of a range."""
     return max(abs(low), abs(high))
 
 

@@ -93,8 +93,13 @@ FINETUNE = "finetune"
 
 @dataclass(frozen=True)
 class Quantized:
-    """One network in integers, also as the host's file, with the float graph that was rounded and
-    the original float network.
+    """A quantised network.
+
+    Attributes:
+        host: the ONNX file for the host, with the core and the host's part.
+        core: the integer core.
+        graph: the float graph that was rounded to `core`.
+        network: the float network before any pass.
     """
 
     host: onnx.ModelProto
@@ -141,9 +146,13 @@ class Plan:
     def core(
         self, candidate: Graph, frac_bits: Mapping[str, int], earlier: RoundedConvs | None = None
     ) -> IntCore:
-        """Round a candidate, whose tensors have these least-squares scales, to an integer core.
+        """Round a float graph to an integer core.
 
-        Convolutions in `earlier` are not rounded again.
+        Args:
+            candidate: `graph`, equalized or with copies of its result.
+            frac_bits: least-squares scale of each tensor, as its number of fractional bits.
+                Equalized tensors get GROUP_FRAC_BITS instead.
+            earlier: convolutions that were rounded before, which are not rounded again.
         """
         # Equalized tensors are scaled to fill int8 at one scale.
         shared = [*chain.from_iterable(self.groups), *self.singles.tensors]
@@ -166,20 +175,24 @@ def quantize_model(
     """Quantise a float network under the DPU's rules: int8, symmetric, per tensor, power-of-two
     scales.
 
-    If there is a global add, it remains on the host, in 12 bits: only the correction is computed in
-    int8.
+    A global add remains on the host, in 12 bits. Then only the correction that is added to the
+    image is computed in int8.
 
     Args:
         model: the float network.
         patches: the calibration patches.
         about: metadata of the files.
-        shifts: the windows of the target.
+        shifts: the ranges of shifts that the target allows.
         tuning: the parameters of fine-tuning; None does not train the integers.
         passes: the passes that reduce the error.
         effort: of the search for equalization factors.
 
+    Returns:
+        The quantised network: integer core, file for the host, and the float graph it was rounded
+        from.
+
     Raises:
-        ModelError: an operation that the DPU does not compute, or weights of absurd size.
+        ModelError: an operation that the DPU does not compute, or weights too large to quantise.
     """
     # 1.
     network = read_network(model)

@@ -189,7 +189,16 @@ def _in_int8(op: Op, core: IntCore, exact: Mapping[str, np.ndarray]) -> np.ndarr
 
 
 def layer_error_rows(result: Quantized, patches: Patches) -> list[Row]:
-    """Return a row for every layer that alone is in int8, and one for all of them."""
+    """Return the error that each layer causes if it alone is in int8, as table rows.
+
+    Args:
+        result: the quantised network.
+        patches: the calibration patches, of which a few are used.
+
+    Returns:
+        A row for each layer: the SQNR of its result in dB, the error of the network's result, and
+        the layer's share of the squared errors of all. The last row has the whole network in int8.
+    """
     crops = few_crops(patches.degraded, result.host)
     layers, together = layer_errors(result.graph, result.core, crops)
     source = f"{len(crops)} patches, all other layers in float"

@@ -41,15 +41,15 @@ TABLE = 256
 
 @dataclass(frozen=True)
 class Rounded:
-    """A tensor of 8 bits.
+    """A tensor quantised to 8 bits.
 
     Attributes:
         name: of the tensor.
         scale: its scale, zero point and integer type.
         low_is_relu: True if a ReLU reads the tensor, so that values clipped at the lower end would
             have become zero anyway.
-        counted: the channels that count. In a result of several copies these are the coarse ones,
-            which hold the values that others clip.
+        counted: the channels that are checked for clipping. In a result of several copies these are
+            the coarse ones, which hold the values that others clip.
     """
 
     name: str
@@ -59,17 +59,20 @@ class Rounded:
 
     @property
     def lowest(self) -> int:
-        """The smallest integer that its 8 bits hold."""
+        """The smallest integer of the 8-bit type."""
         return int(np.iinfo(self.scale.integer_type).min)
 
-    def at_ends(self, values: np.ndarray) -> np.ndarray:
-        """Return True for each value that lies at an end and may have been clipped.
+    def may_be_clipped(self, values: np.ndarray) -> np.ndarray:
+        """Return a mask of the values that may have been clipped.
+
+        These equal the largest or smallest integer of the type. The smallest integer is not counted
+        where it stands for zero or where a ReLU reads it, because clipping loses nothing there.
 
         Args:
             values: the tensor's integers, (N, C, H, W) or flat.
 
         Returns:
-            A mask of the values of the counted channels.
+            A bool array of the values in the channels `counted`; of all values if `values` is flat.
         """
         channels = values[:, self.counted] if values.ndim > 1 else values
         high = channels == self.lowest + 255
@@ -101,7 +104,9 @@ def saturated_shares(model: onnx.ModelProto, images: Iterable[np.ndarray]) -> di
     counts = np.zeros(len(tensors))
     for image in images:
         results = tensors_of(session, [tensor.name for tensor in tensors], image)
-        flags = [tensor.at_ends(values) for tensor, values in zip(tensors, results, strict=True)]
+        flags = [
+            tensor.may_be_clipped(values) for tensor, values in zip(tensors, results, strict=True)
+        ]
         ends += [flag.sum() for flag in flags]
         counts += [flag.size for flag in flags]
     shares = ends / np.maximum(counts, 1)

@@ -22,11 +22,14 @@ ALL = "all"
 
 
 def boards_of(board: BoardLike | Sequence[BoardLike]) -> list[TargetProfile]:
-    """Return one board or several.
+    """Load the target profiles of one or several boards.
 
     Args:
         board: a board, several, or names separated by commas, each with or without the suffix
-            -model; "all" stands for the shipped boards with a DPU.
+            -model. "all" stands for the shipped boards with a DPU.
+
+    Raises:
+        ProfileError: there is no such board, or its file is not valid.
     """
     sources: Sequence[BoardLike]
     if isinstance(board, os.PathLike | TargetProfile):
@@ -179,10 +182,17 @@ def dpu_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
     return Dpu(profile, name, constants)
 
 
-def ruled(profile: TargetProfile, configuration: str | None = None) -> Dpu:
-    """Return the device whose rules a network is compared with: a DPU, or a board's NPU.
+def device_of(profile: TargetProfile, configuration: str | None = None) -> Dpu:
+    """Return the device whose rules a network is checked against: the DPU, or the NPU of the board.
 
     An NPU has rules, but no constants for predictions.
+
+    Args:
+        profile: the board.
+        configuration: the DPU's configuration; None for the board's default.
+
+    Raises:
+        OptionError: the board has an NPU, and a configuration is stated.
     """
     if not profile.npu:
         return dpu_of(profile, configuration)

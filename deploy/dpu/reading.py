@@ -42,18 +42,19 @@ damaged.
 
 
 def read_network(path: Path, tile_px: int | None = 640) -> SizedGraph:
-    """Read an ONNX file as a network for one image with sides of `tile_px`; if None, of the size
-    that it is fixed to.
+    """Read an ONNX file as the operations that a DPU computes.
 
-    The image is that of the whole network. If a core reads places of 2 x 2 pixels, its planes have
-    half the sides of the image.
+    Args:
+        path: the ONNX file.
+        tile_px: side of the image in pixels; None for the size that the file is fixed to. A core
+            that reads places of 2 x 2 pixels has planes of half the side.
     """
     return network_of(load_onnx(path, to_run=False), tile_px, str(path))
 
 
 def own_tile_px(model: onnx.ModelProto) -> int | None:
-    """Return the side of the tile that a network is fixed to, in pixels of the image, or None if it
-    accepts any.
+    """Return the side in pixels of the image that a network is fixed to; None if it accepts any
+    size.
     """
     dims = model.graph.input[0].type.tensor_type.shape.dim
     side = max((d.dim_value for d in dims[2:]), default=0)
@@ -78,8 +79,17 @@ def _places(model: onnx.ModelProto) -> tuple[int, int]:
 def network_of(
     model: onnx.ModelProto, tile_px: int | None, where: str = "ONNX model"
 ) -> SizedGraph:
-    """Convert a model in memory like `read_network`. A host's file is read as the board receives
-    it.
+    """Convert a model in memory like `read_network`.
+
+    A host's file is converted to the board's file first.
+
+    Args:
+        model: the ONNX model.
+        tile_px: side of the image in pixels; None for the size that the file is fixed to.
+        where: name of the file, for messages.
+
+    Raises:
+        ModelError: the model has no nodes, or is not valid.
     """
     model = as_on_board(model)
     if not model.graph.node:
@@ -92,8 +102,14 @@ def network_of(
 
 
 def inputs_of(model: onnx.ModelProto, tile_px: int | None, where: str) -> dict[str, Shape]:
-    """Return the inputs of a file as it is, by name: (C, H, W) in places, for a tile or as the file
-    states them.
+    """Return the shape (C, H, W) of each input of a file, by name.
+
+    H and W count places: squares of pixels that the host has moved into channels.
+
+    Args:
+        model: the ONNX model, as stored.
+        tile_px: side of the image in pixels; None for the sizes that the file states.
+        where: name of the file, for messages.
     """
     places = _places(model)
     return {

@@ -95,7 +95,18 @@ def dual_range(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
 
 
 def offset_windows(coarse: np.ndarray, *windows: np.ndarray) -> np.ndarray:
-    """Choose the last window that contains a value, and the coarse copy if none does."""
+    """Merge a coarse copy of a result with finer copies of overlapping ranges.
+
+    A window is a fine copy that represents values around its offset. The last window in which a
+    value is not clipped is used, and the coarse copy if it is clipped in all.
+
+    Args:
+        coarse: (1, C, h, w) as the core returns it.
+        windows: fine copies of the same shape, in the order of their offsets.
+
+    Returns:
+        The merged result, (1, C, h, w).
+    """
     value = coarse * F(S["gain"])
     for window, offset in zip(windows, S["offsets"]):  # noqa: B905 - a board's Python may be old
         value = np.where(fits(window), window + np.array(offset, F)[:, None, None], value)
@@ -103,7 +114,7 @@ def offset_windows(coarse: np.ndarray, *windows: np.ndarray) -> np.ndarray:
 
 
 def bank_sum(fine: np.ndarray, coarse: np.ndarray, *analytic: np.ndarray) -> np.ndarray:
-    """Add the correction and the copies of the analytic restoration."""
+    """Return the sum of the correction and of the copies of the analytic restoration."""
     added = np.sum(analytic[: S["fine_copies"]], 0) * F(S["fine_gain"])
     # The last copy may be a coarse one, for values at which the others are clipped.
     if S["coarse_gain"]:

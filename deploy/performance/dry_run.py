@@ -84,7 +84,11 @@ def preview_row(
 
 
 def header_scale(name: str, raster: Raster, reading: Reading) -> FullScale | str:
-    """Return the full scale if it does not depend on the pixels, else the reason why it is open."""
+    """Return the full scale that the file's header and the options determine.
+
+    Returns:
+        The full scale, or as text the reason why only the pixels can decide it.
+    """
     if raster.dtype.kind == "f" and reading.full_scale is None:
         return (
             "the pixels decide when they are read: digital numbers if one is above 2, else "

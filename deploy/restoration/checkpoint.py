@@ -135,7 +135,17 @@ class Checkpoint:
             (self.folder / "rows.raw").touch()
 
     def append(self, row: RestoredRow) -> None:
-        """Store a row of tiles, which must follow those that are stored."""
+        """Store a row of restored tiles on disk, directly below the rows stored before.
+
+        The pixels and the journal are flushed to the disk before it returns, so that a power cut
+        loses only rows that were not appended.
+
+        Args:
+            row: the restored rows of all bands.
+
+        Raises:
+            MachineError: the disk is full or cannot be written.
+        """
         with self.disk():
             with (self.folder / "rows.raw").open("r+b") as stream:
                 digest = hashlib.sha256()

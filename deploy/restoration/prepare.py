@@ -93,11 +93,19 @@ class Restoration(ABC):
 
     @abstractmethod
     def ticks(self, done_px: int) -> int:
-        """Return the number of all ticks from row `done_px` of the restored image on."""
+        """Return the number of progress ticks from row `done_px` of the restored image on."""
 
     @abstractmethod
     def rows(self, done_px: int, tick: Tick) -> Generator[RestoredRow, None, None]:
-        """Restore the rows from `done_px` of the restored image on, in order."""
+        """Restore the image from row `done_px` of the result on, in order.
+
+        Args:
+            done_px: rows of the restored image that an earlier run finished.
+            tick: called with the number of ticks that were completed.
+
+        Yields:
+            The next restored rows of all bands.
+        """
 
     def memory_bytes(self) -> int:
         """Return the peak memory of the process, once it no longer grows by itself.
@@ -108,7 +116,7 @@ class Restoration(ABC):
 
     @abstractmethod
     def figures(self, tally: Tally) -> dict[str, Figure]:
-        """Return the figures of a run."""
+        """Return the figures of a run from its tally."""
 
 
 class Pipeline(Protocol):

@@ -31,7 +31,7 @@ from beers_deploy.profiles.sensor_numbers import numbers_of
 from beers_deploy.restoration.bands import in_order
 from beers_deploy.restoration.checkpoint import Checkpoint
 from beers_deploy.restoration.cluster import open_cluster
-from beers_deploy.restoration.detectors.fault_list import FOUND, FaultList, list_beside
+from beers_deploy.restoration.detectors.fault_list import FOUND, FaultList, found_list_path
 from beers_deploy.restoration.detectors.fix import faults_of, fixed
 from beers_deploy.restoration.interval import (
     HalfWidths,
@@ -127,7 +127,7 @@ def restore_file(
             interval = _write_interval(widths, output, work, checkpoint, bands)
             about = what_was_done(work.networks, work.scale)
             write_output(checkpoint, work.source, output, about)
-            listed = list_beside(out, reading.fix_detectors) if faults.faults else None
+            listed = found_list_path(out, reading.fix_detectors) if faults.faults else None
             if listed is not None:
                 write_text(listed, faults.text)
             if output.self_check is not None:

@@ -52,7 +52,7 @@ class TraditionalRestoration(Restoration):
     pipelines: tuple[TraditionalPipeline, ...]
 
     def ticks(self, done_px: int) -> int:
-        """Return the number of rows."""
+        """Return the number of progress ticks from row `done_px` on: one for each row."""
         return self.source.raster.height_px - done_px
 
     def rows(
@@ -76,7 +76,7 @@ class TraditionalRestoration(Restoration):
             top += rows_px
 
     def figures(self, tally: Tally) -> dict[str, Figure]:
-        """Return the figures of a run."""
+        """Return the figures of a run from its tally."""
         return dict(tally.figures)
 
     def _to_dn(self, band: int) -> np.float32:
@@ -98,11 +98,10 @@ class TraditionalRestoration(Restoration):
             yield torch.from_numpy(dn)
 
     def fitted(self) -> "TraditionalRestoration":
-        """Return the restoration with the regularisation of each band, from a first pass over the
-        image.
+        """Return the restoration with the regularisation derived for each band.
 
-        The regularisation is the Wiener optimum of the whole image, so it needs all strips, but
-        little time.
+        The regularisation is the Wiener optimum of the whole image, so one pass reads all strips.
+        It is much quicker than the restoration.
         """
         with steps("measuring noise and contrast", len(self.pipelines) * self.ticks(0)) as bar:
             pipelines = [

@@ -31,12 +31,22 @@ class Column:
         return ", ".join(filter(None, (self.unit, self.mode)))
 
     def stated(self, figure: Figure) -> tuple[str, str]:
-        """Return the figure with its unit, and its mode, unless the heading states them."""
+        """Return the text of a figure and its mode.
+
+        Args:
+            figure: one figure of the column.
+
+        Returns:
+            The value, with its unit unless the heading states the unit; and the mode (such as
+            "measured"), empty if the heading states it.
+        """
         unit = "" if self.unit else figure.unit
         return " ".join(filter(None, (str(figure), unit))), "" if self.mode else figure.mode
 
     def text(self, row: Row) -> str:
-        """Return the cell of a row: empty without the figure, a dash without its value."""
+        """Return the text of a row's cell: empty without the figure, "-" if the figure has no
+        value.
+        """
         figure = row.figures.get(self.name)
         if figure is None or figure.value is None:
             return "" if figure is None else "-"

@@ -244,7 +244,7 @@ def _output(
         fix_detectors: what was asked about faulty detectors.
         how: the other fields of `Output`.
     """
-    from beers_deploy.restoration.detectors.fault_list import list_beside
+    from beers_deploy.restoration.detectors.fault_list import found_list_path
     from beers_deploy.restoration.interval import interval_beside
     from beers_deploy.restoration.output import Output
     from beers_deploy.restoration.stac import network_paths
@@ -266,7 +266,7 @@ def _output(
         (item,) = network_paths(named[0], 1)
         named += [item, item.with_suffix(".onnx")]
     # The list of faults is an output of its own where they are searched for.
-    listed = list_beside(path, fix_detectors)
+    listed = found_list_path(path, fix_detectors)
     return Output(path, others=(*named, listed, how["self_check"], widths), **how)
 
 

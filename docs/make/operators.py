@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import chain
 from pathlib import Path
 
-from beers_deploy.dpu.board import Dpu, load_dpu, ruled
+from beers_deploy.dpu.board import Dpu, device_of, load_dpu
 from beers_deploy.dpu.checker.finding import Rule
 from beers_deploy.dpu.checker.operators import (
     NUMBERS,
@@ -62,7 +62,7 @@ def document() -> str:
     )
     parts += _rules("Remarks, which break no rule", REMARKS)
     for name in npu_names():
-        parts += _npu(ruled(TargetProfile.load(name)))
+        parts += _npu(device_of(TargetProfile.load(name)))
     parts += ["## What to use instead\n"]
     parts += [f"- {names}: {remedy}" for names, remedy in _alike(dict(sorted(INSTEAD.items())))]
     return "\n".join([*parts, ""])

@@ -44,23 +44,34 @@ class Blocks(NamedTuple):
     constant: np.ndarray
 
     def of(self, lines: slice) -> "Blocks":
-        """Return some of the lines."""
+        """Return the measurements of the lines in a slice."""
         return Blocks(*(array[:, lines] for array in self))
 
 
 def join_blocks(blocks: Sequence[Blocks], axis: int = 0) -> Blocks:
-    """Return blocks of the same lines as one; with axis 1, blocks of other lines, all of the same
-    count, line behind line.
+    """Concatenate measurements of blocks.
+
+    Args:
+        blocks: measurements, as `measure_lines` returns them.
+        axis: 0 for blocks of the same lines, one behind the other; 1 for other lines of equally
+            many blocks.
+
+    Returns:
+        The measurements (blocks, lines) of all of them.
     """
     return Blocks(*(np.concatenate(arrays, axis) for arrays in zip(*blocks, strict=True)))
 
 
 def measure_lines(pixels: np.ndarray, valid: np.ndarray) -> Blocks:
-    """Measure the columns of one block of an image.
+    """Measure how each column of one block of an image differs from its two neighbours.
 
     Args:
         pixels: (h, w) float32, NaN where they are missing.
-        valid: where they are measurements, neither missing nor at an end of full scale.
+        valid: (h, w) bool, True for measured pixels: neither missing nor at an end of full scale.
+
+    Returns:
+        Measurements of one block, arrays (1, w) each. `second` and `error` are NaN in the outermost
+        columns, and in all columns of a block narrower than 7 pixels.
     """
     rows, columns = pixels.shape
     constant = constant_columns(pixels)

@@ -240,7 +240,18 @@ def fit_shape(pixels: np.ndarray, limits: Limits, shape: float = 0.0) -> list[Fi
 
 
 def centroids(regions: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> _Lines:
-    """Fit lines through the centroids of the rise in each row of regions (N, H, W)."""
+    """Fit a line to the position of an edge in each row, as a start for the exact fit.
+
+    The position in a row is the centroid of the pixel differences across the edge.
+
+    Args:
+        regions: (N, H, W) pixel values, each with one nearly vertical edge.
+        rows: (H,) coordinate of each row, 0 in the middle.
+        columns: (W,) coordinate of each column, likewise.
+
+    Returns:
+        Position in pixels, slope in pixels per row, and initial gamma of each edge, (N,).
+    """
     rise = np.diff(regions, axis=2)
     rise = np.maximum(rise * np.sign(rise.sum((1, 2)))[:, None, None], 0) * np.hamming(
         rise.shape[2]

@@ -94,12 +94,19 @@ class Backbone(nn.Module):
         self.features = nn.Sequential(*layers)
 
     def forward(self, image: Tensor) -> list[Tensor]:
-        """Compute the compared feature maps, each after a ReLU, of grey images (N, 1, H, W) from 0
-        to 1.
+        """Compute the feature maps that LPIPS and DISTS compare.
 
-        The image is repeated in three channels and prepended to the maps. It has the precision of
-        the parameters; without autocast, so have the features. The scaling layer of `lpips` equals
-        ImageNet's mean and deviation after scaling to [-1, 1].
+        Each map is taken after a ReLU. The scaling layer of `lpips` equals ImageNet's mean and
+        deviation after scaling to [-1, 1].
+
+        Args:
+            image: grey images (N, 1, H, W) from 0 to 1. They are converted to the data type of the
+                parameters.
+
+        Returns:
+            The image repeated in three channels (N, 3, H, W), then the feature maps (N, C, h, w),
+            from the first tapped layer to the last. Without autocast they have the data type of the
+            parameters.
         """
         colour = image.to(next(self.parameters()).dtype).expand(-1, 3, -1, -1)
         mean, std = (colour.new_tensor(x)[:, None, None] for x in (IMAGENET_MEAN, IMAGENET_STD))

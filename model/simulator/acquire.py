@@ -194,11 +194,20 @@ def acquire_three(
 def acquire_padded(
     radiance: np.ndarray, sensor: Instrument, oversampling: int, draw: Draw, role: str
 ) -> np.ndarray:
-    """Acquire a whole scene (H, W), (ceil(H / r), ceil(W / r)): the margin is a mirror image of the
-    scene.
+    """Simulate the acquisition of a whole scene, whose margin is its mirror image.
 
-    Pixel n covers scene pixels r*n to r*n + r - 1. A position x of the scene, with pixel i from i
-    to i + 1, is mapped to x / r.
+    Pixel n covers scene pixels r n to r n + r - 1, where r is `oversampling`. A position x of the
+    scene is mapped to x / r, if pixel i covers i to i + 1.
+
+    Args:
+        radiance: the scene (H, W) in W/m2/sr/um.
+        sensor: the instrument.
+        oversampling: scene pixels per target pixel.
+        draw: seed and patch number of the random effects.
+        role: "degraded" or "reference"; keeps the two noises of a pair independent.
+
+    Returns:
+        Digital numbers (ceil(H / r), ceil(W / r)).
     """
     margin_px = MARGIN_PX * oversampling
     # The last target pixel may lack scene pixels: size % -oversampling is minus their number.

@@ -43,12 +43,18 @@ Order = Literal["denoise-first", "deconvolve-first"]
 
 @dataclass(frozen=True)
 class TraditionalPipeline:
-    """The parameters of a restoration from images of `degraded` to those that `reference` would
-    have acquired without its noise.
+    """The parameters of a traditional restoration.
 
-    `quality` is one of `patch_groups.QUALITIES`. `epsilon` regularises the MTF compensation. With
-    None it is derived from each image: by `restore_traditional` itself, or by `fitted_to` for an
-    image that arrives in strips.
+    It restores images of `degraded` to those that `reference` would have acquired without its
+    noise.
+
+    Attributes:
+        degraded: the instrument that acquired the images.
+        reference: the instrument that the restoration aims at.
+        quality: one of `patch_groups.QUALITIES`.
+        order: which of denoising and MTF compensation comes first.
+        epsilon: regularises the MTF compensation. None derives it from each image: by
+            `restore_traditional`, or by `fitted_to` for an image in strips.
     """
 
     degraded: Instrument
@@ -58,10 +64,12 @@ class TraditionalPipeline:
     epsilon: float | None = None
 
     def fitted_to(self, strips: Iterable[Tensor]) -> "TraditionalPipeline":
-        """Return the pipeline with the epsilon for an image in strips (any, W) of digital numbers,
-        NaN where missing.
+        """Return the pipeline with the epsilon of an image.
 
         A pipeline that has an epsilon is returned unchanged, and no strip is read.
+
+        Args:
+            strips: the image as strips (rows, W) of digital numbers, NaN where missing.
         """
         if self.epsilon is not None:
             return self
@@ -69,8 +77,10 @@ class TraditionalPipeline:
         return replace(self, epsilon=derived_epsilon(noise_and_scene, self.degraded))
 
     def kernel(self) -> Tensor:
-        """Return the filter of the MTF compensation, (2 R + 1, 2 R + 1) float64, for the pipeline's
-        epsilon.
+        """Return the filter of the MTF compensation, (2 R + 1, 2 R + 1) float64.
+
+        Raises:
+            OptionError: the pipeline has no epsilon.
         """
         if self.epsilon is None:
             raise OptionError(

@@ -106,7 +106,14 @@ class BoardWriter(GraphWriter):
     """Writes tensors as the board's flow reads them: quantised to int8, then dequantised."""
 
     def scale(self, tensor: str, frac_bits: int) -> list[str]:  # noqa: ARG002 - tensors of one scale share it here
-        """Return the names of scale and zero point of a tensor."""
+        """Add the scale 2^-frac_bits and the zero point 0 of a tensor to the file, and return their
+        names.
+
+        Args:
+            tensor: name of the tensor. Tensors of one scale share its constant here; VINT8 has one
+                for each.
+            frac_bits: its number of fractional bits.
+        """
         return [self.unit(frac_bits), self.constant("zero_point", np.array(0, np.int8))]
 
     def quantized(self, output: str, source: str, frac_bits: int) -> None:
@@ -119,8 +126,13 @@ class BoardWriter(GraphWriter):
         )
 
     def operation(self, op: IntConv | Op, feeds: list[str], output: str) -> None:
-        """Write an operation on dequantised tensors; weights and bias of a convolution are
-        dequantised int8.
+        """Write an operation on dequantised tensors, with int8 weights and bias before a
+        DequantizeLinear.
+
+        Args:
+            op: the operation.
+            feeds: names of its dequantised inputs.
+            output: name of its result in float.
         """
         if isinstance(op, IntConv):
             weight = onnx_weight(op.weight, op.transposed)
@@ -144,17 +156,23 @@ CLAMPS = (Activation.relu, Activation.relu6)
 
 
 def vint8_model(core: IntCore, about: dict[str, str], tile_px: int | None) -> onnx.ModelProto:
-    """Write VINT8, the file that AMD's current NPU flow compiles: the numbers of the board's file
-    in another layout.
+    """Write VINT8, the file that AMD's current NPU flow compiles.
 
-    It is for one image of one tile, with every size stated. Each reader of a tensor has its own
-    pair of Q and DQ, and each tensor its own scale and zero point. A pair also separates an
-    operation from the clamp behind it, as AMD's quantiser writes it. On the grid of the result it
-    does not matter whether a value is clamped before or after rounding, so no bit changes.
-    LeakyReLU is no clamp: it follows the sums directly, as the core computes it.
+    It has the integers of the board's file in another layout, for one image of one tile, with every
+    size stated. Each reader of a tensor has its own pair of QuantizeLinear and DequantizeLinear,
+    and each tensor its own scale and zero point.
+
+    A pair also separates an operation from its clamp, as AMD's quantiser writes it. No bit changes,
+    because a value on the grid of the result may be clamped before or after rounding. LeakyReLU is
+    not a clamp: it follows the sums directly, as the core computes it.
+
+    Args:
+        core: the integer core.
+        about: metadata of the file.
+        tile_px: side of the tile in pixels of the image.
 
     Raises:
-        OptionError: no tile.
+        OptionError: `tile_px` is None.
     """
     side_px = required_tile(tile_px, OF_NPU)
     parts: list[tuple[IntConv | Op, int]] = []

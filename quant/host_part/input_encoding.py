@@ -40,7 +40,7 @@ class BitSlices:
 
     @property
     def lowest_dn(self) -> int:
-        """The digital number of the smallest value."""
+        """The smallest digital number that can be encoded: 0, or -MAX_DN if signed."""
         return -MAX_DN if self.signed else 0
 
     @property

@@ -80,14 +80,16 @@ OutputDecoding = Plain
 
 @dataclass(frozen=True)
 class DualRange(Plain):
-    """A fine copy for nearly all pixels, then a coarse one for the strongest edges."""
+    """A decoding of two copies of each channel: a fine one for nearly all pixels, and a coarse one
+    for the strongest edges, where the fine one is clipped.
+    """
 
     finer_bits = 1
     _chosen = DECODED
 
     @property
     def gains(self) -> tuple[int, ...]:
-        """The factor by which the host multiplies each copy."""
+        """The factor by which the host multiplies the fine and the coarse copy."""
         return (1, GAIN)
 
     def never_replaced(self, outputs: int) -> slice:
@@ -95,7 +97,13 @@ class DualRange(Plain):
         return slice(outputs, None)
 
     def decode(self, result: np.ndarray, scale: float) -> np.ndarray:
-        """Choose the fine copy where it is not clipped, else the coarse one."""
+        """Return the fine copy where it is not clipped, else the coarse one, as (N, C, H, W).
+
+        Args:
+            result: (N, 2 C, H, W) float32, multiples of `scale`: all fine copies, then all coarse
+                ones.
+            scale: the value of one unit of the result.
+        """
         fine, coarse = np.split(result, self.copies, axis=1)
         return _in_dual_range(fine, coarse, scale)
 
@@ -204,7 +212,16 @@ class BankSum(DualRange):
         return self.coarse_copies * WIDE / (UNIT_STEPS * scale)
 
     def decode(self, result: np.ndarray, scale: float) -> np.ndarray:
-        """Add the correction and the analytic restoration."""
+        """Return the sum of the correction and the analytic restoration, (N, C, H, W).
+
+        The correction is decoded in dual range. The analytic restoration is the sum of its fine
+        copies, or the coarse copy where the fine ones are clipped.
+
+        Args:
+            result: (N, copies C, H, W) float32, multiples of `scale`: fine and coarse correction,
+                then the analytic copies.
+            scale: the value of one unit of the result.
+        """
         fine, coarse, *analytic = np.split(result, self.copies, axis=1)
         fine_sum = np.sum(analytic[: self.fine_copies], 0) * np.float32(self._fine_gain(scale))
         if self.coarse_copies:

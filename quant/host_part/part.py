@@ -86,10 +86,14 @@ class HostPart:
 
     @property
     def full_scale(self) -> np.ndarray | None:
-        """The value (C,) float32 of each channel behind `front` that is encoded as 1; None for 1.
+        """The factor (C,) float32 by which each channel that the encoding reads is divided.
 
-        Zero stays zero, so that the network's zero padding is that of the planes. An offset could
-        not be folded into a bias, because a border that is padded has no offset.
+        It maps the largest absolute value of the channel's range to 1. None if all channels are in
+        [0, 1] already. C counts the channels after the pixel unshuffles in `front`.
+
+        There is no offset: zero stays zero, so that the zero padding of the float network equals
+        that of the int8 planes. An offset could not be folded into a bias, because a padded border
+        has none.
         """
         if not self.input_ranges:
             return None

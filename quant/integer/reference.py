@@ -71,7 +71,7 @@ class Faults:
     touch: Callable[[str, np.ndarray], np.ndarray] = field(default=lambda _, tensor: tensor)
 
     def shift(self, op: str, name: str, meant: int) -> int:
-        """Return the shift that an operation uses."""
+        """Return the shift that an operation uses: the injected one, or `meant` without a fault."""
         return self.shifts.get((op, name), meant)
 
 
@@ -156,13 +156,17 @@ INT8_BITS = 7.0
 def layer_sums(
     core: IntCore, op: IntConv | Op, tensors: Mapping[str, np.ndarray], faults: Faults = SOUND
 ) -> Sums:
-    """Compute the sums of an operation before they are rounded to int8.
+    """Compute the integer sums of an operation, before they are shifted and rounded to int8.
 
     Args:
-        core: of the operation.
+        core: the integer core that the operation belongs to.
         op: the operation.
-        tensors: its inputs, by name.
-        faults: wrong shifts.
+        tensors: int8 tensors by name, with the inputs of the operation.
+        faults: shifts that are replaced by wrong ones, to simulate faults.
+
+    Returns:
+        The sums, the right shift to int8, a bound of the accumulators in bits, and the fractional
+        bits that an activation added.
     """
     inputs = [tensors[name] for name in op.inputs]
     if isinstance(op, IntConv):

@@ -269,7 +269,7 @@ def constants(model: onnx.ModelProto) -> dict[str, np.ndarray]:
 
 
 def attributes_of(node: NodeProto) -> dict[str, Any]:
-    """Return the attributes that a node states, by name, text as such."""
+    """Return the attributes that a node states, by name, with byte strings decoded to str."""
     values = {a.name: helper.get_attribute_value(a) for a in node.attribute}
     return {k: v.decode(errors="replace") if isinstance(v, bytes) else v for k, v in values.items()}
 

@@ -229,11 +229,11 @@ def descend(
     pace: Pace,
     generator: torch.Generator,
 ) -> Iterator[int]:
-    """Train by gradient descent with momentum for a round, on gradients divided by their running
-    root mean square.
+    """Train the integers for one round by gradient descent with momentum.
 
-    The learning rate falls to 0 as a half cosine. While it is high, parameters cross their rounding
-    thresholds back and forth, so that evaluating the rounded core would mean little.
+    Gradients are divided by their running root mean square, as in Adam. The learning rate falls to
+    0 as a half cosine. While it is high, parameters cross their rounding thresholds back and forth,
+    so that evaluating the rounded core would mean little.
 
     Args:
         trainable: the core, whose parameters are changed in place.

@@ -72,14 +72,25 @@ class SampleRange:
 
 
 def histogram(sample: np.ndarray) -> np.ndarray:
-    """Count the pixels of a sample of any shape, values in [0, 1], by bin: (BINS,)."""
+    """Count the pixels of a sample by value.
+
+    Args:
+        sample: of any shape, with values in [0, 1].
+
+    Returns:
+        (BINS,) counts; the last bin also holds the value 1.
+    """
     # The value 1 would open a bin of its own, so it is clipped to the last.
     bins = np.clip(sample * np.float32(BINS), 0, BINS - 1).astype(np.int64)
     return np.bincount(bins.ravel(), minlength=BINS)
 
 
 def range_from(counts: np.ndarray) -> SampleRange:
-    """Compute the range of samples from the sum of their histograms, (BINS,)."""
+    """Compute percentiles and the saturated share of samples.
+
+    Args:
+        counts: the sum of their histograms, (BINS,), as `histogram` returns them.
+    """
     shares = np.cumsum(counts) / counts.sum()
     # The numbers of the bins are digital numbers, and the last of them is full scale.
     p1, p50, p99, p99_9 = (np.searchsorted(shares, SHARES) / (BINS - 1)).tolist()

@@ -36,8 +36,8 @@ from beers_deploy.quant.samples.stored import (
     IN_MEMORY,
     NO_REFERENCE,
     REMEDY,
+    format_shape,
     samples_in,
-    sizes_of,
     stored_samples,
 )
 from beers_deploy.quant.tiling.receptive_field import tiling_of
@@ -247,7 +247,7 @@ def _valid_image(name: str, image: np.ndarray, channels: int, ranges: Ranges | N
             f"channels of {image.dtype}. {REMEDY}"
         )
     if not image.size:
-        raise ImageError(f"{name} has no pixels: its shape is {sizes_of(image)}. {REMEDY}")
+        raise ImageError(f"{name} has no pixels: its shape is {format_shape(image)}. {REMEDY}")
     values = _finite(name, image)
     shares = to_shares(values, ranges or ())
     within = shares.min() >= 1 - LARGEST and shares.max() <= LARGEST

@@ -114,7 +114,7 @@ def _one_image(file: Path, ranges: Ranges) -> np.ndarray:
         return from_shares(_bands_first(file, read_pixels(file)), ranges)
     image, _ = _arrays(file)
     if image.ndim != 3:
-        raise ImageError(f"{file} must be one image (C, H, W), got {sizes_of(image)}. {REMEDY}")
+        raise ImageError(f"{file} must be one image (C, H, W), got {format_shape(image)}. {REMEDY}")
     return image
 
 
@@ -123,7 +123,7 @@ def _pairs(path: Path) -> list[Pair]:
     images, references = _arrays(path)
     if images.ndim != 4:
         raise ImageError(
-            f"{path} must be a batch of (N, C, H, W), got {sizes_of(images)}. {REMEDY}"
+            f"{path} must be a batch of (N, C, H, W), got {format_shape(images)}. {REMEDY}"
         )
     if references is NO_REFERENCE:
         references = np.empty((len(images), 0), np.float32)
@@ -135,7 +135,7 @@ def _paired(label: str, images: np.ndarray, references: np.ndarray) -> list[Pair
     if references.ndim == 0 or len(references) != len(images):
         raise ImageError(
             f"{label} must have a reference for each of its {len(images)} images, got references "
-            f"of {sizes_of(references)}. {REMEDY}"
+            f"of {format_shape(references)}. {REMEDY}"
         )
     return list(zip(images, references, strict=True))
 
@@ -176,6 +176,6 @@ def _bands_first(path: Path, pixels: np.ndarray) -> np.ndarray:
     return bands / np.float32(FULL_SCALE_8 if bands.dtype.itemsize == 1 else MAX_DN)
 
 
-def sizes_of(array: np.ndarray) -> str:
-    """Format the shape of an array."""
+def format_shape(array: np.ndarray) -> str:
+    """Return the shape of an array as text for a message, such as "3 x 64 x 64"."""
     return times(array.shape) or "no dimension"

@@ -69,15 +69,24 @@ class IntegerBank:
 
 
 def coarse_copies(kernels: Kernels) -> int:
-    """Return how many copies of the analytic restoration are coarse by `WIDE`.
+    """Return the number of copies of the analytic restoration with steps that are coarser by
+    `WIDE`.
 
-    Behind fitted kernels it is the last one, for values at which the others are clipped.
+    With fitted kernels the last copy is coarse, for values at which the others are clipped.
     """
     return int(kernels == "fitted")
 
 
 def channels(kernels: Kernels = "fitted") -> list[tuple[int, float]]:
-    """Return the index of the kernel and the offset in steps of each output, for one pixel."""
+    """Return which filter each output channel of the bank computes, and how it is rounded.
+
+    Args:
+        kernels: "fitted" adds a coarse copy of the analytic restoration.
+
+    Returns:
+        For each channel of one pixel: the index of its kernel, and the offset that is added before
+        rounding, in quantisation steps. Copies of a kernel have different offsets.
+    """
     coarse = coarse_copies(kernels)
     copies = [COPIES[0], *[COPIES[1]] * FILTERS, COPIES[2] - coarse, coarse]
     outputs = list[tuple[int, float]]()

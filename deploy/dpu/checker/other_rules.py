@@ -175,11 +175,12 @@ def pool_padding(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def activation_place(op: Operation, dpu: Dpu) -> Finding | None:
-    """Right behind a convolution are fused: {activations[conv]} ({activations[conv].source}).
+    """Activations that are fused behind a convolution: {activations[conv]}
+    ({activations[conv].source}).
 
     Behind a depthwise one: {activations[depthwise]} ({activations[depthwise].source}). Behind a
-    pool: {activations[pool]} ({activations[pool].source}). Behind anything: {activations[alone]}
-    ({activations[alone].source}).
+    pool: {activations[pool]} ({activations[pool].source}). Allowed behind any operation:
+    {activations[alone]} ({activations[alone].source}).
     """
     place = PLACE.get(op.follows or "")
     fused = dpu.target.activations[place].value if place else ()
@@ -195,9 +196,10 @@ def activation_place(op: Operation, dpu: Dpu) -> Finding | None:
 
 
 def activation_of_sums(op: Operation, dpu: Dpu) -> Finding | None:
-    """Behind an add or a mul are fused: {activations[sum]} ({activations[sum].source}).
+    """Activations that are fused behind an add or a mul: {activations[sum]}
+    ({activations[sum].source}).
 
-    Behind anything: {activations[alone]}.
+    Allowed behind any operation: {activations[alone]}.
     """
     fused, alone = (dpu.target.activations[place].value for place in ("sum", "alone"))
     if PLACE.get(op.follows or "") != "sum" or MANUAL[op.op_type] in (*fused, *alone):

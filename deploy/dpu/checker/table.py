@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import onnx
 
-from beers_deploy.dpu.board import Dpu, ruled
+from beers_deploy.dpu.board import Dpu, device_of
 from beers_deploy.dpu.checker.finding import Finding
 from beers_deploy.dpu.checker.placement import Cut, PlacedNode, Placement, place
 from beers_deploy.dpu.checker.remarks import is_island, remarks_on
@@ -94,7 +94,7 @@ def check_network(
     source = Network.load(network, sensor=SENSOR, int8=True, to_run=False)
     if output is not None:
         source = source.with_output(output)
-    build = ruled(target, dpu)
+    build = device_of(target, dpu)
     tile_px = own_tile_px(source.model) or TILE_PX
     if tile is not None:
         tile_px = require_side(tile)

@@ -30,11 +30,12 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True)
 class Constants:
-    """What is fitted.
+    """The constants that are fitted to published rates.
 
-    Hardware is never among it, so a board may be predicted with another's of the same kind.
+    Constants of the hardware are not fitted, so that a board can be predicted with the constants of
+    another board of the same kind.
 
-    The first four are the DPU's. Rates of the host are those of one of its cores; a value is one
+    The first four describe the DPU. Rates of the host are rates of one of its cores; a value is one
     number of a result.
     """
 
@@ -59,7 +60,7 @@ class Constants:
 
     @classmethod
     def of(cls, dpu: Dpu) -> Self:
-        """Those of a target profile."""
+        """Read the constants that a target profile states in [cost]."""
         return cls(*(dpu.value("cost", name) for name in NAMES))
 
     @property
@@ -77,7 +78,7 @@ NAMES = tuple(field.name for field in fields(Constants))
 
 @dataclass(frozen=True)
 class Structure:
-    """What a board's kind decides."""
+    """The parameters of the formula that depend on the kind of the board and are not fitted."""
 
     overlap: float
     """Share of the shorter of compute and memory that is hidden behind the longer."""
@@ -180,9 +181,11 @@ the DPU, then the host's copies and its task. The prediction of each is off by a
 
 
 def shares_of(dpu_s: Array, host_s: Array, contention_exponent: float) -> Array:
-    """Return by how much the rate follows each of PARTS, (n, 6), which adds up to 1.
+    """Return the sensitivity of the frame rate to each part of the time, (n, 6).
 
-    A rate falls by h % where the host takes 1 % longer, and by 1 - h % where the DPU does.
+    The rate falls by about s % if a part with the sensitivity s takes 1 % longer. The parts are
+    those of PARTS: four of the DPU, then two of the host. The sensitivities of an image add up to
+    1.
 
     Args:
         dpu_s: time of an image by the first four parts, (n, 4).
@@ -200,8 +203,12 @@ def shares_of(dpu_s: Array, host_s: Array, contention_exponent: float) -> Array:
 
 
 def frame_rate(dpu_s: float, host_s: float, contention_exponent: float) -> float:
-    """Return the images per second, given the time of the DPU and of the host's cores for one
-    image.
+    """Return the images per second.
+
+    Args:
+        dpu_s: time of the DPU for one image.
+        host_s: time of the host's cores for one image.
+        contention_exponent: q of the formula above.
     """
     longer = max(dpu_s, host_s)
     shorter = min(dpu_s, host_s)
@@ -230,10 +237,18 @@ BANDS = 4
 
 
 def host_work(bytes_in: float, bytes_out: float, values: float, task: Task) -> Array:
-    """Return the units of the host's work for one image, (7,): 1, bytes in, bytes out, and the
-    values of each task except copying.
+    """Return the amounts of work of the host for one image, (7,).
 
-    An image needs no other reading of its bytes than becoming pixels.
+    Args:
+        bytes_in: bytes of the DPU's inputs.
+        bytes_out: bytes of the DPU's results. They are not copied for the task "image", which
+            converts them to pixels anyway.
+        values: number of result values that the task reads.
+        task: what the host does with the results.
+
+    Returns:
+        1 for the image, bytes copied in, bytes copied out, then the values of each task except
+        "copy": 0 for all but `task`.
     """
     copied_bytes = 0.0 if task == "image" else bytes_out
     return np.array([1.0, bytes_in, copied_bytes, *(values * (task == name) for name in TASKS[1:])])
@@ -244,16 +259,26 @@ COPIES = 3
 
 
 def host_parts_s(units: Array, constants: Constants) -> Array:
-    """Return the time of the host's copies and of its task on one core, (n, 2), given the units (n,
-    7).
+    """Return the time of the host's copies and of its task on one core, (n, 2).
+
+    Args:
+        units: amounts of work as `host_work` returns them, (n, 7).
+        constants: of the board.
     """
     times = units * constants.host_s_per_unit
     return np.stack([times[:, :COPIES].sum(axis=1), times[:, COPIES:].sum(axis=1)], axis=1)
 
 
 def placed_work(placement: Placement, task: Task) -> Array:
-    """Return the units of the host's work for a placed network, (7,). The task reads every value of
-    the results, but for YOLO's maps only one score per box.
+    """Return the amounts of work of the host for a placed network, (7,), in the order of
+    `host_work`.
+
+    The task reads every value of the results. A task "sort" on the maps of YOLO reads only one
+    score for each box.
+
+    Args:
+        placement: the operations of the network on DPU and host.
+        task: what the host does with the results.
     """
     onto, back = _crossing_bytes(placement)
     return host_work(onto, back, back * (_scores(placement) if task == "sort" else 1), task)

@@ -100,13 +100,20 @@ class FaultList:
 
 
 def counted(count: int, name: str) -> str:
-    """Return a number and the name of what is counted, in the plural if there are several."""
+    """Return a count and a noun, which gets an "s" unless the count is 1."""
     return f"{count} {name}{'s' if count > 1 else ''}"
 
 
-def list_beside(out: Path, source: str) -> Path | None:
-    """Return the path of the list of found faults next to the restored image, or None if no faults
-    are searched for.
+def found_list_path(out: Path, source: str) -> Path | None:
+    """Return where the list of detected faults of `out` is written, next to the restored image.
+
+    Args:
+        out: the restored image.
+        source: the value of `fix_detectors`.
+
+    Returns:
+        The path of the CSV file; None unless `source` is "found", because only then faults are
+        searched for.
     """
     return out.with_name(f"{out.stem}.detectors.csv") if source == FOUND else None
 

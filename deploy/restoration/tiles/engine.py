@@ -271,8 +271,19 @@ def checked_strip(
     clips: bool = False,
     left: int = 0,
 ) -> Strip:
-    """Return rows from `top` on, (bands, rows, width) as stored, with the mask of missing pixels.
-    Raise ImageError for values outside full scale.
+    """Check rows of an image, and return them with the mask of missing pixels.
+
+    Args:
+        raster: the image, which states how missing pixels are marked.
+        top: the first row.
+        pixels: (bands, rows, width) values as stored.
+        full_scale: the pixel value that is the largest digital number.
+        name: of the image, for messages.
+        clips: True to accept values above full scale, which are clipped later.
+        left: the first column, if the rows do not begin at the image's border.
+
+    Raises:
+        ImageError: a valid pixel is below 0, infinite, or above full scale without `clips`.
     """
     missing = raster.missing(pixels) if raster.may_miss else None
     pixels = np.ma.getdata(pixels)

@@ -46,12 +46,20 @@ __all__ = [
 def measure(
     images: Sequence[Path], edges: Sequence[str] = (), stated: Stated | None = None
 ) -> Measurement:
-    """Measure a sensor on its own frames.
+    """Measure noise, MTF and SNR of a sensor from its raw frames.
 
     Args:
         images: raw images of one sensor at one setting: files, and folders of them.
-        edges: boxes with one straight edge as FILE:X,Y,WIDTH,HEIGHT; none searches for edges.
-        stated: the values that the user states.
+        edges: boxes with one straight edge as FILE:X,Y,WIDTH,HEIGHT. If empty, edges are searched
+            for in the images.
+        stated: the values that the user states. A stated MTF is not measured.
+
+    Returns:
+        The frames, the line of noise, the MTF curves and the SNRs, with the gain stated or assumed.
+
+    Raises:
+        ImageError: there is no image, or the images are not frames of one sensor.
+        OptionError: a box or a stated value does not fit the images.
     """
     stated = stated or Stated()
     frames = open_frames(images, stated.bits, stated.black_level)

@@ -118,8 +118,13 @@ def iou(one: np.ndarray, other: np.ndarray, ignored: np.ndarray | bool = False) 
 
 
 def suppress(boxes: Boxes) -> Boxes:
-    """Return the boxes of a detector after non-maximum suppression within each class, best score
-    first.
+    """Remove boxes that overlap a better box of the same class (non-maximum suppression).
+
+    A box is removed if its IoU with a box of a higher score exceeds OVERLAP. Only the best
+    MAX_CANDIDATES are compared, and at most MAX_BOXES are returned.
+
+    Returns:
+        The remaining boxes, best score first.
     """
     candidates = np.argsort(-boxes.scores, kind="stable")[:MAX_CANDIDATES]
     selection = list[int]()

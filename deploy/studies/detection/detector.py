@@ -242,8 +242,10 @@ def letters(name: str) -> str:
 
 
 def class_names(names: Any) -> tuple[str, ...]:
-    """Return class names from a list, or from a table by number from 0, or none for any other
-    value.
+    """Return the class names that a file states, or () if they are not valid.
+
+    Args:
+        names: a list of names, or a table of names by number from 0. Any other value is not valid.
     """
     names = (
         [names.get(number) for number in range(len(names))] if isinstance(names, dict) else names
@@ -256,7 +258,11 @@ def class_names(names: Any) -> tuple[str, ...]:
 
 
 def parse_classes(text: str) -> dict[str, str]:
-    """Parse LABELLED=DETECTOR,... and return the detector's class for each labelled class."""
+    """Parse LABELLED=DETECTOR,... into the detector's class by labelled class.
+
+    Raises:
+        OptionError: the text has another form, or names a labelled class twice.
+    """
     pairs = [[part.strip() for part in entry.split("=")] for entry in text.split(",")]
     valid = all(len(pair) == 2 and all(map(letters, pair)) for pair in pairs)
     if not valid or len({letters(pair[0]) for pair in pairs}) < len(pairs):
@@ -270,16 +276,23 @@ def parse_classes(text: str) -> dict[str, str]:
 def class_numbers(
     labelled: Sequence[str], detector: Sequence[str], mapping: Mapping[str, str]
 ) -> np.ndarray:
-    """Return for each labelled class its number among the detector's classes: the one that it is
-    mapped to, else the one with the same letters.
+    """Map each labelled class to the index of a class of the detector.
+
+    A class is mapped as `mapping` states. Without an entry it is mapped to the class of the same
+    name; case, spaces and punctuation are ignored.
 
     Args:
         labelled: names in the order of the labels' numbers.
         detector: names in the order of the detector's.
-        mapping: detector's names by labelled ones, as `parse_classes` returns them.
+        mapping: the detector's name by labelled name, as `parse_classes` returns it.
 
     Returns:
-        (L,) int64, -1 for a class that the detector does not know, as `Boxes.renamed` accepts it.
+        (L,) int64 indices, -1 for a class that the detector does not know, as `Boxes.renamed`
+        accepts it.
+
+    Raises:
+        OptionError: `mapping` has a name that is not a class, the detector's names are ambiguous,
+            or no class is mapped.
     """
     number = {letters(name): i for i, name in enumerate(detector)}
     if len(number) < len(detector):

@@ -78,13 +78,14 @@ def flip_table(subject: Subject, source: Calibration, board: TargetProfile) -> T
 
 @dataclass(frozen=True)
 class FaultTarget:
-    """The target of fault injection.
+    """A network prepared for fault injection.
 
     Attributes:
         core: the network as the board stores it.
         guards: learnt from calibration patches.
-        pairs: patches that it restores, degraded and reference, (1, 1, H, W) in [0, 1] each.
-        checks: the self-check of each patch's sensor.
+        pairs: the patches on which flips are tried, degraded and reference, (1, 1, H, W) in [0, 1]
+            each.
+        checks: the self-check for the sensor of each patch.
     """
 
     core: IntCore
@@ -94,12 +95,13 @@ class FaultTarget:
 
 
 def make_target(subject: Subject, source: Calibration) -> FaultTarget:
-    """Build the target of fault injection.
+    """Prepare a network for fault injection: its stored integers, guards, patches and self-checks.
 
     Args:
-        subject: with an INT8 network.
-        source: of the patches. The guards are learnt from some of them. Flips are tried on patches
-            of another seed, so that the guards are not evaluated on their training data.
+        subject: the subject of the study, with an INT8 network.
+        source: where calibration patches come from. The guards are learnt
+            from them. Flips are tried on patches of another seed, so that the guards are not
+            evaluated on their training data.
     """
     core = faults.as_stored(subject.core)
     calibration = replace(source, patches=CALIBRATION_PATCHES)

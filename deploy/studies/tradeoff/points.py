@@ -210,7 +210,7 @@ def _on_board(variant: Variant, board: TargetProfile, swath: Swath) -> list[Poin
     fastest_px = fastest_tile_px(variant, default, swath)
     points = [Point(variant, board, dpu, fastest_px) for dpu in [default, *others]]
     points.append(Point(variant, board, default, TILE_PX))
-    smaller = (halo for halo in HALOS_PX if halo < radius_px(variant))
+    smaller = (halo for halo in HALOS_PX if halo < exact_halo_px(variant))
     points += [Point(variant, board, default, fastest_px, halo) for halo in smaller]
     # The fastest tile may be the paper's: a point is listed once.
     return list({point.name: point for point in points}.values())
@@ -220,7 +220,7 @@ def fastest_tile_px(variant: Variant, dpu: Dpu, whole: Swath) -> int:
     """Return the tile with exact seams, no larger than the paper's, that has the shortest predicted
     time for the swath.
     """
-    radius = radius_px(variant)
+    radius = exact_halo_px(variant)
     # A tile has to be wider than its two halos.
     sides = range(TILE_STEP_PX * (2 * radius // TILE_STEP_PX + 1), TILE_PX + 1, TILE_STEP_PX)
     swaths = [
@@ -244,8 +244,8 @@ def dpu_latency(variant: Variant, dpu: Dpu, swath: Swath) -> Figure:
     return swath_latency(prediction, math.ceil(swath.tiles * swath.runs / prediction.batch))
 
 
-def radius_px(variant: Variant) -> int:
-    """Return the halo that makes the seams of a network exact."""
+def exact_halo_px(variant: Variant) -> int:
+    """Return the smallest halo in pixels at which a network's tiles have no seams."""
     return network_of_variant(variant).tiling.halo_px
 
 
@@ -283,7 +283,7 @@ def board_figures(
         runs: the mean number of runs of the network on a tile of the measured images.
     """
     if point.dpu is not None:
-        halo_px = radius_px(point.variant) if point.halo_px is None else point.halo_px
+        halo_px = exact_halo_px(point.variant) if point.halo_px is None else point.halo_px
         swath = replace(whole, tile_px=point.tile_px, halo_px=halo_px, runs=runs, consistency=True)
         latency = dpu_latency(point.variant, point.dpu, swath)
         power = dpu_power(point.dpu)

@@ -105,10 +105,11 @@ class Study:
 
     @property
     def arguments(self) -> dict[str, str]:
-        """The arguments that are recorded in normalised form. The others are recorded as they were
-        given.
+        """The arguments whose recorded text is normalised, by name; all others are recorded as
+        typed.
 
-        A limit names its figure and unit: `board latency <= 20 s`, however it was typed.
+        Limits are written with the full name of their figure and its unit, such as `board latency
+        <= 20 s`.
         """
         sensor, reference = self.sensors
         return {
@@ -121,7 +122,7 @@ class Study:
 
     @property
     def inputs(self) -> tuple[Input, ...]:
-        """All files that the figures rest on."""
+        """All files that the figures depend on, with their digests."""
         files = [path for path in map(Path, self.names) if path.is_file()]
         for source in (self.scenes, self.calibration):
             files += list_images(source) if source else []

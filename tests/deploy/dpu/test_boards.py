@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beers_deploy.dpu.board import load_dpu, ruled
+from beers_deploy.dpu.board import device_of, load_dpu
 from beers_deploy.dpu.checker.conv_rules import conv_area, conv_weight_bank
 from beers_deploy.dpu.checker.operators import all_rules, applies, rule_name, rule_text
 from beers_deploy.dpu.checker.placement import place
@@ -162,7 +162,7 @@ def test_every_text_names_the_boards_own_dpu(name: str) -> None:
 
 
 def test_a_rule_whose_constants_no_file_states_would_be_dead() -> None:
-    stating = [*DPUS.values(), *(ruled(TargetProfile.load(name)) for name in npu_names())]
+    stating = [*DPUS.values(), *(device_of(TargetProfile.load(name)) for name in npu_names())]
     assert all(any(applies(rule, dpu) for dpu in stating) for rule in all_rules())
 
 

@@ -37,10 +37,10 @@ from beers_deploy.studies.tradeoff.points import (
     Variant,
     board_figures,
     dpu_latency,
+    exact_halo_px,
     fastest_tile_px,
     network_points,
     network_variants,
-    radius_px,
 )
 from beers_deploy.studies.tradeoff.run import require_quantizable
 from tests.deploy.dpu.graphs import integer_convbeers
@@ -110,7 +110,7 @@ def test_the_fastest_tile_is_a_multiple_of_the_step_and_no_other_is_faster(
     variant: Variant,
 ) -> None:
     tile_px = fastest_tile_px(variant, DPU, WHOLE)
-    radius = radius_px(variant)
+    radius = exact_halo_px(variant)
     assert tile_px % TILE_STEP_PX == 0
     assert 2 * radius < tile_px <= TILE_PX
 
@@ -133,7 +133,7 @@ def test_int8_is_compared_on_every_board_and_configuration_in_several_tiles_and_
         assert {point.dpu.name for point in on_board if point.dpu} == set(board.configurations)
         assert {point.halo_px for point in on_board} == {
             None,
-            *(halo for halo in HALOS_PX if halo < radius_px(variant)),
+            *(halo for halo in HALOS_PX if halo < exact_halo_px(variant)),
         }
         assert TILE_PX in {point.tile_px for point in on_board}
     other = network_points(variant, boards[::-1], WHOLE)
