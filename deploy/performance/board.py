@@ -85,11 +85,12 @@ DETAILS = frozenset(
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Bench(Table):
-    """A network's speed, power and energy, next to the traditional pipeline.
+    """The speed, power and energy of a network, next to those of the traditional pipeline.
 
     Attributes:
-        swath: the image that the rows are about; None of a network that is not tiled, or of a host.
-        dn: the image's digital numbers, (H, W); None for a drawn one.
+        swath: the image that the rows describe; None for a network that is not tiled, or for a
+            host.
+        dn: digital numbers (H, W) of the image; None for a simulated one.
     """
 
     swath: Swath | None = None
@@ -103,17 +104,17 @@ class Bench(Table):
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked of the cost model.
+    """The options of a prediction by the cost model.
 
     Attributes:
         boards: configurations of the DPU.
-        corrections: tables that say how the user's own runs correct the cost model.
+        corrections: tables that describe how the user's own runs correct the cost model.
         size: (width, height) of the swath in pixels; None for the paper's, or that of the image.
         tiles_px: tile sides.
         halo: "exact" or a number of pixels.
-        within_s: time that the swath may take; None does not ask.
-        task: of the host; None for what the file tells.
-        consistency: whether the host takes the consistency step.
+        within_s: the time limit of the swath; None for no limit.
+        task: of the host; None derives it from the file.
+        consistency: True if the host computes the consistency step.
     """
 
     boards: Sequence[Dpu]
@@ -129,20 +130,20 @@ class Question:
 def bench_board(
     network: Network, asked: Question, dn: np.ndarray | None = None, sensor: Sensor | None = None
 ) -> Bench:
-    """Predict a network's swath on boards; nothing is measured.
+    """Predict the time of a swath on boards. Nothing is measured.
 
-    A network that cannot be tiled is predicted by the frame, without a swath.
+    A network that cannot be tiled is predicted per frame, without a swath.
 
     Args:
         network: float or INT8.
         asked: boards, tiles and swath.
-        dn: digital numbers (H, W) of the image that is the swath; None for a drawn one.
-        sensor: that a shipped network is conditioned on: the exposures of the image are counted;
-            None counts none.
+        dn: digital numbers (H, W) of the image that is the swath; None for a simulated one.
+        sensor: the sensor that a shipped network is conditioned on. With it, the exposures that the
+            image needs are counted; None counts none.
 
     Raises:
-        ModelError: a network that does not run on the DPU, or that cannot be tiled where a size,
-            an image or a time is asked for.
+        ModelError: the network does not run on the DPU, or it cannot be tiled although a size, an
+            image or a time is requested.
     """
     try:
         tiling = network.tiling
@@ -224,7 +225,7 @@ POOR = 0.15
 
 
 def poor_words(boards: Sequence[Dpu]) -> list[str]:
-    """Return a sentence for each board whose cost model rests on little data."""
+    """Return a sentence for each board whose cost model was fitted to few data."""
     errors = {dpu.target.name: dpu.value("cost", "error_left_out") for dpu in boards}
     return [
         f"Of {name} little is known: networks left out of the fit are off by {error:.0%}"
@@ -276,7 +277,7 @@ def _frames(network: Network, asked: Question, why: ModelError) -> Bench:
 
 
 def quoted(network: Network, target: TargetProfile) -> Bench:
-    """Return what the maker of a board publishes, where nothing is predicted."""
+    """Return the figures that the maker of a board publishes, for a board without a cost model."""
     title = (
         f"{network.input.name} on {target.name}: nothing is predicted; other networks are published"
     )

@@ -28,16 +28,16 @@ PAPER_SIZE = "13600x9016"
 
 @dataclass(frozen=True)
 class Swath:
-    """The image that all rows are about, and the tiles it is cut into.
+    """The image that all rows describe, and the tiles it is cut into.
 
     Attributes:
         width_px: of the image.
         height_px: of the image.
         tile_px: side of a tile.
-        halo_px: context around what is kept of a tile.
-        runs: how often the network runs on a tile, once for each exposure that its pixels ask for;
-            a mean.
-        consistency: whether the host takes the consistency step.
+        halo_px: context around the part of a tile that is stored.
+        runs: mean number of runs of the network on a tile, one for each exposure that its pixels
+            need.
+        consistency: True if the host computes the consistency step.
     """
 
     width_px: int
@@ -87,9 +87,14 @@ def predict_network(
     task: Task | None = None,
     step_px: float = 0.0,
 ) -> Prediction:
-    """Predict a network for tiles of one side or, with None, for the size it is fixed to.
+    """Predict a network on a DPU for tiles of one size.
 
-    The `task` of the host is what the network tells, if none is given; `step_px` as of `predict`.
+    Args:
+        network: the network, or its file or name.
+        dpu: the configuration.
+        tile_px: side of a tile; None for the size that the network is fixed to.
+        task: what the host does with the results; None derives it from the file.
+        step_px: pixels of a tile for which the host computes the consistency step; 0 for no step.
     """
     source = Network.load(network, to_run=False)
     sized = network_of(source.model, tile_px, source.label)
@@ -99,7 +104,14 @@ def predict_network(
 def swath_figures(
     prediction: Prediction, swath: Swath, frames: float, batches: float
 ) -> dict[str, Figure]:
-    """Return the figures of a swath that takes `frames` tiles in `batches` batches."""
+    """Return the figures of a swath: latency, throughput, power, energy and others.
+
+    Args:
+        prediction: of the network for one tile size.
+        swath: the image and its tiles.
+        frames: number of tiles, which may be a fraction.
+        batches: number of batches for them.
+    """
     power = dpu_power(prediction.dpu)
     latency = swath_latency(prediction, batches)
     figures = {
@@ -141,7 +153,12 @@ def step_time(prediction: Prediction, swath: Swath) -> Figure:
 
 
 def host_time(prediction: Prediction, unit: str) -> Figure:
-    """Return the time of all cores of the host for an image, in ms."""
+    """Return the time in ms that all cores of the host need for an image.
+
+    Args:
+        prediction: of the network.
+        unit: the unit that the figure states.
+    """
     low_s, high_s = prediction.host_interval_s
     return predicted(1e3 * prediction.host_s, unit, (1e3 * low_s, 1e3 * high_s), COST_SOURCE)
 
@@ -167,8 +184,9 @@ def swath_latency(prediction: Prediction, batches: float) -> Figure:
 
 
 def fitted_range(prediction: Prediction) -> str:
-    """Return whether the network lies within the range of the fitted networks, and how often the
-    board's intervals held if that is too rarely.
+    """Return text that states whether the network is within the range of the fitted networks.
+
+    If the intervals of the board held too rarely, it also states how often they did.
     """
     words = f"outside: {'; '.join(prediction.outside)}" if prediction.outside else "inside"
     share = prediction.dpu.value("cost", "families_held")
@@ -207,9 +225,12 @@ def interval_ends(figure: Figure) -> Interval:
     return figure.interval or (figure.value or 0.0, figure.value or 0.0)
 
 
-def chain_rate(swath: Swath, latency: Figure) -> Figure:
-    """Return the tiles per second, counted as the paper counts them, given the predicted latency of
-    the swath.
+def pipeline_rate(swath: Swath, latency: Figure) -> Figure:
+    """Return the tiles per second of the traditional pipeline, counted as the paper counts them.
+
+    Args:
+        swath: the image and its tiles.
+        latency: the predicted time of the swath.
     """
     low, high = (swath.frames / end_s for end_s in reversed(interval_ends(latency)))
     return predicted(
@@ -232,7 +253,7 @@ def scaled(value: float, unit: str, prediction: Prediction) -> Figure:
 
 
 def parse_size(size: str | tuple[int, int]) -> tuple[int, int]:
-    """Return (width, height) in pixels, of both or of WIDTHxHEIGHT."""
+    """Return (width, height) in pixels, from a pair or from text WIDTHxHEIGHT."""
     text = size if isinstance(size, str) else "x".join(map(str, size))
     parts = text.lower().split("x")
     # Python raises an error of its own for very long numbers, so these are refused by their length.

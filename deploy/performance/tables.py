@@ -20,7 +20,6 @@ from beers_deploy.dpu.cost.model import Task, between
 from beers_deploy.network import NetworkLike
 from beers_deploy.performance.swath import (
     Swath,
-    chain_rate,
     efficiency,
     energy,
     exact,
@@ -28,6 +27,7 @@ from beers_deploy.performance.swath import (
     host_time,
     interval_ends,
     one_thread_latency,
+    pipeline_rate,
     predict_network,
     scaled,
     swath_figures,
@@ -105,8 +105,9 @@ def published_rows() -> list[Row]:
 
 
 def processor_row(swath: Swath, board: TargetProfile) -> Row:
-    """Return the traditional pipeline on the board's own processor, scaled from the time of 10^6
-    pixels in the board's file.
+    """Return the traditional pipeline on the board's own processor.
+
+    Its time is scaled by the number of pixels, from the time of 10^6 pixels in the board's file.
     """
     cpu = board.tables.get("cpu", {})
     mpx = swath.pixels / 1e6
@@ -126,7 +127,7 @@ def processor_row(swath: Swath, board: TargetProfile) -> Row:
     latency = predicted(between((low_s, high_s)), "s", (low_s, high_s), constant.source)
     figures = {
         "latency": latency,
-        "throughput": chain_rate(swath, latency),
+        "throughput": pipeline_rate(swath, latency),
         "power": power,
         "efficiency": efficiency(swath.pixels, latency, power),
     }
@@ -136,8 +137,8 @@ def processor_row(swath: Swath, board: TargetProfile) -> Row:
 def layer_rows(prediction: Prediction) -> list[Row]:
     """Return a row for each layer, and a last one with the sum of their times.
 
-    The columns are those of AMD's vaitrace, with what bounds the layer; bytes are those of one
-    image.
+    The columns are those of AMD's vaitrace, and in addition what limits the layer. Bytes are those
+    of one image.
     """
     rows = [_layer_row(layer, prediction) for layer in prediction.layers]
     total = f"sum: one batch of {prediction.batch}"
@@ -210,16 +211,16 @@ def named(dpu: Dpu) -> str:
 
 
 def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) -> str:
-    """Name the DPU with the lowest peak that computes the swath in time: by the whole interval, by
-    the prediction, or at best.
+    """Return a sentence that names the smallest DPU which computes the swath in time.
 
-    One that does so surely is not named again for what is less. Peaks stand for prices, which no
+    Up to three are named: in time by the whole interval, by the prediction, and at best. A DPU is
+    named once, for the surest of these. Size is peak performance, in place of a price, which no
     file states.
 
     Args:
-        rows: those of `sweep_rows`, the boards' one behind the other, as many of each.
-        boards: as given there.
-        within_s: what the swath may take.
+        rows: as `sweep_rows` returns them, with the same number of rows for each board in turn.
+        boards: as passed to `sweep_rows`.
+        within_s: the time limit of the swath.
     """
     rows_per_board = len(rows) // len(boards)
     names = dict[str, str]()
@@ -245,9 +246,7 @@ def within_words(rows: Sequence[Row], boards: Sequence[Dpu], within_s: float) ->
 
 
 def frame_row(prediction: Prediction) -> Row:
-    """Return a network that runs on whole images, on one configuration: per frame instead of per
-    swath.
-    """
+    """Return the row of a network that runs on whole images: per frame instead of per swath."""
     power = dpu_power(prediction.dpu)
     frame_s = swath_latency(prediction, 1 / prediction.batch)
     figures = {
@@ -281,7 +280,7 @@ def host_words(prediction: Prediction) -> list[str]:
 
 
 def parse_tiles(tile: int | str | Sequence[int]) -> list[int]:
-    """Return tile sides in pixels, of one side, several, or text with commas between them."""
+    """Return tile sides in pixels, from one side, several, or text with commas between them."""
     parts: Sequence[int | str] = [tile] if isinstance(tile, int) else tile
     if isinstance(tile, str):
         parts = tile.split(",")

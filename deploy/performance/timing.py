@@ -64,15 +64,15 @@ def _read(powercap: Path) -> dict[Path, int] | str:
 def interleaved(
     calls: Sequence[Callable[[], object]], rounds: int, least_s: float = 0.0
 ) -> list[list[tuple[float, Figure]]]:
-    """Time every call once per round, and return time and power of each run.
+    """Time several calls in turn, once per round.
 
     Args:
-        calls: what is timed, already warmed up.
-        rounds: the least of them.
-        least_s: what each call's runs take together, at least.
+        calls: the functions to time, already warmed up.
+        rounds: the least number of rounds.
+        least_s: the least total time of each call. Rounds are added until it is reached.
 
     Returns:
-        Of each call, round by round.
+        For each call, the time in s and the power of each round.
     """
     samples: list[list[tuple[float, Figure]]] = [[] for _ in calls]
     while (

@@ -15,7 +15,7 @@ from beers_deploy.model.simulator.detector import Draw
 from beers_deploy.model.simulator.procedural import procedural_scene
 from beers_deploy.model.traditional.pipeline import TraditionalPipeline, restore_traditional
 from beers_deploy.performance.host import conditions_of
-from beers_deploy.performance.swath import Swath, chain_rate, efficiency
+from beers_deploy.performance.swath import Swath, efficiency, pipeline_rate
 from beers_deploy.performance.tables import TABLE
 from beers_deploy.performance.timing import cpu_load, load_of_others, own_cpu_s, timed
 from beers_deploy.profiles.figures import Figure, Row, measured, predicted
@@ -27,13 +27,13 @@ CROPS = 3
 
 @dataclass(frozen=True)
 class PipelineTime:
-    """What the pipeline takes here for 10^6 pixels, crop by crop.
+    """The measured time and power of the traditional pipeline on this machine.
 
     Attributes:
-        s_per_mpx: of each crop.
-        power: of this processor meanwhile.
+        s_per_mpx: time in s for 10^6 pixels, of each crop.
+        power: of this processor while it ran.
         conditions: threads and CPU load.
-        crop: the crops' size, for the source of the figures.
+        crop: size of the crops, for the source of the figures.
     """
 
     s_per_mpx: list[float]
@@ -44,8 +44,9 @@ class PipelineTime:
     """Share of all CPUs that other processes took meanwhile."""
 
     def row(self, swath: Swath) -> Row:
-        """Return the swath in proportion to the crops. The interval is that of the fastest and the
-        slowest crop.
+        """Return the row of a swath, scaled from the crops by the number of pixels.
+
+        The interval is given by the fastest and the slowest crop.
         """
         median = statistics.median(self.s_per_mpx)
         mpx = swath.pixels / 1e6
@@ -55,7 +56,7 @@ class PipelineTime:
         figures = {
             "time": measured(median, "s/Mpx", f"median of {here}"),
             "latency": latency,
-            "throughput": chain_rate(swath, latency),
+            "throughput": pipeline_rate(swath, latency),
             "power": self.power,
             "efficiency": efficiency(swath.pixels, latency, self.power),
             **self.conditions,

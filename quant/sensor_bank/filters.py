@@ -58,9 +58,10 @@ class IntegerBank:
     """The first convolution in integers.
 
     Attributes:
-        weight: (O, 4 S^2, k, k) int8 for the planes of an image, all of one kind consecutively.
+        weight: (O, 4 S^2, k, k) int8 for the planes of an image. All channels of one plane are
+            consecutive.
         frac_bits: the right shift that converts a sum of products to int8.
-        offsets: (O,) numbers that each channel adds before it is rounded, in steps.
+        offsets: (O,) offset of each output channel before rounding, in quantisation steps.
     """
 
     weight: NDArray[np.int8]

@@ -47,7 +47,7 @@ Bound = Literal["host", "DPU"]
 
 @dataclass(frozen=True)
 class LayerCost:
-    """What one operation costs for one batch; `work` counts one image."""
+    """The predicted times of one operation for a batch, and its work for one image."""
 
     work: Work
     compute_s: float
@@ -56,9 +56,7 @@ class LayerCost:
 
     @property
     def bound(self) -> str:
-        """Return the name of the longest part of the time: compute, memory, or overhead for the
-        rest.
-        """
+        """Return which part of the time is longest: compute, memory or, if neither is, overhead."""
         overhead_s = self.time_s - self.compute_s - self.memory_s
         parts = {"compute": self.compute_s, "memory": self.memory_s, "overhead": overhead_s}
         return max(parts, key=lambda name: parts[name])
@@ -66,23 +64,23 @@ class LayerCost:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What the model says of one network on one configuration; `note` says what was assumed of the
-    file.
+    """The prediction of the cost model for one network on one configuration.
 
     Attributes:
         dpu: the configuration.
-        alone_s: one core's batch on the DPU while its other cores rest.
-        layers: what each costs, for a batch.
-        host_s: time of an image on the host's cores together.
+        alone_s: time of one core's batch on the DPU while its other cores rest.
+        layers: the cost of each layer, for a batch.
+        host_s: time of an image on all cores of the host together.
         task: what the host does with the results.
-        width: half that of the interval, in ln(FPS).
-        bound: what sets the rate.
-        levels: what it has in common with runs of an owner's board.
-        speed: how many times as fast as the constants say it is by these runs.
-        outside: what lies beyond the fitted networks; empty where nothing does.
-        refused: names of nodes that the DPU refuses and the host runs.
-        refused_s: what they take of `host_s`, least and most.
-        step_s: what the consistency step takes of `host_s`, least and most.
+        width: half the width of the interval, in ln(FPS).
+        bound: what limits the rate, the DPU or the host.
+        levels: the properties that it shares with runs of the user's board.
+        speed: the factor by which these runs show the board to be faster than the constants.
+        outside: properties outside the range of the fitted networks; empty if there are none.
+        note: what was assumed of the file.
+        refused: names of the nodes that the DPU refuses and the host runs.
+        refused_s: shortest and longest time of these nodes, a part of `host_s`.
+        step_s: shortest and longest time of the consistency step, a part of `host_s`.
     """
 
     dpu: Dpu
@@ -133,11 +131,10 @@ class Prediction:
 
     @property
     def latency_s(self) -> float:
-        """Return the time from the first image of a batch to its last result with one thread, which
-        uses one core of the DPU and then one core of the host.
+        """Return the time in s from the first image of a batch to its last result, with one thread.
 
-        Its error is about that of the rate (docs/reference/boards.md), and it shares the rate's
-        width.
+        The thread uses one core of the DPU, then one core of the host. The relative error is about
+        that of the rate (docs/reference/boards.md), so the interval has the width of the rate's.
         """
         return self._latency_s(self.host_s)
 
@@ -187,14 +184,19 @@ class Prediction:
 def predict(
     placement: Placement, dpu: Dpu, task: Task | None = None, step_px: float = 0.0
 ) -> Prediction:
-    """Predict a network whose convolutions the DPU runs; what it refuses at the ends of a float
-    file the host does.
+    """Predict the rate and latency of a network on a DPU, from formula and constants.
+
+    The DPU must run all convolutions. Nodes that it refuses before the first or after the last of
+    them run on the host.
 
     Args:
-        placement: where its nodes run.
-        dpu: a board's.
-        task: what the host does with the results; None for what the file tells.
-        step_px: pixels of an image for which the host takes the consistency step; 0 leaves it out.
+        placement: where each node of the network runs.
+        dpu: the configuration of a board.
+        task: what the host does with the results; None derives it from the file.
+        step_px: pixels of an image for which the host computes the consistency step; 0 for no step.
+
+    Raises:
+        ModelError: the DPU refuses a node inside the core, or the network has no convolution.
     """
     if placement.cutting:
         names = ", ".join(node.op.name for node in placement.cutting[:3])
@@ -283,11 +285,11 @@ def _outside(core: Sequence[Operation], dpu: Dpu) -> tuple[str, ...]:
 
 
 def dpu_power(dpu: Dpu) -> Figure:
-    """Return the power in W while the DPU runs: the published range of the board, whatever the
-    network.
+    """Return the power in W while the DPU runs: the published range of the board.
 
-    The published points contradict each other: above idle the VCK190 takes 0.8 pJ for an operation
-    with YOLOv8s and 2.3 pJ with ConvBEERS, so no energy for an operation or a byte can be told.
+    It does not depend on the network. The published points do not allow an energy per operation or
+    per byte: above idle, the VCK190 needs 0.8 pJ for an operation of YOLOv8s, and 2.3 pJ for one of
+    ConvBEERS.
     """
     if "dpu_range_w" not in dpu.tables.get("power", {}):
         return unavailable("W", f"no power of {dpu.target.name} under its DPU is published")

@@ -309,8 +309,10 @@ def _scores(placement: Placement) -> float:
 
 
 def task_of(placement: Placement) -> Task:
-    """Return the task of the host, derived from its operators. A single result of few bands that is
-    not smaller than the input becomes an image.
+    """Return the task of the host, derived from the operators behind the DPU.
+
+    Without such an operator, a single result with few bands that is not smaller than the input is
+    taken for an image.
     """
     for node in placement.nodes:
         if node.part == "host-back" and node.op.op_type in OPERATORS:
@@ -348,12 +350,17 @@ two (assumed).
 
 
 def refused_interval_s(operations: Sequence[Operation], dpu: Dpu) -> Interval:
-    """Return the shortest and the longest time in s of the board's processor, with all cores, for
-    the operations of one image that the DPU refuses.
+    """Return the shortest and the longest time in s that the host needs for the operations that the
+    DPU refuses.
 
-    None of it is fitted: no published rate tells such work apart. The least is what the processor's
-    published rates allow, products as a good library does them and every number moved once; the
-    most is plain code, number by number.
+    It is the time of all cores for one image. It is not fitted, because published rates do not
+    separate such work. The shortest time follows from the processor's published rates: products as
+    in an optimised library, and each number moved once. The longest time is that of plain code,
+    number by number.
+
+    Args:
+        operations: those that the DPU refuses.
+        dpu: the configuration, whose board states the processor.
     """
     if not operations:
         return 0.0, 0.0
@@ -369,7 +376,7 @@ def refused_interval_s(operations: Sequence[Operation], dpu: Dpu) -> Interval:
 
 
 def between(interval: Interval) -> float:
-    """Return the geometric mean of two ends, which are factors apart."""
+    """Return the geometric mean of the ends of an interval."""
     return math.sqrt(interval[0] * interval[1])
 
 
@@ -388,11 +395,14 @@ def _plain_work_s(operations: float, moved_values: float, results: float, dpu: D
 
 
 def consistency_interval_s(pixels: float, dpu: Dpu) -> Interval:
-    """Return the shortest and the longest time in s of the board's processor, with all cores, for
-    the consistency step on `pixels` pixels.
+    """Return the shortest and the longest time in s that the host needs for the consistency step.
 
-    None of it is fitted. The raw and the restored image are read and the result is written; the
-    step's other numbers stay in the caches.
+    It is the time of all cores and is not fitted. The raw and the restored image are read and the
+    result is written; all other numbers stay in the caches.
+
+    Args:
+        pixels: number of pixels that the step is computed for.
+        dpu: the configuration, whose board states the processor.
     """
     # A product with its sum counts as two operations.
     low_s, high_s = _plain_work_s(2 * PRODUCTS_PER_PX * pixels, 3 * pixels, pixels, dpu)

@@ -73,8 +73,8 @@ class Boxes:
         )
 
     def renamed(self, classes: np.ndarray) -> "Boxes":
-        """Return boxes whose class c becomes `classes[c]`. Those of a class that becomes -1 are
-        left out.
+        """Return the boxes with class c replaced by `classes[c]`, without boxes of a class that
+        becomes -1.
         """
         new = np.asarray(classes, np.int64)[self.classes]
         return Boxes(self.corners, new, self.scores, self.ignored)[new >= 0]

@@ -24,7 +24,7 @@ from beers_deploy.model.traditional.baselines import BASELINES
 from beers_deploy.model.traditional.patch_groups import QUALITIES
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.performance import tables
-from beers_deploy.performance.swath import Swath, chain_rate, efficiency, energy, swath_latency
+from beers_deploy.performance.swath import Swath, efficiency, energy, pipeline_rate, swath_latency
 from beers_deploy.profiles.errors import ModelError, OptionError, printable
 from beers_deploy.profiles.figures import Figure, predicted, unavailable
 from beers_deploy.profiles.sensor import Sensor
@@ -303,4 +303,4 @@ def board_figures(
     if latency.value is None:
         return {key: unavailable(unit, latency.reason) for key, unit in UNITS.items()}
     work = energy(latency, power), efficiency(whole.pixels, latency, power)
-    return dict(zip(UNITS, (latency, chain_rate(whole, latency), power, *work), strict=True))
+    return dict(zip(UNITS, (latency, pipeline_rate(whole, latency), power, *work), strict=True))
