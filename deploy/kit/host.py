@@ -231,9 +231,9 @@ def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
 def judged(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return two figures (2, n, m) of each block of CHECK pixels a side of one band (H, W).
 
-    The first is chi2, the mean of (raw - H x)^2 / variance of the noise. The second is the mean of
-    (x - H x)^2 / variance, which shows whether a wrong restoration would be detected. Both are NaN
-    where too few pixels count.
+    The first is chi2, the mean of (raw - H x)^2 / variance of the noise, in which the means of
+    small cells count less. The second is the mean of (x - H x)^2 / variance, which shows whether a
+    wrong restoration would be detected. Both are NaN where too few pixels count.
     """
     facts = S["self_check"]
     kernel = np.array(facts["rows"], F).T @ np.array(facts["columns"], F)
@@ -248,16 +248,22 @@ def judged(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
     counts = brightest_around((raw >= 1).astype(F), CLOSE) == 0
     inside = np.zeros_like(counts)
     inside[CLOSE:-CLOSE, CLOSE:-CLOSE] = counts[CLOSE:-CLOSE, CLOSE:-CLOSE]
-    starts = [np.arange(0, side, CHECK) for side in x.shape]
-
-    def sums(values: np.ndarray) -> np.ndarray:
-        """Add up the values of the pixels that count, block by block."""
-        by_rows = np.add.reduceat(np.where(inside, values, 0), starts[0], 0, dtype=float)
-        return np.asarray(np.add.reduceat(by_rows, starts[1], 1))
-
-    pixels = sums(np.ones_like(x))
+    residual = inside * (raw - blurred) / np.sqrt(variance)
+    cell = facts["cell"]
+    cells = sums(residual, cell) ** 2 / np.maximum(sums(inside, cell), 1)
+    smooth = sums(cells, CHECK // cell)
+    squares = sums(residual**2, CHECK) - (1 - facts["smooth_weight"]) * smooth
+    change = sums(inside * (x - blurred) ** 2 / variance, CHECK)
+    pixels = sums(inside, CHECK)
     enough = np.where(pixels < CHECK**2 // 4, np.nan, pixels)
-    return np.stack([sums((y - blurred) ** 2 / variance) / enough for y in (raw, x)])
+    return np.stack([squares, change]) / enough
+
+
+def sums(values: np.ndarray, side: int) -> np.ndarray:
+    """Return the sums over squares of `side` values a side of (H, W)."""
+    down, across = (np.arange(0, length, side) for length in values.shape)
+    by_rows = np.add.reduceat(values, down, 0, dtype=float)
+    return np.asarray(np.add.reduceat(by_rows, across, 1))
 
 
 def report(blocks: np.ndarray) -> str:

@@ -6,7 +6,13 @@ from collections.abc import Mapping
 
 from beers_deploy.model.consistency import Consistency
 from beers_deploy.model.exposure import HEADROOM
-from beers_deploy.model.self_check import LEAST_SHARPENING, MOST_CHI2, SelfCheck
+from beers_deploy.model.self_check import (
+    CELL_PX,
+    LEAST_SHARPENING,
+    MOST_CHI2,
+    SMOOTH_WEIGHT,
+    SelfCheck,
+)
 from beers_deploy.network import Network
 from beers_deploy.profiles.errors import OptionError
 from beers_deploy.profiles.sensor import Sensor
@@ -123,6 +129,8 @@ def self_check_facts(sensor: Sensor) -> Facts:
         "rows": check.rows.tolist(),
         "columns": check.columns.tolist(),
         "variances": list(check.variances),
+        "cell": CELL_PX,
+        "smooth_weight": SMOOTH_WEIGHT,
         "most_chi2": MOST_CHI2,
         "least_sharpening": LEAST_SHARPENING,
     }

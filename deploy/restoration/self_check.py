@@ -93,10 +93,11 @@ class BlockMap:
         if self.outside <= MANY_OUTSIDE * self.decidable:
             return ""
         return (
-            f"fails the self-check: {self.outside} of {self.decidable} blocks contradict the raw "
-            "image, because they differ from it, blurred as the sensor blurs, by more than "
-            f"{MOST_CHI2:g} times the noise. Check that the network was made for this sensor, that "
-            "its file is intact, and that `sensor` is the one that acquired the image."
+            f"fails the self-check: {self.outside} of {self.decidable} decidable blocks contradict "
+            "the raw image, because they differ from it, blurred as the sensor blurs, by more than "
+            f"{MOST_CHI2:g} times the noise. Check that `sensor` acquired the image, that it was "
+            "not restored or resampled before, that the network was made for this sensor, and that "
+            "its file is intact."
         )
 
     def require(self, name: str) -> None:

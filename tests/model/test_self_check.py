@@ -21,6 +21,7 @@ from beers_deploy.model.self_check import (
     LEAST_SHARPENING,
     NEAR_PX,
     REACH_PX,
+    SMOOTH_WEIGHT,
     Judged,
     SelfCheck,
 )
@@ -120,6 +121,24 @@ def test_what_is_no_restoration_of_the_image_is_found(name: str) -> None:
     textured = judged(check, raw, scene()).sharpening >= LEAST_SHARPENING
     assert textured.any()
     assert result.outside[textured].all()
+
+
+def test_a_smooth_error_counts_a_tenth_of_a_fine_one() -> None:
+    """An offset of a deviation passes and one of four is found; a fine error of one is found."""
+    sensor = plain_sensor()
+    image = blurred(scene(), sensor)
+    raw = noisy(image, sensor)
+    sigma = np.vectorize(lambda signal: sigma_dn(sensor, signal))(np.round(image, -1))
+    check = SelfCheck.of(sensor, REFERENCE)
+    right = judged(check, raw, scene()).chi2
+    known = np.isfinite(right)
+    assert known.any()
+    fine = np.where(np.add.outer(*map(np.arange, raw.shape)) % 2, sigma, -sigma)
+    for error, weight in ((sigma, SMOOTH_WEIGHT), (4 * sigma, SMOOTH_WEIGHT), (fine, 1.0)):
+        result = judged(check, raw + error, scene())
+        expected = weight * np.square(error / sigma).mean()
+        assert_allclose(result.chi2[known] - right[known], expected, rtol=0.1, atol=0.06)
+        assert result.outside[known].all() == (expected > 0.5)
 
 
 def test_a_broken_block_is_found_where_it_is() -> None:

@@ -88,7 +88,7 @@ def test_a_network_for_another_sensor_is_found(
         row = run(image, out, network=other_network)
     assert (row.figures["self-check outside"].value or 0) > 50
     assert "the result fails the self-check" in caplog.text
-    assert "`sensor` is the one" in caplog.text
+    assert "`sensor` acquired the image" in caplog.text
     strict = tmp_path / "strict.tif"
     with pytest.raises(ImageError, match=r"of .* fails the self-check: .* contradict the raw"):
         run(image, strict, network=other_network, strict=True, self_check=tmp_path / "map.tif")
