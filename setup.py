@@ -2,6 +2,7 @@
 inside it.
 """
 
+from os import umask
 from shutil import rmtree
 
 from setuptools import find_namespace_packages, setup
@@ -32,6 +33,7 @@ class FreshBuild(build_py):
         super().run()
 
 
+umask(0o022)  # the modes of the files in a wheel are part of its bytes
 setup(
     cmdclass={"build_py": FreshBuild},
     packages=[installed(name) for name in folders],
