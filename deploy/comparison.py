@@ -13,11 +13,13 @@ from beers_deploy.model.progress import Progress, reporting
 from beers_deploy.model.raster.images import list_images
 from beers_deploy.model.shipped import INT8, SENSOR, VARIANT, shipped_weights
 from beers_deploy.network import Network, NetworkLike
-from beers_deploy.profiles.errors import OptionError, printable
+from beers_deploy.profiles.errors import ImageError, OptionError, printable
 from beers_deploy.profiles.sensor import Sensor, SensorLike
 from beers_deploy.profiles.sensor_numbers import numbers_of
+from beers_deploy.quant.encodings import CORE
 from beers_deploy.quant.gate import METRICS, GateResult, gate_row
 from beers_deploy.quant.gate import compare as differences_of
+from beers_deploy.quant.input_range import UNIT, Ranges
 from beers_deploy.quant.onnx_file import faults_named, metadata, require_quantized
 from beers_deploy.quant.samples.coverage import recorded_range, uncovered
 from beers_deploy.quant.samples.own import (
@@ -35,6 +37,10 @@ if TYPE_CHECKING:
     from beers_deploy.quant.samples.simulated import Calibration
 
 HEADINGS = {"gate": "float against INT8", "samples": "what the samples cover"}
+MOST_BEYOND = 2.0
+"""Samples may reach this many times as far as the INT8 network reads: it clips a little overshoot,
+but digital numbers in place of shares of full scale would look like a bad quantisation.
+"""
 IN_MEMORY = "in memory"
 """The name of samples that are not in a file, in arguments and inputs."""
 
@@ -74,7 +80,10 @@ class Data:
             with faults_named(int8.label):
                 ranges = int8.stated_ranges or ranges
         with faults_named(network.label):
-            return samples_of(network.model, self.samples, ranges)
+            own = samples_of(network.model, self.samples, ranges)
+        if own is not None and int8 is not None:
+            require_in_range(own.ranges, int8)
+        return own
 
     @property
     def _has_pictures(self) -> bool:
@@ -117,6 +126,29 @@ class Data:
             path = Path(self.samples)
             inputs.append(_files_input("samples", path, sample_files(path)))
         return inputs
+
+
+def require_in_range(ranges: Ranges, int8: Network) -> None:
+    """Raise ImageError if samples are far outside the range that an INT8 network of ours reads.
+
+    Args:
+        ranges: of the samples' channels; empty if all are in [0, 1].
+        int8: the INT8 network.
+
+    Raises:
+        ImageError: a channel reaches more than MOST_BEYOND times as far as the network reads.
+    """
+    if CORE not in metadata(int8.model):
+        return
+    reads = int8.input_ranges or (UNIT,) * len(ranges)
+    for (low, high), (least, most) in zip(ranges, reads, strict=False):
+        reach = max(-low, high)
+        limit = max(-least, most)
+        if reach > MOST_BEYOND * limit:
+            raise ImageError(
+                f"The samples reach {reach:g}, but {int8.label} reads values up to {limit:g}. Give "
+                "samples in the units of the network, or quantise it with their `input_range`."
+            )
 
 
 def sensor_input(sensor: Sensor) -> Input:

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 import beers_deploy as bd
-from beers_deploy.profiles.errors import ModelError
+from beers_deploy.profiles.errors import ImageError, ModelError
 from beers_deploy.quant.encodings import read_core
 from tests.deploy.command_line import done, refused
 from tests.quant.quick import one_guess
@@ -73,6 +73,8 @@ def test_a_map_of_noise_levels_is_a_channel_of_its_own_range(
         (note,) = notes
         assert "found in the samples" in note or option
     verdict = bd.gate(floating, int8, samples=given, max_mae=0.02, progress=False)
+    with pytest.raises(ImageError, match=r"samples reach .* but .* reads values up to"):
+        bd.gate(floating, int8, samples=255 * given, max_mae=0.02, progress=False)
     assert verdict
     assert bd.check(int8, tile=64)
     assert bd.bench(int8, tile=64, traditional=False)
