@@ -44,7 +44,10 @@ INSTEAD = {
         "reciprocal"
     ),
     "Exp": "leave it to the host, behind the network",
-    "Sigmoid": "use HardSigmoid, or let 'quantize --adapt' put it there",
+    "Sigmoid": (
+        "use HardSigmoid, and HardSwish in place of SiLU, which is x * Sigmoid(x); 'quantize "
+        "--adapt' replaces both"
+    ),
     "Tanh": "use HardSigmoid, scaled by the weights behind it",
     "Log": "leave it to the host, in front of the network",
     "Sqrt": "leave it to the host, in front of the network",
