@@ -15,7 +15,7 @@ folders = find_namespace_packages(
 
 
 def installed(name: str) -> str:
-    """What a folder's package is called where it is installed."""
+    """Return the name of a folder's package where it is installed."""
     return (
         name.replace("deploy", "beers_deploy", 1)
         if name.startswith("deploy")

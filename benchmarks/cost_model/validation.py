@@ -216,7 +216,7 @@ def family_mean(sizes: Array, families: NDArray[np.str_]) -> float:
 
 
 def family_quantile(errors: Array, families: NDArray[np.str_]) -> float:
-    """The size of error that SHARE of all families keep to with every one of
+    """Return the size of error that SHARE of all families keep to with every one of
     theirs, at CONFIDENCE.
     """
     largest = sorted(np.abs(errors)[families == name].max() for name in set(families))
@@ -234,8 +234,8 @@ def tolerance_rank(count: int) -> int:
 
 
 def pair_width(board: str) -> float:
-    """What ln of the ratio of two published rates was off by, at most, in SHARE of pairs of one
-    family.
+    """Return the largest error of the logarithm of the ratio of two published rates, in SHARE of
+    pairs of one family.
 
     Each network predicted without itself; only rates that the DPU bounds.
     """
@@ -260,7 +260,7 @@ def pair_width(board: str) -> float:
 
 
 def outside_width(cases: Cases, share: float = 0.25) -> float:
-    """The error of the networks with the largest maps, predicted from the others.
+    """Return the error of the networks with the largest maps, predicted from the others.
 
     The largest: above `share` of the largest map of a network that the DPU bounds. Only such are
     predicted.

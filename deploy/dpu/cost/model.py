@@ -89,7 +89,7 @@ class Structure:
 
     @classmethod
     def of(cls, dpu: Dpu) -> Self:
-        """That of a target profile."""
+        """Read the constants of a target profile."""
         return cls(*(dpu.value("cost", field.name) for field in fields(cls)))
 
 
@@ -110,7 +110,7 @@ class Layers:
 
     @classmethod
     def of(cls, works: Sequence[Work], dpu: Dpu) -> Self:
-        """The layers of one network."""
+        """Collect the layers of one network."""
         array = dpu.engine_ops_per_s
         lanes = dpu.lane_steps_per_s
         clock_hz = dpu.value("array", "pl_clock_hz")
