@@ -147,7 +147,7 @@ def require_in_range(ranges: Ranges, int8: Network) -> None:
         if reach > MOST_BEYOND * limit:
             raise ImageError(
                 f"The samples reach {reach:g}, but {int8.label} reads values up to {limit:g}. Give "
-                "samples in the units of the network, or quantise it with their `input_range`."
+                "samples in the units of the network, or quantise it again on samples like these."
             )
 
 
