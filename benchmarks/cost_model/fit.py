@@ -15,15 +15,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from beers_deploy.dpu.cost.model import (
-    NAMES,
-    Array,
-    Constants,
-    Layers,
-    Structure,
-    host_parts_s,
-    shares_of,
-)
+from beers_deploy.dpu.cost.host import host_parts_s
+from beers_deploy.dpu.cost.model import NAMES, Array, Constants, Layers, Structure, shares_of
 from benchmarks.cost_model.published import Case
 
 START = Constants(0.8, 40, 0.55, 6e-6, 5e-5, 0.4e9, 0.8e9, 0.3e9, 30e6, 60e6, 1.3e9)

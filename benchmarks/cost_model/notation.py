@@ -53,7 +53,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
-from beers_deploy.dpu.cost.model import Task
+from beers_deploy.dpu.cost.host import Task
 from benchmarks.cost_model.builder import Builder, Tensor, Written
 
 STEPS: Mapping[str, Callable[..., Tensor]] = {

@@ -31,7 +31,8 @@ from functools import cache
 from pathlib import Path
 
 from beers_deploy.dpu.board import Dpu, load_dpu
-from beers_deploy.dpu.cost.model import Array, Layers, host_work
+from beers_deploy.dpu.cost.host import host_work
+from beers_deploy.dpu.cost.model import Array, Layers
 from beers_deploy.dpu.cost.work import count_work, largest_map_bytes
 from benchmarks.cost_model.builder import Written
 from benchmarks.cost_model.notation import read_library

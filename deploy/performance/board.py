@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from beers_deploy.dpu.board import ALL, Dpu, dpu_of
+from beers_deploy.dpu.cost.host import Task
 from beers_deploy.dpu.cost.latency import Prediction
-from beers_deploy.dpu.cost.model import Task
 from beers_deploy.dpu.cost.own_runs import read_own_runs
 from beers_deploy.dpu.reading import own_tile_px
 from beers_deploy.model.exposure import factors_for

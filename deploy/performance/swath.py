@@ -9,8 +9,9 @@ from operator import mul
 
 from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.cost.host import Task
 from beers_deploy.dpu.cost.latency import Prediction, dpu_power, predict
-from beers_deploy.dpu.cost.model import Interval, Task, between
+from beers_deploy.dpu.cost.model import Interval, between
 from beers_deploy.dpu.reading import network_of
 from beers_deploy.model.raster.facts import SIDE_PX
 from beers_deploy.network import Network, NetworkLike

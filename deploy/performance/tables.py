@@ -11,12 +11,13 @@ from dataclasses import replace
 from itertools import product
 
 from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.cost.host import Task
 from beers_deploy.dpu.cost.latency import (
     LayerCost,
     Prediction,
     dpu_power,
 )
-from beers_deploy.dpu.cost.model import Task, between
+from beers_deploy.dpu.cost.model import between
 from beers_deploy.network import NetworkLike
 from beers_deploy.performance.swath import (
     Swath,

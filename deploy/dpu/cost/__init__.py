@@ -1,8 +1,8 @@
 """How long a network takes on a DPU, and at what power.
 
 - `work`: what each layer computes and moves, counted from shapes;
-- `model`: the constants of a target's [cost], and the times of layers, host and processor that
-  follow;
+- `model`: the constants of a target's [cost], and the times of layers that follow;
+- `host`: the work of the host, and the time of the processor for what no rate is published for;
 - `latency`: the prediction with its interval, power;
 - `own_runs`: the runs of a user's own board, by which `kinship` corrects predictions.
 

@@ -1,8 +1,8 @@
 """How long a network takes on the DPU, layer by layer, how far off that may be, and at what power.
 
-Counts come from `work`, the formula from `model`, constants and widths from the target's [cost],
-where `benchmarks/cost_model` writes what it finds on published networks. None of them is ConvBEERS:
-the paper's own figure is what the model is compared with, never what it is made from.
+Counts come from `work` and `host`, the formula from `model`, constants and widths from the target's
+[cost], where `benchmarks/cost_model` writes what it finds on published networks. None of them is
+ConvBEERS: the paper's own figure is what the model is compared with, never what it is made from.
 
 The interval is FPS e^-width to FPS e^width, so wide that nine of ten families of networks, each
 left out of the fit once, lie inside. Each part of an image's time has a width of its own, and the
@@ -20,6 +20,14 @@ import numpy as np
 
 from beers_deploy.dpu.board import Dpu, Levels
 from beers_deploy.dpu.checker.placement import Placement
+from beers_deploy.dpu.cost.host import (
+    Task,
+    consistency_interval_s,
+    host_parts_s,
+    placed_work,
+    refused_interval_s,
+    task_of,
+)
 from beers_deploy.dpu.cost.kinship import correction, levels_of
 from beers_deploy.dpu.cost.model import (
     PARTS,
@@ -27,15 +35,9 @@ from beers_deploy.dpu.cost.model import (
     Interval,
     Layers,
     Structure,
-    Task,
     between,
-    consistency_interval_s,
     frame_rate,
-    host_parts_s,
-    placed_work,
-    refused_interval_s,
     shares_of,
-    task_of,
 )
 from beers_deploy.dpu.cost.work import Work, count_work, largest_map_bytes
 from beers_deploy.dpu.graph import Operation

@@ -6,8 +6,9 @@ import pytest
 
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.cost.host import placed_work
 from beers_deploy.dpu.cost.latency import WIDTHS
-from beers_deploy.dpu.cost.model import PARTS, frame_rate, placed_work, shares_of
+from beers_deploy.dpu.cost.model import PARTS, frame_rate, shares_of
 from beers_deploy.dpu.cost.work import BURST_BYTES, Work, count_work
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.performance.swath import predict_network

@@ -7,8 +7,9 @@ import pytest
 
 from beers_deploy.dpu.board import load_dpu
 from beers_deploy.dpu.checker.placement import place
+from beers_deploy.dpu.cost.host import refused_interval_s
 from beers_deploy.dpu.cost.latency import Prediction
-from beers_deploy.dpu.cost.model import between, refused_interval_s
+from beers_deploy.dpu.cost.model import between
 from beers_deploy.dpu.reading import read_network
 from beers_deploy.performance.swath import predict_network
 from beers_deploy.performance.tables import host_words

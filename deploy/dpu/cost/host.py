@@ -1,0 +1,205 @@
+"""Count the work of the host for one image, and estimate the time of what no rate is published for.
+
+The host copies the image in and the results out, and then has a task, such as finding the best of
+classes. The rates of these are fitted constants (`model`). The time of nodes that the DPU refuses
+and of the consistency step follows from the processor's published rates as an interval.
+"""
+
+import math
+from collections.abc import Sequence
+from itertools import chain
+from typing import Literal, get_args
+
+import numpy as np
+
+from beers_deploy.dpu.board import Dpu
+from beers_deploy.dpu.checker.placement import Placement
+from beers_deploy.dpu.cost.model import Array, Constants, Interval
+from beers_deploy.dpu.graph import Operation
+from beers_deploy.model.consistency import PRODUCTS_PER_PX
+
+Task = Literal["copy", "argmax", "softmax", "sort", "image"]
+"""What the host does with the results: reads them and no more (copy); finds the best of classes
+(argmax, softmax); ranks boxes or key points (sort); makes pixels of them (image).
+"""
+TASKS = get_args(Task)
+
+OPERATORS: dict[str, Task] = {
+    "ArgMax": "argmax",
+    "Softmax": "softmax",
+    "NonMaxSuppression": "sort",
+    "TopK": "sort",
+}
+"""What tells the task in a file."""
+
+BANDS = 4
+"""Most that an image has: red, green, blue and transparency or infrared."""
+
+
+def host_work(bytes_in: float, bytes_out: float, values: float, task: Task) -> Array:
+    """Return the amounts of work of the host for one image, (7,).
+
+    Args:
+        bytes_in: bytes of the DPU's inputs.
+        bytes_out: bytes of the DPU's results. They are not copied for the task "image", which
+            converts them to pixels anyway.
+        values: number of result values that the task reads.
+        task: what the host does with the results.
+
+    Returns:
+        1 for the image, bytes copied in, bytes copied out, then the values of each task except
+        "copy": 0 for all but `task`.
+    """
+    copied_bytes = 0.0 if task == "image" else bytes_out
+    return np.array([1.0, bytes_in, copied_bytes, *(values * (task == name) for name in TASKS[1:])])
+
+
+COPIES = 3
+"""Units of `host_work` that are copies: the image, its bytes in and its bytes out."""
+
+
+def host_parts_s(units: Array, constants: Constants) -> Array:
+    """Return the time of the host's copies and of its task on one core, (n, 2).
+
+    Args:
+        units: amounts of work as `host_work` returns them, (n, 7).
+        constants: of the board.
+    """
+    times = units * constants.host_s_per_unit
+    return np.stack([times[:, :COPIES].sum(axis=1), times[:, COPIES:].sum(axis=1)], axis=1)
+
+
+def placed_work(placement: Placement, task: Task) -> Array:
+    """Return the amounts of work of the host for a placed network, (7,), in the order of
+    `host_work`.
+
+    The task reads every value of the results. A task "sort" on the maps of YOLO reads only one
+    score for each box.
+
+    Args:
+        placement: the operations of the network on DPU and host.
+        task: what the host does with the results.
+    """
+    onto, back = _crossing_bytes(placement)
+    return host_work(onto, back, back * (_scores(placement) if task == "sort" else 1), task)
+
+
+BOXES = 3
+LEAST = 6
+"""Boxes that a pixel of YOLO's maps has in versions 2 to 7, and the least numbers of a box: its
+place and size, a score, and a class.
+"""
+
+
+def _scores(placement: Placement) -> float:
+    """Return the share of the results that a sort reads.
+
+    The host skips a box whose score is low. A file with maps of one number of channels, a multiple
+    of BOXES, is taken as YOLO's; of others, which have classes apart from places, all is read.
+    """
+    back = {cut.tensor for cut in placement.cuts if not cut.onto_dpu}
+    channels = {
+        node.op.out_shape[0]
+        for node in placement.nodes
+        if node.op.out_shape is not None and not back.isdisjoint(node.op.outputs)
+    }
+    # Of maps with different numbers of channels all is read, as of one whose number is 1.
+    count = channels.pop() if len(channels) == 1 else 1
+    return BOXES / count if count % BOXES == 0 and count >= LEAST * BOXES else 1.0
+
+
+def task_of(placement: Placement) -> Task:
+    """Return the task of the host, derived from the operators behind the DPU.
+
+    Without such an operator, a single result with few bands that is not smaller than the input is
+    taken for an image.
+    """
+    for node in placement.nodes:
+        if node.part == "host-back" and node.op.op_type in OPERATORS:
+            return OPERATORS[node.op.op_type]
+    onto, back = _crossing_bytes(placement)
+    return "image" if back >= onto and _gives_an_image(placement) else "copy"
+
+
+def _crossing_bytes(placement: Placement) -> tuple[int, int]:
+    """Return the bytes of one image that the host sends to the DPU, and those that it receives."""
+    onto = sum(cut.size_bytes or 0 for cut in placement.cuts if cut.onto_dpu)
+    return onto, sum(cut.size_bytes or 0 for cut in placement.cuts if not cut.onto_dpu)
+
+
+def _gives_an_image(placement: Placement) -> bool:
+    read_names = set(chain.from_iterable(node.op.inputs for node in placement.nodes))
+    shapes = [
+        node.op.out_shape for node in placement.nodes if read_names.isdisjoint(node.op.outputs)
+    ]
+    return len(shapes) == 1 and shapes[0] is not None and shapes[0][0] <= BANDS
+
+
+FLOAT_BYTES = 4
+"""The vendor's operators on the CPU work on float32 (Vitis-AI 3.0, xcompiler: fix2float in front of
+them).
+"""
+INSTRUCTIONS = 20.0
+"""Of plain code for a value of a result: four loads, their weights, their sum and its address
+(assumed).
+"""
+PRODUCT_INSTRUCTIONS = 2.0
+"""Of plain code for an operation: two loads, a product with its sum and a step of the loop count as
+two (assumed).
+"""
+
+
+def refused_interval_s(operations: Sequence[Operation], dpu: Dpu) -> Interval:
+    """Return the shortest and the longest time in s that the host needs for the operations that the
+    DPU refuses.
+
+    It is the time of all cores for one image. It is not fitted, because published rates do not
+    separate such work. The shortest time follows from the processor's published rates: products as
+    in an optimised library, and each number moved once. The longest time is that of plain code,
+    number by number.
+
+    Args:
+        operations: those that the DPU refuses.
+        dpu: the configuration, whose board states the processor.
+    """
+    if not operations:
+        return 0.0, 0.0
+    times = []
+    for op in operations:
+        values = op.out_bytes + sum(math.prod(shape) for shape in op.in_shapes if shape is not None)
+        moved_values = values + op.weight_bytes
+        times.append(_plain_work_s(op.operations, moved_values, op.out_bytes, dpu))
+    low_s, high_s = (
+        math.fsum(ends) / dpu.whole("cpu", "cores") for ends in zip(*times, strict=True)
+    )
+    return low_s, high_s
+
+
+def _plain_work_s(operations: float, moved_values: float, results: float, dpu: Dpu) -> Interval:
+    """Return the shortest and the longest time of one core for float32 work: by a good library, and
+    by plain code.
+    """
+    keys = ("clock_ghz", "product_flops_per_cycle", "moved_bytes_per_s", "decoding_mips_per_ghz")
+    clock, products, bandwidth, decoding = (dpu.limit("cpu", key) for key in keys)
+    moved_bytes = FLOAT_BYTES * moved_values
+    # A good library is bound by its products or by the memory; plain code pays for both.
+    least_s = max(operations / (1e9 * clock.high * products.high), moved_bytes / bandwidth.high)
+    instructions = INSTRUCTIONS * results + PRODUCT_INSTRUCTIONS * operations
+    most_s = instructions / (1e6 * decoding.low * clock.low) + moved_bytes / bandwidth.low
+    return least_s, most_s
+
+
+def consistency_interval_s(pixels: float, dpu: Dpu) -> Interval:
+    """Return the shortest and the longest time in s that the host needs for the consistency step.
+
+    It is the time of all cores and is not fitted. The raw and the restored image are read and the
+    result is written; all other numbers stay in the caches.
+
+    Args:
+        pixels: number of pixels that the step is computed for.
+        dpu: the configuration, whose board states the processor.
+    """
+    # A product with its sum counts as two operations.
+    low_s, high_s = _plain_work_s(2 * PRODUCTS_PER_PX * pixels, 3 * pixels, pixels, dpu)
+    cores = dpu.whole("cpu", "cores")
+    return low_s / cores, high_s / cores
