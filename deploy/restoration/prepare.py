@@ -74,7 +74,6 @@ class Restoration(ABC):
             The number and kind of machines is not part of it.
         how: the runtime and machines, for the figures of time.
         text: the run in words.
-        steady_ticks: the number of ticks after which memory is checked again; 0 if it is not.
     """
 
     source: Source
@@ -89,7 +88,6 @@ class Restoration(ABC):
     identity: Mapping[str, object]
     how: str
     text: Mapping[str, str]
-    steady_ticks: int = 0
 
     @abstractmethod
     def ticks(self, done_px: int) -> int:
@@ -107,12 +105,14 @@ class Restoration(ABC):
             The next restored rows of all bands.
         """
 
-    def memory_bytes(self) -> int:
-        """Return the peak memory of the process, once it no longer grows by itself.
+    @abstractmethod
+    def watch_memory(self, done: int, total: int) -> None:
+        """Check the memory again, if this tick is the one after which its use is steady.
 
-        It is called only if `steady_ticks` is not 0. A class that sets one defines the other.
+        Args:
+            done: number of ticks of this run so far.
+            total: number of all its ticks.
         """
-        raise NotImplementedError
 
     @abstractmethod
     def figures(self, tally: Tally) -> dict[str, Figure]:
@@ -168,10 +168,16 @@ class NetworkRestoration(Restoration):
         rows = self._rows_left(done_px)
         return restore_rows(self.source, self.restorer, rows, lambda: tick(1), self.at_once)
 
-    def memory_bytes(self) -> int:
-        """Return the peak memory: what the process uses now, plus the rows to come."""
+    def watch_memory(self, done: int, total: int) -> None:
+        """Check after the first tiles that the memory in use and the rows to come fit."""
+        if done != min(RUNS_UNTIL_STEADY * self.at_once, total):
+            return
         needed = rows_bytes(self.source, self.plan, begun=True)
-        return check_memory(needed, self.reading.memory_bytes)
+        most = check_memory(needed, self.reading.memory_bytes)
+        logger.info(
+            "memory: about %.2f GB (measured after the first tiles, and the rows to come)",
+            most / 1e9,
+        )
 
     def figures(self, tally: Tally) -> dict[str, Figure]:
         """Return the figures of a run."""
@@ -251,7 +257,6 @@ class NetworkPipeline:
             identity=identity,
             how=runtime,
             text=text,
-            steady_ticks=RUNS_UNTIL_STEADY * at_once,
             plan=plan,
             restorer=restorer,
             at_once=at_once,

@@ -258,17 +258,11 @@ def require_unchanged(
 def _finish_rows(checkpoint: Checkpoint, work: Restoration) -> None:
     """Restore the rows that a checkpoint lacks, and store each while the next is computed."""
     total = work.ticks(checkpoint.rows)
-    steady = min(work.steady_ticks, total)
     with steps("restoring", total) as bar, held_back() as interrupt:
 
         def tick(count: int) -> None:
             bar.advance(count)
-            if bar.done == steady:
-                most = work.memory_bytes()
-                logger.info(
-                    "memory: about %.2f GB (measured after the first tiles, and the rows to come)",
-                    most / 1e9,
-                )
+            work.watch_memory(bar.done, total)
             if interrupt.asked:
                 raise KeyboardInterrupt
 

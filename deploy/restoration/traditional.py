@@ -75,6 +75,9 @@ class TraditionalRestoration(Restoration):
             yield self._stored(torch.stack(bands).numpy(), top)
             top += rows_px
 
+    def watch_memory(self, done: int, total: int) -> None:
+        """Check nothing: `prepare` knows the memory of a strip before the first one."""
+
     def figures(self, tally: Tally) -> dict[str, Figure]:
         """Return the figures of a run from its tally."""
         return dict(tally.figures)
