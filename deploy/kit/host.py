@@ -95,17 +95,9 @@ def dual_range(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
 
 
 def offset_windows(coarse: np.ndarray, *windows: np.ndarray) -> np.ndarray:
-    """Merge a coarse copy of a result with finer copies of overlapping ranges.
+    """Merge a coarse copy (1, C, h, w) of a result with fine ones of values around their offsets.
 
-    A window is a fine copy that represents values around its offset. The last window in which a
-    value is not clipped is used, and the coarse copy if it is clipped in all.
-
-    Args:
-        coarse: (1, C, h, w) as the core returns it.
-        windows: fine copies of the same shape, in the order of their offsets.
-
-    Returns:
-        The merged result, (1, C, h, w).
+    A value is taken from the last window that does not clip it, or else from the coarse copy.
     """
     value = coarse * F(S["gain"])
     for window, offset in zip(windows, S["offsets"]):  # noqa: B905 - a board's Python may be old
@@ -255,8 +247,8 @@ def judged(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
     squares = sums(residual**2, CHECK) - (1 - facts["smooth_weight"]) * smooth
     change = sums(inside * (x - blurred) ** 2 / variance, CHECK)
     pixels = sums(inside, CHECK)
-    enough = np.where(pixels < CHECK**2 // 4, np.nan, pixels)
-    return np.stack([squares, change]) / enough
+    pixels[pixels < CHECK**2 // 4] = np.nan
+    return np.asarray(np.stack([squares, change]) / pixels)
 
 
 def sums(values: np.ndarray, side: int) -> np.ndarray:
@@ -267,9 +259,7 @@ def sums(values: np.ndarray, side: int) -> np.ndarray:
 
 
 def report(blocks: np.ndarray) -> str:
-    """Return a sentence with the number of blocks (bands, 2, n, m) that contradict the raw
-    image.
-    """
+    """Return a sentence on the blocks (bands, 2, n, m) that contradict the raw image."""
     facts = S["self_check"]
     chi2 = blocks[:, 0]
     sharpening = blocks[:, 1]
@@ -282,9 +272,7 @@ def report(blocks: np.ndarray) -> str:
 
 
 def extended(x: np.ndarray, margin: int) -> np.ndarray:
-    """Mirror an image (H, W) beyond its borders: to whole blocks, and `margin` pixels more on every
-    side.
-    """
+    """Mirror an image (H, W) to whole blocks, and by `margin` pixels more on every side."""
     for axis, size in enumerate(x.shape):
         places = np.arange(-margin, -(-size // BLOCK) * BLOCK + margin) % (2 * size)
         x = x.take(np.minimum(places, 2 * size - 1 - places), axis)
@@ -312,9 +300,7 @@ def block_means(x: np.ndarray) -> np.ndarray:
 
 
 def around(means: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """Compute the far part of H x: the sum of the block means around each
-    block, weighted by `far`.
-    """
+    """Compute the far part of H x: the means around each block, weighted by `far`."""
     height, width = (size - len(far) + 1 for size in means.shape)
     total = np.zeros((height, width), F)
     for y, weights in enumerate(far):
@@ -331,9 +317,8 @@ def interpolated(blocks: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """
     for size in shape:
         place = np.arange(size) - BLOCK // 2
-        left_out = 2 if len(blocks) > 4 else 0
-        low = left_out
-        high = len(blocks) - 1 - left_out
+        low = 2 if len(blocks) > 4 else 0
+        high = len(blocks) - 1 - low
         left, right = (np.clip(place // BLOCK + k, low, high) for k in (0, 1))
         share = (((2 * place + 1) % (2 * BLOCK)).astype(F) / F(2 * BLOCK))[:, None]
         blocks = (blocks[left] * (F(1) - share) + blocks[right] * share).T
@@ -396,9 +381,7 @@ def main(source: str, target: str, runs: dict[int, Any]) -> None:
 
 
 def cores() -> dict[int, Any]:
-    """Open the core of each factor in onnxruntime. On a board, replace this by the board's own
-    runners.
-    """
+    """Open the core of each factor in onnxruntime; a board has runners of its own instead."""
     import onnxruntime as ort
 
     # onnxruntime's fused kernels may saturate.
