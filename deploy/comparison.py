@@ -138,10 +138,10 @@ def require_in_range(ranges: Ranges, int8: Network) -> None:
     Raises:
         ImageError: a channel reaches more than MOST_BEYOND times as far as the network reads.
     """
-    if CORE not in metadata(int8.model):
+    if not ranges or CORE not in metadata(int8.model):
         return
     reads = int8.input_ranges or (UNIT,) * len(ranges)
-    for (low, high), (least, most) in zip(ranges, reads, strict=False):
+    for (low, high), (least, most) in zip(ranges, reads, strict=True):
         reach = max(-low, high)
         limit = max(-least, most)
         if reach > MOST_BEYOND * limit:

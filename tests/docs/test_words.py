@@ -9,10 +9,13 @@ SOURCE = ("profiles", "model", "quant", "deploy")
 PARTICIPLES = {"found", "held", "kept", "looked", "lost", "made", "said", "seen", "told", "wanted"}
 """They leave out what was found or kept: a reader must look for the noun."""
 REPLACED = {
+    "Chain": "TraditionalPipeline",
     "Ends": "HostPart",
+    "PEERS": "BASELINES",
     "Told": "Condition",
     "Veil": "mask",
     "characterise": "characterize",
+    "crowding": "contention_exponent",
     "equivalents": "simplify",
     "fit_weights": "adaptive_rounding",
     "host_state": "load of other programs",

@@ -99,9 +99,9 @@ def make_target(subject: Subject, source: Calibration) -> FaultTarget:
 
     Args:
         subject: the subject of the study, with an INT8 network.
-        source: where calibration patches come from. The guards are learnt
-            from them. Flips are tried on patches of another seed, so that the guards are not
-            evaluated on their training data.
+        source: where calibration patches come from. The guards are learnt from them. Flips are
+            tried on patches of another seed, so that the guards are not evaluated on their training
+            data.
     """
     core = faults.as_stored(subject.core)
     calibration = replace(source, patches=CALIBRATION_PATCHES)
