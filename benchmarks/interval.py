@@ -16,7 +16,7 @@ import argparse
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -228,7 +228,7 @@ def judgements(
     """Judge a network on all images of some folders, each acquired by a draw of a profile."""
     interval = interval_of(Network.load(name, sensor=LIKE))
     results = []
-    for number, path in enumerate(p for paths in by_site(folders).values() for p in paths):
+    for number, path in enumerate(chain.from_iterable(by_site(folders).values())):
         image = acquired(path, sensor.draw, (number,), radiance=radiance)
         if image is not None and (image.raw < image.sensor.max_dn).any():
             results.append(judgement(name, image, interval))

@@ -9,6 +9,7 @@ import os
 import platform
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -151,7 +152,7 @@ class Table:
             print_rows(heading if heading != self.title else "", rows, console)
             if heading in self.captions:
                 console.print(plain(self.captions[heading]), highlight=False, soft_wrap=True)
-        if any(row.figures for rows in tables.values() for row in rows):
+        if any(row.figures for row in chain.from_iterable(tables.values())):
             console.print(LEGEND, style="dim", highlight=False, markup=False)
         for sentence in self.sentences:
             # Whoever searches a log finds a sentence on one line.

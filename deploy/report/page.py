@@ -111,7 +111,9 @@ def _grid(table: Section, *, upright: bool) -> dict[str, object]:
     heads = [_head(row.name) for row in rows]
     if not upright and len(columns) > max(WIDE, len(rows)):
         # Columns that do not fit on a page are turned into rows, because a page is open downwards.
-        columns, heads = heads, columns
+        upright_columns = columns
+        columns = heads
+        heads = upright_columns
         cells = [list(line) for line in zip(*cells, strict=True)]
     return {
         "title": table.title,

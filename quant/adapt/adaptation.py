@@ -9,6 +9,7 @@
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 import onnx
@@ -153,7 +154,8 @@ def _trial(
     if not approximated:
         return Trial(network, before, before)
     nodes = nodes_by_kind(OnnxGraph(model))
-    changed = [node.outputs[0] for kind in approximated for node in nodes[kind]]
+    approximations = chain.from_iterable(nodes[kind] for kind in approximated)
+    changed = [node.outputs[0] for node in approximations]
     fitted = compensated(model, network, changed, images)
     after = compare(session, open_any_size(fitted), held_out)
     # Not by the references: another network may gain on a few samples by chance.

@@ -13,6 +13,7 @@
 from collections.abc import Collection, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 import onnx
@@ -152,7 +153,7 @@ def _targets(networks: Networks, nodes: Sequence[Node]) -> list[list[Target]]:
 def _scale_activations(networks: Networks, replaced: Sequence[Node]) -> dict[str, np.ndarray]:
     """Put k in front of activations and 1 / k behind them; return k (C,) of each tensor."""
     nodes = [node for node in replaced if _may_scale(networks, node)]
-    names = [name for node in nodes for name in (node.inputs[0], node.outputs[0])]
+    names = list(chain.from_iterable((node.inputs[0], node.outputs[0]) for node in nodes))
     if not names:
         return {}
     values = list[list[np.ndarray]]()

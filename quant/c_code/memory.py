@@ -25,7 +25,8 @@ def share_buffers(core: IntCore, sizes: Mapping[str, int]) -> tuple[dict[str, in
     """
     steps = list(enumerate(core.ops))
     last_use = {PLANES: 0} | {op.output: k for k, op in steps}
-    last_use |= {name: k for k, op in steps for name in op.inputs}
+    for k, op in steps:
+        last_use |= dict.fromkeys(op.inputs, k)
     # The result is read after the last operation, when `run` copies it to `out`.
     last_use[CORRECTION] = len(steps)
     number = {PLANES: 0}

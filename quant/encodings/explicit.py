@@ -69,12 +69,11 @@ def implicit_parts(model: onnx.ModelProto) -> dict[str, list[str]]:
     for node in graph.node:
         tensors += node.output
     producer = {"name": model.producer_name, "version": model.producer_version}
+    unset = list[str]()
+    for node in graph.node:
+        unset += [f"{node.name}: {attribute.name}" for attribute in _defaults(node, opset)]
     return {
-        "attributes left to a default (REQ-OP-070)": [
-            f"{node.name}: {attribute.name}"
-            for node in graph.node
-            for attribute in _defaults(node, opset)
-        ],
+        "attributes left to a default (REQ-OP-070)": unset,
         "tensors without a stated size (REQ-GR-000)": [t for t in tensors if t not in sized],
         "inputs and outputs without a description (REQ-FO-040)": [
             value.name for value in ends if not value.doc_string

@@ -320,13 +320,15 @@ def fold_full_scale(graph: Graph, full_scale: np.ndarray | None) -> Graph:
     if full_scale is None:
         return graph
     gains = full_scale[:, None, None]
-    return tuple(
-        # The channels of a depthwise convolution are its results' axis.
-        replace(op, weight=op.weight * (gains if op.groups == 1 else gains[..., None]))
-        if isinstance(op, Conv) and op.input == IMAGE
-        else op
-        for op in graph
-    )
+    scaled = list[Op]()
+    for op in graph:
+        if isinstance(op, Conv) and op.input == IMAGE:
+            # A depthwise convolution has its channels on the axis of its results.
+            factors = gains if op.groups == 1 else gains[..., None]
+            scaled.append(replace(op, weight=op.weight * factors))
+        else:
+            scaled.append(op)
+    return tuple(scaled)
 
 
 def _reads_planes(op: Conv) -> Conv:

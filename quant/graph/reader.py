@@ -125,7 +125,9 @@ class _Reader:
             return model
         network = deepcopy(model)
         graph = OnnxGraph(network)
-        plan = {key: nodes for node in graph.nodes for key, nodes in aligned(graph, node).items()}
+        plan = {}
+        for node in graph.nodes:
+            plan.update(aligned(graph, node))
         graph.rewrite(lambda _, node: plan.get(node))
         graph.save()
         fault = f"{resizes[0]} enlarges to the size of another map, by no whole factor."

@@ -16,7 +16,9 @@ def sort_nodes(graph: GraphProto) -> None:
         graph: of a file that has not been checked.
     """
     nodes = list(graph.node)
-    writers = {name: number for number, node in enumerate(nodes) for name in node.output if name}
+    writers = dict[str, int]()
+    for number, node in enumerate(nodes):
+        writers |= dict.fromkeys(filter(None, node.output), number)
     sources = {
         number: {writers[name] for name in node.input if name in writers}
         for number, node in enumerate(nodes)

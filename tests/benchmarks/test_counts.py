@@ -36,6 +36,16 @@ def test_what_is_counted() -> None:
 def test_a_limit_that_is_passed_is_told(monkeypatch: pytest.MonkeyPatch, limit: float) -> None:
     totals = dict.fromkeys(counts.PARTS, counts.counted(("benchmarks/detector",)))
     monkeypatch.setattr(counts, "DENSITY_LIMITS", {"source": limit})
-    monkeypatch.setattr(counts, "PAIRED_LIMITS", {})
+    monkeypatch.setattr(counts, "PACKED", {})
     (sentence,) = counts.over(totals)
     assert f"{limit:.2f} at most" in sentence
+
+
+@pytest.mark.parametrize("field", counts.PACKED)
+def test_packed_code_is_named_in_every_part(field: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(counts, "DENSITY_LIMITS", {})
+    clean = counts.counted(("benchmarks/detector",))
+    packed = clean._replace(**{field: 2})
+    assert list(counts.over({"benchmarks": clean})) == []
+    (sentence,) = counts.over({"benchmarks": packed})
+    assert sentence.startswith("benchmarks: 2 ")

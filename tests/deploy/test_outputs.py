@@ -8,7 +8,7 @@ import os
 import socket
 import stat
 from collections.abc import Callable, Iterable, Iterator
-from itertools import combinations, cycle
+from itertools import chain, combinations, cycle, product
 from pathlib import Path
 
 import pytest
@@ -54,7 +54,7 @@ def read(name: str) -> list[str]:
     return [option.name for option in options(name).values() if option.is_input]
 
 
-WRITERS = [(name, output) for name in COMMANDS for output in written(name)]
+WRITERS = list(chain.from_iterable(product([name], written(name)) for name in COMMANDS))
 TELLS_CI = ("gate", "junit")
 """What is written where nothing could be judged, too: a CI job then shows why."""
 FILES = [(name, output) for name, output in WRITERS if not written(name)[output]]
@@ -280,15 +280,14 @@ def pairs_of_outputs() -> Iterator[tuple[str, str, str]]:
 
 @pytest.mark.parametrize(("name", "one", "other"), list(pairs_of_outputs()))
 def test_no_two_outputs_are_one(name: str, one: str, other: str, tmp_path: Path) -> None:
-    value, file = output_at(name, one, tmp_path)
-    if (name, other) in FOLDERS:
-        value, file = output_at(name, other, tmp_path)
-        one, other = other, one
+    first = other if (name, other) in FOLDERS else one
+    second = one if first == other else other
+    value, file = output_at(name, first, tmp_path)
     words = str(tmp_path), "another output"
-    refused(command_with(name, tmp_path, **{one: value, other: file}), tmp_path, *words)
+    refused(command_with(name, tmp_path, **{first: value, second: file}), tmp_path, *words)
     (tmp_path / "detour").mkdir(exist_ok=True)
     around = tmp_path / "detour" / ".." / file.relative_to(tmp_path)
-    refused(command_with(name, tmp_path, **{one: value, other: around}), tmp_path, *words)
+    refused(command_with(name, tmp_path, **{first: value, second: around}), tmp_path, *words)
 
 
 def test_the_curves_of_bit_flips_are_an_output_too(tmp_path: Path) -> None:

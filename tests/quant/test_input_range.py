@@ -3,6 +3,7 @@ refused.
 """
 
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -294,7 +295,7 @@ def test_shares_are_inverse(ranges: Ranges) -> None:
 @given(RANGES)
 def test_a_stated_range_is_read_as_it_is(ranges: Ranges) -> None:
     """A range is read the same from text, from pairs, and from one pair for all channels."""
-    text = ",".join(f"{end!r}" for pair in ranges for end in map(float, pair))
+    text = ",".join(repr(float(end)) for end in chain.from_iterable(ranges))
     assert read_ranges(text, len(ranges)) == ranges
     assert read_ranges(ranges, len(ranges)) == ranges
     assert read_ranges(ranges[0], 3) == ranges[:1] * 3

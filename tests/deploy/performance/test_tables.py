@@ -1,5 +1,6 @@
 import math
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -113,7 +114,7 @@ def test_small_tiles_keep_maps_on_chip_and_cost_work(tmp_path: Path) -> None:
     tiles = (640, 128, 64)
     rows = sweep_rows(path, Swath(700, 600, halo_px=5), boards, tiles)
     assert [row.name for row in rows] == [
-        f"vck190 {dpu.name}, tiles of {tile}" for dpu in boards for tile in tiles
+        f"vck190 {dpu.name}, tiles of {tile}" for dpu, tile in product(boards, tiles)
     ]
     layers = [value(row, "layers on chip") for row in rows]
     factors = [value(row, "work factor") for row in rows]

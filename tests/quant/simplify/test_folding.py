@@ -85,7 +85,9 @@ def test_what_works_on_each_channel_is_folded_into_convolutions(parts: list[str]
     after = after[:, :, border_px : after.shape[2] - border_px, border_px:]
     after = after[..., : before.shape[3]]
     np.testing.assert_allclose(after, before, rtol=0, atol=1e-5 * max(np.abs(before).max(), 1))
-    kind = {tensor: n.op_type for n in short.graph.node for tensor in n.output}
+    kind = dict[str, str]()
+    for n in short.graph.node:
+        kind |= dict.fromkeys(n.output, n.op_type)
     assert "BatchNormalization" not in kind.values()
     for n in short.graph.node:
         sources = CONVOLUTIONS.intersection(kind.get(name, "") for name in n.input)
