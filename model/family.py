@@ -89,9 +89,8 @@ def sensor_vector(sensor: Instrument) -> SensorVector:
         inside = min(max(value, low), high)
         if inside != value:
             outside.append(
-                f"{name} {value:.3g} is outside {low:g} to {high:g}, the network is told "
-                f"{inside:g} "
-                "and may restore worse than blind"
+                f"{name} {value:.3g} is outside the range of the training, {low:g} to {high:g}; "
+                f"the network uses {inside:g} and may restore worse than without a profile"
             )
         entries.append(2 * math.log(inside / low) / math.log(high / low) - 1)
     lower, higher = sorted((values["mtf_across"], values["mtf_along"]))

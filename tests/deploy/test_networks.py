@@ -120,7 +120,10 @@ def test_a_value_outside_the_training_is_reported_each_time(
     for _ in range(2):
         Network.load(conditioned, sensor=sensor)
     assert [record.levelno for record in caplog.records] == 4 * [logging.WARNING]
-    sentences = [f"mtf_{axis} 0.004 is outside 0.015 to 0.15" for axis in ("across", "along")]
+    sentences = [
+        f"mtf_{axis} 0.004 is outside the range of the training, 0.015 to 0.15"
+        for axis in ("across", "along")
+    ]
     for message, sentence in zip(caplog.messages, 2 * sentences, strict=True):
         assert message.startswith(sentence)
 
