@@ -62,6 +62,13 @@ class Placed:
         last = (self.keep_stop - 1 - half) // BLOCK_PX + 1
         return min(max(first, low), high), max(min(last, high), low)
 
+    @property
+    def inside(self) -> NDArray[np.float32]:
+        """1 for each pixel of the result within the blocks that count, 0 at the image's border."""
+        start, stop = self.span(0)
+        pixels = np.arange(self.keep_start, self.keep_stop)
+        return np.asarray((pixels >= start) & (pixels < stop), np.float32)
+
     def span(self, around_px: int) -> tuple[int, int]:
         """Return first pixel and end of all these blocks with `around_px` more on both sides; they
         may lie beyond the image.
@@ -93,23 +100,25 @@ def extend(
     return np.pad(image[slices[0], slices[1]], pads, "symmetric")
 
 
-def weighted_sums(image: Image, weights: Image, axis: int) -> Image:
-    """Return weighted sums over windows along an axis, as long as `weights` and BLOCK_PX apart."""
-    count = (image.shape[axis] - len(weights)) // BLOCK_PX + 1
-    end = BLOCK_PX * (count - 1) + 1
+def weighted_sums(image: Image, weights: Image, axis: int, block_px: int = BLOCK_PX) -> Image:
+    """Return weighted sums over windows along an axis, as long as `weights` and `block_px`
+    apart.
+    """
+    count = (image.shape[axis] - len(weights)) // block_px + 1
+    end = block_px * (count - 1) + 1
     total: Image | None = None
     for place, weight in enumerate(weights):
-        steps = slice(place, place + end, BLOCK_PX)
+        steps = slice(place, place + end, block_px)
         term = (image[steps] if axis == 0 else image[:, steps]) * weight
         total = term if total is None else np.add(total, term, out=total)
     assert total is not None  # noqa: S101 - there are weights
     return total
 
 
-def block_means(image: Image) -> Image:
+def block_means(image: Image, block_px: int = BLOCK_PX) -> Image:
     """Return the means of whole blocks."""
-    mean = np.full(BLOCK_PX, 1 / BLOCK_PX, np.float32)
-    return weighted_sums(weighted_sums(image, mean, 0), mean, 1)
+    mean = np.full(block_px, 1 / block_px, np.float32)
+    return weighted_sums(weighted_sums(image, mean, 0, block_px), mean, 1, block_px)
 
 
 def reached_blocks(flags: Image, reach_px: int) -> Image:
@@ -126,22 +135,31 @@ def reached_blocks(flags: Image, reach_px: int) -> Image:
     return np.asarray(weighted_sums(weighted_sums(flags, ones, 0), ones, 1) > 0, np.float32)
 
 
-def interpolate(blocks: Image, down: Placed, across: Placed) -> Image:
-    """Interpolate bilinearly between the centres of blocks, at the pixels of the result."""
-    return _along(_along(blocks, down).T, across).T
+def interpolate(blocks: Image, down: Placed, across: Placed, block_px: int = BLOCK_PX) -> Image:
+    """Interpolate bilinearly between the centres of blocks, at the pixels of the result.
+
+    Args:
+        blocks: values of all blocks of `block_px` pixels within `down.blocks` and `across.blocks`.
+        down: where the rows lie, and which are kept.
+        across: where the columns lie, likewise.
+        block_px: side of a block, 8 or a divisor of it that is even.
+    """
+    return _along(_along(blocks, down, block_px).T, across, block_px).T
 
 
-def _along(blocks: Image, placed: Placed) -> Image:
+def _along(blocks: Image, placed: Placed, block_px: int) -> Image:
     """Interpolate linearly along the first axis; at the image's border the nearest block inside
     counts.
     """
-    half = BLOCK_PX // 2
-    first, last = placed.blocks
+    half = block_px // 2
+    start, stop = placed.span(0)
+    first = start // block_px
+    last = stop // block_px - 1
     pixels = np.arange(placed.keep_start, placed.keep_stop)
-    left = (pixels - half) // BLOCK_PX
-    # In sixteenths, which float32 holds exactly: the two weights add up to 1.
-    share = ((2 * (pixels - half) + 1) % (2 * BLOCK_PX)).astype(np.float32) / np.float32(
-        2 * BLOCK_PX
+    left = (pixels - half) // block_px
+    # In sixteenths or less, which float32 holds exactly: the two weights add up to 1.
+    share = ((2 * (pixels - half) + 1) % (2 * block_px)).astype(np.float32) / np.float32(
+        2 * block_px
     )
     lower = np.clip(left, first, last) - first
     upper = np.clip(left + 1, first, last) - first

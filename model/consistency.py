@@ -43,8 +43,9 @@ from beers_deploy.model.blocks import (
     extend,
     interpolate,
     reached_blocks,
-    weighted_sums,
 )
+from beers_deploy.model.departure import departure
+from beers_deploy.model.detail_step import DetailStep, separable_sums, window_weights
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.profiles.instrument import Instrument
 
@@ -113,6 +114,8 @@ class Consistency:
         means: mean values of a raw block at which `excess` is given, ascending.
         excess: the amount that clipping the noise at zero has added to them.
         full_scale: the pixel value at and above which a raw pixel is saturated.
+        detail: the step for finer detail, where the sensor's MTF departs from the formula's curve;
+            else None.
     """
 
     rows: Image
@@ -121,6 +124,7 @@ class Consistency:
     means: Image
     excess: Image
     full_scale: float
+    detail: DetailStep | None
 
     @classmethod
     def of(
@@ -141,16 +145,18 @@ class Consistency:
         left = left[:, :RANK]
         values = values[:RANK]
         right = right[:RANK]
-        near = (left * values) @ right
-        box = np.full(BLOCK_PX, 1 / BLOCK_PX)
-        # Convolution turns a filter around; the sums below go forwards.
-        rows = np.array(
-            [np.convolve(vector[::-1], box) for vector in (left * values).T], np.float32
-        )
-        columns = np.array([np.convolve(vector[::-1], box) for vector in right], np.float32)
-        far = _far_weights(kernel, near)[::-1, ::-1]
+        down = (left * values).T
+        far = _far_weights(kernel, down.T @ right)[::-1, ::-1]
         means, excess = _clipped_noise(sensor, scale)
-        return cls(rows, columns, far.astype(np.float32), means, excess, float(scale))
+        return cls(
+            rows=window_weights(down, BLOCK_PX),
+            columns=window_weights(right, BLOCK_PX),
+            far=far.astype(np.float32),
+            means=means,
+            excess=excess,
+            full_scale=float(scale),
+            detail=DetailStep.of(down, right) if departure(sensor, "cut") else None,
+        )
 
     def correction(
         self, raw: Image, restored: Image, down: Placed, across: Placed, raw_at: tuple[int, int]
@@ -176,9 +182,11 @@ class Consistency:
         any_missing = bool(missing.any())
         finite = np.where(missing, np.float32(0), restored) if any_missing else restored
         origin = down.start, across.start
-        blurred = self._near(extend(finite, (down, across), origin, NEAR_PX))
+        near_pixels = extend(finite, (down, across), origin, NEAR_PX)
+        raw_pixels = extend(raw, (down, across), raw_at, 0)
+        blurred = separable_sums(near_pixels, self.rows, self.columns, BLOCK_PX)
         blurred += self._far(finite, missing if any_missing else None, down, across)
-        raw_means = block_means(extend(raw, (down, across), raw_at, 0))
+        raw_means = block_means(raw_pixels)
         residual = raw_means - _interpolated_excess(raw_means, self.means, self.excess) - blurred
         saturated = (raw >= self.full_scale).astype(np.float32)
         weights = np.float32(1) - reached_blocks(
@@ -188,19 +196,14 @@ class Consistency:
             missing_pixels = extend(missing.astype(np.float32), (down, across), origin, NEAR_PX)
             weights *= np.float32(1) - reached_blocks(missing_pixels, NEAR_PX)
         if weights.all():
-            return interpolate(residual, down, across)
-        share = interpolate(weights, down, across)
-        change = interpolate(residual * weights, down, across)
-        change /= np.maximum(share, np.float32(LEAST_SHARE))
+            change = interpolate(residual, down, across)
+        else:
+            share = interpolate(weights, down, across)
+            change = interpolate(residual * weights, down, across)
+            change /= np.maximum(share, np.float32(LEAST_SHARE))
+        if self.detail is not None:
+            change += self.detail.correction(raw_pixels, near_pixels, weights, down, across)
         return change
-
-    def _near(self, padded: Image) -> Image:
-        """Compute block means of the near part of H x from pixels padded by NEAR_PX on
-        every side.
-        """
-        terms = zip(self.rows, self.columns, strict=True)
-        sums = (weighted_sums(weighted_sums(padded, row, 0), column, 1) for row, column in terms)
-        return np.asarray(sum(sums))
 
     def _far(
         self, finite: Image, missing: NDArray[np.bool_] | None, down: Placed, across: Placed

@@ -36,9 +36,10 @@ pixel or the border within which no pixel counts.
 """
 HERE = Path(__file__).parent
 BLOCK = 8
+FINE = 2
 NEAR = 8
-"""Pixels: the side of a block of the consistency step (BLOCK), and the radius of the near part of
-its blur (NEAR).
+"""Pixels: the side of a block of the consistency step (BLOCK) and of its part for finer detail
+(FINE), and the radius of the near part of its blur (NEAR).
 """
 S = json.loads((HERE / "host.json").read_text(encoding="utf-8"))
 UNITS = {1: S["unit"], **{int(factor): unit for factor, unit in S["exposures"].items()}}
@@ -210,14 +211,32 @@ def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
     # Blocks that a saturated pixel reaches through the near part of H are left out.
     ones = np.ones(BLOCK + 2 * NEAR, F)
     reached = summed(extended((raw >= 1).astype(F), NEAR), ones, ones) > 0
-    if not reached.any():
-        return np.asarray(np.clip(x + interpolated(residual, x.shape), 0, F(1)))
     usable = (~reached).astype(F)
+    share = interpolated(usable, x.shape)
     # Where few of the blocks around are usable, the correction fades out.
-    change = interpolated(residual * usable, x.shape) / np.maximum(
-        interpolated(usable, x.shape), F(0.25)
-    )
+    change = interpolated(residual * usable, x.shape) / np.maximum(share, F(0.25))
+    if S["consistency"]["detail"]:
+        change = change + np.where(share == 1, detail(raw, near), F(0))
     return np.asarray(np.clip(x + change, 0, F(1)))
+
+
+def detail(raw: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Compute the consistency step's part for finer detail of one band (H, W).
+
+    It is the residual of fine blocks without that of the large ones, and 0 at the image's border.
+    `near` is x with NEAR pixels more on every side.
+    """
+    weights = (np.array(S["consistency"]["detail"][name], F) for name in ("rows", "columns"))
+    blurred = sum(summed(near, row, column, FINE) for row, column in zip(*weights))  # noqa: B905 - as above
+    residual = block_means(extended(raw, 0), FINE) - blurred
+    change = interpolated(residual, raw.shape, FINE)
+    change = change - interpolated(block_means(residual, BLOCK // FINE), raw.shape)
+    for size in raw.shape:
+        low, high = inner(-(-size // BLOCK))
+        change[: BLOCK * low] = 0
+        change[BLOCK * high :] = 0
+        change = change.T
+    return np.asarray(change)
 
 
 def judged(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -279,24 +298,25 @@ def extended(x: np.ndarray, margin: int) -> np.ndarray:
     return x
 
 
-def summed(x: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+def summed(x: np.ndarray, row: np.ndarray, column: np.ndarray, side: int = BLOCK) -> np.ndarray:
     """Compute the weighted sum of a window of each block.
 
     Args:
         x: an image (H, W) that reaches beyond the blocks by what the windows need.
         row: weight of each row of the window.
         column: weight of each column of the window.
+        side: of a block.
     """
     for weights in (row, column):
         end = x.shape[0] - len(weights) + 1
-        x = sum(x[place : place + end : BLOCK] * weight for place, weight in enumerate(weights)).T
+        x = sum(x[place : place + end : side] * weight for place, weight in enumerate(weights)).T
     return x
 
 
-def block_means(x: np.ndarray) -> np.ndarray:
-    """Compute the mean of each block."""
-    mean = np.full(BLOCK, 1 / BLOCK, F)
-    return summed(x, mean, mean)
+def block_means(x: np.ndarray, side: int = BLOCK) -> np.ndarray:
+    """Compute the mean of each block of `side` pixels."""
+    mean = np.full(side, 1 / side, F)
+    return summed(x, mean, mean, side)
 
 
 def around(means: np.ndarray, far: np.ndarray) -> np.ndarray:
@@ -309,18 +329,22 @@ def around(means: np.ndarray, far: np.ndarray) -> np.ndarray:
     return total
 
 
-def interpolated(blocks: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Interpolate bilinearly between the centres of blocks.
+def inner(count: int) -> tuple[int, int]:
+    """Return the first and the end of the blocks that count among `count` along a side."""
+    return (2, count - 2) if count > 4 else (0, count)
+
+
+def interpolated(blocks: np.ndarray, shape: tuple[int, ...], side: int = BLOCK) -> np.ndarray:
+    """Interpolate bilinearly between the centres of blocks of `side` pixels.
 
     Blocks at the image's border are left out, because H brings light into them that the image does
     not show. Nearer to the border the nearest block inside counts.
     """
     for size in shape:
-        place = np.arange(size) - BLOCK // 2
-        low = 2 if len(blocks) > 4 else 0
-        high = len(blocks) - 1 - low
-        left, right = (np.clip(place // BLOCK + k, low, high) for k in (0, 1))
-        share = (((2 * place + 1) % (2 * BLOCK)).astype(F) / F(2 * BLOCK))[:, None]
+        place = np.arange(size) - side // 2
+        low, high = (BLOCK // side * end for end in inner(len(blocks) * side // BLOCK))
+        left, right = (np.clip(place // side + k, low, high - 1) for k in (0, 1))
+        share = (((2 * place + 1) % (2 * side)).astype(F) / F(2 * side))[:, None]
         blocks = (blocks[left] * (F(1) - share) + blocks[right] * share).T
     return blocks
 

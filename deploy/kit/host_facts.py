@@ -148,4 +148,8 @@ def consistency_facts(network: Network, sensor: Sensor) -> Facts | None:
         return None
     step = Consistency.of(sensor.nominal(), sensor.reference.nominal(), full_scale=1.0)
     names = ("rows", "columns", "far", "means", "excess")
-    return {name: getattr(step, name).tolist() for name in names}
+    detail = step.detail
+    return {
+        **{name: getattr(step, name).tolist() for name in names},
+        "detail": detail and {"rows": detail.rows.tolist(), "columns": detail.columns.tolist()},
+    }

@@ -63,7 +63,12 @@ COLUMNS = 301
 
 @cache
 def step_for(name: str) -> Consistency:
-    return Consistency.of(SENSORS[name], REFERENCE)
+    """The step without the one for finer detail."""
+    return coarse(SENSORS[name])
+
+
+def coarse(sensor: Instrument) -> Consistency:
+    return replace(Consistency.of(sensor, REFERENCE), detail=None)
 
 
 @cache

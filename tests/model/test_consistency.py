@@ -27,6 +27,7 @@ from tests.model.consistency_images import (
     TWO_AXES,
     Pixels,
     blurred,
+    coarse,
     corrected,
     noisy,
     rms,
@@ -41,6 +42,8 @@ from tests.model.simulator.stages import (
 )
 
 Cut = tuple[int, int, int, int]
+
+WITH_DETAIL = Consistency.of(SENSORS["lopsided point"], REFERENCE)
 
 
 OTHERS: dict[str, tuple[Instrument, float]] = {
@@ -91,14 +94,18 @@ def spans(draw: st.DrawFn) -> tuple[int, int, int]:
 
 @settings(max_examples=50)
 @given(
-    name=st.sampled_from(["formula", "lopsided point"]),
+    step=st.sampled_from([step_for("formula"), WITH_DETAIL]),
     down=spans(),
     across=spans(),
     lacks=st.sets(st.sampled_from(["pixels", "area", "saturated"])),
     seed=st.integers(0, 99),
 )
 def test_any_part_is_corrected_as_the_whole_image_is_bit_for_bit(
-    name: str, down: tuple[int, int, int], across: tuple[int, int, int], lacks: set[str], seed: int
+    step: Consistency,
+    down: tuple[int, int, int],
+    across: tuple[int, int, int],
+    lacks: set[str],
+    seed: int,
 ) -> None:
     generator = np.random.default_rng(seed)
     height, top, bottom = down
@@ -111,8 +118,7 @@ def test_any_part_is_corrected_as_the_whole_image_is_bit_for_bit(
         restored[height // 3 : height // 2, width // 4 : width // 2] = np.nan
     if "saturated" in lacks:
         raw[some[0][::-1], some[1]] = FULL_SCALE
-    uncut = corrected(step_for(name), raw, restored)
-    step = step_for(name)
+    uncut = corrected(step, raw, restored)
     part = corrected_in_part(step, raw, restored, (top, bottom, left, right))
     np.testing.assert_array_equal(part, uncut[top:bottom, left:right])
     assert np.isfinite(uncut).all()
@@ -121,12 +127,12 @@ def test_any_part_is_corrected_as_the_whole_image_is_bit_for_bit(
 @pytest.mark.parametrize(
     ("reach_px", "changes", "value"), [(REACH_PX, 1, 1e6), (RAW_REACH_PX, 0, FULL_SCALE)]
 )
+@pytest.mark.parametrize("step", [step_for("formula"), WITH_DETAIL], ids=["coarse", "detail"])
 def test_no_pixel_farther_than_the_reach_matters_and_the_farthest_does(
-    reach_px: int, changes: int, value: float
+    step: Consistency, reach_px: int, changes: int, value: float
 ) -> None:
     """The pixels at the image's border reach farthest: the block at the border is left out."""
     generator = np.random.default_rng(5)
-    step = step_for("formula")
     images = generator.random((2, 333, 301)) * 2000 + 1000
     before = corrected(step, *images)
     changed_sides = []
@@ -178,7 +184,7 @@ def test_a_pair_of_another_blur_is_not_consistent(name: str) -> None:
     other, times = OTHERS[name]
     raw = blurred(restored, SENSORS[name])
     own = rms(corrected(step_for(name), raw, restored)[INSIDE])
-    assert rms(corrected(Consistency.of(other, REFERENCE), raw, restored)[INSIDE]) > times * own
+    assert rms(corrected(coarse(other), raw, restored)[INSIDE]) > times * own
 
 
 ERRORS = {

@@ -20,7 +20,7 @@ from cyclonedx.validation.json import JsonStrictValidator
 import beers_deploy as bd
 from beers_deploy.kit import RECORD
 from beers_deploy.kit.golden import read_golden
-from beers_deploy.kit.host_facts import host_facts
+from beers_deploy.kit.host_facts import consistency_facts, host_facts
 from beers_deploy.model.bank import bank_of_vector
 from beers_deploy.model.blocks import Placed
 from beers_deploy.model.consistency import Consistency
@@ -30,6 +30,8 @@ from beers_deploy.model.io.tensors import Weights
 from beers_deploy.model.self_check import SelfCheck
 from beers_deploy.model.variants import Variant
 from beers_deploy.profiles.errors import OptionError, ProfileError
+from beers_deploy.profiles.response import MtfTable
+from beers_deploy.profiles.sensor_file import axes_of
 from beers_deploy.quant.encodings import host_model
 from beers_deploy.quant.sensor_bank.calibrate import bank_results, quantize_behind_bank
 from tests.deploy.command_line import done
@@ -195,12 +197,17 @@ def test_the_host_part_chooses_factors_and_takes_the_consistency_step_as_the_lib
     restored = np.clip(image + np.random.default_rng(2).normal(0, 0.01, image.shape), 0, 1).astype(
         np.float32
     )
-    step = Consistency.of(sensor.nominal(), sensor.reference.nominal(), full_scale=1.0)
-    for raw in (image, np.minimum(image, np.float32(0.95))):
-        down, across = (Placed(side, 0, 0, side) for side in image.shape)
-        change: np.ndarray = step.correction(raw, restored, down, across, (0, 0))
-        expected = np.clip(restored + change, 0, 1)
-        np.testing.assert_array_equal(host["consistent"](raw, restored), expected)
+    table = MtfTable((0.0, 0.25, 0.5), (1.0, 0.6, 0.1), (1.0, 0.6, 0.1))
+    departing = sensor.with_fields(response=table, **axes_of(table, "stated", "for a test"))
+    for profile in (sensor, departing):
+        host["S"]["consistency"] = consistency_facts(bd.Network.load(NAME), profile)
+        step = Consistency.of(profile.nominal(), profile.reference.nominal(), full_scale=1.0)
+        assert (step.detail is not None) == (profile is departing)
+        for raw in (image, np.minimum(image, np.float32(0.95))):
+            down, across = (Placed(side, 0, 0, side) for side in image.shape)
+            change: np.ndarray = step.correction(raw, restored, down, across, (0, 0))
+            expected = np.clip(restored + change, 0, 1)
+            np.testing.assert_array_equal(host["consistent"](raw, restored), expected)
 
 
 def test_the_host_part_judges_blocks_as_the_library_does(
