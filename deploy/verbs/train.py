@@ -66,8 +66,8 @@ def train(
     """Train a network on simulated or stored pairs; the same seed makes the same weights.
 
     The loss is the paper's: 1.0 L1 + 0.5 LPIPS + 0.1 L1 of spectra. Without weights for LPIPS that
-    term is left out, which is logged and recorded. A twentieth of the images, whole sites, is held
-    out for validation. For several GPUs start it with torchrun.
+    term is left out, which is logged. A twentieth of the images, whole sites, is held out for
+    validation. For several GPUs start it with torchrun.
 
     Args:
         out: folder of checkpoint, logs, pictures and weights.
@@ -77,8 +77,8 @@ def train(
             it for several.
         pairs: folder of pairs that 'simulate' wrote, in place of images.
         variant: size of the network.
-        sensor: sensor of the degraded images: a name, or a .toml file; of pairs the one that made
-            them, else pleiades-variable if none.
+        sensor: sensor of the degraded images: name or .toml file; of pairs the one that made them,
+            else pleiades-variable if none.
         conditioned: draw sensors of a wide range with that gain, and condition the network on each:
             it becomes the network of any sensor in range.
         reference: sensor of the reference images; pleiades-reference if none.
@@ -93,7 +93,7 @@ def train(
         psnr_weight: weight of the mean PSNR of the patches in the loss, such as 0.01 without L1.
         lpips: weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.
         start: weights to start from; those of a smaller network are widened.
-        rounding: INT8 file of the `start` weights, whose rounding of the feature maps is applied in
+        rounding: INT8 file of the `start` weights, whose rounding of feature maps is applied in
             training, so that a new quantisation loses less.
         validate_every: number of steps between validations; 0 for none.
         seed: seed of every random draw.
