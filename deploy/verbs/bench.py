@@ -74,7 +74,7 @@ def bench(
         network: ONNX network, or a shipped name, which stands for its INT8 file; convbeers-s-int8
             if none.
         target: board whose model predicts: name, also with -model behind it, or .toml file; several
-            with commas, or all. An NPU has published figures only. 'host' measures on this machine.
+            with commas, or all. An NPU has published figures only; 'host' measures on this machine.
         sensor: sensor of a shipped network: name, .toml file or blind.
         image: mono image of at most 12 bits that is the swath; its exposures are counted.
         full_scale: full scale of the image; 4095 if none.
@@ -82,8 +82,8 @@ def bench(
         tile: side of a tile in pixels; several with commas are compared.
         halo: context around each tile in pixels, or 'exact' (no seams).
         dpu: configuration of the DPU, such as C32B3; all compares those of the board.
-        host_task: work of the host on the results, if the file does not state it: copy to read
-            them, argmax or softmax for the best class, sort for boxes, image to add an image.
+        host_task: work of the host on the results, if the file does not state it: argmax and
+            softmax find the best class, sort finds boxes, image adds an image, copy reads only.
         measured: JSON list of runs on your board, which correct the cost model.
         traditional: measure the traditional pipeline on this machine, for some seconds.
         within: time in seconds that the swath may take; names the smallest DPU that is fast enough.

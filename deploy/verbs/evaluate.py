@@ -63,11 +63,11 @@ def evaluate(
 ) -> "Table":
     """Compare restorations with the reference, in the mean and by site.
 
-    PSNR leaves out clipped pixels; of simulated pairs it is also measured against the reference
-    without its noise. Inner PSNR leaves out a border of 57 pixels. MTF and SNR are measured on
-    restored slanted edges and flat fields, targets on points, faint bars and zone plates. With a
-    detector the table has average precision, precision and recall on reference, degraded and
-    restored scenes, with intervals over sites, and the share of the loss that restoration regains.
+    PSNR leaves out clipped pixels, inner PSNR also a border of 57 pixels. Of simulated pairs PSNR
+    is also measured against the reference without its noise. MTF and SNR are measured on restored
+    slanted edges and flat fields, targets on points, faint bars and zone plates. With a detector
+    the table has average precision, precision and recall on reference, degraded and restored
+    scenes, with intervals over sites, and the share of the loss that restoration regains.
 
     Args:
         methods: names, separated by commas: degraded is always a row. Shipped networks and the
@@ -82,12 +82,12 @@ def evaluate(
         out: folder for report.html and pictures.
         calibrate: copy of the network's file to write with the interval that 'restore --interval'
             uses, fitted on these pairs; `methods` must be that file alone. A level of 90 % needs at
-            least 9 images in addition to those of the sites that the fit uses.
+            least 9 images outside the sites that are fitted.
         sweep: also compare under 16 sensors that are known exactly, and 7 that are known wrongly.
         brightness: also compare with the radiance of the scenes times these factors, such as
             0.25,0.05.
-        bits_per_pixel: also compare restoration on board, before JPEG 2000 compresses to this
-            number of bits per pixel, with restoration on the ground after it; several with commas.
+        bits_per_pixel: also compare restoration before and after JPEG 2000 compresses to this
+            number of bits per pixel; several with commas.
         consistency: networks that are given the sensor agree with the image at low frequencies.
         exposure: shipped networks restore dark parts at a higher exposure.
         strict: refuse pairs whose pixels contradict the sensor, instead of a warning.

@@ -33,13 +33,9 @@ def export(
 ) -> Path:
     """Write a network as an ONNX file, for any height and width unless a tile is given.
 
-    Your own weights are checked against torch. Weights that are conditioned on a sensor, as all
-    shipped ones are, become the network of one sensor: the middle of each range of its profile. A
-    value outside the trained range is replaced by its nearest limit, with a warning.
-
-    An INT8 file of such weights needs no new calibration for another sensor. `delta` writes what
-    the sensor changes, and `apply` makes that sensor's file again, to the byte. As far as the noise
-    allows, NAME-x2.delta to NAME-x8.delta are written too, for the exposures of 'restore'.
+    Weights that are conditioned on a sensor, as all shipped ones are, become the network of one
+    sensor: the middle of each range of its profile, or the nearest limit of the trained range, with
+    a warning. An INT8 file of such weights needs no new calibration for another sensor.
 
     Args:
         out: ONNX file to write.
@@ -51,8 +47,10 @@ def export(
             NPU VINT8.
         c: also write the core of an INT8 network as a C99 file for one tile, with integers only.
         target: board or NPU of `board_file`: name or .toml file.
-        delta: also write what the sensor changes in an INT8 network, 1 to 3 kB.
-        apply: condition the INT8 network on the sensor of this delta, in place of `sensor`.
+        delta: also write what the sensor changes in an INT8 network, 1 to 3 kB; and NAME-x2.delta
+            to NAME-x8.delta for the exposures of 'restore', as far as the noise allows.
+        apply: condition the INT8 network on the sensor of this delta, in place of `sensor`; the
+            file is the same to the byte.
 
     Returns:
         The path of the ONNX file.

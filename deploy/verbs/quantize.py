@@ -86,19 +86,17 @@ def quantize(
         patches: number of simulated patches.
         patch: side of a simulated patch in pixels.
         effort: how thoroughly channels are equalized: fast takes first guesses, normal searches
-            groups of channels for a bounded time, best searches each channel without a bound. An
-            estimate of the time is printed first.
+            groups of channels for a bounded time, best searches each channel without a bound.
         finetune: number of steps that train the integers on the patches; 'auto' trains for some
             minutes, as long as the error falls.
-        adapt: replace activations that the DPU lacks, and report the loss in float: SiLU by
-            HardSwish, Sigmoid by HardSigmoid, LeakyReLU and PReLU by LeakyReLU of 26/256, or
-            exactly if that loses more than 0.05 dB.
+        adapt: replace activations that the DPU lacks, such as SiLU by HardSwish, and report the
+            loss in float.
         output: name of the output to keep of a network that has several.
         seed: seed of every random draw.
         board_file: also write the core in the board's encoding: QDQ ONNX, of an NPU VINT8.
         tile: side of the tile in pixels that `board_file` is fixed to; an NPU needs one.
-        report: folder for report.html and report.json, which name the layers and patches that err
-            most, and node-data.json for Google's Model Explorer.
+        report: folder for report.html and report.json with the layers and patches that err most,
+            and node-data.json for Google's Model Explorer.
         progress: a function that is called at each step, False for silence, None for a bar or lines
             on standard error.
 

@@ -67,8 +67,7 @@ def restore(
 
     A file is read and written by rows, so memory does not grow with its height. OUT has the pixel
     type and the scale of IMAGE, and keeps its georeference, RPCs, missing pixels and alpha. Bands
-    are restored one by one. A warning says where noise, edges or detectors of the image contradict
-    the sensor.
+    are restored one by one. A warning says where noise, edges or detectors contradict the sensor.
 
     Args:
         image: image file of any size: TIFF, or what GDAL reads. In Python also an array (H, W) or
@@ -76,8 +75,8 @@ def restore(
         out: TIFF to write.
         network: ONNX network, or a shipped name (NAME in float32, NAME-int8); convbeers-s-int8 if
             none.
-        method: a network, or the traditional pipeline, which takes about a minute for a megapixel
-            and cannot be resumed.
+        method: a network, or the traditional pipeline: about a minute for a megapixel, not
+            resumable.
         quality: quality of the traditional pipeline.
         sensor: sensor that acquired the image, which shipped networks and the consistency step use:
             name or .toml file; B0=a.toml,B1=b.toml for bands; blind if unknown.
@@ -97,18 +96,17 @@ def restore(
         stac: STAC item of the output to write; needs `cog`.
         self_check: TIFF to write: for each block of 64 x 64 pixels, whether the result, blurred as
             the sensor blurs, agrees with the image.
-        interval: also write OUT-interval.tif: the half-width, for each pixel, of an interval that
-            contains the error of this percentage of pixels. Needs the sensor, and a network with a
-            calibrated interval, as shipped ones have. In Python an array returns (restored,
+        interval: also write OUT-interval.tif: for each pixel the half-width of an interval that
+            contains the error of this percentage of pixels. Needs the sensor, and a network with
+            such an interval, as shipped ones have. In Python an array returns (restored,
             half_width).
-        view: HTML file to write, to swipe and zoom between raw and restored in a browser.
+        view: HTML file to write, which compares raw and restored in a browser.
         strict: refuse what contradicts the sensor or fails the self-check, instead of a warning.
         consistency: make the result agree with the image at low spatial frequencies, if the sensor
             is named.
         exposure: restore dark parts at a higher exposure (shipped networks).
-        fix_detectors: interpolate faulty pixels before the restoration: 'found' searches for them
-            and writes the list next to the output; or a list, lines of column,row with * for a
-            whole column.
+        fix_detectors: interpolate faulty pixels first: 'found' searches for them and lists them
+            next to the output; or a list, lines of column,row with * for a whole column.
         force: accept an image that was restored before, follow an index out of its folder, and
             write any result.
         overwrite: replace the output if it exists.

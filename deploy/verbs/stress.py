@@ -47,10 +47,10 @@ def stress(
 ) -> "Table":
     """Run hard cases through a network in float32, in INT8, in integers alone and in tiles.
 
-    The tables show what holds, the worst measurements, the known limitations that were met, and
-    which sums are proven not to overflow. The command exits with 1 if something fails. `bit_flips`
-    shows what flipped bits in weights, shifts, feature maps and the image cost, and what guards
-    gain and cost on the board.
+    The tables show what holds, the worst measurements, known limitations that were met, and which
+    sums are proven not to overflow. The command exits with 1 if something fails. `bit_flips` shows
+    what flipped bits in weights, shifts, feature maps and the image cost, and what guards gain and
+    cost on the board.
 
     Args:
         float_network: float ONNX or weights. The name of a shipped pair stands for both;

@@ -65,8 +65,8 @@ def tradeoff(
         images: folder of scenes to simulate from; drawn scenes if none.
         sensor: sensor of the degraded images: name or .toml file.
         reference: sensor of the reference images; pleiades-reference if none.
-        network: shipped names, float ONNX or safetensors files, which are quantised on the way, or
-            INT8 files, separated by commas; all stands for the shipped ones.
+        network: separated by commas: shipped names, INT8 files, or float ONNX or safetensors files,
+            which are quantised on the way; all stands for the shipped ones.
         budget: what you can afford, such as latency<=9s,power<=20W. The best PSNR wins.
         need: what you must reach, such as psnr>=44. Without a budget the least latency wins.
         lpips: weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.
