@@ -73,13 +73,13 @@ def restore(
         image: image file of any size: TIFF, or what GDAL reads. In Python also an array (H, W) or
             (bands, H, W) of NumPy, torch, Dask or xarray, or a dataset of rasterio.
         out: TIFF to write.
-        network: ONNX network, or a shipped name (NAME in float32, NAME-int8); convbeers-s-int8 if
-            none.
+        network: ONNX network, or a shipped name (NAME in float32, NAME-int8 in INT8);
+            convbeers-s-int8 if none.
         method: a network, or the traditional pipeline: about a minute for a megapixel, not
             resumable.
         quality: quality of the traditional pipeline.
         sensor: sensor that acquired the image, which shipped networks and the consistency step use:
-            name or .toml file; B0=a.toml,B1=b.toml for bands; blind if unknown.
+            name or .toml file; B0=a.toml,B1=b.toml for each band; blind if unknown.
         tile: longest side of a tile in pixels.
         halo: context around each tile in pixels, or 'exact' (no seams).
         full_scale: pixel value that is full scale; else what the image states, the bits of the
