@@ -43,10 +43,10 @@ OPENING = """# Operators of the DPUs
 applies these rules to your network; `beers-deploy profiles NAME` lists the limits of a board with their sources. A
 rule applies to all boards or to those named with it; parentheses have what differs on the boards named there.
 
-A node runs on the DPU if it keeps every rule of its kind, the rules of size, and in a quantised file also those of
-numbers. A fully connected layer, or a convolution as large as its map, is also judged as a 1 x 1 convolution over the
-flattened map. Other nodes run on the board's processor: `check` fails, and `bench` counts their time at the start and
-the end of a float network and refuses the network elsewhere.
+A node runs on the DPU if it keeps every rule of its kind, the rules of size, and in a quantised file those of numbers. A
+fully connected layer, or a convolution as large as its map, is also judged as a 1 x 1 convolution over the flattened
+map. Other nodes run on the board's processor: `check` fails, and `bench` counts their time at the start and the end of
+a float network, and refuses the network elsewhere.
 """
 VARYING = re.compile(r"((?<=: )[^.:]+(?=\.)|\d+)")
 """Where the text of a rule may differ between boards: a list up to the end of a sentence, or a
@@ -78,7 +78,6 @@ FIGURES: dict[str, Callable[[Dpu], str]] = {
     "input x output channels x pixels": lambda dpu: (
         f"{dpu.input_parallel} x {dpu.output_parallel} x {dpu.whole('array', 'pixel_parallel')}"
     ),
-    "map kept on chip, KiB": lambda dpu: f"{dpu.value('memory', 'feature_map_bytes') / 2**10:g}",
 }
 """What a board's file states, in the words of a table."""
 
@@ -128,11 +127,19 @@ def _npu(npu: Dpu) -> Iterator[str]:
         "AMD publishes no limits; numbers are its quantiser's. [The NPU's flow](npu.md) has "
         "what else is known."
     )
-    yield f"As for the DPUs: {', '.join(same)}. Otherwise ({npu.target.documents['quantiser']}):\n"
-    rest = {name: text for name, (_, text) in texts.items() if name not in same}
+    yield f"As for the DPUs: {', '.join(same)}. What differs ({npu.target.documents['quantiser']}):\n"
     above = f" ({npu.target.documents['quantiser']})"
-    yield from (f"- **{name}**: {text.replace(above, '')}" for name, text in rest.items())
+    for name, (rule, text) in texts.items():
+        if name not in same:
+            yield f"- **{name}**: {_own_sentences(rule, text.replace(above, ''))}"
     yield ""
+
+
+def _own_sentences(rule: Callable[..., object], text: str) -> str:
+    """Return the sentences of a rule's text on an NPU that it has on no DPU."""
+    others = _texts(rule).values()
+    sentences = re.split(r"(?<=\.) ", text)
+    return " ".join(s for s in sentences if not any(s in other for other in others))
 
 
 def _texts(rule: Callable[..., object]) -> dict[str, str]:
