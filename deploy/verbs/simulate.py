@@ -88,7 +88,7 @@ def simulate(
         size: side in pixels of the pair of a drawn scene, in Python.
         patch: side of a patch in pixels; whole scenes if none.
         oversampling: number of scene pixels for each pixel; the sensor's if none.
-        scene: scene whose light and effects are applied, such as night-port: name or .toml file.
+        scene: scene whose light and effects are applied, such as night-port, or a .toml file.
         with_: effect to add, at typical values; repeat it for several.
         without: effect to leave out; repeat it for several.
         explain: print for each effect what is decided and why, and write nothing.

@@ -32,11 +32,13 @@ and, where it reports figures, `--json`.
 
 ## Options of several commands
 
-Boards are {boards}, or your .toml file ([boards](boards.md)); where nothing is
-predicted also {npus}. Sensors are profiles by their names, or your .toml file ([sensors](sensor-profile.md)).
+A board is {boards}, or your .toml file ([boards](boards.md)); where nothing is
+predicted also {npus}. A sensor is the name of a profile, or your .toml file ([sensors](sensor-profile.md)).
 """
 SEVERAL = 3
 """Commands that have the same line for an option, from which on it is described once."""
+NAMED = ": name or .toml file"
+"""How boards and sensors are named, which the opening says once."""
 
 
 def reference() -> str:
@@ -66,7 +68,7 @@ def _lines(command: Command) -> dict[str, str]:
     texts = {entry.arg_name: entry.description or "" for entry in command.doc.params}
     lines = {}
     for parameter in command.parameters:
-        text = text_for_command(texts[parameter.name], command.verb)
+        text = text_for_command(texts[parameter.name], command.verb).replace(NAMED, "")
         label = _label(parameter)
         about = _about(parameter)
         lines[label] = f"- `{label}`{f' ({about})' if about else ''}: {text}"
