@@ -65,9 +65,10 @@ def evaluate(
 
     PSNR leaves out clipped pixels, inner PSNR also a border of 57 pixels. Of simulated pairs PSNR
     is also measured against the reference without its noise. MTF and SNR are measured on restored
-    slanted edges and flat fields, targets on points, faint bars and zone plates. With a detector
-    the table has average precision, precision and recall on reference, degraded and restored
-    scenes, with intervals over sites, and the share of the loss that restoration regains.
+    slanted edges and flat fields, the flux of points and the contrast of faint bars and zone plates
+    on targets. With a detector the table has average precision, precision and recall on reference,
+    degraded and restored scenes, with intervals over sites, and the share of the loss that
+    restoration regains.
 
     Args:
         methods: names, separated by commas: degraded is always a row. Shipped networks and the

@@ -47,10 +47,10 @@ def export(
             NPU VINT8.
         c: also write the core of an INT8 network as a C99 file for one tile, with integers only.
         target: board or NPU of `board_file`: name or .toml file.
-        delta: also write what the sensor changes in an INT8 network, 1 to 3 kB; and NAME-x2.delta
-            to NAME-x8.delta for the exposures of 'restore', as far as the noise allows.
-        apply: condition the INT8 network on the sensor of this delta, in place of `sensor`; the
-            file is the same to the byte.
+        delta: also write what the sensor changes in an INT8 network, 1 to 3 kB; and NAME-x4.delta
+            and so on for the exposures of 'restore', as far as the noise allows.
+        apply: condition the INT8 network on the sensor of this delta, in place of `sensor`: that
+            sensor's file, to the byte.
 
     Returns:
         The path of the ONNX file.

@@ -75,8 +75,8 @@ def restore(
         out: TIFF to write.
         network: ONNX network, or a shipped name (NAME in float32, NAME-int8 in INT8);
             convbeers-s-int8 if none.
-        method: a network, or the traditional pipeline: about a minute for a megapixel, not
-            resumable.
+        method: a network, or the traditional pipeline, which takes about a minute for a megapixel
+            and cannot be resumed.
         quality: quality of the traditional pipeline.
         sensor: sensor that acquired the image, which shipped networks and the consistency step use:
             name or .toml file; B0=a.toml,B1=b.toml for each band; blind if unknown.
