@@ -67,27 +67,26 @@ def bench(
     """Predict a network on a DPU, next to the traditional pipeline and the paper's figures.
 
     The DPU's figures come from a cost model; the traditional pipeline is measured on crops on this
-    machine. A network that cannot be tiled is predicted by the frame. -v adds where the time
-    goes, layer by layer.
+    machine. A network that cannot be tiled is predicted by the frame. -v adds the time of each
+    layer.
 
     Args:
-        network: ONNX network, or a shipped name, which stands for its INT8 file. The shipped INT8
-            network if none.
-        target: board whose model predicts: a name, with or without -model behind it, or a .toml
-            file; several with commas, or all. An NPU has published figures only. 'host' measures
-            on this machine.
-        sensor: sensor of a shipped network: a name, a .toml file, or blind.
+        network: ONNX network, or a shipped name, which stands for its INT8 file; convbeers-s-int8
+            if none.
+        target: board whose model predicts: name, also with -model behind it, or .toml file; several
+            with commas, or all. An NPU has published figures only; 'host' measures on this machine.
+        sensor: sensor of a shipped network: name, .toml file or blind.
         image: mono image of at most 12 bits that is the swath; its exposures are counted.
-        full_scale: pixel value of the image that is full scale; 4095 if none.
+        full_scale: full scale of the image; 4095 if none.
         size: width x height of the swath in pixels; 13600x9016 if none.
         tile: side of a tile in pixels; several with commas are compared.
         halo: context around each tile in pixels, or 'exact' (no seams).
         dpu: configuration of the DPU, such as C32B3; all compares those of the board.
-        host_task: work of the host on the results, if its file does not state it: copy reads them,
-            argmax and softmax find the best class, sort finds boxes, image adds an image.
+        host_task: work of the host on the results, if the file does not state it: argmax and
+            softmax find the best class, sort finds boxes, image adds an image, copy reads only.
         measured: JSON list of runs on your board, which correct the cost model.
-        traditional: measure the traditional pipeline on this machine; takes some seconds.
-        within: time in seconds that the swath may take: names the smallest DPU that is fast enough.
+        traditional: measure the traditional pipeline on this machine, for some seconds.
+        within: time in seconds that the swath may take; names the smallest DPU that is fast enough.
         consistency: count the consistency step on the board's processor.
         threads: threads of the host's runtime; 0 uses all cores.
         progress: a function that is called at each step, False for silence, None for a bar or lines

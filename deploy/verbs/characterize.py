@@ -29,17 +29,17 @@ def characterize(
 ) -> "MeasuredSensor":
     """Measure the MTF and the noise of a sensor on its raw images, and write its profile.
 
-    The MTF needs straight edges: a target, roofs, kerbs, shadows. Without edges `mtf` or an
-    assumption takes its place. The noise needs raw pixels: images that were denoised, sharpened or
-    resampled are refused.
+    The MTF needs straight edges (a target, roofs, kerbs, shadows), else `mtf` or an assumption
+    takes its place. Images that were denoised, sharpened or resampled are refused, because the
+    noise needs raw pixels.
 
     Args:
         images: raw images of one sensor at one setting, or folders of them: integers, one band. In
             Python also arrays (H, W).
         out: sensor profile to write, a .toml file.
         edge: box with one straight edge, FILE:X,Y,WIDTH,HEIGHT; edges are searched for if none.
-        mtf: contrast at Nyquist across the track, or across and along it, if you know it: 0.07 is
-            7 %; measured if none.
+        mtf: contrast at Nyquist across the track, or across and along it, if you know it: 0.07 is 7
+            %; measured if none.
         black_level: pixel value of the dark; assumed to be 0 if none.
         bits: bits of a pixel; found from clipped pixels if none.
         gain: DN per W/m2/sr/um; full scale is assumed to be 400 W/m2/sr/um if none.

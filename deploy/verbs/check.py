@@ -21,14 +21,15 @@ def check(
 ) -> "Checked":
     """Check every operator of a network against the rules of a DPU.
 
-    Each node is placed on the host, the DPU or the CPU. The check fails if the DPU cannot run its
-    part. AMD publishes no limits of its NPUs: there nodes are placed by its table of operators.
+    Each node is placed on the host, the DPU or the CPU. The command exits with 1 if the DPU cannot
+    run its part. AMD publishes no limits of its NPUs: there nodes are placed by its table of
+    operators.
 
     Args:
-        network: ONNX network, float, INT8 or the core for a board; or a shipped name, which stands
-            for its INT8 file. The shipped INT8 network if none.
-        target: board or NPU whose rules count: a name, or a .toml file.
-        dpu: configuration of the DPU that the board lists; its default if none.
+        network: ONNX network: float, INT8 or the core for a board; or a shipped name, which stands
+            for its INT8 file; convbeers-s-int8 if none.
+        target: board or NPU whose rules count: name or .toml file.
+        dpu: configuration of the DPU, such as C32B3; the board's default if none.
         tile: side of a tile in pixels; the network's own if it has one, else 640.
         output: name of the output to keep of a network that has several; all if none.
 

@@ -38,8 +38,8 @@ def demo(
 
     Args:
         image: raw 12-bit image, or an 8-bit photograph as the scene; a drawn scene if none.
-        full_scale: pixel value of a raw image that is full scale; 4095 if none, needed for 0..1.
-        sensor: sensor of the raw image, or to simulate, of 12 bits: a name, or a .toml file.
+        full_scale: full scale of a raw image; 4095 if none, needed for 0..1.
+        sensor: 12-bit sensor of the raw image, or to simulate: name or .toml file.
         out: folder for report.html and files.
         seed: seed of every random draw.
         progress: a function that is called at each step, False for silence, None for a bar or lines

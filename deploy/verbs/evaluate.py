@@ -63,37 +63,36 @@ def evaluate(
 ) -> "Table":
     """Compare restorations with the reference, in the mean and by site.
 
-    PSNR leaves out clipped pixels; of simulated pairs it is also measured against the reference
-    without its noise. Inner PSNR leaves out a border of 57 pixels. MTF and SNR are measured on
-    restored slanted edges and flat fields. The table of targets has the flux of points and the
-    contrast of faint bars and zone plates. With a detector the table has what it finds in scenes as
-    the reference sees them, degraded and restored: average precision, precision and recall with
-    intervals over sites, and the share of the loss that restoration regains.
+    PSNR leaves out clipped pixels, inner PSNR also a border of 57 pixels. Of simulated pairs PSNR
+    is also measured against the reference without its noise. MTF and SNR are measured on restored
+    slanted edges and flat fields, the flux of points and the contrast of faint bars and zone plates
+    on targets. With a detector the table has average precision, precision and recall on reference,
+    degraded and restored scenes, with intervals over sites, and the share of the loss that
+    restoration regains.
 
     Args:
-        methods: names, separated by commas: degraded is always a row. A shipped network and the
-            traditional methods use the sensor; NAME@blind is given no sensor, NAME@SENSOR another
-            one. In Python also a mapping of names to networks or functions of an image (H, W).
+        methods: names, separated by commas: degraded is always a row. Shipped networks and the
+            traditional methods use the sensor; NAME@blind is given none, NAME@SENSOR another one.
+            In Python also a mapping of names to networks or functions of an image (H, W).
         images: folder of scenes to simulate from; drawn scenes if none.
         pairs: folder with degraded/ and reference/, as 'simulate' writes it; in Python also pairs.
-        sensor: sensor of the degraded images, a name or a .toml file; of pairs the one that made
-            them, else pleiades-degraded if none. With a detector several, separated by commas.
+        sensor: sensor of the degraded images: name or .toml file; of pairs the one that made them,
+            else pleiades-degraded if none. With a detector several, separated by commas.
         reference: sensor of the reference images; pleiades-reference if none.
         lpips: weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.
         out: folder for report.html and pictures.
         calibrate: copy of the network's file to write with the interval that 'restore --interval'
-            uses, fitted on these pairs; `methods` must be that file alone. A level of 90 % needs
-            at least 9 images in addition to those of the sites that the fit uses.
+            uses, fitted on these pairs; `methods` must be that file alone. A level of 90 % needs at
+            least 9 images outside the sites that are fitted.
         sweep: also compare under 16 sensors that are known exactly, and 7 that are known wrongly.
-        brightness: also compare with the radiance of the scenes times these factors, separated by
-            commas, such as 0.25,0.05.
-        bits_per_pixel: also compare restoration on board, before JPEG 2000 compresses to this
-            number of bits per pixel, with restoration on the ground after it; several with commas:
-            1,2,3.
+        brightness: also compare with the radiance of the scenes times these factors, such as
+            0.25,0.05.
+        bits_per_pixel: also compare restoration before and after JPEG 2000 compresses to this
+            number of bits per pixel; several with commas.
         consistency: networks that are given the sensor agree with the image at low frequencies.
         exposure: shipped networks restore dark parts at a higher exposure.
         strict: refuse pairs whose pixels contradict the sensor, instead of a warning.
-        detector: ONNX detector as Ultralytics exports it, to be shown the labelled images.
+        detector: ONNX detector as Ultralytics exports it, which is shown the labelled images.
         labels: folder of VOC labels, or COCO's .json, of the images; next to them if none.
         split: use only the pictures that a list in the folder names, such as test.
         side: side of the detector's input in pixels, if its file leaves it open.

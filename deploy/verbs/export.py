@@ -33,27 +33,24 @@ def export(
 ) -> Path:
     """Write a network as an ONNX file, for any height and width unless a tile is given.
 
-    Your own weights are checked against torch. Weights that are conditioned on a sensor, as all
-    shipped ones are, become the network of one sensor: the middle of each range of its profile. A
-    value outside the range of the training is replaced by its nearest end, with a warning.
-
-    An INT8 file of such weights is conditioned on another sensor without a new calibration. `delta`
-    writes what the sensor changes, and `apply` makes that sensor's file again, to the byte. For the
-    exposures of 'restore', which stand for sensors of 2, 4 or 8 times the gain, NAME-x4.delta and
-    so on are written too, as far as the sensor's noise allows.
+    Weights that are conditioned on a sensor, as all shipped ones are, become the network of one
+    sensor: the middle of each range of its profile, or the nearest limit of the trained range, with
+    a warning. An INT8 file of such weights needs no new calibration for another sensor.
 
     Args:
         out: ONNX file to write.
         network: a shipped name, also with -int8; weights (.safetensors); or an INT8 file that
             'quantize' made of weights of 'train --conditioned'.
-        sensor: sensor of the network: a name, a .toml file, or blind; pleiades-degraded if none.
-        tile: side in pixels of the one tile that the input is fixed to, such as 640 for a board.
-        board_file: also write the core of an INT8 network in the board's encoding, QDQ ONNX or an
-            NPU's VINT8.
-        c: also write the core of an INT8 network as one C99 file for one tile, with integers only.
-        target: board or NPU of `board_file`: a name, or a .toml file.
-        delta: also write what the sensor changes in an INT8 network, 1 to 3 kB.
-        apply: condition the INT8 network on the sensor of this delta, in place of `sensor`.
+        sensor: sensor of the network: name, .toml file or blind; pleiades-degraded if none.
+        tile: side in pixels of the one tile that the input is fixed to, such as 640.
+        board_file: also write the core of an INT8 network in the board's encoding: QDQ ONNX, of an
+            NPU VINT8.
+        c: also write the core of an INT8 network as a C99 file for one tile, with integers only.
+        target: board or NPU of `board_file`: name or .toml file.
+        delta: also write what the sensor changes in an INT8 network, 1 to 3 kB; and NAME-x4.delta
+            and so on for the exposures of 'restore', as far as the noise allows.
+        apply: condition the INT8 network on the sensor of this delta, in place of `sensor`: that
+            sensor's file, to the byte.
 
     Returns:
         The path of the ONNX file.

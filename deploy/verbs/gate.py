@@ -63,15 +63,16 @@ def gate(
         limits: TOML file of limits by name; others have their defaults. In Python also a mapping.
         baseline: JSON file of an earlier gate that passed on the same patches: the MAE may not
             grow.
-        target: board or NPU whose rules the INT8 file must obey: a name, or a .toml file.
-        sensor: sensor of the simulated patches, and of shipped networks: a name, or a .toml file.
-        images: folder of scenes for the patches; drawn scenes if none.
-        samples: your own samples in place of patches: .npy or .npz (N, C, H, W), or a folder of
-            images; in Python also arrays.
+        target: board or NPU whose rules count: name or .toml file.
+        sensor: sensor of the simulated patches, and of a network that is conditioned on one: name
+            or .toml file.
+        images: folder of scenes to simulate from; drawn scenes if none.
+        samples: your own samples in place of simulated patches: .npy or .npz (N, C, H, W), or a
+            folder of images; in Python also arrays.
         patches: number of simulated patches of 128 x 128 pixels.
         metric: also compare the results with the references of the samples, by this metric.
-        output: name of the output to compare, of a network that has several.
-        seed: seed of the patches.
+        output: name of the output to keep of a network that has several.
+        seed: seed of every random draw.
         junit: JUnit XML file to write the verdict to.
         record: folder for a record of evidence: JSON, a page and an ML-BOM.
         progress: a function that is called at each step, False for silence, None for a bar or lines

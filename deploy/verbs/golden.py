@@ -33,15 +33,15 @@ def golden(
     """Write golden vectors of an INT8 network, or compare a board's results with them.
 
     The vectors are inputs and the exact int8 tensors of every layer. A comparison names the first
-    layer that differs, by how much and where. Results of some of the layers are enough. The command
-    exits with 1 if a layer differs.
+    layer that differs, by how much and where; results of some layers are enough. The command exits
+    with 1 if a layer differs.
 
     Args:
         network: INT8 ONNX or a shipped name; with `compare` the folder of a board's results.
         out: folder to write the vectors to.
         compare: folder of vectors that the results are compared with.
         tile: side of a tile in pixels; the network's own if it has one, else 64.
-        target: board or NPU, whose rounding of ties is used: a name, or a .toml file.
+        target: board or NPU whose rounding of ties is used: name or .toml file.
 
     Returns:
         A table of the cases that were written; or of the layers that were compared, which is true

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 def profiles(name: ProfileName | None = None, *, toml: bool = False) -> "Table | str":
     """List sensors, scenes and boards, or show one: every constant, its status and its source.
 
-    The keys of a sensor's file, with units and ranges: docs/reference/sensor-profile.md.
+    docs/reference/sensor-profile.md has the keys of a sensor's file, with units and ranges.
 
     Args:
         name: a shipped profile, or a .toml file; all are listed if none.

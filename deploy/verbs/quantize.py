@@ -65,42 +65,38 @@ def quantize(
 ) -> "Network":
     """Quantise a network to int8 with power-of-two scales.
 
-    The DPU computes the correction, and the host adds it to the image. Any network that a DPU
-    computes is accepted: see docs/reference/any-network.md, or ask 'check'. The table has each
-    integer layer: bits of its accumulator, measured and proven, and the share of saturated results.
-    It also has what each restriction of the DPU costs, measured on samples that calibration did not
-    see.
+    Any network that a DPU computes is accepted: see docs/reference/any-network.md, or ask 'check'.
+    The table has the bits of each accumulator, measured and proven, and the share of saturated
+    results. It also has what each restriction of the DPU costs, measured on samples that
+    calibration did not see.
 
     Args:
         network: float ONNX or weights, or a shipped name. Weights of 'train --conditioned' are
             calibrated over the whole family of sensors.
         out: INT8 ONNX file to write, for any onnxruntime.
-        target: board or NPU whose rules count: a name, or a .toml file.
-        sensor: sensor of the simulated patches, and of a network that is conditioned on one.
+        target: board or NPU whose rules count: name or .toml file.
+        sensor: sensor of the simulated patches, and of a network that is conditioned on one: name
+            or .toml file.
         samples: your own samples in place of simulated patches: .npy or .npz (N, C, H, W), or a
-            folder; in Python also arrays (N, C, H, W), two of them (images, references), or an
-            iterable of these such as a DataLoader. They are what the network reads.
+            folder of images; in Python also arrays (N, C, H, W), two of them (images, references),
+            or an iterable of these such as a DataLoader.
         input_range: LOW,HIGH of the values that the network reads, or such a pair for each channel,
-            as 0,1,0,1,0,1,0,50 for colours and a map of noise levels; [0, 1] for channels whose
-            samples lie in it, else what the samples span.
-        images: folder of scenes for the simulated patches; drawn scenes if none.
+            as 0,1,0,50; [0, 1] for channels whose samples lie in it, else what the samples span.
+        images: folder of scenes to simulate from; drawn scenes if none.
         patches: number of simulated patches.
         patch: side of a simulated patch in pixels.
         effort: how thoroughly channels are equalized: fast takes first guesses, normal searches
-            groups of channels within a bound of time, best searches each channel without a bound.
-            An estimate of the time is printed first.
-        finetune: number of steps that train the integers on the patches, between which scales are
-            moved; 'auto' trains for some minutes, as long as the error falls.
-        adapt: replace activations that the DPU lacks: SiLU by HardSwish, Sigmoid by HardSigmoid,
-            LeakyReLU and PReLU by LeakyReLU of 26/256, or exactly if that loses more than 0.05 dB.
-            The convolutions around them are fitted to the original network, and the table has the
-            loss in float. INT8 is compared with the original.
+            groups of channels for a bounded time, best searches each channel without a bound.
+        finetune: number of steps that train the integers on the patches; 'auto' trains for some
+            minutes, as long as the error falls.
+        adapt: replace activations that the DPU lacks, such as SiLU by HardSwish, and report the
+            loss in float.
         output: name of the output to keep of a network that has several.
-        seed: seed of the patches.
+        seed: seed of every random draw.
         board_file: also write the core in the board's encoding: QDQ ONNX, of an NPU VINT8.
         tile: side of the tile in pixels that `board_file` is fixed to; an NPU needs one.
-        report: folder for report.html and report.json: which layers and patches err most; and
-            node-data.json, by which Google's Model Explorer colours the nodes.
+        report: folder for report.html and report.json with the layers and patches that err most,
+            and node-data.json for Google's Model Explorer.
         progress: a function that is called at each step, False for silence, None for a bar or lines
             on standard error.
 

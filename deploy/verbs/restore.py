@@ -67,21 +67,19 @@ def restore(
 
     A file is read and written by rows, so memory does not grow with its height. OUT has the pixel
     type and the scale of IMAGE, and keeps its georeference, RPCs, missing pixels and alpha. Bands
-    are restored one by one. Noise, edges and detectors of the image are checked, and a warning says
-    what contradicts the sensor.
+    are restored one by one. A warning says where noise, edges or detectors contradict the sensor.
 
     Args:
         image: image file of any size: TIFF, or what GDAL reads. In Python also an array (H, W) or
             (bands, H, W) of NumPy, torch, Dask or xarray, or a dataset of rasterio.
         out: TIFF to write.
-        network: ONNX network, or a shipped name, in float32 (NAME) or INT8 (NAME-int8);
+        network: ONNX network, or a shipped name (NAME in float32, NAME-int8 in INT8);
             convbeers-s-int8 if none.
         method: a network, or the traditional pipeline, which takes about a minute for a megapixel
             and cannot be resumed.
         quality: quality of the traditional pipeline.
-        sensor: sensor that acquired the image, a name or a .toml file: shipped networks and the
-            consistency step use it. B0=a.toml,B1=b.toml names one for each band; blind for an
-            unknown sensor.
+        sensor: sensor that acquired the image, which shipped networks and the consistency step use:
+            name or .toml file; B0=a.toml,B1=b.toml for each band; blind if unknown.
         tile: longest side of a tile in pixels.
         halo: context around each tile in pixels, or 'exact' (no seams).
         full_scale: pixel value that is full scale; else what the image states, the bits of the
@@ -94,29 +92,27 @@ def restore(
         memory: budget of this process in GB; what is free if none.
         scheduler: address of a Dask scheduler whose workers run the network, such as
             tcp://host:8786.
-        cog: write a Cloud-Optimised GeoTIFF: tiles, overviews and what was done.
+        cog: write a Cloud-Optimised GeoTIFF, with overviews and what was done.
         stac: STAC item of the output to write; needs `cog`.
-        self_check: TIFF to write with one pixel for each block of 64 x 64 pixels: whether the
-            result, blurred as the sensor blurs, agrees with the image.
+        self_check: TIFF to write: for each block of 64 x 64 pixels, whether the result, blurred as
+            the sensor blurs, agrees with the image.
         interval: also write OUT-interval.tif: for each pixel the half-width of an interval that
-            contains the error of this percentage of pixels. It needs the sensor, and a network with
-            a calibrated interval, as shipped ones have. In Python an array returns (restored,
+            contains the error of this percentage of pixels. Needs the sensor, and a network with
+            such an interval, as shipped ones have. In Python an array returns (restored,
             half_width).
-        view: HTML file to write that shows raw and restored in a browser, to swipe and zoom.
-        strict: refuse an image whose pixels contradict the sensor, and a result that fails the
-            self-check, instead of a warning.
+        view: HTML file to write, which compares raw and restored in a browser.
+        strict: refuse what contradicts the sensor or fails the self-check, instead of a warning.
         consistency: make the result agree with the image at low spatial frequencies, if the sensor
             is named.
         exposure: restore dark parts at a higher exposure (shipped networks).
-        fix_detectors: interpolate faulty pixels before the restoration: 'found' searches for them
-            and writes the list next to the output; or a list, lines of column,row with * as the
-            row for a whole column.
+        fix_detectors: interpolate faulty pixels first: 'found' searches for them and lists them
+            next to the output; or a list, lines of column,row with * for a whole column.
         force: accept an image that was restored before, follow an index out of its folder, and
             write any result.
         overwrite: replace the output if it exists.
         resume: continue a run that was stopped or killed.
-        dry_run: print facts of the image, the plan of tiles and the time it would take, and write
-            no image.
+        dry_run: print facts of the image, the plan of tiles and the expected time, and write no
+            image.
         progress: a function that is called at each step, False for silence, None for a bar or lines
             on standard error.
 

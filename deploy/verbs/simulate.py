@@ -74,29 +74,28 @@ def simulate(
 ) -> "Pair | Table":
     """Simulate what a sensor sees of a scene, and what a better one sees.
 
-    Pairs are written as 12-bit TIFFs, degraded/NAME.tif and reference/NAME.tif, of whole scenes or
-    of patches.
+    Pairs, of whole scenes or of patches, are written as 12-bit TIFFs degraded/NAME.tif and
+    reference/NAME.tif.
 
     Args:
         images: scenes: image files, or folders of them, of 8 bits, 16-bit DN or float radiance;
             repeat it for several. In Python also the pixels of one. A drawn scene if none.
         out: folder of the data set; in Python one pair is returned if none.
-        sensor: sensor of the degraded images, a name or a .toml file: each of its ranges is drawn
-            from; pleiades-degraded if none.
+        sensor: sensor of the degraded images, whose ranges are drawn from: name or .toml file;
+            pleiades-degraded if none.
         reference: sensor of the reference images; pleiades-reference if none.
         preset: data set of the paper: its sensor and its patch size.
         size: side in pixels of the pair of a drawn scene, in Python.
         patch: side of a patch in pixels; whole scenes if none.
         oversampling: number of scene pixels for each pixel; the sensor's if none.
-        scene: scene whose light and effects are applied: night-port, snow and others, or a .toml
-            file.
+        scene: scene whose light and effects are applied, such as night-port, or a .toml file.
         with_: effect to add, at typical values; repeat it for several.
         without: effect to leave out; repeat it for several.
         explain: print for each effect what is decided and why, and write nothing.
         tolerance: largest change of a pixel in DN for which an effect is skipped.
         workers: number of processes; 0 uses all cores.
-        scheduler: address of a Dask scheduler whose workers simulate, such as tcp://host:8786;
-            they must find the scenes under the same paths.
+        scheduler: address of a Dask scheduler whose workers simulate, such as tcp://host:8786; they
+            must find the scenes under the same paths.
         seed: seed of every random draw.
         resume: continue an unfinished data set; pairs that do not match the manifest are simulated
             again.

@@ -47,10 +47,10 @@ def stress(
 ) -> "Table":
     """Run hard cases through a network in float32, in INT8, in integers alone and in tiles.
 
-    The tables show what holds, the worst measurements, the known limitations that were met, and
-    which sums are proven not to overflow. The command exits with 1 if something fails. `bit_flips`
-    shows what flipped bits in weights, shifts, feature maps and the image cost, and what guards
-    gain and cost on the board.
+    The tables show what holds, the worst measurements, known limitations that were met, and which
+    sums are proven not to overflow. The command exits with 1 if something fails. `bit_flips` shows
+    what flipped bits in weights, shifts, feature maps and the image cost, and what guards gain and
+    cost on the board.
 
     Args:
         float_network: float ONNX or weights. The name of a shipped pair stands for both;
@@ -61,10 +61,9 @@ def stress(
         side: side of the images in pixels, if a case has none of its own.
         bit_flips: inject bit flips into the INT8 network instead of running hard cases.
         draws: number of injections into each memory at each rate.
-        sensor: sensor of a shipped network, and of the patches for bit flips: a name, or a .toml
-            file.
+        sensor: sensor of a shipped network, and of the patches for bit flips: name or .toml file.
         images: folder of aerial images for the patches for bit flips; drawn scenes if none.
-        target: board whose cost model predicts the cost of the guards: a name, or a .toml file.
+        target: board whose cost model predicts the cost of the guards: name or .toml file.
         seed: seed of every random draw.
         out: tables as Markdown; with `bit_flips` the curves are written next to it as SVG.
         progress: a function that is called at each step, False for silence, None for a bar or lines

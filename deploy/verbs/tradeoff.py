@@ -57,22 +57,21 @@ def tradeoff(
     """Find what accuracy costs in time, over networks and boards, and recommend a point.
 
     Networks and pipelines are measured on the same images, and their runs on boards are predicted.
-    All boards are compared, and a line states for each one that is not recommended why it is not.
-    The command exits with 1 if no point keeps the budget and the need; the page is written all the
-    same.
+    A line states for each board that is not recommended why it is not. The command exits with 1 if
+    no point keeps the budget and the need; the page is written all the same.
 
     Args:
         out: folder of the page and the figures.
-        images: folder of held-out scenes to simulate from; drawn scenes if none.
-        sensor: sensor of the degraded images: a name, or a .toml file.
+        images: folder of scenes to simulate from; drawn scenes if none.
+        sensor: sensor of the degraded images: name or .toml file.
         reference: sensor of the reference images; pleiades-reference if none.
-        network: shipped names, float ONNX or safetensors files, which are quantised on the way, or
-            INT8 files, separated by commas; all stands for the shipped ones.
-        budget: what you can afford: latency<=20s, or latency<=9s,power<=20W. The best PSNR wins.
-        need: what you must reach: psnr>=44. Without a budget the least latency wins.
+        network: separated by commas: shipped names, INT8 files, or float ONNX or safetensors files,
+            which are quantised on the way; all stands for the shipped ones.
+        budget: what you can afford, such as latency<=9s,power<=20W. The best PSNR wins.
+        need: what you must reach, such as psnr>=44. Without a budget the least latency wins.
         lpips: weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.
         calibration: folder of scenes to quantise your networks on; drawn scenes if none.
-        target: board whose model predicts: a name, or a .toml file; several with commas, or all.
+        target: board whose model predicts: name or .toml file; several with commas, or all.
         size: width x height of the swath in pixels.
         dry_run: print how much is measured and about how long that takes, and write nothing.
         seed: seed of every random draw.

@@ -66,21 +66,21 @@ def train(
     """Train a network on simulated or stored pairs; the same seed makes the same weights.
 
     The loss is the paper's: 1.0 L1 + 0.5 LPIPS + 0.1 L1 of spectra. Without weights for LPIPS that
-    term is left out, which is logged and recorded. A twentieth of the images, whole sites, is held
-    out for validation. For several GPUs start it with torchrun.
+    term is left out, which is logged. A twentieth of the images, whole sites, is held out for
+    validation. For several GPUs start it with torchrun.
 
     Args:
         out: folder of checkpoint, logs, pictures and weights.
-        recipe: recipe to run, a shipped name or a .toml file; it states all other options of the
+        recipe: recipe to run, a shipped name or a .toml file, which states all other options of the
             training.
         images: folder of sharp aerial images (8-bit RGB, or 16-bit mono) to simulate from; repeat
             it for several.
         pairs: folder of pairs that 'simulate' wrote, in place of images.
         variant: size of the network.
-        sensor: sensor of the degraded images: a name, or a .toml file; of pairs the one that made
-            them, else pleiades-variable if none.
-        conditioned: draw sensors of a wide range with that gain, and condition the network on each:
-            it becomes the network of any sensor in range.
+        sensor: sensor of the degraded images: name or .toml file; of pairs the one that made them,
+            else pleiades-variable if none.
+        conditioned: condition the network on sensors of a wide range with that gain: it becomes the
+            network of any sensor in range.
         reference: sensor of the reference images; pleiades-reference if none.
         drawn: number of drawn scenes to add to the images.
         steps: number of gradient steps.
@@ -90,16 +90,16 @@ def train(
         l1_weight: weight of L1 in the loss.
         lpips_weight: weight of LPIPS in the loss.
         fft_weight: weight of the L1 of spectra in the loss.
-        psnr_weight: weight of the mean PSNR of the patches in the loss, such as 0.01 without L1.
+        psnr_weight: weight of the patches' mean PSNR in the loss, such as 0.01 without L1.
         lpips: weights of SqueezeNet 1.1 for LPIPS-squeeze, or a folder of backbones.
         start: weights to start from; those of a smaller network are widened.
-        rounding: INT8 file of the `start` weights, whose rounding of the feature maps is applied in
-            training, so that a new quantisation loses less.
+        rounding: INT8 file of the `start` weights: training applies its rounding of feature maps,
+            so that a new quantisation loses less.
         validate_every: number of steps between validations; 0 for none.
         seed: seed of every random draw.
         device: device of the training, cpu or cuda.
-        precision: number format of the convolutions; bfloat16 is faster where the device has units
-            for it.
+        precision: number format of the convolutions; bfloat16 is faster on devices with units for
+            it.
         resume: continue the run from its checkpoint.
         progress: a function that is called at each step, False for silence, None for a bar or lines
             on standard error.

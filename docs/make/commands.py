@@ -19,27 +19,26 @@ from beers_deploy.cli.generate import (
     text_for_command,
 )
 from beers_deploy.profiles.shipped import board_names, npu_names
-from beers_deploy.verbs.parameters import Interval
-from beers_deploy.verbs.verb import marker
 
 TARGET = Path(__file__).parents[1] / "reference" / "commands.md"
 OPENING = """# Commands
 
-Each command but `profiles` is one function of the library: `beers-deploy NAME --help` and `help(bd.NAME)` print the
-same text.
+`beers-deploy NAME --help` and, for each command but `profiles`, `help(bd.NAME)` print the same text.
 
-Parentheses have the values that an option accepts and its default. An option that would have no effect next to
-others is refused with exit code 2. An output is a regular file or a new name, and is written whole or not at all: an
-input, another output, a link, a pipe or a device is refused. Every command accepts `-q`, `-v` and, where it reports
-figures, `--json`.
+Parentheses have the values that an option accepts and its default; `--help` also has its range. An option that would
+have no effect next to others is refused with exit code 2. An output is a regular file or a new name, and is written
+whole or not at all; an input, another output, a link, a pipe or a device is refused. Every command accepts `-q`, `-v`
+and, where it reports figures, `--json`.
 
 ## Options of several commands
 
-Boards are {boards}, or your .toml file ([boards](boards.md)); where nothing is
-predicted also {npus}. Sensors are profiles by their names, or your .toml file ([sensors](sensor-profile.md)).
+A board is {boards}, or your .toml file ([boards](boards.md)); where nothing is
+predicted also {npus}. A sensor is the name of a profile, or your .toml file ([sensors](sensor-profile.md)).
 """
 SEVERAL = 3
 """Commands that have the same line for an option, from which on it is described once."""
+NAMED = ": name or .toml file"
+"""How boards and sensors are named, which the opening says once."""
 
 
 def reference() -> str:
@@ -69,7 +68,7 @@ def _lines(command: Command) -> dict[str, str]:
     texts = {entry.arg_name: entry.description or "" for entry in command.doc.params}
     lines = {}
     for parameter in command.parameters:
-        text = text_for_command(texts[parameter.name], command.verb)
+        text = text_for_command(texts[parameter.name], command.verb).replace(NAMED, "")
         label = _label(parameter)
         about = _about(parameter)
         lines[label] = f"- `{label}`{f' ({about})' if about else ''}: {text}"
@@ -88,12 +87,6 @@ def _about(parameter: Parameter) -> str:
     hint, repeated = read_as(parameter.annotation)
     if get_origin(hint) is Literal:
         words.append(", ".join(map(str, get_args(hint))))
-    interval = marker(parameter, Interval)
-    # Nobody needs to know the largest seed.
-    if interval is not None and interval.le is not None and parameter.name != "seed":
-        words.append(f"{interval.ge} to {interval.le}")
-    elif interval is not None:
-        words.append(f"at least {interval.ge}")
     default = parameter.default
     if default is Parameter.empty:
         words.append("required")

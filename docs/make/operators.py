@@ -23,9 +23,7 @@ from beers_deploy.dpu.checker.operators import (
 )
 from beers_deploy.dpu.checker.other_rules import INSTEAD
 from beers_deploy.dpu.checker.remarks import REMARKS
-from beers_deploy.dpu.cost.latency import dpu_power
 from beers_deploy.dpu.shapes import KINDS, Kind
-from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.shipped import board_names, npu_names
 from beers_deploy.profiles.target import TargetProfile
 
@@ -43,12 +41,16 @@ OPENING = """# Operators of the DPUs
     beers-deploy check network.onnx --target zcu102
 
 applies these rules to your network; `beers-deploy profiles NAME` lists the limits of a board with their sources. A
-rule applies to all boards or to those named with it; numbers in parentheses belong to the boards named there.
+rule applies to all boards or to those named with it; parentheses have what differs on the boards named there.
 
-A node runs on the DPU if it keeps every rule of its kind, the rules of size, and in a quantised file also those of
-numbers. A fully connected layer, or a convolution as large as its map, is also judged as a 1 x 1 convolution over the
-flattened map. Other nodes run on the board's processor: `check` fails, and `bench` counts their time at the start and
-the end of a float network and refuses the network elsewhere.
+A node runs on the DPU if it keeps every rule of its kind, the rules of size, and in a quantised file those of numbers. A
+fully connected layer, or a convolution as large as its map, is also judged as a 1 x 1 convolution over the flattened
+map. Other nodes run on the board's processor: `check` fails, and `bench` counts their time at the start and the end of
+a float network, and refuses the network elsewhere.
+"""
+VARYING = re.compile(r"((?<=: )[^.:]+(?=\.)|\d+)")
+"""Where the text of a rule may differ between boards: a list up to the end of a sentence, or a
+number.
 """
 
 
@@ -76,9 +78,6 @@ FIGURES: dict[str, Callable[[Dpu], str]] = {
     "input x output channels x pixels": lambda dpu: (
         f"{dpu.input_parallel} x {dpu.output_parallel} x {dpu.whole('array', 'pixel_parallel')}"
     ),
-    "map kept on chip, KiB": lambda dpu: f"{dpu.value('memory', 'feature_map_bytes') / 2**10:g}",
-    "DDR, GB/s": lambda dpu: _gigabytes(dpu.limit("memory", "ddr_bytes_per_s")),
-    "power under the DPU, W": lambda dpu: str(dpu_power(dpu)),
 }
 """What a board's file states, in the words of a table."""
 
@@ -91,10 +90,6 @@ def _boards() -> Iterator[str]:
     for title, cell in FIGURES.items():
         yield f"| {title} | {' | '.join(map(cell, DPUS.values()))} |"
     yield ""
-
-
-def _gigabytes(rate: Constant) -> str:
-    return " to ".join(dict.fromkeys(f"{end / 1e9:g}" for end in (rate.low, rate.high)))
 
 
 def _kinds() -> Iterator[str]:
@@ -110,7 +105,7 @@ def _kinds() -> Iterator[str]:
 
 
 def _rules(title: str, rules: Iterable[Callable[..., object]]) -> list[str]:
-    """Return a line for each rule, and for each wording if boards differ in more than numbers."""
+    """Return a line for each rule, and for each wording if boards differ in more than a list."""
     lines = list(chain.from_iterable(map(_lines, rules)))
     return [f"## {title}\n", *(lines or ["Runs on every DPU."]), ""]
 
@@ -132,11 +127,19 @@ def _npu(npu: Dpu) -> Iterator[str]:
         "AMD publishes no limits; numbers are its quantiser's. [The NPU's flow](npu.md) has "
         "what else is known."
     )
-    yield f"As for the DPUs: {', '.join(same)}. Otherwise ({npu.target.documents['quantiser']}):\n"
-    rest = {name: text for name, (_, text) in texts.items() if name not in same}
+    yield f"As for the DPUs: {', '.join(same)}. What differs ({npu.target.documents['quantiser']}):\n"
     above = f" ({npu.target.documents['quantiser']})"
-    yield from (f"- **{name}**: {text.replace(above, '')}" for name, text in rest.items())
+    for name, (rule, text) in texts.items():
+        if name not in same:
+            yield f"- **{name}**: {_own_sentences(rule, text.replace(above, ''))}"
     yield ""
+
+
+def _own_sentences(rule: Callable[..., object], text: str) -> str:
+    """Return the sentences of a rule's text on an NPU that it has on no DPU."""
+    others = _texts(rule).values()
+    sentences = re.split(r"(?<=\.) ", text)
+    return " ".join(s for s in sentences if not any(s in other for other in others))
 
 
 def _texts(rule: Callable[..., object]) -> dict[str, str]:
@@ -150,23 +153,23 @@ def _texts(rule: Callable[..., object]) -> dict[str, str]:
 
 def _lines(rule: Callable[..., object]) -> Iterator[str]:
     texts = _texts(rule)
-    if len({re.sub(r"\d+", "", text) for text in texts.values()}) == 1:
-        texts = dict.fromkeys(texts, _with_each_number(texts))
+    if len({VARYING.sub("", text) for text in texts.values()}) == 1:
+        texts = dict.fromkeys(texts, _with_each_part(texts))
     for names, text in _alike(texts):
         where = "" if names == "all" else f" on {names}"
         yield f"- **{rule_name(rule)}**{where}: {text}"
 
 
-def _with_each_number(texts: Mapping[str, str]) -> str:
-    """One text for boards whose texts differ in numbers alone: "at most 4096 (vek280: 8192)"."""
-    parts = zip(*(re.split(r"(\d+)", text) for text in texts.values()), strict=True)
+def _with_each_part(texts: Mapping[str, str]) -> str:
+    """Return one text for boards that differ in numbers or lists: "at most 4096 (vek280: 8192)"."""
+    parts = zip(*map(VARYING.split, texts.values()), strict=True)
     return "".join(_each(dict(zip(texts, part, strict=True))) for part in parts)
 
 
 def _each(values: Mapping[str, str]) -> str:
     most = max(values.values(), key=[*values.values()].count)
     rest = _alike({name: value for name, value in values.items() if value != most})
-    others = ", ".join(f"{names}: {value}" for names, value in rest)
+    others = "; ".join(f"{names}: {value}" for names, value in rest)
     return f"{most} ({others})" if others else most
 
 

@@ -1,8 +1,7 @@
 """Write docs/reference/target-file.md, every key of a board's file: `python
 docs/make/target_file.py`.
 
-The keys, and the values among the shipped boards, are read from their files; unit and meaning stand
-below. A test keeps the page fresh, and fails for a key that the tables below lack or that no board
+The keys, and the values of the shipped boards, are read from their files; meanings stand below. A test keeps the page fresh, and fails for a key that the tables below lack or that no board
 has.
 """
 
@@ -10,140 +9,128 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-from beers_deploy.profiles import target_limits
-from beers_deploy.profiles.constant import Constant, Limits
+from beers_deploy.profiles.constant import Constant
 from beers_deploy.profiles.shipped import board_names
 from beers_deploy.profiles.target import DOCUMENTS, FUSED, NPU, PLACES, TargetProfile
 
 TARGET = Path(__file__).parents[1] / "reference" / "target-file.md"
 BUILD = "configurations.NAME"
+FITTED = "cost"
 WINDOW = {
-    "kernel": ("px", "height and width of a kernel"),
-    "stride": ("px", "step along height and width"),
+    "kernel": "sides of a kernel",
+    "stride": "steps along height and width",
 }
 PADDED = {
-    "pad_begin": ("px", "zeros above and to the left"),
-    "pad_end": ("px", "zeros below and to the right"),
+    "pad_begin": "zeros above and to the left",
+    "pad_end": "zeros below and to the right",
 }
 SIZES = {
-    "input_channel_parallel": ("channels", "input channels read at a time"),
-    "pixel_parallel": ("px", "pixels at a time, or rows where `column_parallel` is above 1"),
-    "feature_map_bytes": ("B", "one group of on-chip banks for maps"),
-    "weight_bytes": ("B", "on-chip banks for weights"),
-    "weight_banks": ("banks", "banks for weights"),
-    "channels_per_cycle": (
-        "channels",
-        "channels per cycle of pools, depthwise convolutions and adds",
-    ),
-    "pixels_per_cycle": ("px", "their pixels per cycle"),
+    "input_channel_parallel": "input channels read at a time",
+    "pixel_parallel": "pixels at a time, or rows where `column_parallel` is above 1",
+    "feature_map_bytes": "one group of on-chip banks for maps",
+    "weight_bytes": "on-chip banks for weights",
+    "weight_banks": "number of banks for weights",
+    "channels_per_cycle": "of pools, depthwise convolutions and adds",
+    "pixels_per_cycle": "likewise",
 }
 """Keys that a configuration may also state for itself, with another value than the board's."""
 
-KEYS: dict[str, dict[str, tuple[str, str]]] = {
+KEYS: dict[str, dict[str, str]] = {
     BUILD: {
-        "cores": ("cores", "compute units"),
-        "batch_handlers": ("handlers", "images that a core computes at once"),
-        "cpb": ("channels", "output channels at a time"),
-        "aie_cores": ("cores", "AI engines"),
-        "peak_tops": ("10^12/s", "int8 operations of all cores; a multiply-accumulate is two"),
+        "cores": "compute units",
+        "batch_handlers": "images that a core computes at once",
+        "cpb": "output channels at a time",
+        "aie_cores": "AI engines",
+        "peak_tops": "10^12 int8 operations a second of all cores; a multiply-accumulate is two",
         **SIZES,
     },
     "array": {
         **{key: SIZES[key] for key in ("input_channel_parallel", "pixel_parallel")},
-        "column_parallel": ("px", "columns computed at a time"),
-        "input_groups": ("groups", "groups of input channels read together"),
-        "channel_groups": ("groups", "most groups of `input_channel_parallel` channels in a layer"),
-        "pl_clock_hz": ("Hz", "clock of the programmable logic"),
-        "aie_clock_hz": ("Hz", "clock of the AI engines"),
+        "column_parallel": "columns computed at a time",
+        "input_groups": "groups of input channels read together",
+        "channel_groups": "most groups of `input_channel_parallel` channels in a layer",
+        "pl_clock_hz": "clock of the programmable logic",
+        "aie_clock_hz": "clock of the AI engines",
     },
     "memory": {
         **{key: SIZES[key] for key in ("feature_map_bytes", "weight_bytes", "weight_banks")},
-        "feature_map_groups": ("groups", "groups of banks for maps"),
-        "weight_bank_depth": ("words", "depth of a bank for weights"),
-        "ddr_bytes_per_s": ("B/s", "peak rate of the board's memory"),
+        "feature_map_groups": "groups of banks for maps",
+        "weight_bank_depth": "words in a bank for weights",
+        "ddr_bytes_per_s": "peak rate of the board's memory",
     },
     "conv": {
         **WINDOW,
-        "weight_bias_depth": ("words", "depth of the bias in a bank for weights"),
-        "window_max": ("1", "largest kernel area x ceil(input channels / `window_channels`)"),
-        "window_channels": ("channels", "see `window_max`"),
-        "area_max": ("px", "largest kernel height x width"),
+        "weight_bias_depth": "words of the bias in a bank for weights",
+        "window_max": "largest kernel area x ceil(input channels / `window_channels`)",
+        "window_channels": "see `window_max`",
+        "area_max": "largest kernel height x width",
     },
     "depthwise": {
         **WINDOW,
         **PADDED,
-        "window_max": ("1", "largest share of a bank that a kernel takes"),
+        "window_max": "largest share of a bank that a kernel takes",
     },
     "transposed": {
-        "kernel_per_stride": ("1", "kernel / stride, rounded down and up"),
-        "output_padding": ("px", "largest output padding"),
+        "kernel_per_stride": "kernel / stride, rounded down and up",
+        "output_padding": "largest output padding",
     },
     "pool": {**WINDOW, **PADDED},
-    "leaky_relu": {"alpha": ("1", "the only slope that the DPU supports")},
+    "leaky_relu": {"alpha": "the only slope that the DPU supports"},
     "elementwise": {key: SIZES[key] for key in ("channels_per_cycle", "pixels_per_cycle")},
     "resize": {
-        "bilinear_scale": ("1", "bilinear enlargement, in powers of two"),
-        "half_pixel_scale": ("1", "the same with half-pixel centres"),
+        "bilinear_scale": "bilinear enlargement, in powers of two",
+        "half_pixel_scale": "the same with half-pixel centres",
     },
-    "argmax": {"channels_max": ("channels", "most channels; 0 means that ArgMax is refused")},
+    "argmax": {"channels_max": "most channels; 0 means that ArgMax is refused"},
     "numbers": {
-        "shift_cut": ("bit", "shift from a layer's accumulator to its output"),
-        "shift_bias_max": ("bit", "largest shift from a bias to the accumulator"),
-        "shift_read": ("bit", "shift between the inputs of an add"),
-        "shift_write": ("bit", "shift from an add to its output"),
-        "accumulator_bits": ("bit", "width of the accumulator"),
+        "shift_cut": "shift from a layer's accumulator to its output",
+        "shift_bias_max": "largest shift from a bias to the accumulator",
+        "shift_read": "shift between the inputs of an add",
+        "shift_write": "shift from an add to its output",
+        "accumulator_bits": "width of the accumulator",
     },
     "power": {
-        "dpu_range_w": (
-            "W",
-            "lowest and highest published power of the board, idle or while the DPU runs",
-        ),
-        "cpu_run_w": ("W", "power of the board while its processor runs the traditional pipeline"),
+        "dpu_range_w": "published power of the board, idle or while the DPU runs",
+        "cpu_run_w": "power while the processor runs the traditional pipeline",
     },
-    "tile": {"memory_bytes": ("B", "memory of the board, into which maps must fit")},
-    "cost": {
-        "array_efficiency": ("1", "share of the peak that convolutions reach, at most 1"),
-        "port_bytes_per_cycle": ("B/cycle", "rate between a core and the memory"),
-        "memory_efficiency": ("1", "share of `ddr_bytes_per_s` that maps reach"),
-        "layer_s": ("s", "time added to each layer"),
-        "host_image_s": ("s", "time of the host for an image"),
-        "host_in_bytes_per_s": ("B/s", "rate of input from the host"),
-        "host_out_bytes_per_s": ("B/s", "rate of output to the host"),
-        "argmax_values_per_s": ("1/s", "rate of this task on the host"),
-        "softmax_values_per_s": ("1/s", "likewise"),
-        "sort_values_per_s": ("1/s", "likewise, for boxes and key points"),
-        "image_values_per_s": ("1/s", "likewise, for an image"),
-        "overlap": ("1", "share of the shorter of computing and moving that is hidden; assumed"),
-        "contention_exponent": (
-            "1",
-            "how sharply the slower of DPU and host sets the rate; cross-validated",
-        ),
-        "width_array": ("1", "half width of the interval of ln(FPS) as far as the array sets it"),
-        "width_lanes": ("1", "the same for the ALU and the element-wise engine"),
-        "width_memory": ("1", "the same for transfers"),
-        "width_start": ("1", "the same for starts of layers"),
-        "width_copies": ("1", "the same for the host's copies"),
-        "width_task": ("1", "the same for the host's task"),
-        "width_outside": ("1", "the least of it for a network beyond those fitted"),
-        "families_held": ("1", "share of the families left out that intervals held"),
-        "error_left_out": ("1", "mean error of the networks left out"),
-        "pair_width": ("1", "the same for ln of the ratio of two networks' rates"),
-        "fitted_map_bytes": ("B", "range of the fitted networks"),
-        "fitted_operations": ("operations", "range of the fitted networks"),
+    "tile": {"memory_bytes": "memory of the board, into which maps must fit"},
+    FITTED: {
+        "array_efficiency": "share of the peak that convolutions reach",
+        "port_bytes_per_cycle": "rate between a core and the memory",
+        "memory_efficiency": "share of `ddr_bytes_per_s` that maps reach",
+        "layer_s": "time added to each layer",
+        "host_image_s": "time of the host for an image",
+        "host_in_bytes_per_s": "rate of input from the host",
+        "host_out_bytes_per_s": "rate of output to the host",
+        "argmax_values_per_s": "rate of this task on the host",
+        "softmax_values_per_s": "likewise",
+        "sort_values_per_s": "likewise, for boxes and key points",
+        "image_values_per_s": "likewise, for an image",
+        "overlap": "share of the shorter of computing and moving that is hidden; assumed",
+        "contention_exponent": "how sharply the slower of DPU and host sets the rate",
+        "width_array": "half width of the interval of ln(FPS) as far as the array sets it",
+        "width_lanes": "the same for the ALU and the element-wise engine",
+        "width_memory": "the same for transfers",
+        "width_start": "the same for starts of layers",
+        "width_copies": "the same for the host's copies",
+        "width_task": "the same for the host's task",
+        "width_outside": "the least of it for a network beyond those fitted",
+        "families_held": "share of the families left out that intervals held",
+        "error_left_out": "mean error of the networks left out",
+        "pair_width": "half width for ln of the ratio of two networks' rates",
+        "fitted_map_bytes": "range of the fitted networks",
+        "fitted_operations": "likewise",
     },
     "cpu": {
-        "cores": ("cores", "cores of the board's processor"),
-        "clock_ghz": ("GHz", "clock of the processor"),
-        "product_flops_per_cycle": ("1/cycle", "float32 operations of a core in matrix products"),
-        "moved_bytes_per_s": ("B/s", "bytes that a core moves"),
-        "decoding_mips_per_ghz": ("MIPS/GHz", "7-zip's rating, by which plain code is scaled"),
-        "chain_s_per_mpx": (
-            "s/Mpx",
-            "time of the traditional pipeline for 10^6 pixels on all cores",
-        ),
+        "cores": "cores of the board's processor",
+        "clock_ghz": "its clock",
+        "product_flops_per_cycle": "float32 operations of a core in matrix products",
+        "moved_bytes_per_s": "bytes that a core moves",
+        "decoding_mips_per_ghz": "7-zip's rating, by which plain code is scaled",
+        "chain_s_per_mpx": "time of the traditional pipeline on all cores",
     },
 }
-"""Unit and meaning of every key, by its table."""
+"""The meaning of every key, by its table."""
 
 OPENING = """# A board's file
 
@@ -156,11 +143,9 @@ Each constant is `{ value = ..., status = "...", source = "..." }`, a range is `
 number has the status "stated"; other statuses are published, measured, inferred and assumed. A rule applies where the
 file has its constants, so leave out what your DPU does not limit.
 
-| key at the top | what it is |
-|---|---|
-| `base` | a shipped board that supplies what the file does not state, except the watts of `[power]` |
-| `description` | one sentence; required |
-| `default_configuration` | the configuration that is used where `--dpu` names none |
+- `base`: a shipped board that supplies what the file does not state, except the watts of `[power]`
+- `description`: one sentence; required
+- `default_configuration`: the configuration that is used where `--dpu` names none
 """
 
 
@@ -178,20 +163,12 @@ def shipped() -> dict[str, dict[str, list[Constant]]]:
     return by_table
 
 
-def accepted(limit: Limits) -> str:
-    """Return the limits of a key in a few words."""
-    low = "above 0" if limit.low == target_limits.SMALLEST else f"{limit.low:g}"
-    return f"{'whole, ' if limit.whole else ''}{low} to {limit.high:g}"
-
-
-def line(key: str, unit: str, meaning: str, limit: Limits, constants: list[Constant]) -> str:
-    """Return the line of a key: its meaning, its unit, the values of the shipped boards, and its
-    limits.
-    """
+def line(key: str, meaning: str, constants: list[Constant]) -> str:
+    """Return the line of a key: its meaning, and the values of the shipped boards."""
     low = min(c.low for c in constants)
     high = max(c.high for c in constants)
     among = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
-    return f"- `{key}`: {meaning} ({among}{f' {unit}' if unit != '1' else ''}; {accepted(limit)})"
+    return f"- `{key}`: {meaning} ({among})"
 
 
 def document() -> str:
@@ -202,22 +179,24 @@ def document() -> str:
 def _constants() -> Iterator[str]:
     yield "## Constants\n"
     yield (
-        "Parentheses have the values among the shipped boards with the unit, then the numbers "
-        "that are accepted. A"
+        "Parentheses have the values of the shipped boards. A name ends in its unit; kernels, "
+        "strides and padding are in pixels, shifts in bits. A value out of range is refused with "
+        f"its limits. A configuration may state these keys of other tables for itself: "
+        f"{_names((*SIZES,))}."
     )
-    yield f"configuration may state these keys of other tables for itself: {_names((*SIZES,))}."
     constants = shipped()
     for table, keys in KEYS.items():
         yield f"\n### [{table}]\n"
-        if table == "cost":
-            yield "Fitted, where nothing else is said.\n"
         selected = {
-            key: constant for key, constant in keys.items() if table != BUILD or key not in SIZES
+            key: meaning for key, meaning in keys.items() if table != BUILD or key not in SIZES
         }
-        yield from (
-            line(key, *constant, target_limits.LIMITS[key], constants[table][key])
-            for key, constant in selected.items()
-        )
+        if table == FITTED:
+            yield "Fitted by `python -m benchmarks.cost_model.refit`, where nothing else is said.\n"
+            yield from (f"- `{key}`: {meaning}" for key, meaning in selected.items())
+        else:
+            yield from (
+                line(key, meaning, constants[table][key]) for key, meaning in selected.items()
+            )
 
 
 def _words() -> Iterator[str]:
