@@ -5,7 +5,8 @@ markers.
     python docs/make/results.py evaluation.json 'without steps'=plain.json
 
 A table lies between `<!-- NAME -->` and `<!-- end -->`, NAME being that of the document's table.
-The heading of the table on the page says which of the document's columns are shown; what the
+The table on the page says what is shown: its heading the document's columns, its rows the names of
+the rows (every row if it has none), and a bracket in it that figures have their intervals. What the
 document does not hold stays as it is. Tables whose name begins with "mean", such as "mean, radiance
 x 0.25", and "targets" have a row for each method. A document given as WORDS=FILE fills the tables
 whose name is WORDS, a colon and the document's name of it.
@@ -57,26 +58,29 @@ def filled(tables: Mapping[str, list[Row]], match: re.Match[str]) -> str:
     name = match["name"]
     if name not in tables:
         return match[0]
-    columns = [cell.strip() for cell in match["table"].split("\n")[0].strip("| ").split("|")]
+    lines = match["table"].splitlines()
+    columns, _, *old = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
+    names = {cells[0] for cells in old}
     kind = name.rpartition(": ")[2]
     by_method = kind.startswith("mean") or kind == "targets"
-    # Intervals of single figures would fill a table of conditions: there only differences have them.
-    intervals = by_method or "gain" in kind or "lost" in kind
-    rows = [row for row in tables[name] if not row["name"].startswith("paper")]
+    intervals = "[" in match["table"]
+    rows = [row for row in tables[name] if not names or row["name"] in names]
     keys = dict[str, str]()
     for row in rows:
         for key, figure in row["figures"].items():
             title = f"{key} {figure['unit']}".replace(" ratio", "") if by_method else key
             keys.setdefault(title, key)
     titles = [title for title in columns if title in keys]
-    lines = [["method", "sensor", *titles] if by_method else ["", *titles]]
-    lines.append(["---"] * len(lines[0]))
+    first = columns[:2] if "sensor" in columns else columns[:1]
+    filled_lines = [[*first, *titles]]
+    filled_lines.append(["---"] * len(filled_lines[0]))
     for row in rows:
         cells = [shown(row["figures"].get(keys[title]), keys[title], intervals) for title in titles]
-        sensor = [row["text"]["sensor"]] if by_method else []
-        lines.append([row["name"], *sensor, *cells])
+        sensor = [row["text"]["sensor"]] if "sensor" in columns else []
+        filled_lines.append([row["name"], *sensor, *cells])
     texts = (
-        f"|{'|'.join(line)}|" if "---" in line else f"| {' | '.join(line)} |" for line in lines
+        f"|{'|'.join(line)}|" if "---" in line else f"| {' | '.join(line)} |"
+        for line in filled_lines
     )
     return "\n".join([match[1].rstrip("\n"), *texts, match[4]])
 

@@ -24,19 +24,20 @@ def row(table: str, name: str, **figures: Any) -> dict[str, Any]:
     return {"table": table, "name": name, "figures": cells, "text": {"sensor": "known"}}
 
 
-def fill(table: str, heading: str, *rows: dict[str, Any]) -> str:
-    page = f"before\n<!-- {table} -->\n{heading}\n|---|\n| old |\n<!-- end -->\nafter\n"
+def fill(table: str, heading: str, *rows: dict[str, Any], old: str = "") -> str:
+    page = f"before\n<!-- {table} -->\n{heading}\n|---|\n{old}<!-- end -->\nafter\n"
     return MARKED.sub(lambda match: filled({table: list(rows)}, match), page)
 
 
 @pytest.mark.parametrize("table", ["mean", "mean, radiance x 0.25"])
-def test_tables_of_means_have_a_row_for_each_method_without_the_papers(table: str) -> None:
+def test_tables_of_means_have_the_rows_and_columns_that_the_page_names(table: str) -> None:
     means = {"PSNR": figure(47.123, "dB", [46.0, 48.5]), "bias_of_the_mean": figure(-0.0149, "%")}
     page = fill(
         table,
         "| method | sensor | bias of the mean % | PSNR dB |",
         row(table, "net", **means, SSIM=figure(0.9, "ratio")),
         row(table, "paper: net", **means),
+        old="| net | known | 0 | 0 [0, 0] |\n",
     )
     assert page.splitlines()[2:5] == [
         "| method | sensor | bias of the mean % | PSNR dB |",
@@ -56,7 +57,19 @@ def test_targets_are_filled_likewise() -> None:
     assert page.splitlines()[2:5] == [
         heading,
         "|---|---|---|",
-        "| net | known | 0.55 [0.53, 0.57] |",
+        "| net | known | 0.55 |",
+    ]
+
+
+def test_a_table_of_differences_keeps_its_empty_corner() -> None:
+    figures = {"net-int8": figure(0.472, "dB", [0.151, 0.999])}
+    rows = [{**row("sweep", name), "figures": figures} for name in ("MTF 7%", "MTF 5%")]
+    page = fill("sweep", "|  | net-int8 |", *rows, old="| MTF 5% | 0 [0, 0] |\n")
+    assert page.splitlines()[2:6] == [
+        "|  | net-int8 |",
+        "|---|---|",
+        "| MTF 5% | 0.47 [0.15, 1.00] |",
+        "<!-- end -->",
     ]
 
 
