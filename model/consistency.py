@@ -45,7 +45,12 @@ from beers_deploy.model.blocks import (
     reached_blocks,
 )
 from beers_deploy.model.departure import departure
-from beers_deploy.model.detail_step import DetailStep, separable_sums, window_weights
+from beers_deploy.model.detail_step import (
+    DetailStep,
+    products_per_px,
+    separable_sums,
+    window_weights,
+)
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.profiles.instrument import Instrument
 
@@ -93,6 +98,9 @@ PRODUCTS_PER_PX = (
     + 2 * (1 + 1 / BLOCK_PX)  # Interpolation.
 )
 """The number of multiply-accumulate operations of the step per pixel."""
+
+DETAIL_PRODUCTS_PER_PX = products_per_px(RANK, NEAR_PX)
+"""The number of additional ones where the step corrects finer detail too."""
 
 EXCESS_SIGMAS = 6.0
 """Signals of more than this number of standard deviations of noise are never clipped at zero."""

@@ -18,6 +18,7 @@ from beers_deploy.dpu.cost.host import Task
 from beers_deploy.dpu.cost.latency import Prediction
 from beers_deploy.dpu.cost.own_runs import read_own_runs
 from beers_deploy.dpu.reading import own_tile_px
+from beers_deploy.model.departure import departure
 from beers_deploy.model.exposure import factors_for
 from beers_deploy.network import Network
 from beers_deploy.performance.swath import PAPER_SIZE, Swath, parse_size, predict_network
@@ -157,7 +158,10 @@ def bench_board(
     halo_px = parse_halo(asked.halo, tiling.halo_px)
     takes_step = asked.consistency and keeps_pixels(tiling)
     tile_px = asked.tiles_px[0]
-    swath = Swath(width_px, height_px, tile_px, halo_px, consistency=takes_step)
+    takes_detail = sensor is not None and bool(departure(sensor.nominal(), "cut"))
+    swath = Swath(
+        width_px, height_px, tile_px, halo_px, consistency=takes_step, detail=takes_detail
+    )
     counts = dict[int, int]()
     if dn is not None and sensor is not None:
         plan = make_plan((1, height_px, width_px), tile_px, halo_px, tiling)

@@ -13,6 +13,7 @@ from beers_deploy.dpu.cost.host import Task
 from beers_deploy.dpu.cost.latency import Prediction, dpu_power, predict
 from beers_deploy.dpu.cost.model import Interval, between
 from beers_deploy.dpu.reading import network_of
+from beers_deploy.model.consistency import DETAIL_PRODUCTS_PER_PX, PRODUCTS_PER_PX
 from beers_deploy.model.raster.facts import SIDE_PX
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import OptionError, printable
@@ -39,6 +40,8 @@ class Swath:
         runs: mean number of runs of the network on a tile, one for each exposure that its pixels
             need.
         consistency: True if the host computes the consistency step.
+        detail: True if that step corrects finer detail too, as it does where the sensor's MTF
+            departs from the formula's curve.
     """
 
     width_px: int
@@ -47,6 +50,7 @@ class Swath:
     halo_px: int = 0
     runs: float = 1.0
     consistency: bool = False
+    detail: bool = False
 
     @property
     def pixels(self) -> int:
@@ -76,9 +80,12 @@ class Swath:
     @property
     def step_px(self) -> float:
         """Return the number of pixels for which the host computes the consistency step, per run of
-        the network.
+        the network. With detail a pixel counts as the several that cost as much without it.
         """
-        return self.pixels / (self.tiles * self.runs) if self.consistency else 0.0
+        if not self.consistency:
+            return 0.0
+        products = PRODUCTS_PER_PX + (DETAIL_PRODUCTS_PER_PX if self.detail else 0.0)
+        return self.pixels / (self.tiles * self.runs) * products / PRODUCTS_PER_PX
 
 
 def predict_network(

@@ -22,7 +22,9 @@ from beers_deploy.performance.swath import Swath
 from beers_deploy.performance.tables import sweep_rows, within_words
 from beers_deploy.profiles.errors import ModelError, OptionError
 from beers_deploy.profiles.figures import Row
+from beers_deploy.profiles.response import MtfTable
 from beers_deploy.profiles.sensor import Sensor
+from beers_deploy.profiles.sensor_file import axes_of
 from beers_deploy.profiles.shipped import board_names, npu_names
 from tests.deploy.dpu.graphs import integer_convbeers
 
@@ -177,3 +179,19 @@ def test_the_exposures_of_an_image_are_counted_whatever_the_bits_of_the_sensor(
     assert int(shares["x1"]) > 0
     assert int(shares["x8"]) > 0
     assert int(shares["x4"]) == 0
+
+
+def test_a_curve_of_another_shape_takes_the_host_longer(network: Path) -> None:
+    """Where the MTF departs from the formula's curve the consistency step corrects detail too."""
+    table = MtfTable((0.0, 0.25, 0.5), (1.0, 0.6, 0.1), (1.0, 0.6, 0.1))
+    sensor = Sensor.load("pleiades-degraded")
+    departing = sensor.with_fields(response=table, **axes_of(table, "stated", "for a test"))
+    boards, _ = boards_for(boards_of("vck190"), None, None)
+    asked = Question(boards, [], (700, 600), [128], "exact", None, None, consistency=True)
+    times = []
+    for profile in (sensor, departing):
+        rows = bench_board(Network.load(network), asked, sensor=profile).rows
+        step, *_ = [r.figures["consistency step"] for r in rows if "consistency step" in r.figures]
+        assert step.interval is not None
+        times.append(step.interval[1])
+    assert 2 < times[1] / times[0] < 4
