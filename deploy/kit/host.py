@@ -47,12 +47,9 @@ UNITS = {1: S["unit"], **{int(factor): unit for factor, unit in S["exposures"].i
 
 
 def shuffled(x: np.ndarray, r: int, up: bool) -> np.ndarray:
-    """Move squares of r x r pixels into the channels, or back.
+    """Move squares of r x r pixels of (1, C, H, W) into the channels.
 
-    Args:
-        x: (1, C, H, W); sides are multiples of r unless `up`.
-        r: the side of a square in pixels.
-        up: if True, move channels back into pixels: (1, C / r^2, r H, r W).
+    If `up`, move channels back into pixels: (1, C / r^2, r H, r W).
     """
     _, c, h, w = x.shape
     if up:
@@ -64,11 +61,9 @@ def shuffled(x: np.ndarray, r: int, up: bool) -> np.ndarray:
 
 
 def encoded(image: np.ndarray) -> np.ndarray:
-    """Encode a tile (1, C, h, w) as the core's planes: coarse steps, remainder and part.
+    """Encode a tile (1, C, h, w) as the core's planes (1, P, h', w'): coarse, remainder and part.
 
-    Returns:
-        Planes (1, P, h', w') float32 in multiples of 1/128, because the core reads int8 at that
-        scale.
+    They are multiples of 1/128, because the core reads int8 at that scale.
     """
     wide = np.pad(image, ((0, 0), (0, 0), *[(S["border_px"],) * 2] * 2), "reflect")
     places = shuffled(wide, S["front"], up=False)
@@ -127,12 +122,10 @@ host.json.
 
 
 def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
-    """Restore a tile by one core: encode it, decode the result, and add both.
+    """Restore a tile (1, C, h, w) by one core: encode it, decode the result, and add both.
 
-    Args:
-        image: the tile (1, C, h, w) float32.
-        run: computes the core's result (1, copies C', h', w') from the planes.
-        unit: the share of full scale that is 1 in the decoded result.
+    `run` computes the core's result (1, copies C', h', w') from the planes, and `unit` is the share
+    of full scale that is 1 in the decoded result.
     """
     copies = np.split(run(encoded(image)), S["copies"], 1)
     value = shuffled(DECODINGS[S["decoding"]](*copies), S["back"], up=True) * F(unit)
@@ -144,11 +137,9 @@ def restored(image: np.ndarray, run: Any, unit: float) -> np.ndarray:
 
 
 def exposed(factor: int, image: np.ndarray, run: Any) -> np.ndarray:
-    """Restore a tile at the exposure of a factor.
+    """Restore a tile whose light is multiplied by a factor by that factor's core, and divide it.
 
-    1. Multiply the light of the tile by the factor. The dark offset is not light and stays.
-    2. Restore the tile by the core of that factor.
-    3. Divide the light by the factor again.
+    The dark offset is not light and stays.
     """
     if factor == 1:
         return restored(image, run, UNITS[1])
@@ -221,10 +212,9 @@ def consistent(raw: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def detail(raw: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Compute the consistency step's part for finer detail of one band (H, W).
+    """Compute the part for finer detail from one band and `near`, x with NEAR pixels around it.
 
     It is the residual of fine blocks without that of the large ones, and 0 at the image's border.
-    `near` is x with NEAR pixels more on every side.
     """
     weights = (np.array(S["consistency"]["detail"][name], F) for name in ("rows", "columns"))
     blurred = sum(summed(near, row, column, FINE) for row, column in zip(*weights))  # noqa: B905 - as above
@@ -299,13 +289,9 @@ def extended(x: np.ndarray, margin: int) -> np.ndarray:
 
 
 def summed(x: np.ndarray, row: np.ndarray, column: np.ndarray, side: int = BLOCK) -> np.ndarray:
-    """Compute the weighted sum of a window of each block.
+    """Compute the weighted sum of a window of each block of `side` pixels of an image (H, W).
 
-    Args:
-        x: an image (H, W) that reaches beyond the blocks by what the windows need.
-        row: weight of each row of the window.
-        column: weight of each column of the window.
-        side: of a block.
+    The image reaches beyond the blocks by what the weights of rows and columns need.
     """
     for weights in (row, column):
         end = x.shape[0] - len(weights) + 1
@@ -350,16 +336,9 @@ def interpolated(blocks: np.ndarray, shape: tuple[int, ...], side: int = BLOCK) 
 
 
 def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
-    """Return where the tiles along a side lie, so that they overlap by at least two halos.
+    """Return the start of each tile along a side, and the start and end of its retained pixels.
 
-    Args:
-        size: of the image along the side, in pixels.
-        tile: side of a tile in pixels.
-        halo: pixels at an inner border of a tile that are discarded.
-
-    Returns:
-        For each tile its start, and the start and end (excluded) of its retained pixels, in the
-        image.
+    Tiles overlap by at least two halos, the pixels that are discarded at a tile's inner borders.
     """
     starts = [*range(0, size - tile, tile - 2 * halo), size - tile]
     return [
@@ -369,10 +348,7 @@ def spans(size: int, tile: int, halo: int) -> list[tuple[int, int, int]]:
 
 
 def main(source: str, target: str, runs: dict[int, Any]) -> None:
-    """Restore an image of at least a tile, tile by tile.
-
-    `runs` has the core of each factor: planes to result.
-    """
+    """Restore an image of at least a tile, tile by tile, by the core of each factor in `runs`."""
     image = np.load(source).astype(F)
     t = S["tile_px"]
     r = S["scale"]
