@@ -97,7 +97,7 @@ def list_of_profiles() -> Table:
 
 
 def text_of_profile(name: str) -> str:
-    """Return the TOML text of a profile, which is a valid profile file by itself."""
+    """Return the TOML text of a shipped sensor, scene or board, which is a valid file by itself."""
     kind, _ = _profile(name)
     return profile_path(kind, name).read_text(encoding="utf-8")
 

@@ -226,7 +226,16 @@ class GateFailedError(AssertionError):
 def baseline_for(
     path: Any, arguments: Mapping[str, object], limits: Limits, metric: str | None
 ) -> Baseline | None:
-    """Return the baseline of a gate, if there is one.
+    """Read the baseline that a gate compares with: the document of an earlier `gate --json`.
+
+    Args:
+        path: of the document; None for no baseline.
+        arguments: of this gate. The baseline must have judged the same patches.
+        limits: of this gate; some need a baseline or a metric.
+        metric: by which results are compared with references; None for no metric.
+
+    Returns:
+        None if no path is given.
 
     Raises:
         OptionError: a limit needs a baseline or a metric and none is given, or the baseline is of
@@ -333,7 +342,15 @@ def _mae_note(result: GateResult, limits: Limits, checks: Sequence[Check]) -> li
 def file_checks(
     float_model: onnx.ModelProto, int8: Network, target: TargetProfile, must_describe: bool = False
 ) -> list[Check]:
-    """Check the INT8 file itself: the rules of the target's DPU or NPU, then its structure."""
+    """Check the INT8 file itself: the rules of the target's DPU or NPU, then its structure.
+
+    Args:
+        float_model: the network that the file was quantised from, whose ReLUs and shapes the file
+            must have.
+        int8: the file.
+        target: the board. One with neither DPU nor NPU has no rules.
+        must_describe: True if a file without a description of its host part fails.
+    """
     checks = structure_checks(float_model, int8.model, must_describe)
     if not (target.configurations or target.npu):
         return checks

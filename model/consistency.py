@@ -108,7 +108,7 @@ EXCESS_SIGMAS = 6.0
 
 @dataclass(frozen=True)
 class Consistency:
-    """The consistency step x + G (y - H x) for images of one sensor.
+    """The consistency step x + G (y - H x) for images y of one sensor, restored to x.
 
     H blurs a restored image x from the reference's MTF to the sensor's. G averages over blocks and
     interpolates between their centres.
@@ -119,8 +119,8 @@ class Consistency:
         columns: weights of the columns, likewise; a term's weight of a pixel is the product of the
             two.
         far: weights (2 FAR_BLOCKS + 1, 2 FAR_BLOCKS + 1) of the block means around a block.
-        means: mean values of a raw block at which `excess` is given, ascending.
-        excess: the amount that clipping the noise at zero has added to them.
+        means: mean values of a raw block at which `excess` is given, ascending, in pixel values.
+        excess: the amount that clipping the noise at zero has added to them, in pixel values.
         full_scale: the pixel value at and above which a raw pixel is saturated.
         detail: the step for finer detail, where the sensor's MTF departs from the formula's curve;
             else None.

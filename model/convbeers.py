@@ -266,10 +266,15 @@ class BankedConvBEERS(Layers):
 
 
 class OfOneSensor(nn.Module):
-    """A network behind a bank, conditioned on one sensor vector (4,). It maps (N, 1, H, W) in [0,
-    1] of full scale to the same shape.
+    """A network for every sensor, conditioned on one of them.
 
-    It shares the network's weights. If no bank is given, it is built from the vector.
+    It maps (N, 1, H, W) in [0, 1] of full scale to the same shape, and shares the weights of the
+    given network.
+
+    Args:
+        network: the network for every sensor.
+        vector: the sensor vector, shape (4,).
+        bank: the filters of the sensor; None builds those of the vector's MTF and noise.
     """
 
     def __init__(self, network: BankedConvBEERS, vector: Tensor, bank: Bank | None = None) -> None:
@@ -336,7 +341,11 @@ def initialise(network: Network, generator: torch.Generator) -> None:
 
 
 def vector_tensor(sensor: Instrument) -> Tensor:
-    """Return the sensor vector (4,) float32, clamped to the ranges."""
+    """Return the sensor vector as a tensor (4,) float32: MTF across and along the track, noise of
+    dark and of bright ground.
+
+    Values outside the ranges of the training are clamped to them.
+    """
     return torch.tensor(sensor_vector(sensor).values)
 
 

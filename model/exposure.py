@@ -77,7 +77,10 @@ def choose_factors(
     full_scale: float,
     offset: float,
 ) -> NDArray[np.int64]:
-    """Choose the factor of every pixel.
+    """Choose for every pixel the factor that multiplies it before the network.
+
+    A pixel gets the largest factor at which no pixel within `radius_px` exceeds HEADROOM, so that
+    dark ground is restored at a higher exposure and nothing is clipped.
 
     Args:
         image: (h, w) pixel values, none missing.

@@ -100,9 +100,9 @@ class PixelInterval:
     """The calibrated interval of a network.
 
     Attributes:
-        exponents: of the half-width.
-        quantiles: q for each level in percent that the calibration had enough acquisitions for.
-        acquisitions: the number of them that the quantiles were taken from.
+        exponents: how the half-width grows with local detail, blur and noise.
+        quantiles: the factor q for each level in percent, for levels with enough acquisitions.
+        acquisitions: the number of images that the quantiles were computed from.
     """
 
     exponents: Exponents

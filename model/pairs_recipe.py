@@ -24,9 +24,10 @@ class PairsRecipe:
     scenes: tuple[str | None, ...]
 
     def site(self, stem: str) -> str:
-        """Return the site of the pair NUMBER-SCENE or NUMBER-SCENE-PATCH.
+        """Return the site of a pair by the stem of its file, NUMBER-SCENE or NUMBER-SCENE-PATCH.
 
-        Two frames of a site, or two patches, belong to one site. A drawn scene is its own site.
+        The recipe gives the photograph of NUMBER, whose name begins with its site. Every drawn
+        scene is a site of its own, "NUMBER-drawn".
         """
         number = stem.split("-", 1)[0]
         is_number = number.isdecimal() and int(number) < len(self.scenes)

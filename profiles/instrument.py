@@ -178,9 +178,10 @@ def _rounded_off(difference: float, rounding: float) -> float:
 
 
 def snr_0_bounds(radiance_0: float, radiance_1: float, snr_1: float) -> tuple[float, float]:
-    """Return the SNRs at `radiance_0` for which alpha = 0 (lower bound) and beta = 0 (upper bound).
+    """Return the SNRs at `radiance_0` that a noise of variance alpha L + beta can have.
 
-    Between them alpha and beta are both at least 0.
+    L is the radiance. At the lower bound alpha is 0, at the upper bound beta; between them both are
+    at least 0.
 
     Args:
         radiance_0: the darker radiance, in W/m2/sr/um.

@@ -53,7 +53,7 @@ def target_names() -> list[str]:
 
 
 def board_names() -> list[str]:
-    """Return the names of the shipped targets with a DPU: their files name its manual."""
+    """Return the names of the shipped boards with a DPU, whose files name the DPU's manual."""
     return _targets_with(r"^(base =|operators =)")
 
 

@@ -38,7 +38,10 @@ class LayerBound:
 
 
 def layer_bounds(core: IntCore) -> list[LayerBound]:
-    """Compute the bounds of every operation, in order."""
+    """Compute the largest accumulator and the range of results of every operation, in order.
+
+    They hold for all images, because they follow from the weights and the ranges of the inputs.
+    """
     ranges: dict[str, Range] = {PLANES: _planes(core)}
     bounds = []
     for op in core.ops:

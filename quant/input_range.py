@@ -80,7 +80,9 @@ def require_ranges(ranges: Iterable[tuple[float, ...]]) -> None:
 
 
 def is_range(low: float, high: float) -> bool:
-    """Return True if `low` < `high` and the larger absolute value of the two is within SIZES."""
+    """Return True if `low` < `high` and the larger absolute value of the two is within SIZES, the
+    smallest and the largest size that a range may have.
+    """
     # NaN fails every comparison, so it is refused as well.
     return low < high and SIZES[0] <= largest_size(low, high) <= SIZES[1]
 

@@ -159,7 +159,7 @@ class Measured:
             yield session.run(None, {PLANES: planes_of(image, self.host_part)})[0]
 
     def cost(self, results: Iterable[np.ndarray]) -> Cost:
-        """Return the mean loss of restored images over the samples.
+        """Return the mean absolute error and the PSNR drop of restored images over the samples.
 
         Args:
             results: restored images (1, C, H', W') in the network's units, in the order of the

@@ -204,7 +204,9 @@ class Relus:
 
 
 def count_relus(model: onnx.ModelProto) -> Relus:
-    """Count the ReLUs of a network.
+    """Count the ReLUs of a network, so that a file that lost one can be detected.
+
+    In an INT8 file a convolution whose 8 bits begin at zero may be a ReLU; these are counted apart.
 
     Args:
         model: a float or an INT8 network.

@@ -49,7 +49,10 @@ CONTEXT_SETTINGS = {"help_option_names": ["-h", "--help"]}
 
 @lru_cache
 def command_of(spelling: str) -> Any:
-    """Return the command of Typer for a spelling; raise KeyError if there is none."""
+    """Return the Typer command that a user's word names, such as "characterise".
+
+    Raises KeyError if there is no command of that name or spelling.
+    """
     command = COMMANDS[SPELLINGS.get(spelling, spelling)]
     alone = typer.Typer(
         add_completion=False, rich_markup_mode=None, context_settings=CONTEXT_SETTINGS

@@ -30,7 +30,15 @@ def require_core_file(
 
 
 def save_core(core: Network, path: Path, target: TargetProfile) -> None:
-    """Write a core for a board, and next to it the configuration for the compiler of an NPU."""
+    """Write the integer core of a network as ONNX in the board's encoding.
+
+    For a target with an NPU, the configuration of AMD's compiler is written next to it.
+
+    Args:
+        core: the network without its host part.
+        path: of the ONNX file.
+        target: the board.
+    """
     core.save(path)
     logger.info("wrote %s: the same numbers in the board's encoding", path)
     if target.npu:

@@ -40,8 +40,16 @@ class Timed:
 def time_networks(
     runs: Sequence[Timed], tile_px: int, threads: int, min_time_s: float, min_runs: int
 ) -> None:
-    """Time each for a grey tile, interleaved, until all have run for `min_time_s` and `min_runs`
-    times.
+    """Time networks on a grey tile on this processor, and add the results to `runs`.
+
+    The runs are interleaved until each network has run for `min_time_s` and `min_runs` times.
+
+    Args:
+        runs: the networks; they receive times, powers and memory.
+        tile_px: side of the tile.
+        threads: of the runtime.
+        min_time_s: the shortest total time of a network's runs.
+        min_runs: the smallest number of them.
     """
     calls = []
     for run in runs:

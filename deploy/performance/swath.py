@@ -143,7 +143,7 @@ def swath_figures(
 
 
 def throughput(prediction: Prediction) -> Figure:
-    """Return the frames per second of the DPU and its host."""
+    """Return the predicted rate of the DPU and its host together, in tiles per second."""
     return predicted(prediction.fps, "frame/s", prediction.fps_interval, COST_SOURCE)
 
 

@@ -104,11 +104,11 @@ class Tally:
         valid: np.ndarray | None,
         valid_restored: np.ndarray | None,
     ) -> "Tally":
-        """Return the tally of a part of an image.
+        """Count the clipped and missing pixels and the sums of a part of an image.
 
         Args:
-            stored: its pixels (bands, h, w), in shares of full scale.
-            restored: its results (bands', h s, w s) at a scale s.
+            stored: the raw pixels (bands, h, w), in shares of full scale.
+            restored: the restored pixels (bands', h s, w s), where s is the network's scale.
             valid: mask of the pixels that are not missing; None if none is missing.
             valid_restored: mask of the results that are not missing; None if none is missing.
         """

@@ -60,8 +60,12 @@ class TraditionalRestoration(Restoration):
         done_px: int,  # noqa: ARG002
         tick: Callable[[int], None],
     ) -> Generator[RestoredRow, None, None]:
-        """Restore the image from its first row, strip by strip, all bands of one strip at a
-        time.
+        """Restore the image strip by strip, all bands of one strip at a time.
+
+        Args:
+            done_px: rows that an earlier run has written. They are restored again, because a strip
+                depends on the ones before it; the caller skips them.
+            tick: called with the number of rows of each finished strip.
         """
         height_px = self.source.raster.height_px
         by_band = [

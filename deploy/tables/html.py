@@ -11,9 +11,10 @@ STYLE = "border-bottom: 1px solid; padding: 2px 8px; text-align: left"
 
 
 def html_table(title: str, rows: Sequence[Row]) -> str:
-    """Return one table with a line for each row.
+    """Return an HTML table with a line for each row.
 
-    The mode follows each figure. Its tooltip is its source, or the reason why it is missing.
+    Each figure is followed by its mode: measured, predicted or published. The tooltip of a figure
+    is its source, or the reason why it is missing.
     """
     columns = columns_of(rows)
     words = words_of(rows)

@@ -187,7 +187,14 @@ class Raster:
         return self.dtype.kind == "f" or self.nodata is not None or bool(self.mask_kind)
 
     def fill_margin_px(self, radius_px: int) -> int:
-        """Return how far around a window pixels are read that missing ones are filled from."""
+        """Return how many pixels around a window must be read to fill its missing pixels.
+
+        Args:
+            radius_px: the receptive radius of the network. Farther pixels do not matter.
+
+        Returns:
+            0 if the image cannot have missing pixels.
+        """
         return radius_px if self.may_miss else 0
 
     def enlarged(self, shape: Sequence[int]) -> "Raster":

@@ -94,7 +94,14 @@ def write_raster(
 
 
 def require_equal(path: Path, raster: Raster, pixels: Pixels) -> None:
-    """Raise OSError if bands, mask or alpha of a TIFF differ from the pixels that were written."""
+    """Read a written TIFF again, and raise OSError if its pixels differ from those in memory.
+
+    Args:
+        path: of the TIFF.
+        raster: the facts by which it was written; they tell which pixels the mask or alpha leaves
+            out.
+        pixels: the bands that were written.
+    """
     with disk_errors(), gdal(), rasterio.open(path, driver="GTiff") as file:
         for plane, window, rows in _planes(raster, pixels):
             if plane == MASK:

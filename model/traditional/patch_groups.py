@@ -43,12 +43,12 @@ QUALITIES = {"fast": Quality(4, 2), "standard": Quality(3, 4), "best": Quality(2
 
 @dataclass(frozen=True)
 class PassSettings:
-    """The parameters of one pass; sigma and distances are in grey levels.
+    """The parameters of one of the two passes of NL-Bayes, by the letters of its authors.
 
     Attributes:
         side_px: k, the side of a patch.
-        similar: N, the patches of a group.
-        most_similar: the largest group, where more than N patches lie within ALIKE_RMS.
+        similar: N, the number of patches of a group.
+        most_similar: the largest group, where more than N patches differ by less than ALIKE_RMS.
         excess: beta, the factor on the noise variance.
         clean_guide: True in pass 2, in which the guide's covariance is that of the signal alone,
             without noise.

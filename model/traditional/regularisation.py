@@ -81,8 +81,10 @@ class NoiseAndScene:
     Attributes:
         radiance: the mean radiance L in W/m2/sr/um, at least 0.
         noise: variance of the noise, v.
-        residual: the part of it that denoising is expected to leave, v u / (u + 1).
-        contrast: squared difference of neighbours less that of the noise, g - 2 v; may be negative.
+        residual: the part of the noise that denoising is expected to leave, v u / (u + 1), where
+            u = g / (2 v) - 1 is the scene over the noise.
+        contrast: the mean squared difference of neighbours, g, less that of the noise, 2 v; may be
+            negative.
     """
 
     radiance: float

@@ -17,7 +17,7 @@ Range = tuple[Amount, Amount]
 
 @dataclass(frozen=True)
 class Look:
-    """The appearance of one pass over a scene.
+    """The appearance of a scene in one acquisition: its light, contrast and softness.
 
     Attributes:
         light: factor on the scene's radiance.

@@ -144,17 +144,17 @@ class Trainer:
         variant: the network's size.
         recipe: the parameters of the run.
         loss: the loss that the recipe weights.
-        worker: this process among those of the run.
+        worker: the rank of this process, and the number of processes that train together.
         device: on which the steps are computed.
         start: a network of the same kind and size to continue from; None draws new weights.
         precision: number format of the body; it depends on the machine, and a resumed run may use
             another.
         conditioned: whether the network is given the sensor of each patch.
-        rounding: of a conditioned network's maps, as its INT8 file rounds them; None does not round
-            them.
+        rounding: the steps by which the INT8 file of a conditioned network rounds its feature maps,
+            so that the training rounds them too; None trains without rounding.
 
     Attributes:
-        data: digest of all data that the run learns from; a checkpoint belongs to one.
+        data: digest of all data that the run learns from. A checkpoint of other data is refused.
     """
 
     def __init__(

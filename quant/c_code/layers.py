@@ -156,15 +156,16 @@ class LayerWriter:
         activation: Activation = Activation.none,
         frac_bits: int = 0,
     ) -> str:
-        """Return how sums of `frac_bits` become the result of an operation.
+        """Return the C initializer of the rounding by which sums become the result of an operation.
 
         Args:
             op: the operation, for the message.
             shift: right shift from the unit of the sums to that of the result. A negative one
                 shifts left.
-            bits: that no sum exceeds, without the sign.
-            activation: of the sums.
-            frac_bits: of the sums.
+            bits: the bits without the sign that the largest possible sum needs.
+            activation: applied to the sums.
+            frac_bits: the fractional bits of the sums, in which the limits of the activation are
+                expressed.
 
         Returns:
             The initializer of a `struct rounding` in C.

@@ -89,11 +89,10 @@ def _core_file(
 
 
 def as_on_board(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Return the board's model of the core that a host's file describes; return any other model
-    unchanged.
+    """Convert an INT8 file for onnxruntime to the board's encoding of the same integers.
 
-    Operators that the host expresses by several nodes, such as a transposed convolution, are single
-    operators there.
+    Operators that onnxruntime needs several nodes for, such as a transposed convolution, become
+    single operators. Any other model is returned unchanged.
     """
     if KEY not in metadata(model):
         return model
@@ -106,13 +105,15 @@ class BoardWriter(GraphWriter):
     """Writes tensors as the board's flow reads them: quantised to int8, then dequantised."""
 
     def scale(self, tensor: str, frac_bits: int) -> list[str]:  # noqa: ARG002 - tensors of one scale share it here
-        """Add the scale 2^-frac_bits and the zero point 0 of a tensor to the file, and return their
-        names.
+        """Add the scale 2^-frac_bits and the zero point 0 of a tensor to the file.
 
         Args:
-            tensor: name of the tensor. Tensors of one scale share its constant here; VINT8 has one
-                for each.
+            tensor: name of the tensor. In this encoding tensors of equal scale share a constant;
+                the encoding for AMD's NPU (VINT8) writes one for each tensor.
             frac_bits: its number of fractional bits.
+
+        Returns:
+            The names of the two constants: [scale, zero point].
         """
         return [self.unit(frac_bits), self.constant("zero_point", np.array(0, np.int8))]
 

@@ -127,8 +127,15 @@ class Conv(OneInput):
     """A convolution with zero padding and an activation; `groups` is 1, or the number of channels
     (depthwise).
 
-    If it is transposed, its weights are still (O, I, kh, kw), with O the channels that it writes.
-    `window` then has ONNX's meaning: its strides enlarge, and its pads crop.
+    Attributes:
+        weight: (O, I / groups, kh, kw), with O the channels that it writes, also if transposed.
+        bias: (O,).
+        activation: applied to the result.
+        window: kernel, strides, pads and dilations. If transposed, it has ONNX's meaning: the
+            strides enlarge, and the pads crop.
+        groups: 1, or the number of channels.
+        transposed: True for a transposed convolution.
+        ceiling: (O,) upper limits of a ReLU6 whose channels were scaled; None for 6.
     """
 
     weight: np.ndarray  # (O, I / groups, kh, kw) float32

@@ -130,7 +130,10 @@ class Integers:
         return node.outputs[0] in self._int8 or node.outputs[0] in self._wide
 
     def is_notation(self, node: Node) -> bool:
-        """Return True if a node only defines how the integers of its neighbours are read."""
+        """Return True if a node, such as a DequantizeLinear, is no operation of the network.
+
+        Such a node only defines how the integers that it reads are to be interpreted.
+        """
         result = node.outputs[0]
         if node.op_type == "DequantizeLinear" and result not in self._same:
             readers = self._graph.readers.get(result, [])

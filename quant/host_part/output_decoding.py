@@ -66,7 +66,8 @@ class Plain:
             w: gets the nodes.
             feeds: the names of the result in uint8, of its scale and of its zero point.
             outputs: the number of decoded channels.
-            scale: the value of one unit of the result.
+            scale: the value of the scale that `feeds` names, from which other decodings compute
+                their limits.
         """
         w.node("DequantizeLinear", DECODED, feeds)
 
@@ -147,7 +148,12 @@ class OffsetWindows(Plain):
         return OffsetWindows(tuple(map(tuple, (np.array(self.offsets) + fine).tolist())))
 
     def decode(self, result: np.ndarray, scale: float) -> np.ndarray:
-        """Choose the last window that holds a value, and the coarse copy where none does."""
+        """Decode a result (N, copies C, H, W) as (N, C, H, W).
+
+        The first copy of each channel is coarse. Each other one is fine around its offset, and
+        clipped elsewhere. A value comes from the last window that does not clip it, or else from
+        the coarse copy.
+        """
         coarse, *windows = np.split(result, self.copies, axis=1)
         value = coarse * np.float32(GAIN)
         for window, offset in zip(windows, np.array(self.offsets, np.float32), strict=True):

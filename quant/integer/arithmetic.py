@@ -206,7 +206,15 @@ def six_in_units(frac_bits: int) -> int:
 
 
 def activation_table(op: Pointwise, frac_bits: Mapping[str, int]) -> np.ndarray:
-    """Return an activation of every int8 value from -128 on: (256,) int16, clipped."""
+    """Tabulate an activation: its int8 result for each int8 input from -128 to 127.
+
+    Args:
+        op: the activation.
+        frac_bits: the fractional bits of its input and of its output, by the name of the tensor.
+
+    Returns:
+        (256,) int16, clipped to int8.
+    """
     values = op.activation(np.arange(INT8_MIN, INT8_MAX + 1) * 2.0 ** -frac_bits[op.input])
     # The DPU rounds activations half up, where np.rint would round half to even.
     units = np.floor(values * 2.0 ** frac_bits[op.output] + 0.5)

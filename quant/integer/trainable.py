@@ -137,7 +137,10 @@ class TrainableCore(torch.nn.Module):
         return copy
 
     def forward(self, planes: Tensor) -> Tensor:
-        """Return the one correction (N, C, H, W) for int8 planes (N, P, H, W), both in float32."""
+        """Return the correction (N, C, H, W), decoded from its copies, for planes (N, P, H, W).
+
+        The planes hold int8 values. Both are float32, and gradients pass through the roundings.
+        """
         return self.tensors(planes)[CORRECTION] * self._core.scale(CORRECTION)
 
     def tensors(self, planes: Tensor) -> dict[str, Tensor]:

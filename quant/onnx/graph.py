@@ -73,7 +73,8 @@ class Node:
 
         Args:
             kernel: sides of its weights; empty to use the node's own attribute.
-            size: of the map that it reads, or any that differs by integer strides: for `auto_pad`.
+            size: height and width of the map that it reads, from which `auto_pad` is computed. A
+                size that differs by whole strides gives the same pads.
         """
         attribute = self.attributes.get
         sides = (

@@ -76,11 +76,15 @@ def _guess(ranges: np.ndarray, weights: np.ndarray, gamma: float, headroom: floa
 
 @dataclass(frozen=True)
 class SingleTensors:
-    """Tensors that may be equalized, in the graph's order, and how many channels each has.
+    """Tensors that may be equalized by themselves, not as members of a residual group.
 
     Factors and ranges of all of them are one array (sum of the channels,), tensor behind tensor.
-    Next to a residual group `by_channel` is off: trying each channel buys nothing there, nor each
-    tensor of a deep network.
+
+    Attributes:
+        tensors: their names, in the graph's order.
+        widths: the number of channels of each.
+        by_channel: True if the search tries groups of channels. It gains nothing in a network that
+            has a residual group too.
     """
 
     tensors: tuple[str, ...]

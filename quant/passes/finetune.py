@@ -143,8 +143,8 @@ class Sample:
             correction: (1, C, H', W') in the unit of `floats`.
 
         Returns:
-            The mean squared difference from the float network's correction, plus that from the
-            reference if there is one, times `weight`.
+            `weight` times the sum of two terms: the mean squared difference from the float
+            network's correction, and that from the reference, if there is one.
         """
         error = (self.weight * (correction - self.floats).square()).mean()
         if self.reference is not None:

@@ -200,7 +200,13 @@ def _ground(
 def relit(
     views: Sequence[View], lightings: Lightings, generator: np.random.Generator
 ) -> list[View]:
-    """Return the same views, their ground lit in the shares of the lightings."""
+    """Return the views with other light: each share of them is lit as `lightings` states.
+
+    Args:
+        views: the ground of each is multiplied by a factor.
+        lightings: the share of the views for each kind of light.
+        generator: draws which views get which light, and the factors.
+    """
     assigned = assign_lightings(len(views), lightings, generator)
     result = []
     for view, lighting in zip(views, assigned, strict=True):

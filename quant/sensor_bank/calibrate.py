@@ -167,7 +167,12 @@ def _head(weights: Weights) -> Conv:
 
 
 def bank_host_part(scale: int, decoding: BankSum) -> HostPart:
-    """Return the host's part around a network of that scale behind a bank."""
+    """Return the pre- and post-processing of a network that reads the planes of a filter bank.
+
+    Args:
+        scale: side of the square of pixels that is one place of the network's maps.
+        decoding: how the host merges the copies of the correction and of the analytic restoration.
+    """
     pixels = scale**2
     back = (Shuffle("shuffle", "", "", scale, True, False),) if scale > 1 else ()
     front = tuple(replace(shuffle.inverse, name="unshuffle") for shuffle in back)

@@ -97,7 +97,11 @@ def channels(kernels: Kernels = "fitted") -> list[tuple[int, float]]:
 
 
 def spread_over_a_step(count: int) -> list[float]:
-    """Return the offsets of `count` copies before they are rounded, in steps; their mean is 0."""
+    """Return offsets that spread `count` copies of a result evenly over one quantisation step.
+
+    Each copy adds its offset before it is rounded, so that the mean of the copies is finer than a
+    step. Offsets are in steps, and their mean is 0.
+    """
     return [(k + 0.5) / count - 0.5 for k in range(count)]
 
 

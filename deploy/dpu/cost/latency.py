@@ -119,8 +119,9 @@ class Prediction:
 
     @property
     def fps_interval(self) -> Interval:
-        """Return the lowest and the highest rate: the host at its slowest and at its fastest, both
-        widened by `spread`.
+        """Return the lowest and the highest rate in frames per second.
+
+        The first assumes the slowest host, the second the fastest; both are widened by `spread`.
         """
         # The host at its fastest comes first.
         fast, slow = map(self._rate, self._host_ends_s)

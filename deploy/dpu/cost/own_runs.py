@@ -75,7 +75,12 @@ class Run:
 
 @dataclass(frozen=True)
 class OwnRuns:
-    """The runs of an owner's board."""
+    """Rates that a user measured on their own board, which correct predictions.
+
+    Attributes:
+        source: the name of the file that states them.
+        runs: each with the prediction of the same network and configuration.
+    """
 
     source: str
     runs: Sequence[Run]

@@ -136,7 +136,16 @@ def _smoothed(blocks: Blocks, stated: StatedSensor) -> list[str]:
 def compare_blur(
     axis: str, blur: AxisMtf | Refusal, stated: StatedSensor
 ) -> tuple[Figure, list[str]]:
-    """Return the MTF along an axis, and a sentence if it contradicts the profile."""
+    """Compare the MTF at Nyquist that edges of the image show with that of the profile.
+
+    Args:
+        axis: "across" or "along" the track.
+        blur: the measured MTF along the axis, or the reason why there is none.
+        stated: what the profile states.
+
+    Returns:
+        The measured MTF in %, and a sentence if it contradicts the profile, else no sentence.
+    """
     if isinstance(blur, Refusal):
         return unavailable("%", blur.reason), []
     low, high = blur.interval

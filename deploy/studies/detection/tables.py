@@ -44,9 +44,9 @@ def detection_table(
 
     Args:
         compared: comparisons under each sensor.
-        file: of the detector.
+        file: path of the detector.
         detector: the detector that ran on the scenes.
-        scenes: labelled.
+        scenes: the scenes with their labels.
         notes: sentences that a reader must know about the labels.
     """
     rows = (*chain.from_iterable(map(detection_rows, compared)), *paper_rows())

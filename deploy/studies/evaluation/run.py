@@ -262,7 +262,10 @@ def strip_of(pair: NamedPair, methods: Sequence[Method]) -> tuple[np.ndarray, fl
 
 
 def pictures(pairs: Sequence[NamedPair], methods: Sequence[Method], out: Path) -> list[Picture]:
-    """Draw a strip for each of a few sites, and also write it to OUT/SITE.png."""
+    """Draw a strip of crops for each of the first few sites, and write it to OUT/SITE.png.
+
+    A strip shows one pair as each method restores it, with the reference, and below the errors.
+    """
     # Reversed, so that the first pair of each site is the one that stays.
     by_site = {pair.site: pair for pair in reversed(pairs)}
     sites = list(dict.fromkeys(pair.site for pair in pairs))[:SITES]

@@ -173,7 +173,7 @@ class Guards:
     checksums: Mapping[str, int]
 
     def limit(self, correction: np.ndarray) -> np.ndarray:
-        """Clip a correction of any shape, in shares of full scale, to the bound on both sides."""
+        """Clip a correction of any shape, in shares of full scale, to `limit_dn` on both sides."""
         bound = np.float32(self.limit_dn / MAX_DN)
         return np.asarray(np.clip(correction, -bound, bound), np.float32)
 

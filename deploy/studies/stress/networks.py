@@ -264,7 +264,12 @@ def restoration(
 
 
 def reference(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Measure]:
-    """Check the INT8 network in integer arithmetic, on 48 x 48 pixels of larger images (H, W)."""
+    """Check the INT8 network by the integer reference, layer by layer.
+
+    The runtime must agree with it bit for bit, no accumulator may exceed its proven bound, and only
+    layers that are known to may saturate. Images (H, W) are cropped to CROP_PX, because the
+    reference is slow.
+    """
     core = subject.core
     network = subject.quantized
     if case.pixels != "sound":

@@ -82,15 +82,15 @@ CAPTION = (
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Tradeoff(Table):
-    """Accuracy compared with time: the recommended point, the Pareto front, and every point with
-    its figures. It is true if a point complies with the budget and the need.
+    """The result of the study of accuracy against time: the recommended point, the Pareto front,
+    and every point with its figures. Its truth value is True if a point meets all constraints.
 
     Attributes:
         boards: the names of all boards that were compared.
         points: all of them, in the order networks, chains, other libraries, the paper's runs.
         front: those on the Pareto front over all boards, sorted by increasing cost.
         constraints: budget and need.
-        cost: the figure that the front is against.
+        cost: the name of the figure that quality is traded against, such as "latency".
         best: the recommended point; None if none complies with the budget and the need.
         line: the sentence that recommends it.
         remarks: how the figures were measured.
