@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.model.blocks import Placed
+from beers_deploy.model.consistency.blocks import Placed
 from beers_deploy.model.self_check import BLOCK_PX, Judged, SelfCheck
 from beers_deploy.model.simulator.procedural import load_scenes
 from beers_deploy.network import Network

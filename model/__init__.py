@@ -8,6 +8,7 @@ It imports `profiles` and nothing else of this project.
   without training;
 - `dataset`: pairs on disk, and the sensors and scenes that made them; `training`: runs that produce
   weights;
+- `consistency`: makes a restored image consistent with the raw one;
 - `metrics`: the quality of a restored image;
 - `io`: images and tensors on disk; `shipped`: the location of the shipped weights; `processor`: the
   behaviour of this machine's kernels;

@@ -33,8 +33,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, maximum_filter
 
-from beers_deploy.model.blocks import Image, Placed
-from beers_deploy.model.consistency import blur_between, centre
+from beers_deploy.model.consistency.blocks import Image, Placed
+from beers_deploy.model.consistency.step import blur_between, centre
 from beers_deploy.profiles.effects import Dsnu, Prnu, Striping
 from beers_deploy.profiles.instrument import Instrument
 

@@ -12,7 +12,7 @@ from beers_deploy.dpu.checker.table import check_network
 from beers_deploy.kit.golden import PICTURE, save_array, write_golden
 from beers_deploy.kit.host_facts import host_facts
 from beers_deploy.kit.record import require_library, write_record
-from beers_deploy.model.consistency import REACH_PX
+from beers_deploy.model.consistency.step import REACH_PX
 from beers_deploy.model.exposure import HEADROOM
 from beers_deploy.model.io.files import write_text
 from beers_deploy.network import Network, NetworkLike

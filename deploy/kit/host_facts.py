@@ -4,7 +4,7 @@ the consistency step.
 
 from collections.abc import Mapping
 
-from beers_deploy.model.consistency import Consistency
+from beers_deploy.model.consistency.step import Consistency
 from beers_deploy.model.exposure import HEADROOM
 from beers_deploy.model.self_check import (
     CELL_PX,

@@ -14,8 +14,8 @@ import onnx
 import psutil
 
 from beers_deploy.dpu.reading import inputs_of
-from beers_deploy.model.blocks import Placed
-from beers_deploy.model.consistency import Consistency
+from beers_deploy.model.consistency.blocks import Placed
+from beers_deploy.model.consistency.step import Consistency
 from beers_deploy.model.processor import require_cores
 from beers_deploy.network import Network, NetworkLike, other_precision
 from beers_deploy.performance.timing import cpu_load, interleaved, resident_bytes

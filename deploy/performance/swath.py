@@ -13,7 +13,7 @@ from beers_deploy.dpu.cost.host import Task
 from beers_deploy.dpu.cost.latency import Prediction, dpu_power, predict
 from beers_deploy.dpu.cost.model import Interval, between
 from beers_deploy.dpu.reading import network_of
-from beers_deploy.model.consistency import DETAIL_PRODUCTS_PER_PX, PRODUCTS_PER_PX
+from beers_deploy.model.consistency.step import DETAIL_PRODUCTS_PER_PX, PRODUCTS_PER_PX
 from beers_deploy.model.raster.facts import SIDE_PX
 from beers_deploy.network import Network, NetworkLike
 from beers_deploy.profiles.errors import OptionError, printable

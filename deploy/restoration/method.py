@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 import onnx
 
-from beers_deploy.model.consistency import Consistency
+from beers_deploy.model.consistency.step import Consistency
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.shipped import TILE_PX
 from beers_deploy.quant.tiling.receptive_field import tiling_of

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beers_deploy.model.blocks import Placed
+from beers_deploy.model.consistency.blocks import Placed
 from beers_deploy.model.io.files import whole_file
 from beers_deploy.model.progress import steps
 from beers_deploy.model.raster.facts import BandInfo, Raster

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 import onnx
 
-from beers_deploy.model.consistency import Consistency
+from beers_deploy.model.consistency.step import Consistency
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.network import Network
 from beers_deploy.profiles.sensor import Sensor

@@ -23,7 +23,7 @@ from pydantic import with_config
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from beers_deploy.model.blocks import BLOCK_PX
+from beers_deploy.model.consistency.blocks import BLOCK_PX
 from beers_deploy.model.metrics.perceptual import Lpips
 from beers_deploy.profiles.instrument import MAX_DN
 from beers_deploy.profiles.validation import CONFIG, Amount

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
-from beers_deploy.model.blocks import Placed
+from beers_deploy.model.consistency.blocks import Placed
 from beers_deploy.model.self_check import (
     BLOCK_PX,
     LEAST_PX,
@@ -27,7 +27,7 @@ from beers_deploy.model.self_check import (
 )
 from beers_deploy.profiles.effects import Dsnu, Prnu, Striping
 from beers_deploy.profiles.instrument import Instrument
-from tests.model.consistency_images import (
+from tests.model.consistency.images import (
     COLUMNS,
     FULL_SCALE,
     REFERENCE,

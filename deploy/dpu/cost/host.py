@@ -16,7 +16,7 @@ from beers_deploy.dpu.board import Dpu
 from beers_deploy.dpu.checker.placement import Placement
 from beers_deploy.dpu.cost.model import Array, Constants, Interval
 from beers_deploy.dpu.graph import Operation
-from beers_deploy.model.consistency import PRODUCTS_PER_PX
+from beers_deploy.model.consistency.step import PRODUCTS_PER_PX
 
 Task = Literal["copy", "argmax", "softmax", "sort", "image"]
 """What the host does with the results: reads them and no more (copy); finds the best of classes

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from beers_deploy.model.blocks import Placed
-from beers_deploy.model.consistency import RAW_REACH_PX, REACH_PX, Consistency
+from beers_deploy.model.consistency.blocks import Placed
+from beers_deploy.model.consistency.step import RAW_REACH_PX, REACH_PX, Consistency
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.full_scale import remedy_outside
 from beers_deploy.model.raster.source import Source

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from beers_deploy.model.consistency import Consistency
+from beers_deploy.model.consistency.step import Consistency
 from beers_deploy.model.raster.facts import Raster
 from beers_deploy.model.raster.source import ArraySource, Source
 from beers_deploy.profiles.errors import ModelError

@@ -15,7 +15,7 @@ import numpy as np
 from beers_deploy.dpu.board import Dpu, dpu_of
 from beers_deploy.dpu.cost.latency import Prediction
 from beers_deploy.dpu.cost.model import Constants
-from beers_deploy.model.blocks import Placed
+from beers_deploy.model.consistency.blocks import Placed
 from beers_deploy.model.metrics.fidelity import psnr_db
 from beers_deploy.model.progress import steps
 from beers_deploy.model.self_check import SelfCheck

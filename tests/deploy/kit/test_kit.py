@@ -22,8 +22,8 @@ from beers_deploy.kit import RECORD
 from beers_deploy.kit.golden import read_golden
 from beers_deploy.kit.host_facts import consistency_facts, host_facts
 from beers_deploy.model.bank import bank_of_vector
-from beers_deploy.model.blocks import Placed
-from beers_deploy.model.consistency import Consistency
+from beers_deploy.model.consistency.blocks import Placed
+from beers_deploy.model.consistency.step import Consistency
 from beers_deploy.model.convbeers import arrays
 from beers_deploy.model.exposure import choose_factors, factors_for
 from beers_deploy.model.io.tensors import Weights

@@ -14,7 +14,7 @@ import pytest
 import tifffile
 from numpy.testing import assert_array_equal
 
-from beers_deploy.model.consistency import REACH_PX
+from beers_deploy.model.consistency.step import REACH_PX
 from beers_deploy.profiles.errors import MachineError, OptionError
 from beers_deploy.profiles.sensor import Sensor
 from beers_deploy.profiles.shipped import BLIND

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from beers_deploy.model.blocks import Placed
-from beers_deploy.model.consistency import RAW_REACH_PX, REACH_PX, Consistency
+from beers_deploy.model.consistency.blocks import Placed
+from beers_deploy.model.consistency.step import RAW_REACH_PX, REACH_PX, Consistency
 from beers_deploy.profiles.effects import Offset
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import PointSpread, packed, unpacked
-from tests.model.consistency_images import (
+from tests.model.consistency.images import (
     COLUMNS,
     FULL_SCALE,
     INSIDE,

@@ -10,8 +10,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from beers_deploy.model.blocks import Placed
-from beers_deploy.model.consistency import Consistency
+from beers_deploy.model.consistency.blocks import Placed
+from beers_deploy.model.consistency.step import Consistency
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.profiles.effects import AntiAlias, Offset, Smear
 from beers_deploy.profiles.instrument import Instrument

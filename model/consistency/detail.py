@@ -2,8 +2,8 @@
 
     x'' = x' + (G_2 - G_8) (y - H x)
 
-G_b averages over blocks of b x b pixels and interpolates bilinearly, as G of `model.consistency`,
-whose blocks of 8 pixels are G_8. The difference of the two is a band-pass filter for periods of
+G_b averages over blocks of b x b pixels and interpolates bilinearly; G_8 is G of `step`, whose
+blocks have 8 pixels. The difference of the two is a band-pass filter for periods of
 about 4 to 30 pixels. A network conditioned on the contrast at Nyquist alone amplifies them as if
 the sensor's curve were the formula's, so for another curve the residual there is not noise but a
 part of the scene. Behind a Gaussian curve the step brought `convbeers-s` in INT8 from 46.1 to 47.7
@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beers_deploy.model.blocks import (
+from beers_deploy.model.consistency.blocks import (
     BLOCK_PX,
     Image,
     Placed,

@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from beers_deploy.model.consistency import Consistency
+from beers_deploy.model.consistency.step import Consistency
 from beers_deploy.profiles.instrument import Instrument
-from tests.model.consistency_images import (
+from tests.model.consistency.images import (
     FULL_SCALE,
     INSIDE,
     REFERENCE,

@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from beers_deploy.model.blocks import (
+from beers_deploy.model.consistency.blocks import (
     BLOCK_PX,
     BORDER_BLOCKS,
     Image,
@@ -44,13 +44,13 @@ from beers_deploy.model.blocks import (
     interpolate,
     reached_blocks,
 )
-from beers_deploy.model.departure import departure
-from beers_deploy.model.detail_step import (
+from beers_deploy.model.consistency.detail import (
     DetailStep,
     products_per_px,
     separable_sums,
     window_weights,
 )
+from beers_deploy.model.departure import departure
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.profiles.instrument import Instrument
 
