@@ -14,6 +14,7 @@ from tests.model.consistency.images import (
     INSIDE,
     REFERENCE,
     SENSORS,
+    Pixels,
     blurred,
     corrected,
     noisy,
@@ -27,7 +28,7 @@ GAUSSIAN = with_response(plain_sensor(), gaussian_pixel(1.1, 1.1, 8, 129))
 """A sensor whose blur is a Gaussian of 1.1 pixels."""
 
 
-def detail(sensor: Instrument, raw: NDArray, restored: NDArray) -> NDArray[np.float32]:
+def detail(sensor: Instrument, raw: Pixels, restored: Pixels) -> NDArray[np.float32]:
     """What the step for finer detail adds to the consistency step."""
     step = Consistency.of(sensor, REFERENCE)
     return corrected(step, raw, restored) - corrected(replace(step, detail=None), raw, restored)
