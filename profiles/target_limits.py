@@ -48,7 +48,7 @@ LIMITS: Mapping[str, Limits] = {
     **dict.fromkeys(("width_array", "width_lanes", "width_memory", "width_start"), POSITIVE),
     **dict.fromkeys(("width_copies", "width_task", "width_outside", "pair_width"), POSITIVE),
     **dict.fromkeys(("error_left_out", "clock_ghz", "product_flops_per_cycle"), POSITIVE),
-    "chain_s_per_mpx": POSITIVE,
+    "pipeline_s_per_mpx": POSITIVE,
     **dict.fromkeys(("port_bytes_per_cycle", "host_in_bytes_per_s", "host_out_bytes_per_s"), RATE),
     **dict.fromkeys(("argmax_values_per_s", "softmax_values_per_s", "sort_values_per_s"), RATE),
     **dict.fromkeys(("image_values_per_s", "moved_bytes_per_s", "decoding_mips_per_ghz"), RATE),

@@ -41,7 +41,7 @@ from beers_deploy.profiles.target import TargetProfile
 
 TABLE = "bench"
 LAYERS = "layers"
-CHAIN = "chain_s_per_mpx"
+PIPELINE_TIME = "pipeline_s_per_mpx"
 """In a target's [cpu]: time of the traditional pipeline for 10^6 pixels on all cores."""
 PAPER = "ConvBEERS paper, table of the VCK190 benchmark, 13600 x 9016"
 PAPER_TARGET = "vck190"
@@ -116,11 +116,11 @@ def processor_row(swath: Swath, board: TargetProfile) -> Row:
     power = unavailable("W", "no power of a run on this board's processor is published")
     if watts is not None:
         power = published(watts.low, "W", watts.source)
-    constant = cpu.get(CHAIN)
+    constant = cpu.get(PIPELINE_TIME)
     cores = f", {cpu['cores']} cores" if "cores" in cpu else ""
     name = f"traditional pipeline on the processor of {board.name}{cores}"
     if constant is None:
-        reason = f"the target states no [cpu] {CHAIN}"
+        reason = f"the target states no [cpu] {PIPELINE_TIME}"
         return Row(TABLE, name, {"latency": unavailable("s", reason), "power": power})
     low_s = mpx * constant.low
     high_s = mpx * constant.high

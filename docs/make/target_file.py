@@ -127,7 +127,7 @@ KEYS: dict[str, dict[str, str]] = {
         "product_flops_per_cycle": "float32 operations of a core in matrix products",
         "moved_bytes_per_s": "bytes that a core moves",
         "decoding_mips_per_ghz": "7-zip's rating, by which plain code is scaled",
-        "chain_s_per_mpx": "time of the traditional pipeline on all cores",
+        "pipeline_s_per_mpx": "time of the traditional pipeline on all cores",
     },
 }
 """The meaning of every key, by its table."""

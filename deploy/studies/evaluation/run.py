@@ -333,9 +333,9 @@ SITES_CAPTION = (
     "bias of the mean is that of inner pixels against the reference."
 )
 SWEEP_CAPTION = (
-    "One image of each site. The chain and every network that can know a sensor know that of the "
-    "row, unless it says that another one is supposed. Of gains and losses the interval is that of "
-    "differences on the same images."
+    "One image of each site. The pipeline and every network that can know a sensor have the row's "
+    "profile, unless the row states that another one is supposed. Intervals of gains and losses are "
+    "those of the differences on the same images."
 )
 CAPTIONS = {
     "mean,": DIMMED_CAPTION,

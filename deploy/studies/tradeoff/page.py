@@ -87,7 +87,7 @@ class Tradeoff(Table):
 
     Attributes:
         boards: the names of all boards that were compared.
-        points: all of them, in the order networks, chains, other libraries, the paper's runs.
+        points: all of them, in the order networks, pipelines, other libraries, the paper's runs.
         front: those on the Pareto front over all boards, sorted by increasing cost.
         constraints: budget and need.
         cost: the name of the figure that quality is traded against, such as "latency".

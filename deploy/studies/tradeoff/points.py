@@ -292,9 +292,9 @@ def board_figures(
         latency = row.figures["latency"]
         power = row.figures["power"]
         if latency.value is not None and latency.interval is not None:
-            # A board's file states the standard chain alone: others are scaled by their times here.
+            # A board's file states the standard quality alone; times here scale the others.
             low_s, high_s = (end * slower for end in latency.interval)
-            source = f"{latency.source}; times of the chains here: {slower:.2f} of {STANDARD}"
+            source = f"{latency.source}; times of the pipelines here: {slower:.2f} of {STANDARD}"
             latency = predicted(latency.value * slower, "s", (low_s, high_s), source)
     else:
         latency = unavailable(

@@ -282,7 +282,7 @@ def _measured(
     medians_s = {variant: times["host p50"].value or 1.0 for variant, times in host.items()}
     for point, result in zip(points, results, strict=True):
         here_s = medians_s[point.variant]
-        # If the chain itself was not timed, the board's stated time is used as it is.
+        # If the pipeline itself was not timed, the board's stated time is used as it is.
         slower = here_s / medians_s.get(Variant(STANDARD), here_s)
         runs = benchmark.runs(point) if point.dpu is not None else 1.0
         figures = host[point.variant] | board_figures(point, swath, slower, runs)
@@ -339,4 +339,4 @@ def _notes(benchmark: Benchmark, boards: Sequence[str]) -> Iterator[str]:
         "Exact halos give the same pictures in tiles of any size; smaller ones were measured "
         "in the point's tiles."
     )
-    yield "The chains know both sensors; what a network knows of them stands beside it."
+    yield "The pipelines know both sensors; next to each network stands what it knows of them."

@@ -43,4 +43,4 @@ def test_the_boards_processor_holds_the_papers_run_and_lacks_what_its_file_lacks
         (SWATH.pixels / high / 22.5, SWATH.pixels / low / 22.5)
     )
     row = processor_row(SWATH, replace(board, tables={}))
-    assert "chain_s_per_mpx" in row.figures["latency"].reason
+    assert "pipeline_s_per_mpx" in row.figures["latency"].reason

@@ -171,7 +171,7 @@ def test_a_chain_on_a_boards_processor_takes_the_stated_time_by_the_measured_rat
     time_s_per_mpx = Constant((10.0, 40.0), "inferred", "a test")
     tables = {
         **DPU.target.tables,
-        "cpu": {**DPU.target.tables["cpu"], "chain_s_per_mpx": time_s_per_mpx},
+        "cpu": {**DPU.target.tables["cpu"], "pipeline_s_per_mpx": time_s_per_mpx},
     }
     board = replace(DPU.target, tables=tables)
     swath = Swath(1000, 2000)
