@@ -334,8 +334,8 @@ SITES_CAPTION = (
 )
 SWEEP_CAPTION = (
     "One image of each site. The pipeline and every network that can know a sensor have the row's "
-    "profile, unless the row states that another one is supposed. Intervals of gains and losses are "
-    "those of the differences on the same images."
+    "profile, unless the row states that another one is supposed. Intervals of gains and losses "
+    "are those of the differences on the same images."
 )
 CAPTIONS = {
     "mean,": DIMMED_CAPTION,
