@@ -25,34 +25,38 @@ BOARD = "vck190"
 
 OPENING = f"""# Bit flips
 
-You see here what bit flips by radiation cost the shipped {", ".join(VARIANTS[:-1])} and {VARIANTS[-1]}, and
-what guards gain. This command measures it, on patches of drawn scenes:
+This page shows what bit flips by radiation cost {", ".join(VARIANTS[:-1])} and {VARIANTS[-1]}, and what guards gain:
 
     beers-deploy stress --bit-flips --draws {SOURCE.patches} --side {SOURCE.patch_px}
 
 ![PSNR against bit flips in a megabit, for weights, shifts, feature maps and the image](../assets/bit-flips.svg)
 
-A particle can flip a bit in a memory (a single-event upset). Bit flips are injected into one kind of memory at a
-time: int8 weights and bias, six-bit shifts of each operation, int8 feature maps, and 12-bit pixels. The DPU's
-arithmetic then runs in integers (`quant/integer/`). Instructions, addresses, accumulators, read shifts of adds and
-the processor's own memory get no flips. The copy from which weights are loaded, and the checksums, count as intact.
+Bits are flipped in one kind of memory at a time: int8 weights and bias, six-bit shifts of each operation, int8
+feature maps, and 12-bit pixels. Instructions, addresses, accumulators, read shifts of adds and the processor's own
+memory get no flips. The copy from which weights are loaded, and the checksums, count as intact.
 
 Guards:
 
 - **ReLU6** in place of ReLU where calibration stays below 96 units. The DPU fuses it.
 - **Limit of the correction**: the next power of two above what calibration reaches, on the host.
 - **Scrubbing**: CRC-32 of each convolution's weights before each tile; weights that differ are loaded again.
-- **Triple modular redundancy** of the shifts: three copies, of which two must agree, bit by bit.
+- **Triple modular redundancy** of the shifts: two of three copies must agree, bit by bit.
 
 ## What is found
 
 """
 
-FINDINGS = """- Weights: one bit may cost nothing or 20 dB. CRC-32 finds every injection here.
+FINDINGS = f"""- Weights: one bit may cost nothing or 20 dB. CRC-32 finds every injection here.
 - Shifts are few and seldom hit, but a wrong one costs 10 dB in the mean and above 20 dB at worst. Triple modular
   redundancy corrects everything except two flips of the same bit, which occur at 10 000 in a megabit.
 - Feature maps and pixels: the guards gain at most 0.3 dB. From 100 bits in a megabit on, memory with error correction
   is needed.
+
+The cost of all guards on a {BOARD.upper()} (predicted), where "share" is that of a tile's time if nothing hides, and "loss"
+that of the frame rate next to the DPU:
+
+| network | time | share | loss |
+|---|---|---|---|
 """
 
 
@@ -67,11 +71,7 @@ def price_lines(networks: Mapping[str, Sequence[Row]]) -> Iterator[str]:
     for name, rows in networks.items():
         row = next(row for row in rows if row.table == "guards" and row.name == "all guards")
         time, share, loss = (f"{figure} {figure.unit}" for figure in row.figures.values())
-        yield (
-            f"- All guards of {name} on a {BOARD.upper()} (predicted): {time}, or {share} of a "
-            "tile if nothing "
-            f"hides; frame rate lost beside the DPU: {loss}."
-        )
+        yield f"| {name} | {time} | {share} | {loss} |"
 
 
 def table(networks: Mapping[str, Sequence[Row]]) -> Iterator[str]:

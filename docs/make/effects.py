@@ -54,18 +54,13 @@ or a scene has their table; `profiles/effects.toml` has typical values. In the p
 {shown}.
 
 They apply in the order of the signal: one transfer function for MTF, anti-alias filter and smear; sampling; then
-{order}; `veil` is haze.
-
-The anti-alias filter is part of the MTF that the profile states; motion smear is added along the track.
+{order}; `veil` is haze. The MTF that a profile states includes the anti-alias filter, but not smear.
 
 ## Which effects a scene gets
 
-A bound is the largest change that any pixel
-could undergo, in DN before digitising, proven from the scene's radiances and the kernels' sizes. What a scene cannot
-show is left out:
-{tolerance:g} DN at most, for all such effects together.
-
-The four shipped scenes under `pleiades-degraded` ask for these effects, with these bounds in DN:
+A bound is the largest change that any pixel could undergo, in DN before digitising, proven from the scene's radiances
+and the kernels' sizes. Effects that change a scene by at most {tolerance:g} DN together are left out. The four shipped scenes
+under `pleiades-degraded` have these effects, with these bounds:
 
 """
 

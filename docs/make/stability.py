@@ -27,12 +27,9 @@ OPENING = f"""# Stability
 
     beers-deploy stress float.onnx int8.onnx
 
-runs hard cases on your own pair; the exit code is 1 when something fails. The figures below are those of
-`beers-deploy stress` on the shipped {VARIANT}.
-
-{len(CASES)} hard cases run through {len(STAGES)} stages. A check beyond its bound is a failure, unless one of the
-known limitations below explains it, each up to its own ceiling. `--out` and `--json` write every measured figure with
-its bound.
+runs {len(CASES)} hard cases through {len(STAGES)} stages on your own pair; the exit code is 1 when a check exceeds its bound and
+no known limitation explains it up to its ceiling. The figures below are those of the shipped {VARIANT}. `--out` and
+`--json` write all figures with their bounds.
 """
 
 
@@ -50,7 +47,7 @@ def finding_lines(subject: Subject, results: list[StageResult]) -> Iterator[str]
     failed, limited = (
         sum(bool(getattr(r, name)) for r in results) for name in ("failed", "limitations")
     )
-    yield f"- {len(results)} looks, {failed} failed, {limited} explained by a known limitation."
+    yield f"- {len(results)} checks of a case at a stage, {failed} failed, {limited} explained by a known limitation."
     worst = {row.name: row for row in worst_rows(results)}
     yield (
         "- The same pixels come out, bit for bit, of a second run, on more threads and of "
