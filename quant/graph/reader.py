@@ -70,7 +70,7 @@ REMEDIES = {
         ("GroupNormalization", "InstanceNormalization", "LayerNormalization"), NORMALISES
     ),
     **dict.fromkeys(("ReduceL2", "ReduceMax", "ReduceMean", "ReduceSum"), STATISTICS),
-    **dict.fromkeys(("PRelu", "Sigmoid"), ADAPT),
+    **dict.fromkeys(("PRelu", "Sigmoid", "Gelu", "Erf"), ADAPT),
     **dict.fromkeys(("ConstantOfShape", "Expand", "Shape", "Size", "Tile"), OF_ONE_SIZE),
     "Pad": (
         "Pad in the convolution; a network behind a bank is quantised from its weights "

@@ -51,7 +51,7 @@ class SampleRange:
     def __str__(self) -> str:
         return (
             f"1, 50, 99 and 99.9 % of the pixels lie below {self.p1:.3f}, {self.p50:.3f}, "
-            f"{self.p99:.3f} and {self.p99_9:.3f} of full scale, {100 * self.saturated:.2g} % are "
+            f"{self.p99:.3f} and {self.p99_9:.3f} of full scale, {100 * self.saturated:.3g} % are "
             "saturated"
         )
 

@@ -58,7 +58,11 @@ from beers_deploy.quant.simplify.free_sizes import free_sizes
 from beers_deploy.quant.simplify.fully_connected import ConnectByConvolutions
 from beers_deploy.quant.simplify.large_kernels import is_large, split_large_kernel
 from beers_deploy.quant.simplify.missing_border import with_missing_border
-from beers_deploy.quant.simplify.spelled_activations import join_hard_swish, join_relu
+from beers_deploy.quant.simplify.spelled_activations import (
+    halve_before_gelu,
+    join_hard_swish,
+    join_relu,
+)
 from beers_deploy.quant.simplify.split_channels import split_channels
 from beers_deploy.quant.simplify.standard_operators import (
     drop_cast,
@@ -137,6 +141,7 @@ def _run_passes(model: onnx.ModelProto) -> None:
         split_sums,
         join_relu,
         join_hard_swish,
+        halve_before_gelu,
         add_negated,
         fold_behind,
         split_large_kernel,

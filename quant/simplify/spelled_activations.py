@@ -3,9 +3,12 @@
 1. A Clip at 0 without an upper limit, and a Max with 0, are ReLU.
 2. A shift by 3, a clip from 0 to 6 and a sixth are HardSigmoid. They are HardSwish if they are
    multiplied by the tensor itself, in any order.
+3. GELU, x (1 + Erf(x / sqrt(2))) / 2, stays spelled out, but its half comes first. Behind the
+   product it would be folded into the next convolution, and nobody would recognise the rest.
 """
 
 from collections.abc import Callable
+from math import sqrt
 
 import numpy as np
 
@@ -35,7 +38,7 @@ def join_relu(graph: OnnxGraph, node: Node) -> list[Node] | None:
         if low == 0 and high is not None and high > UNLIMITED:
             source = node.inputs[0]
     else:
-        source = _other_operand(graph, node, "Max", 0)
+        source = other_operand(graph, node, "Max", 0)
     if source is None:
         return None
     return [Node.new("Relu", [source], node.outputs[0], node.name)]
@@ -63,6 +66,42 @@ def join_hard_swish(graph: OnnxGraph, node: Node) -> list[Node] | None:
     return None if source is None else [Node.new("HardSwish", [source], result, node.name)]
 
 
+def halve_before_gelu(graph: OnnxGraph, node: Node) -> list[Node] | None:
+    """Move the half of a GELU in front of its product (3).
+
+    Args:
+        graph: that the node belongs to.
+        node: any node.
+
+    Returns:
+        The half, and the product that completes the GELU; None if the node halves no such product.
+    """
+    product = graph.sole_writer(other_operand(graph, node, "Mul", 0.5) or "")
+    if product is None or product.op_type != "Mul":
+        return None
+    for source, gate in (product.inputs, product.inputs[::-1]):
+        if gelu_gate_input(graph, gate) == source:
+            (half,) = (name for name in node.inputs if name in graph.constants)
+            halved = f"{product.outputs[0]}.half"
+            result = node.outputs[0]
+            return [
+                Node.new("Mul", [source, half], halved, halved),
+                Node.new("Mul", [halved, gate], result, node.name),
+            ]
+    return None
+
+
+def gelu_gate_input(graph: OnnxGraph, name: str) -> str | None:
+    """Return x if a tensor is 1 + Erf(x / sqrt(2))."""
+    erf = graph.writers.get(other_operand(graph, graph.writers.get(name), "Add", 1) or "")
+    if erf is None or erf.op_type != "Erf":
+        return None
+    scaled = graph.writers.get(erf.inputs[0])
+    # Exporters divide by sqrt(2), or multiply by its reciprocal.
+    by_factor = other_operand(graph, scaled, "Mul", sqrt(0.5))
+    return by_factor or other_operand(graph, scaled, "Div", sqrt(2))
+
+
 def _gated_by(
     graph: OnnxGraph, node: Node, gated: Callable[[OnnxGraph, str], str | None]
 ) -> str | None:
@@ -87,7 +126,7 @@ def _sixth_of(graph: OnnxGraph, node: Node) -> str | None:
     """Return the tensor of which a node computes a sixth."""
     if node.op_type == "Div" and _scalar(graph, node, 1) == 6:
         return node.inputs[0]
-    return _other_operand(graph, node, "Mul", 1 / 6)
+    return other_operand(graph, node, "Mul", 1 / 6)
 
 
 def _shifted_and_clipped(graph: OnnxGraph, name: str) -> str | None:
@@ -98,20 +137,20 @@ def _shifted_and_clipped(graph: OnnxGraph, name: str) -> str | None:
     shift = graph.writers.get(clip.inputs[0])
     if (_scalar(graph, clip, 1), _scalar(graph, clip, 2)) != (0, 6) or shift is None:
         return None
-    return _other_operand(graph, shift, "Add", 3)
+    return other_operand(graph, shift, "Add", 3)
 
 
-def _other_operand(graph: OnnxGraph, node: Node, kind: str, number: float) -> str | None:
+def other_operand(graph: OnnxGraph, node: Node | None, kind: str, number: float) -> str | None:
     """Return the tensor that a node of this operator combines with a constant number.
 
     Args:
         graph: that the node belongs to.
-        node: any node.
-        kind: an operator of two operands in any order.
+        node: any node; None returns None.
+        kind: an operator of two operands, in any order but for Div, whose constant divides.
         number: the constant, up to the rounding of float32.
     """
-    if node.op_type == kind and len(node.inputs) == 2:
-        for place in (0, 1):
+    if node is not None and node.op_type == kind and len(node.inputs) == 2:
+        for place in (0, 1)[: 1 if kind == "Div" else 2]:
             constant = _scalar(graph, node, 1 - place)
             if constant is not None and np.isclose(constant, number, rtol=1e-6, atol=0):
                 return node.inputs[place]

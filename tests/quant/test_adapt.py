@@ -53,6 +53,24 @@ def quick_gelu(w: GraphWriter, x: str, name: str) -> str:
     return w.node("Mul", name, [gate, x])
 
 
+def gelu(divides: bool) -> Act:
+    """Return the GELU as exporters write it: they divide by sqrt(2), or multiply."""
+
+    def write(w: GraphWriter, x: str, name: str) -> str:
+        """Write the operators in the order of the exporter."""
+        half = w.constant("half", np.array(0.5, np.float32))
+        one = w.constant("one", np.array(1, np.float32))
+        root = 2**0.5 if divides else 2**-0.5
+        scale = w.constant("root", np.array(root, np.float32))
+        scaled = w.node("Div" if divides else "Mul", f"{name}.scaled", [x, scale])
+        gate = w.node("Add", f"{name}.gate", [w.node("Erf", f"{name}.erf", [scaled]), one])
+        if divides:
+            return w.node("Mul", name, [w.node("Mul", f"{name}.both", [x, gate]), half])
+        return w.node("Mul", name, [w.node("Mul", f"{name}.half", [half, x]), gate])
+
+    return write
+
+
 def gated(w: GraphWriter, x: str, name: str) -> str:
     """A Sigmoid that multiplies another tensor."""
     other = conv(w, x, f"{name}.other")
@@ -243,6 +261,8 @@ def test_one_slope_for_all_channels_and_a_twin_of_each_convolution() -> None:
 REPLACED = {
     "SiLU": (silu, Kind.silu, 3),
     "quick GELU": (quick_gelu, Kind.silu, 3),
+    "GELU, divided": (gelu(divides=True), Kind.silu, 3),
+    "GELU, multiplied": (gelu(divides=False), Kind.silu, 3),
     "Sigmoid": (gated, Kind.sigmoid, 3),
     "LeakyReLU": (leaky(0.2), Kind.leaky_relu, 3),
     "PReLU": (prelu(*np.linspace(0.05, 0.3, FEATURES)), Kind.prelu, 3),
@@ -356,7 +376,7 @@ def test_what_a_dpu_has_and_what_nothing_replaces_stays() -> None:
         adapt(network(silu_but_tanh_third), BARE, BARE)
 
 
-@pytest.mark.parametrize("act", [prelu(0.2), hard_sigmoid(0.2, 0.5)])
+@pytest.mark.parametrize("act", [prelu(0.2), hard_sigmoid(0.2, 0.5), gelu(divides=True)])
 def test_the_refusal_names_adapt(act: Act) -> None:
     """The error about an activation that can be replaced names the option that replaces it."""
     with pytest.raises(ModelError, match=r"quantize --adapt"):
