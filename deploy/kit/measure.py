@@ -66,7 +66,8 @@ def arguments() -> argparse.Namespace:
         help="of the provider; repeatable",
     )
     add("--configuration", default="C32B3", help="DPU in the board's bitstream, C32B1 to C64B5")
-    add("--tile", type=int, default=640, help="tile side in pixels")
+    sides = "tile side in image pixels; if none, that of host.json next to the model, or 640"
+    add("--tile", type=int, help=sides)
     add("--batch", type=int, default=1, help="tiles in one call")
     add("--frames", type=int, default=300, help="tiles to time, after a warm-up")
     add("--threads", type=int, default=1, help="calls in flight; try 1, 2, 3, ... batch handlers")
@@ -81,7 +82,8 @@ def measure(options: argparse.Namespace) -> dict[str, object]:
     session = open_session(
         options.model, options.provider, dict(option.split("=", 1) for option in options.option)
     )
-    feed = make_feed(session, options.batch, options.tile)
+    tile_px = options.tile or kit_tile_px(options.model.parent / "host.json")
+    feed = make_feed(session, options.batch, tile_px)
     if not options.no_compare:
         compare(options.model, session, feed)
     stamps, _ = run_threads(session, feed, 1 + WARM_UP_CALLS + LATENCY_CALLS, 1, [])
@@ -99,10 +101,17 @@ def measure(options: argparse.Namespace) -> dict[str, object]:
         f"{options.threads} threads"
     )
     entry: dict[str, object] = {"model": options.model.name, "configuration": options.configuration}
-    entry.update(tile_px=options.tile, fps=round(fps, 4), provider=options.provider)
+    entry.update(tile_px=tile_px, fps=round(fps, 4), provider=options.provider)
     if power_w:
         entry["power_w"] = round(statistics.fmean(power_w), 3)
     return entry
+
+
+def kit_tile_px(facts: Path) -> int:
+    """Return the side of a kit's tiles by its host.json, or 640 if there is none."""
+    if not facts.is_file():
+        return 640
+    return int(json.loads(facts.read_text(encoding="utf-8"))["tile_px"])
 
 
 def open_session(model: Path, provider: str, options: dict[str, str]) -> ort.InferenceSession:
@@ -129,17 +138,19 @@ def open_session(model: Path, provider: str, options: dict[str, str]) -> ort.Inf
 
 def make_feed(session: ort.InferenceSession, batch: int, tile_px: int) -> dict[str, np.ndarray]:
     """Return noise that quantisation leaves unchanged: multiples of 2^-7, or int8 itself. It is the
-    same in every run.
+    same in every run. Sizes that the model fixes are kept: a core may read a border around its
+    tile, or several pixels as channels of one place.
     """
     random = np.random.default_rng(0)
     feed = {}
     for tensor in session.get_inputs():
-        shape = [batch, tensor.shape[1], tile_px, tile_px]
-        sides = zip(tensor.shape, shape)  # noqa: B905 - a board's Python may be old
-        if any(isinstance(size, int) and size != expected for size, expected in sides):
+        free = [batch, tensor.shape[1], tile_px, tile_px]
+        sizes = zip(tensor.shape, free)  # noqa: B905 - a board's Python may be old
+        shape = [size if isinstance(size, int) else other for size, other in sizes]
+        if shape[0] != batch:
             raise ValueError(
-                f"{tensor.name} is fixed to {tensor.shape}, not {shape}. Give its --tile and "
-                "--batch."
+                f"{tensor.name} is fixed to {shape[0]} tiles in a call, not {batch}. Give --batch "
+                f"{shape[0]}."
             )
         values = random.integers(-100, 100, shape)
         feed[tensor.name] = (

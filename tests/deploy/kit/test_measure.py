@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+import beers_deploy as bd
 from beers_deploy.kit import measure
 from tests.deploy.dpu.graphs import board_convbeers
 
@@ -38,6 +39,23 @@ def test_runs_are_added_to_the_list(
     assert set(second) == {*first, "power_w"}
     assert second["power_w"] == 45
     assert min(first["fps"], second["fps"]) > 0
+
+
+def test_the_core_of_a_kit_is_measured_at_its_own_size(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """It reads a border around the tile, at half the resolution; the entry has the image's tile."""
+    kit = bd.Board.load("vck190").kit("convbeers-half-xs-int8", tmp_path / "kit", tile=64)
+    out = kit / "board.json"
+    provider = ("--provider", "CPUExecutionProvider", "--frames", 4, "--out", out)
+    assert run(monkeypatch, kit / "core.onnx", *provider) == 0
+    (entry,) = json.loads(out.read_text())
+    assert entry["tile_px"] == 64
+    # As if the board had run it.
+    out.write_text(json.dumps([{**entry, "provider": "VitisAIExecutionProvider", "fps": 900.0}]))
+    table = bd.bench("convbeers-half-xs-int8", tile=64, measured=out, size="700x600")
+    assert any("your runs" in row.figures for row in table.rows)
+    assert run(monkeypatch, kit / "core.onnx", *provider, "--batch", 2) == 2
 
 
 def test_throughput_leaves_the_first_calls_latency_out() -> None:
