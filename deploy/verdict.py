@@ -345,11 +345,10 @@ def file_checks(
     """Check the INT8 file itself: the rules of the target's DPU or NPU, then its structure.
 
     Args:
-        float_model: the network that the file was quantised from, whose ReLUs and shapes the file
-            must have.
+        float_model: the network that the file was quantised from, whose ReLUs the file must have.
         int8: the file.
         target: the board. One with neither DPU nor NPU has no rules.
-        must_describe: True if a file without a description of its host part fails.
+        must_describe: True if a file that does not describe its integers fails.
     """
     checks = structure_checks(float_model, int8.model, must_describe)
     if not (target.configurations or target.npu):

@@ -176,7 +176,9 @@ class Checkpoint:
         return pixels.reshape(-1, self.shape[2])
 
     def remove(self) -> None:
-        """Delete the rows, the journal first, so that no journal refers to missing rows."""
+        """Delete the rows and half-written outputs, the journal first, so that no journal refers to
+        missing rows.
+        """
         # The journal is the first of these, because it counts on the rows.
         for name in ROWS_FILES:
             (self.folder / name).unlink(missing_ok=True)

@@ -104,7 +104,7 @@ class Tally:
         valid: np.ndarray | None,
         valid_restored: np.ndarray | None,
     ) -> "Tally":
-        """Count the clipped and missing pixels and the sums of a part of an image.
+        """Return counts and sums over the pixels of a part of an image that are not missing.
 
         Args:
             stored: the raw pixels (bands, h, w), in shares of full scale.

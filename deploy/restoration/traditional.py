@@ -63,8 +63,7 @@ class TraditionalRestoration(Restoration):
         """Restore the image strip by strip, all bands of one strip at a time.
 
         Args:
-            done_px: rows that an earlier run has written. They are restored again, because a strip
-                depends on the ones before it; the caller skips them.
+            done_px: always 0, because a traditional restoration cannot be resumed.
             tick: called with the number of rows of each finished strip.
         """
         height_px = self.source.raster.height_px

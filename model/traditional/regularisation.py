@@ -82,7 +82,7 @@ class NoiseAndScene:
         radiance: the mean radiance L in W/m2/sr/um, at least 0.
         noise: variance of the noise, v.
         residual: the part of the noise that denoising is expected to leave, v u / (u + 1), where
-            u = g / (2 v) - 1 is the scene over the noise.
+            u = g / (2 v) - 1, at least 0, is the scene over the noise.
         contrast: the mean squared difference of neighbours, g, less that of the noise, 2 v; may be
             negative.
     """

@@ -131,7 +131,7 @@ class Conv(OneInput):
         weight: (O, I / groups, kh, kw), with O the channels that it writes, also if transposed.
         bias: (O,).
         activation: applied to the result.
-        window: kernel, strides, pads and dilations. If transposed, it has ONNX's meaning: the
+        window: strides, pads and dilations. If transposed, it has ONNX's meaning: the
             strides enlarge, and the pads crop.
         groups: 1, or the number of channels.
         transposed: True for a transposed convolution.

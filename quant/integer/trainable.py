@@ -137,9 +137,10 @@ class TrainableCore(torch.nn.Module):
         return copy
 
     def forward(self, planes: Tensor) -> Tensor:
-        """Return the correction (N, C, H, W), decoded from its copies, for planes (N, P, H, W).
+        """Return the correction (N, C, H, W) in its own unit for int8 planes (N, P, H, W).
 
-        The planes hold int8 values. Both are float32, and gradients pass through the roundings.
+        If the core writes several copies of the correction, one copy without rounding is computed
+        instead. Both tensors are float32, and gradients pass through the roundings.
         """
         return self.tensors(planes)[CORRECTION] * self._core.scale(CORRECTION)
 

@@ -144,7 +144,7 @@ class Sample:
 
         Returns:
             `weight` times the sum of two terms: the mean squared difference from the float
-            network's correction, and that from the reference, if there is one.
+            network's correction, and that from the reference without its border, if there is one.
         """
         error = (self.weight * (correction - self.floats).square()).mean()
         if self.reference is not None:

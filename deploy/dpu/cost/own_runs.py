@@ -78,7 +78,7 @@ class OwnRuns:
     """Rates that a user measured on their own board, which correct predictions.
 
     Attributes:
-        source: the name of the file that states them.
+        source: what figures state as their source: the number of runs and the file's name.
         runs: each with the prediction of the same network and configuration.
     """
 

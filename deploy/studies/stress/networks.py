@@ -267,8 +267,9 @@ def reference(subject: Subject, case: Case, image: np.ndarray) -> list[checks.Me
     """Check the INT8 network by the integer reference, layer by layer.
 
     The runtime must agree with it bit for bit, no accumulator may exceed its proven bound, and only
-    layers that are known to may saturate. Images (H, W) are cropped to CROP_PX, because the
-    reference is slow.
+    layers whose bounds allow it may saturate. Rounding ties up, as a DPU does, may change the
+    result by at most ROUNDING_DN. Images (H, W) are cropped to CROP_PX, because the reference is
+    slow.
     """
     core = subject.core
     network = subject.quantized
