@@ -27,7 +27,7 @@ INDENTED = re.compile(r"(?:^ {4}\S.*\n?)+", re.MULTILINE)
 Sitting = tuple[str, ...]
 
 LEFT_OUT = {
-    "pip install 'beers-deploy[notebook]'": "fetches from a registry",
+    "pip install '.[notebook,dask]' rioxarray": "fetches from a registry",
     "xdputil query": "is a program of the board",
     "xdputil benchmark core.xmodel 3": "is a program of the board",
     "beers-deploy golden results --compare kit/golden": "compares what a board wrote",
