@@ -36,6 +36,7 @@ logger = logging.getLogger(__name__)
 
 
 def make_network(
+    name: str,
     recipe: NetworkRecipe,
     toml: str,
     images: Sequence[Path],
@@ -46,6 +47,7 @@ def make_network(
     """Run a recipe to its end.
 
     Args:
+        name: of the network, for its files and its model card.
         recipe: of the network.
         toml: its text, for the model card.
         images: folders of photographs.
@@ -61,13 +63,13 @@ def make_network(
         weights = run.weights
         logger.info("stage %d of %d, %s: wrote %s", number, len(recipe.stages), stage.name, weights)
     assert weights is not None  # noqa: S101 - a recipe has a stage
-    finished = out / f"{recipe.variant}.safetensors"
+    finished = out / f"{name}.safetensors"
     shutil.copyfile(weights, finished)
-    int8 = out / f"{recipe.variant}{INT8}.onnx"
-    save_onnx(family_model(Conditioned(recipe.variant, finished), images), int8)
-    card = out / f"{recipe.variant}.md"
+    int8 = out / f"{name}{INT8}.onnx"
+    save_onnx(family_model(Conditioned(name, finished), images), int8)
+    card = out / f"{name}.md"
     with whole_file(card) as temporary:
-        temporary.write_text(model_card(recipe, toml, images), encoding="utf-8")
+        temporary.write_text(model_card(name, recipe, toml, images), encoding="utf-8")
     for path in (finished, int8, card):
         logger.info("wrote %s", path)
 
@@ -129,7 +131,7 @@ def stage_run(
     )
 
 
-def model_card(recipe: NetworkRecipe, toml: str, images: Sequence[Path]) -> str:
+def model_card(name: str, recipe: NetworkRecipe, toml: str, images: Sequence[Path]) -> str:
     """Return the text of a network's card: its recipe, its data, and the machine it was made on."""
     variant = VARIANTS[recipe.variant]
     files = list(chain.from_iterable(map(list_images, images)))
@@ -141,14 +143,14 @@ def model_card(recipe: NetworkRecipe, toml: str, images: Sequence[Path]) -> str:
     attribution = "".join(f"- {line}\n" for line in recipe.attribution)
     notes = "".join(f"{line}\n\n" for line in recipe.notes)
     patches = sum(stage.steps * stage.batch for stage in recipe.stages)
-    return f"""# {recipe.variant}
+    return f"""# {name}
 
 {described(variant)} behind the bank of its sensor: one set of weights and one INT8 file for \
 every sensor in range.
 
 **Made by**
 
-    beers-deploy train --recipe {recipe.variant} --images aerial/ --out runs/{recipe.variant}
+    beers-deploy train --recipe {name} --images aerial/ --out runs/{name}
 
 on {processor_name()} with PyTorch {torch.__version__}: {patches} patches of {len(photos)} \
 photographs, whose list of names and digests has the SHA-256 `{data[:16]}`, and {recipe.charts} \

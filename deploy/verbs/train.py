@@ -206,8 +206,9 @@ def _make(name: str, images: Sequence[Path], out: Path, resume: bool, device: st
             "`recipe` needs `images`. Give the folders of the photographs that the model card "
             "names."
         )
-    outputs = [out / f"{recipe.variant}{end}" for end in (".safetensors", f"{INT8}.onnx", ".md")]
+    path = recipe_file(name)
+    outputs = [out / f"{path.stem}{end}" for end in (".safetensors", f"{INT8}.onnx", ".md")]
     require_writable(*outputs, inputs=images)
-    toml = recipe_file(name).read_text(encoding="utf-8")
-    make_network(recipe, toml, images, out, resume, device)
+    toml = path.read_text(encoding="utf-8")
+    make_network(path.stem, recipe, toml, images, out, resume, device)
     return outputs[0]

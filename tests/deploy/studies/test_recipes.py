@@ -69,7 +69,7 @@ def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes
     recipe.write_text(RECIPE)
     command = ["train", "--recipe", recipe, *image_options(folders), "--out", out]
     done(*command)
-    names = [f"convbeers-half-xs{end}" for end in (".safetensors", "-int8.onnx", ".md")]
+    names = [f"own{end}" for end in (".safetensors", "-int8.onnx", ".md")]
     first = [(out / name).read_bytes() for name in names]
     weights = read_conditioned(out / names[0])
     assert weights.kernels == "fitted"
@@ -78,7 +78,7 @@ def test_a_recipe_makes_weights_int8_file_and_card_and_resumes_to_the_same_bytes
     assert RECIPE.strip() in card
     assert "- Drawn for a test, CC0 1.0" in card
     assert "10 patches of 1 photographs" in card
-    trained = read_tensors(out / "1-float" / names[0])[1]["recipe"]
+    trained = read_tensors(out / "1-float" / "convbeers-half-xs.safetensors")[1]["recipe"]
     assert isinstance(trained, dict)
     assert trained["held_out"] == ["town_1.png"]
     # As if it had been stopped between the stages, and within the second one before its first
