@@ -1,7 +1,7 @@
 """Compare networks and the traditional pipeline under sensors with one contrast at Nyquist and
 different MTF curves.
 
-    python benchmarks/mtf_shapes.py --images aerial-test/ [--networks convbeers-s-int8]
+    python benchmarks/mtf_shapes.py --images aerial-test/ [--methods traditional,convbeers-s-int8]
 
 Each curve is given as a table up to Nyquist, where it is 7 %, and all methods receive it. The
 script prints the PSNR of inner pixels against the reference without noise.
@@ -45,14 +45,14 @@ def main() -> None:
     """Evaluate the methods under each curve."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--images", type=Path, required=True)
-    parser.add_argument("--networks", default="convbeers-s-int8")
+    parser.add_argument("--methods", default="traditional,convbeers-s-int8,convbeers-s-curves-int8")
     arguments = parser.parse_args()
     sensor = Sensor.load("pleiades-degraded")
     for name, contrasts in curves().items():
         values = tuple(contrasts.tolist())
         response: Response = MtfTable(tuple(FREQUENCIES.tolist()), values, values)
         table = bd.evaluate(
-            methods=f"traditional,{arguments.networks}",
+            methods=arguments.methods,
             images=arguments.images,
             sensor=sensor.with_fields(response=response, **axes_of(response, "stated", name)),
         )

@@ -1,4 +1,4 @@
-"""Detect where the MTF of a sensor differs from the curves that a network was trained on."""
+"""Detect where the MTF of a sensor differs from the curves that networks were trained on."""
 
 import math
 
@@ -17,6 +17,12 @@ from beers_deploy.model.variants import Kernels
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import NYQUIST
 
+CURVES = "convbeers-s-curves"
+"""The shipped network that was trained on many curves of the MTF."""
+
+EXPECTED = {"cut": "the formula's curve has", "fitted": "networks were trained on"}
+"""What a curve is compared with, by the kind of banks."""
+
 MARGIN = 0.05
 """How far a curve may lie outside the training curves, as a share. Beyond it networks lose 0.1 dB
 and more (measured).
@@ -24,14 +30,32 @@ and more (measured).
 
 
 def departure(sensor: Instrument, kernels: Kernels) -> str:
-    """Return a sentence on where a sensor's MTF leaves the range of the training curves; "" if it
-    does not.
+    """Return a warning where a sensor's MTF has another curve than the formula's; "" if it has not.
 
     Args:
         sensor: its MTF and smear are used.
         kernels: the kind of the network's banks. Networks behind cut kernels were trained on the
-            formula's curve only.
+            formula's curve only, those behind fitted ones on many.
     """
+    off_formula = _outside(sensor, "cut")
+    if not off_formula:
+        return ""
+    outside = _outside(sensor, "fitted")
+    worse = "the network may restore worse than the traditional pipeline"
+    if outside:
+        return f"{outside}: {worse}"
+    if kernels == "cut":
+        return f"{off_formula}: {worse}. {CURVES} was trained on such curves"
+    return f"{off_formula}: the network is then about level with the traditional pipeline"
+
+
+def has_other_curve(sensor: Instrument) -> bool:
+    """Return True if a sensor's MTF differs from the formula's of that contrast at Nyquist."""
+    return bool(_outside(sensor, "cut"))
+
+
+def _outside(sensor: Instrument, kernels: Kernels) -> str:
+    """Return where the MTF leaves the training curves of one kind of banks; "" if it does not."""
     zero = np.zeros((1, 1))
     frequency = FREQUENCIES[None]
     responses = sensor_mtf(frequency, zero, sensor), sensor_mtf(zero, frequency.T, sensor)
@@ -51,10 +75,8 @@ def departure(sensor: Instrument, kernels: Kernels) -> str:
         if outside[worst] > 1:
             return (
                 f"the MTF {axis} the track is {curve[worst]:.3g} at {FREQUENCIES[worst]:.2g} "
-                "cycles per pixel, where "
-                f"the network was trained on {low[worst]:.3g} to {high[worst]:.3g} for that "
-                "contrast at Nyquist: it "
-                "may restore worse than the traditional pipeline"
+                f"cycles per pixel, but {EXPECTED[kernels]} {low[worst]:.3g} to {high[worst]:.3g} "
+                "for that contrast at Nyquist"
             )
     return ""
 

@@ -18,7 +18,7 @@ from beers_deploy.dpu.cost.host import Task
 from beers_deploy.dpu.cost.latency import Prediction
 from beers_deploy.dpu.cost.own_runs import read_own_runs
 from beers_deploy.dpu.reading import own_tile_px
-from beers_deploy.model.departure import departure
+from beers_deploy.model.departure import has_other_curve
 from beers_deploy.model.exposure import factors_for
 from beers_deploy.network import Network
 from beers_deploy.performance.swath import PAPER_SIZE, Swath, parse_size, predict_network
@@ -158,7 +158,7 @@ def bench_board(
     halo_px = parse_halo(asked.halo, tiling.halo_px)
     takes_step = asked.consistency and keeps_pixels(tiling)
     tile_px = asked.tiles_px[0]
-    takes_detail = sensor is not None and bool(departure(sensor.nominal(), "cut"))
+    takes_detail = sensor is not None and has_other_curve(sensor.nominal())
     swath = Swath(
         width_px, height_px, tile_px, halo_px, consistency=takes_step, detail=takes_detail
     )

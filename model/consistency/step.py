@@ -50,7 +50,7 @@ from beers_deploy.model.consistency.detail import (
     separable_sums,
     window_weights,
 )
-from beers_deploy.model.departure import departure
+from beers_deploy.model.departure import has_other_curve
 from beers_deploy.model.simulator.mtf import sensor_mtf
 from beers_deploy.profiles.instrument import Instrument
 
@@ -163,7 +163,7 @@ class Consistency:
             means=means,
             excess=excess,
             full_scale=float(scale),
-            detail=DetailStep.of(down, right) if departure(sensor, "cut") else None,
+            detail=DetailStep.of(down, right) if has_other_curve(sensor) else None,
         )
 
     def correction(

@@ -17,6 +17,7 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 import beers_deploy as bd
+from beers_deploy.model.shipped import shipped_names
 from beers_deploy.profiles.sensor_numbers import numbers_of
 from beers_deploy.profiles.shipped import board_names, sensor_names
 from beers_deploy.results import SCHEMA_PATH
@@ -207,7 +208,9 @@ def test_a_pair_in_memory_is_evaluated_as_one_of_files(pair: bd.Pair, tmp_path: 
     scene = np.full((700, 800), 90.0, np.float32)
     assert simulated(images=scene).degraded.shape == (76, 96)
     assert {row.name for row in bd.boards().rows} == set(board_names())
-    assert [row.text["precision"] for row in bd.networks().rows] == ["float32", "int8"] * 5
+    assert [row.text["precision"] for row in bd.networks().rows] == ["float32", "int8"] * len(
+        shipped_names()
+    )
 
 
 def test_tensors_and_masked_arrays_are_returned_as_such(raw: np.ndarray) -> None:

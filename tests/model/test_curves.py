@@ -10,8 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beers_deploy.model.curves import FREQUENCIES, OBSCURATIONS, draw_table, pupil_contrast
-from beers_deploy.model.departure import departure
+from beers_deploy.model.departure import CURVES, departure, has_other_curve
 from beers_deploy.model.family import SensorFamily, sensor_vector
+from beers_deploy.model.io.tensors import read_conditioned
+from beers_deploy.model.shipped import shipped_weights
+from beers_deploy.model.variants import Kernels
 from beers_deploy.profiles.instrument import Instrument
 from beers_deploy.profiles.response import READING, MtfTable
 from beers_deploy.profiles.sensor import Sensor
@@ -67,25 +70,38 @@ def test_no_sensor_that_is_drawn_departs_from_what_was_trained(
     table = draw_table(contrast, ratio * contrast, np.random.default_rng(seed))
     across, along = table.at_nyquist
     sensor = replace(NOMINAL, response=table, mtf_nyquist=across, mtf_nyquist_along=along)
-    assert departure(sensor, "fitted") == ""
+    assert "may restore worse" not in departure(sensor, "fitted")
     formula = replace(NOMINAL, mtf_nyquist=contrast, mtf_nyquist_along=ratio * contrast)
     assert departure(formula, "fitted") == departure(formula, "cut") == ""
+    assert not has_other_curve(formula)
 
 
-def test_curves_that_no_training_drew_are_said() -> None:
+@pytest.mark.parametrize(
+    ("bend", "behind_cut", "behind_fitted"),
+    [
+        (0.02, "", ""),
+        (-0.1, f"{CURVES} was trained on such curves", "about level with the traditional"),
+        (0.1, f"{CURVES} was trained on such curves", "about level with the traditional"),
+        (-0.45, "may restore worse", "may restore worse"),
+    ],
+)
+def test_a_curve_that_a_network_does_not_know_is_a_warning(
+    bend: float, behind_cut: str, behind_fitted: str
+) -> None:
     formula = (0.07 / np.sinc(0.5)) ** (FREQUENCIES / 0.5) * np.sinc(FREQUENCIES)
     hill = np.exp(-(((FREQUENCIES - 0.25) / 0.1) ** 2))
-    for bend, cut, fitted in (
-        (-0.1, True, False),
-        (0.1, True, False),
-        (-0.45, True, True),
-        (0.02, False, False),
-    ):
-        sensor = of_curve(formula * (1 + bend * hill))
-        assert [departure(sensor, "cut") != "", departure(sensor, "fitted") != ""] == [cut, fitted]
-    message = departure(of_curve(formula * (1 - 0.45 * hill)), "fitted")
-    assert message.startswith("the MTF across the track is 0.1")
-    assert "where the network was trained on" in message
+    sensor = of_curve(formula * (1 + bend * hill))
+    assert has_other_curve(sensor) == bool(behind_cut)
+    expected: dict[Kernels, str] = {"cut": behind_cut, "fitted": behind_fitted}
+    for kernels, words in expected.items():
+        message = departure(sensor, kernels)
+        assert bool(message) == bool(words)
+        assert words in message
+        assert (CURVES in message) == (CURVES in words)
+
+
+def test_the_recommended_network_is_shipped_and_was_trained_on_such_curves() -> None:
+    assert read_conditioned(shipped_weights(CURVES)).kernels == "fitted"
 
 
 def test_a_family_draws_other_curves_in_their_share_and_none_is_outside_the_ranges() -> None:

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from beers_deploy.model.shipped import shipped_names
+from beers_deploy.model.io.tensors import read_conditioned
+from beers_deploy.model.shipped import shipped_names, shipped_weights
 from beers_deploy.model.training.recipe import RECIPES, load_recipe, recipe_names
 from beers_deploy.model.variants import VARIANTS
 from beers_deploy.profiles.errors import BeersError
@@ -16,9 +17,10 @@ WHOLE = f'variant = "convbeers-xs"\n{STAGE}'
 @pytest.mark.parametrize("name", recipe_names())
 def test_a_shipped_recipe_is_that_of_the_network_of_its_name(name: str) -> None:
     recipe = load_recipe(name)
-    assert recipe.variant == name
+    variant = VARIANTS[recipe.variant]
+    assert read_conditioned(shipped_weights(name)).variant == variant
     # The consistency step reads whole blocks of 8 pixels at the network's resolution.
-    assert recipe.patch_px % (8 * VARIANTS[name].scale) == 0
+    assert recipe.patch_px % (8 * variant.scale) == 0
     assert recipe.stages[-1].rounding
     assert recipe.start in ("", *shipped_names())
     assert recipe.held_out
