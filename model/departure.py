@@ -46,7 +46,7 @@ def departure(sensor: Instrument, kernels: Kernels) -> str:
         return f"{outside}: {worse}"
     if kernels == "cut":
         return f"{off_formula}: {worse}. {CURVES} was trained on such curves"
-    return f"{off_formula}: the network is then about level with the traditional pipeline"
+    return f"{off_formula}: there {CURVES} is about level with the traditional pipeline (measured)"
 
 
 def has_other_curve(sensor: Instrument) -> bool:
